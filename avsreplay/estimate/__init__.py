@@ -1,0 +1,1 @@
+"""The adaptive constrained filter and the maximum-likelihood fit."""

@@ -1,0 +1,187 @@
+"""Poses, quaternions and rotation vectors; every function takes one or a batch (leading axes).
+
+Quaternions are ``[x y z w]``, Hamilton, active: ``matrix(q_ab)`` takes coordinates in b to
+coordinates in a. ``multiply(q_ab, q_bc)`` is ``q_ac``: the matrices multiply in the same order.
+The paper writes the same product with its factors exchanged, ``a (x) b = multiply(b, a)``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+__all__ = [
+    "IDENTITY_QUAT",
+    "Array",
+    "Pose",
+    "angle",
+    "conjugate",
+    "exp",
+    "frozen",
+    "log",
+    "matrix",
+    "multiply",
+    "normalise",
+    "quaternion",
+    "skew",
+    "slerp",
+]
+
+Array = NDArray[np.float64]
+
+
+def frozen(values: ArrayLike, *shape: int) -> Array:
+    """A read-only float64 copy in C order; with ``shape`` given, checked against it (-1: any)."""
+    array = np.array(values, dtype=np.float64, order="C")
+    if shape and (array.ndim != len(shape) or any(s not in (-1, n) for s, n in zip(shape, array.shape, strict=True))):
+        raise ValueError(f"expected shape {shape}, got {array.shape}")
+    array.flags.writeable = False
+    return array
+
+
+IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])
+
+
+def skew(v: ArrayLike) -> Array:
+    """The matrix [v x] with ``skew(v) @ u == cross(v, u)``. (..., 3) -> (..., 3, 3)."""
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def normalise(q: ArrayLike) -> Array:
+    """Unit quaternion of the sign with w >= 0 (first non-zero component > 0 when w is 0). (..., 4)."""
+    q = np.asarray(q, dtype=np.float64)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    lead = np.where(q[..., 3] != 0.0, q[..., 3], np.take_along_axis(q, _first_nonzero(q)[..., None], -1)[..., 0])
+    return np.where(lead[..., None] < 0.0, -q, q)
+
+
+def _first_nonzero(q: Array) -> NDArray[np.intp]:
+    return np.argmax(q[..., :3] != 0.0, axis=-1)
+
+
+def multiply(q_ab: ArrayLike, q_bc: ArrayLike) -> Array:
+    """Hamilton product, ``q_ac``. (..., 4) x (..., 4) -> (..., 4)."""
+    a, b = np.asarray(q_ab, dtype=np.float64), np.asarray(q_bc, dtype=np.float64)
+    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    vector = aw * bv + bw * av + np.cross(av, bv)
+    scalar = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
+    return np.concatenate([vector, scalar], axis=-1)
+
+
+def conjugate(q_ab: ArrayLike) -> Array:
+    """``q_ba``. (..., 4)."""
+    return np.asarray(q_ab, dtype=np.float64) * np.array([-1.0, -1.0, -1.0, 1.0])
+
+
+def matrix(q_ab: ArrayLike) -> Array:
+    """R_ab = I + 2 w [v x] + 2 [v x]^2 (paper, eq:R): active. (..., 4) -> (..., 3, 3)."""
+    q = np.asarray(q_ab, dtype=np.float64)
+    s = skew(q[..., :3])
+    return np.eye(3) + 2.0 * q[..., 3, None, None] * s + 2.0 * (s @ s)
+
+
+def quaternion(R_ab: ArrayLike) -> Array:
+    """Unit quaternion of a rotation matrix, w >= 0. (..., 3, 3) -> (..., 4)."""
+    R = np.asarray(R_ab, dtype=np.float64)
+    xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
+    four_q_qT = np.empty((*R.shape[:-2], 4, 4))  # row k is 4 q_k q: the row of the largest q_k is well conditioned
+    four_q_qT[..., 0, 0], four_q_qT[..., 1, 1] = 1 + xx - yy - zz, 1 - xx + yy - zz
+    four_q_qT[..., 2, 2], four_q_qT[..., 3, 3] = 1 - xx - yy + zz, 1 + xx + yy + zz
+    for i, j, value in (
+        (0, 1, R[..., 0, 1] + R[..., 1, 0]),
+        (0, 2, R[..., 0, 2] + R[..., 2, 0]),
+        (1, 2, R[..., 1, 2] + R[..., 2, 1]),
+        (0, 3, R[..., 2, 1] - R[..., 1, 2]),
+        (1, 3, R[..., 0, 2] - R[..., 2, 0]),
+        (2, 3, R[..., 1, 0] - R[..., 0, 1]),
+    ):
+        four_q_qT[..., i, j] = four_q_qT[..., j, i] = value
+    best = np.argmax(np.diagonal(four_q_qT, axis1=-2, axis2=-1), axis=-1)
+    return normalise(np.take_along_axis(four_q_qT, best[..., None, None], axis=-2)[..., 0, :])
+
+
+def exp(rotvec: ArrayLike) -> Array:
+    """Quaternion of a rotation vector [rad]. (..., 3) -> (..., 4)."""
+    v = np.asarray(rotvec, dtype=np.float64)
+    half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.concatenate([0.5 * np.sinc(half / np.pi) * v, np.cos(half)], axis=-1)
+
+
+def log(q: ArrayLike) -> Array:
+    """Rotation vector [rad], angle in [0, pi]. (..., 4) -> (..., 3)."""
+    q = normalise(q)
+    v, w = q[..., :3], q[..., 3:]
+    norm = np.linalg.norm(v, axis=-1, keepdims=True)
+    small = norm < 1e-8
+    scale = np.where(small, 2.0 / np.where(w > 0.5, w, 1.0), 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm))
+    return scale * v
+
+
+def angle(q: ArrayLike) -> Array:
+    """Rotation angle [rad] in [0, pi]. (..., 4) -> (...)."""
+    q = np.asarray(q, dtype=np.float64)
+    return 2.0 * np.arctan2(np.linalg.norm(q[..., :3], axis=-1), np.abs(q[..., 3]))
+
+
+def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:
+    """Constant-rate interpolation from q0 (fraction 0) to q1 (1) the short way. (4) x (4) -> (4)."""
+    return normalise(multiply(q0, exp(fraction * log(multiply(conjugate(q0), q1)))))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pose:
+    """T_ab: takes coordinates in b to coordinates in a, ``p_a = R_ab p_b + t_ab_a``.
+
+    Attributes:
+        q: (4,) unit quaternion q_ab ``[x y z w]``, w >= 0.
+        t: (3,) origin of b in a [m].
+    """
+
+    q: Array
+    t: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "q", frozen(normalise(self.q), 4))
+        object.__setattr__(self, "t", frozen(self.t, 3))
+
+    @classmethod
+    def identity(cls) -> Pose:
+        """The pose that changes nothing."""
+        return cls(IDENTITY_QUAT, np.zeros(3))
+
+    @classmethod
+    def from_matrix(cls, T_ab: ArrayLike) -> Pose:
+        """From a (4, 4) homogeneous matrix; the rotation part is re-orthonormalised through the quaternion."""
+        T = np.asarray(T_ab, dtype=np.float64)
+        return cls(quaternion(T[:3, :3]), T[:3, 3])
+
+    @property
+    def R(self) -> Array:
+        """(3, 3) rotation matrix R_ab."""
+        return matrix(self.q)
+
+    @property
+    def matrix(self) -> Array:
+        """(4, 4) homogeneous matrix T_ab."""
+        out = np.eye(4)
+        out[:3, :3], out[:3, 3] = self.R, self.t
+        return out
+
+    def inverse(self) -> Pose:
+        """T_ba."""
+        q_ba = conjugate(self.q)
+        return Pose(q_ba, -matrix(q_ba) @ self.t)
+
+    def __matmul__(self, other: Pose) -> Pose:
+        """T_ab @ T_bc = T_ac."""
+        return Pose(multiply(self.q, other.q), self.R @ other.t + self.t)
+
+    def apply(self, points_b: ArrayLike) -> Array:
+        """Points (..., 3) from b to a."""
+        return np.asarray(points_b, dtype=np.float64) @ self.R.T + self.t

@@ -1,0 +1,1 @@
+"""The door for bytes: logs, bags and folders in; MCAP out."""

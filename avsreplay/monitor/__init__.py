@@ -1,0 +1,1 @@
+"""Watching the estimate: faults, observability, consistency, convergence."""

@@ -1,0 +1,1 @@
+"""Rendezvous with a moving grasp point in least time."""

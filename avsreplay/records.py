@@ -1,0 +1,303 @@
+"""The nouns every stage speaks: frozen, float64, read-only; verbs are functions from these to these.
+
+Frames: {A} camera (inertial), {B} principal axes at the target's centre of mass, {C} grapple fixture, which is
+also the frame of the model. ``T_ac`` is the pose of {C} in {A}. SI units and radians; instants are ``t_ns``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose, frozen
+
+__all__ = [
+    "AlignStatus",
+    "Alignment",
+    "Belief",
+    "Fit",
+    "Innovation",
+    "Label",
+    "LogHeader",
+    "Plan",
+    "PlanStatus",
+    "Reason",
+    "Scan",
+    "ScanStatus",
+    "State",
+    "Surface",
+    "Trajectory",
+    "Verdict",
+]
+
+
+class ScanStatus(Enum):
+    """What the door found of a scan."""
+
+    OK = "ok"
+    EMPTY = "empty"  # a message with no finite point
+    DAMAGED = "damaged"  # a message that could not be decoded
+    CLOCK = "clock"  # an implausible stamp: placed by the log's clock, not to be trusted in time
+
+
+class AlignStatus(Enum):
+    """What the ruler (register.assess) found of an alignment."""
+
+    ALIGNED = "aligned"
+    NOT_CONVERGED = "not_converged"  # n_max reached; the pose is still graded
+    DEGENERATE = "degenerate"  # the view leaves a direction free
+    NO_OVERLAP = "no_overlap"  # no or too few inliers: not aligned, whatever the back end says
+    NO_POINTS = "no_points"
+    AMBIGUOUS = "ambiguous"  # acquisition: a second pose fits as well
+    FAILED = "failed"  # the back end raised or returned a pose that is not finite
+
+
+class Reason(Enum):
+    """Why gamma is 0 (``OK``: gamma is 1). The first that holds, in this order."""
+
+    OK = "ok"
+    NO_SCAN = "no_scan"  # empty or damaged scan
+    NOT_ALIGNED = "not_aligned"  # no overlap, failed, ambiguous
+    NOT_CONVERGED = "not_converged"
+    FEW_INLIERS = "few_inliers"
+    FIT_ERROR = "fit_error"  # rms_m >= threshold
+    POSE_JUMP = "pose_jump"  # weighted innovation norm >= threshold
+    CLOCK = "clock"  # stamp steps back or jumps: the scan cannot be placed in time
+
+
+class PlanStatus(Enum):
+    """What the planner can claim."""
+
+    OPTIMAL = "optimal"  # first feasible time, certified to the stated gap
+    FEASIBLE = "feasible"  # satisfies all constraints; no claim of least time
+    INFEASIBLE = "infeasible_within_horizon"
+    NO_CONVERGENCE = "no_convergence"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A target model in {C}: a triangle mesh, or a bare cloud where ``faces`` is empty.
+
+    Attributes:
+        vertices: (n, 3) [m].  faces: (m, 3) vertex indices, int32, possibly (0, 3).
+        name: file name as given.  sha256: of the file's bytes.  data: those bytes (for the log's attachment).
+    """
+
+    vertices: Array
+    faces: NDArray[np.int32]
+    name: str
+    sha256: str
+    data: bytes = b""
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the bounding box [m]."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """The motion of a target and its parameters (eq:x): the mean that the 20 error states surround.
+
+    Attributes:
+        q_ab: (4,) attitude of {B}.  w_b: (3,) angular rate of {B} in {A}, in {B} [rad/s].
+        r_a: (3,) centre of mass, rho_o [m].  v_a: (3,) its velocity [m/s].
+        sigma: (2,) inertia ratios.  c_b: (3,) fixture in {B}, varrho [m].  q_bc: (4,) mu, {C} to {B}.
+    """
+
+    q_ab: Array
+    w_b: Array
+    r_a: Array
+    v_a: Array
+    sigma: Array
+    c_b: Array
+    q_bc: Array
+
+    def __post_init__(self) -> None:
+        for name, size in (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4)):
+            object.__setattr__(self, name, frozen(getattr(self, name), size))
+
+    @property
+    def T_ac(self) -> Pose:
+        """Pose of the fixture in the camera: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho."""
+        return Pose(geometry.multiply(self.q_ab, self.q_bc), self.r_a + geometry.matrix(self.q_ab) @ self.c_b)
+
+    @property
+    def fixture_velocity(self) -> Array:
+        """(3,) velocity of {C}'s origin in {A} [m/s] (section 8)."""
+        return self.v_a + geometry.matrix(self.q_ab) @ np.cross(self.w_b, self.c_b)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Label:
+    """A fault put into the log on purpose: its kind over a window of the log clock."""
+
+    kind: str
+    start_ns: int
+    end_ns: int
+    harmful: bool = True
+    strength: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scan:
+    """One cloud as the door hands it on.
+
+    Attributes:
+        seq: place in the replay's order, from 0.  t_ns: instant on the chosen clock.
+        log_ns: when the recorder wrote it.
+        points: (n, 3) finite, float32 or float64, possibly strided, in {A} [m].
+        times_s: (n,) instant of each point relative to ``t_ns`` [s], or None.
+        dropped_points: how many non-finite points were left out.
+        truth: pose T_ac at t_ns where the log has one.  body: full true state where the log has it.
+        fault: label of the injected fault, None outside every window.
+    """
+
+    seq: int
+    t_ns: int
+    points: NDArray[Any]
+    status: ScanStatus = ScanStatus.OK
+    times_s: NDArray[Any] | None = None
+    dropped_points: int = 0
+    truth: Pose | None = None
+    body: State | None = None
+    fault: str | None = None
+    note: str | None = None
+    log_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LogHeader:
+    """What a log says of itself, so that it runs with no flag.
+
+    Attributes:
+        surface: the target's model.  scenario: its TOML text, "" for a recorded log.  seed: of the simulation.
+        labels: faults put in on purpose, windows on the log clock.  start: first belief (mean and covariance).
+        truth: the true state at the first scan.  notes: free text by name (source, units, clock).
+    """
+
+    surface: Surface | None = None
+    scenario: str = ""
+    seed: int | None = None
+    labels: tuple[Label, ...] = ()
+    start: Belief | None = None
+    truth: State | None = None
+    notes: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """What a back end returns, nothing more: T_ca (scan {A} into model {C}), iterations, its own flag."""
+
+    T_ca: Pose
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Alignment:
+    """A graded pose (register.assess): one ruler for every back end.
+
+    Attributes:
+        T_ac: measured pose of the model in the camera (the inverse of what ICP iterates).
+        info: (6, 6) information of the error d = [theta; v], both in {C} [rad, m], where
+            T_ac_true = T_ac @ Exp(d): noise-scaled, singular directions left singular.
+        covariance: (6, 6) calibrated covariance of the same d, or None where the view is degenerate.
+        weakest: words for the free directions ("slides along x"), empty if none.
+    """
+
+    T_ac: Pose
+    iterations: int
+    converged: bool
+    points: int
+    inliers: int
+    rms_m: float
+    info: Array
+    status: AlignStatus
+    covariance: Array | None = None
+    weakest: str = ""
+
+    @property
+    def inlier_ratio(self) -> float:
+        """Inliers over points, 0 for an empty scan."""
+        return self.inliers / self.points if self.points else 0.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Belief:
+    """Mean and covariance at an instant.
+
+    Attributes:
+        P: (20, 20) covariance of [dq_v, w, rho_o, v, sigma, varrho, dmu_v]; dq_v, dmu_v are HALF-angle vectors,
+            q = dq (x) q_hat and mu = mu_hat (x) dmu in the paper's product.
+    """
+
+    t_ns: int
+    x: State
+    P: Array
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "P", frozen(self.P, 20, 20))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Innovation:
+    """alpha = z - h(x-) for z = (rho, deta_v) [m, half-angle], its covariance and its size.
+
+    Attributes:
+        alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.
+        nis: alpha' S^-1 alpha.  distance_m: |d rho|.  angle_rad: rotation angle of the innovation.
+    """
+
+    alpha: Array
+    S: Array
+    R: Array
+    nis: float
+    distance_m: float
+    angle_rad: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Verdict:
+    """The fault detector's word on one scan: gamma 1 (healthy) or 0, and why."""
+
+    gamma: int
+    reason: Reason
+
+
+Trajectory = Callable[[Array], tuple[Array, Array]]
+"""Times (n,) [s after now] -> positions (n, 3) [m] and velocities (n, 3) [m/s] of the grasp point in {A}."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """A rendezvous: least time to meet r(t_f) = rho(t_f) and the velocities alike, with |u| <= a_max.
+
+    Attributes:
+        t_ns: instant of planning.  t_go_s: t_f - t (NaN where there is none).
+        costate: (6,) [c1, c2] of p = c2 - c1 tau, tau from t, unit norm.
+        lower_bound_s: certified least t_go.  u_max: largest |u| found along the propagated plan [m/s2].
+        position_error_m, velocity_error_mps: terminal errors of the propagated plan.
+    """
+
+    t_ns: int
+    status: PlanStatus
+    t_go_s: float
+    costate: Array
+    a_max: float
+    lower_bound_s: float
+    position_error_m: float
+    velocity_error_mps: float
+    u_max: float
+    extras: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def found(self) -> bool:
+        """Is there a capture to fly?"""
+        return self.status in (PlanStatus.OPTIMAL, PlanStatus.FEASIBLE)

@@ -1,0 +1,1 @@
+"""Rows to people and files: tables, golden comparison, exports, pages."""

@@ -1,0 +1,1 @@
+"""Simulated scans with truth: target, motion, scanner, faults, scenario."""
