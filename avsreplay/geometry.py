@@ -46,23 +46,20 @@ IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])
 
 def skew(v: ArrayLike) -> Array:
     """The matrix [v x] with ``skew(v) @ u == cross(v, u)``. (..., 3) -> (..., 3, 3)."""
-    v = np.asarray(v, dtype=np.float64)
-    out = np.zeros((*v.shape, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    a: Array = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*a.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -a[..., 2], a[..., 1], -a[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = a[..., 2], -a[..., 1], a[..., 0]
     return out
 
 
 def normalise(q: ArrayLike) -> Array:
-    """Unit quaternion of the sign with w >= 0 (first non-zero component > 0 when w is 0). (..., 4)."""
-    q = np.asarray(q, dtype=np.float64)
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    lead = np.where(q[..., 3] != 0.0, q[..., 3], np.take_along_axis(q, _first_nonzero(q)[..., None], -1)[..., 0])
-    return np.where(lead[..., None] < 0.0, -q, q)
-
-
-def _first_nonzero(q: Array) -> NDArray[np.intp]:
-    return np.argmax(q[..., :3] != 0.0, axis=-1)
+    """Unit quaternion of the sign with w >= 0 (where w is 0: first non-zero component > 0). (..., 4)."""
+    unit: Array = np.asarray(q, dtype=np.float64)
+    unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
+    wxyz = np.roll(unit, 1, axis=-1)
+    lead = np.take_along_axis(wxyz, np.argmax(wxyz != 0.0, axis=-1)[..., None], axis=-1)
+    return np.asarray(np.where(lead < 0.0, -unit, unit), dtype=np.float64)
 
 
 def multiply(q_ab: ArrayLike, q_bc: ArrayLike) -> Array:
@@ -81,9 +78,10 @@ def conjugate(q_ab: ArrayLike) -> Array:
 
 def matrix(q_ab: ArrayLike) -> Array:
     """R_ab = I + 2 w [v x] + 2 [v x]^2 (paper, eq:R): active. (..., 4) -> (..., 3, 3)."""
-    q = np.asarray(q_ab, dtype=np.float64)
+    q: Array = np.asarray(q_ab, dtype=np.float64)
     s = skew(q[..., :3])
-    return np.eye(3) + 2.0 * q[..., 3, None, None] * s + 2.0 * (s @ s)
+    R: Array = np.eye(3) + 2.0 * q[..., 3, None, None] * s + 2.0 * (s @ s)
+    return R
 
 
 def quaternion(R_ab: ArrayLike) -> Array:
@@ -115,18 +113,20 @@ def exp(rotvec: ArrayLike) -> Array:
 
 def log(q: ArrayLike) -> Array:
     """Rotation vector [rad], angle in [0, pi]. (..., 4) -> (..., 3)."""
-    q = normalise(q)
-    v, w = q[..., :3], q[..., 3:]
+    unit = normalise(q)
+    v, w = unit[..., :3], unit[..., 3:]
     norm = np.linalg.norm(v, axis=-1, keepdims=True)
     small = norm < 1e-8
-    scale = np.where(small, 2.0 / np.where(w > 0.5, w, 1.0), 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm))
-    return scale * v
+    scale = np.where(small, 2.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm))
+    rotvec: Array = scale * v
+    return rotvec
 
 
 def angle(q: ArrayLike) -> Array:
     """Rotation angle [rad] in [0, pi]. (..., 4) -> (...)."""
-    q = np.asarray(q, dtype=np.float64)
-    return 2.0 * np.arctan2(np.linalg.norm(q[..., :3], axis=-1), np.abs(q[..., 3]))
+    a: Array = np.asarray(q, dtype=np.float64)
+    theta: Array = 2.0 * np.arctan2(np.linalg.norm(a[..., :3], axis=-1), np.abs(a[..., 3]))
+    return theta
 
 
 def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:

@@ -63,9 +63,7 @@ class Row:
     seq: int = _flag("place of the scan in the replay, from 0", table=True)
     t_ns: int = _flag("instant of the scan on the chosen clock [ns]")
     t_s: float = column("s", ".2f", 0.0, 1e-9, "time since the first scan", True)
-    status: str = _flag(
-        "what the door and the ruler found: ok, empty, damaged, clock; aligned, degenerate, ...", table=True
-    )
+    status: str = _flag("what the door and the ruler found of the scan", table=True)
     gamma: int = _flag("1: healthy, used by the filter; 0: faulty, the filter coasts", table=True)
     reason: str = _flag("why gamma is 0; 'ok' where it is 1", table=True)
     guess: str = _flag("where the registration's guess came from: init, predicted, last, acquired")
@@ -80,20 +78,16 @@ class Row:
     reg_x_m: float | None = _metres("registration's pose of {C} in {A}")
     reg_y_m: float | None = _metres("see reg_x_m")
     reg_z_m: float | None = _metres("see reg_x_m")
-    reg_qx: float | None = _number("registration's attitude q_ac, scalar last, w >= 0")
+    reg_qx: float | None = _number("measured attitude q_ac, scalar last, w >= 0")
     reg_qy: float | None = _number("see reg_qx")
     reg_qz: float | None = _number("see reg_qx")
     reg_qw: float | None = _number("see reg_qx")
 
-    nis: float | None = column(
-        "", ".2f", 1e-3, 1e-4, "normalised innovation squared, chi-square with 6 degrees of freedom", True
-    )
+    nis: float | None = column("", ".2f", 1e-3, 1e-4, "normalised innovation squared, chi-square of 6", True)
     innov_m: float | None = _metres("length of the position innovation")
     innov_deg: float | None = _degrees("rotation angle of the innovation")
 
-    estimator: str = _flag(
-        "who speaks: near, start (rate from first poses), fit (maximum likelihood), filter", table=False
-    )
+    estimator: str = _flag("who speaks: near, start, fit, filter", table=False)
     x_m: float | None = _metres("estimated pose of {C} in {A}, after the update")
     y_m: float | None = _metres("see x_m")
     z_m: float | None = _metres("see x_m")
@@ -126,18 +120,12 @@ class Row:
     muw: float | None = _number("see mux")
     mu_1s_deg: float | None = _number("1 sigma of mu, root of the trace", "deg")
 
-    pos_err_m: float | None = column("m", ".4f", 1e-3, 1e-5, "distance of the estimated from the true position", True)
-    rot_err_deg: float | None = column(
-        "deg", ".3f", 1e-3, 1e-3, "angle between the estimated and the true attitude", True
-    )
-    reg_pos_err_m: float | None = column(
-        "m", ".4f", 1e-3, 1e-5, "distance of the registration's from the true position"
-    )
-    reg_rot_err_deg: float | None = column(
-        "deg", ".3f", 1e-3, 1e-3, "angle between the registration's and the true attitude"
-    )
+    pos_err_m: float | None = column("m", ".4f", 1e-3, 1e-5, "distance of estimated and true position", True)
+    rot_err_deg: float | None = column("deg", ".3f", 1e-3, 1e-3, "angle between estimated and true attitude", True)
+    reg_pos_err_m: float | None = column("m", ".4f", 1e-3, 1e-5, "distance of measured and true position")
+    reg_rot_err_deg: float | None = column("deg", ".3f", 1e-3, 1e-3, "angle between measured and true attitude")
     nees: float | None = column(
-        "", ".2f", 1e-2, 1e-3, "normalised estimation error squared over the 20 states, modulo relabelling"
+        "", ".2f", 1e-2, 1e-3, "normalised estimation error squared of 20 states, modulo relabelling"
     )
 
     r_pos_m: float | None = _number("adapted measurement noise, position, root mean diagonal", "m")
@@ -146,19 +134,15 @@ class Row:
     r_floors: int | None = _flag("times an eigenvalue floor of R acted so far")
 
     ogm_log10_cond: float | None = column(
-        "", ".1f", 1e-3, 1e-2, "log10 condition of the observability Gramian (null below full rank)", True
+        "", ".1f", 1e-3, 1e-2, "log10 condition of the Gramian (null below full rank)", True
     )
-    ogm_log10_cond_scaled: float | None = column(
-        "", ".1f", 1e-3, 1e-2, "the same, scaled by the prior standard deviations"
-    )
+    ogm_log10_cond_scaled: float | None = column("", ".1f", 1e-3, 1e-2, "the same, scaled by the prior sigmas")
     ogm_rank: int | None = _flag("numerical rank of the scaled Gramian out of 20", table=True)
     consistent: bool | None = _flag("innovations inside their chi-square band")
     converged: bool = _flag("may the planner rely on the estimate", table=True)
-    grasp_pos_1s_m: float | None = _number(
-        "largest predicted 1 sigma of the grasp point's position over the horizon", "m"
-    )
-    grasp_vel_1s_mps: float | None = _number("largest predicted 1 sigma of its velocity over the horizon", "m/s")
-    grasp_rot_1s_deg: float | None = _number("largest predicted 1 sigma of its attitude over the horizon", "deg")
+    grasp_pos_1s_m: float | None = _number("horizon's largest 1 sigma of the grasp point's position", "m")
+    grasp_vel_1s_mps: float | None = _number("horizon's largest 1 sigma of its velocity", "m/s")
+    grasp_rot_1s_deg: float | None = _number("horizon's largest 1 sigma of its attitude", "deg")
 
     plan_status: str | None = _flag("what the planner claims")
     capture_time_s: float | None = column(

@@ -22,6 +22,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 __all__ = ["Document", "build", "dump", "load", "override", "parse"]
 
 T = TypeVar("T")
+_Path = tuple[str | int, ...]
 MAX_BYTES = 1 << 20
 _HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
 _KEY = re.compile(r"^\s*([A-Za-z0-9_\-.\"']+)\s*=")
@@ -119,7 +120,7 @@ def _deep_copy(value: Any) -> Any:
     return [_deep_copy(v) for v in value] if isinstance(value, list) else value
 
 
-def _build(cls: Any, table: Any, document: Document, path: tuple[str | int, ...]) -> Any:
+def _build(cls: Any, table: Any, document: Document, path: _Path) -> Any:
     if not isinstance(table, Mapping):
         raise UsageError(f"'{_dotted(path)}' must be a table", where=document.where(path), hint="write it as [table]")
     hints = typing.get_type_hints(cls)
@@ -139,7 +140,7 @@ def _build(cls: Any, table: Any, document: Document, path: tuple[str | int, ...]
         raise UsageError(str(error), where=document.where(path), hint="correct the value") from None
 
 
-def _coerce(hint: Any, value: Any, document: Document, path: tuple[str | int, ...]) -> Any:
+def _coerce(hint: Any, value: Any, document: Document, path: _Path) -> Any:
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, types.UnionType):
         if value is None:
@@ -173,17 +174,12 @@ def _coerce(hint: Any, value: Any, document: Document, path: tuple[str | int, ..
     )
 
 
-def _coerce_tuple(
-    args: tuple[Any, ...], value: list[Any], document: Document, path: tuple[str | int, ...]
-) -> tuple[Any, ...]:
+def _coerce_tuple(args: tuple[Any, ...], value: list[Any], document: Document, path: _Path) -> tuple[Any, ...]:
     if len(args) == 2 and args[1] is Ellipsis:
         args = (args[0],) * len(value)
     if len(args) != len(value):
-        raise UsageError(
-            f"'{_dotted(path)}' must have {len(args)} values, not {len(value)}",
-            where=document.where(path),
-            hint="correct the value",
-        )
+        wrong = f"'{_dotted(path)}' must have {len(args)} values, not {len(value)}"
+        raise UsageError(wrong, where=document.where(path), hint="correct the value")
     return tuple(_coerce(a, v, document, (*path, i)) for i, (a, v) in enumerate(zip(args, value, strict=True)))
 
 

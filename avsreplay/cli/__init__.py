@@ -1,1 +1,112 @@
-"""The command line: one file a command; nothing else prints or exits."""
+"""The command line: one file a command; nothing else prints or exits.
+
+A command is the object named ``command`` in ``avsreplay/cli/<name>.py``; it is imported when it is called, so that
+``avsreplay --help`` stays quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+from avsreplay.errors import AvsError
+
+__all__ = ["main"]
+
+SUMMARIES = {
+    "record": "Write a log: simulate a scenario, or take over scans that others recorded.",
+    "run": "Replay a log and print the tables; gate it with a golden file.",
+    "info": "Say what is in a log.",
+    "doctor": "Examine a log for damage and repair it.",
+    "backends": "List the registration back ends; check one against the contract.",
+    "bench": "Time back ends side by side on a log.",
+    "observability": "Show what the measurements can and cannot tell.",
+    "plan": "Replan the capture from a saved result.",
+    "report": "Build the HTML report of a saved result.",
+    "compare": "Compare saved results; gate one against a baseline.",
+    "sweep": "Run a campaign of many runs.",
+    "config": "Print the effective configuration.",
+}
+
+EPILOG = """\b
+Examples:
+  avsreplay record -o tumble.mcap          the built-in scenario, simulated
+  avsreplay run tumble.mcap                replay it and print the tables
+  avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
+
+\b
+Exit codes: 0 ok, 1 the check asked for failed, 2 usage,
+            3 unreadable input, 4 finished but data was lost."""
+
+
+class _Commands(click.Group):
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(SUMMARIES)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in SUMMARIES:
+            return None
+        command: click.Command = importlib.import_module(f"avsreplay.cli.{name}").command
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl(list(SUMMARIES.items()))
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            raise click.UsageError(f"{error.message} Known: {', '.join(SUMMARIES)}.", ctx) from None
+
+
+def _print_version(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
+    if not wanted or ctx.resilient_parsing:
+        return
+    from avsreplay.cli.version import version_text
+
+    click.echo(version_text())
+    ctx.exit()
+
+
+@click.group(cls=_Commands, epilog=EPILOG, context_settings={"help_option_names": ["-h", "--help"]})
+@click.option(
+    "--version",
+    is_flag=True,
+    expose_value=False,
+    is_eager=True,
+    callback=_print_version,
+    help="Show the version of avsreplay and of what it stands on.",
+)
+def group() -> None:
+    """Record, replay and gate the chain of vision-guided capture.
+
+    Point clouds in; pose error, fault flags, observability and planned capture time out; the same bytes every time.
+    """
+
+
+def main() -> None:
+    """Entry point: an AvsError is one line on stderr and its exit code; no traceback."""
+    try:
+        code = group.main(standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY")
+    except AvsError as error:
+        code = _fail(str(error), error.exit_code)
+    except click.ClickException as error:
+        error.show()
+        code = error.exit_code
+    except (click.Abort, KeyboardInterrupt):
+        code = _fail("interrupted", 130)
+    except BrokenPipeError:
+        sys.stderr.close()
+        code = 0
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _fail(message: str, code: int) -> int:
+    printable = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
+    click.echo(f"avsreplay: {printable}", err=True)
+    return code

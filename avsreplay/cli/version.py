@@ -1,0 +1,29 @@
+"""What ``--version`` prints."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+
+import avsreplay
+
+PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", "clarabel", "click", "rich")
+
+__all__ = ["version_text", "versions"]
+
+
+def versions() -> dict[str, str]:
+    """Versions of the package, Python and the libraries it stands on; "missing" where one is not installed."""
+    found = {"avsreplay": avsreplay.__version__, "python": platform.python_version()}
+    for part in PARTS:
+        try:
+            found[part] = metadata.version(part)
+        except metadata.PackageNotFoundError:
+            found[part] = "missing"
+    return found
+
+
+def version_text() -> str:
+    """One line for the package, one for the rest."""
+    own, *rest = versions().items()
+    return f"{own[0]} {own[1]}\n" + ", ".join(f"{name} {version}" for name, version in rest)
