@@ -73,7 +73,7 @@ def multiply(q_ab: ArrayLike, q_bc: ArrayLike) -> Array:
 
 def conjugate(q_ab: ArrayLike) -> Array:
     """``q_ba``. (..., 4)."""
-    return np.asarray(q_ab, dtype=np.float64) * np.array([-1.0, -1.0, -1.0, 1.0])
+    return np.asarray(np.multiply(q_ab, [-1.0, -1.0, -1.0, 1.0]), dtype=np.float64)
 
 
 def matrix(q_ab: ArrayLike) -> Array:

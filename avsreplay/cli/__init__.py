@@ -42,16 +42,16 @@ Exit codes: 0 ok, 1 the check asked for failed, 2 usage,
 
 
 class _Commands(click.Group):
-    def list_commands(self, ctx: click.Context) -> list[str]:
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 (click names it)
         return list(SUMMARIES)
 
-    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:  # noqa: ARG002 (click names it)
         if name not in SUMMARIES:
             return None
         command: click.Command = importlib.import_module(f"avsreplay.cli.{name}").command
         return command
 
-    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 (click names it)
         with formatter.section("Commands"):
             formatter.write_dl(list(SUMMARIES.items()))
 

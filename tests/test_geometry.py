@@ -1,0 +1,112 @@
+"""The laws of rotations and poses, against scipy's Rotation as the oracle."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.spatial.transform import Rotation
+
+from avsreplay import geometry
+from avsreplay.geometry import Pose
+
+finite = st.floats(-10.0, 10.0, allow_nan=False)
+vectors = arrays(np.float64, 3, elements=finite)
+quaternions = arrays(np.float64, 4, elements=st.floats(-1.0, 1.0)).filter(lambda q: np.linalg.norm(q) > 1e-3)
+
+
+def batch(n=200, seed=3):
+    return geometry.normalise(np.random.default_rng(seed).normal(size=(n, 4)))
+
+
+def test_matrix_is_the_active_rotation():
+    q = batch()
+    np.testing.assert_allclose(geometry.matrix(q), Rotation.from_quat(q).as_matrix(), atol=1e-15)
+
+
+def test_product_multiplies_the_matrices_in_the_same_order():
+    a, b = batch(seed=1), batch(seed=2)
+    np.testing.assert_allclose(
+        geometry.matrix(geometry.multiply(a, b)), geometry.matrix(a) @ geometry.matrix(b), atol=1e-14
+    )
+
+
+def test_papers_product_is_hamiltons_with_its_factors_exchanged():
+    a, b = batch(1, seed=4)[0], batch(1, seed=5)[0]
+    av, aw, bv, bw = a[:3], a[3], b[:3], b[3]
+    printed = np.append(aw * bv + bw * av - np.cross(av, bv), aw * bw - av @ bv)
+    np.testing.assert_allclose(printed, geometry.multiply(b, a), atol=1e-15)
+
+
+@given(quaternions)
+def test_quaternion_inverts_matrix(q):
+    unit = geometry.normalise(q)
+    back = geometry.quaternion(geometry.matrix(unit))
+    np.testing.assert_allclose(geometry.matrix(back), geometry.matrix(unit), atol=1e-12)
+    assert back[3] >= 0.0
+
+
+def test_quaternion_near_half_turns():
+    axes = np.random.default_rng(0).normal(size=(100, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    for angle in (np.pi, np.pi - 1e-9, np.pi - 1e-4):
+        R = Rotation.from_rotvec(angle * axes).as_matrix()
+        np.testing.assert_allclose(geometry.matrix(geometry.quaternion(R)), R, atol=1e-9)
+
+
+@given(vectors)
+def test_log_inverts_exp_within_half_a_turn(v):
+    v = v * min(1.0, 3.14 / max(np.linalg.norm(v), 1e-12))
+    np.testing.assert_allclose(geometry.log(geometry.exp(v)), v, atol=1e-9)
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-300, 1e-12, 1e-8, 1e-4, 1.0, 3.0])
+def test_exp_agrees_with_rotvec_at_every_size(size):
+    v = size * np.array([0.6, -0.0, 0.8])
+    np.testing.assert_allclose(geometry.matrix(geometry.exp(v)), Rotation.from_rotvec(v).as_matrix(), atol=1e-15)
+
+
+@given(quaternions)
+def test_normalise_gives_one_of_the_two_signs(q):
+    np.testing.assert_array_equal(geometry.normalise(q), geometry.normalise(-q))
+
+
+def test_skew_is_the_cross_product():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=(2, 50, 3))
+    np.testing.assert_allclose(np.einsum("nij,nj->ni", geometry.skew(a), b), np.cross(a, b), atol=1e-15)
+
+
+def test_pose_inverse_and_composition():
+    q, t = batch(3), np.random.default_rng(1).normal(size=(3, 3))
+    a, b, c = (Pose(*pair) for pair in zip(q, t, strict=True))
+    np.testing.assert_allclose((a @ a.inverse()).matrix, np.eye(4), atol=1e-14)
+    np.testing.assert_allclose(((a @ b) @ c).matrix, a.matrix @ b.matrix @ c.matrix, atol=1e-14)
+    points = np.random.default_rng(2).normal(size=(7, 3))
+    np.testing.assert_allclose((a @ b).apply(points), a.apply(b.apply(points)), atol=1e-14)
+
+
+def test_pose_from_matrix_restores_orthonormality():
+    q = batch(1)[0]
+    T = Pose(q, [1.0, 2.0, 3.0]).matrix
+    T[:3, :3] *= 1.0 + 1e-9
+    pose = Pose.from_matrix(T)
+    np.testing.assert_allclose(pose.R.T @ pose.R, np.eye(3), atol=1e-15)
+
+
+def test_slerp_turns_at_constant_rate_the_short_way():
+    a, b = batch(1, seed=7)[0], batch(1, seed=8)[0]
+    whole = geometry.angle(geometry.multiply(geometry.conjugate(a), b))
+    for fraction in (0.0, 0.25, 1.0):
+        part = geometry.slerp(a, b, fraction)
+        assert geometry.angle(geometry.multiply(geometry.conjugate(a), part)) == pytest.approx(
+            fraction * whole, abs=1e-12
+        )
+
+
+def test_frozen_cannot_be_written_and_checks_its_shape():
+    array = geometry.frozen([1, 2, 3], 3)
+    with pytest.raises(ValueError, match="read-only"):
+        array[0] = 5.0
+    with pytest.raises(ValueError, match="shape"):
+        geometry.frozen([1, 2, 3], 4)

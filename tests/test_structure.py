@@ -1,0 +1,49 @@
+"""The house keeps its shape: one direction of imports, clean types and lint, a quick start."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def run(*command):
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+
+def test_imports_point_one_way():
+    code = "from importlinter.cli import lint_imports_command as c; c()"
+    done = run(sys.executable, "-c", code)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_lint_is_clean():
+    done = run(sys.executable, "-m", "ruff", "check", ".")
+    assert done.returncode == 0, done.stdout
+
+
+def test_types_are_clean():
+    done = run(sys.executable, "-m", "mypy")
+    assert done.returncode == 0, done.stdout
+
+
+def test_importing_the_package_does_nothing():
+    code = "import sys; before = set(sys.modules); import avsreplay; print(len(set(sys.modules) - before))"
+    done = run(sys.executable, "-c", code)
+    assert int(done.stdout) <= 2, done.stdout  # the package and its __future__
+
+
+def test_help_loads_no_heavy_library():
+    code = (
+        "import sys\nfrom avsreplay.cli import group\n"
+        "group.main(['--help'], standalone_mode=False)\n"
+        "heavy = {'numpy', 'scipy', 'mcap', 'rosbags', 'trimesh', 'kiss_icp', 'rich', 'plotly'}\n"
+        "print('HEAVY', sorted(heavy & set(sys.modules)))"
+    )
+    done = run(sys.executable, "-c", code)
+    assert "HEAVY []" in done.stdout, done.stdout + done.stderr
+
+
+def test_no_module_outgrows_its_room():
+    long = {p: n for p in ROOT.glob("avsreplay/**/*.py") if (n := p.read_text().count("\n")) > 350}
+    assert not long, long
