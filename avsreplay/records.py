@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,10 +19,12 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 
 __all__ = [
+    "BLOCKS",
     "AlignStatus",
     "Alignment",
     "Belief",
     "Fit",
+    "Forecast",
     "Innovation",
     "Label",
     "LogHeader",
@@ -35,6 +38,19 @@ __all__ = [
     "Trajectory",
     "Verdict",
 ]
+
+BLOCKS: Mapping[str, slice] = MappingProxyType(
+    {
+        "attitude": slice(0, 3),  # dq_v, half angle, {B}
+        "rate": slice(3, 6),  # w_b [rad/s]
+        "position": slice(6, 9),  # rho_o [m], {A}
+        "velocity": slice(9, 12),  # [m/s], {A}
+        "sigma": slice(12, 14),
+        "varrho": slice(14, 17),  # [m], {B}
+        "mu": slice(17, 20),  # dmu_v, half angle, {B}
+    }
+)
+"""The 20 error states by name, in the order of every covariance."""
 
 
 class ScanStatus(Enum):
@@ -269,6 +285,20 @@ class Verdict:
 
     gamma: int
     reason: Reason
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Forecast:
+    """Predicted 1 sigma of the grasp point over a horizon, each the root of the trace of its 3x3 covariance.
+
+    Attributes:
+        times_s: (n,) [s after now].  pos_1s_m, vel_1s_mps, rot_1s_rad: (n,) position, velocity, attitude (full angle).
+    """
+
+    times_s: Array
+    pos_1s_m: Array
+    vel_1s_mps: Array
+    rot_1s_rad: Array
 
 
 Trajectory = Callable[[Array], tuple[Array, Array]]
