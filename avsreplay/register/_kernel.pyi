@@ -1,0 +1,30 @@
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+class Index:
+    def __init__(
+        self,
+        vertices: NDArray[np.float64],
+        faces: NDArray[np.int32],
+        kept: NDArray[np.int32],
+        reach_m: float,
+    ) -> None: ...
+    def closest(self, points: NDArray[Any], threads: int) -> tuple[Any, ...]: ...
+    def icp(
+        self,
+        points: NDArray[Any],
+        T_ca: NDArray[np.float64],
+        n_max: float,
+        n_plane: float,
+        gate_m: float,
+        tighten: float,
+        floor_m: float,
+        eps_rad: float,
+        eps_m: float,
+        threads: int,
+    ) -> tuple[Any, ...]: ...
+    def normal_equations(
+        self, points: NDArray[Any], T_ca: NDArray[np.float64], gate_m: float, threads: int
+    ) -> tuple[Any, ...]: ...

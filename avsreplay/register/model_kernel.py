@@ -1,0 +1,45 @@
+"""The C++ engine's Python side: hands arrays to ``_kernel`` and says plainly when the extension is not there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.errors import MissingBackend
+from avsreplay.geometry import Array
+
+__all__ = ["KernelIndex"]
+
+
+class KernelIndex:
+    """Closest points, the ICP loop and the normal equations in C++."""
+
+    def __init__(self, vertices: Array, faces: NDArray[np.int32], kept: NDArray[np.int32], reach_m: float) -> None:
+        try:
+            from avsreplay.register import _kernel
+        except ImportError as error:
+            raise MissingBackend(
+                "the C++ kernel is not built", where="avsreplay.register._kernel", hint="install a compiler and run pip"
+            ) from error
+        self._index: Any = _kernel.Index(vertices, faces, kept, reach_m)
+
+    def closest(self, points: NDArray[Any], threads: int) -> tuple[Array, Array, NDArray[np.int32], Array]:
+        """Feet (n, 3), squared distances (n,), ids (n,), normals (n, 3)."""
+        foot, d2, ids, normal = self._index.closest(points, threads)
+        return foot, d2, ids, normal
+
+    def icp(self, points: NDArray[Any], T_ca: Array, rule: tuple[float, ...], threads: int) -> tuple[Any, ...]:
+        """The loop of ``Model.icp``; ``rule`` is (n_max, n_plane, gate, tighten, floor, eps_rad, eps_m)."""
+        result: tuple[Any, ...] = self._index.icp(points, T_ca, *rule, threads)
+        return result
+
+    def normal_equations(
+        self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int
+    ) -> tuple[Array, Array, int, float, float, int, int]:
+        """Sums of ``Model.normal_equations``."""
+        info, gradient, inliers, sum_e2, sum_d2, seen, ignored = self._index.normal_equations(
+            points, T_ca, gate_m, threads
+        )
+        return info, gradient, inliers, sum_e2, sum_d2, seen, ignored

@@ -1,0 +1,202 @@
+"""The reference engine: numpy and scipy, plain and slow. What the C++ kernel must agree with.
+
+Closest point on a mesh: a triangle's distance is at least |q - centroid| - radius, so every triangle whose bound is
+under the exact distance of the best-bounded one is measured, and no other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.geometry import Array
+
+__all__ = ["NORMAL_NEIGHBOURS", "ReferenceIndex", "cloud_normals", "foot_on_triangles"]
+
+NORMAL_NEIGHBOURS = 10
+_CHUNK_PAIRS = 2_000_000
+_MIN_INLIERS = 6
+
+_Search = Callable[[Array], tuple[Array, Array, NDArray[np.int32]]]
+
+
+class ReferenceIndex:
+    """Closest points, the ICP loop and the normal equations in numpy."""
+
+    def __init__(self, vertices: Array, faces: NDArray[np.int32], kept: NDArray[np.int32], reach_m: float) -> None:
+        self._reach = reach_m
+        if len(faces):
+            corners = vertices[faces[kept]]
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+            self._search: _Search = _MeshSearch(corners)
+            self._ids = kept
+        else:
+            self._normals = cloud_normals(vertices)
+            self._search = _CloudSearch(vertices)
+            self._ids = np.arange(len(vertices), dtype=np.int32)
+
+    def closest(self, points: NDArray[Any], threads: int) -> tuple[Array, Array, NDArray[np.int32], Array]:
+        """Feet (n, 3), squared distances (n,), ids (n,), normals (n, 3)."""
+        del threads
+        n = len(points)
+        foot, normal = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
+        d2, ids = np.full(n, np.inf), np.full(n, -1, dtype=np.int32)
+        good = np.flatnonzero(np.isfinite(points).all(axis=1))
+        f, d, i = self._near(points[good].astype(np.float64))
+        near = np.flatnonzero(i >= 0)
+        rows = good[near]
+        foot[rows], d2[rows], ids[rows], normal[rows] = f[near], d[near], self._ids[i[near]], self._normals[i[near]]
+        return foot, d2, ids, normal
+
+    def icp(self, points: NDArray[Any], T_ca: Array, rule: tuple[float, ...], threads: int) -> tuple[Any, ...]:
+        """The loop of ``Model.icp``; ``rule`` is (n_max, n_plane, gate, tighten, floor, eps_rad, eps_m)."""
+        del threads
+        n_max, n_plane, gate, tighten, floor, eps_rad, eps_m = rule
+        finite = np.isfinite(points).all(axis=1)
+        scan = points[finite].astype(np.float64)
+        T, plane, done, passes = T_ca.copy(), n_plane > 0, False, 0
+        inliers, rms, turn, move = 0, float("nan"), float("inf"), float("inf")
+        while passes < n_max and not done:
+            p, foot, normal, d2 = self._matched(scan, T, gate)
+            passes += 1
+            inliers = len(p)
+            rms = float(np.sqrt(np.mean(d2))) if inliers else float("nan")
+            if inliers < _MIN_INLIERS:
+                break
+            D, turn, move = _plane_step(p, foot, normal) if plane else _horn_step(p, foot)
+            T = D @ T
+            tighter = min(gate, max(floor, tighten * rms)) if tighten > 0.0 else gate
+            small = turn < eps_rad and move < eps_m and tighter >= 0.99 * gate
+            gate, done = tighter, small and not plane
+            plane = plane and passes < n_plane and not small
+        searched = passes * len(scan)
+        return T, passes, done, inliers, rms, gate, turn, move, len(points) - len(scan), searched
+
+    def normal_equations(
+        self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int
+    ) -> tuple[Array, Array, int, float, float, int, int]:
+        """Sums of ``Model.normal_equations``."""
+        del threads
+        scan = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        p, foot, normal, d2 = self._matched(scan, T_ca, gate_m)
+        J, e = np.hstack([np.cross(p, normal), normal]), np.sum((foot - p) * normal, axis=1)
+        return J.T @ J, J.T @ e, len(p), float(e @ e), float(np.sum(d2)), len(scan), len(points) - len(scan)
+
+    def _near(self, p: Array) -> tuple[Array, Array, NDArray[np.int32]]:
+        """Foot, d2 and index into the primitives; -1 at the reach or farther."""
+        foot, d2, i = self._search(p)
+        return foot, d2, np.where(d2 < self._reach**2, i, -1).astype(np.int32)
+
+    def _matched(self, scan: Array, T_ca: Array, gate: float) -> tuple[Array, Array, Array, Array]:
+        p = scan @ T_ca[:3, :3].T + T_ca[:3, 3]
+        foot, d2, i = self._near(p)
+        take = (i >= 0) & (d2 < gate**2)
+        return p[take], foot[take], self._normals[i[take]], d2[take]
+
+
+class _CloudSearch:
+    def __init__(self, vertices: Array) -> None:
+        from scipy.spatial import cKDTree
+
+        self._points, self._tree = vertices, cKDTree(vertices)
+
+    def __call__(self, p: Array) -> tuple[Array, Array, NDArray[np.int32]]:
+        _, i = self._tree.query(p)
+        foot = self._points[i]
+        return foot, np.sum((foot - p) ** 2, axis=1), i.astype(np.int32)
+
+
+class _MeshSearch:
+    def __init__(self, corners: Array) -> None:
+        self._corners = corners
+        self._centroids = corners.mean(axis=1)
+        self._radius = np.linalg.norm(corners - self._centroids[:, None], axis=2).max(axis=1)
+
+    def __call__(self, p: Array) -> tuple[Array, Array, NDArray[np.int32]]:
+        step = max(1, _CHUNK_PAIRS // len(self._corners))
+        parts = [self._chunk(p[k : k + step]) for k in range(0, len(p), step)] or [self._chunk(p)]
+        foot, d2, i = zip(*parts, strict=True)
+        return np.concatenate(foot), np.concatenate(d2), np.concatenate(i)
+
+    def _chunk(self, p: Array) -> tuple[Array, Array, NDArray[np.int32]]:
+        from scipy.spatial.distance import cdist
+
+        bound = np.maximum(cdist(p, self._centroids) - self._radius, 0.0)
+        first = np.argmin(bound, axis=1)
+        reach = np.sqrt(np.sum((foot_on_triangles(p, self._corners[first]) - p) ** 2, axis=1))
+        row, tri = np.nonzero(bound <= reach[:, None] * (1.0 + 1e-9))
+        foot = foot_on_triangles(p[row], self._corners[tri])
+        d2 = np.sum((foot - p[row]) ** 2, axis=1)
+        order = np.lexsort((tri, d2, row))
+        _, starts = np.unique(row[order], return_index=True)
+        best = order[starts]
+        return foot[best], d2[best], tri[best].astype(np.int32)
+
+
+def foot_on_triangles(p: Array, corners: Array) -> Array:
+    """Nearest point of triangle k to p[k]. (n, 3) x (n, 3, 3) -> (n, 3).
+
+    The foot in the plane where it falls inside, else the nearest of the feet on the three edges.
+    """
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    n = np.cross(b - a, c - a)
+    n = n / np.linalg.norm(n, axis=1, keepdims=True)
+    plane = p - np.sum((p - a) * n, axis=1, keepdims=True) * n
+    sides = [np.sum(np.cross(v - u, plane - u) * n, axis=1) >= 0.0 for u, v in ((a, b), (b, c), (c, a))]
+    feet = np.stack([_foot_on_edge(p, u, v) for u, v in ((a, b), (b, c), (c, a))])
+    nearest = feet[np.argmin(np.sum((feet - p) ** 2, axis=2), axis=0), np.arange(len(p))]
+    foot: Array = np.where(np.logical_and.reduce(sides)[:, None], plane, nearest)
+    return foot
+
+
+def _foot_on_edge(p: Array, u: Array, v: Array) -> Array:
+    edge = v - u
+    t = np.sum((p - u) * edge, axis=1) / np.sum(edge * edge, axis=1)
+    foot: Array = u + np.clip(t, 0.0, 1.0)[:, None] * edge
+    return foot
+
+
+def cloud_normals(points: Array, neighbours: int = NORMAL_NEIGHBOURS) -> Array:
+    """Least direction of each point's nearest ``neighbours`` (itself among them). (n, 3) -> (n, 3) unit, sign free."""
+    from scipy.spatial import cKDTree
+
+    k = min(neighbours, len(points))
+    _, near = cKDTree(points).query(points, k=[*range(1, k + 1)])
+    patch = points[near] - points[near].mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", patch, patch))
+    return np.ascontiguousarray(vectors[:, :, 0])
+
+
+def _horn_step(p: Array, foot: Array) -> tuple[Array, float, float]:
+    """Horn's closed form, section 6: the best D with D p = foot; its angle [rad] and the centroid's move [m]."""
+    pc, fc = p.mean(axis=0), foot.mean(axis=0)
+    N = (p - pc).T @ (foot - fc) / len(p)
+    M = np.empty((4, 4))  # scalar first [w x y z]
+    M[0, 0] = np.trace(N)
+    M[0, 1:] = M[1:, 0] = [N[1, 2] - N[2, 1], N[2, 0] - N[0, 2], N[0, 1] - N[1, 0]]
+    M[1:, 1:] = N + N.T - np.trace(N) * np.eye(3)
+    q = np.linalg.eigh(M)[1][:, -1]
+    q_xyzw = geometry.normalise(q[[1, 2, 3, 0]])
+    R = geometry.matrix(q_xyzw)
+    return _pose(R, fc - R @ pc), float(geometry.angle(q_xyzw)), float(np.linalg.norm(fc - pc))
+
+
+def _plane_step(p: Array, foot: Array, normal: Array) -> tuple[Array, float, float]:
+    """One Gauss-Newton step of sum (n . (foot - D p))^2; the same angle and move as Horn's."""
+    c = p.mean(axis=0)
+    J, e = np.hstack([np.cross(p - c, normal), normal]), np.sum((foot - p) * normal, axis=1)
+    H = J.T @ J
+    d = np.linalg.solve(H + np.diag(1e-9 * np.diag(H) + 1e-30), J.T @ e)
+    R = geometry.matrix(geometry.exp(d[:3]))
+    return _pose(R, c + d[3:] - R @ c), float(np.linalg.norm(d[:3])), float(np.linalg.norm(d[3:]))
+
+
+def _pose(R: Array, t: Array) -> Array:
+    out = np.eye(4)
+    out[:3, :3], out[:3, 3] = R, t
+    return out
