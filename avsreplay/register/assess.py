@@ -1,0 +1,113 @@
+"""One ruler for every back end: inliers, rms, information, covariance and a status, from the pose alone.
+
+With p_c = T_ca p_a, foot c and face normal n, the error d = [theta; v] in {C}, T_ac_true = T_ac @ Exp(d), shows as
+n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over the inliers give everything below.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Array, Pose, frozen
+from avsreplay.records import Alignment, AlignStatus, Fit
+from avsreplay.register.freedom import free_directions
+from avsreplay.register.model import Model
+from avsreplay.register.params import Limits, RegisterParams
+
+__all__ = ["Evidence", "assess", "covariance", "evidence", "nothing"]
+
+SIGMA_PER_MEDIAN = 1.4826  # of |e| for a normal e
+NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """What the inliers at a pose say, all in {C}.
+
+    Attributes:
+        points: of the scan.  inliers: nearer to the model than the gate.  rms_m: of their distances.
+        J: (k, 6) rows [p x n, n].  e: (k,) n . (p - foot) [m].  centre: (3,) centroid of the inliers.
+        noise_m: 1 sigma of e, robust.
+    """
+
+    points: int
+    inliers: int
+    rms_m: float
+    J: Array
+    e: Array
+    centre: Array
+    noise_m: float
+
+
+def evidence(model: Model, points: NDArray[Any], T_ca: Pose, gate_m: float, noise_m: float | None = None) -> Evidence:
+    """Gather it: ``points`` (n, 3) in {A} [m]; ``noise_m`` None estimates it from the residuals."""
+    moved = T_ca.apply(points)
+    found = model.closest(moved)
+    near = found.d2 < gate_m**2
+    p, n = moved[near], found.normal[near]
+    e = np.einsum("ij,ij->i", n, p - found.foot[near])
+    count = len(p)
+    rms = float(np.sqrt(found.d2[near].mean())) if count else float("nan")
+    centre = p.mean(axis=0) if count else np.zeros(3)
+    J = np.hstack([np.cross(p, n), n])
+    return Evidence(len(points), count, rms, J, e, centre, noise_m or _noise(e, gate_m))
+
+
+def _noise(e: Array, gate_m: float) -> float:
+    floor = NOISE_FLOOR_OF_GATE * gate_m
+    return max(SIGMA_PER_MEDIAN * float(np.median(np.abs(e))), floor) if len(e) else floor
+
+
+def covariance(found: Evidence) -> Array:
+    """(6, 6) covariance of d = [theta; v], the sandwich N^-1 (sum e^2 J'J) N^-1 with N = J'J, corrected for six fitted.
+
+    It holds where the noise across the surface differs from point to point (a range error seen at a slant) and where
+    some inliers are outliers; its meat is not let under what the robust noise alone would say.
+    """
+    normal = found.J.T @ found.J
+    spread = np.maximum(found.e**2, 0.0)
+    meat = found.J.T @ (found.J * spread[:, None]) * (found.inliers / max(found.inliers - 6, 1))
+    bread = np.linalg.pinv(normal, hermitian=True)
+    P = bread @ meat @ bread
+    return 0.5 * (P + P.T)
+
+
+def assess(model: Model, points: NDArray[Any], fit: Fit, limits: Limits, params: RegisterParams) -> Alignment:
+    """Grade a back end's pose. No or too few inliers is NO_OVERLAP whatever the back end's flag says."""
+    if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
+        return nothing(len(points), AlignStatus.FAILED)
+    found = evidence(model, points, fit.T_ca, limits.gate_m, params.noise_m)
+    info = frozen(found.J.T @ found.J / found.noise_m**2)
+    weakest = free_directions(found.J, found.centre) if found.inliers else ()
+    status = _status(found, fit.converged, bool(weakest), params)
+    certain = status in (AlignStatus.ALIGNED, AlignStatus.NOT_CONVERGED) and not weakest
+    return Alignment(
+        T_ac=fit.T_ca.inverse(),
+        iterations=fit.iterations,
+        converged=fit.converged,
+        points=found.points,
+        inliers=found.inliers,
+        rms_m=found.rms_m,
+        info=info,
+        status=status,
+        covariance=frozen(covariance(found)) if certain else None,
+        weakest=", ".join(weakest),
+    )
+
+
+def nothing(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:
+    """An alignment that measured nothing: the guess kept, no inliers, no information."""
+    pose = T_ac if T_ac is not None else Pose.identity()
+    return Alignment(pose, 0, False, points, 0, float("nan"), frozen(np.zeros((6, 6))), status)
+
+
+def _status(found: Evidence, converged: bool, free: bool, params: RegisterParams) -> AlignStatus:
+    if found.inliers < max(params.min_inliers, params.min_inlier_ratio * found.points):
+        return AlignStatus.NO_OVERLAP
+    if not converged:
+        return AlignStatus.NOT_CONVERGED
+    return AlignStatus.DEGENERATE if free else AlignStatus.ALIGNED

@@ -1,0 +1,43 @@
+"""The ``horn`` back end: point-to-plane passes to come near, then Horn's quaternion ICP to its fixed point, in C++."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Pose
+from avsreplay.records import Fit
+from avsreplay.register.model import IcpParams
+from avsreplay.register.port import Target
+
+__all__ = ["HornBackend"]
+
+
+class HornBackend:
+    """Ours: exact closest points on the model, one fused pass, the same bits for any number of threads.
+
+    Rejection and stopping are those of :class:`avsreplay.register.model.IcpParams`: the gate starts at ``reach_m``,
+    follows three times the last pass' rms and never goes under ``gate_m``.
+    """
+
+    name: ClassVar[str] = "horn"
+    about: ClassVar[str] = "plane start, then Horn's quaternion ICP to its fixed point on the mesh itself, C++"
+
+    def __init__(self, target: Target) -> None:
+        limits = target.limits
+        self._model = target.model
+        self._rule = IcpParams(
+            n_max=limits.n_max,
+            n_plane=min(6, limits.n_max),
+            gate_m=limits.reach_m,
+            floor_m=limits.gate_m,
+            eps_rad=limits.eps_rad,
+            eps_m=limits.eps_m,
+            threads=limits.threads,
+        )
+
+    def align(self, points: NDArray[Any], guess: Pose) -> Fit:
+        """See :class:`avsreplay.register.port.Backend`."""
+        found = self._model.icp(points, guess, self._rule)
+        return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged)

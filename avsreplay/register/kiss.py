@@ -1,0 +1,70 @@
+"""The ``kiss`` back end: kiss-icp against a voxel map of points drawn from the model.
+
+Known of kiss-icp 1.2 and 1.3: its reach is one voxel; ``kernel`` acts as a squared length; more than one thread is not
+repeatable to the bit; a guess whose rotation is off by 2e-9 ends the interpreter; it returns a pose and nothing else,
+and returns the guess where nothing matched.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.geometry import Pose
+from avsreplay.records import Fit
+from avsreplay.register.port import Target
+from avsreplay.register.sampling import sample
+
+__all__ = ["KissBackend"]
+
+POINTS_PER_VOXEL = 40
+SURFACE_POINTS = 100_000
+FINE_OF_REACH = 0.2
+
+
+class KissBackend:
+    """Two maps, coarse to fine: voxels of ``reach_m`` to come near, then a fifth of it to settle.
+
+    The iteration count is not given by the library, so ``Fit.iterations`` counts its calls. ``converged`` means that
+    one more call, begun where the last one ended, moved the pose by less than ten times eps.
+    """
+
+    name: ClassVar[str] = "kiss"
+    about: ClassVar[str] = "kiss-icp against a voxel map of the model, one thread"
+    requires: ClassVar[tuple[tuple[str, str], ...]] = (("kiss_icp", "kiss-icp"),)
+    get: ClassVar[str] = "pip install kiss-icp"
+
+    def __init__(self, target: Target) -> None:
+        from kiss_icp.mapping import VoxelHashMap
+        from kiss_icp.registration import Registration
+
+        self._limits = target.limits
+        points = np.ascontiguousarray(sample(target.surface, SURFACE_POINTS)[0])
+        self._maps: list[tuple[float, Any]] = []
+        for voxel in (target.limits.reach_m, max(FINE_OF_REACH * target.limits.reach_m, target.limits.gate_m)):
+            voxel_map: Any = VoxelHashMap(voxel, 1e9, POINTS_PER_VOXEL)
+            voxel_map.add_points(points)
+            self._maps.append((voxel, voxel_map))
+        self._registration = Registration(target.limits.n_max, target.limits.eps_rad, 1)
+
+    def align(self, points: NDArray[Any], guess: Pose) -> Fit:
+        """See :class:`avsreplay.register.port.Backend`."""
+        scan = np.ascontiguousarray(points, dtype=np.float64)
+        T_ca = guess
+        for voxel, voxel_map in self._maps:
+            T_ca = self._run(scan, voxel, voxel_map, T_ca)
+        again = self._run(scan, *self._maps[-1], T_ca)
+        return Fit(again, len(self._maps) + 1, self._settled(T_ca, again))
+
+    def _run(self, scan: NDArray[np.float64], voxel: float, voxel_map: Any, T_ca: Pose) -> Pose:
+        # Pose re-orthonormalises: the matrix of a unit quaternion is a rotation to 1e-16.
+        T = self._registration.align_points_to_map(scan, voxel_map, T_ca.matrix, voxel, (voxel / 3.0) ** 2)
+        return Pose.from_matrix(T)
+
+    def _settled(self, before: Pose, after: Pose) -> bool:
+        step = after @ before.inverse()  # in {C}: seen from the camera a turn would count as a move
+        turn, move = float(geometry.angle(step.q)), float(np.linalg.norm(step.t))
+        return turn < 10.0 * self._limits.eps_rad and move < 10.0 * self._limits.eps_m

@@ -1,0 +1,76 @@
+"""A scan and a guess in, a graded pose out: the one place where T_ac and T_ca meet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.errors import MissingBackend
+from avsreplay.geometry import Pose
+from avsreplay.records import Alignment, AlignStatus, Fit, Surface
+from avsreplay.register.assess import assess, nothing
+from avsreplay.register.model import Model
+from avsreplay.register.params import RegisterParams
+from avsreplay.register.port import Target, load
+from avsreplay.register.sampling import thin
+
+__all__ = ["Registrar"]
+
+
+class Registrar:
+    """Registers scans against one surface with one back end. Built once, used for every scan of a log."""
+
+    def __init__(self, surface: Surface, params: RegisterParams | None = None) -> None:
+        """Index the surface and build the back end.
+
+        Raises:
+            UsageError: an unknown back end, or a surface that cannot be indexed.  MissingBackend: not installed.
+        """
+        self.params = params or RegisterParams()
+        self.limits = self.params.limits(surface.extent)
+        factory = load(self.params.backend)
+        self._model = _indexed(surface, self.limits.reach_m)
+        self._backend = factory(Target(surface, self._model, self.limits))
+
+    def register(self, points: NDArray[Any], guess: Pose) -> Alignment:
+        """The pose of the model in the camera.
+
+        Args:
+            points: (n, 3) in {A} [m], float32 or float64, possibly strided; points that are not finite are left out.
+            guess: predicted T_ac. ICP aligns scan to model, so its inverse goes in and the result's inverse comes out.
+
+        Returns:
+            The graded pose; what went wrong is its status, never an exception. Where nothing was measured T_ac is
+            the guess.
+        """
+        scan = self._scan(points)
+        if len(scan) == 0:
+            return nothing(len(points), AlignStatus.NO_POINTS, guess)
+        fit = self._align(scan, guess.inverse())
+        if fit is None:
+            return nothing(len(scan), AlignStatus.FAILED, guess)
+        return assess(self._model, scan, fit, self.limits, self.params)
+
+    def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
+        finite = np.isfinite(points).all(axis=1)
+        scan = points if finite.all() else points[finite]
+        return thin(scan, self.params.subsample_m) if self.params.subsample_m > 0.0 else scan
+
+    def _align(self, scan: NDArray[Any], guess: Pose) -> Fit | None:
+        """The wall: whatever a back end raises stops here and becomes FAILED."""
+        try:
+            fit = self._backend.align(scan, guess)
+            finite = bool(np.isfinite(fit.T_ca.matrix).all())
+        except Exception:  # the one place that may: a library's trouble is a status, not the end of a replay
+            return None
+        return fit if finite else None
+
+
+def _indexed(surface: Surface, reach_m: float) -> Model:
+    """The exact index, in numpy where the C++ kernel is not built: the same feet, slower."""
+    try:
+        return Model.build(surface, reach_m)
+    except MissingBackend:
+        return Model.build(surface, reach_m, engine="reference")
