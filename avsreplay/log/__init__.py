@@ -1,1 +1,17 @@
 """The door for bytes: logs, bags and folders in; MCAP out."""
+
+from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions, TopicInfo
+from avsreplay.log.surface import parse_surface, read_surface
+from avsreplay.log.writer import LogWriter
+
+__all__ = [
+    "ClockChoice",
+    "ClockSummary",
+    "LogInfo",
+    "LogWriter",
+    "Loss",
+    "SourceOptions",
+    "TopicInfo",
+    "parse_surface",
+    "read_surface",
+]

@@ -1,0 +1,94 @@
+"""What a log says of itself, as one metadata record of exact JSON and the model as an attachment.
+
+Floats are written by their shortest exact form, so a header read back is the header written, bit for bit.
+A metadata record has no checksum in MCAP; ours carries one over its own values.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from avsreplay.records import Belief, Label, LogHeader, State
+
+__all__ = ["FORMAT", "HEADER_RECORD", "decode_header", "encode_header"]
+
+HEADER_RECORD = "avsreplay"
+FORMAT = "1"
+_STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")
+
+
+def encode_header(header: LogHeader) -> dict[str, str]:
+    """The metadata record of a header (without its surface's bytes)."""
+    values = {
+        "format": FORMAT,
+        "scenario": header.scenario,
+        "seed": _json(header.seed),
+        "labels": _json([_label(label) for label in header.labels]),
+        "start": _json(_belief(header.start)),
+        "truth": _json(_state(header.truth)),
+        "notes": _json(dict(header.notes)),
+        "model": _json(None if header.surface is None else header.surface.name),
+        "model_sha256": _json(None if header.surface is None else header.surface.sha256),
+    }
+    return {**values, "crc32": f"{_checksum(values):08x}"}
+
+
+def decode_header(values: Mapping[str, str]) -> LogHeader:
+    """The header of a metadata record, without its surface.
+
+    Raises ValueError where the record's checksum or a value in it is wrong.
+    """
+    rest = {k: v for k, v in values.items() if k != "crc32"}
+    if values.get("crc32") != f"{_checksum(rest):08x}":
+        raise ValueError("the checksum of the header record does not hold")
+    if values.get("format") != FORMAT:
+        raise ValueError(f"header record of format {values.get('format')!r}, this version reads {FORMAT}")
+    try:
+        return LogHeader(
+            scenario=values["scenario"],
+            seed=json.loads(values["seed"]),
+            labels=tuple(Label(**label) for label in json.loads(values["labels"])),
+            start=_to_belief(json.loads(values["start"])),
+            truth=_to_state(json.loads(values["truth"])),
+            notes=json.loads(values["notes"]),
+        )
+    except (KeyError, TypeError, RecursionError) as error:
+        raise ValueError(f"header record: {error}") from None
+
+
+def _checksum(values: Mapping[str, str]) -> int:
+    return zlib.crc32(json.dumps(dict(sorted(values.items()))).encode())
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, allow_nan=False, sort_keys=True)
+
+
+def _label(label: Label) -> dict[str, Any]:
+    return {name: getattr(label, name) for name in ("kind", "start_ns", "end_ns", "harmful", "strength")}
+
+
+def _state(state: State | None) -> dict[str, Any] | None:
+    return None if state is None else {name: getattr(state, name).tolist() for name in _STATE}
+
+
+def _belief(belief: Belief | None) -> dict[str, Any] | None:
+    return None if belief is None else {"t_ns": belief.t_ns, "x": _state(belief.x), "P": belief.P.tolist()}
+
+
+def _to_state(values: Any) -> State | None:
+    return None if values is None else State(**{name: np.array(values[name], dtype=np.float64) for name in _STATE})
+
+
+def _to_belief(values: Any) -> Belief | None:
+    if values is None:
+        return None
+    state = _to_state(values["x"])
+    if state is None:
+        raise ValueError("a first belief without a state")
+    return Belief(int(values["t_ns"]), state, np.array(values["P"], dtype=np.float64))

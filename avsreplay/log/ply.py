@@ -1,0 +1,252 @@
+"""PLY: ascii and both binary orders; elements and properties that are not asked for are passed over.
+
+Own, because the scans at hand carry a ``range_grid`` element that readers made for meshes stop at, and because a
+header may promise 2^32 vertices: every count is checked against the bytes that are there before memory is taken.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["BadFile", "Ply", "read_ply"]
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+_MAX_HEADER = 1 << 16
+
+
+class BadFile(ValueError):
+    """A file whose bytes do not hold what its header says."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Property:
+    name: str
+    kind: str
+    count: str | None = None  # type of the length, for a list
+
+
+@dataclass(slots=True)
+class _Element:
+    name: str
+    size: int
+    properties: list[_Property]
+
+    @property
+    def plain(self) -> bool:
+        return all(p.count is None for p in self.properties)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ply:
+    """What was read: vertex columns by name, and faces as vertex lists cut into triangles.
+
+    Attributes:
+        vertex: one array of n a property, in the file's type.  faces: (m, 3) int64.
+    """
+
+    vertex: dict[str, NDArray[Any]]
+    faces: NDArray[np.int64]
+
+    def points(self) -> NDArray[Any]:
+        """(n, 3) coordinates in the file's type. Raises BadFile where x, y or z is missing."""
+        missing = [axis for axis in "xyz" if axis not in self.vertex]
+        if missing:
+            raise BadFile(f"its vertices have no '{missing[0]}'")
+        return np.stack([self.vertex[axis] for axis in "xyz"], axis=1)
+
+
+def read_ply(data: bytes) -> Ply:
+    """Parse a PLY file. Raises BadFile with the reason."""
+    order, elements, start = _header(data)
+    vertex: dict[str, NDArray[Any]] = {}
+    faces = np.zeros((0, 3), dtype=np.int64)
+    body = _Text(data[start:]) if order is None else _Binary(data, start, order)
+    wanted = {"vertex", "face"} & {e.name for e in elements}
+    for element in elements:
+        if not wanted:
+            break
+        if element.name == "vertex":
+            vertex = body.columns(element)
+        elif element.name == "face":
+            faces = _triangles(body.lists(element))
+        else:
+            body.skip(element)
+        wanted.discard(element.name)
+    if not vertex:
+        raise BadFile("no vertex element")
+    return Ply(vertex, faces)
+
+
+def _header(data: bytes) -> tuple[str | None, list[_Element], int]:
+    end = data.find(b"end_header", 0, _MAX_HEADER)
+    if not data.startswith(b"ply") or end < 0:
+        raise BadFile("no PLY header")
+    line_end = data.find(b"\n", end)
+    lines = data[:end].decode("ascii", "replace").split("\n")
+    order, elements = "?", list[_Element]()
+    orders = {"ascii": None, "binary_little_endian": "<", "binary_big_endian": ">"}
+    chosen: str | None = order
+    for line in lines:
+        words = line.split()
+        if len(words) >= 2 and words[0] == "format":
+            if words[1] not in orders:
+                raise BadFile(f"unknown PLY format '{words[1]}'")
+            chosen = orders[words[1]]
+        elif words[:1] == ["element"]:
+            elements.append(_element(words, len(data)))
+        elif words[:1] == ["property"]:
+            if not elements:
+                raise BadFile("a property before any element")
+            elements[-1].properties.append(_property(words))
+    if chosen == "?":
+        raise BadFile("no format line")
+    return chosen, elements, (line_end + 1 if line_end >= 0 else len(data))
+
+
+def _element(words: list[str], limit: int) -> _Element:
+    if len(words) != 3 or not words[2].isdecimal():
+        raise BadFile(f"unreadable line '{' '.join(words)[:60]}'")
+    size = int(words[2][:20])
+    if size > limit:
+        raise BadFile(f"promises {size} {words[1]} elements in a file of {limit} bytes")
+    return _Element(words[1], size, [])
+
+
+def _property(words: list[str]) -> _Property:
+    try:
+        if words[1] == "list":
+            return _Property(words[4], _TYPES[words[3]], _TYPES[words[2]])
+        return _Property(words[2], _TYPES[words[1]])
+    except (IndexError, KeyError):
+        raise BadFile(f"unreadable line '{' '.join(words)[:60]}'") from None
+
+
+class _Text:
+    """The body of an ascii file, line by line."""
+
+    def __init__(self, body: bytes) -> None:
+        self._lines = body.splitlines()
+        self._at = 0
+
+    def _take(self, element: _Element) -> list[bytes]:
+        lines = self._lines[self._at : self._at + element.size]
+        if len(lines) < element.size:
+            raise BadFile(f"ends after {len(lines)} of {element.size} {element.name} lines")
+        self._at += element.size
+        return lines
+
+    def skip(self, element: _Element) -> None:
+        self._at += element.size
+
+    def columns(self, element: _Element) -> dict[str, NDArray[Any]]:
+        lines, width = self._take(element), len(element.properties)
+        if not element.plain:
+            raise BadFile("lists among the vertex properties of an ascii file are not read")
+        words = b" ".join(lines).split()
+        if len(words) != width * element.size:
+            raise BadFile(f"{len(words)} numbers in {element.size} vertex lines of {width}")
+        try:
+            table = np.array(words, dtype=np.float64).reshape(element.size, width)
+        except ValueError:
+            raise BadFile("a vertex line holds something that is not a number") from None
+        with np.errstate(all="ignore"):
+            return {p.name: table[:, i].astype(p.kind) for i, p in enumerate(element.properties)}
+
+    def lists(self, element: _Element) -> list[NDArray[np.int64]]:
+        out = []
+        for line in self._take(element):
+            words = line.split()
+            if not words or not words[0].isdigit() or len(words) < 1 + int(words[0][:9]):
+                raise BadFile("a face line is shorter than its own count")
+            try:
+                out.append(np.array(words[1 : 1 + int(words[0])], dtype=np.int64))
+            except (ValueError, OverflowError):
+                raise BadFile("a face line holds something that is not a number") from None
+        return out
+
+
+class _Binary:
+    """The body of a binary file."""
+
+    def __init__(self, data: bytes, start: int, order: str) -> None:
+        self._data, self._at, self._order = data, start, order
+
+    def _dtype(self, element: _Element) -> np.dtype[Any]:
+        try:
+            return np.dtype([(p.name, self._order + p.kind) for p in element.properties])
+        except ValueError:
+            raise BadFile(f"a property name stands twice in '{element.name}'") from None
+
+    def _read(self, dtype: np.dtype[Any], count: int, what: str) -> NDArray[Any]:
+        if self._at + count * dtype.itemsize > len(self._data):
+            raise BadFile(f"ends inside its {what} elements")
+        values = np.frombuffer(self._data, dtype, count, self._at)
+        self._at += count * dtype.itemsize
+        return values
+
+    def skip(self, element: _Element) -> None:
+        if element.plain:
+            self._read(self._dtype(element), element.size, element.name)
+        else:
+            self.lists(element)
+
+    def columns(self, element: _Element) -> dict[str, NDArray[Any]]:
+        if not element.plain:
+            raise BadFile("lists among the vertex properties are not read")
+        table = self._read(self._dtype(element), element.size, element.name)
+        return {p.name: table[p.name].astype(p.kind) for p in element.properties}
+
+    def lists(self, element: _Element) -> list[NDArray[np.int64]]:
+        """The first list of each element; equal lengths, the common case, are read at one go."""
+        same = self._uniform(element)
+        if same is not None:
+            return list(same)
+        out = []
+        for _ in range(element.size):
+            found: NDArray[np.int64] | None = None
+            for p in element.properties:
+                count = 1
+                if p.count is not None:
+                    count = int(self._read(np.dtype(self._order + p.count), 1, element.name)[0])
+                    if count < 0:
+                        raise BadFile(f"a list of {count} in '{element.name}'")
+                values = self._read(np.dtype(self._order + p.kind), count, element.name)
+                found = values.astype(np.int64) if p.count is not None and found is None else found
+            out.append(np.zeros(0, np.int64) if found is None else found)
+        return out
+
+    def _uniform(self, element: _Element) -> NDArray[np.int64] | None:
+        if element.size == 0 or len(element.properties) != 1 or element.properties[0].count is None:
+            return None
+        p = element.properties[0]
+        head = np.dtype(self._order + str(p.count))
+        if self._at + head.itemsize > len(self._data):
+            raise BadFile(f"ends inside its {element.name} elements")
+        count = int(np.frombuffer(self._data, head, 1, self._at)[0])
+        size = element.size * (head.itemsize + count * np.dtype(p.kind).itemsize)
+        if not 0 < count < 256 or self._at + size > len(self._data):
+            return None
+        row = np.dtype([("n", head), ("v", self._order + p.kind, (count,))])
+        table = np.frombuffer(self._data, row, element.size, self._at)
+        if not np.all(table["n"] == count):
+            return None
+        self._at += size
+        with np.errstate(all="ignore"):
+            values: NDArray[np.int64] = table["v"].astype(np.int64)
+        return values
+
+
+def _triangles(lists: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Polygons as fans of triangles."""
+    if lists and all(len(face) == 3 for face in lists):
+        return np.stack(lists)
+    out = [(face[0], face[i], face[i + 1]) for face in lists for i in range(1, len(face) - 1)]
+    return np.array(out, dtype=np.int64).reshape(-1, 3)

@@ -1,0 +1,161 @@
+"""sensor_msgs/PointCloud2 into points: strided views where the layout allows, any layout otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.log.cursor import BadMessage, Cursor
+
+__all__ = ["Cloud", "Field", "Layout", "decode_cloud", "read_layout"]
+
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+_MAX_FIELDS = 256
+_TIME_NAMES = ("t", "time", "timestamp", "time_offset", "offset_time")
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A PointField: name, byte offset, numpy kind (``f4``), count."""
+
+    name: str
+    offset: int
+    kind: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """A cloud before its bytes are looked at.
+
+    Attributes:
+        stamp_ns: header stamp.  frame: header frame.  shape: (height, width).  order: ``<`` or ``>``.
+        point_step, row_step: bytes.  data: the cloud's bytes.
+    """
+
+    stamp_ns: int
+    frame: str
+    shape: tuple[int, int]
+    fields: tuple[Field, ...]
+    order: str
+    point_step: int
+    row_step: int
+    data: memoryview
+
+    def column(self, name: str) -> NDArray[Any]:
+        """(height, width) view of one field in the message's own byte order. Raises BadMessage where it is not there."""
+        field = next((f for f in self.fields if f.name == name), None)
+        if field is None:
+            raise BadMessage(f"no field '{name}' among {', '.join(f.name for f in self.fields) or 'none'}")
+        strides = (self.row_step, self.point_step)
+        return np.ndarray(self.shape, self.order + field.kind, self.data, field.offset, strides)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Points as decoded: (n, 3) finite in the frame of the message, per-point times [s] after the stamp or None."""
+
+    stamp_ns: int
+    frame: str
+    points: NDArray[Any]
+    times_s: NDArray[np.float32] | None
+    dropped: int
+
+
+def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
+    """A cloud with its non-finite points left out. Raises BadMessage with the reason."""
+    layout = read_layout(payload, encoding)
+    if 0 in layout.shape:
+        return Cloud(layout.stamp_ns, layout.frame, np.zeros((0, 3), np.float32), None, 0)
+    points, times = _points(layout), _times(layout)
+    finite = np.isfinite(points).all(axis=1)
+    dropped = len(points) - int(np.count_nonzero(finite))
+    if dropped:
+        points, times = points[finite], None if times is None else times[finite]
+    return Cloud(layout.stamp_ns, layout.frame, points, times, dropped)
+
+
+def read_layout(payload: bytes | memoryview, encoding: str = "cdr") -> Layout:
+    """Parse and check a message without touching its points. Raises BadMessage with the reason."""
+    cursor = Cursor(payload, encoding)
+    stamp_ns, frame = cursor.header()
+    height, width = cursor.u32(), cursor.u32()
+    fields = _fields(cursor)
+    order = ">" if cursor.u8() else "<"
+    point_step, row_step = cursor.u32(), cursor.u32()
+    data = cursor.octets()
+    if height == 1 or row_step == 0:  # writers leave row_step unset where there is one row
+        row_step = width * point_step
+    layout = Layout(stamp_ns, frame, (height, width), fields, order, point_step, row_step, data)
+    if height and width:
+        _check(layout)
+    return layout
+
+
+def _fields(cursor: Cursor) -> tuple[Field, ...]:
+    count = cursor.u32()
+    if count > _MAX_FIELDS:
+        raise BadMessage(f"{count} fields, at most {_MAX_FIELDS} are read")
+    fields = []
+    for _ in range(count):
+        name, offset, datatype, many = cursor.string(), cursor.u32(), cursor.u8(), cursor.u32()
+        if datatype not in _DATATYPES:
+            raise BadMessage(f"field '{name}' is of unknown datatype {datatype}")
+        fields.append(Field(name, offset, _DATATYPES[datatype], many))
+    return tuple(fields)
+
+
+def _check(layout: Layout) -> None:
+    height, width = layout.shape
+    if layout.row_step < width * layout.point_step:
+        raise BadMessage(f"row_step {layout.row_step} is shorter than {width} points of {layout.point_step}")
+    needed = (height - 1) * layout.row_step + width * layout.point_step
+    if needed > len(layout.data):
+        raise BadMessage(f"{height} x {width} points of {layout.point_step} bytes in {len(layout.data)} bytes")
+    for field in layout.fields:
+        size = int(field.kind[1]) * max(field.count, 1)
+        if field.offset + size > layout.point_step:
+            raise BadMessage(f"field '{field.name}' ends past point_step {layout.point_step}")
+    spans = sorted((f.offset, f.offset + int(f.kind[1])) for f in layout.fields if f.name in ("x", "y", "z"))
+    if any(before[1] > after[0] for before, after in zip(spans, spans[1:], strict=False)):
+        raise BadMessage("the fields x, y and z overlap")
+
+
+def _points(layout: Layout) -> NDArray[Any]:
+    """(n, 3) float32 or float64; a view where x, y, z stand side by side in native order."""
+    x, y, z = (layout.column(axis) for axis in "xyz")
+    size = x.dtype.itemsize
+    bases = [next(f.offset for f in layout.fields if f.name == axis) for axis in "xyz"]
+    native = x.dtype.isnative and x.dtype.kind == "f" and x.dtype == y.dtype == z.dtype
+    rows_meet = layout.row_step == layout.shape[1] * layout.point_step
+    if native and rows_meet and bases == [bases[0], bases[0] + size, bases[0] + 2 * size]:
+        count = layout.shape[0] * layout.shape[1]
+        return np.ndarray((count, 3), x.dtype, layout.data, bases[0], (layout.point_step, size))
+    kind = np.float32 if all(c.dtype.kind == "f" and c.dtype.itemsize == 4 for c in (x, y, z)) else np.float64
+    return np.stack([c.reshape(-1) for c in (x, y, z)], axis=1).astype(kind)
+
+
+def _times(layout: Layout) -> NDArray[np.float32] | None:
+    """Seconds after the stamp: floats are seconds, whole numbers nanoseconds, large doubles absolute seconds."""
+    names = {f.name for f in layout.fields}
+    if {"time_sec", "time_nsec"} <= names:
+        seconds = layout.column("time_sec").reshape(-1).astype(np.int64) * 1_000_000_000
+        return _relative(seconds + layout.column("time_nsec").reshape(-1).astype(np.int64), layout.stamp_ns)
+    name = next((n for n in _TIME_NAMES if n in names), None)
+    if name is None:
+        return None
+    column = layout.column(name).reshape(-1)
+    if column.dtype.kind in "iu":
+        return _relative(column.astype(np.int64), layout.stamp_ns)
+    if column.dtype.itemsize == 8 and len(column) and np.nanmax(np.abs(column)) > 1e6:
+        return (column.astype(np.float64) - layout.stamp_ns * 1e-9).astype(np.float32)
+    return column.astype(np.float32)
+
+
+def _relative(times_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[np.float32]:
+    """Nanoseconds, absolute where they are large, to seconds after the stamp."""
+    absolute = len(times_ns) > 0 and abs(int(times_ns[0])) > 10**15
+    return ((times_ns - (stamp_ns if absolute else 0)) * 1e-9).astype(np.float32)

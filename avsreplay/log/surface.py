@@ -1,0 +1,150 @@
+"""Reading of a target model: PLY by our own reader, STL, OBJ, OFF and GLB through trimesh."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import struct
+import zlib
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.errors import UnreadableInput
+from avsreplay.geometry import Array, frozen
+from avsreplay.log.ply import BadFile, read_ply
+from avsreplay.log.text import shown
+from avsreplay.records import Surface
+
+__all__ = ["parse_surface", "read_surface", "surface_bytes"]
+
+MAX_BYTES = 512 << 20
+_FORMATS = ("ply", "stl", "obj", "off", "glb")
+# What a foreign parser may raise on bytes that are not what they seem; a crash of the interpreter it cannot be.
+_FOREIGN = (
+    ArithmeticError, AssertionError, AttributeError, BufferError, EOFError, ImportError, LookupError, MemoryError,
+    NotImplementedError, OSError, RuntimeError, TypeError, ValueError, struct.error, zlib.error,
+)  # fmt: skip
+
+
+def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
+    """Read a model file.
+
+    Args:
+        path: PLY, STL, OBJ, OFF or GLB.
+        cloud_ok: take a file without faces as a cloud model.
+
+    Raises:
+        UnreadableInput: not there, not a model, NaN vertices, or no faces where they are needed.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise UnreadableInput("larger than 512 MiB", where=shown(path), hint="decimate the model")
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise UnreadableInput("no such file", where=shown(path), hint="check the path of the model") from None
+    except OSError as error:
+        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+    return _parsed(data, path.name, shown(path), cloud_ok)
+
+
+def parse_surface(data: bytes, name: str, cloud_ok: bool = True) -> Surface:
+    """A model from the bytes of its file; the ending of ``name`` says which format.
+
+    Raises UnreadableInput as ``read_surface`` does.
+    """
+    return _parsed(data, PurePath(name).name, shown(name), cloud_ok)
+
+
+def surface_bytes(surface: Surface) -> bytes:
+    """The bytes of the model's file; where it has none, a binary PLY with exact (float64) vertices."""
+    if surface.data:
+        return surface.data
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(surface.vertices)}\n"
+        "property double x\nproperty double y\nproperty double z\n"
+        f"element face {len(surface.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(surface.faces), dtype=[("n", "u1"), ("v", "<i4", (3,))])
+    faces["n"], faces["v"] = 3, surface.faces
+    return header.encode() + surface.vertices.astype("<f8").tobytes() + faces.tobytes()
+
+
+def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
+    suffix = PurePath(name).suffix.lower().lstrip(".")
+    if not data:
+        raise UnreadableInput("the model file is empty", where=where, hint="name a mesh file")
+    if data.startswith(b"ply"):
+        suffix = "ply"
+    if suffix not in _FORMATS:
+        hint = f"give a model as {', '.join(_FORMATS).upper()}"
+        raise UnreadableInput(f"'{shown(suffix)}' is not a model format known here", where=where, hint=hint)
+    try:
+        vertices, faces = _ply(data) if suffix == "ply" else _trimesh(data, suffix)
+    except _FOREIGN as error:
+        reason = shown(str(error) or type(error).__name__)[:120]
+        raise UnreadableInput(
+            f"not a readable {suffix.upper()}: {reason}", where=where, hint="check the file"
+        ) from None
+    _check(vertices, faces, where, cloud_ok)
+    vertices = frozen(vertices, -1, 3)
+    faces = _with_area(vertices, faces)
+    if not cloud_ok and not len(faces):
+        raise UnreadableInput("every triangle has zero area", where=where, hint="check the units of the model")
+    faces.flags.writeable = False
+    return Surface(vertices, faces, name, hashlib.sha256(data).hexdigest(), data)
+
+
+def _ply(data: bytes) -> tuple[Array, NDArray[np.int64]]:
+    ply = read_ply(data)
+    return ply.points().astype(np.float64), ply.faces
+
+
+def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
+    import trimesh
+
+    if suffix == "stl" and len(data) >= 84 and not data.lstrip().startswith(b"solid"):
+        promised = int.from_bytes(data[80:84], "little")
+        if 84 + 50 * promised > len(data):
+            raise BadFile(f"promises {promised} triangles in a file of {len(data)} bytes")
+    options: dict[str, Any] = {"skip_materials": True} if suffix in ("obj", "glb") else {}
+    # process=False keeps vertices as they stand; force="mesh" puts the parts of a scene together.
+    mesh = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
+    return _merged(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces))
+
+
+def _merged(vertices: Array, faces: NDArray[Any]) -> tuple[Array, NDArray[Any]]:
+    """One vertex where a format (STL) or its reader (OBJ with normals) has several equal ones."""
+    if not np.isfinite(vertices).all():
+        return vertices, faces
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    place = np.empty(len(first), dtype=np.int64)
+    place[np.argsort(first)] = np.arange(len(first))
+    return vertices[np.sort(first)], place[inverse.reshape(-1)][faces]
+
+
+def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> None:
+    if not len(vertices):
+        raise UnreadableInput("the model has no vertices", where=where, hint="check the file")
+    bad = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
+    if bad:
+        hint = "remove them in a mesh editor"
+        raise UnreadableInput(f"{bad} of {len(vertices)} vertices are not finite", where=where, hint=hint)
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise UnreadableInput("a face names a vertex that is not there", where=where, hint="check the file")
+    if not len(faces) and not cloud_ok:
+        hint = "give a mesh, or --cloud-model to use its points as the model"
+        raise UnreadableInput("the model has no faces", where=where, hint=hint)
+
+
+def _with_area(vertices: Array, faces: NDArray[Any]) -> NDArray[np.int32]:
+    """The triangles that have an area: display meshes carry some without, which have no closest normal."""
+    corners = vertices[faces.reshape(-1, 3)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    kept: NDArray[np.int32] = np.ascontiguousarray(
+        faces.reshape(-1, 3)[np.linalg.norm(normals, axis=1) > 0.0], np.int32
+    )
+    return kept

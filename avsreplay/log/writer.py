@@ -1,0 +1,234 @@
+"""Writing of a log: MCAP, profile ros2, CDR only, small checked chunks, the model and the scenario inside.
+
+The bytes depend on nothing but what is written: no clock, path or library version is in the file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.geometry import Pose
+from avsreplay.log.encode import diagnostic, odometry, point_cloud2, pose_stamped, static_transform
+from avsreplay.log.header import HEADER_RECORD, encode_header
+from avsreplay.log.schemas import schema_text
+from avsreplay.log.surface import surface_bytes
+from avsreplay.records import Label, LogHeader, Scan, State
+
+__all__ = ["BODY_TOPIC", "CLOUD_TOPIC", "FAULT_TOPIC", "TRUTH_TOPIC", "LogWriter"]
+
+CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = "/points", "/truth/pose", "/truth/body", "/faults"
+CAMERA_FRAME, TARGET_FRAME, BODY_FRAME, ROOT_FRAME = "camera", "target", "target_body", "map"
+LIBRARY = "avsreplay"
+_TYPES = {
+    CLOUD_TOPIC: "sensor_msgs/msg/PointCloud2",
+    TRUTH_TOPIC: "geometry_msgs/msg/PoseStamped",
+    BODY_TOPIC: "nav_msgs/msg/Odometry",
+    FAULT_TOPIC: "diagnostic_msgs/msg/DiagnosticArray",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+}
+_INFINITE = "{sec: 9223372036, nsec: 854775807}"
+_LATCHED = (  # keep last, reliable, transient local: whole, since readers want every key
+    f"- {{history: 1, depth: 1, reliability: 1, durability: 1, deadline: {_INFINITE}, lifespan: {_INFINITE}, "
+    f"liveliness: 1, liveliness_lease_duration: {_INFINITE}, avoid_ros_namespace_conventions: false}}\n"
+)
+
+
+class LogWriter:
+    """Writes one log; a context manager.
+
+    The file grows under ``<name>.partial`` and takes its own name when it is whole. An exception inside the ``with``
+    removes it; a write that fails for want of room keeps the complete chunks under the partial name and says so.
+
+    Args:
+        path: the output.  header: what the log says of itself; its surface is attached.
+        overwrite: replace an existing output.  compression: ``zstd``, ``lz4`` or ``none``.
+        chunk_bytes, chunk_s: a chunk is closed and handed to the system at this size or span of the log clock.
+        streaming: write under the final name from the first byte (for a reader that follows).
+        point_type: ``float32`` or ``float64``, how coordinates are stored.
+
+    Raises:
+        UsageError: the output exists, or its folder does not.
+        UnreadableInput: the output cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        header: LogHeader,
+        *,
+        overwrite: bool = False,
+        compression: str = "zstd",
+        chunk_bytes: int = 4 << 20,
+        chunk_s: float = 1.0,
+        streaming: bool = False,
+        point_type: str = "float32",
+    ) -> None:
+        if compression not in ("zstd", "lz4", "none"):
+            raise ValueError(f"compression is {compression!r}, not zstd, lz4 or none")
+        if chunk_bytes < 1 or chunk_s <= 0.0:
+            raise ValueError(f"chunk_bytes {chunk_bytes} and chunk_s {chunk_s} must be positive")
+        self._path, self._overwrite = Path(path), overwrite
+        self._partial = self._path if streaming else self._path.with_name(self._path.name + ".partial")
+        self._point_type, self._chunk_bytes, self._chunk_ns = point_type, chunk_bytes, round(chunk_s * 1e9)
+        self._labels = sorted(_edges(header.labels), key=lambda edge: (edge[0], edge[1]))
+        self._channels: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+        self._chunk_start_ns: int | None = None
+        self._pending_bytes = self._complete = self._last_ns = 0
+        self._stream = self._create()
+        self._begin(header, compression)
+
+    def __enter__(self) -> LogWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        elif not self._stream.closed:
+            self._discard()
+
+    def write(self, scan: Scan) -> None:
+        """Append a scan's cloud, stamped ``scan.t_ns``, at ``scan.log_ns``.
+
+        Raises ValueError for times that a log cannot hold, UnreadableInput where the disk refuses.
+        """
+        payload = point_cloud2(scan.t_ns, CAMERA_FRAME, scan.points, scan.times_s, self._point_type)
+        self._message(CLOUD_TOPIC, scan.log_ns, payload)
+
+    def write_truth(self, log_ns: int, t_ns: int, pose: Pose, body: State | None = None) -> None:
+        """Append the true pose T_ac at ``t_ns`` and, where given, the full state of the body.
+
+        Raises ValueError for times that a log cannot hold, UnreadableInput where the disk refuses.
+        """
+        self._message(TRUTH_TOPIC, log_ns, pose_stamped(t_ns, CAMERA_FRAME, pose))
+        if body is not None:
+            self._message(BODY_TOPIC, log_ns, odometry(t_ns, CAMERA_FRAME, BODY_FRAME, body))
+
+    def close(self) -> None:
+        """Finish the file and give it its name. Raises UnreadableInput where the disk refuses."""
+        if self._stream.closed:
+            return
+        if not self._counts:
+            self._guarded(lambda: self._static(0))
+        self._labels_until(None)
+        self._guarded(self._finish)
+        if self._partial != self._path:
+            if self._path.exists() and not self._overwrite:
+                raise UsageError("appeared while recording", where=str(self._path), hint=f"see {self._partial}")
+            self._partial.replace(self._path)
+
+    def _create(self) -> BinaryIO:
+        for path in dict.fromkeys((self._path, self._partial)):
+            if path.exists() and not self._overwrite:
+                raise UsageError("exists already", where=str(path), hint="name another output or add --overwrite")
+        try:
+            return self._partial.open("wb")
+        except FileNotFoundError:
+            raise UsageError("no such folder", where=str(self._path.parent), hint="make it first") from None
+        except OSError as error:
+            raise UnreadableInput(
+                f"cannot be written: {error.strerror}", where=str(self._path), hint="name another output"
+            ) from None
+
+    def _begin(self, header: LogHeader, compression: str) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
+        # The library closes a chunk only past its size; spans and sizes are watched here.
+        self._writer = Writer(self._stream, 1 << 62, kinds[compression], enable_data_crcs=True)
+
+        def begin() -> None:
+            self._writer.start(profile="ros2", library=LIBRARY)
+            self._writer.add_metadata(HEADER_RECORD, encode_header(header))
+            if header.surface is not None:
+                data = surface_bytes(header.surface)
+                self._writer.add_attachment(0, 0, header.surface.name, "application/octet-stream", data)
+            self._stream.flush()
+
+        self._guarded(begin)
+        self._complete = self._stream.tell()
+
+    def _message(self, topic: str, log_ns: int, payload: bytes) -> None:
+        if not 0 <= log_ns < 2**63:
+            raise ValueError(f"log time {log_ns} ns is outside what a log can hold")
+        self._guarded(lambda: self._append_with_labels(topic, log_ns, payload))
+
+    def _append_with_labels(self, topic: str, log_ns: int, payload: bytes) -> None:
+        if not self._counts:
+            self._static(log_ns)
+        self._labels_until(log_ns)
+        self._append(topic, log_ns, payload)
+
+    def _static(self, log_ns: int) -> None:
+        self._append("/tf_static", log_ns, static_transform(log_ns, ROOT_FRAME, CAMERA_FRAME))
+
+    def _labels_until(self, log_ns: int | None) -> None:
+        while self._labels and (log_ns is None or self._labels[0][0] <= log_ns):
+            at_ns, place, label = self._labels.pop(0)
+            written_ns = at_ns if log_ns is not None else min(at_ns, self._last_ns)  # a window may outlast its log
+            self._guarded(partial(self._append, FAULT_TOPIC, written_ns, diagnostic(at_ns, label, place % 2 == 0)))
+
+    def _append(self, topic: str, log_ns: int, payload: bytes) -> None:
+        start = self._chunk_start_ns
+        full = self._pending_bytes + len(payload) > self._chunk_bytes
+        if start is not None and (full or abs(log_ns - start) >= self._chunk_ns):
+            self._flush()
+        self._chunk_start_ns = log_ns if self._chunk_start_ns is None else self._chunk_start_ns
+        sequence = self._counts.get(topic, 0)
+        self._writer.add_message(self._channel(topic), log_ns, payload, log_ns, sequence)
+        self._counts[topic] = sequence + 1
+        self._pending_bytes += len(payload)
+        self._last_ns = max(self._last_ns, log_ns)
+
+    def _flush(self) -> None:
+        self._writer.flush()
+        self._complete = self._stream.tell()
+        self._chunk_start_ns, self._pending_bytes = None, 0
+
+    def _channel(self, topic: str) -> int:
+        if topic not in self._channels:
+            kind = _TYPES[topic]
+            schema = self._writer.register_schema(kind, "ros2msg", schema_text(kind))
+            qos = {"offered_qos_profiles": _LATCHED if topic == "/tf_static" else ""}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, qos)
+        return self._channels[topic]
+
+    def _finish(self) -> None:
+        self._writer.finish()
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._stream.close()
+
+    def _guarded(self, action: Callable[[], None]) -> None:
+        try:
+            action()
+        except OSError as error:
+            self._keep_complete()
+            hint = f"{self._complete} complete bytes are kept in {self._partial}"
+            raise UnreadableInput(f"cannot be written: {error.strerror}", where=str(self._path), hint=hint) from None
+
+    def _keep_complete(self) -> None:
+        """What the disk took stays up to the last complete chunk; the rest is cut off."""
+        try:
+            self._stream.close()
+        except OSError:
+            pass  # the buffered rest does not fit either; the raw file is closed all the same
+        os.truncate(self._partial, min(self._complete, self._partial.stat().st_size))
+
+    def _discard(self) -> None:
+        self._stream.close()
+        self._partial.unlink(missing_ok=True)
+
+
+def _edges(labels: tuple[Label, ...]) -> list[tuple[int, int, Label]]:
+    """Every label's begin (even place) and end (odd place)."""
+    ends = [(max(label.start_ns, 0), 2 * i, label) for i, label in enumerate(labels)]
+    return ends + [(max(label.end_ns, 0), 2 * i + 1, label) for i, label in enumerate(labels)]
