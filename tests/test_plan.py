@@ -1,0 +1,190 @@
+"""The least-time rendezvous: its laws, and answers found another way."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from avsreplay.plan import Flight, PlanParams, rendezvous
+from avsreplay.plan.reach import integrals, support, touch
+from avsreplay.records import PlanStatus
+
+ORIGIN = np.zeros(3)
+
+
+def fixed(point, rate=(0.0, 0.0, 0.0)):
+    point, rate = np.asarray(point, float), np.asarray(rate, float)
+    return lambda t: (point + rate * t[:, None], np.tile(rate, (len(t), 1)))
+
+
+def tumbling(rng, rate=(0.1, 0.35), arm=1.5):
+    """Grasp point of a torque-free body by DOP853: an oracle that shares nothing with the package."""
+    J, w, c = np.sort(rng.uniform(1, 3, 3)), rng.normal(size=3), rng.normal(size=3)
+    w *= rng.uniform(*rate) / np.linalg.norm(w)
+    c *= arm / np.linalg.norm(c)
+    centre, drift = rng.uniform(2, 8) * (d := rng.normal(size=3)) / np.linalg.norm(d), 0.02 * rng.normal(size=3)
+
+    def flow(_, y):
+        q, w = y[:4], y[4:]
+        return np.r_[0.5 * (q[3] * w + np.cross(q[:3], w)), -0.5 * q[:3] @ w, -np.cross(w, J * w) / J]
+
+    start = np.r_[Rotation.random(random_state=int(rng.integers(1 << 30))).as_quat(), w]
+    path = solve_ivp(flow, [0, 125], start, method="DOP853", rtol=1e-11, atol=1e-12, dense_output=True).sol
+
+    def goal(t):
+        y = path(np.asarray(t)).T
+        R = Rotation.from_quat(y[:, :4])
+        return centre + drift * t[:, None] + R.apply(c), drift + R.apply(np.cross(y[:, 4:], c))
+
+    return goal
+
+
+def ratio(goal, r0, v0, a, times):
+    """a*(t) / a by the gauge at each time, 1 where thrust just suffices."""
+    rho, rate = goal(times)
+    out = []
+    for t, p, v in zip(times, rho, rate, strict=True):
+        dr, dv = p - r0 - v0 * t, v - v0
+        out.append(touch(dr, t * dv - dr).gauge / (a * t * t))
+    return np.array(out)
+
+
+def graded(P):
+    """Nodes and weights over [0, 1], crowded where |P| is least."""
+    D = P[2:] - P[:2]
+    s0 = min(max(-(P[:2] @ D) / (D @ D), 0.0), 1.0)
+    x, w = np.polynomial.legendre.leggauss(400)
+    x, w = 0.5 * (x + 1), 0.5 * w
+    s = np.r_[s0 - s0 * x**5, s0 + (1 - s0) * x**5]
+    return s, np.r_[s0 * w * 5 * x**4, (1 - s0) * w * 5 * x**4]
+
+
+@pytest.mark.parametrize("kind", ["general", "straight", "reversing", "collinear"])
+def test_support_gradient_and_hessian_are_those_of_the_integral(kind):
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        P = rng.normal(size=4)
+        if kind == "straight":
+            P[2:] = P[:2] * 1.1 + 0.05 * rng.normal(size=2)
+        elif kind == "reversing":
+            P[2:] = -P[:2] * rng.uniform(0.3, 2) + 0.05 * rng.normal(size=2)
+        elif kind == "collinear":
+            P[2:] = P[:2] * rng.uniform(0.2, 3)
+        h, grad, hess = support(*P)
+        s, w = graded(P)
+        path = (1 - s)[:, None] * P[:2] + s[:, None] * P[2:]
+        r = np.linalg.norm(path, axis=1)
+        unit = path / r[:, None]
+        assert h == pytest.approx(w @ r, rel=1e-10)
+        assert np.allclose(grad, np.r_[(w * (1 - s)) @ unit, (w * s) @ unit], atol=1e-9)
+        across = (np.eye(2) - unit[:, :, None] * unit[:, None, :]) / r[:, None, None]
+        for i, f in enumerate(((1 - s) ** 2, s * (1 - s), s * s)):
+            block = np.einsum("n,nij->ij", w * f, across)
+            expected = [block[0, 0], block[0, 1], block[1, 1]]
+            assert np.allclose(hess[3 * i : 3 * i + 3], expected, rtol=1e-8, atol=1e-9)
+
+
+def test_touching_point_lies_on_the_ray_through_the_goal():
+    rng = np.random.default_rng(2)
+    for k in range(200):
+        b0, b1 = rng.normal(size=(2, 3))
+        if k % 2:
+            b1 = rng.normal() * b0 + 10.0 ** rng.uniform(-14, -1) * rng.normal(size=3)
+        found = touch(b0, b1)
+        first, second = integrals(found.P0[None], found.P1[None])
+        reached = found.gauge * np.r_[second[0], first[0] - second[0]]
+        assert np.allclose(reached, np.r_[b0, b1], atol=1e-11)
+
+
+def test_rest_to_rest_is_bang_bang():
+    plan = rendezvous(fixed([5.0, 0, 0]), ORIGIN, ORIGIN, PlanParams(a_max_mps2=0.05))
+    assert plan.status is PlanStatus.OPTIMAL
+    assert plan.t_go_s == pytest.approx(2 * math.sqrt(5 / 0.05), abs=1e-9)
+
+
+def test_speed_alone_is_matched_along_one_straight_line():
+    half = 0.5 * 0.4**2 / 0.05
+    goal = fixed([half - 8 * 0.4, 0, 0], [0.4, 0, 0])  # full thrust for 8 s meets it exactly: w is constant
+    plan = rendezvous(goal, ORIGIN, ORIGIN, PlanParams(a_max_mps2=0.05))
+    assert plan.t_go_s == pytest.approx(8.0, abs=1e-6)
+
+
+def test_already_there_needs_no_time():
+    plan = rendezvous(fixed([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 3.0]), ORIGIN)
+    assert plan.t_go_s == 0.0
+    assert plan.status is PlanStatus.OPTIMAL
+
+
+def test_turning_the_whole_scene_turns_the_plan():
+    rng = np.random.default_rng(5)
+    goal, R = tumbling(rng), Rotation.random(random_state=3)
+    one = rendezvous(goal, ORIGIN, ORIGIN)
+    two = rendezvous(lambda t: tuple(R.apply(x) for x in goal(t)), ORIGIN, ORIGIN)
+    assert two.t_go_s == pytest.approx(one.t_go_s, abs=1e-7)
+    assert np.allclose(R.apply(np.array(one.costate).reshape(2, 3)), two.costate.reshape(2, 3), atol=1e-6)
+
+
+def test_a_moving_observer_sees_the_same_time():
+    goal, drift = tumbling(np.random.default_rng(6)), np.array([0.05, -0.02, 0.03])
+    one = rendezvous(goal, ORIGIN, ORIGIN)
+    two = rendezvous(lambda t: (goal(t)[0] + drift * t[:, None], goal(t)[1] + drift), ORIGIN, drift)
+    assert two.t_go_s == pytest.approx(one.t_go_s, abs=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_first_feasible_time_of_a_tumbling_goal(seed):
+    rng = np.random.default_rng(seed)
+    goal, a = tumbling(rng), rng.uniform(0.02, 0.1)
+    r0, v0 = 0.5 * rng.normal(size=3), 0.05 * rng.normal(size=3)
+    plan = rendezvous(goal, r0, v0, PlanParams(a_max_mps2=a))
+    assert plan.status is PlanStatus.OPTIMAL
+    assert plan.t_go_s - 1e-5 <= plan.lower_bound_s <= plan.t_go_s
+    assert np.all(ratio(goal, r0, v0, a, np.arange(0.05, plan.lower_bound_s, 0.2)) > 1.0)
+
+    def fly(t, y):
+        return np.r_[y[3:], flight.thrust(np.array([t]))[0]]
+
+    flight = Flight.of(plan, r0, v0)
+    end = solve_ivp(fly, [0, plan.t_go_s], np.r_[r0, v0], method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    rho, rate = goal(np.array([plan.t_go_s]))
+    assert np.linalg.norm(end[:3] - rho[0]) < 1e-8
+    assert np.linalg.norm(end[3:] - rate[0]) < 1e-8
+    assert plan.u_max == pytest.approx(a, rel=1e-12)
+
+
+def test_latency_is_a_coast_and_then_the_same_problem():
+    goal = tumbling(np.random.default_rng(7))
+    v0 = np.array([0.03, 0.0, -0.02])
+    late = rendezvous(goal, ORIGIN, v0, PlanParams(latency_s=2.5))
+    same = rendezvous(lambda t: goal(t + 2.5), 2.5 * v0, v0, PlanParams())
+    assert late.t_go_s == pytest.approx(same.t_go_s + 2.5, abs=1e-7)
+    assert np.all(Flight.of(late, ORIGIN, v0).thrust(np.array([0.0, 2.4])) == 0.0)
+    assert late.position_error_m < 1e-8
+
+
+def test_a_goal_that_runs_away_is_infeasible_and_says_until_when():
+    plan = rendezvous(
+        lambda t: (0.5 * 0.06 * t[:, None] ** 2 + 1.0 + ORIGIN, 0.06 * t[:, None] + ORIGIN), ORIGIN, ORIGIN
+    )
+    assert plan.status is PlanStatus.INFEASIBLE
+    assert plan.lower_bound_s == pytest.approx(120.0)
+    assert math.isnan(plan.t_go_s)
+    assert not plan.found
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"a_max_mps2": 0.0}, {"a_max_mps2": math.nan}, {"horizon_s": 0.0}, {"latency_s": -1.0}, {"latency_s": 120.0}],
+)
+def test_bad_parameters_are_named(bad):
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        PlanParams(**bad)
+
+
+def test_a_state_that_is_not_finite_is_named():
+    with pytest.raises(ValueError, match="r0 is"):
+        rendezvous(fixed([1.0, 0, 0]), np.array([math.nan, 0, 0]), ORIGIN)
+    with pytest.raises(ValueError, match="goal trajectory is not finite"):
+        rendezvous(fixed([math.nan, 0, 0]), ORIGIN, ORIGIN)
