@@ -18,7 +18,7 @@ class KernelIndex:
 
     def __init__(self, vertices: Array, faces: NDArray[np.int32], kept: NDArray[np.int32], reach_m: float) -> None:
         try:
-            from avsreplay.register import _kernel
+            import avsreplay.register._kernel as _kernel
         except ImportError as error:
             raise MissingBackend(
                 "the C++ kernel is not built", where="avsreplay.register._kernel", hint="install a compiler and run pip"

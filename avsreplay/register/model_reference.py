@@ -106,9 +106,9 @@ class _CloudSearch:
         self._points, self._tree = vertices, cKDTree(vertices)
 
     def __call__(self, p: Array) -> tuple[Array, Array, NDArray[np.int32]]:
-        _, i = self._tree.query(p)
+        i = np.asarray(self._tree.query(p)[1], dtype=np.int32)
         foot = self._points[i]
-        return foot, np.sum((foot - p) ** 2, axis=1), i.astype(np.int32)
+        return foot, np.sum((foot - p) ** 2, axis=1), i
 
 
 class _MeshSearch:
