@@ -1,1 +1,62 @@
-"""Rows to people and files: tables, golden comparison, exports, pages."""
+"""Rows to people and files: tables, golden comparison, exports, pages. Names load when first used."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from avsreplay.report.export import row_poses, write_csv, write_kitti, write_parquet, write_tum
+    from avsreplay.report.golden import GoldenResult, compare_golden, update_golden
+    from avsreplay.report.json_document import document, dump_document
+    from avsreplay.report.jsonl import RowWriter, read_rows, write_rows
+    from avsreplay.report.summary import Summary, SummaryFold
+    from avsreplay.report.table import make_console, print_golden, print_tables
+
+_HOME = {
+    "GoldenResult": "golden",
+    "RowWriter": "jsonl",
+    "Summary": "summary",
+    "SummaryFold": "summary",
+    "compare_golden": "golden",
+    "document": "json_document",
+    "dump_document": "json_document",
+    "make_console": "table",
+    "print_golden": "table",
+    "print_tables": "table",
+    "read_rows": "jsonl",
+    "row_poses": "export",
+    "update_golden": "golden",
+    "write_csv": "export",
+    "write_kitti": "export",
+    "write_parquet": "export",
+    "write_rows": "jsonl",
+    "write_tum": "export",
+}
+
+__all__ = [
+    "GoldenResult",
+    "RowWriter",
+    "Summary",
+    "SummaryFold",
+    "compare_golden",
+    "document",
+    "dump_document",
+    "make_console",
+    "print_golden",
+    "print_tables",
+    "read_rows",
+    "row_poses",
+    "update_golden",
+    "write_csv",
+    "write_kitti",
+    "write_parquet",
+    "write_rows",
+    "write_tum",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

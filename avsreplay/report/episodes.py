@@ -1,0 +1,207 @@
+"""Injected faults against what the detector said, and how long it took to be back on track.
+
+A label is *harmful* (the scan must be flagged) or not (either word is right). A harmful label is *detected* where at
+least one of its scans has gamma 0 or, where no scan came at all, where a gap covers it. A flagged scan without a
+label is a *false alarm*. A *gap* is an interval between scans longer than 1.5 times the median interval.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from avsreplay.records import Label
+from avsreplay.report.spread import median
+
+__all__ = ["GAP", "Coast", "Episode", "FaultAccount", "Mark", "account", "coasts", "gaps"]
+
+GAP = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """What the account needs of a row."""
+
+    t_ns: int
+    gamma: int
+    fault: str | None
+    pos_err_m: float | None = None
+    rot_err_deg: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One label and its fate.
+
+    Attributes:
+        start_s, end_s: its window, since the first scan.  scans: rows that carry it.  flagged: those with gamma 0.
+        detected: see the module.  recover_scans: scans without a label after it that were still flagged.
+        recover_s: from the first scan without a label after it to the first healthy scan (0: at once);
+            None where there was nothing to recover from or no recovery.
+    """
+
+    kind: str
+    harmful: bool
+    start_s: float
+    end_s: float
+    scans: int
+    flagged: int
+    detected: bool
+    recover_scans: int | None
+    recover_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class FaultAccount:
+    """All labels of a log.
+
+    Attributes:
+        known: does the log say what was injected? Without that a flagged scan is no proven false alarm.
+        injected, detected, missed: harmful labels.  missed_scans: harmful scans with gamma 1.
+        false_alarms: flagged scans without a label, of ``unlabelled`` scans.
+    """
+
+    known: bool
+    injected: int
+    detected: int
+    missed: int
+    harmful_scans: int
+    missed_scans: int
+    unlabelled: int
+    false_alarms: int
+    episodes: tuple[Episode, ...]
+
+    @property
+    def false_alarm_rate(self) -> float:
+        """False alarms over scans without a label."""
+        return self.false_alarms / self.unlabelled if self.unlabelled else 0.0
+
+    @property
+    def longest_recovery_s(self) -> float | None:
+        """The worst time to recover."""
+        return max((e.recover_s for e in self.episodes if e.recover_s is not None), default=None)
+
+
+@dataclass(frozen=True, slots=True)
+class Coast:
+    """A run of scans with gamma 0, and the pose error at its last scan."""
+
+    start_s: float
+    scans: int
+    duration_s: float
+    pos_err_m: float | None
+    rot_err_deg: float | None
+
+
+def gaps(t_ns: Sequence[int]) -> list[tuple[int, int]]:
+    """(before, after) instants of every interval longer than ``GAP`` times the median interval."""
+    steps = [b - a for a, b in pairwise(t_ns) if b > a]
+    if not steps:
+        return []
+    limit = GAP * median(steps)
+    return [(a, b) for a, b in pairwise(t_ns) if b - a > limit]
+
+
+def account(marks: Sequence[Mark], labels: Sequence[Label] | None) -> FaultAccount:
+    """Set rows against labels; without labels they are read off the rows' own ``fault`` column."""
+    known = labels is not None or any(m.fault is not None for m in marks)
+    labels = _labels_of(marks) if labels is None else labels
+    members = _members(marks, labels)
+    holes = gaps([m.t_ns for m in marks])
+    t0 = marks[0].t_ns if marks else 0
+    episodes = tuple(_episode(label, members[i], marks, holes, t0) for i, label in enumerate(labels))
+    harmful = [i for i, label in enumerate(labels) if label.harmful]
+    scans = [k for i in harmful for k in members[i]]
+    free = [m for m in marks if m.fault is None]
+    detected = sum(episodes[i].detected for i in harmful)
+    return FaultAccount(
+        known=known,
+        injected=len(harmful),
+        detected=detected,
+        missed=len(harmful) - detected,
+        harmful_scans=len(scans),
+        missed_scans=sum(marks[k].gamma == 1 for k in scans),
+        unlabelled=len(free),
+        false_alarms=sum(m.gamma == 0 for m in free),
+        episodes=episodes,
+    )
+
+
+def _labels_of(marks: Sequence[Mark]) -> list[Label]:
+    """One harmful label for each run of rows with the same fault."""
+    out: list[Label] = []
+    for before, mark in zip([None, *marks], marks, strict=False):
+        if mark.fault is None:
+            continue
+        if before is not None and before.fault == mark.fault:
+            out[-1] = Label(mark.fault, out[-1].start_ns, mark.t_ns)
+        else:
+            out.append(Label(mark.fault, mark.t_ns, mark.t_ns))
+    return out
+
+
+def _members(marks: Sequence[Mark], labels: Sequence[Label]) -> list[list[int]]:
+    """Rows of each label: those of its kind to whose stamp its window is the nearest (a fault may shift stamps)."""
+    out: list[list[int]] = [[] for _ in labels]
+    for k, mark in enumerate(marks):
+        same = [i for i, label in enumerate(labels) if label.kind == mark.fault]
+        if same:
+            out[min(same, key=lambda i: _distance(labels[i], mark.t_ns))].append(k)
+    return out
+
+
+def _distance(label: Label, t_ns: int) -> int:
+    return max(label.start_ns - t_ns, t_ns - label.end_ns, 0)
+
+
+def _episode(
+    label: Label, rows: Sequence[int], marks: Sequence[Mark], holes: Sequence[tuple[int, int]], t0: int
+) -> Episode:
+    flagged = sum(marks[k].gamma == 0 for k in rows)
+    missing = not rows and any(a <= label.end_ns and label.start_ns <= b for a, b in holes)
+    last = rows[-1] + 1 if rows else bisect_right([m.t_ns for m in marks], label.end_ns)
+    recovery = _recovery(marks, last) if flagged or missing else None
+    return Episode(
+        kind=label.kind,
+        harmful=label.harmful,
+        start_s=(label.start_ns - t0) * 1e-9,
+        end_s=(label.end_ns - t0) * 1e-9,
+        scans=len(rows),
+        flagged=flagged,
+        detected=bool(flagged or missing),
+        recover_scans=recovery[0] if recovery else None,
+        recover_s=recovery[1] if recovery else None,
+    )
+
+
+def _recovery(marks: Sequence[Mark], start: int) -> tuple[int, float] | None:
+    free = [m for m in marks[start:] if m.fault is None]
+    for late, mark in enumerate(free):
+        if mark.gamma == 1:
+            return late, (mark.t_ns - free[0].t_ns) * 1e-9
+    return None
+
+
+def coasts(marks: Sequence[Mark]) -> list[Coast]:
+    """Every run of scans with gamma 0; its duration is from the last healthy scan before it to its last scan."""
+    out: list[Coast] = []
+    begin: int | None = None
+    for k, mark in enumerate(marks):
+        if mark.gamma == 1:
+            begin = None
+            continue
+        if begin is None:
+            begin = k
+        else:
+            out.pop()
+        out.append(_coast(marks, begin, k))
+    return out
+
+
+def _coast(marks: Sequence[Mark], begin: int, end: int) -> Coast:
+    before, last = marks[max(begin - 1, 0)], marks[end]
+    seconds = (last.t_ns - before.t_ns) * 1e-9
+    start_s = (marks[begin].t_ns - marks[0].t_ns) * 1e-9
+    return Coast(start_s, end - begin + 1, seconds, last.pos_err_m, last.rot_err_deg)

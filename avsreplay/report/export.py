@@ -1,0 +1,100 @@
+"""Rows and poses in the formats other tools open: TUM, KITTI, CSV, Parquet.
+
+Stamps are written from integer nanoseconds, never through a float; values as the shortest text that reads back
+to the same float64.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Literal
+
+from avsreplay.errors import MissingBackend
+from avsreplay.geometry import Pose
+from avsreplay.report.atomic import atomic_path, atomic_text
+from avsreplay.report.jsonl import field_types, plain
+from avsreplay.rows import Row, columns
+
+__all__ = ["StampedPose", "row_poses", "stamp_text", "write_csv", "write_kitti", "write_parquet", "write_tum"]
+
+StampedPose = tuple[int, Pose]
+"""(t_ns, T_ac): an instant and the pose of {C} in {A} at it."""
+
+_COLUMNS = {
+    "estimate": (("qx", "qy", "qz", "qw"), ("x_m", "y_m", "z_m")),
+    "registration": (("reg_qx", "reg_qy", "reg_qz", "reg_qw"), ("reg_x_m", "reg_y_m", "reg_z_m")),
+}
+
+
+def row_poses(rows: Iterable[Row], which: Literal["estimate", "registration"]) -> Iterator[StampedPose]:
+    """The estimated or the registered pose of every row that has one."""
+    attitude, position = _COLUMNS[which]
+    for row in rows:
+        q, t = [getattr(row, n) for n in attitude], [getattr(row, n) for n in position]
+        if None not in (*q, *t):
+            yield row.t_ns, Pose(q, t)  # type: ignore[arg-type]
+
+
+def stamp_text(t_ns: int) -> str:
+    """Seconds with nine decimals, exact."""
+    sign, t_ns = ("-", -t_ns) if t_ns < 0 else ("", t_ns)
+    return f"{sign}{t_ns // 1_000_000_000}.{t_ns % 1_000_000_000:09d}"
+
+
+def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
+    """TUM trajectory, ``stamp x y z qx qy qz qw`` a line, poses of {C} in {A} [s, m]. Returns the count."""
+    return _write_lines(path, (f"{stamp_text(t_ns)} {_text((*pose.t, *pose.q))}" for t_ns, pose in poses))
+
+
+def write_kitti(path: str | Path, poses: Iterable[StampedPose]) -> int:
+    """KITTI trajectory: the upper 3x4 of T_ac row by row a line, no stamps [m]. Returns the count."""
+    return _write_lines(path, (_text(pose.matrix[:3].reshape(-1)) for _, pose in poses))
+
+
+def _text(values: Iterable[Any]) -> str:
+    return " ".join(repr(float(v)) for v in values)
+
+
+def _write_lines(path: str | Path, lines: Iterable[str]) -> int:
+    count = 0
+    with atomic_text(path) as stream:
+        for line in lines:
+            stream.write(line + "\n")
+            count += 1
+    return count
+
+
+def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
+    """All columns, their names (with units as suffixes) in the first line; null is an empty cell."""
+    names = [c.name for c in columns()]
+    with atomic_text(path) as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow(names)
+        writer.writerows([_cell(plain(getattr(row, name))) for name in names] for row in rows)
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
+    """All columns, typed; unit and meaning stand in each field's metadata. Raises MissingBackend without pyarrow."""
+    try:
+        pa: Any = import_module("pyarrow")
+        pq: Any = import_module("pyarrow.parquet")
+    except ModuleNotFoundError:
+        raise MissingBackend("pyarrow is not installed", where="Parquet", hint="install avsreplay[sweep]") from None
+    kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
+    types = field_types()
+    schema = pa.schema(
+        [pa.field(c.name, kinds[types[c.name][0]], types[c.name][1], {"unit": c.unit, "doc": c.doc}) for c in columns()]
+    )
+    table = {f.name: [plain(getattr(row, f.name)) for row in rows] for f in dataclasses.fields(Row)}
+    with atomic_path(path) as part:
+        pq.write_table(pa.table(table, schema=schema), part)

@@ -1,0 +1,141 @@
+"""Rows as JSON lines: one object a scan, keys in the order of ``Row``'s fields, floats as their shortest exact text.
+
+A float that is not finite is written as null. Facts about the run stand elsewhere (``run.json``), so the same
+input gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from avsreplay.errors import UnreadableInput
+from avsreplay.report.atomic import atomic_text
+from avsreplay.rows import Row
+
+__all__ = ["RowWriter", "dump_row", "field_types", "parse_row", "plain", "read_records", "read_rows", "write_rows"]
+
+_NAMES = tuple(f.name for f in dataclasses.fields(Row))
+_MAX_LINE = 1 << 20
+
+
+def field_types() -> dict[str, tuple[type, bool]]:
+    """Column name -> (str, int, float or bool; may it be null)."""
+    hints = typing.get_type_hints(Row)
+    return {name: _split(hints[name]) for name in _NAMES}
+
+
+def _split(hint: Any) -> tuple[type, bool]:
+    args = typing.get_args(hint)
+    return (next(a for a in args if a is not type(None)), True) if args else (hint, False)
+
+
+def plain(value: Any) -> Any:
+    """A JSON value: numpy scalars as Python's, floats that are not finite as None."""
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def dump_row(row: Row) -> str:
+    """One line of JSON, without the line end."""
+    record = {name: plain(getattr(row, name)) for name in _NAMES}
+    return json.dumps(record, ensure_ascii=False, allow_nan=False, separators=(", ", ": "))
+
+
+class RowWriter:
+    """Writes rows one by one; the file appears when the ``with`` block ends well, and not otherwise."""
+
+    def __init__(self, path: str | Path) -> None:
+        self._path = Path(path)
+        self._stack = ExitStack()
+        self.count = 0
+
+    def __enter__(self) -> RowWriter:
+        self._stream = self._stack.enter_context(atomic_text(self._path))
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self._stack.__exit__(kind, error, tb)
+
+    def write(self, row: Row) -> None:
+        """Append one row."""
+        self._stream.write(dump_row(row) + "\n")
+        self.count += 1
+
+
+def write_rows(path: str | Path, rows: Iterable[Row]) -> int:
+    """Write all rows, atomically; how many. Raises UnreadableInput where the path cannot be written."""
+    with RowWriter(path) as writer:
+        for row in rows:
+            writer.write(row)
+    return writer.count
+
+
+def read_records(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Each line as (``file:line``, object), unchecked but for being a JSON object.
+
+    Raises UnreadableInput for a missing file, text that is not UTF-8, or a line that is not a JSON object.
+    """
+    path = Path(path)
+    try:
+        with path.open(encoding="utf-8") as stream:
+            for number, line in enumerate(stream, 1):
+                if line.strip():
+                    yield f"{path}:{number}", _parse(line, f"{path}:{number}")
+    except UnicodeDecodeError:
+        raise UnreadableInput("not UTF-8 text", where=str(path), hint="name a rows.jsonl file") from None
+    except OSError as error:
+        what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
+        raise UnreadableInput(what, where=str(path), hint="check the path") from None
+
+
+def _parse(line: str, where: str) -> dict[str, Any]:
+    if len(line) > _MAX_LINE:
+        raise UnreadableInput("a line longer than 1 MiB, not a row", where=where, hint="name a rows.jsonl file")
+    try:
+        record = json.loads(line, parse_constant=_refuse)
+    except (ValueError, RecursionError):
+        raise UnreadableInput("not valid JSON", where=where, hint="name a rows.jsonl file") from None
+    if not isinstance(record, dict):
+        raise UnreadableInput("not a JSON object", where=where, hint="name a rows.jsonl file")
+    return record
+
+
+def _refuse(constant: str) -> Any:
+    raise ValueError(f"{constant} is not JSON")
+
+
+def parse_row(record: Mapping[str, Any], where: str) -> Row:
+    """A row from its JSON object. A column that may be null may be missing.
+
+    Raises UnreadableInput for an unknown or a missing column or a value of the wrong type.
+    """
+    types = field_types()
+    for name in record:
+        if name not in types:
+            raise UnreadableInput(f"unknown column '{name}'", where=where, hint="was it written by another version?")
+    return Row(**{name: _checked(record.get(name), name, *types[name], where) for name in types})
+
+
+def _checked(value: Any, name: str, kind: type, nullable: bool, where: str) -> Any:
+    if value is None and nullable:
+        return None
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(value, kind) and isinstance(value, bool) == (kind is bool):
+        return value
+    what = f"column '{name}' is missing or null" if value is None else f"column '{name}' is {value!r}"
+    raise UnreadableInput(what, where=where, hint=f"it must be {kind.__name__}")
+
+
+def read_rows(path: str | Path) -> list[Row]:
+    """All rows of a file. Raises UnreadableInput (see read_records, parse_row)."""
+    return [parse_row(record, where) for where, record in read_records(path)]

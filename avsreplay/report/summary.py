@@ -1,0 +1,315 @@
+"""What a run came to: one fold over its rows.
+
+Terms: a scan is *healthy* where gamma is 1 and *coasting* where it is 0. Errors are against the log's truth. Sums are
+correctly rounded, so the summary does not depend on their order. What the clock on the wall says (scans per
+second) is no part of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.records import Label, State
+from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
+from avsreplay.report.spread import Spread, median
+from avsreplay.rows import Row
+
+__all__ = ["Capture", "Convergence", "Errors", "Observability", "Parameter", "Share", "Summary", "SummaryFold"]
+
+NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
+NEES_BAND = (9.5908, 34.1696)  # the same with 20
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Translation [m] and rotation [deg] errors over the same scans; None without truth."""
+
+    position_m: Spread | None
+    rotation_deg: Spread | None
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """An estimated constant at the last scan.
+
+    Attributes:
+        estimate, truth: its components, in ``unit``.  error: length of their difference (rotation angle for mu).
+        one_sigma: root of the trace of its covariance.
+    """
+
+    name: str
+    unit: str
+    estimate: tuple[float, ...]
+    truth: tuple[float, ...] | None
+    error: float | None
+    one_sigma: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """A chi-square statistic: its median and the share of scans inside the two-sided 95 % band."""
+
+    count: int
+    median: float
+    inside: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, slots=True)
+class Observability:
+    """The Gramian at the last scan, and when its rank first was 20 (None: never)."""
+
+    log10_cond: float | None
+    log10_cond_scaled: float | None
+    rank: int | None
+    full_rank_s: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Convergence:
+    """t_1: the first scan on which the planner may rely on the estimate, and whether that word was taken back."""
+
+    t1_s: float | None
+    at_end: bool
+    withdrawn: int
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """Planned instants of capture, since the first scan; a replan is a row where the plan differs from the one before.
+
+    Attributes:
+        last_s, first_s: of the last and the first plan.  std_s, range_s: over all replans.
+        status: the planner's last word.
+    """
+
+    replans: int
+    first_s: float | None
+    last_s: float | None
+    std_s: float | None
+    range_s: float | None
+    status: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """All of it.
+
+    Attributes:
+        pose_healthy, pose_coasting: of the estimate.  registration_healthy, registration_flagged: of the measurement.
+        reasons: why scans were flagged.  status: what door and ruler found.  counts: handed in (losses, clock).
+        coasts: runs without a measurement.  interval_s: median between scans.  gaps: longer than 1.5 times it.
+    """
+
+    scans: int
+    duration_s: float
+    interval_s: float | None
+    healthy: int
+    coasting: int
+    gaps: int
+    status: Mapping[str, int]
+    reasons: Mapping[str, int]
+    pose_healthy: Errors
+    pose_coasting: Errors
+    registration_healthy: Errors
+    registration_flagged: Errors
+    fit_error_m: Spread | None
+    iterations: Spread | None
+    faults: FaultAccount
+    coasts: tuple[Coast, ...]
+    parameters: tuple[Parameter, ...]
+    sigma_hits: int | None
+    r_floors: int | None
+    nis: Share | None
+    nees: Share | None
+    observability: Observability
+    convergence: Convergence
+    capture: Capture
+    counts: Mapping[str, int] = field(default_factory=dict)
+
+    @classmethod
+    def fold(
+        cls,
+        rows: Iterable[Row],
+        *,
+        labels: Sequence[Label] | None = None,
+        truth: State | None = None,
+        counts: Mapping[str, int] | None = None,
+    ) -> Summary:
+        """Fold rows in their order; see SummaryFold."""
+        fold = SummaryFold(labels=labels, truth=truth, counts=counts)
+        for row in rows:
+            fold.add(row)
+        return fold.result()
+
+    @property
+    def longest_coast(self) -> Coast | None:
+        """The longest run without a measurement (the first of equals)."""
+        return max(self.coasts, key=lambda c: c.duration_s, default=None)
+
+
+class SummaryFold:
+    """Takes rows one by one and keeps a few numbers of each.
+
+    Args:
+        labels: faults put into the log; None where the log does not say (a recorded one).
+        truth: the true state, its axes named as the estimate's are (see estimate.relabel).
+        counts: losses and clock trouble met on the way, by name.
+    """
+
+    def __init__(
+        self,
+        *,
+        labels: Sequence[Label] | None = None,
+        truth: State | None = None,
+        counts: Mapping[str, int] | None = None,
+    ) -> None:
+        self._labels, self._truth, self._counts = labels, truth, dict(counts or {})
+        self._marks: list[Mark] = []
+        self._values: dict[str, list[float]] = {}
+        self._status: Counter[str] = Counter()
+        self._reasons: Counter[str] = Counter()
+        self._last: Row | None = None
+        self._full_rank_s: float | None = None
+        self._t1_s: float | None = None
+        self._withdrawn = 0
+        self._plans: list[tuple[str | None, float | None]] = []
+
+    def add(self, row: Row) -> None:
+        """Take the next row."""
+        self._marks.append(Mark(row.t_ns, row.gamma, row.fault, row.pos_err_m, row.rot_err_deg))
+        self._status[row.status] += 1
+        if row.gamma == 0:
+            self._reasons[row.reason] += 1
+        self._add_errors(row)
+        self._add_milestones(row)
+        self._last = row
+
+    def _add_errors(self, row: Row) -> None:
+        state = "healthy" if row.gamma == 1 else "coasting"
+        for name in ("pos_err_m", "rot_err_deg", "reg_pos_err_m", "reg_rot_err_deg", "nis", "rms_m", "iterations"):
+            self._keep(f"{name}/{state}", getattr(row, name))
+        self._keep("nees", row.nees)
+
+    def _keep(self, name: str, value: float | None) -> None:
+        if value is not None and math.isfinite(value):
+            self._values.setdefault(name, []).append(float(value))
+
+    def _add_milestones(self, row: Row) -> None:
+        if self._full_rank_s is None and row.ogm_rank == 20:
+            self._full_rank_s = row.t_s
+        if self._t1_s is None and row.converged:
+            self._t1_s = row.t_s
+        if self._last is not None and self._last.converged and not row.converged:
+            self._withdrawn += 1
+        plan = (row.plan_status, row.capture_time_s)
+        if plan != (None, None) and (not self._plans or plan != self._plans[-1]):
+            self._plans.append(plan)
+
+    def result(self) -> Summary:
+        """The summary of all rows so far."""
+        stamps = [m.t_ns for m in self._marks]
+        steps = [b - a for a, b in pairwise(stamps) if b > a]
+        last = self._last
+        healthy = sum(m.gamma == 1 for m in self._marks)
+        return Summary(
+            scans=len(stamps),
+            duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0,
+            interval_s=median(steps) * 1e-9 if steps else None,
+            healthy=healthy,
+            coasting=len(stamps) - healthy,
+            gaps=len(gaps(stamps)),
+            status=dict(sorted(self._status.items())),
+            reasons=dict(sorted(self._reasons.items())),
+            pose_healthy=self._errors("", "healthy"),
+            pose_coasting=self._errors("", "coasting"),
+            registration_healthy=self._errors("reg_", "healthy"),
+            registration_flagged=self._errors("reg_", "coasting"),
+            fit_error_m=Spread.of(self._values.get("rms_m/healthy", [])),
+            iterations=Spread.of(self._values.get("iterations/healthy", [])),
+            faults=account(self._marks, self._labels),
+            coasts=tuple(coasts(self._marks)),
+            parameters=_parameters(last, self._truth) if last else (),
+            sigma_hits=last.sigma_hits if last else None,
+            r_floors=last.r_floors if last else None,
+            nis=_share(self._values.get("nis/healthy", []), NIS_BAND),
+            nees=_share(self._values.get("nees", []), NEES_BAND),
+            observability=self._observability(),
+            convergence=Convergence(self._t1_s, bool(last and last.converged), self._withdrawn),
+            capture=_capture(self._plans),
+            counts=self._counts,
+        )
+
+    def _errors(self, prefix: str, state: str) -> Errors:
+        position = self._values.get(f"{prefix}pos_err_m/{state}", [])
+        return Errors(Spread.of(position), Spread.of(self._values.get(f"{prefix}rot_err_deg/{state}", [])))
+
+    def _observability(self) -> Observability:
+        row = self._last
+        if row is None:
+            return Observability(None, None, None, None)
+        return Observability(row.ogm_log10_cond, row.ogm_log10_cond_scaled, row.ogm_rank, self._full_rank_s)
+
+
+def _share(values: Sequence[float], band: tuple[float, float]) -> Share | None:
+    if not values:
+        return None
+    inside = sum(band[0] <= v <= band[1] for v in values) / len(values)
+    return Share(len(values), median(values), inside, *band)
+
+
+def _capture(plans: Sequence[tuple[str | None, float | None]]) -> Capture:
+    times = [t for _, t in plans if t is not None]
+    spread = Spread.of(times)
+    status = plans[-1][0] if plans else None
+    if spread is None:
+        return Capture(0, None, None, None, None, status)
+    return Capture(len(times), times[0], times[-1], spread.std, spread.max - spread.min, status)
+
+
+def _parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
+    sigma = (None, None) if truth is None else ((float(truth.sigma[0]),), (float(truth.sigma[1]),))
+    found = [
+        _vector("sigma1", "", (row.sigma1,), sigma[0], row.sigma1_1s),
+        _vector("sigma2", "", (row.sigma2,), sigma[1], row.sigma2_1s),
+        _vector(
+            "c (varrho)", "m", (row.cx_m, row.cy_m, row.cz_m), None if truth is None else _tuple(truth.c_b), row.c_1s_m
+        ),
+        _attitude(row, truth),
+    ]
+    return tuple(p for p in found if p is not None)
+
+
+def _tuple(values: geometry.Array | None) -> tuple[float, ...] | None:
+    return None if values is None else tuple(float(v) for v in values)
+
+
+def _vector(
+    name: str, unit: str, values: tuple[float | None, ...], truth: tuple[float, ...] | None, one_sigma: float | None
+) -> Parameter | None:
+    estimate = tuple(v for v in values if v is not None)
+    if len(estimate) != len(values):
+        return None
+    error = None if truth is None else math.dist(estimate, truth)
+    return Parameter(name, unit, estimate, truth, error, one_sigma)
+
+
+def _attitude(row: Row, truth: State | None) -> Parameter | None:
+    """Attitude mu as a rotation vector [deg]; its error is the angle of mu_true^-1 mu."""
+    q = (row.mux, row.muy, row.muz, row.muw)
+    if None in q:
+        return None
+    estimate = _tuple(np.degrees(geometry.log(np.array(q, dtype=np.float64)))) or ()
+    if truth is None:
+        return Parameter("mu", "deg", estimate, None, None, row.mu_1s_deg)
+    apart = geometry.multiply(geometry.conjugate(truth.q_bc), np.array(q, dtype=np.float64))
+    error = math.degrees(float(geometry.angle(apart)))
+    return Parameter("mu", "deg", estimate, _tuple(np.degrees(geometry.log(truth.q_bc))), error, row.mu_1s_deg)
