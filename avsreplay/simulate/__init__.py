@@ -1,1 +1,18 @@
 """Simulated scans with truth: target, motion, scanner, faults, scenario."""
+
+from __future__ import annotations
+
+from avsreplay.simulate.scenario import Scenario, load_scenario, scenario_of
+from avsreplay.simulate.simulation import EPOCH_NS, Simulation, simulate
+from avsreplay.simulate.target import Shape, builtin_surface
+
+__all__ = [
+    "EPOCH_NS",
+    "Scenario",
+    "Shape",
+    "Simulation",
+    "builtin_surface",
+    "load_scenario",
+    "scenario_of",
+    "simulate",
+]

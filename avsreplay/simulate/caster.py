@@ -1,0 +1,118 @@
+"""First hits of rays on a triangle mesh: embreex where it is installed, an exact search of our own elsewhere.
+
+Either engine only says which triangle; the range is then the ray's own with that triangle's plane, in float64.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.errors import MissingBackend
+from avsreplay.geometry import Array
+from avsreplay.records import Surface
+
+__all__ = ["Caster", "Engine"]
+
+CHUNK = 1 << 20  # ray-triangle pairs held at once by the exact search
+Hits = NDArray[np.int64]
+Search = Callable[[Array, Array], Hits]
+
+
+class Engine(Enum):
+    """Who looks for the triangle."""
+
+    AUTO = "auto"  # embreex where installed, else exact
+    EMBREE = "embree"  # float32, fast; an edge may fall to either side on another processor
+    EXACT = "exact"  # every triangle tried in float64: slow, the same bits on any machine
+
+
+class Caster:
+    """Rays against one mesh.
+
+    Raises MissingBackend where embree is asked for and not installed.
+    """
+
+    def __init__(self, surface: Surface, engine: Engine = Engine.AUTO) -> None:
+        corners = surface.vertices[surface.faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        keep = np.linalg.norm(normals, axis=1) > 0.0  # a zero-area triangle cannot be hit
+        self._corners = np.ascontiguousarray(corners[keep])
+        self._normals = normals[keep] / np.linalg.norm(normals[keep], axis=1, keepdims=True)
+        self.engine = _resolve(engine)
+        build = _embree if self.engine is Engine.EMBREE else _exact
+        self._search = build(self._corners)
+
+    def ranges(self, origins: Array, directions: Array) -> tuple[Array, Array]:
+        """Range (n,) [m] to the first hit (inf: none) and cosine (n,) of its incidence; unit ``directions`` (n, 3)."""
+        face = self._search(origins, directions)
+        hit = np.flatnonzero(face >= 0)
+        normal = self._normals[face[hit]]
+        cosine = _dot(normal, directions[hit])
+        ranges, cosines = np.full(len(face), np.inf), np.zeros(len(face))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth = _dot(normal, self._corners[face[hit], 0] - origins[hit]) / cosine
+        good = np.isfinite(depth) & (depth > 0.0)
+        ranges[hit[good]], cosines[hit[good]] = depth[good], np.abs(cosine[good])
+        return ranges, cosines
+
+
+def _resolve(engine: Engine) -> Engine:
+    present = importlib.util.find_spec("embreex") is not None
+    if engine is Engine.EMBREE and not present:
+        hint = "pip install embreex, or set scanner.engine to 'exact' (slower)"
+        raise MissingBackend("embreex is not installed", where="scanner.engine", hint=hint)
+    if engine is Engine.AUTO:
+        return Engine.EMBREE if present else Engine.EXACT
+    return engine
+
+
+def _embree(corners: Array) -> Search:
+    from embreex import rtcore_scene
+    from embreex.mesh_construction import TriangleMesh
+
+    scene = rtcore_scene.EmbreeScene()
+    TriangleMesh(scene, corners.astype(np.float32))
+
+    def search(origins: Array, directions: Array) -> Hits:
+        if not len(origins):
+            return np.empty(0, np.int64)
+        found = scene.run(np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32))
+        return np.asarray(found, dtype=np.int64)
+
+    return search
+
+
+def _exact(corners: Array) -> Search:
+    a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+
+    def search(origins: Array, directions: Array) -> Hits:
+        rows = max(1, CHUNK // max(1, len(a)))
+        parts = [
+            _moeller_trumbore(origins[k : k + rows, None], directions[k : k + rows, None], a, e1, e2)
+            for k in range(0, len(origins), rows)
+        ]
+        return np.concatenate([np.empty(0, np.int64), *parts])
+
+    return search
+
+
+def _moeller_trumbore(o: Array, d: Array, a: Array, e1: Array, e2: Array) -> Hits:
+    """Index of the nearest triangle hit by each ray, -1 where none: o, d (n, 1, 3), triangles (m, 3)."""
+    p, s = np.cross(d, e2), o - a
+    q = np.cross(s, e1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / _dot(p, e1)
+        u, v, t = _dot(s, p) * scale, _dot(d, q) * scale, _dot(q, e2) * scale
+        inside = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
+    t = np.where(inside, t, np.inf)
+    best = np.argmin(t, axis=1)
+    return np.where(np.isfinite(t[np.arange(len(t)), best]), best, -1)
+
+
+def _dot(u: Array, v: Array) -> Array:
+    return np.asarray(u[..., 0] * v[..., 0] + u[..., 1] * v[..., 1] + u[..., 2] * v[..., 2])

@@ -1,0 +1,161 @@
+"""Faults put into a simulated log on purpose, each over a window of the log clock and labelled there.
+
+=================  ===========================================  =======  ========================================
+kind               strength (default)                           harmful  what happens
+=================  ===========================================  =======  ========================================
+occlusion          part of the view covered (1.0)               yes      a plate in front hides it; few plate points
+partial_occlusion  part of the target's returns hidden (0.5)    no       the same, from one side
+dropped            none                                         yes      no message is written
+empty              none                                         yes      a message without a point
+clutter            added points over returns (0.5)              no       points anywhere about the target
+range_bias         added to every range [m] (0.3)               yes      the target seems farther away
+noise_burst        factor on the range noise (5.0)              no       as it says
+frozen             none                                         yes      the last scan before the window again
+stamp_jump         added to the stamps [s] (30.0)               yes      log time stays true
+=================  ===========================================  =======  ========================================
+
+``harmful`` is what the label says of the scan: by design it cannot give a good pose at its stamp. Harmless kinds are
+meant to be lived through; a scenario may state either for itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from avsreplay.records import Label
+from avsreplay.simulate.scanner import Returns
+
+__all__ = ["FaultParams", "Kind", "active", "clutter", "label", "occlude", "strength"]
+
+NS = 1_000_000_000
+PLATE_RETURN_RATIO = 0.05  # a dark plate: this part of the rays it stops comes back
+PLATE_DEPTH_RATIO = 0.4  # of the target's median range
+PLATE_TILT = math.tan(math.radians(15.0))
+CLUTTER_RADIUS_RATIO = 1.2  # of the target's bounding sphere
+
+
+class Kind(Enum):
+    """What goes wrong."""
+
+    OCCLUSION = "occlusion"
+    PARTIAL_OCCLUSION = "partial_occlusion"
+    DROPPED = "dropped"
+    EMPTY = "empty"
+    CLUTTER = "clutter"
+    RANGE_BIAS = "range_bias"
+    NOISE_BURST = "noise_burst"
+    FROZEN = "frozen"
+    STAMP_JUMP = "stamp_jump"
+
+
+_DEFAULTS: dict[Kind, tuple[float | None, bool]] = {
+    Kind.OCCLUSION: (1.0, True),
+    Kind.PARTIAL_OCCLUSION: (0.5, False),
+    Kind.DROPPED: (None, True),
+    Kind.EMPTY: (None, True),
+    Kind.CLUTTER: (0.5, False),
+    Kind.RANGE_BIAS: (0.3, True),
+    Kind.NOISE_BURST: (5.0, False),
+    Kind.FROZEN: (None, True),
+    Kind.STAMP_JUMP: (30.0, True),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class FaultParams:
+    """One table [[fault]]: a kind over [start_s, start_s + duration_s) after the first instant."""
+
+    # what goes wrong
+    kind: Kind
+    # beginning of the window, seconds after the first instant
+    start_s: float
+    # length of the window
+    duration_s: float
+    # how much; its meaning and default depend on the kind
+    strength: float | None = None
+    # what the label says; None: the kind's own
+    harmful: bool | None = None
+
+    def __post_init__(self) -> None:
+        if not self.start_s >= 0.0:
+            raise ValueError(f"start_s = {self.start_s} must not be negative")
+        if not 0.0 < self.duration_s < math.inf:
+            raise ValueError(f"duration_s = {self.duration_s} must be positive")
+        default, _ = _DEFAULTS[self.kind]
+        if self.strength is not None and default is None:
+            raise ValueError(f"a fault of kind '{self.kind.value}' has no strength")
+        if self.strength is not None and not _fits(self.kind, self.strength):
+            raise ValueError(f"strength = {self.strength} is out of range for '{self.kind.value}'")
+
+
+def _fits(kind: Kind, value: float) -> bool:
+    if kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
+        return 0.0 < value <= 1.0
+    return math.isfinite(value) and (value > 0.0 or kind in (Kind.RANGE_BIAS, Kind.STAMP_JUMP))
+
+
+def strength(fault: FaultParams) -> float:
+    """Its strength, the kind's default where none is given (0 for a kind that has none)."""
+    return fault.strength if fault.strength is not None else _DEFAULTS[fault.kind][0] or 0.0
+
+
+def label(fault: FaultParams, epoch_ns: int) -> Label:
+    """The fault's window on the log clock, half-open."""
+    default, harmful = _DEFAULTS[fault.kind]
+    return Label(
+        kind=fault.kind.value,
+        start_ns=epoch_ns + round(fault.start_s * NS),
+        end_ns=epoch_ns + round((fault.start_s + fault.duration_s) * NS),
+        harmful=harmful if fault.harmful is None else fault.harmful,
+        strength=default if fault.strength is None else fault.strength,
+    )
+
+
+def active(faults: Sequence[FaultParams], epoch_ns: int, log_ns: int) -> dict[Kind, FaultParams]:
+    """The faults whose window holds ``log_ns``, the first of each kind, in the scenario's order."""
+    found: dict[Kind, FaultParams] = {}
+    for fault in faults:
+        window = label(fault, epoch_ns)
+        if window.start_ns <= log_ns < window.end_ns:
+            found.setdefault(fault.kind, fault)
+    return found
+
+
+def occlude(returns: Returns, covered: float, side_rad: float, rng: np.random.Generator) -> Returns:
+    """A plate from one side of the image hides ``covered`` of the returns; a few plate points come back.
+
+    ``side_rad``: the side it comes from, 0 the left, a quarter turn the top of the image (x right, y down).
+    """
+    draw = rng.random(len(returns.ranges))
+    if not len(returns.ranges):
+        return returns
+    image = returns.directions[:, :2] / returns.directions[:, 2:]
+    across = image[:, 0] * math.cos(side_rad) + image[:, 1] * math.sin(side_rad)
+    order = np.argsort(across, kind="stable")
+    hidden = np.zeros(len(across), dtype=bool)
+    hidden[order[: math.ceil(covered * len(across))]] = True
+    depth = PLATE_DEPTH_RATIO * float(np.median(returns.ranges))
+    on_plate = depth / (
+        returns.directions[:, 2] + PLATE_TILT * returns.directions[:, 0]
+    )  # plane z + tan(tilt) x = depth
+    back = hidden & (draw < PLATE_RETURN_RATIO) & (on_plate > 0.0)
+    return Returns(returns.directions, np.where(hidden, on_plate, returns.ranges), returns.times_s).keep(~hidden | back)
+
+
+def clutter(returns: Returns, ratio: float, centre_a: ArrayLike, radius_m: float, rng: np.random.Generator) -> Returns:
+    """``ratio`` times as many points again, even over a ball about the target (centre (3,) in {A} [m])."""
+    n = round(ratio * len(returns.ranges))
+    towards = rng.standard_normal((n, 3))
+    radii = CLUTTER_RADIUS_RATIO * radius_m * np.cbrt(rng.random(n)) / np.sqrt(np.sum(towards * towards, axis=1))
+    points = np.asarray(centre_a, dtype=np.float64) + towards * radii[:, None]
+    times = rng.choice(returns.times_s, n) if n else np.empty(0)
+    ranges = np.sqrt(np.sum(points * points, axis=1))
+    ahead = points[:, 2] > 0.0
+    added = Returns(points[ahead] / ranges[ahead, None], ranges[ahead], times[ahead])
+    return returns.joined(added)

@@ -1,0 +1,213 @@
+"""The true motion: a rigid body by its full inertia tensor in {C}'s axes, never by sigma.
+
+    I dw/dt = -w x (I w) + torque,   dq/dt = 1/2 q o [w; 0]   (Hamilton, w in the body's axes)
+
+The right-hand sides are quadratic, so the Taylor coefficients of the solution follow by recurrence. A step spans at
+most a quarter of a radian and takes 22 terms (truncation under 1e-13); between steps the polynomial itself is the
+dense output. Plain float arithmetic: the same bits on any machine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import State
+from avsreplay.simulate.inertia import Body
+
+__all__ = ["Motion", "MotionParams", "rotate"]
+
+ORDER = 22
+STEP_RAD = 0.25
+Vector = tuple[float, ...]
+Rows = Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True, slots=True)
+class MotionParams:
+    """The table [motion]: the target at the start, and what disturbs it."""
+
+    # q_ac, attitude of the fixture in the camera at the start
+    attitude_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    # angular rate of the target, in {C}'s axes
+    rate_radps: tuple[float, float, float] = (0.0, 0.0, 0.1)
+    # mass centre in the camera at the start
+    position_m: tuple[float, float, float] = (0.0, 0.0, 5.0)
+    # velocity of the mass centre in the camera
+    velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # 1 sigma of the disturbance torque over the trace of the inertia, each axis of {C}, held over a step
+    torque_std_radps2: float = 0.0
+    # 1 sigma of the disturbance force over the mass, each axis of {A}, held over a step
+    force_std_mps2: float = 0.0
+    # how long a disturbance is held
+    disturbance_step_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not math.isclose(math.hypot(*self.attitude_xyzw), 1.0, abs_tol=1e-3):
+            raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
+        for name in ("torque_std_radps2", "force_std_mps2"):
+            if not getattr(self, name) >= 0.0:
+                raise ValueError(f"{name} = {getattr(self, name)} must not be negative")
+        if not self.disturbance_step_s > 0.0:
+            raise ValueError(f"disturbance_step_s = {self.disturbance_step_s} must be positive")
+
+
+class Motion:
+    """The motion of ``body`` over [0, span_s], from ``params``; disturbances drawn from ``rng`` where asked for."""
+
+    def __init__(self, body: Body, params: MotionParams, span_s: float, rng: np.random.Generator) -> None:
+        self._body = body
+        self._starts, self._coefficients = _integrate(body, params, span_s, rng)
+
+    def states(self, times_s: ArrayLike) -> tuple[Array, Array, Array, Array]:
+        """At times (n,) [s]: q_ac (n, 4), rate in {C} (n, 3), mass centre (n, 3) and its velocity (n, 3) in {A}."""
+        times = np.asarray(times_s, dtype=np.float64)
+        step = np.clip(np.searchsorted(self._starts, times, side="right") - 1, 0, len(self._starts) - 1)
+        tau = (times - self._starts[step])[:, None]
+        value = np.zeros((len(times), 13))
+        for term in range(ORDER, -1, -1):
+            value = value * tau + self._coefficients[step, term]
+        return geometry.normalise(value[:, :4]), value[:, 4:7], value[:, 7:10], value[:, 10:]
+
+    def poses(self, times_s: ArrayLike) -> tuple[Array, Array]:
+        """Rotations R_ac (n, 3, 3) and fixture positions (n, 3) in {A} at times (n,) [s]."""
+        q_ac, _, centre, _ = self.states(times_s)
+        R_ac = geometry.matrix(q_ac)
+        return R_ac, centre - rotate(R_ac, self._body.centre_c)
+
+    def pose(self, t_s: float) -> Pose:
+        """T_ac at an instant [s]."""
+        return self.state(t_s).T_ac
+
+    def state(self, t_s: float) -> State:
+        """The full true state at an instant [s]."""
+        q_ac, w_c, centre, velocity = (value[0] for value in self.states([t_s]))
+        body = self._body
+        return State(
+            q_ab=geometry.normalise(geometry.multiply(q_ac, geometry.conjugate(body.q_bc))),
+            w_b=rotate(geometry.matrix(body.q_bc), w_c),
+            r_a=centre,
+            v_a=velocity,
+            sigma=body.sigma,
+            c_b=body.c_b,
+            q_bc=body.q_bc,
+        )
+
+
+def rotate(R_ab: Array, v_b: Array) -> Array:
+    """R v term by term for batches (..., 3, 3) and (..., 3): no fused library call, so the same bits everywhere."""
+    return R_ab[..., :, 0] * v_b[..., :1] + R_ab[..., :, 1] * v_b[..., 1:2] + R_ab[..., :, 2] * v_b[..., 2:]
+
+
+@dataclass(frozen=True, slots=True)
+class _Instant:
+    """Where a step begins: q_ac, w_c, r_a, v_a."""
+
+    q: Vector
+    w: Vector
+    r: Vector
+    v: Vector
+
+
+def _integrate(body: Body, params: MotionParams, span_s: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Step starts (k,) and Taylor coefficients (k, ORDER + 1, 13) of [q_ac, w_c, r_a, v_a]."""
+    inertia = [[float(x) for x in row] for row in body.inertia_c]
+    least = min(float(m) for m in body.moments)
+    now = _Instant(_unit(params.attitude_xyzw), params.rate_radps, params.position_m, params.velocity_mps)
+    starts: list[float] = []
+    table: list[list[Vector]] = []
+    for begin, until, torque, force in _windows(params, sum(inertia[i][i] for i in range(3)), span_s, rng):
+        t = begin
+        while t < until:
+            momentum = math.sqrt(sum(x * x for x in _times(inertia, now.w)))
+            end = min(until, t + STEP_RAD * least / momentum) if momentum > 0.0 else until
+            terms = _terms(now, inertia, torque, force)
+            starts.append(t)
+            table.append(terms)
+            now, t = _at_end(terms, end - t), end
+    return np.array(starts), np.array(table)
+
+
+def _windows(
+    params: MotionParams, trace: float, span_s: float, rng: np.random.Generator
+) -> Iterator[tuple[float, float, Vector, Vector]]:
+    """Spans of constant disturbance: begin, end [s], torque [m2/s2] in {C}, force [m/s2] in {A}."""
+    if params.torque_std_radps2 == 0.0 and params.force_std_mps2 == 0.0:
+        yield 0.0, span_s, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+        return
+    for k in range(math.ceil(span_s / params.disturbance_step_s)):
+        torque = tuple(params.torque_std_radps2 * trace * float(x) for x in rng.standard_normal(3))
+        force = tuple(params.force_std_mps2 * float(x) for x in rng.standard_normal(3))
+        yield k * params.disturbance_step_s, (k + 1) * params.disturbance_step_s, torque, force
+
+
+def _terms(now: _Instant, inertia: Rows, torque: Vector, force: Vector) -> list[Vector]:
+    """Taylor coefficients about ``now``, ORDER + 1 rows of 13."""
+    zero = (0.0, 0.0, 0.0)
+    centre = [now.r, now.v, tuple(0.5 * f for f in force)] + [zero] * (ORDER - 2)
+    velocity = [now.v, force] + [zero] * (ORDER - 1)
+    turning = _turning(now, inertia, _inverse(inertia), torque)
+    return [(*q, *w, *r, *v) for (q, w), r, v in zip(turning, centre, velocity, strict=True)]
+
+
+def _turning(now: _Instant, inertia: Rows, inverse: Rows, torque: Vector) -> list[tuple[Vector, Vector]]:
+    """Coefficients of attitude and rate: products of series are sums over i of term i with term k - i."""
+    qs, ws, hs = [now.q], [now.w], [_times(inertia, now.w)]
+    for k in range(ORDER):
+        load = [torque[i] if k == 0 else 0.0 for i in range(3)]
+        turn = [0.0, 0.0, 0.0, 0.0]
+        for i in range(k + 1):
+            _subtract_cross(load, ws[i], hs[k - i])
+            _add_product(turn, qs[i], ws[k - i])
+        ws.append(tuple(x / (k + 1) for x in _times(inverse, load)))
+        hs.append(_times(inertia, ws[-1]))
+        qs.append(tuple(0.5 * x / (k + 1) for x in turn))
+    return list(zip(qs, ws, strict=True))
+
+
+def _subtract_cross(out: list[float], a: Vector, b: Vector) -> None:
+    out[0] -= a[1] * b[2] - a[2] * b[1]
+    out[1] -= a[2] * b[0] - a[0] * b[2]
+    out[2] -= a[0] * b[1] - a[1] * b[0]
+
+
+def _add_product(out: list[float], q: Vector, w: Vector) -> None:
+    """Adds q o [w; 0], Hamilton."""
+    out[0] += q[3] * w[0] + q[1] * w[2] - q[2] * w[1]
+    out[1] += q[3] * w[1] + q[2] * w[0] - q[0] * w[2]
+    out[2] += q[3] * w[2] + q[0] * w[1] - q[1] * w[0]
+    out[3] -= q[0] * w[0] + q[1] * w[1] + q[2] * w[2]
+
+
+def _at_end(terms: list[Vector], tau: float) -> _Instant:
+    value = [0.0] * 13
+    for row in reversed(terms):
+        value = [v * tau + x for v, x in zip(value, row, strict=True)]
+    return _Instant(_unit(value[:4]), tuple(value[4:7]), tuple(value[7:10]), tuple(value[10:]))
+
+
+def _unit(q: Sequence[float]) -> Vector:
+    norm = math.sqrt(sum(x * x for x in q))
+    return tuple(x / norm for x in q)
+
+
+def _times(m: Rows, v: Sequence[float]) -> Vector:
+    return tuple(row[0] * v[0] + row[1] * v[1] + row[2] * v[2] for row in m)
+
+
+def _inverse(m: Rows) -> Rows:
+    """Inverse of a symmetric 3 x 3 matrix by cofactors."""
+    (a, b, c), (_, d, e), (_, _, f) = m
+    cofactors = [
+        [d * f - e * e, c * e - b * f, b * e - c * d],
+        [0.0, a * f - c * c, b * c - a * e],
+        [0.0, 0.0, a * d - b * b],
+    ]
+    det = a * cofactors[0][0] + b * cofactors[0][1] + c * cofactors[0][2]
+    return [[cofactors[min(i, j)][max(i, j)] / det for j in range(3)] for i in range(3)]

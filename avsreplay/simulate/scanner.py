@@ -1,0 +1,200 @@
+"""The scanner: a fixed grid of rays from the camera, cast on the moving target, with its noise.
+
+A flash scanner takes the whole grid at once; a raster scanner takes it point by point, row after row, while the
+target moves: every ray then meets the target where it truly is at that ray's instant.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Array, frozen
+from avsreplay.records import Surface
+from avsreplay.simulate.caster import Caster, Engine
+from avsreplay.simulate.motion import Motion, rotate
+
+__all__ = ["Pattern", "Returns", "Scanner", "ScannerParams", "View"]
+
+
+class Pattern(Enum):
+    """How the grid is taken."""
+
+    FLASH = "flash"  # all rays at the stamp
+    RASTER = "raster"  # row after row over ``scan_s``, each point with its own time
+
+
+class View(Enum):
+    """Outline of the field of view."""
+
+    RECTANGLE = "rectangle"
+    CONE = "cone"  # the ellipse inside the rectangle
+
+
+@dataclass(frozen=True, slots=True)
+class ScannerParams:
+    """The table [scanner]: grid, field of view and noise. The camera looks along +z of {A}, x to the right."""
+
+    # flash or raster
+    pattern: Pattern = Pattern.FLASH
+    # full angles of the field of view, across and down
+    fov_deg: tuple[float, float] = (44.0, 44.0)
+    # rectangle, or the cone inside it
+    view: View = View.RECTANGLE
+    # rays across and down
+    rays: tuple[int, int] = (128, 128)
+    # duration of a raster scan, from its stamp on
+    scan_s: float = 0.0
+    # 1 sigma of the range, along the ray
+    noise_m: float = 0.008
+    # part of the returns whose range is anything between range_min_m and range_max_m
+    outlier_ratio: float = 0.02
+    # part of the returns that are lost
+    dropout_ratio: float = 0.0
+    # returns at a flatter angle to the surface than this are lost (angle from the normal)
+    max_incidence_deg: float = 85.0
+    # nearest and farthest range there is a return from
+    range_min_m: float = 0.5
+    range_max_m: float = 12.0
+    # who casts the rays: auto, embree, exact
+    engine: Engine = Engine.AUTO
+
+    def __post_init__(self) -> None:
+        if not all(0.0 < angle < 170.0 for angle in self.fov_deg):
+            raise ValueError(f"fov_deg = {list(self.fov_deg)} must lie between 0 and 170")
+        if not all(1 <= n <= 4096 for n in self.rays):
+            raise ValueError(f"rays = {list(self.rays)} must lie between 1 and 4096")
+        for name in ("outlier_ratio", "dropout_ratio"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
+        for name in ("noise_m", "scan_s"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} = {getattr(self, name)} must not be negative")
+        if not 0.0 <= self.range_min_m < self.range_max_m:
+            raise ValueError(f"range_min_m = {self.range_min_m} must be below range_max_m = {self.range_max_m}")
+        if not 0.0 < self.max_incidence_deg <= 90.0:
+            raise ValueError(f"max_incidence_deg = {self.max_incidence_deg} must lie between 0 and 90")
+        if (self.pattern is Pattern.RASTER) != (self.scan_s > 0.0):
+            raise ValueError(f"scan_s = {self.scan_s}: positive for a raster scan, 0 for a flash")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Returns:
+    """What came back, ray by ray.
+
+    Attributes:
+        directions: (n, 3) unit, in {A}.  ranges: (n,) [m].  times_s: (n,) after the stamp [s].
+    """
+
+    directions: Array
+    ranges: Array
+    times_s: Array
+
+    def keep(self, mask: NDArray[np.bool_]) -> Returns:
+        """Those of the mask (n,)."""
+        return Returns(self.directions[mask], self.ranges[mask], self.times_s[mask])
+
+    def joined(self, other: Returns) -> Returns:
+        """These, then those of ``other``."""
+        return Returns(
+            np.concatenate([self.directions, other.directions]),
+            np.concatenate([self.ranges, other.ranges]),
+            np.concatenate([self.times_s, other.times_s]),
+        )
+
+    def in_order(self) -> Returns:
+        """The same by time, equal times left in place."""
+        order = np.argsort(self.times_s, kind="stable")
+        return Returns(self.directions[order], self.ranges[order], self.times_s[order])
+
+    @property
+    def points(self) -> NDArray[np.float32]:
+        """(n, 3) float32 in {A} [m]."""
+        return (self.directions * self.ranges[:, None]).astype(np.float32)
+
+
+class Scanner:
+    """A scanner in front of one target in one motion.
+
+    Attributes:
+        params: as given.  centre_c: (3,), radius_m: the target's bounding sphere in {C} [m].
+    """
+
+    def __init__(self, params: ScannerParams, surface: Surface, motion: Motion) -> None:
+        self.params = params
+        self._motion = motion
+        self._caster = Caster(surface, params.engine)
+        self._directions, self._times = _grid(params)
+        low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+        self.centre_c = frozen(0.5 * (low + high))
+        self.radius_m = float(np.max(np.linalg.norm(surface.vertices - self.centre_c, axis=1)))
+
+    @property
+    def engine(self) -> Engine:
+        """Who casts the rays."""
+        return self._caster.engine
+
+    def cast(self, t_s: float) -> Returns:
+        """Noise-free first returns of a scan stamped ``t_s`` [s], the lost ones left out."""
+        R_ac, t_ac = self._poses(t_s)
+        near = self._may_hit(R_ac, t_ac)
+        R_ca = np.swapaxes(R_ac[near] if len(R_ac) > 1 else R_ac, -1, -2)
+        origins = rotate(R_ca, -(t_ac[near] if len(t_ac) > 1 else t_ac))
+        directions = rotate(R_ca, self._directions[near])
+        ranges, cosine = self._caster.ranges(np.broadcast_to(origins, directions.shape), directions)
+        p = self.params
+        seen = (ranges >= p.range_min_m) & (ranges <= p.range_max_m)
+        seen &= cosine >= math.cos(math.radians(p.max_incidence_deg))
+        return Returns(self._directions[near], ranges, self._times[near]).keep(seen)
+
+    def disturb(self, returns: Returns, rng: np.random.Generator, noise_factor: float = 1.0) -> Returns:
+        """Range noise, outliers and dropouts upon noise-free returns."""
+        p, n = self.params, len(returns.ranges)
+        ranges = returns.ranges + noise_factor * p.noise_m * rng.standard_normal(n)
+        wrong = rng.random(n) < p.outlier_ratio
+        ranges = np.where(wrong, rng.uniform(p.range_min_m, p.range_max_m, n), ranges)
+        kept = rng.random(n) >= p.dropout_ratio
+        return Returns(returns.directions, ranges, returns.times_s).keep(kept & (ranges > 0.0))
+
+    def _poses(self, t_s: float) -> tuple[Array, Array]:
+        """Poses of the target at every ray's instant: (n, 3, 3) and (n, 3), n = 1 for a flash."""
+        if self.params.pattern is Pattern.FLASH:
+            return self._motion.poses([t_s])
+        return self._motion.poses(t_s + self._times)
+
+    def _may_hit(self, R_ac: Array, t_ac: Array) -> NDArray[np.intp]:
+        """Rays that pass through the target's bounding sphere."""
+        centre = rotate(R_ac, self.centre_c) + t_ac
+        along = np.sum(self._directions * centre, axis=1)
+        aside = np.sum(centre * centre, axis=1) - along * along
+        return np.flatnonzero(aside <= (1.001 * self.radius_m) ** 2)
+
+
+def _grid(params: ScannerParams) -> tuple[Array, Array]:
+    """Unit directions (n, 3) in {A}, row after row from the top left, and times (n,) [s] after the stamp.
+
+    A flash images on a plane (even steps in tangent), a raster turns a mirror (even steps in angle).
+    """
+    (across, down), (columns, rows) = params.fov_deg, params.rays
+    u, v = _steps(columns), _steps(rows)
+    halves = [math.radians(0.5 * across), math.radians(0.5 * down)]
+    if params.pattern is Pattern.FLASH:
+        x, y = [math.tan(halves[0]) * s for s in u], [math.tan(halves[1]) * s for s in v]
+    else:
+        x, y = [math.tan(halves[0] * s) for s in u], [math.tan(halves[1] * s) for s in v]
+    grid = np.array([(a, b, 1.0) for b in y for a in x])
+    grid /= np.sqrt(np.sum(grid * grid, axis=1))[:, None]
+    times = np.arange(len(grid)) * (params.scan_s / len(grid))
+    if params.view is View.CONE:
+        inside = np.array([a * a + b * b <= 1.0 for b in v for a in u])
+        grid, times = grid[inside], times[inside]
+    return frozen(grid), frozen(times)
+
+
+def _steps(n: int) -> list[float]:
+    """N cell centres over (-1, 1)."""
+    return [(2 * k + 1) / n - 1.0 for k in range(n)]

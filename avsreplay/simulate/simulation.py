@@ -1,0 +1,133 @@
+"""Scenario and surface to scans with truth, one by one. Same seed, same scans, to the bit.
+
+Every scan draws from its own streams, named by purpose and place, so that a fault added to a scenario leaves all
+other scans as they were.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface
+from avsreplay.simulate import faults
+from avsreplay.simulate.faults import FaultParams, Kind
+from avsreplay.simulate.motion import Motion
+from avsreplay.simulate.scanner import Pattern, Returns, Scanner
+from avsreplay.simulate.scenario import Scenario, belief
+from avsreplay.simulate.target import body
+
+__all__ = ["EPOCH_NS", "Simulation", "simulate"]
+
+EPOCH_NS = 1_700_000_000_000_000_000  # the first instant of every simulated log: a fixed date, so that bytes repeat
+NS = 1_000_000_000
+_STREAMS = {"motion": 0, "start": 1, "noise": 2, "fault": 3, "plate": 4}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """A scenario ready to be recorded or replayed.
+
+    Attributes:
+        header: what the log says of itself.  count: instants at which a scan is due (dropped ones included).
+    """
+
+    header: LogHeader
+    count: int
+    _scenario: Scenario = field(repr=False)
+    _motion: Motion = field(repr=False)
+    _scanner: Scanner = field(repr=False)
+
+    def truth(self, log_ns: int) -> State:
+        """The full true state at an instant of the log clock."""
+        return self._motion.state((log_ns - EPOCH_NS) / NS)
+
+    def scans(self) -> Iterator[Scan]:
+        """The scans in the recorder's order; a dropped one leaves a gap in ``seq``."""
+        last: Scan | None = None
+        for k in range(self.count):
+            scan = self._scan(k, last)
+            if scan is not None:
+                if scan.fault != Kind.FROZEN.value:
+                    last = scan
+                yield scan
+
+    def _scan(self, k: int, last: Scan | None) -> Scan | None:
+        log_ns = EPOCH_NS + round(k * NS / self._scenario.params.rate_hz)
+        now = faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
+        if Kind.DROPPED in now:
+            return None
+        body_now = self.truth(log_ns)
+        returns = self._returns(k, log_ns, now, body_now)
+        timed = self._scenario.params.scanner.pattern is Pattern.RASTER
+        jump = faults.strength(now[Kind.STAMP_JUMP]) if Kind.STAMP_JUMP in now else 0.0
+        scan = Scan(
+            seq=k,
+            t_ns=log_ns + round(jump * NS),
+            log_ns=log_ns,
+            points=returns.points,
+            times_s=returns.times_s.astype(np.float32) if timed else None,
+            status=ScanStatus.OK if len(returns.ranges) else ScanStatus.EMPTY,
+            truth=body_now.T_ac,
+            body=body_now,
+            fault=next((kind.value for kind in now), None),
+        )
+        if Kind.FROZEN in now and last is not None:
+            scan = replace(scan, points=last.points, times_s=last.times_s, status=last.status)
+        return scan
+
+    def _returns(self, k: int, log_ns: int, now: dict[Kind, FaultParams], state: State) -> Returns:
+        """Cast, cover, disturb, bias, clutter: in the order light meets them."""
+        noise, wrong = self._rng("noise", k), self._rng("fault", k)
+        returns = self._scanner.cast((log_ns - EPOCH_NS) / NS)
+        for kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
+            if kind in now:
+                returns = faults.occlude(returns, faults.strength(now[kind]), self._side(now[kind]), wrong)
+        factor = faults.strength(now[Kind.NOISE_BURST]) if Kind.NOISE_BURST in now else 1.0
+        returns = self._scanner.disturb(returns, noise, factor)
+        if Kind.RANGE_BIAS in now:
+            returns = replace(returns, ranges=returns.ranges + faults.strength(now[Kind.RANGE_BIAS]))
+        if Kind.CLUTTER in now:
+            ratio, centre = faults.strength(now[Kind.CLUTTER]), state.T_ac.apply(self._scanner.centre_c)
+            returns = faults.clutter(returns, ratio, centre, self._scanner.radius_m, wrong)
+        return returns.keep(np.zeros(len(returns.ranges), dtype=bool)) if Kind.EMPTY in now else returns.in_order()
+
+    def _side(self, fault: FaultParams) -> float:
+        """The side one plate comes from, the same for all its scans [rad]."""
+        return float(self._rng("plate", self._scenario.params.fault.index(fault)).uniform(0.0, 2.0 * math.pi))
+
+    def _rng(self, stream: str, k: int) -> np.random.Generator:
+        return _generator(self._scenario.params.seed, stream, k)
+
+
+def simulate(scenario: Scenario, surface: Surface) -> Simulation:
+    """The simulation of ``scenario`` with the model ``surface`` (in {C}).
+
+    Raises UsageError for a model without mass, MissingBackend for a ray engine that is not installed.
+    """
+    params = scenario.params
+    span_s = params.duration_s + params.scanner.scan_s
+    motion = Motion(body(params.target, surface), params.motion, span_s, _generator(params.seed, "motion", 0))
+    scanner = Scanner(params.scanner, surface, motion)
+    first = motion.state(0.0)
+    start = None
+    if params.start is not None:
+        start = belief(params.start, first, EPOCH_NS, _generator(params.seed, "start", 0))
+    header = LogHeader(
+        surface=surface,
+        scenario=scenario.text,
+        seed=params.seed,
+        labels=tuple(faults.label(f, EPOCH_NS) for f in params.fault),
+        start=start,
+        truth=first,
+        notes={"source": "simulated", "name": params.name, "ray_engine": scanner.engine.value},
+    )
+    count = int(params.duration_s * params.rate_hz + 1e-9)
+    return Simulation(header, count, scenario, motion, scanner)
+
+
+def _generator(seed: int, stream: str, k: int) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(_STREAMS[stream], k))))
