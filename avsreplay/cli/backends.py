@@ -1,40 +1,72 @@
-"""``avsreplay backends``: what is installed, what is not and how to get it."""
+"""``avsreplay backends``: what is installed, what is not and how to get it; and the contract a back end must keep."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
+    from avsreplay.register.contract import Finding
     from avsreplay.register.port import Availability
 
 __all__ = ["command"]
 
 
 @click.command("backends")
+@click.option("--check", "name", metavar="NAME", help="Run the contract's laws on this back end; exit 1 if one fails.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
-def command(as_json: bool) -> None:
+def command(name: str | None, as_json: bool) -> None:
     """List the registration back ends: what is installed, and how to get what is not."""
+    if name is None:
+        _list(as_json)
+    else:
+        _check(name, as_json)
+
+
+def _list(as_json: bool) -> None:
     from avsreplay.register.port import available
 
     states = available()
     if as_json:
-        click.echo(json.dumps([dataclasses.asdict(state) for state in states], indent=2))
-        return
+        _print_json([dataclasses.asdict(state) for state in states])
+    else:
+        _print_table(("name", "installed", "version", "what it is", "how to get it"), map(_state_row, states))
+
+
+def _state_row(state: Availability) -> tuple[str, ...]:
+    return state.name, "yes" if state.installed else "no", state.version, state.about, state.get
+
+
+def _check(name: str, as_json: bool) -> None:
+    from avsreplay.errors import CheckFailed
+    from avsreplay.register.contract import check
+
+    findings = check(name)
+    if as_json:
+        _print_json({"backend": name, "findings": [dataclasses.asdict(finding) for finding in findings]})
+    else:
+        _print_table(("law", "holds", "found"), map(_finding_row, findings))
+    broken = [finding.law for finding in findings if not finding.held]
+    if broken:
+        raise CheckFailed(f"{len(broken)} of {len(findings)} laws broken: {'; '.join(broken)}", where=name)
+
+
+def _finding_row(finding: Finding) -> tuple[str, ...]:
+    return finding.law, "yes" if finding.held else "NO", finding.detail
+
+
+def _print_json(value: Any) -> None:
+    click.echo(json.dumps(value, indent=2))
+
+
+def _print_table(heads: tuple[str, ...], rows: Any) -> None:
     from rich.console import Console
-
-    Console(width=120).print(_table(states))
-
-
-def _table(states: tuple[Availability, ...]) -> Table:
     from rich.table import Table
 
-    table = Table("name", "installed", "version", "what it is", "how to get it")
-    for state in states:
-        table.add_row(state.name, "yes" if state.installed else "no", state.version, state.about, state.get)
-    return table
+    table = Table(*heads)
+    for row in rows:
+        table.add_row(*row)
+    Console(width=120).print(table)

@@ -66,11 +66,10 @@ def covariance(found: Evidence) -> Array:
     """(6, 6) covariance of d = [theta; v], the sandwich N^-1 (sum e^2 J'J) N^-1 with N = J'J, corrected for six fitted.
 
     It holds where the noise across the surface differs from point to point (a range error seen at a slant) and where
-    some inliers are outliers; its meat is not let under what the robust noise alone would say.
+    some inliers are outliers.
     """
     normal = found.J.T @ found.J
-    spread = np.maximum(found.e**2, 0.0)
-    meat = found.J.T @ (found.J * spread[:, None]) * (found.inliers / max(found.inliers - 6, 1))
+    meat = found.J.T @ (found.J * (found.e**2)[:, None]) * (found.inliers / max(found.inliers - 6, 1))
     bread = np.linalg.pinv(normal, hermitian=True)
     P = bread @ meat @ bread
     return 0.5 * (P + P.T)
@@ -82,9 +81,9 @@ def assess(model: Model, points: NDArray[Any], fit: Fit, limits: Limits, params:
         return nothing(len(points), AlignStatus.FAILED)
     found = evidence(model, points, fit.T_ca, limits.gate_m, params.noise_m)
     info = frozen(found.J.T @ found.J / found.noise_m**2)
-    weakest = free_directions(found.J, found.centre) if found.inliers else ()
-    status = _status(found, fit.converged, bool(weakest), params)
-    certain = status in (AlignStatus.ALIGNED, AlignStatus.NOT_CONVERGED) and not weakest
+    overlap = found.inliers >= max(params.min_inliers, params.min_inlier_ratio * found.points)
+    weakest = free_directions(found.J, found.centre) if overlap else ()
+    certain = overlap and not weakest
     return Alignment(
         T_ac=fit.T_ca.inverse(),
         iterations=fit.iterations,
@@ -93,7 +92,7 @@ def assess(model: Model, points: NDArray[Any], fit: Fit, limits: Limits, params:
         inliers=found.inliers,
         rms_m=found.rms_m,
         info=info,
-        status=status,
+        status=_status(overlap, fit.converged, bool(weakest)),
         covariance=frozen(covariance(found)) if certain else None,
         weakest=", ".join(weakest),
     )
@@ -105,8 +104,8 @@ def nothing(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Align
     return Alignment(pose, 0, False, points, 0, float("nan"), frozen(np.zeros((6, 6))), status)
 
 
-def _status(found: Evidence, converged: bool, free: bool, params: RegisterParams) -> AlignStatus:
-    if found.inliers < max(params.min_inliers, params.min_inlier_ratio * found.points):
+def _status(overlap: bool, converged: bool, free: bool) -> AlignStatus:
+    if not overlap:
         return AlignStatus.NO_OVERLAP
     if not converged:
         return AlignStatus.NOT_CONVERGED

@@ -7,6 +7,7 @@ and returns the guess where nothing matched.
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -20,13 +21,13 @@ from avsreplay.register.sampling import sample
 
 __all__ = ["KissBackend"]
 
-POINTS_PER_VOXEL = 40
+POINTS_PER_VOXEL = 20
 SURFACE_POINTS = 100_000
-FINE_OF_REACH = 0.2
+FAR_M = 1e9  # the map is never thinned by distance
 
 
 class KissBackend:
-    """Two maps, coarse to fine: voxels of ``reach_m`` to come near, then a fifth of it to settle.
+    """Three maps, coarse to fine: voxels of ``reach_m`` to come near, of ``gate_m`` to settle, of their mean between.
 
     The iteration count is not given by the library, so ``Fit.iterations`` counts its calls. ``converged`` means that
     one more call, begun where the last one ended, moved the pose by less than ten times eps.
@@ -43,9 +44,10 @@ class KissBackend:
 
         self._limits = target.limits
         points = np.ascontiguousarray(sample(target.surface, SURFACE_POINTS)[0])
+        reach, gate = target.limits.reach_m, target.limits.gate_m
         self._maps: list[tuple[float, Any]] = []
-        for voxel in (target.limits.reach_m, max(FINE_OF_REACH * target.limits.reach_m, target.limits.gate_m)):
-            voxel_map: Any = VoxelHashMap(voxel, 1e9, POINTS_PER_VOXEL)
+        for voxel in (reach, math.sqrt(reach * gate), gate):
+            voxel_map: Any = VoxelHashMap(voxel, FAR_M, POINTS_PER_VOXEL)
             voxel_map.add_points(points)
             self._maps.append((voxel, voxel_map))
         self._registration = Registration(target.limits.n_max, target.limits.eps_rad, 1)

@@ -1,0 +1,130 @@
+"""One contract for every back end: each law on each one that is installed, at two sizes of target."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from avsreplay.cli.backends import command
+from avsreplay.errors import CheckFailed, MissingBackend, UsageError
+from avsreplay.geometry import Pose
+from avsreplay.records import Fit
+from avsreplay.register import port
+from avsreplay.register.contract import LAWS, Bench, check
+
+BUILT_IN = ("horn", "kiss", "open3d", "reference", "small_gicp")
+SCALES = {"satellite": 1.0, "statue": 0.03}
+
+
+@pytest.fixture(scope="module", params=[(name, size) for name in BUILT_IN for size in SCALES], ids="-".join)
+def bench(request: pytest.FixtureRequest) -> Bench:
+    name, size = request.param
+    if not _installed(name):
+        pytest.skip(f"{name} is not installed here")
+    return Bench(name, SCALES[size])
+
+
+@pytest.mark.parametrize("law", LAWS, ids=lambda law: law.__name__)
+def test_contract(bench: Bench, law) -> None:
+    finding = law(bench)
+    assert finding.held, f"{finding.law}: {finding.detail}"
+
+
+class _Guesser:
+    """Returns its guess and calls it settled."""
+
+    name = "guesser"
+
+    def __init__(self, target: port.Target) -> None:
+        pass
+
+    def align(self, points, guess: Pose) -> Fit:
+        return Fit(guess, 1, True)
+
+
+class _Raiser(_Guesser):
+    def align(self, points, guess: Pose) -> Fit:
+        raise RuntimeError("library trouble")
+
+
+class _Forward(_Guesser):
+    """Takes the right answer the wrong way round."""
+
+    def align(self, points, guess: Pose) -> Fit:
+        return Fit(guess.inverse(), 1, True)
+
+
+class _Drifter(_Guesser):
+    """Moves a little further at every call: not repeatable."""
+
+    calls = 0
+
+    def align(self, points, guess: Pose) -> Fit:
+        _Drifter.calls += 1
+        return Fit(Pose(guess.q, guess.t + 1e-9 * _Drifter.calls), 1, True)
+
+
+@pytest.mark.parametrize(
+    ("fake", "broken"),
+    [
+        (_Guesser, {"recovers the exact pose"}),
+        (_Raiser, {"recovers the exact pose", "stays at the true pose"}),
+        (_Forward, {"stays at the true pose", "T_ac carries the model onto the scan"}),
+        (_Drifter, {"runs repeat to the bit"}),
+    ],
+)
+def test_the_contract_catches_a_bad_back_end(monkeypatch: pytest.MonkeyPatch, fake, broken: set[str]) -> None:
+    monkeypatch.setattr("avsreplay.register.registrar.load", lambda name: fake)
+    failed = {finding.law for finding in check("fake") if not finding.held}
+    assert broken <= failed
+
+
+def test_every_built_in_is_registered_and_says_how_to_get_it() -> None:
+    states = {state.name: state for state in port.available()}
+    assert set(BUILT_IN) <= set(states)
+    for state in states.values():
+        assert state.about
+        assert state.installed == (state.get == "")
+
+
+def test_an_unknown_name_lists_the_known() -> None:
+    with pytest.raises(UsageError, match=r"'icp'.*horn.*kiss.*reference"):
+        port.load("icp")
+
+
+def test_a_missing_library_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avsreplay.register.kiss.KissBackend.requires", (("no_such_module", "kiss-icp"),))
+    with pytest.raises(MissingBackend, match="pip install kiss-icp"):
+        port.load("kiss")
+    assert [state.installed for state in port.available() if state.name == "kiss"] == [False]
+
+
+def test_command_lists_and_checks() -> None:
+    listed = CliRunner().invoke(command, ["--json"])
+    assert {entry["name"] for entry in json.loads(listed.stdout)} >= set(BUILT_IN)
+    assert "kiss" in CliRunner().invoke(command, []).stdout
+    checked = CliRunner().invoke(command, ["--check", "horn", "--json"])
+    assert checked.exit_code == 0
+    assert all(finding["held"] for finding in json.loads(checked.stdout)["findings"])
+
+
+def test_command_fails_where_a_law_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avsreplay.register.registrar.load", lambda name: _Guesser)
+    result = CliRunner().invoke(command, ["--check", "guesser"])
+    assert isinstance(result.exception, CheckFailed)
+    assert "recovers the exact pose" in str(result.exception)
+
+
+def _installed(name: str) -> bool:
+    return any(state.installed for state in port.available() if state.name == name)
+
+
+def test_frames_are_not_mixed() -> None:
+    """The oracle: T_ac takes a model point to where the scanner saw it; no ICP needed to say so."""
+    bench = Bench("horn")
+    found = bench.registrar.register(bench.scan, bench.guess)
+    corner = bench.surface.vertices[0]
+    np.testing.assert_allclose(found.T_ac.apply(corner), bench.T_ac.R @ corner + bench.T_ac.t, atol=1e-6)
