@@ -1,0 +1,68 @@
+"""What a measured pose says of the state (eq:h_nonlin): z, h, H, and the noise in their units.
+
+z = (rho, deta_v) with deta = mu_hat^-1 (x) eta (x) q_hat^-1, in Hamilton's product q_hat^-1 * eta * mu_hat^-1, of the
+sign with w >= 0. The errors are zero after each update, so h's attitude part is zero and H is taken there.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from avsreplay.estimate.layout import DIM, hamilton
+from avsreplay.geometry import Array, Pose, matrix
+from avsreplay.records import Alignment, State
+
+__all__ = ["innovation", "measured_pose", "noise_of", "sensitivity"]
+
+
+def sensitivity(x: State) -> Array:
+    """H (6, 20) at zero error: [-2A(q)[c x] 0 I 0 0 A(q) 0; I 0 0 0 0 0 I]."""
+    A = matrix(x.q_ab)
+    cx, cy, cz = x.c_b.tolist()
+    H = np.zeros((6, DIM))
+    H[:3, :3] = A @ np.array([[0.0, 2 * cz, -2 * cy], [-2 * cz, 0.0, 2 * cx], [2 * cy, -2 * cx, 0.0]])
+    H[:3, 14:17] = A
+    H[(0, 1, 2), (6, 7, 8)] = H[(3, 4, 5), (0, 1, 2)] = H[(3, 4, 5), (17, 18, 19)] = 1.0
+    return H
+
+
+def innovation(x: State, T_ac: Pose) -> Array:
+    """The innovation alpha (6,) = z - h at zero error: [m in {A}, half-angle vector in {B}]."""
+    q = hamilton(hamilton(_inverse(x.q_ab), T_ac.q), _inverse(x.q_bc))
+    s = 1.0 if q[3] >= 0.0 else -1.0
+    dx, dy, dz = (T_ac.t - x.r_a - matrix(x.q_ab) @ x.c_b).tolist()
+    return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
+
+
+def measured_pose(x: State, alpha: Array) -> Pose:
+    """The pose T_ac that ``innovation`` made alpha of: its inverse in the second argument."""
+    vx, vy, vz = alpha[3:].tolist()
+    deta = (vx, vy, vz, math.sqrt(max(0.0, 1.0 - vx * vx - vy * vy - vz * vz)))
+    q = hamilton(hamilton(x.q_ab, deta), x.q_bc)
+    return Pose(np.array(q), x.r_a + matrix(x.q_ab) @ x.c_b + alpha[:3])
+
+
+def noise_of(alignment: Alignment, x: State, free: tuple[float, float]) -> Array | None:
+    """R (6, 6) [m, half-angle] from the registration's own word on d = [theta; v] in {C}, None if it says nothing.
+
+    dq-block A(mu) theta / 2 in {B}, position R_ac v in {A}: both of one sign, so the cross terms stay. Where the view
+    is degenerate the covariance is taken from ``info``, its free directions at the standard deviations ``free``
+    (rad, m): the scan then still tells what it does see.
+    """
+    if alignment.covariance is not None:
+        C = alignment.covariance
+    elif np.any(alignment.info):
+        C = np.asarray(np.linalg.inv(alignment.info + np.diag(np.repeat(np.asarray(free) ** -2.0, 3))))
+    else:
+        return None
+    J = np.zeros((6, 6))
+    J[:3, 3:], J[3:, :3] = alignment.T_ac.R, 0.5 * matrix(x.q_bc)
+    R: Array = J @ C @ J.T
+    return 0.5 * (R + R.T)
+
+
+def _inverse(q: Array) -> tuple[float, float, float, float]:
+    x, y, z, w = q.tolist()
+    return -x, -y, -z, w

@@ -1,0 +1,140 @@
+"""What the estimator may be told. Lengths left out are fractions of the target's extent, so that any size runs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from avsreplay.geometry import Array
+
+__all__ = ["Adaptation", "EstimatorParams", "NoiseSource"]
+
+_POSITIVE = (
+    "torque_noise_radps15",
+    "force_noise_mps15",
+    "r0_pos_m",
+    "r0_rot_deg",
+    "r_floor",
+    "start_pos_1s_m",
+    "start_rot_1s_deg",
+    "start_rate_1s_radps",
+    "start_vel_1s_mps",
+    "start_sigma_1s",
+    "start_varrho_1s_m",
+    "start_mu_1s_deg",
+)
+
+
+class NoiseSource(Enum):
+    """What the base of R is."""
+
+    REGISTRATION = "registration"  # the alignment's own covariance, R0 where it has none
+    R0 = "r0"
+
+
+class Adaptation(Enum):
+    """What residuals do to R."""
+
+    SCALE = "scale"  # a factor for position and one for attitude
+    MATRIX = "matrix"  # the paper's whole matrix, from R0
+    OFF = "off"
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorParams:
+    """Noise, adaptation and start of the filter."""
+
+    # root density of the angular disturbance eps_tau [rad/s^1.5]
+    torque_noise_radps15: float = 1e-6
+    # root density of the linear disturbance eps_f [m/s^1.5]; auto: 1e-6 of the extent
+    force_noise_mps15: float | None = None
+    # what the measurement noise is taken from: the registration's covariance, or the fixed R0
+    noise: NoiseSource = NoiseSource.REGISTRATION
+    # how residuals change it: two factors, the paper's whole matrix (over R0), or not at all
+    adapt: Adaptation = Adaptation.SCALE
+    # healthy epochs in the noise window
+    window: int = 30
+    # R0: 1 sigma of the measured position [m]; auto: 0.002 of the extent
+    r0_pos_m: float | None = None
+    # R0: 1 sigma of the measured attitude about each axis [deg]
+    r0_rot_deg: float = 0.5
+    # least eigenvalue of R in units of R0
+    r_floor: float = 1e-6
+    # |sigma| stays below 1 minus this
+    sigma_margin: float = 0.01
+    # healthy poses the first rate is taken from
+    start_poses: int = 2
+    # 1 sigma of the pose that is handed in before any scan [m]; auto: 0.05 of the extent
+    start_pos_1s_m: float | None = None
+    # the same, attitude about each axis [deg]
+    start_rot_1s_deg: float = 10.0
+    # 1 sigma of the unknown rate about each axis [rad/s]
+    start_rate_1s_radps: float = 0.5
+    # 1 sigma of the unknown velocity [m/s]; auto: 0.05 of the extent per second
+    start_vel_1s_mps: float | None = None
+    # 1 sigma of each unknown inertia ratio
+    start_sigma_1s: float = 0.5
+    # 1 sigma of the unknown fixture position in {B} [m]; auto: 0.25 of the extent
+    start_varrho_1s_m: float | None = None
+    # 1 sigma of the unknown misalignment about each axis [deg]
+    start_mu_1s_deg: float = 20.0
+
+    def __post_init__(self) -> None:
+        for name in _POSITIVE:
+            value = getattr(self, name)
+            if value is not None and not (0.0 < value < math.inf):
+                raise ValueError(f"{name} is {value}, must be positive and finite")
+        if not 0.0 < self.sigma_margin < 0.5:
+            raise ValueError(f"sigma_margin is {self.sigma_margin}, must be in (0, 0.5)")
+        if self.window < 6 or self.start_poses < 2:
+            raise ValueError(f"window is {self.window} (6 at least), start_poses is {self.start_poses} (2 at least)")
+
+    def resolved(self, extent_m: float) -> EstimatorParams:
+        """The same with every auto value filled in from the target's extent [m]."""
+        if not 0.0 < extent_m < math.inf:
+            raise ValueError(f"extent_m is {extent_m}, must be positive and finite")
+        auto: dict[str, Any] = {
+            "force_noise_mps15": 1e-6,
+            "r0_pos_m": 0.002,
+            "start_pos_1s_m": 0.05,
+            "start_vel_1s_mps": 0.05,
+            "start_varrho_1s_m": 0.25,
+        }
+        return replace(self, **{k: f * extent_m for k, f in auto.items() if getattr(self, k) is None})
+
+    @property
+    def R0(self) -> Array:
+        """(6, 6) noise for (metres, half angle); auto values must be filled in."""
+        return np.diag(np.repeat([_given(self.r0_pos_m), 0.5 * math.radians(self.r0_rot_deg)], 3) ** 2)
+
+    @property
+    def force(self) -> float:
+        """Root density of eps_f, filled in."""
+        return _given(self.force_noise_mps15)
+
+    @property
+    def start_1s(self) -> Array:
+        """(20,) standard deviations of a start from a guessed pose alone."""
+        half = 0.5 * math.radians(self.start_rot_1s_deg), 0.5 * math.radians(self.start_mu_1s_deg)
+        return np.repeat(
+            [
+                half[0],
+                self.start_rate_1s_radps,
+                _given(self.start_pos_1s_m),
+                _given(self.start_vel_1s_mps),
+                self.start_sigma_1s,
+                _given(self.start_varrho_1s_m),
+                half[1],
+            ],
+            [3, 3, 3, 3, 2, 3, 3],
+        )
+
+
+def _given(value: float | None) -> float:
+    if value is None:
+        raise ValueError("auto value not filled in: call resolved(extent_m) first")
+    return value

@@ -1,0 +1,64 @@
+"""The first belief where none is given: the rate from the first healthy poses, everything else unknown and said so.
+
+sigma and varrho are zero, mu is the identity. The covariance is that of one linearised fit: the prior's information
+plus H' R^-1 H of each pose carried back along the motion, so rate, velocity and their correlations with the
+unknown parameters come out as the poses fix them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.estimate.layout import hamilton
+from avsreplay.estimate.measure import sensitivity
+from avsreplay.estimate.motion import advance, flow, transition
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Belief, State
+
+__all__ = ["PoseFix", "first_belief", "guessed_belief"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseFix:
+    """A healthy pose T_ac at an instant with its noise R (6, 6) [m, half-angle]."""
+
+    t_ns: int
+    T_ac: Pose
+    R: Array
+
+
+def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
+    """A body at rest at a guessed pose, with the start's wide standard deviations."""
+    return Belief(t_ns, _state(T_ac, np.zeros(3), np.zeros(3)), np.diag(params.start_1s**2))
+
+
+def first_belief(fixes: tuple[PoseFix, ...], params: EstimatorParams) -> Belief:
+    """The belief at the last of the poses: rate and velocity from the last two, at rest from a single one."""
+    last = fixes[-1]
+    x = _state(last.T_ac, *_rates(fixes))
+    info = np.diag(params.start_1s**-2.0)
+    for fix in fixes:
+        h = (fix.t_ns - last.t_ns) * 1e-9
+        step = flow(x.w_b, x.sigma, h)
+        H = sensitivity(advance(x, step, h)) @ transition(step, x.sigma, h)
+        info += H.T @ np.linalg.solve(fix.R, H)
+    P = np.linalg.inv(info)
+    return Belief(last.t_ns, x, 0.5 * (P + P.T))
+
+
+def _rates(fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
+    """Rate in {C} [rad/s] and velocity in {A} [m/s], mean over the poses; zero for one pose or no time between."""
+    h = (fixes[-1].t_ns - fixes[0].t_ns) * 1e-9
+    if h <= 0.0:
+        return np.zeros(3), np.zeros(3)
+    turns = [geometry.log(np.array(hamilton(geometry.conjugate(a.T_ac.q), b.T_ac.q))) for a, b in pairwise(fixes)]
+    return np.sum(turns, axis=0) / h, (fixes[-1].T_ac.t - fixes[0].T_ac.t) / h
+
+
+def _state(T_ac: Pose, w: Array, v: Array) -> State:
+    return State(T_ac.q, w, T_ac.t, v, np.zeros(2), np.zeros(3), geometry.IDENTITY_QUAT)

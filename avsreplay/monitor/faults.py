@@ -1,0 +1,127 @@
+"""The fault rule: gamma for each scan, and why it is 0 (section 6 of the equations).
+
+The pose test is |alpha|_W = sqrt(|d rho|^2 + (L theta)^2) against a limit. While the filter tracks, the limit is
+``alpha_max_m``; where the prediction itself is unsure (the start, a long blackout) it grows to ``sigmas`` times the
+predicted 1 sigma of the same norm, sqrt(tr S_rho + (2 L)^2 tr S_half), so the first healthy scan takes the track up.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+
+from avsreplay.records import Alignment, AlignStatus, Belief, Innovation, Reason, ScanStatus, Verdict
+
+__all__ = ["FaultDetector", "FaultParams", "Policy", "pose_limit", "weighted_norm"]
+
+
+class Policy(Enum):
+    """How the fit test and the pose test are joined."""
+
+    ANY = "any"  # either one is a fault
+    ALL = "all"  # as printed: a fault only where both fail
+
+
+@dataclass(frozen=True, slots=True)
+class FaultParams:
+    """Limits of the fault rule."""
+
+    # any: every test alone is a fault; all: the fit and the pose test must both fail (as printed)
+    policy: Policy = Policy.ANY
+    # fit error at and above which a scan is faulty [m]; auto: 0.01 of the extent
+    rms_max_m: float | None = None
+    # pose innovation at and above which a scan is faulty, in the weighted norm [m]; auto: 0.02 of the extent
+    alpha_max_m: float | None = None
+    # characteristic length that turns an angle into metres [m]; auto: 0.25 of the extent
+    length_m: float | None = None
+    # the pose limit is never below this many predicted 1 sigma
+    sigmas: float = 4.0
+    # inliers a scan must have
+    min_inliers: int = 50
+    # inliers over points a scan must have
+    min_inlier_ratio: float = 0.3
+
+    def __post_init__(self) -> None:
+        for name in ("rms_max_m", "alpha_max_m", "length_m", "sigmas"):
+            value = getattr(self, name)
+            if value is not None and not (0.0 < value < math.inf):
+                raise ValueError(f"{name} is {value}, must be positive and finite")
+        if self.min_inliers < 0 or not 0.0 <= self.min_inlier_ratio <= 1.0:
+            raise ValueError(f"min_inliers is {self.min_inliers}, min_inlier_ratio is {self.min_inlier_ratio}")
+
+    def resolved(self, extent_m: float) -> FaultParams:
+        """The same with every auto value filled in from the target's extent [m]."""
+        if not 0.0 < extent_m < math.inf:
+            raise ValueError(f"extent_m is {extent_m}, must be positive and finite")
+        return replace(
+            self,
+            rms_max_m=self.rms_max_m or 0.01 * extent_m,
+            alpha_max_m=self.alpha_max_m or 0.02 * extent_m,
+            length_m=self.length_m or 0.25 * extent_m,
+        )
+
+
+def weighted_norm(seen: Innovation, length_m: float) -> float:
+    """|alpha|_W [m]: the printed W = diag(I, L I) on metres and the full rotation angle."""
+    return math.hypot(seen.distance_m, length_m * seen.angle_rad)
+
+
+def pose_limit(seen: Innovation, alpha_max_m: float, length_m: float, sigmas: float) -> float:
+    """The limit on |alpha|_W [m]: ``alpha_max_m``, or ``sigmas`` predicted 1 sigma where that is more."""
+    variances = np.diagonal(seen.S)
+    predicted = math.sqrt(float(variances[:3].sum()) + (2.0 * length_m) ** 2 * float(variances[3:].sum()))
+    return max(alpha_max_m, sigmas * predicted)
+
+
+class FaultDetector:
+    """Judges one scan at a time; it remembers nothing.
+
+    Args:
+        params: limits; those left out are taken from ``extent_m``, the target's bounding diagonal [m].
+    """
+
+    def __init__(self, params: FaultParams, extent_m: float) -> None:
+        self.params = params.resolved(extent_m)
+        p = self.params
+        self._rms, self._alpha, self._length = (float(v or 0.0) for v in (p.rms_max_m, p.alpha_max_m, p.length_m))
+
+    def judge(
+        self, scan_status: ScanStatus, alignment: Alignment | None, innovation: Innovation | None, prior: Belief
+    ) -> Verdict:
+        """Gamma and the first reason that holds, in ``Reason``'s order."""
+        reason = self._unusable(scan_status, alignment, innovation, prior)
+        if reason is None and alignment is not None and innovation is not None:
+            reason = self._doubtful(alignment, innovation)
+        if reason is None and scan_status is ScanStatus.CLOCK:
+            reason = Reason.CLOCK
+        return Verdict(1, Reason.OK) if reason is None else Verdict(0, reason)
+
+    def _unusable(
+        self, status: ScanStatus, alignment: Alignment | None, seen: Innovation | None, prior: Belief
+    ) -> Reason | None:
+        """No pose that could be judged at all, whatever the policy."""
+        if status in (ScanStatus.EMPTY, ScanStatus.DAMAGED) or (
+            alignment and alignment.status is AlignStatus.NO_POINTS
+        ):
+            return Reason.NO_SCAN
+        lost = (AlignStatus.NO_OVERLAP, AlignStatus.FAILED, AlignStatus.AMBIGUOUS)
+        if alignment is None or seen is None or alignment.status in lost or not np.isfinite(seen.nis):
+            return Reason.NOT_ALIGNED
+        return None if np.all(np.isfinite(prior.P)) else Reason.NOT_ALIGNED
+
+    def _doubtful(self, alignment: Alignment, seen: Innovation) -> Reason | None:
+        p = self.params
+        poor_fit = not alignment.rms_m < self._rms
+        jump = weighted_norm(seen, self._length) >= pose_limit(seen, self._alpha, self._length, p.sigmas)
+        if p.policy is Policy.ALL:
+            return Reason.FIT_ERROR if poor_fit and jump else None
+        if not alignment.converged or alignment.status is AlignStatus.NOT_CONVERGED:
+            return Reason.NOT_CONVERGED
+        if alignment.inliers < p.min_inliers or alignment.inlier_ratio < p.min_inlier_ratio:
+            return Reason.FEW_INLIERS
+        if poor_fit:
+            return Reason.FIT_ERROR
+        return Reason.POSE_JUMP if jump else None
