@@ -48,8 +48,12 @@ class Caster:
         self._search = build(self._corners)
 
     def ranges(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Range (n,) [m] to the first hit (inf: none) and cosine (n,) of its incidence; unit ``directions`` (n, 3)."""
+        """Range (n,) [m] to the first hit (inf: none) and cosine (n,) of its incidence.
+
+        ``directions`` (n, 3) unit; ``origins`` (n, 3), or (1, 3) where all rays start at one point.
+        """
         face = self._search(origins, directions)
+        origins = np.broadcast_to(origins, directions.shape)
         hit = np.flatnonzero(face >= 0)
         normal = self._normals[face[hit]]
         cosine = _dot(normal, directions[hit])
@@ -81,7 +85,8 @@ def _embree(corners: Array) -> Search:
     def search(origins: Array, directions: Array) -> Hits:
         if not len(origins):
             return np.empty(0, np.int64)
-        found = scene.run(np.ascontiguousarray(origins, np.float32), np.ascontiguousarray(directions, np.float32))
+        starts = np.ascontiguousarray(np.broadcast_to(origins, directions.shape), np.float32)
+        found = scene.run(starts, np.ascontiguousarray(directions, np.float32))
         return np.asarray(found, dtype=np.int64)
 
     return search
@@ -93,21 +98,27 @@ def _exact(corners: Array) -> Search:
     def search(origins: Array, directions: Array) -> Hits:
         rows = max(1, CHUNK // max(1, len(a)))
         parts = [
-            _moeller_trumbore(origins[k : k + rows, None], directions[k : k + rows, None], a, e1, e2)
-            for k in range(0, len(origins), rows)
+            _nearest(
+                origins[k : k + rows, None] if len(origins) > 1 else origins[None], directions[k : k + rows], a, e1, e2
+            )
+            for k in range(0, len(directions), rows)
         ]
         return np.concatenate([np.empty(0, np.int64), *parts])
 
     return search
 
 
-def _moeller_trumbore(o: Array, d: Array, a: Array, e1: Array, e2: Array) -> Hits:
-    """Index of the nearest triangle hit by each ray, -1 where none: o, d (n, 1, 3), triangles (m, 3)."""
-    p, s = np.cross(d, e2), o - a
-    q = np.cross(s, e1)
+def _nearest(origins: Array, directions: Array, a: Array, e1: Array, e2: Array) -> Hits:
+    """Index of the nearest triangle (m, corner a, edges e1, e2) hit by each ray, -1 where none.
+
+    Moeller and Trumbore's test with its triple products turned so that all but the direction is known beforehand
+    where the rays share an origin: origins (n or 1, 1, 3), directions (n, 3).
+    """
+    s = origins - a
+    q, rays = np.cross(s, e1), directions[:, None]
     with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1.0 / _dot(p, e1)
-        u, v, t = _dot(s, p) * scale, _dot(d, q) * scale, _dot(q, e2) * scale
+        scale = 1.0 / _dot(rays, np.cross(e2, e1))
+        u, v, t = _dot(rays, np.cross(e2, s)) * scale, _dot(rays, q) * scale, _dot(q, e2) * scale
         inside = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0) & (t > 0.0)
     t = np.where(inside, t, np.inf)
     best = np.argmin(t, axis=1)

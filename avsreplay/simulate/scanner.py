@@ -145,7 +145,7 @@ class Scanner:
         R_ca = np.swapaxes(R_ac[near] if len(R_ac) > 1 else R_ac, -1, -2)
         origins = rotate(R_ca, -(t_ac[near] if len(t_ac) > 1 else t_ac))
         directions = rotate(R_ca, self._directions[near])
-        ranges, cosine = self._caster.ranges(np.broadcast_to(origins, directions.shape), directions)
+        ranges, cosine = self._caster.ranges(origins, directions)
         p = self.params
         seen = (ranges >= p.range_min_m) & (ranges <= p.range_max_m)
         seen &= cosine >= math.cos(math.radians(p.max_incidence_deg))

@@ -1,0 +1,113 @@
+"""``avsreplay record``: write a log, from a scenario or from scans that others recorded."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from avsreplay.errors import DataLost, UsageError
+
+if TYPE_CHECKING:
+    from avsreplay.log import SourceOptions
+    from avsreplay.recording import Recorded
+    from avsreplay.records import Scan
+
+__all__ = ["command"]
+
+EPILOG = """\b
+Examples:
+  avsreplay record -o tumble.mcap                       the built-in scenario
+  avsreplay record scenario.toml -o x.mcap --seed 7     a scenario file
+  avsreplay record scans/ -o y.mcap --model m.ply       a folder of scans with a poses file
+  avsreplay record drive.bag -o z.mcap --topic /points  a ROS 1 or 2 bag, or an MCAP"""
+READING = ("topic", "truth_topic", "truth_file", "rate_hz", "every", "start_s", "end_s", "n_scans", "clock", "strict")
+
+
+@click.command("record", epilog=EPILOG)
+@click.argument("source", required=False, type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The log to write (.mcap).")
+@click.option("--seed", type=click.IntRange(0), help="Seed of a simulation, over the scenario's own.")
+@click.option("--model", type=click.Path(path_type=Path), help="Model of the target: PLY, OBJ or STL, in metres.")
+@click.option("--cloud-model", is_flag=True, help="The model may be a bare cloud, without faces.")
+@click.option("--topic", help="Cloud topic of a recorded source, where there are several.")
+@click.option("--truth-topic", help="Topic of the true poses.")
+@click.option("--truth", "truth_file", type=click.Path(path_type=Path), help="File of the true poses.")
+@click.option("--rate", "rate_hz", type=float, help="Scans a second of a folder (1 by default).")
+@click.option("--every-scan", "every", type=click.IntRange(1), help="Take every N-th scan, each at its own time.")
+@click.option("--start", "start_s", type=float, help="Leave out what is before, seconds after the first scan.")
+@click.option("--end", "end_s", type=float, help="Leave out what is after, seconds after the first scan.")
+@click.option("--n-scans", type=click.IntRange(1), help="At most so many scans.")
+@click.option("--clock", type=click.Choice(["header", "log", "publish"]), help="Clock of a recorded source.")
+@click.option("--strict", is_flag=True, default=None, help="Any damage of the source is an error (exit 3).")
+@click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True)
+@click.option("--overwrite", is_flag=True, help="Replace an existing output.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
+def command(
+    source: Path | None,
+    output: Path,
+    seed: int | None,
+    model: Path | None,
+    cloud_model: bool,
+    compression: str,
+    overwrite: bool,
+    as_json: bool,
+    **reading: Any,
+) -> None:
+    """Write a log: simulate a scenario, or take over scans that others recorded.
+
+    SOURCE is a scenario (.toml), a folder of PLY or PCD scans, a ROS 1 or ROS 2 bag, or an MCAP; without it the
+    built-in scenario is simulated. The log holds the model, the scenario and the truth, and runs with no flag.
+    """
+    from avsreplay.recording import RecordOptions, record
+
+    options = RecordOptions(model=model, cloud_model=cloud_model, overwrite=overwrite, compression=compression)
+    done = record(source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
+    click.echo(json.dumps(dataclasses.asdict(done), indent=2) if as_json else _sentence(done))
+    if done.losses or done.damaged:
+        lost = f"{len(done.losses)} damaged places, {done.damaged} messages that could not be decoded were left out"
+        raise DataLost(lost, where=str(source), hint="see 'avsreplay doctor'")
+
+
+def _reading(flags: dict[str, Any]) -> SourceOptions | None:
+    """The flags for recorded sources, None where none was given."""
+    from avsreplay.log import ClockChoice, SourceOptions
+
+    given = {name: flags[name] for name in READING if flags[name] is not None}
+    if "clock" in given:
+        given["clock"] = ClockChoice(given["clock"])
+    try:
+        return SourceOptions(**given) if given else None
+    except ValueError as error:
+        raise UsageError(str(error), where="record", hint="correct the flag") from None
+
+
+def _sentence(done: Recorded) -> str:
+    lines = [
+        f"{done.path}: {done.scans} scans, {done.span_s:.1f} s, {done.points} points, {done.bytes} bytes",
+        f"model: {done.model or 'none'}" + (f", seed {done.seed}" if done.seed is not None else ""),
+    ]
+    lines += [
+        f"fault: {kind} from {start:.1f} s to {end:.1f} s, {'harmful' if harmful else 'harmless'}"
+        for kind, start, end, harmful in done.faults
+    ]
+    return "\n".join(lines)
+
+
+@contextmanager
+def _progress(scans: Iterable[Scan], due: int) -> Iterator[Iterator[Scan]]:
+    """A bar on stderr, on a terminal only."""
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield iter(scans)
+        return
+    with Progress(console=console, transient=True) as bar:
+        yield iter(bar.track(scans, total=due or None, description="recording"))

@@ -1,0 +1,172 @@
+"""Recording: a simulation or a source folded into a log writer, scan by scan. The layer that knows both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from avsreplay.errors import UsageError
+from avsreplay.log import LogWriter, Loss, SourceOptions, read_surface
+from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface
+from avsreplay.simulate import Scenario, builtin_surface, load_scenario, simulate
+
+__all__ = ["RecordOptions", "Recorded", "Ticker", "record", "record_scenario", "record_source", "surface_for"]
+
+Ticker = Callable[[Iterable[Scan], int], AbstractContextManager[Iterator[Scan]]]
+"""Wraps the scans to show progress: (scans, how many are due, 0 if not known) -> a context that yields them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordOptions:
+    """How to write: see log.LogWriter. ``model`` stands in for the scenario's or the source's own."""
+
+    model: Path | None = None
+    cloud_model: bool = False
+    overwrite: bool = False
+    compression: str = "zstd"
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """What was written.
+
+    Attributes:
+        path: the log.  scans: clouds in it.  points: in all of them.  empty: clouds without a point.
+        damaged: messages of the source that could not be decoded and were left out.
+        span_s: first to last scan.  bytes: of the file.  model: name of the model inside, None without.
+        faults: labels as (kind, start [s], end [s] after the first scan, harmful).  losses: of the source.
+    """
+
+    path: str
+    scans: int
+    points: int
+    empty: int
+    damaged: int
+    span_s: float
+    bytes: int
+    model: str | None
+    seed: int | None
+    faults: tuple[tuple[str, float, float, bool], ...]
+    losses: tuple[Loss, ...] = ()
+
+
+def record(
+    source: Path | None,
+    output: Path,
+    *,
+    seed: int | None = None,
+    options: RecordOptions | None = None,
+    reading: SourceOptions | None = None,
+    ticker: Ticker | None = None,
+) -> Recorded:
+    """Record ``source`` to ``output``: None is the built-in scenario, a .toml a scenario, all else a recorded source.
+
+    Raises UsageError for flags that do not fit the source, and what the scenario, the model, the source or the
+    writer raise.
+    """
+    options = options or RecordOptions()
+    if source is None or source.suffix.lower() == ".toml":
+        if reading is not None:
+            hint = "leave out the flags for recorded sources"
+            raise UsageError("a scenario has no topics or files to read", where=str(source or "record"), hint=hint)
+        return record_scenario(load_scenario(source, seed), output, options, ticker)
+    if seed is not None:
+        raise UsageError("a recorded source has no seed", where=str(source), hint="leave out --seed")
+    return record_source(source, output, reading or SourceOptions(), options, ticker)
+
+
+def surface_for(scenario: Scenario, model: Path | None = None, cloud_ok: bool = False) -> Surface:
+    """The model of a scenario: ``model`` where given, else the file it names, else its built-in shape.
+
+    Raises what log.read_surface raises.
+    """
+    path = model or scenario.model
+    return read_surface(path, cloud_ok) if path is not None else builtin_surface(scenario.params.target.shape)
+
+
+def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ticker: Ticker | None = None) -> Recorded:
+    """Simulate ``scenario`` into ``output``; the truth is stamped with the true instants."""
+    simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model))
+    with (
+        _writer(output, simulation.header, options) as writer,
+        _ticked(ticker, simulation.scans(), simulation.count) as scans,
+    ):
+        tally = _fold(scans, writer, true_clock=True)
+    return tally.recorded(output, simulation.header)
+
+
+def record_source(
+    source: Path, output: Path, reading: SourceOptions, options: RecordOptions, ticker: Ticker | None = None
+) -> Recorded:
+    """Take over the scans, truth, labels and model of ``source``; stamps are those the clock rule chose."""
+    if output.exists() and source.exists() and output.samefile(source):
+        raise UsageError("the output is the source", where=str(output), hint="name another output")
+    from avsreplay.log import open_source
+
+    reading = replace(
+        reading, model=options.model or reading.model, cloud_model=options.cloud_model or reading.cloud_model
+    )
+    with open_source(source, reading) as opened:
+        header, due = opened.header, opened.info().scans
+        with _writer(output, header, options) as writer, _ticked(ticker, opened.scans(), due) as scans:
+            tally = _fold(scans, writer, true_clock=False)
+        return tally.recorded(output, header, tuple(opened.losses))
+
+
+@dataclass(slots=True)
+class _Tally:
+    scans: int = 0
+    points: int = 0
+    empty: int = 0
+    damaged: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+    def add(self, scan: Scan) -> None:
+        self.first_ns = self.first_ns if self.scans else scan.log_ns
+        self.last_ns = scan.log_ns
+        self.scans += 1
+        self.points += len(scan.points)
+        self.empty += not len(scan.points)
+
+    def recorded(self, output: Path, header: LogHeader, losses: tuple[Loss, ...] = ()) -> Recorded:
+        return Recorded(
+            path=str(output),
+            scans=self.scans,
+            points=self.points,
+            empty=self.empty,
+            damaged=self.damaged,
+            span_s=(self.last_ns - self.first_ns) * 1e-9,
+            bytes=output.stat().st_size,
+            model=header.surface.name if header.surface else None,
+            seed=header.seed,
+            faults=tuple(self._fault(label) for label in header.labels),
+            losses=losses,
+        )
+
+    def _fault(self, label: Label) -> tuple[str, float, float, bool]:
+        start, end = ((t - self.first_ns) / 1_000_000_000 for t in (label.start_ns, label.end_ns))
+        return label.kind, start, end, label.harmful
+
+
+def _fold(scans: Iterable[Scan], writer: LogWriter, true_clock: bool) -> _Tally:
+    tally = _Tally()
+    for scan in scans:
+        if scan.status is ScanStatus.DAMAGED:
+            tally.damaged += 1
+            continue
+        writer.write(scan)
+        if scan.truth is not None:
+            writer.write_truth(scan.log_ns, scan.log_ns if true_clock else scan.t_ns, scan.truth, scan.body)
+        tally.add(scan)
+    return tally
+
+
+def _writer(output: Path, header: LogHeader, options: RecordOptions) -> LogWriter:
+    return LogWriter(output, header, overwrite=options.overwrite, compression=options.compression)
+
+
+def _ticked(ticker: Ticker | None, scans: Iterable[Scan], due: int) -> AbstractContextManager[Iterator[Scan]]:
+    return ticker(scans, due) if ticker else nullcontext(iter(scans))
