@@ -1,0 +1,247 @@
+"""The summary: statistics, faults injected against faults flagged, recovery, parameters, plans."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import random
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import chi2
+
+from avsreplay import report
+from avsreplay.geometry import exp
+from avsreplay.records import Label, State
+from avsreplay.report.spread import Spread
+from avsreplay.report.summary import NEES_BAND, NIS_BAND
+
+STEP = 200_000_000
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.randoms())
+def test_statistics_are_numpys_and_know_no_order(values, rng):
+    spread = Spread.of(values)
+    array = np.array(values)
+    assert spread.count == len(values)
+    assert spread.rmse == pytest.approx(math.sqrt(np.mean(array**2)), rel=1e-12, abs=1e-9)
+    assert (spread.mean, spread.std) == pytest.approx((array.mean(), array.std()), rel=1e-9, abs=1e-6)
+    assert (spread.median, spread.min, spread.max) == (pytest.approx(np.median(array)), array.min(), array.max())
+    shuffled = list(values)
+    rng.shuffle(shuffled)
+    assert Spread.of(shuffled) == spread
+
+
+def test_nothing_has_no_statistics():
+    assert Spread.of([]) is None
+
+
+def test_the_bands_are_chi_squares():
+    np.testing.assert_allclose(NIS_BAND, chi2.ppf([0.025, 0.975], 6), atol=5e-5)
+    np.testing.assert_allclose(NEES_BAND, chi2.ppf([0.025, 0.975], 20), atol=5e-5)
+
+
+def test_errors_are_split_by_gamma(make_rows):
+    rows = make_rows(40)
+    summary = report.Summary.fold(rows)
+    for state, gamma in ((summary.pose_healthy, 1), (summary.pose_coasting, 0)):
+        expected = [r.pos_err_m for r in rows if r.gamma == gamma]
+        assert state.position_m == Spread.of(expected)
+        assert state.rotation_deg == Spread.of([r.rot_err_deg for r in rows if r.gamma == gamma])
+    assert summary.registration_flagged.position_m is None
+    assert summary.registration_healthy.position_m.count == 34
+
+
+def test_without_truth_there_are_no_errors_and_no_zeros(make_rows):
+    summary = report.Summary.fold(make_rows(10, pos_err_m=None, rot_err_deg=None, nees=None))
+    assert summary.pose_healthy.position_m is None
+    assert summary.nees is None
+
+
+def test_row_by_row_is_the_same_as_all_at_once(make_rows):
+    rows = make_rows(40)
+    fold = report.SummaryFold()
+    for row in rows:
+        fold.add(row)
+    assert fold.result() == report.Summary.fold(rows)
+
+
+def test_no_rows_make_a_summary():
+    summary = report.Summary.fold([])
+    assert (summary.scans, summary.duration_s, summary.convergence.t1_s, summary.longest_coast) == (0, 0.0, None, None)
+
+
+def _flag(rows, where, reason="fit_error", fault=None):
+    return [dataclasses.replace(r, gamma=0, reason=reason, fault=fault) if r.seq in where else r for r in rows]
+
+
+@pytest.fixture
+def clean(make_rows):
+    return make_rows(40, blackout=range(0))
+
+
+def _label(rows, kind, first, last, harmful=True):
+    return Label(kind, rows[first].t_ns, rows[last].t_ns, harmful)
+
+
+def test_a_flagged_label_is_detected_and_recovery_counts_late_scans(clean):
+    rows = [dataclasses.replace(r, fault="clutter") if 10 <= r.seq <= 14 else r for r in clean]
+    rows = [dataclasses.replace(r, gamma=0, reason="fit_error") if 11 <= r.seq <= 16 else r for r in rows]
+    faults = report.Summary.fold(rows, labels=[_label(rows, "clutter", 10, 14)]).faults
+    (episode,) = faults.episodes
+    assert (faults.injected, faults.detected, faults.missed) == (1, 1, 0)
+    assert (faults.harmful_scans, faults.missed_scans) == (5, 1)
+    assert (episode.scans, episode.flagged, episode.recover_scans) == (5, 4, 2)
+    assert episode.recover_s == pytest.approx(0.4)
+    assert faults.longest_recovery_s == pytest.approx(0.4)
+    assert (faults.false_alarms, faults.unlabelled) == (2, 35)
+    assert faults.false_alarm_rate == pytest.approx(2 / 35)
+
+
+def test_an_unflagged_harmful_label_is_missed_and_a_harmless_one_is_not(clean):
+    rows = [dataclasses.replace(r, fault={5: "range_bias", 9: "partial_occlusion"}.get(r.seq)) for r in clean]
+    labels = [_label(rows, "range_bias", 5, 5), _label(rows, "partial_occlusion", 9, 9, harmful=False)]
+    faults = report.Summary.fold(rows, labels=labels).faults
+    assert (faults.injected, faults.missed, faults.missed_scans) == (1, 1, 1)
+    assert [e.recover_s for e in faults.episodes] == [None, None]
+
+
+def test_a_flagged_harmless_label_is_no_false_alarm(clean):
+    rows = _flag(clean, {9}, fault="partial_occlusion")
+    faults = report.Summary.fold(rows, labels=[_label(rows, "partial_occlusion", 9, 9, False)]).faults
+    assert (faults.injected, faults.false_alarms, faults.unlabelled) == (0, 0, 39)
+
+
+def test_a_dropped_scan_has_no_row_and_is_seen_as_a_gap(clean):
+    label = _label(clean, "dropped", 12, 12)
+    summary = report.Summary.fold([r for r in clean if r.seq != 12], labels=[label])
+    assert summary.gaps == 1
+    assert summary.faults.detected == 1
+    assert summary.faults.episodes[0].recover_s == 0.0
+    unseen = report.Summary.fold(clean, labels=[label]).faults
+    assert (unseen.detected, unseen.missed) == (0, 1)
+
+
+def test_two_windows_of_one_kind_keep_their_own_scans(clean):
+    rows = _flag(clean, {5, 6, 20}, fault="clutter")
+    labels = [_label(rows, "clutter", 5, 6), _label(rows, "clutter", 20, 20)]
+    assert [e.scans for e in report.Summary.fold(rows, labels=labels).faults.episodes] == [2, 1]
+
+
+def test_a_stamp_pushed_out_of_its_window_still_finds_its_label(clean):
+    label = _label(clean, "stamp_jump", 12, 12)
+    rows = [dataclasses.replace(r, t_ns=r.t_ns + 90_000_000, fault="stamp_jump") if r.seq == 12 else r for r in clean]
+    assert report.Summary.fold(rows, labels=[label]).faults.episodes[0].scans == 1
+
+
+def test_rows_alone_give_labels_where_the_log_gave_none(clean):
+    rows = _flag(_flag(clean, {5, 6}, fault="clutter"), {7, 20}, fault="frozen")
+    faults = report.Summary.fold(rows).faults
+    assert faults.known
+    assert [(e.kind, e.scans) for e in faults.episodes] == [("clutter", 2), ("frozen", 1), ("frozen", 1)]
+
+
+def test_without_labels_a_flag_is_not_called_false(clean):
+    assert not report.Summary.fold(_flag(clean, {3})).faults.known
+    assert report.Summary.fold(_flag(clean, {3}), labels=()).faults.known
+
+
+def test_a_track_never_taken_up_again_has_no_recovery_time(clean):
+    rows = _flag(_flag(clean, range(30, 40)), {28, 29}, fault="clutter")
+    faults = report.Summary.fold(rows, labels=[_label(rows, "clutter", 28, 29)]).faults
+    assert faults.episodes[0].detected
+    assert faults.episodes[0].recover_s is None
+
+
+def test_the_longest_coast_ends_with_its_error(make_rows):
+    rows = _flag(make_rows(40), {3})
+    summary = report.Summary.fold(rows)
+    assert len(summary.coasts) == 2
+    coast = summary.longest_coast
+    assert (coast.scans, coast.pos_err_m) == (6, rows[25].pos_err_m)
+    assert coast.duration_s == pytest.approx(1.2)
+
+
+def _truth(**changes):
+    values = {
+        "q_ab": [0, 0, 0, 1],
+        "w_b": [0.1, 0, 0],
+        "r_a": [0, 0, 5],
+        "v_a": [0, 0, 0],
+        "sigma": [0.25, -0.4],
+        "c_b": [0.5, 0.6, -0.4],
+        "q_bc": exp([0, 0, 0.1]),
+    }
+    return State(**(values | changes))
+
+
+def test_parameters_stand_against_truth(make_rows):
+    rows = make_rows(40)
+    found = {p.name: p for p in report.Summary.fold(rows, truth=_truth()).parameters}
+    assert found["sigma1"].error == pytest.approx(abs(rows[-1].sigma1 - 0.25))
+    assert found["c (varrho)"].error == pytest.approx(0.3)
+    assert found["mu"].error == pytest.approx(math.degrees(0.1))
+    assert found["mu"].estimate == pytest.approx((0, 0, math.degrees(0.2)))
+    assert found["mu"].one_sigma == 0.2
+
+
+def test_the_angle_of_mu_knows_no_sign(make_rows):
+    rows = make_rows(2, mux=0.0, muy=0.0, muz=-math.sin(0.05), muw=-math.cos(0.05))
+    found = {p.name: p for p in report.Summary.fold(rows, truth=_truth()).parameters}
+    assert found["mu"].error == pytest.approx(0.0, abs=1e-6)
+
+
+def test_parameters_without_truth_or_without_estimate(make_rows):
+    assert all(p.truth is None and p.error is None for p in report.Summary.fold(make_rows(3)).parameters)
+    names = [p.name for p in report.Summary.fold(make_rows(3, sigma1=None, muw=None)).parameters]
+    assert names == ["sigma2", "c (varrho)"]
+
+
+def test_t1_rank_and_withdrawals(make_rows):
+    rows = make_rows(40)
+    summary = report.Summary.fold(rows)
+    assert (summary.convergence.t1_s, summary.convergence.at_end) == (rows[10].t_s, True)
+    assert summary.observability.full_rank_s == rows[20].t_s
+    rows[30] = dataclasses.replace(rows[30], converged=False)
+    assert report.Summary.fold(rows).convergence.withdrawn == 1
+
+
+def test_a_replan_is_a_plan_that_differs(make_rows):
+    capture = report.Summary.fold(make_rows(40)).capture
+    assert capture.replans == 3
+    assert (capture.first_s, capture.last_s) == (30.1, 30.3)
+    assert capture.range_s == pytest.approx(0.2)
+    assert capture.std_s == pytest.approx(np.std([30.1, 30.2, 30.3]))
+
+
+def test_a_planner_that_finds_nothing_has_a_word_and_no_time(make_rows):
+    rows = make_rows(20, plan_status="infeasible_within_horizon", capture_time_s=None)
+    capture = report.Summary.fold(rows).capture
+    assert (capture.replans, capture.last_s, capture.status) == (0, None, "infeasible_within_horizon")
+
+
+def test_shares_count_what_is_inside(make_rows):
+    rows = [dataclasses.replace(r, nis=v) for r, v in zip(make_rows(4, blackout=range(0)), (1.0, 2.0, 14.0, 15.0), strict=True)]
+    nis = report.Summary.fold(rows).nis
+    assert (nis.count, nis.inside, nis.median) == (4, 0.5, 8.0)
+
+
+def test_counts_are_handed_through(make_rows):
+    counts = {"messages lost": 2}
+    assert report.Summary.fold(make_rows(2), counts=counts).counts == counts
+
+
+def test_states_and_reasons_are_counted_in_a_stable_order(make_rows):
+    rows = _flag(_flag(make_rows(40), {1}, "pose_jump"), {2}, "clock")
+    for order in itertools.islice(itertools.permutations((rows[1], rows[2], rows[21])), 6):
+        assert list(report.Summary.fold(order).reasons) == ["clock", "no_scan", "pose_jump"]
+
+
+def test_a_shuffled_log_has_the_same_errors(make_rows):
+    rows = make_rows(40)
+    shuffled = list(rows)
+    random.Random(3).shuffle(shuffled)
+    assert report.Summary.fold(shuffled).pose_healthy == report.Summary.fold(rows).pose_healthy

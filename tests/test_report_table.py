@@ -1,0 +1,142 @@
+"""Tables: fit the width, say what they leave out, need no colour."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import re
+import subprocess
+import sys
+
+import pytest
+
+from avsreplay import report
+from avsreplay.records import Label
+from avsreplay.report.table.console import Palette, decimals, head
+from avsreplay.report.table.scans import choose_rows
+from avsreplay.rows import columns
+
+
+def _printed(rows, *, width=None, encoding="utf-8", **flags) -> str:
+    raw = io.BytesIO()
+    stream = io.TextIOWrapper(raw, encoding=encoding, newline="\n")
+    summary = report.Summary.fold(rows, labels=flags.pop("labels", None))
+    report.print_tables(report.make_console(stream, width=width), rows, summary, **flags)
+    stream.flush()
+    return raw.getvalue().decode(encoding)
+
+
+def test_off_a_terminal_it_is_80_wide_whatever_the_environment_says(make_rows, monkeypatch):
+    plain = _printed(make_rows(600))
+    monkeypatch.setenv("COLUMNS", "200")
+    assert _printed(make_rows(600)) == plain
+    assert max(len(line) for line in plain.splitlines()) <= 80
+
+
+def test_no_cell_is_cut_at_80(make_rows):
+    for n in (5, 600, 6000):
+        assert "…" not in _printed(make_rows(n))
+
+
+def test_no_escape_codes_off_a_terminal(make_rows):
+    assert "\x1b" not in _printed(make_rows(30))
+
+
+@pytest.mark.parametrize("width", [40, 80, 100, 140, 250])
+def test_every_width_is_kept_and_what_is_left_out_is_named(make_rows, width):
+    text = _printed(make_rows(30), width=width)
+    assert max(len(line.rstrip()) for line in text.splitlines()) <= width
+    assert ("not shown at this width" in text) == (width < 140)
+
+
+def test_units_stand_in_the_heads(make_rows):
+    text = _printed(make_rows(30), width=200)
+    for unit in ("[m]", "[deg]", "[s]"):
+        assert unit in text.split("Errors")[0]
+
+
+def test_heads_lose_the_suffix_and_keep_the_unit():
+    heads = {c.name: head(c) for c in columns()}
+    assert heads["rms_m"] == "rms\n[m]"
+    assert heads["wx_radps"] == "wx\n[rad/s]"
+    assert all((f"[{c.unit}]" in heads[c.name]) == bool(c.unit) for c in columns())
+
+
+def test_a_log_of_600_is_decimated_and_keeps_the_turns(make_rows):
+    rows = make_rows(600, blackout=range(301, 361))
+    chosen, words = choose_rows(rows)
+    assert [r.seq for r in chosen if r.gamma == 0] == [301, 325, 350]
+    assert 361 in [r.seq for r in chosen]
+    assert (chosen[0].seq, chosen[-1].seq) == (0, 599)
+    assert words == "every 25th of 600 scans and where gamma changes"
+
+
+def test_every_and_all(make_rows):
+    rows = make_rows(100)
+    assert [r.seq for r in choose_rows(rows, every=40)[0]] == [0, 40, 80]
+    assert choose_rows(rows, every=40)[1] == "every 40th of 100 scans"
+    assert len(choose_rows(rows, all=True)[0]) == 100
+
+
+def test_a_flickering_detector_does_not_flood_the_table(make_rows):
+    rows = [dataclasses.replace(r, gamma=r.seq % 2) for r in make_rows(600)]
+    assert len(choose_rows(rows)[0]) <= 26
+
+
+@pytest.mark.parametrize(("gamma", "reason"), [(1, "ok"), (0, "no_scan"), (0, "pose_jump")])
+def test_the_three_states_differ_without_colour(gamma, reason):
+    signs = {
+        Palette.of(report.make_console(io.StringIO())).state(g, r).plain[0]
+        for g, r in ((1, "ok"), (0, "no_scan"), (0, "pose_jump"))
+    }
+    assert len(signs) == 3
+    assert reason in Palette.of(report.make_console(io.StringIO())).state(gamma, reason).plain
+
+
+def test_an_ascii_stream_gets_ascii(make_rows):
+    text = _printed(make_rows(40), encoding="ascii")
+    assert "o ok" in text
+    assert "~ no_scan" in text
+
+
+def test_small_targets_get_their_figures():
+    assert decimals([0.00004, 0.00005], 4) == 7
+    assert decimals([0.5], 4) == 4
+    assert decimals([0.0], 4) == 4
+    assert decimals([1e-30], 4) == 8
+
+
+def test_the_fault_table_says_detected_missed_and_harmless(make_rows):
+    rows = [dataclasses.replace(r, fault={30: "range_bias", 35: "clutter"}.get(r.seq, r.fault)) for r in make_rows(40)]
+    labels = [
+        Label("full_occlusion", rows[20].t_ns, rows[25].t_ns),
+        Label("range_bias", rows[30].t_ns, rows[30].t_ns),
+        Label("clutter", rows[35].t_ns, rows[35].t_ns, harmful=False),
+    ]
+    text = _printed(rows, labels=labels)
+    for pattern in (
+        r"full_occlusion .* 6 .* 6 .*detected .* 0.00",
+        r"range_bias .* 1 .* 0 .*missed",
+        r"clutter .* 1 .* 0 .*harmless, used",
+        r"2 injected, 1 detected, 1 missed; 6 of 7 harmful scans",
+    ):
+        assert re.search(pattern, text), pattern
+
+
+def test_speed_stands_in_the_table_only(make_rows):
+    assert "speed" not in _printed(make_rows(3))
+    assert "123.4 scans/s" in _printed(make_rows(3), scans_per_s=123.4)
+
+
+def test_no_rows_print_a_summary():
+    assert "scans" in _printed([])
+
+
+def test_a_brackets_in_a_cell_are_text(make_rows):
+    assert "[bold]" in _printed(make_rows(3, reason="[bold]", gamma=0, fault=None), width=120)
+
+
+def test_naming_the_report_loads_nothing_heavy():
+    code = "import avsreplay.report, sys; print([m for m in ('rich', 'plotly', 'pyarrow') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
