@@ -124,62 +124,117 @@ def support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, list
     return _closed_support(p0x, p0y, p1x, p1y)
 
 
-def _newton_step(grad: list[float], hess: list[float], b: list[float], damping: float) -> list[float]:
-    """Step that lowers h on the plane P.b = const: the KKT system of one Newton step, damped."""
-    kkt = np.zeros((5, 5))
-    xx0, xy0, yy0, xx1, xy1, yy1, xx2, xy2, yy2 = hess
-    kkt[:4, :4] = ((xx0, xy0, xx1, xy1), (xy0, yy0, xy1, yy1), (xx1, xy1, xx2, xy2), (xy1, yy1, xy2, yy2))
-    kkt[[0, 1, 2, 3], [0, 1, 2, 3]] += damping
-    kkt[4, :4] = kkt[:4, 4] = b
-    step: list[float] = np.linalg.solve(kkt, (-grad[0], -grad[1], -grad[2], -grad[3], 0.0)).tolist()
-    return step[:4]
+def _newton_step(
+    residual: list[float], hess: list[float], P: list[float], b: list[float], damping: float
+) -> list[float]:
+    """The step that lowers h on the plane P.b = 1.
+
+    h is homogeneous, so H P = 0 and P.(grad - h b) = 0: the solution of (H + k b b^T) step = -(grad - h b) has
+    b.step = 0 of itself, and the KKT system shrinks to four symmetric positive definite equations (LDL^T).
+    """
+    k = hess[0] + hess[2] + hess[6] + hess[8]
+    b0, b1, b2, b3 = b
+    d0 = hess[0] + k * b0 * b0 + damping
+    l1, l2, l3 = (hess[1] + k * b0 * b1) / d0, (hess[3] + k * b0 * b2) / d0, (hess[4] + k * b0 * b3) / d0
+    d1 = hess[2] + k * b1 * b1 + damping - l1 * l1 * d0
+    m2, m3 = (hess[4] + k * b1 * b2 - l1 * l2 * d0) / d1, (hess[5] + k * b1 * b3 - l1 * l3 * d0) / d1
+    d2 = hess[6] + k * b2 * b2 + damping - l2 * l2 * d0 - m2 * m2 * d1
+    n3 = (hess[7] + k * b2 * b3 - l2 * l3 * d0 - m2 * m3 * d1) / d2
+    d3 = hess[8] + k * b3 * b3 + damping - l3 * l3 * d0 - m3 * m3 * d1 - n3 * n3 * d2
+    y0 = -residual[0]
+    y1 = -residual[1] - l1 * y0
+    y2 = -residual[2] - l2 * y0 - m2 * y1
+    x3 = (-residual[3] - l3 * y0 - m3 * y1 - n3 * y2) / d3
+    x2 = y2 / d2 - n3 * x3
+    x1 = y1 / d1 - m2 * x2 - m3 * x3
+    x0 = y0 / d0 - l1 * x1 - l2 * x2 - l3 * x3
+    off = b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+    return [x0 - off * P[0], x1 - off * P[1], x2 - off * P[2], x3 - off * P[3]]
 
 
 def _norm(v: list[float]) -> float:
-    return math.sqrt(sum(x * x for x in v))
+    return math.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2] + v[3] * v[3])
 
 
-def _descend(P: list[float], b: list[float]) -> tuple[list[float], float, float]:
-    """Least h on P.b = 1 by damped Newton with a line search. Returns P, h(P) and |grad h - h b|."""
+def _dot(a: list[float], b: list[float]) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3]
+
+
+@dataclass(slots=True)
+class _Point:
+    """One trial of the descent: P, h(P), its Hessian, grad h - h b and the size of that."""
+
+    P: list[float]
+    h: float
+    hess: list[float]
+    residual: list[float]
+    size: float
+
+
+def _evaluate(P: list[float], b: list[float]) -> _Point:
     h, grad, hess = support(*P)
-    residual = _norm([g - h * v for g, v in zip(grad, b, strict=True)])
+    residual = [grad[0] - h * b[0], grad[1] - h * b[1], grad[2] - h * b[2], grad[3] - h * b[3]]
+    return _Point(P, h, hess, residual, _norm(residual))
+
+
+def _descend(P: list[float], b: list[float], tolerance: float) -> _Point:
+    """Least h on P.b = 1 by damped Newton with a line search, down to |grad h - h b| <= tolerance."""
+    now = _evaluate(P, b)
     for _ in range(MAX_NEWTON):
-        if residual <= 1e-15 + 4e-16 * h:
+        if now.size <= tolerance + 4e-16 * now.h:
             break
-        trace = hess[0] + hess[2] + hess[6] + hess[8]
-        step = _newton_step(grad, hess, b, 1e-3 * min(residual, 1.0) * trace + 1e-14 * trace)
-        size = min(1.0, 2.0 * _norm(P) / max(_norm(step), _FLOOR))
-        slope = sum(g * v for g, v in zip(grad, step, strict=True))
-        best = None
-        for _ in range(30):
-            trial = [p + size * v for p, v in zip(P, step, strict=True)]
-            h_new, grad_new, hess_new = support(*trial)
-            residual_new = _norm([g - h_new * v for g, v in zip(grad_new, b, strict=True)])
-            if h_new <= h + 1e-4 * size * slope or (h_new <= h * (1 + 1e-15) and residual_new < residual):
-                best = (trial, h_new, grad_new, hess_new, residual_new)
-                break
-            size *= 0.5
-        if best is None or (best[4] >= residual and residual < 1e-13):
+        trace = now.hess[0] + now.hess[2] + now.hess[6] + now.hess[8]
+        damping = 1e-3 * min(now.size, 1.0) * trace + 1e-14 * trace
+        better = _search(now, _newton_step(now.residual, now.hess, now.P, b, damping), b)
+        if better is None or (better.size >= now.size and now.size < 1e-13):
             break
-        P, h, grad, hess, residual = best
-    return P, h, residual
+        now = better
+    return now
 
 
-def touch(b0: Array, b1: Array, warm: tuple[Array, Array] | None = None) -> Touch:
-    """Where the ray through (b0, b1) leaves K. (3,), (3,) -> Touch; ``warm`` is a normal found nearby."""
+def _search(now: _Point, step: list[float], b: list[float]) -> _Point | None:
+    """The first point along the step that lowers h enough (Armijo), or the residual where h is at its floor."""
+    size = min(1.0, 2.0 * _norm(now.P) / max(_norm(step), _FLOOR))
+    slope = _dot(now.residual, step)  # that of h: b.step is 0
+    P = now.P
+    for _ in range(30):
+        trial = [P[0] + size * step[0], P[1] + size * step[1], P[2] + size * step[2], P[3] + size * step[3]]
+        point = _evaluate(trial, b)
+        falls = point.h <= now.h + 1e-4 * size * slope
+        if falls or (point.h <= now.h * (1.0 + 1e-15) and point.size < now.size):
+            return point
+        size *= 0.5
+    return None
+
+
+def touch(b0: Array, b1: Array, warm: tuple[Array, Array] | None = None, tolerance: float = 1e-15) -> Touch:
+    """Where the ray through (b0, b1) leaves K. (3,), (3,) -> Touch.
+
+    Args:
+        b0: (3,) first moment.
+        b1: (3,) second moment; not both are zero.
+        warm: a normal found nearby.
+        tolerance: on the residual; a gauge found too early is too small, by the square of the residual.
+    """
     size = math.sqrt(float(b0 @ b0 + b1 @ b1))
-    e0, e1 = _plane(b0 / size, b1 / size)
-    b = [float(v) / size for v in (b0 @ e0, b0 @ e1, b1 @ e0, b1 @ e1)]
+    plane = _plane(b0 / size, b1 / size)
+    b = _in_plane(b0 / size, b1 / size, plane)
     start = [4 * b[0] - 2 * b[2], 4 * b[1] - 2 * b[3], 4 * b[2] - 2 * b[0], 4 * b[3] - 2 * b[1]]  # least int |w|^2
     if warm is not None:
-        start = [float(v) for v in (warm[0] @ e0, warm[0] @ e1, warm[1] @ e0, warm[1] @ e1)]
-    along = sum(p * v for p, v in zip(start, b, strict=True))
-    P, h, residual = _descend([p / along for p in start], b)
-    return Touch((P[0] * e0 + P[1] * e1) / h, (P[2] * e0 + P[3] * e1) / h, size / h, residual)
+        tried = _in_plane(*warm, plane)
+        start = tried if _dot(tried, b) > 0.0 else start
+    along = _dot(start, b)
+    end = _descend([p / along for p in start], b, tolerance)
+    p0x, p0y, p1x, p1y = (p / end.h for p in end.P)
+    return Touch(plane.T @ (p0x, p0y), plane.T @ (p1x, p1y), size / end.h, end.size)
 
 
-def _plane(b0: Array, b1: Array) -> tuple[Array, Array]:
-    """Two orthonormal (3,) vectors that span b0 and b1, also where these are parallel or one is zero."""
+def _in_plane(b0: Array, b1: Array, plane: Array) -> list[float]:
+    return [*(plane @ b0).tolist(), *(plane @ b1).tolist()]
+
+
+def _plane(b0: Array, b1: Array) -> Array:
+    """(2, 3) orthonormal rows that span b0 and b1, also where these are parallel or one is zero."""
     first, second = (b0, b1) if b0 @ b0 >= b1 @ b1 else (b1, b0)
     e0 = first / math.sqrt(float(first @ first))
     across = second - (second @ e0) * e0
@@ -189,7 +244,7 @@ def _plane(b0: Array, b1: Array) -> tuple[Array, Array]:
         across = np.eye(3)[int(np.argmin(np.abs(e0)))]
         across = across - (across @ e0) * e0
         norm = math.sqrt(float(across @ across))
-    return e0, across / norm
+    return np.array((e0, across / norm))
 
 
 def integrals(P0: Array, P1: Array) -> tuple[Array, Array]:
@@ -203,7 +258,7 @@ def integrals(P0: Array, P1: Array) -> tuple[Array, Array]:
     length = np.linalg.norm(D, axis=1)
     still = length < SMALL_TURN * (r0 + r1)
     safe = np.where(still, 1.0, length)
-    dot, cross = np.sum(P0 * P1, axis=1), np.cross(P0, P1)
+    dot, cross = np.sum(P0 * P1, axis=1), _cross(P0, P1)
     opposed = 2.0 * np.sum(cross * cross, axis=1) / np.maximum(r0 * r1 - dot, _FLOOR)
     gap = np.maximum(np.where(dot > 0.0, 2.0 * (r0 * r1 + dot), opposed), _FLOOR)
     j0 = np.log(np.maximum((r0 + r1 + length) ** 2, _FLOOR) / gap) / safe
@@ -219,6 +274,10 @@ def integrals(P0: Array, P1: Array) -> tuple[Array, Array]:
     if still.any():
         first[still], second[still] = _gauss_integrals(P0[still], P1[still])
     return first, second
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return a[:, (1, 2, 0)] * b[:, (2, 0, 1)] - a[:, (2, 0, 1)] * b[:, (1, 2, 0)]
 
 
 def _gauss_integrals(P0: Array, P1: Array) -> tuple[Array, Array]:

@@ -9,7 +9,7 @@ touches a* to first order and the steps end quadratically at the first root, fro
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from avsreplay.records import Plan, PlanStatus, Trajectory
 __all__ = ["PlanParams", "rendezvous"]
 
 MAX_STEPS = 400
+STRETCH_S = 30.0  # the goal is sampled this far at a time: most captures need no more
 RESIDUAL_LIMIT = 1e-8  # terminal errors above this, in metres or metres a second, are not a solution
 
 
@@ -33,7 +34,7 @@ class PlanParams:
     horizon_s: float = 120.0  # latest capture looked for, after the instant of planning
     latency_s: float = 0.0  # the robot coasts for this long before the plan's thrust begins
     replan_period_s: float = 1.0  # a new plan is made at the first scan this long after the last one
-    grid_s: float = 0.1  # spacing of the samples of the goal
+    grid_s: float = 0.2  # spacing of the samples of the goal
     robot_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # end-effector in {A} when planning
     robot_velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)  # its velocity in {A}
 
@@ -83,21 +84,18 @@ def rendezvous(goal: Trajectory, r0: Array, v0: Array, params: PlanParams | None
     """
     params = params or PlanParams()
     r0, v0 = _finite("r0", r0), _finite("v0", v0)
-    sampled = sample(goal, r0, v0, params.latency_s, params.horizon_s, params.grid_s)
-    search = _first_feasible(sampled, params.a_max_mps2)
+    search, sampled = _first_feasible(goal, r0, v0, params)
     if search.reached and search.normal is None:
         here = np.array([1.0, 0.0, 0.0])  # nothing to make good: no thrust time, so its direction does not matter
-        flight = Flight(
-            r0, v0, params.a_max_mps2, params.latency_s, params.latency_s, np.concatenate([0.0 * here, here])
+        wait = params.latency_s
+        return _grade(
+            Flight(r0, v0, params.a_max_mps2, wait, wait, np.concatenate([0.0 * here, here])), goal, t_ns, search
         )
-        return _grade(flight, goal, t_ns, search)
     if not search.reached or search.normal is None:
-        ended = search.t >= sampled.times[-1]
-        status = PlanStatus.INFEASIBLE if ended else PlanStatus.NO_CONVERGENCE
-        return _no_plan(t_ns, status, params, search)
-    t, found = _polish(goal, r0, v0, params, sampled, search)
+        return _no_plan(t_ns, params, search)
+    t, found, bound = _polish(goal, r0, v0, params, sampled, search, search.normal)
     flight = Flight.from_normal(r0, v0, params.a_max_mps2, params.latency_s, t, found.P0, found.P1)
-    return _grade(flight, goal, t_ns, search)
+    return _grade(flight, goal, t_ns, replace(search, t=bound))
 
 
 def _finite(name: str, value: Array) -> Array:
@@ -107,7 +105,9 @@ def _finite(name: str, value: Array) -> Array:
     return array
 
 
-def _no_plan(t_ns: int, status: PlanStatus, params: PlanParams, search: _Search) -> Plan:
+def _no_plan(t_ns: int, params: PlanParams, search: _Search) -> Plan:
+    ended = search.t >= params.horizon_s - params.latency_s
+    status = PlanStatus.INFEASIBLE if ended else PlanStatus.NO_CONVERGENCE
     nan, bound = math.nan, params.latency_s + search.t
     return Plan(t_ns, status, nan, np.full(6, nan), params.a_max_mps2, bound, nan, nan, nan, {"steps": search.steps})
 
@@ -132,77 +132,121 @@ def _grade(flight: Flight, goal: Trajectory, t_ns: int, search: _Search) -> Plan
     )
 
 
-def _first_feasible(goal: SampledGoal, a_max: float) -> _Search:
-    """Step from one certified bound to the next until thrust just suffices."""
-    end, t = float(goal.times[-1]), _first_bound(goal, a_max)
-    if t is None:
-        return _Search(0.0, True, None, 0)
-    found: Touch | None = None
-    for count in range(MAX_STEPS):
-        if t >= end:
-            return _Search(end, False, None, count)
+def _first_feasible(goal: Trajectory, r0: Array, v0: Array, params: PlanParams) -> tuple[_Search, SampledGoal]:
+    """Step from one certified bound to the next, stretch by stretch, until thrust just suffices."""
+    end, t, found = params.horizon_s - params.latency_s, 0.0, None
+    begin, steps = 0.0, 0
+    while True:
+        stretch = min(begin + STRETCH_S, end)
+        sampled = sample(goal, r0, v0, params.latency_s, begin, stretch, params.grid_s)
+        if begin == 0.0:
+            if _met(sampled):
+                return _Search(0.0, True, None, 0), sampled
+            t = _first_bound(sampled, params.a_max_mps2)
+        search = _search_stretch(sampled, params.a_max_mps2, t, found, steps)
+        if search.reached or search.steps >= MAX_STEPS or stretch >= end:
+            return search, sampled
+        t, found, steps, begin = search.t, search.normal, search.steps, stretch
+
+
+def _search_stretch(goal: SampledGoal, a_max: float, t: float, found: Touch | None, steps: int) -> _Search:
+    """Certified steps within one stretch of samples, from thrust time t on."""
+    excess = 1.0
+    for count in range(steps, MAX_STEPS):
+        if t >= goal.end:
+            return _Search(goal.end, False, found, count)
         dr, dv, ddv = goal.at(t)
-        found = touch(dr, t * dv - dr, (found.P0, found.P1) if found else None)
+        # a rough normal is as good a certificate while far from the root; G's error is the square of the residual
+        tolerance = max(1e-15, 1e-2 * min(excess * excess, 1.0))
+        found = touch(dr, t * dv - dr, (found.P0, found.P1) if found else None, tolerance)
         margin = found.gauge - a_max * t * t  # G(t), with h(P) = 1
-        if margin <= 1e-12 * a_max * t * t:
-            return _Search(t, True, found, count)
-        t_new = _step(goal, found, t, margin, ddv, dv, a_max)
+        ahead = _Ahead.of(found, t, dv, ddv, a_max)
+        if margin <= 1e-12 * found.gauge:
+            if tolerance <= 1e-15:
+                return _Search(ahead.before(goal, t), True, found, count)
+            excess = 0.0
+            continue
+        excess = margin / found.gauge
+        t_new = ahead.step(goal, found, t, margin, a_max)
         if t_new - t <= 1e-10 * t:
-            return _Search(t, True, found, count)
+            return _Search(ahead.before(goal, t), True, found, count)
         t = t_new
-    return _Search(t, False, None, MAX_STEPS)
+    return _Search(t, False, found, MAX_STEPS)
 
 
-def _first_bound(goal: SampledGoal, a_max: float) -> float | None:
-    """A time before which neither the distance nor the speed can be made good; None where there is nothing to do."""
+def _met(goal: SampledGoal) -> bool:
+    """Is there nothing to make good at the start?"""
+    return float(np.linalg.norm(goal.dr[0])) <= RESIDUAL_LIMIT and float(np.linalg.norm(goal.dv[0])) <= RESIDUAL_LIMIT
+
+
+def _first_bound(goal: SampledGoal, a_max: float) -> float:
+    """A time before which the distance or the speed cannot be made good."""
     distance, speed = float(np.linalg.norm(goal.dr[0])), float(np.linalg.norm(goal.dv[0]))
-    if distance <= RESIDUAL_LIMIT and speed <= RESIDUAL_LIMIT:
-        return None
     pull = a_max + goal.acceleration
     by_distance = 2.0 * distance / (speed + math.sqrt(speed * speed + 2.0 * pull * distance))
-    return max(by_distance, speed / pull)
+    return min(max(by_distance, speed / pull), goal.end)
 
 
-def _step(goal: SampledGoal, found: Touch, t: float, margin: float, ddv: Array, dv: Array, a_max: float) -> float:
-    """The latest instant up to which G of this normal is certainly positive."""
-    across = found.P0 - found.P1
-    n0, n1 = float(np.linalg.norm(across)), float(np.linalg.norm(found.P1))
-    slope = float(across @ dv + found.P1 @ (dv + t * ddv)) - 2.0 * a_max * t
-    reach = t
-    first = int(t / goal.step) + 1
-    if first < len(goal.times):
+@dataclass(frozen=True, slots=True)
+class _Ahead:
+    """G of one normal seen from t: |P0 - P1|, |P1|, and dG/dt."""
+
+    n0: float
+    n1: float
+    slope: float
+
+    @classmethod
+    def of(cls, found: Touch, t: float, dv: Array, ddv: Array, a_max: float) -> _Ahead:
+        across = found.P0 - found.P1
+        slope = float(across @ dv + found.P1 @ (dv + t * ddv)) - 2.0 * a_max * t
+        return cls(math.sqrt(float(across @ across)), math.sqrt(float(found.P1 @ found.P1)), slope)
+
+    def before(self, goal: SampledGoal, t: float) -> float:
+        """The bound t, taken back by what interpolating the goal may have moved the root."""
+        return max(t - goal.blur(self.n0, self.n1, t) / max(-self.slope, 1e-9), 0.0)
+
+    def joined(self, goal: SampledGoal, t: float, margin: float, bound: float, a_max: float) -> float:
+        """The bound moved up to the root t where G, falling through it, is positive all the way back to ``bound``."""
+        bend = float(goal.curvature(self.n0, self.n1, t)) + 2.0 * a_max
+        if self.slope < 0.0 and t - bound < -self.slope / bend:
+            return max(bound, t - 2.0 * margin / -self.slope)
+        return bound
+
+    def step(self, goal: SampledGoal, found: Touch, t: float, margin: float, a_max: float) -> float:
+        """The latest instant up to which G is certainly positive: by nodes and sag, or by Taylor within a cell."""
+        sag = 0.125 * goal.step**2
+        near = float(goal.curvature(self.n0, self.n1, t + goal.step)) + 2.0 * a_max
+        taylor = 2.0 * margin / (math.sqrt(self.slope * self.slope + 2.0 * near * margin) - self.slope)
+        reach = t + min(taylor, goal.step)
+        first = int((t - goal.begin) / goal.step) + 1
+        if first >= len(goal.times) or margin <= near * sag:
+            return reach
         times = goal.times[first:]
-        bend = goal.curvature(n0, n1, times + goal.step) + 2.0 * a_max  # of the cell after each node
-        values = goal.dr[first:] @ across + times * (goal.dv[first:] @ found.P1) - a_max * times**2
-        positive = values > bend * (0.125 * goal.step**2)
-        stop = int(np.argmin(positive)) if not positive.all() else len(positive)
-        # every cell before node ``stop`` has both ends above the sag between nodes; t itself ends the first one
-        if stop > 0 and margin > bend[0] * 0.125 * goal.step**2:
-            reach = float(times[stop - 1])
-    near = float(goal.curvature(n0, n1, np.array(t + goal.step))) + 2.0 * a_max
-    taylor = 2.0 * margin / (math.sqrt(slope * slope + 2.0 * near * margin) - slope)
-    return max(reach, t + min(taylor, goal.step))
+        bend = goal.curvature(self.n0, self.n1, times + goal.step) + 2.0 * a_max  # of the cell after each node
+        along = goal.dr[first:] @ (found.P0 - found.P1) + times * (goal.dv[first:] @ found.P1)
+        positive = along - a_max * times * times > sag * bend
+        stop = int(positive.argmin())
+        if positive[stop]:
+            return goal.end
+        return max(reach, float(times[stop - 1])) if stop > 0 else reach
 
 
 def _polish(
-    goal: Trajectory, r0: Array, v0: Array, params: PlanParams, sampled: SampledGoal, search: _Search
-) -> tuple[float, Touch]:
-    """Newton on G(t) = 0 with the goal itself in place of its interpolation."""
-    t, found = search.t, search.normal
-    if found is None:
-        raise ValueError("there is no normal to polish")
-    best: tuple[float, float, Touch] | None = None
+    goal: Trajectory, r0: Array, v0: Array, params: PlanParams, sampled: SampledGoal, search: _Search, found: Touch
+) -> tuple[float, Touch, float]:
+    """Newton on G(t) = 0 with the goal itself in place of its interpolation. Returns t, the normal and the bound."""
+    t, a_max = search.t, params.a_max_mps2
+    best = (math.inf, t, found, search.t)
     for _ in range(6):
         rho, rate = goal(np.array([params.latency_s + t]))
         dv = rate[0] - v0
         dr = rho[0] - r0 - v0 * (params.latency_s + t)
         found = touch(dr, t * dv - dr, (found.P0, found.P1))
-        margin = found.gauge - params.a_max_mps2 * t * t
-        if best is None or abs(margin) < best[0]:
-            best = (abs(margin), t, found)
-        across = found.P0 - found.P1
-        slope = float(across @ dv + found.P1 @ (dv + t * sampled.at(t)[2])) - 2.0 * params.a_max_mps2 * t
-        if slope >= 0.0 or abs(margin) <= 4e-16 * found.gauge:
+        margin = found.gauge - a_max * t * t
+        ahead = _Ahead.of(found, t, dv, sampled.at(t)[2], a_max)
+        if abs(margin) < best[0]:
+            best = (abs(margin), t, found, ahead.joined(sampled, t, abs(margin), search.t, a_max))
+        if ahead.slope >= 0.0 or abs(margin) <= 1e-13 * found.gauge:
             break
-        t -= margin / slope
-    return (best[1], best[2]) if best else (t, found)
+        t -= margin / ahead.slope
+    return best[1:]
