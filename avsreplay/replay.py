@@ -1,0 +1,108 @@
+"""The path: one scan in, one row out. Read ``step`` and know the program.
+
+scan -> register -> innovation -> verdict (gamma) -> estimate -> monitors -> plan -> row; the predicted pose goes back
+to registration as its guess, the only loop.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+
+from avsreplay.config import Guess
+from avsreplay.estimate import Estimator, Prediction, Track
+from avsreplay.fill import Findings, row_of
+from avsreplay.geometry import Pose
+from avsreplay.mission import Mission, replan
+from avsreplay.monitor.faults import FaultDetector
+from avsreplay.plan import PlanParams
+from avsreplay.records import Alignment, AlignStatus, Innovation, Scan
+from avsreplay.register import Registrar
+from avsreplay.rows import Row
+from avsreplay.watch import Monitors, Watch, look
+
+__all__ = ["Memory", "Stages", "replay", "step"]
+
+_UNMEASURED = (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stages:
+    """The parts of the chain, ready. ``first_pose`` gives T_ac to begin with, from the first scan."""
+
+    registrar: Registrar
+    estimator: Estimator
+    detector: FaultDetector
+    monitors: Monitors
+    plan: PlanParams
+    guess: Guess
+    first_pose: Callable[[Scan], Pose]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Memory:
+    """What is carried from scan to scan.
+
+    Attributes:
+        watch: the monitors' memory.  mission: the plan in force.  track: the estimate, None before the first scan.
+        last: last healthy measured pose.  since_ns: instant of the first scan.
+    """
+
+    watch: Watch
+    mission: Mission
+    track: Track | None = None
+    last: Pose | None = None
+    since_ns: int = 0
+
+
+def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
+    """One scan through the whole chain. A scan that goes wrong still leaves a row."""
+    since_ns = scan.t_ns if memory.track is None else memory.since_ns
+    track = memory.track or stages.estimator.initial(scan.t_ns, stages.first_pose(scan))
+    prediction = stages.estimator.predict(track, scan.t_ns)
+    guess, origin = _guess(stages, memory, prediction)
+
+    alignment = stages.registrar.register(scan.points, guess)
+    seen = _innovate(stages.estimator, prediction, alignment)
+    verdict = stages.detector.judge(scan.status, alignment, seen, prediction.belief)
+    track = stages.estimator.update(track, prediction, seen, verdict.gamma)
+
+    watch, columns = look(stages.monitors, memory.watch, stages.estimator, prediction, seen, verdict.gamma, track)
+    converged = watch.convergence.converged
+    mission = replan(memory.mission, stages.plan, scan.t_ns, converged, stages.estimator.motion(track.belief))
+    row = row_of(
+        Findings(
+            scan=scan,
+            since_ns=since_ns,
+            guess=origin,
+            alignment=alignment,
+            verdict=verdict,
+            innovation=seen,
+            belief=track.belief,
+            estimator=track.mode,
+            plan=mission.plan,
+            converged=converged,
+            monitors=columns,
+        )
+    )
+    last = alignment.T_ac if verdict.gamma else memory.last
+    return Memory(watch, mission, track, last, since_ns), row
+
+
+def replay(stages: Stages, memory: Memory, scans: Iterable[Scan]) -> Iterator[tuple[Memory, Row]]:
+    """Fold ``step`` over the scans, one at a time: what is held is one scan, not one log."""
+    for scan in scans:
+        memory, row = step(stages, memory, scan)
+        yield memory, row
+
+
+def _guess(stages: Stages, memory: Memory, prediction: Prediction) -> tuple[Pose, str]:
+    if memory.track is None:
+        return prediction.belief.x.T_ac, "init"
+    if stages.guess is Guess.LAST and memory.last is not None:
+        return memory.last, "last"
+    return prediction.belief.x.T_ac, "predicted"
+
+
+def _innovate(estimator: Estimator, prediction: Prediction, alignment: Alignment) -> Innovation | None:
+    return None if alignment.status in _UNMEASURED else estimator.innovate(prediction, alignment)
