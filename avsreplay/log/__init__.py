@@ -1,6 +1,8 @@
 """The door for bytes: logs, bags and folders in; MCAP out."""
 
+from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions, TopicInfo
+from avsreplay.log.source import Source
 from avsreplay.log.surface import parse_surface, read_surface
 from avsreplay.log.writer import LogWriter
 
@@ -10,8 +12,10 @@ __all__ = [
     "LogInfo",
     "LogWriter",
     "Loss",
+    "Source",
     "SourceOptions",
     "TopicInfo",
+    "open_source",
     "parse_surface",
     "read_surface",
 ]

@@ -1,0 +1,161 @@
+"""``avsreplay info``: what a log or a folder holds, before anything is run on it."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from avsreplay.log import ClockSummary, LogInfo, Loss
+
+__all__ = ["command", "document", "loss_line"]
+
+
+@click.command(name="info")
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("--topic", help="The cloud topic, where there are several.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
+@click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message read.")
+def command(source: Path, topic: str | None, as_json: bool, max_message_mib: int) -> None:
+    """Show topics, types, counts, rates, time span, model, scenario and injected faults of SOURCE.
+
+    Exit code 4 where a part of it could not be read.
+    """
+    from avsreplay.errors import DataLost, UsageError
+    from avsreplay.log import SourceOptions, open_source
+
+    try:
+        options = SourceOptions(topic=topic, max_message_mib=max_message_mib)
+    except ValueError as error:
+        raise UsageError(str(error), where="--max-message-mib", hint="give a whole number of MiB") from None
+    with open_source(source, options) as opened:
+        info = opened.info()
+    if as_json:
+        click.echo(json.dumps(document(info), indent=2))
+    else:
+        _print(info)
+    if info.losses:
+        what = f"{len(info.losses)} part(s) could not be read"
+        raise DataLost(what, where=info.path, hint="avsreplay doctor says more")
+
+
+def document(info: LogInfo) -> dict[str, Any]:
+    """The JSON form: the fields of ``LogInfo``, topics with their rate."""
+    import dataclasses
+
+    out = dataclasses.asdict(info)
+    for table, topic in zip(out["topics"], info.topics, strict=True):
+        table["rate_hz"] = topic.rate_hz
+    out["span_s"] = info.span_s
+    keys = ("kind", "start_s", "end_s", "harmful")
+    out["faults"] = [dict(zip(keys, fault, strict=True)) for fault in info.faults]
+    return out
+
+
+def loss_line(loss: Loss) -> str:
+    """One loss in one line."""
+    from avsreplay.log.text import shown
+
+    parts = [f"{loss.file}: " if loss.file else "", loss.what, f" (byte {loss.offset}, {loss.bytes} bytes"]
+    if loss.chunks:
+        parts.append(f", {loss.chunks} chunk")
+    if loss.messages is not None:
+        parts.append(f", {loss.messages} messages")
+    if loss.start_ns is not None and loss.end_ns is not None:
+        parts.append(f", {(loss.end_ns - loss.start_ns) * 1e-9:.3f} s")
+    return shown("".join([*parts, ")"]))
+
+
+def _print(info: LogInfo) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from avsreplay.log.text import shown
+
+    console = Console(highlight=False, soft_wrap=True)
+    facts = Table.grid(padding=(0, 2))
+    for name, value in _facts(info):
+        facts.add_row(name, Text(shown(value)))
+    console.print(facts)
+    if info.topics:
+        console.print(_topics(info))
+    if info.faults:
+        console.print(_faults(info))
+    for loss in info.losses:
+        console.print(Text("lost: " + loss_line(loss)))
+
+
+def _facts(info: LogInfo) -> list[tuple[str, str]]:
+    span = "" if info.span_s is None else f"{info.span_s:.3f} s"
+    rows = [
+        ("file", info.path),
+        ("kind", ", ".join(filter(None, (info.kind, info.profile, info.library)))),
+        ("size", f"{info.bytes} bytes"),
+        ("log clock", " ".join(filter(None, (_instant(info.start_ns), "for", span))) if span else "-"),
+        ("scans", str(info.scans) + (f" on {info.cloud_topic}" if info.cloud_topic else "")),
+        ("model", _model(info)),
+        ("truth", "yes" if info.truth else "no"),
+        ("scenario", "yes" + ("" if info.seed is None else f", seed {info.seed}") if info.scenario else "no"),
+    ]
+    if info.clock is not None and info.scans:
+        rows.append(("clock", _clock(info.clock)))
+    return rows + [(name, value) for name, value in info.notes.items()]
+
+
+def _instant(t_ns: int | None) -> str:
+    if t_ns is None:
+        return "-"
+    if t_ns < 10**17:  # before 1973: a clock that started at zero, not a date
+        return f"from {t_ns * 1e-9:.3f} s"
+    return f"from {datetime.fromtimestamp(t_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
+
+
+def _model(info: LogInfo) -> str:
+    if info.model is None:
+        return "none (give --model)"
+    return f"{info.model}: {info.model_vertices} vertices, {info.model_faces} triangles, {info.model_extent_m:.3f} m"
+
+
+def _clock(clock: ClockSummary) -> str:
+    text = f"{clock.clock}; header minus log {clock.offset_s:+.3f} s; median period {clock.period_s:.4f} s"
+    counts = ("unset", "jumps", "equal", "back", "header_steps", "log_steps")
+    found = [f"{getattr(clock, name)} {name.replace('_', ' ')}" for name in counts if getattr(clock, name)]
+    return "; ".join([text, *found, *([clock.note] if clock.note else [])])
+
+
+def _topics(info: LogInfo) -> Any:
+    from rich.table import Table
+    from rich.text import Text
+
+    from avsreplay.log.text import shown
+
+    table = Table("topic", "type", "encoding", title="topics", title_justify="left")
+    for head in ("messages", "rate [Hz]", "span [s]"):
+        table.add_column(head, justify="right")
+    for topic in info.topics:
+        rate = "-" if topic.rate_hz is None else f"{topic.rate_hz:.3f}"
+        span = "-"
+        if topic.first_ns is not None and topic.last_ns is not None:
+            span = f"{(topic.last_ns - topic.first_ns) * 1e-9:.3f}"
+        words = (Text(shown(w)) for w in (topic.name, topic.type, topic.encoding))
+        table.add_row(*words, str(topic.count), rate, span)
+    return table
+
+
+def _faults(info: LogInfo) -> Any:
+    from rich.table import Table
+    from rich.text import Text
+
+    from avsreplay.log.text import shown
+
+    table = Table("fault", title="faults injected", title_justify="left")
+    for head in ("start [s]", "end [s]", "harmful"):
+        table.add_column(head, justify="right")
+    for kind, start, end, harmful in info.faults:
+        table.add_row(Text(shown(kind)), f"{start:.3f}", f"{end:.3f}", "yes" if harmful else "no")
+    return table

@@ -1,0 +1,427 @@
+"""Reading of MCAP: one linear pass that checks every checksum and finds its way again past damage.
+
+The pass needs no index and no summary: it takes what is intact, lists what is not, counts topics, keeps where each
+cloud is and hands truth to its sinks. Clouds are then read by place. The summary, where it is whole, serves to know
+channels whose first chunk is lost and messages that nothing else tells of.
+"""
+
+from __future__ import annotations
+
+import os
+import zlib
+from array import array
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from avsreplay.errors import UnreadableInput
+from avsreplay.log import mcap_records as mcap
+from avsreplay.log.cursor import BadMessage, Cursor
+from avsreplay.log.inflate import inflate
+from avsreplay.log.mcap_records import Channel, ChunkHead, Fields
+from avsreplay.log.options import Loss, TopicInfo
+from avsreplay.log.recording import CLOUD_TYPES, CloudIndex, Sink, TopicCount, canonical_type
+from avsreplay.log.text import shown
+
+__all__ = ["McapFile"]
+
+_COMPRESSIONS = ("", "zstd", "lz4")
+_MODELS = (".ply", ".stl", ".obj", ".off", ".glb")
+_WINDOW = 1 << 20
+_MAX_CANDIDATES = 1_000_000
+
+
+class McapFile:
+    """One MCAP file, surveyed; a Recording.
+
+    Args:
+        path: the file.  limit: most bytes a message, chunk or attachment may take.
+        sinks: who takes the messages of a topic while the survey passes over them.
+
+    Raises:
+        UnreadableInput: not there, empty, or not MCAP.
+    """
+
+    kind = "mcap"
+
+    def __init__(self, path: Path, limit: int, sinks: Mapping[str, Sink] | None = None) -> None:
+        self.path, self.losses = path, list[Loss]()
+        self.metadata: dict[str, dict[str, str]] = {}
+        self.profile = self.library = ""
+        self.closed_properly = False
+        self._limit, self._sinks = limit, dict(sinks or {})
+        self._channels: dict[int, Channel] = {}
+        self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        self._topics: dict[str, TopicCount] = {}
+        self._clouds: dict[str, CloudIndex] = {}
+        self._chunks = tuple(array("q") for _ in range(4))  # data offset, data size, compression, inflated size
+        self._cache: dict[int, bytes] = {}
+        self._model: tuple[str, int, int] | None = None
+        self._bad_chunk: Loss | None = None
+        self._orphans = self._seen = 0
+        self._file = _opened(path)
+        try:
+            self._size = os.fstat(self._file).st_size
+            self._survey()
+        except BaseException:
+            os.close(self._file)
+            raise
+
+    def topics(self) -> list[TopicInfo]:
+        """Every topic that has a message or a channel, by name."""
+        return sorted((count.info() for count in self._topics.values()), key=lambda t: t.name)
+
+    def channels(self) -> dict[int, Channel]:
+        """Channels by id."""
+        return dict(self._channels)
+
+    def clouds(self, topic: str) -> CloudIndex:
+        """The index of a cloud topic."""
+        return self._clouds.get(topic, CloudIndex())
+
+    def encoding(self, topic: str) -> str:
+        """The message encoding of a topic."""
+        return self._topics[topic].encoding
+
+    def read(self, topic: str, place: int) -> bytes | memoryview:
+        """The payload of a cloud. Raises BadMessage where it cannot be had."""
+        index = self._clouds[topic]
+        chunk, offset, size = index.container[place], index.offset[place], index.size[place]
+        if chunk < 0:
+            return self._bytes(offset, size)
+        return memoryview(self._chunk(chunk))[offset : offset + size]
+
+    def attachment(self) -> tuple[str, bytes] | None:
+        """The model the file carries: the first attachment that is a mesh file."""
+        if self._model is None:
+            return None
+        name, offset, size = self._model
+        return name, self._bytes(offset, size)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        if self._file >= 0:
+            os.close(self._file)
+            self._file = -1
+
+    def _bytes(self, offset: int, size: int) -> bytes:
+        data = os.pread(self._file, size, offset)
+        while 0 < len(data) < size:
+            more = os.pread(self._file, size - len(data), offset + len(data))
+            if not more:
+                break
+            data += more
+        if len(data) < size:
+            raise BadMessage("the file became shorter while it was read")
+        return data
+
+    def _chunk(self, number: int) -> bytes:
+        if number not in self._cache:
+            if len(self._cache) > 1:
+                self._cache.pop(next(iter(self._cache)))
+            offset, size, compression, inflated = (column[number] for column in self._chunks)
+            self._cache[number] = inflate(self._bytes(offset, size), _COMPRESSIONS[compression], inflated)
+        return self._cache[number]
+
+    def _survey(self) -> None:
+        if self._size == 0:
+            raise UnreadableInput("the file is empty", where=shown(self.path), hint="record it again")
+        if self._size < 8 or self._bytes(0, 8) != mcap.MAGIC:
+            raise UnreadableInput(
+                "not an MCAP file", where=shown(self.path), hint="give an MCAP, a ROS bag or a folder"
+            )
+        summary = _Summary.read(self)
+        self._adopt(summary)
+        at = 8
+        while at < self._size and not self.closed_properly:
+            at = self._step(at, summary)
+        self._settle()
+        if not self.closed_properly:
+            self._lose(Loss("the file was not closed: what its recorder still held is lost", self._size, 0))
+        self._account(summary)
+
+    def _step(self, at: int, summary: _Summary) -> int:
+        """Take one record and return where the next one begins."""
+        if at + 9 > self._size:
+            return self._cut(at)
+        head = self._bytes(at, 9)
+        opcode, length = head[0], int.from_bytes(head[1:], "little")
+        end = at + 9 + length
+        if opcode != mcap.MESSAGE_INDEX:
+            self._settle()
+        try:
+            if end > self._size or (summary.start and end > summary.start):
+                raise BadMessage("a record ends past the file")
+            self._take(opcode, at, end)
+        except BadMessage as error:
+            return self._resync(at, summary, str(error))
+        return end
+
+    def _cut(self, at: int) -> int:
+        self._lose(Loss("the file is cut inside a record", at, self._size - at))
+        return self._size
+
+    def _take(self, opcode: int, at: int, end: int) -> None:
+        handler = _HANDLERS.get(opcode)
+        if handler is not None:
+            handler(self, at, end)
+        elif opcode < 0x80:
+            raise BadMessage(f"a record of unknown kind 0x{opcode:02x}")
+        elif end - at >= 49 and self._is_chunk(at):
+            raise BadMessage("a chunk whose kind is damaged")
+
+    def _is_chunk(self, at: int) -> bool:
+        try:
+            mcap.chunk_head(b"\x06" + self._bytes(at + 1, min(mcap.CHUNK_PREFIX, self._size - at) - 1))
+        except BadMessage:
+            return False
+        return True
+
+    def _content(self, at: int, end: int) -> Fields:
+        if end - at > self._limit:
+            raise BadMessage(f"a record of {end - at} bytes is over the limit of {self._limit}")
+        return Fields(memoryview(self._bytes(at + 9, end - at - 9)))
+
+    def _take_header(self, at: int, end: int) -> None:
+        fields = self._content(at, end)
+        self.profile, self.library = fields.text(), fields.text()
+
+    def _take_schema(self, at: int, end: int) -> None:
+        self._schema(self._content(at, end))
+
+    def _take_channel(self, at: int, end: int) -> None:
+        self._channel(self._content(at, end))
+
+    def _take_metadata(self, at: int, end: int) -> None:
+        fields = self._content(at, end)
+        self.metadata.setdefault(fields.text(), fields.mapping())
+
+    def _take_message(self, at: int, end: int) -> None:
+        if end - at < 31:
+            raise BadMessage("a message shorter than its head")
+        payload = self._content(at, end).view
+        self._message(payload, 0, len(payload), -1, at + 9)
+
+    def _take_message_index(self, at: int, end: int) -> None:
+        if self._bad_chunk is None:
+            return
+        count = (end - at - 15) // 16
+        self._bad_chunk = replace(self._bad_chunk, messages=(self._bad_chunk.messages or 0) + max(count, 0))
+
+    def _take_attachment(self, at: int, end: int) -> None:
+        fields = self._content(at, end)
+        fields.take(16)
+        name, _ = fields.text(), fields.text()
+        size = fields.number(8)
+        start = at + 9 + fields.at
+        fields.take(size)
+        checked = fields.view[: fields.at]
+        crc = fields.number(4)
+        if crc and zlib.crc32(checked) != crc:
+            self._lose(Loss(f"the checksum of attachment '{shown(name)}' does not hold", at, end - at))
+        elif self._model is None and name.lower().endswith(_MODELS):
+            self._model = (name, start, size)
+
+    def _take_data_end(self, at: int, end: int) -> None:
+        if end - at != 13:
+            raise BadMessage("the end of data is malformed")
+        self.closed_properly = True
+
+    def _take_chunk(self, at: int, end: int) -> None:
+        head = mcap.chunk_head(self._bytes(at, min(mcap.CHUNK_PREFIX, end - at)), end - at)
+        try:
+            data = self._inflated(at, head)
+            walked = [(op, b, e) for op, b, e in mcap.records(memoryview(data))]
+        except BadMessage as error:
+            span = {"start_ns": min(head.start_ns, 2**63 - 1), "end_ns": min(head.end_ns, 2**63 - 1)}
+            self._bad_chunk = Loss(str(error), at, end - at, chunks=1, **span)
+            return
+        number = len(self._chunks[0])
+        for column, value in zip(
+            self._chunks,
+            (at + head.data_at, head.data_size, _COMPRESSIONS.index(head.compression), head.size),
+            strict=True,
+        ):
+            column.append(value)
+        view = memoryview(data)
+        for opcode, begin, stop in walked:
+            if opcode == mcap.MESSAGE:
+                self._message(view, begin, stop, number, begin)
+            elif opcode == mcap.SCHEMA:
+                self._schema(Fields(view[begin:stop]))
+            elif opcode == mcap.CHANNEL:
+                self._channel(Fields(view[begin:stop]))
+
+    def _inflated(self, at: int, head: ChunkHead) -> bytes:
+        if max(head.size, head.data_size) > self._limit:
+            raise BadMessage(f"a chunk of {head.size} bytes is over the limit of {self._limit}")
+        data = inflate(self._bytes(at + head.data_at, head.data_size), head.compression, head.size)
+        if head.crc and zlib.crc32(data) != head.crc:
+            raise BadMessage("the checksum of a chunk does not hold")
+        return data
+
+    def _schema(self, fields: Fields) -> None:
+        number, name, encoding = fields.number(2), fields.text(), fields.text()
+        self._schemas.setdefault(number, (name, encoding, bytes(fields.take(fields.number(4)))))
+
+    def _channel(self, fields: Fields) -> None:
+        number, schema = fields.number(2), fields.number(2)
+        topic, encoding = fields.text(), fields.text()
+        name, schema_encoding, text = self._schemas.get(schema, ("", "", b""))
+        channel = Channel(number, topic, canonical_type(name), encoding, schema_encoding, text)
+        if number in self._channels:
+            return
+        self._channels[number] = channel
+        self._topics.setdefault(topic, TopicCount(topic, channel.type, encoding))
+
+    def _message(self, view: memoryview, begin: int, end: int, container: int, offset: int) -> None:
+        if end - begin < 22:
+            raise BadMessage("a message shorter than its head")
+        channel_id = view[begin] | view[begin + 1] << 8
+        channel = self._channels.get(channel_id)
+        self._seen += 1
+        if channel is None:
+            self._orphans += 1
+            return
+        log_ns = min(int.from_bytes(view[begin + 6 : begin + 14], "little"), 2**63 - 1)
+        self._topics[channel.topic].saw(log_ns)
+        if channel.type in CLOUD_TYPES:
+            clocks = (log_ns, int.from_bytes(view[begin + 14 : begin + 22], "little"), _stamp(view[begin + 22 : end]))
+            index = self._clouds.setdefault(channel.topic, CloudIndex())
+            index.add(clocks, container, offset + 22, end - begin - 22)
+        if channel.topic in self._sinks:
+            self._sinks[channel.topic](channel.type, channel.encoding, log_ns, view[begin + 22 : end])
+
+    def _lose(self, loss: Loss) -> None:
+        self.losses.append(replace(loss, file=self.path.name))
+
+    def _settle(self) -> None:
+        """A bad chunk is put on the list once the index records behind it have told its messages."""
+        if self._bad_chunk is not None:
+            self._lose(self._bad_chunk)
+            self._bad_chunk = None
+
+    def _resync(self, at: int, summary: _Summary, why: str) -> int:
+        """The next place after ``at`` where the file makes sense again."""
+        stop = summary.start - 13 if summary.start else self._size
+        found = self._next_chunk(at + 1, stop)
+        resume = found if found is not None else max(stop, at + 1)
+        self._lose(Loss(why, at, resume - at))
+        return resume
+
+    def _next_chunk(self, at: int, stop: int) -> int | None:
+        tried = 0
+        while at < stop:
+            window = self._bytes(at, min(_WINDOW + 64, self._size - at))
+            for place in mcap.chunk_candidates(window):
+                tried += 1
+                if tried > _MAX_CANDIDATES:
+                    return None
+                if at + place < stop and self._plausible(at + place, stop):
+                    return at + place
+            at += _WINDOW
+        return None
+
+    def _plausible(self, at: int, stop: int) -> bool:
+        try:
+            mcap.chunk_head(self._bytes(at, min(mcap.CHUNK_PREFIX, self._size - at)), stop - at)
+        except BadMessage:
+            return False
+        return True
+
+    def _adopt(self, summary: _Summary) -> None:
+        """Channels from a whole summary, in case the chunk that defines them is lost."""
+        for opcode, fields in summary.definitions:
+            (self._schema if opcode == mcap.SCHEMA else self._channel)(fields)
+
+    def _account(self, summary: _Summary) -> None:
+        """Messages that the summary counts and nothing else tells of."""
+        if self._orphans:
+            self._lose(Loss("messages of a channel whose definition is lost", 0, 0, messages=self._orphans))
+        known = self._seen + sum(loss.messages or 0 for loss in self.losses if loss.chunks)
+        blind = [loss for loss in self.losses if loss.bytes and loss.messages is None]
+        missing = 0 if summary.messages is None else summary.messages - known
+        if missing > 0 and len(blind) == 1:
+            self.losses[self.losses.index(blind[0])] = replace(blind[0], messages=missing)
+        elif missing > 0:
+            self._lose(Loss("messages that the summary counts and the file does not hold", 0, 0, messages=missing))
+
+
+class _Summary:
+    """What the end of a file tells, where it is whole.
+
+    Attributes:
+        start: where the summary begins, 0 where there is none to trust.  messages: how many the file holds.
+        definitions: its schemas and channels.
+    """
+
+    def __init__(self) -> None:
+        self.start = 0
+        self.messages: int | None = None
+        self.definitions: list[tuple[int, Fields]] = []
+
+    @classmethod
+    def read(cls, file: McapFile) -> _Summary:
+        """From the footer; an empty one where the footer or its checksum does not hold."""
+        out = cls()
+        try:
+            out._parse(file)
+        except BadMessage:
+            return cls()
+        return out
+
+    def _parse(self, file: McapFile) -> None:
+        size = file._size
+        if size < 8 + 29 + 8:
+            return
+        tail = file._bytes(size - 37, 37)
+        start = int.from_bytes(tail[9:17], "little")
+        if tail[29:] != mcap.MAGIC or tail[:9] != b"\x02\x14\0\0\0\0\0\0\0":
+            return
+        if start == 0:
+            return
+        if not 8 < start <= size - 37 or size - start > file._limit:
+            return
+        data = file._bytes(start, size - 37 - start + 25)
+        crc = int.from_bytes(tail[25:29], "little")
+        if crc and zlib.crc32(data) != crc:
+            return
+        self._walk(memoryview(data)[: len(data) - 25])
+        self.start = start
+
+    def _walk(self, view: memoryview) -> None:
+        for opcode, begin, end in mcap.records(view):
+            if opcode in (mcap.SCHEMA, mcap.CHANNEL):
+                self.definitions.append((opcode, Fields(view[begin:end])))
+            elif opcode == mcap.STATISTICS:
+                self.messages = Fields(view[begin:end]).number(8)
+
+
+def _opened(path: Path) -> int:
+    try:
+        return os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        raise UnreadableInput("no such file", where=shown(path), hint="check the path") from None
+    except OSError as error:
+        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+
+
+def _stamp(payload: memoryview) -> int:
+    """The header stamp of a CDR message, 0 where it is too short to have one."""
+    try:
+        return Cursor(payload).stamp()
+    except BadMessage:
+        return 0
+
+
+_HANDLERS: dict[int, Callable[[McapFile, int, int], None]] = {
+    mcap.HEADER: McapFile._take_header,
+    mcap.SCHEMA: McapFile._take_schema,
+    mcap.CHANNEL: McapFile._take_channel,
+    mcap.MESSAGE: McapFile._take_message,
+    mcap.CHUNK: McapFile._take_chunk,
+    mcap.MESSAGE_INDEX: McapFile._take_message_index,
+    mcap.ATTACHMENT: McapFile._take_attachment,
+    mcap.METADATA: McapFile._take_metadata,
+    mcap.DATA_END: McapFile._take_data_end,
+}

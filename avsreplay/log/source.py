@@ -1,0 +1,215 @@
+"""A source of scans: whatever the bytes were, the same nouns come out."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from avsreplay.errors import UnreadableInput
+from avsreplay.geometry import Pose
+from avsreplay.log.clock import Placed, place
+from avsreplay.log.cursor import BadMessage
+from avsreplay.log.feed import Feed
+from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
+from avsreplay.log.point_cloud2 import Cloud
+from avsreplay.log.prefetch import ahead
+from avsreplay.log.text import shown
+from avsreplay.log.truth import PoseTrack
+from avsreplay.records import LogHeader, Scan, ScanStatus, State
+
+__all__ = ["Source"]
+
+_BLOCK = 1 << 20
+
+
+class Source:
+    """Scans of one log or folder, in the recorder's order; a context manager.
+
+    Attributes:
+        path: as given.  header: what the log says of itself, with the model asked for in place of its own.
+        options: how it is read.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        feed: Feed,
+        header: LogHeader,
+        options: SourceOptions,
+        *,
+        truth: PoseTrack | None = None,
+        body: PoseTrack | None = None,
+        sensor: Callable[[int, str], Pose | None] | None = None,
+        extra: dict[str, str] | None = None,
+        losses: tuple[Loss, ...] = (),
+    ) -> None:
+        self.path, self.header, self.options = path, header, options
+        self._feed, self._truth, self._body, self._sensor = feed, truth, body, sensor
+        self._extra = extra or {}
+        self._placed, self._clock = place(feed.log_ns, feed.publish_ns, feed.header_ns, options.clock)
+        self._lost = losses
+
+    def __enter__(self) -> Source:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        """How many scans the selection holds."""
+        return len(self._selected)
+
+    @property
+    def losses(self) -> list[Loss]:
+        """What could not be read, in the file's order."""
+        return [*self._feed.losses, *self._lost]
+
+    @property
+    def clock(self) -> ClockSummary:
+        """How the scans' instants were found."""
+        return self._clock
+
+    @cached_property
+    def sha256(self) -> str:
+        """Of the file's bytes; of a folder or a split log, of its files' names and bytes in order."""
+        digest = hashlib.sha256()
+        for path in self._files():
+            if self.path.is_dir():
+                digest.update(path.relative_to(self.path).as_posix().encode("utf-8", "surrogateescape") + b"\0")
+            with path.open("rb") as file:
+                while block := file.read(_BLOCK):
+                    digest.update(block)
+        return digest.hexdigest()
+
+    def scans(self, prefetch: int = 0) -> Iterator[Scan]:
+        """The scans one by one; with ``prefetch`` so many are decoded ahead on a thread of their own."""
+        scans = (self._scan(seq, i) for seq, i in enumerate(self._selected))
+        return ahead(scans, prefetch) if prefetch else scans
+
+    def info(self) -> LogInfo:
+        """What ``avsreplay info`` prints."""
+        topics = tuple(self._feed.topics())
+        starts = [t.first_ns for t in topics if t.first_ns is not None] or list(self._feed.log_ns)
+        ends = [t.last_ns for t in topics if t.last_ns is not None] or list(self._feed.log_ns)
+        start, surface = min(starts, default=None), self.header.surface
+        origin = start or 0
+        labels = ((lab.kind, lab.start_ns, lab.end_ns, lab.harmful) for lab in self.header.labels)
+        return LogInfo(
+            path=str(self.path),
+            kind=self._feed.kind,
+            bytes=sum(p.stat().st_size for p in self._files()),
+            topics=topics,
+            start_ns=start,
+            end_ns=max(ends, default=None),
+            cloud_topic=self._feed.topic,
+            scans=len(self._placed),
+            profile=self._extra.get("profile", ""),
+            library=self._extra.get("library", ""),
+            model=None if surface is None else surface.name,
+            model_vertices=0 if surface is None else len(surface.vertices),
+            model_faces=0 if surface is None else len(surface.faces),
+            model_extent_m=None if surface is None else surface.extent,
+            scenario=bool(self.header.scenario),
+            seed=self.header.seed,
+            truth=bool(self._truth),
+            faults=tuple((k, (a - origin) * 1e-9, (b - origin) * 1e-9, h) for k, a, b, h in labels),
+            clock=self._clock,
+            losses=tuple(self.losses),
+            notes=dict(self.header.notes),
+        )
+
+    def close(self) -> None:
+        """Let go of the files."""
+        self._feed.close()
+
+    def _files(self) -> list[Path]:
+        return sorted(p for p in self.path.rglob("*") if p.is_file()) if self.path.is_dir() else [self.path]
+
+    @cached_property
+    def _selected(self) -> list[int]:
+        """Places of the scans asked for: the window, then every n-th, then at most so many."""
+        if not self._placed:
+            return []
+        start, end = self.options.window_s
+        first = self._placed[0].t_ns
+        inside = [i for i, p in enumerate(self._placed) if start <= (p.t_ns - first) * 1e-9 < end]
+        return inside[:: self.options.every][: self.options.n_scans]
+
+    def _scan(self, seq: int, place: int) -> Scan:
+        placed, log_ns = self._placed[place], self._feed.log_ns[place]
+        try:
+            cloud = self._taken(self._feed.load(place), placed.t_ns)
+        except BadMessage as error:
+            return self._finish(seq, placed, log_ns, None, shown(error))
+        return self._finish(seq, placed, log_ns, cloud, placed.note)
+
+    def _finish(self, seq: int, placed: Placed, log_ns: int, cloud: Cloud | None, note: str | None) -> Scan:
+        return Scan(
+            seq=seq,
+            t_ns=placed.t_ns,
+            points=np.zeros((0, 3), np.float32) if cloud is None else cloud.points,
+            status=_status(cloud, placed),
+            times_s=None if cloud is None else cloud.times_s,
+            dropped_points=0 if cloud is None else cloud.dropped,
+            truth=None if self._truth is None else self._truth.pose(placed.t_ns),
+            body=self._body_at(placed.t_ns),
+            fault=self._fault(log_ns),
+            note=note,
+            log_ns=log_ns,
+        )
+
+    def _body_at(self, t_ns: int) -> State | None:
+        constants = self.header.truth
+        return None if self._body is None or constants is None else self._body.body(t_ns, constants)
+
+    def _fault(self, log_ns: int) -> str | None:
+        """The label whose window [start, end) holds the instant; the latest begun where several do."""
+        inside = [label for label in self.header.labels if label.start_ns <= log_ns < label.end_ns]
+        return max(inside, key=lambda label: label.start_ns).kind if inside else None
+
+    def _taken(self, cloud: Cloud, t_ns: int) -> Cloud:
+        """Cropped, and brought to the fixed frame where one is asked for. Raises BadMessage without a pose for it."""
+        cloud = _cropped(cloud, self.options)
+        if self._sensor is None:
+            return cloud
+        pose = self._sensor(t_ns, cloud.frame)
+        if pose is None:
+            raise BadMessage("no pose of the sensor at the time of the scan")
+        return Cloud(cloud.stamp_ns, cloud.frame, pose.apply(cloud.points), cloud.times_s, cloud.dropped)
+
+
+def _status(cloud: Cloud | None, placed: Placed) -> ScanStatus:
+    if cloud is None:
+        return ScanStatus.DAMAGED
+    if not len(cloud.points):
+        return ScanStatus.EMPTY
+    return ScanStatus.CLOCK if placed.note else ScanStatus.OK
+
+
+def _cropped(cloud: Cloud, options: SourceOptions) -> Cloud:
+    if options.crop_box is None and options.crop_range is None:
+        return cloud
+    keep = np.ones(len(cloud.points), dtype=bool)
+    if options.crop_box is not None:
+        low, high = np.array(options.crop_box[:3]), np.array(options.crop_box[3:])
+        keep &= ((cloud.points >= low) & (cloud.points <= high)).all(axis=1)
+    if options.crop_range is not None:
+        distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
+        keep &= (distance >= options.crop_range[0]) & (distance <= options.crop_range[1])
+    times = None if cloud.times_s is None else cloud.times_s[keep]
+    return Cloud(cloud.stamp_ns, cloud.frame, cloud.points[keep], times, cloud.dropped)
+
+
+def refuse_losses(source: Source) -> None:
+    """Raise UnreadableInput where anything was lost (``--strict``)."""
+    if source.losses:
+        first = source.losses[0]
+        what = f"{len(source.losses)} losses, the first: {first.what} (byte {first.offset})"
+        raise UnreadableInput(what, where=shown(source.path), hint="leave out --strict to use what is intact")
