@@ -1,0 +1,157 @@
+"""What the 3D view of a report needs, small enough to keep: a thinned model, thinned clouds, planned paths.
+
+All in one ``view.npz`` beside the rows; it is written only when a report is asked for. Nothing in it is random: clouds
+are thinned by even strides, the model by clustering its vertices on a grid.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from avsreplay.errors import UnreadableInput
+from avsreplay.geometry import Array
+from avsreplay.records import Surface
+from avsreplay.report.atomic import atomic_path
+
+__all__ = ["CloudView", "Faces", "PathView", "View", "read_view", "thin_cloud", "thin_surface", "write_view"]
+
+MOST_POINTS = 300
+MOST_FACES = 4000
+_MOST_BYTES = 1 << 30
+
+Floats = NDArray[np.float32]
+Faces = NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CloudView:
+    """A few points of scan ``seq``: (n, 3) in {A} [m], and each one's distance to the model (n,) [m] or None."""
+
+    seq: int
+    points: Floats
+    residual_m: Floats | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PathView:
+    """A planned path: when it was planned, (n, 3) positions in {A} [m], and by how much it would miss [m]."""
+
+    t_ns: int
+    points: Floats
+    miss_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class View:
+    """Model (vertices (n, 3) in {C} [m], faces (m, 3), possibly none), clouds and paths."""
+
+    vertices: Floats
+    faces: Faces
+    clouds: tuple[CloudView, ...] = ()
+    paths: tuple[PathView, ...] = ()
+
+
+def thin_cloud(
+    seq: int, points: ArrayLike, residual_m: ArrayLike | None = None, *, most: int = MOST_POINTS
+) -> CloudView:
+    """At most ``most`` points at an even stride. points (n, 3) in {A} [m], residual_m (n,) [m]."""
+    points = np.asarray(points)
+    chosen = np.unique(np.linspace(0, max(len(points) - 1, 0), min(most, len(points))).astype(np.intp))
+    residual = None if residual_m is None else np.asarray(residual_m, dtype=np.float32)[chosen]
+    return CloudView(seq, np.asarray(points[chosen], dtype=np.float32), residual)
+
+
+def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, Faces]:
+    """At most ``most`` faces (vertices, for a bare cloud): vertices are merged on an ever coarser grid."""
+    vertices, faces = surface.vertices, surface.faces
+    size = surface.extent / 256.0 or 1.0
+    while max(len(faces), 0 if len(faces) else len(vertices)) > most:
+        vertices, faces = _clustered(surface.vertices, surface.faces, size)
+        size *= 1.25
+    return np.asarray(vertices, dtype=np.float32), np.asarray(faces, dtype=np.int32)
+
+
+def _clustered(vertices: Array, faces: Faces, size: float) -> tuple[Array, Faces]:
+    """Each grid cell's vertices become their mean; faces that collapse or double go."""
+    cells = np.floor((vertices - vertices.min(axis=0)) / size).astype(np.int64)
+    _, member = np.unique(cells, axis=0, return_inverse=True)
+    member = member.reshape(-1)
+    counts = np.bincount(member)
+    merged = np.stack([np.bincount(member, weights=vertices[:, k]) / counts for k in range(3)], axis=1)
+    mapped = member[faces]
+    whole = (mapped[:, 0] != mapped[:, 1]) & (mapped[:, 1] != mapped[:, 2]) & (mapped[:, 2] != mapped[:, 0])
+    mapped = mapped[whole]
+    _, first = np.unique(np.sort(mapped, axis=1), axis=0, return_index=True)
+    return merged, mapped[np.sort(first)].astype(np.int32)
+
+
+def write_view(path: str | Path, view: View) -> None:
+    """One npz, atomically; the same view gives the same bytes."""
+    arrays = {
+        "vertices": view.vertices,
+        "faces": view.faces,
+        "cloud_seq": np.array([c.seq for c in view.clouds], dtype=np.int64),
+        "cloud_size": np.array([len(c.points) for c in view.clouds], dtype=np.int64),
+        "cloud_points": _joined([c.points for c in view.clouds]),
+        "cloud_residual": np.concatenate([np.zeros(0, np.float32), *(_residual(c) for c in view.clouds)]),
+        "path_t_ns": np.array([p.t_ns for p in view.paths], dtype=np.int64),
+        "path_size": np.array([len(p.points) for p in view.paths], dtype=np.int64),
+        "path_points": _joined([p.points for p in view.paths]),
+        "path_miss": np.array([np.nan if p.miss_m is None else p.miss_m for p in view.paths], dtype=np.float64),
+    }
+    with atomic_path(path) as part, part.open("wb") as stream:
+        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+
+
+def _joined(parts: Sequence[Floats]) -> Floats:
+    return np.concatenate([np.zeros((0, 3), np.float32), *parts]).astype(np.float32)
+
+
+def _residual(cloud: CloudView) -> Floats:
+    return np.full(len(cloud.points), np.nan, np.float32) if cloud.residual_m is None else cloud.residual_m
+
+
+def read_view(path: str | Path) -> View:
+    """The view in a file. Raises UnreadableInput where it is missing or is not one."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            if sum(info.file_size for info in data.zip.infolist()) > _MOST_BYTES:
+                raise ValueError("too large")
+            arrays = {name: data[name] for name in data.files}
+        return _view(arrays)
+    except FileNotFoundError:
+        raise UnreadableInput("no such file", where=str(path), hint="check the path") from None
+    except (OSError, ValueError, KeyError, IndexError, AttributeError, EOFError, zipfile.BadZipFile):
+        raise UnreadableInput("not a view file", where=str(path), hint="run again with --report") from None
+
+
+def _view(arrays: dict[str, NDArray[np.float32]]) -> View:
+    points = _split(arrays["cloud_points"], arrays["cloud_size"])
+    residuals = _split(arrays["cloud_residual"], arrays["cloud_size"])
+    clouds = tuple(
+        CloudView(int(seq), p, None if np.isnan(r).any() or not len(r) else r)
+        for seq, p, r in zip(arrays["cloud_seq"], points, residuals, strict=True)
+    )
+    lines = _split(arrays["path_points"], arrays["path_size"])
+    paths = tuple(
+        PathView(int(t), p, None if np.isnan(miss) else float(miss))
+        for t, p, miss in zip(arrays["path_t_ns"], lines, arrays["path_miss"], strict=True)
+    )
+    faces = arrays["faces"].astype(np.int32).reshape(-1, 3)
+    vertices = arrays["vertices"].reshape(-1, 3)
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise ValueError("faces name vertices that are not there")
+    return View(vertices, faces, clouds, paths)
+
+
+def _split(joined: NDArray[np.float32], sizes: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    ends = np.cumsum(sizes.astype(np.int64))
+    if (ends[-1] if len(ends) else 0) != len(joined):
+        raise ValueError("sizes do not add up")
+    return np.split(joined, ends[:-1]) if len(ends) else []
