@@ -134,7 +134,9 @@ def _topics(info: LogInfo) -> Any:
 
     from avsreplay.log.text import shown
 
-    table = Table("topic", "type", "encoding", title="topics", title_justify="left")
+    table = Table(title="topics", title_justify="left")
+    for head in ("topic", "type", "encoding"):
+        table.add_column(head, overflow="fold")
     for head in ("messages", "rate [Hz]", "span [s]"):
         table.add_column(head, justify="right")
     for topic in info.topics:

@@ -52,7 +52,7 @@ def place(
         return placed, replace(summary, unset=0, note="header stamps are never set: the log clock is used")
     tracker = _Tracker(max(_FLOOR_NS, _PERIODS * period), period, _first_offset(offsets, header_ns))
     placed = [tracker.take(r, h) for r, h in zip(log_ns, header_ns, strict=True)]
-    return placed, replace(summary, **tracker.counts)
+    return placed, tracker.summary(summary)
 
 
 def _median(values: Sequence[int]) -> int:
@@ -104,11 +104,19 @@ class _Tracker:
                 departure = 0
         trouble = self._trouble(departure, header_ns)
         if trouble is not None:
-            return self._by_log(log_ns, header_ns, departure, trouble)
+            return self._by_log(log_ns, departure, trouble)
         self._jumped.clear()
         self._offset += round(_FOLLOW * departure)
         self._last, self._last_t = (log_ns, header_ns), header_ns - self._correction
         return Placed(self._last_t)
+
+    def summary(self, summary: ClockSummary) -> ClockSummary:
+        """With what was counted."""
+        c = self.counts
+        return replace(
+            summary, unset=c["unset"], jumps=c["jumps"], equal=c["equal"], back=c["back"],
+            header_steps=c["header_steps"], log_steps=c["log_steps"],
+        )  # fmt: skip
 
     def _trouble(self, departure: int, header_ns: int) -> str | None:
         if abs(departure) > self._tolerance:
@@ -118,7 +126,7 @@ class _Tracker:
             return None
         return "equal" if t_ns == self._last_t else "back"
 
-    def _by_log(self, log_ns: int, header_ns: int, departure: int, trouble: str) -> Placed:
+    def _by_log(self, log_ns: int, departure: int, trouble: str) -> Placed:
         self.counts[trouble] += 1
         t_ns = log_ns + self._offset - self._correction
         if self._last_t is not None:

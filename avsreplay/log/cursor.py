@@ -83,7 +83,7 @@ class Cursor:
         return self.data[start : self.pos]
 
     def string(self) -> str:
-        """Text; bytes that are not UTF-8 are kept readable as ``\\xNN``."""
+        r"""Text; bytes that are not UTF-8 are kept readable as ``\xNN``."""
         raw = bytes(self.octets())
         return (raw if self.ros1 else raw.rstrip(b"\x00")).decode("utf-8", "backslashreplace")
 

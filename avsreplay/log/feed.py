@@ -14,18 +14,27 @@ __all__ = ["Feed", "MessageFeed"]
 
 
 class Feed(Protocol):
-    """Clouds in recorder's order, with their three clocks [ns].
+    """Clouds in recorder's order, with their three clocks [ns], one entry a cloud."""
 
-    Attributes:
-        kind: what it is, in words.  topic: the cloud topic, None where there are none.
-        log_ns, publish_ns, header_ns: one entry a cloud.  losses: what could not be read of the container.
-    """
+    @property
+    def kind(self) -> str:
+        """What it is, in words."""
 
-    kind: str
-    topic: str | None
-    log_ns: Sequence[int]
-    publish_ns: Sequence[int]
-    header_ns: Sequence[int]
+    @property
+    def topic(self) -> str | None:
+        """The cloud topic, None where there are none."""
+
+    @property
+    def log_ns(self) -> Sequence[int]:
+        """When the recorder received each cloud."""
+
+    @property
+    def publish_ns(self) -> Sequence[int]:
+        """When it was sent."""
+
+    @property
+    def header_ns(self) -> Sequence[int]:
+        """The stamp in its header."""
 
     @property
     def losses(self) -> Sequence[Loss]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from avsreplay.log.cursor import BadMessage
 
 __all__ = ["inflate"]
@@ -39,7 +41,8 @@ def _lz4(data: bytes, size: int) -> bytes:
     import lz4.frame
 
     try:
-        out: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        frame: Any = lz4.frame
+        out: bytes = frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
     except (RuntimeError, EOFError, ValueError, MemoryError) as error:
         raise BadMessage(f"a chunk does not inflate: {error}") from None
     return out

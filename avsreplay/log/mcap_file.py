@@ -7,7 +7,6 @@ channels whose first chunk is lost and messages that nothing else tells of.
 
 from __future__ import annotations
 
-import os
 import zlib
 from array import array
 from collections.abc import Callable, Mapping
@@ -16,9 +15,12 @@ from pathlib import Path
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.log import mcap_records as mcap
+from avsreplay.log.byte_file import ByteFile
 from avsreplay.log.cursor import BadMessage, Cursor
 from avsreplay.log.inflate import inflate
 from avsreplay.log.mcap_records import Channel, ChunkHead, Fields
+from avsreplay.log.mcap_resync import hides_chunk, next_record
+from avsreplay.log.mcap_summary import Summary, read_summary
 from avsreplay.log.options import Loss, TopicInfo
 from avsreplay.log.recording import CLOUD_TYPES, CloudIndex, Sink, TopicCount, canonical_type
 from avsreplay.log.text import shown
@@ -27,8 +29,6 @@ __all__ = ["McapFile"]
 
 _COMPRESSIONS = ("", "zstd", "lz4")
 _MODELS = (".ply", ".stl", ".obj", ".off", ".glb")
-_WINDOW = 1 << 20
-_MAX_CANDIDATES = 1_000_000
 
 
 class McapFile:
@@ -59,12 +59,12 @@ class McapFile:
         self._model: tuple[str, int, int] | None = None
         self._bad_chunk: Loss | None = None
         self._orphans = self._seen = 0
-        self._file = _opened(path)
+        self._file = ByteFile(path)
+        self._size = self._file.size
         try:
-            self._size = os.fstat(self._file).st_size
             self._survey()
         except BaseException:
-            os.close(self._file)
+            self._file.close()
             raise
 
     def topics(self) -> list[TopicInfo]:
@@ -88,7 +88,7 @@ class McapFile:
         index = self._clouds[topic]
         chunk, offset, size = index.container[place], index.offset[place], index.size[place]
         if chunk < 0:
-            return self._bytes(offset, size)
+            return self._file.read(offset, size)
         return memoryview(self._chunk(chunk))[offset : offset + size]
 
     def attachment(self) -> tuple[str, bytes] | None:
@@ -96,41 +96,28 @@ class McapFile:
         if self._model is None:
             return None
         name, offset, size = self._model
-        return name, self._bytes(offset, size)
+        return name, self._file.read(offset, size)
 
     def close(self) -> None:
         """Let go of the file."""
-        if self._file >= 0:
-            os.close(self._file)
-            self._file = -1
-
-    def _bytes(self, offset: int, size: int) -> bytes:
-        data = os.pread(self._file, size, offset)
-        while 0 < len(data) < size:
-            more = os.pread(self._file, size - len(data), offset + len(data))
-            if not more:
-                break
-            data += more
-        if len(data) < size:
-            raise BadMessage("the file became shorter while it was read")
-        return data
+        self._file.close()
 
     def _chunk(self, number: int) -> bytes:
         if number not in self._cache:
             if len(self._cache) > 1:
                 self._cache.pop(next(iter(self._cache)))
             offset, size, compression, inflated = (column[number] for column in self._chunks)
-            self._cache[number] = inflate(self._bytes(offset, size), _COMPRESSIONS[compression], inflated)
+            self._cache[number] = inflate(self._file.read(offset, size), _COMPRESSIONS[compression], inflated)
         return self._cache[number]
 
     def _survey(self) -> None:
         if self._size == 0:
             raise UnreadableInput("the file is empty", where=shown(self.path), hint="record it again")
-        if self._size < 8 or self._bytes(0, 8) != mcap.MAGIC:
+        if self._size < 8 or self._file.read(0, 8) != mcap.MAGIC:
             raise UnreadableInput(
                 "not an MCAP file", where=shown(self.path), hint="give an MCAP, a ROS bag or a folder"
             )
-        summary = _Summary.read(self)
+        summary = read_summary(self._file, self._limit)
         self._adopt(summary)
         at = 8
         while at < self._size and not self.closed_properly:
@@ -140,11 +127,11 @@ class McapFile:
             self._lose(Loss("the file was not closed: what its recorder still held is lost", self._size, 0))
         self._account(summary)
 
-    def _step(self, at: int, summary: _Summary) -> int:
+    def _step(self, at: int, summary: Summary) -> int:
         """Take one record and return where the next one begins."""
         if at + 9 > self._size:
             return self._cut(at)
-        head = self._bytes(at, 9)
+        head = self._file.read(at, 9)
         opcode, length = head[0], int.from_bytes(head[1:], "little")
         end = at + 9 + length
         if opcode != mcap.MESSAGE_INDEX:
@@ -167,20 +154,13 @@ class McapFile:
             handler(self, at, end)
         elif opcode < 0x80:
             raise BadMessage(f"a record of unknown kind 0x{opcode:02x}")
-        elif end - at >= 49 and self._is_chunk(at):
+        elif hides_chunk(self._file, at, end):
             raise BadMessage("a chunk whose kind is damaged")
-
-    def _is_chunk(self, at: int) -> bool:
-        try:
-            mcap.chunk_head(b"\x06" + self._bytes(at + 1, min(mcap.CHUNK_PREFIX, self._size - at) - 1))
-        except BadMessage:
-            return False
-        return True
 
     def _content(self, at: int, end: int) -> Fields:
         if end - at > self._limit:
             raise BadMessage(f"a record of {end - at} bytes is over the limit of {self._limit}")
-        return Fields(memoryview(self._bytes(at + 9, end - at - 9)))
+        return Fields(memoryview(self._file.read(at + 9, end - at - 9)))
 
     def _take_header(self, at: int, end: int) -> None:
         fields = self._content(at, end)
@@ -228,13 +208,13 @@ class McapFile:
         self.closed_properly = True
 
     def _take_chunk(self, at: int, end: int) -> None:
-        head = mcap.chunk_head(self._bytes(at, min(mcap.CHUNK_PREFIX, end - at)), end - at)
+        head = mcap.chunk_head(self._file.upto(at, min(mcap.CHUNK_PREFIX, end - at)), end - at)
         try:
             data = self._inflated(at, head)
             walked = [(op, b, e) for op, b, e in mcap.records(memoryview(data))]
         except BadMessage as error:
-            span = {"start_ns": min(head.start_ns, 2**63 - 1), "end_ns": min(head.end_ns, 2**63 - 1)}
-            self._bad_chunk = Loss(str(error), at, end - at, chunks=1, **span)
+            start_ns, end_ns = (min(t, 2**63 - 1) for t in (head.start_ns, head.end_ns))
+            self._bad_chunk = Loss(str(error), at, end - at, 1, None, start_ns, end_ns)
             return
         number = len(self._chunks[0])
         for column, value in zip(
@@ -255,7 +235,7 @@ class McapFile:
     def _inflated(self, at: int, head: ChunkHead) -> bytes:
         if max(head.size, head.data_size) > self._limit:
             raise BadMessage(f"a chunk of {head.size} bytes is over the limit of {self._limit}")
-        data = inflate(self._bytes(at + head.data_at, head.data_size), head.compression, head.size)
+        data = inflate(self._file.read(at + head.data_at, head.data_size), head.compression, head.size)
         if head.crc and zlib.crc32(data) != head.crc:
             raise BadMessage("the checksum of a chunk does not hold")
         return data
@@ -301,40 +281,21 @@ class McapFile:
             self._lose(self._bad_chunk)
             self._bad_chunk = None
 
-    def _resync(self, at: int, summary: _Summary, why: str) -> int:
+    def _resync(self, at: int, summary: Summary, why: str) -> int:
         """The next place after ``at`` where the file makes sense again."""
         stop = summary.start - 13 if summary.start else self._size
-        found = self._next_chunk(at + 1, stop)
+        chunked = bool(self._chunks[0]) or not self._seen
+        found = next_record(self._file, at + 1, stop, frozenset(self._channels), chunked)
         resume = found if found is not None else max(stop, at + 1)
         self._lose(Loss(why, at, resume - at))
         return resume
 
-    def _next_chunk(self, at: int, stop: int) -> int | None:
-        tried = 0
-        while at < stop:
-            window = self._bytes(at, min(_WINDOW + 64, self._size - at))
-            for place in mcap.chunk_candidates(window):
-                tried += 1
-                if tried > _MAX_CANDIDATES:
-                    return None
-                if at + place < stop and self._plausible(at + place, stop):
-                    return at + place
-            at += _WINDOW
-        return None
-
-    def _plausible(self, at: int, stop: int) -> bool:
-        try:
-            mcap.chunk_head(self._bytes(at, min(mcap.CHUNK_PREFIX, self._size - at)), stop - at)
-        except BadMessage:
-            return False
-        return True
-
-    def _adopt(self, summary: _Summary) -> None:
+    def _adopt(self, summary: Summary) -> None:
         """Channels from a whole summary, in case the chunk that defines them is lost."""
         for opcode, fields in summary.definitions:
             (self._schema if opcode == mcap.SCHEMA else self._channel)(fields)
 
-    def _account(self, summary: _Summary) -> None:
+    def _account(self, summary: Summary) -> None:
         """Messages that the summary counts and nothing else tells of."""
         if self._orphans:
             self._lose(Loss("messages of a channel whose definition is lost", 0, 0, messages=self._orphans))
@@ -345,65 +306,6 @@ class McapFile:
             self.losses[self.losses.index(blind[0])] = replace(blind[0], messages=missing)
         elif missing > 0:
             self._lose(Loss("messages that the summary counts and the file does not hold", 0, 0, messages=missing))
-
-
-class _Summary:
-    """What the end of a file tells, where it is whole.
-
-    Attributes:
-        start: where the summary begins, 0 where there is none to trust.  messages: how many the file holds.
-        definitions: its schemas and channels.
-    """
-
-    def __init__(self) -> None:
-        self.start = 0
-        self.messages: int | None = None
-        self.definitions: list[tuple[int, Fields]] = []
-
-    @classmethod
-    def read(cls, file: McapFile) -> _Summary:
-        """From the footer; an empty one where the footer or its checksum does not hold."""
-        out = cls()
-        try:
-            out._parse(file)
-        except BadMessage:
-            return cls()
-        return out
-
-    def _parse(self, file: McapFile) -> None:
-        size = file._size
-        if size < 8 + 29 + 8:
-            return
-        tail = file._bytes(size - 37, 37)
-        start = int.from_bytes(tail[9:17], "little")
-        if tail[29:] != mcap.MAGIC or tail[:9] != b"\x02\x14\0\0\0\0\0\0\0":
-            return
-        if start == 0:
-            return
-        if not 8 < start <= size - 37 or size - start > file._limit:
-            return
-        data = file._bytes(start, size - 37 - start + 25)
-        crc = int.from_bytes(tail[25:29], "little")
-        if crc and zlib.crc32(data) != crc:
-            return
-        self._walk(memoryview(data)[: len(data) - 25])
-        self.start = start
-
-    def _walk(self, view: memoryview) -> None:
-        for opcode, begin, end in mcap.records(view):
-            if opcode in (mcap.SCHEMA, mcap.CHANNEL):
-                self.definitions.append((opcode, Fields(view[begin:end])))
-            elif opcode == mcap.STATISTICS:
-                self.messages = Fields(view[begin:end]).number(8)
-
-
-def _opened(path: Path) -> int:
-    try:
-        return os.open(path, os.O_RDONLY)
-    except FileNotFoundError:
-        raise UnreadableInput("no such file", where=shown(path), hint="check the path") from None
-    except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
 
 
 def _stamp(payload: memoryview) -> int:

@@ -89,7 +89,7 @@ class Fields:
         return self.view[self.at - size : self.at]
 
     def text(self) -> str:
-        """A string; bytes that are not UTF-8 stay readable as ``\\xNN``."""
+        r"""A string; bytes that are not UTF-8 stay readable as ``\xNN``."""
         return bytes(self.take(self.number(4))).decode("utf-8", "backslashreplace")
 
     def mapping(self) -> dict[str, str]:

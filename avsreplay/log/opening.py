@@ -54,7 +54,7 @@ def _messages(path: Path, options: SourceOptions) -> Source:
     try:
         _check_truth(recording.topics(), options, path)
         topic = _cloud_topic(recording.topics(), options.topic, path)
-        header, lost = _header(recording, options, path)
+        header, lost = _header(recording, options)
     except BaseException:
         recording.close()
         raise
@@ -111,7 +111,7 @@ def _cloud_topic(topics: Sequence[TopicInfo], wanted: str | None, path: Path) ->
     return chosen
 
 
-def _header(recording: Recording, options: SourceOptions, path: Path) -> tuple[LogHeader, tuple[Loss, ...]]:
+def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tuple[Loss, ...]]:
     lost: tuple[Loss, ...] = ()
     header = LogHeader()
     if HEADER_RECORD in recording.metadata:

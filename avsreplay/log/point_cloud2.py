@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ class Layout:
     data: memoryview
 
     def column(self, name: str) -> NDArray[Any]:
-        """(height, width) view of one field in the message's own byte order. Raises BadMessage where it is not there."""
+        """(height, width) view of one field in the message's byte order. Raises BadMessage where it is not there."""
         field = next((f for f in self.fields if f.name == name), None)
         if field is None:
             raise BadMessage(f"no field '{name}' among {', '.join(f.name for f in self.fields) or 'none'}")
@@ -120,7 +121,7 @@ def _check(layout: Layout) -> None:
         if field.offset + size > layout.point_step:
             raise BadMessage(f"field '{field.name}' ends past point_step {layout.point_step}")
     spans = sorted((f.offset, f.offset + int(f.kind[1])) for f in layout.fields if f.name in ("x", "y", "z"))
-    if any(before[1] > after[0] for before, after in zip(spans, spans[1:], strict=False)):
+    if any(before[1] > after[0] for before, after in pairwise(spans)):
         raise BadMessage("the fields x, y and z overlap")
 
 

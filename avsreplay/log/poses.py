@@ -25,7 +25,7 @@ class Transform:
 
 
 def read_pose(kind: str, payload: bytes | memoryview, encoding: str = "cdr") -> Transform:
-    """A pose of one of ``POSE_TYPES``. Raises BadMessage where it is cut, not finite, or its quaternion has no length."""
+    """A pose of one of ``POSE_TYPES``. Raises BadMessage where it is cut, not finite, or no unit quaternion."""
     out = POSE_TYPES[kind](Cursor(payload, encoding))
     norm = math.hypot(*out.pose[3:])
     if not all(map(math.isfinite, out.pose)) or not 0.5 < norm < 2.0:

@@ -21,7 +21,8 @@ def ahead(items: Iterator[T], count: int) -> Iterator[T]:
     def put(entry: tuple[bool, T | BaseException | None]) -> None:
         while not stop.is_set():
             try:
-                return queue.put(entry, timeout=_WAIT_S)
+                queue.put(entry, timeout=_WAIT_S)
+                return
             except Full:
                 continue
 

@@ -73,11 +73,23 @@ class TopicCount:
 class Recording(Protocol):
     """A log of messages that was read through once."""
 
-    kind: str
     losses: list[Loss]
-    metadata: Mapping[str, dict[str, str]]
-    profile: str
-    library: str
+
+    @property
+    def kind(self) -> str:
+        """What it is, in words."""
+
+    @property
+    def profile(self) -> str:
+        """What the file says of its use."""
+
+    @property
+    def library(self) -> str:
+        """What the file says of its writer."""
+
+    @property
+    def metadata(self) -> Mapping[str, dict[str, str]]:
+        """Metadata records by name."""
 
     def topics(self) -> list[TopicInfo]:
         """Every topic, by name."""

@@ -112,7 +112,7 @@ def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
             raise BadFile(f"promises {promised} triangles in a file of {len(data)} bytes")
     options: dict[str, Any] = {"skip_materials": True} if suffix in ("obj", "glb") else {}
     # process=False keeps vertices as they stand; force="mesh" puts the parts of a scene together.
-    mesh = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
+    mesh: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
     return _merged(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces))
 
 

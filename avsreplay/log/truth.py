@@ -58,7 +58,7 @@ class PoseTrack:
         return None if row is None else Pose(row[3:7], row[:3])
 
     def body(self, t_ns: int, constants: State) -> State | None:
-        """The full state at an instant from a track of {B} with twists in {B}; sigma, varrho and mu are ``constants``'."""
+        """The full state from a track of {B} with twists in {B}; sigma, varrho and mu are ``constants``'."""
         row = self._at(t_ns)
         if row is None or not np.isfinite(row[7:]).all():
             return None

@@ -5,12 +5,13 @@ The bytes depend on nothing but what is written: no clock, path or library versi
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
@@ -143,7 +144,7 @@ class LogWriter:
 
         kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
         # The library closes a chunk only past its size; spans and sizes are watched here.
-        self._writer = Writer(self._stream, 1 << 62, kinds[compression], enable_data_crcs=True)
+        self._writer: Any = Writer(self._stream, 1 << 62, kinds[compression], enable_data_crcs=True)
 
         def begin() -> None:
             self._writer.start(profile="ros2", library=LIBRARY)
@@ -217,10 +218,8 @@ class LogWriter:
 
     def _keep_complete(self) -> None:
         """What the disk took stays up to the last complete chunk; the rest is cut off."""
-        try:
+        with contextlib.suppress(OSError):  # the buffered rest does not fit either; the file is closed all the same
             self._stream.close()
-        except OSError:
-            pass  # the buffered rest does not fit either; the raw file is closed all the same
         os.truncate(self._partial, min(self._complete, self._partial.stat().st_size))
 
     def _discard(self) -> None:
