@@ -23,6 +23,8 @@ __all__ = ["PlanParams", "rendezvous"]
 
 MAX_STEPS = 400
 STRETCH_S = 30.0  # the goal is sampled this far at a time: most captures need no more
+NEAR_ROOT = 1e-2  # a_max short by less than this part: Newton ends the search, and G closes the gap behind it
+GAP_LIMIT_S = 1e-6  # t_f less its bound above this: step instead
 RESIDUAL_LIMIT = 1e-8  # terminal errors above this, in metres or metres a second, are not a solution
 
 
@@ -84,7 +86,7 @@ def rendezvous(goal: Trajectory, r0: Array, v0: Array, params: PlanParams | None
     """
     params = params or PlanParams()
     r0, v0 = _finite("r0", r0), _finite("v0", v0)
-    search, sampled = _first_feasible(goal, r0, v0, params)
+    search, sampled = _first_feasible(goal, r0, v0, params, near=True)
     if search.reached and search.normal is None:
         here = np.array([1.0, 0.0, 0.0])  # nothing to make good: no thrust time, so its direction does not matter
         wait = params.latency_s
@@ -94,6 +96,11 @@ def rendezvous(goal: Trajectory, r0: Array, v0: Array, params: PlanParams | None
     if not search.reached or search.normal is None:
         return _no_plan(t_ns, params, search)
     t, found, bound = _polish(goal, r0, v0, params, sampled, search, search.normal)
+    if t - bound > GAP_LIMIT_S:  # the thrust needed all but touches the limit: step on to the very root
+        search, sampled = _first_feasible(goal, r0, v0, params, near=False)
+        if not search.reached or search.normal is None:
+            return _no_plan(t_ns, params, search)
+        t, found, bound = _polish(goal, r0, v0, params, sampled, search, search.normal)
     flight = Flight.from_normal(r0, v0, params.a_max_mps2, params.latency_s, t, found.P0, found.P1)
     return _grade(flight, goal, t_ns, replace(search, t=bound))
 
@@ -132,8 +139,10 @@ def _grade(flight: Flight, goal: Trajectory, t_ns: int, search: _Search) -> Plan
     )
 
 
-def _first_feasible(goal: Trajectory, r0: Array, v0: Array, params: PlanParams) -> tuple[_Search, SampledGoal]:
-    """Step from one certified bound to the next, stretch by stretch, until thrust just suffices."""
+def _first_feasible(
+    goal: Trajectory, r0: Array, v0: Array, params: PlanParams, near: bool
+) -> tuple[_Search, SampledGoal]:
+    """Step from one certified bound to the next, stretch by stretch, until thrust suffices (``near``: all but)."""
     end, t, found = params.horizon_s - params.latency_s, 0.0, None
     begin, steps = 0.0, 0
     while True:
@@ -143,13 +152,13 @@ def _first_feasible(goal: Trajectory, r0: Array, v0: Array, params: PlanParams) 
             if _met(sampled):
                 return _Search(0.0, True, None, 0), sampled
             t = _first_bound(sampled, params.a_max_mps2)
-        search = _search_stretch(sampled, params.a_max_mps2, t, found, steps)
+        search = _search_stretch(sampled, params.a_max_mps2, t, found, steps, near)
         if search.reached or search.steps >= MAX_STEPS or stretch >= end:
             return search, sampled
         t, found, steps, begin = search.t, search.normal, search.steps, stretch
 
 
-def _search_stretch(goal: SampledGoal, a_max: float, t: float, found: Touch | None, steps: int) -> _Search:
+def _search_stretch(goal: SampledGoal, a_max: float, t: float, found: Touch | None, steps: int, near: bool) -> _Search:
     """Certified steps within one stretch of samples, from thrust time t on."""
     excess = 1.0
     for count in range(steps, MAX_STEPS):
@@ -167,6 +176,8 @@ def _search_stretch(goal: SampledGoal, a_max: float, t: float, found: Touch | No
             excess = 0.0
             continue
         excess = margin / found.gauge
+        if near and excess < NEAR_ROOT and margin < 0.25 * ahead.slope * ahead.slope / ahead.bend(goal, t, a_max):
+            return _Search(t, True, found, count)
         t_new = ahead.step(goal, found, t, margin, a_max)
         if t_new - t <= 1e-10 * t:
             return _Search(ahead.before(goal, t), True, found, count)
@@ -205,17 +216,20 @@ class _Ahead:
         """The bound t, taken back by what interpolating the goal may have moved the root."""
         return max(t - goal.blur(self.n0, self.n1, t) / max(-self.slope, 1e-9), 0.0)
 
+    def bend(self, goal: SampledGoal, t: float, a_max: float) -> float:
+        """Bound on |d2G/dt2| up to t."""
+        return float(goal.curvature(self.n0, self.n1, t)) + 2.0 * a_max
+
     def joined(self, goal: SampledGoal, t: float, margin: float, bound: float, a_max: float) -> float:
         """The bound moved up to the root t where G, falling through it, is positive all the way back to ``bound``."""
-        bend = float(goal.curvature(self.n0, self.n1, t)) + 2.0 * a_max
-        if self.slope < 0.0 and t - bound < -self.slope / bend:
+        if self.slope < 0.0 and t - bound < -self.slope / self.bend(goal, t, a_max):
             return max(bound, t - 2.0 * margin / -self.slope)
         return bound
 
     def step(self, goal: SampledGoal, found: Touch, t: float, margin: float, a_max: float) -> float:
         """The latest instant up to which G is certainly positive: by nodes and sag, or by Taylor within a cell."""
         sag = 0.125 * goal.step**2
-        near = float(goal.curvature(self.n0, self.n1, t + goal.step)) + 2.0 * a_max
+        near = self.bend(goal, t + goal.step, a_max)
         taylor = 2.0 * margin / (math.sqrt(self.slope * self.slope + 2.0 * near * margin) - self.slope)
         reach = t + min(taylor, goal.step)
         first = int((t - goal.begin) / goal.step) + 1
