@@ -9,9 +9,12 @@ class Index:
         vertices: NDArray[np.float64],
         faces: NDArray[np.int32],
         kept: NDArray[np.int32],
+        normals: NDArray[np.float64],
         reach_m: float,
+        threads: int = 1,
+        portable: bool = False,
     ) -> None: ...
-    def closest(self, points: NDArray[Any], threads: int) -> tuple[Any, ...]: ...
+    def closest(self, points: NDArray[Any], threads: int = 1) -> tuple[Any, ...]: ...
     def icp(
         self,
         points: NDArray[Any],
@@ -23,8 +26,15 @@ class Index:
         floor_m: float,
         eps_rad: float,
         eps_m: float,
-        threads: int,
+        threads: int = 1,
+        keep: bool = False,
     ) -> tuple[Any, ...]: ...
     def normal_equations(
-        self, points: NDArray[Any], T_ca: NDArray[np.float64], gate_m: float, threads: int
+        self, points: NDArray[Any], T_ca: NDArray[np.float64], gate_m: float, threads: int = 1
     ) -> tuple[Any, ...]: ...
+    @property
+    def bytes(self) -> int: ...
+    @property
+    def isa(self) -> str: ...
+    @property
+    def shape(self) -> dict[str, Any]: ...

@@ -144,7 +144,7 @@ class Model:
     _index: _Index
 
     @classmethod
-    def build(cls, surface: Surface, reach_m: float, *, engine: Engine = "reference") -> Model:
+    def build(cls, surface: Surface, reach_m: float, *, engine: Engine = "kernel") -> Model:
         """Index ``surface`` for queries up to ``reach_m`` [m] from it.
 
         Raises:

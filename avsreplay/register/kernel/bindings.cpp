@@ -1,0 +1,180 @@
+// The door to Python: checks shapes, keeps the arrays alive, lets go of the interpreter while it works.
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+#include <nanobind/stl/string.h>
+#include <nanobind/stl/tuple.h>
+
+#include <algorithm>
+#include <cstring>
+#include <stdexcept>
+
+#include "build.hpp"
+#include "loop.hpp"
+
+namespace nb = nanobind;
+using namespace avs;
+
+namespace {
+
+using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+using Ints = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
+using Cloud = nb::ndarray<nb::ro, nb::ndim<2>, nb::device::cpu>;
+using Numpy = nb::ndarray<nb::numpy, double>;
+
+void require(bool good, const char* what) {
+  if (!good) throw std::invalid_argument(what);
+}
+
+View view(const Cloud& c) {
+  const bool single = c.dtype() == nb::dtype<float>();
+  require(single || c.dtype() == nb::dtype<double>(), "points must be float32 or float64");
+  require(c.shape(1) == 3, "points must be (n, 3)");
+  const int64_t size = single ? 4 : 8;
+  return {static_cast<const char*>(c.data()), (int64_t)c.shape(0), c.stride(0) * size, c.stride(1) * size, single};
+}
+
+struct Rows {
+  double v[12];
+};
+
+Rows rows(const Doubles& T) {
+  require(T.ndim() == 2 && T.shape(0) == 4 && T.shape(1) == 4, "a pose must be (4, 4)");
+  Rows r;
+  std::memcpy(r.v, T.data(), sizeof r.v);
+  return r;
+}
+
+template <class T>
+nb::ndarray<nb::numpy, T> array(std::initializer_list<size_t> shape, T** data) {
+  size_t n = 1;
+  for (size_t k : shape) n *= k;
+  *data = new T[n];
+  nb::capsule owner(*data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+  return nb::ndarray<nb::numpy, T>(*data, shape.size(), shape.begin(), owner);
+}
+
+Numpy matrix(const double* rows34) {
+  double* T;
+  Numpy out = array<double>({4, 4}, &T);
+  std::memcpy(T, rows34, 12 * sizeof(double));
+  T[12] = T[13] = T[14] = 0, T[15] = 1;
+  return out;
+}
+
+class Index {
+ public:
+  Index(Doubles vertices, Ints faces, Ints kept, Doubles normals, double reach, int threads, bool portable)
+      : portable_(portable) {
+    require(vertices.ndim() == 2 && vertices.shape(1) == 3 && vertices.shape(0) > 0, "vertices must be (n, 3), n > 0");
+    require(kept.shape(0) > 0 || normals.size() == vertices.size(), "a cloud needs its normals, (n, 3)");
+    const Surface s{vertices.data(), (int64_t)vertices.shape(0), faces.data(), kept.data(), (int64_t)kept.shape(0),
+                    normals.data()};
+    nb::gil_scoped_release release;
+    build(store_, s, reach, threads);
+  }
+
+  nb::tuple closest(const Cloud& points, int threads) const {
+    const View v = view(points);
+    Feet out;
+    auto foot = array<double>({(size_t)v.n, 3}, &out.foot), normal = array<double>({(size_t)v.n, 3}, &out.normal);
+    auto d2 = array<double>({(size_t)v.n}, &out.d2);
+    auto id = array<int32_t>({(size_t)v.n}, &out.id);
+    {
+      nb::gil_scoped_release release;
+      Team team(threads);
+      const Code& code = this->code();
+      team.each((v.n + CHUNK - 1) / CHUNK, [&](int64_t k) {
+        code.closest(store_, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), out);
+      });
+    }
+    return nb::make_tuple(foot, d2, id, normal);
+  }
+
+  nb::tuple icp(const Cloud& points, const Doubles& T_ca, double n_max, double n_plane, double gate, double tighten,
+                double floor, double eps_rad, double eps_m, int threads, bool keep) const {
+    const View v = view(points);
+    const Rows T = rows(T_ca);
+    const Rule rule{(int)n_max, (int)n_plane, gate, tighten, floor, eps_rad, eps_m};
+    Outcome o;
+    {
+      nb::gil_scoped_release release;
+      Team team(threads);
+      o = avs::icp(store_, code(), v, T.v, rule, keep, team);
+    }
+    return nb::make_tuple(matrix(o.T), o.passes, o.converged, o.inliers, o.rms, o.gate, o.turn, o.move, o.ignored,
+                          o.searched);
+  }
+
+  nb::tuple normal_equations(const Cloud& points, const Doubles& T_ca, double gate, int threads) const {
+    const View v = view(points);
+    const Rows T = rows(T_ca);
+    Sums s;
+    {
+      nb::gil_scoped_release release;
+      Team team(threads);
+      s = run_pass(store_, code(), v, T.v, gate, Pass::plane, nullptr, team);
+    }
+    double *H, *b;
+    auto info = array<double>({6, 6}, &H), gradient = array<double>({6}, &b);
+    move_to_origin(s, H, b);
+    const int64_t ignored = (int64_t)s.v[2];
+    return nb::make_tuple(info, gradient, (int64_t)s.v[0], s.v[34], s.v[1], v.n - ignored, ignored);
+  }
+
+  size_t bytes() const { return store_.bytes(); }
+  const char* isa() const { return code().name; }
+
+  nb::dict shape() const {
+    nb::dict d;
+    d["cell_m"] = store_.cell;
+    d["blocks"] = store_.blocks;
+    d["top"] = store_.top.size();
+    d["bricks"] = store_.bricks.size() / 64;
+    d["lists"] = store_.lists.size();
+    return d;
+  }
+
+ private:
+  const Code& code() const { return avs::code(portable_); }
+
+  // The sums are about the model's centre c, the answer about {C}'s origin: p x n grows by c x n.
+  void move_to_origin(const Sums& s, double* H, double* b) const {
+    const double c[3] = {store_.centre.x, store_.centre.y, store_.centre.z};
+    const double C[3][3] = {{0, -c[2], c[1]}, {c[2], 0, -c[0]}, {-c[1], c[0], 0}};
+    double A[6][6];
+    int k = 7;
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j <= i; ++j) A[i][j] = A[j][i] = s.v[k++];
+    std::memcpy(b, s.v + 28, 6 * sizeof(double));
+    for (int i = 0; i < 3; ++i)
+      for (int l = 0; l < 3; ++l) {
+        b[i] += C[i][l] * b[3 + l];
+        for (int j = 0; j < 6; ++j) A[i][j] += C[i][l] * A[3 + l][j];
+      }
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j < 3; ++j)
+        for (int l = 0; l < 3; ++l) A[i][j] += A[i][3 + l] * C[j][l];
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j < 6; ++j) H[6 * i + j] = i >= j ? A[i][j] : A[j][i];
+  }
+
+  Store store_;
+  bool portable_;
+};
+
+}  // namespace
+
+NB_MODULE(_kernel, m) {
+  nb::class_<Index>(m, "Index")
+      .def(nb::init<Doubles, Ints, Ints, Doubles, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
+           nb::arg("kept"), nb::arg("normals"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
+      .def("closest", &Index::closest, nb::arg("points"), nb::arg("threads") = 1)
+      .def("icp", &Index::icp, nb::arg("points"), nb::arg("T_ca"), nb::arg("n_max"), nb::arg("n_plane"),
+           nb::arg("gate_m"), nb::arg("tighten"), nb::arg("floor_m"), nb::arg("eps_rad"), nb::arg("eps_m"),
+           nb::arg("threads") = 1, nb::arg("keep") = false)
+      .def("normal_equations", &Index::normal_equations, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"),
+           nb::arg("threads") = 1)
+      .def_prop_ro("bytes", &Index::bytes)
+      .def_prop_ro("isa", &Index::isa)
+      .def_prop_ro("shape", &Index::shape);
+}

@@ -1,0 +1,186 @@
+// Primitives split at medians into blocks of eight, and the tree of boxes over them.
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <numeric>
+
+#include "build.hpp"
+
+namespace avs {
+namespace {
+
+Vec3 operator-(const Vec3& a, const Vec3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+Vec3 operator*(double s, const Vec3& a) { return {s * a.x, s * a.y, s * a.z}; }
+double dot(const Vec3& a, const Vec3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+Vec3 cross(const Vec3& a, const Vec3& b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
+Vec3 unit(const Vec3& a) { return (1.0 / std::sqrt(dot(a, a))) * a; }
+double axis_of(const Vec3& a, int k) { return k == 0 ? a.x : k == 1 ? a.y : a.z; }
+
+Vec3 vertex(const Surface& s, int64_t i) { return {s.vertices[3 * i], s.vertices[3 * i + 1], s.vertices[3 * i + 2]}; }
+
+struct Corners {
+  Vec3 a, b, c;
+};
+
+Corners corners(const Surface& s, int32_t face) {
+  const int32_t* f = s.faces + 3 * (int64_t)face;
+  return {vertex(s, f[0]), vertex(s, f[1]), vertex(s, f[2])};
+}
+
+// Corners turned so that ab is the longest side; the winding stays.
+Triangle triangle(Corners t) {
+  const double ab = dot(t.b - t.a, t.b - t.a), bc = dot(t.c - t.b, t.c - t.b), ca = dot(t.a - t.c, t.a - t.c);
+  if (bc > ab && bc >= ca)
+    t = {t.b, t.c, t.a};
+  else if (ca > ab && ca > bc)
+    t = {t.c, t.a, t.b};
+  Triangle r;
+  r.a = t.a;
+  r.length = std::sqrt(dot(t.b - t.a, t.b - t.a));
+  r.u = unit(t.b - t.a);
+  const Vec3 ac = t.c - t.a;
+  Vec3 w = ac - dot(ac, r.u) * r.u;
+  w = unit(w - dot(w, r.u) * r.u);  // twice is enough
+  r.w = w;
+  r.n = cross(r.u, r.w);
+  r.cx = dot(ac, r.u), r.cy = dot(ac, r.w);
+  r.inv_ac2 = 1.0 / (r.cx * r.cx + r.cy * r.cy);
+  r.inv_bc2 = 1.0 / ((r.length - r.cx) * (r.length - r.cx) + r.cy * r.cy);
+  return r;
+}
+
+void split(std::vector<int32_t>& order, const std::vector<Vec3>& at, size_t first, size_t last) {
+  const size_t n = last - first;
+  if (n <= (size_t)LANES) {
+    std::sort(order.begin() + first, order.begin() + last);
+    return;
+  }
+  double lo[3], hi[3];
+  for (int k = 0; k < 3; ++k) lo[k] = std::numeric_limits<double>::infinity(), hi[k] = -lo[k];
+  for (size_t i = first; i < last; ++i)
+    for (int k = 0; k < 3; ++k) {
+      const double x = axis_of(at[order[i]], k);
+      lo[k] = std::min(lo[k], x), hi[k] = std::max(hi[k], x);
+    }
+  int axis = 0;
+  for (int k = 1; k < 3; ++k)
+    if (hi[k] - lo[k] > hi[axis] - lo[axis]) axis = k;
+  const size_t blocks = (n + LANES - 1) / LANES, mid = first + LANES * ((blocks + 1) / 2);
+  const auto less = [&](int32_t a, int32_t b) {
+    const double x = axis_of(at[a], axis), y = axis_of(at[b], axis);
+    return x < y || (x == y && a < b);
+  };
+  std::nth_element(order.begin() + first, order.begin() + mid, order.begin() + last, less);
+  split(order, at, first, mid);
+  split(order, at, mid, last);
+}
+
+void put(float (&to)[3][LANES], int lane, const Vec3& v) {
+  to[0][lane] = (float)v.x, to[1][lane] = (float)v.y, to[2][lane] = (float)v.z;
+}
+
+void add_point(Store& s, const Surface& from, size_t block, int lane, int32_t i) {
+  const Vec3 p = vertex(from, i), q = p - s.centre;
+  s.points.push_back(p);
+  s.normals.push_back({from.normals[3 * (int64_t)i], from.normals[3 * (int64_t)i + 1], from.normals[3 * (int64_t)i + 2]});
+  s.id.push_back(i);
+  PointBlock& b = s.point_blocks[block];
+  b.x[lane] = (float)q.x, b.y[lane] = (float)q.y, b.z[lane] = (float)q.z;
+}
+
+void add_triangle(Store& s, const Surface& from, size_t block, int lane, int32_t i) {
+  const Triangle t = triangle(corners(from, from.kept[i]));
+  s.triangles.push_back(t);
+  s.normals.push_back(t.n);
+  s.id.push_back(from.kept[i]);
+  TriangleBlock& b = s.triangle_blocks[block];
+  put(b.a, lane, t.a - s.centre), put(b.u, lane, t.u), put(b.w, lane, t.w), put(b.n, lane, t.n);
+  b.length[lane] = (float)t.length, b.cx[lane] = (float)t.cx, b.cy[lane] = (float)t.cy;
+  b.inv_ac2[lane] = (float)t.inv_ac2, b.inv_bc2[lane] = (float)t.inv_bc2;
+}
+
+void grow(Box& b, const Vec3& p, float slack) {
+  for (int k = 0; k < 3; ++k) {
+    const float x = (float)axis_of(p, k);
+    b.lo[k] = std::min(b.lo[k], x - slack), b.hi[k] = std::max(b.hi[k], x + slack);
+  }
+}
+
+Box no_box() {
+  constexpr float inf = std::numeric_limits<float>::infinity();
+  return {{inf, inf, inf}, {-inf, -inf, -inf}};
+}
+
+Box box_of(const Store& s, uint32_t block) {
+  Box b = no_box();
+  for (size_t lane = (size_t)LANES * block; lane < (size_t)LANES * (block + 1); ++lane) {
+    if (!s.mesh) {
+      grow(b, s.points[lane] - s.centre, s.slack);
+      continue;
+    }
+    const Triangle& t = s.triangles[lane];
+    const Vec3 a = t.a - s.centre;
+    grow(b, a, s.slack);
+    grow(b, a - (-t.length) * t.u, s.slack);
+    grow(b, (a - (-t.cx) * t.u) - (-t.cy) * t.w, s.slack);
+  }
+  return b;
+}
+
+Box make_nodes(Store& s, uint32_t node, uint32_t first, uint32_t last) {
+  Box b = no_box();
+  if (last - first == 1) {
+    b = box_of(s, first);
+  } else {
+    const uint32_t left = (last - first + 1) / 2;
+    const Box l = make_nodes(s, node + 1, first, first + left), r = make_nodes(s, node + 2 * left, first + left, last);
+    for (int k = 0; k < 3; ++k) b.lo[k] = std::min(l.lo[k], r.lo[k]), b.hi[k] = std::max(l.hi[k], r.hi[k]);
+  }
+  s.nodes[node] = b;
+  return b;
+}
+
+void set_frame(Store& s, const Surface& from) {
+  Vec3 lo = vertex(from, 0), hi = lo;
+  for (int64_t i = 1; i < from.n_vertices; ++i) {
+    const Vec3 p = vertex(from, i);
+    lo = {std::min(lo.x, p.x), std::min(lo.y, p.y), std::min(lo.z, p.z)};
+    hi = {std::max(hi.x, p.x), std::max(hi.y, p.y), std::max(hi.z, p.z)};
+  }
+  s.centre = {0.5 * (lo.x + hi.x), 0.5 * (lo.y + hi.y), 0.5 * (lo.z + hi.z)};
+  s.extent = std::sqrt(dot(hi - lo, hi - lo));
+  // About 20 roundings of 6e-8 of the largest coordinate, doubled.
+  s.slack = (float)(2e-6 * (s.extent + s.reach));
+  const double grown = s.reach + 4.0 * s.slack;
+  s.low = {lo.x - grown, lo.y - grown, lo.z - grown};
+}
+
+}  // namespace
+
+void build_blocks(Store& s, const Surface& from) {
+  s.mesh = from.n_kept > 0;
+  set_frame(s, from);
+  const size_t n = (size_t)(s.mesh ? from.n_kept : from.n_vertices);
+  std::vector<Vec3> at(n);
+  for (size_t i = 0; i < n; ++i) {
+    if (!s.mesh) {
+      at[i] = vertex(from, (int64_t)i);
+      continue;
+    }
+    const Corners t = corners(from, from.kept[i]);
+    at[i] = {(t.a.x + t.b.x + t.c.x) / 3.0, (t.a.y + t.b.y + t.c.y) / 3.0, (t.a.z + t.b.z + t.c.z) / 3.0};
+  }
+  std::vector<int32_t> order(n);
+  std::iota(order.begin(), order.end(), 0);
+  split(order, at, 0, n);
+  s.blocks = (uint32_t)((n + LANES - 1) / LANES);
+  s.mesh ? s.triangle_blocks.resize(s.blocks) : s.point_blocks.resize(s.blocks);
+  for (size_t i = 0; i < (size_t)LANES * s.blocks; ++i) {
+    const int32_t k = order[std::min(i, n - 1)];  // the last block is filled up with the last primitive
+    s.mesh ? add_triangle(s, from, i / LANES, (int)(i % LANES), k) : add_point(s, from, i / LANES, (int)(i % LANES), k);
+  }
+  s.nodes.resize(2 * (size_t)s.blocks - 1);
+  make_nodes(s, 0, 0, s.blocks);
+}
+
+}  // namespace avs

@@ -1,0 +1,70 @@
+// What is compiled once for each instruction set, and how to call it.
+#pragma once
+#include "layout.hpp"
+
+namespace avs {
+
+// (n, 3) numbers with any strides [bytes].
+struct View {
+  const char* data;
+  int64_t n, row, column;
+  bool single;
+};
+
+constexpr int CHUNK = 512;  // points; partial sums are added in the order of chunks
+constexpr int SUMS = 32;
+
+enum class Pass { point, plane };
+
+// Sums of one chunk, coordinates relative to the model's centre.
+//   always: [0] inliers, [1] sum d2, [2] points not finite, [3] searches, [4..6] sum p
+//   point:  [7..9] sum foot, [10..18] sum p foot'
+//   plane:  [7..27] lower triangle of sum J'J, row by row, [28..] is in `extra`
+struct Sums {
+  double v[SUMS + 4];
+};
+
+// Place, foot and identity of each point at its last search.
+struct Kept {
+  double x, y, z;
+  float radius2;   // the neighbour is the same nearer than this to (x, y, z)
+  int32_t lane;    // 8 block + lane, -1: none
+};
+
+struct Feet {
+  double* foot;     // (n, 3)
+  double* d2;       // (n)
+  int32_t* id;      // (n)
+  double* normal;   // (n, 3)
+};
+
+// The top of a cell to be filled by `filter`: blocks that can hold the nearest primitive of some place in a box.
+struct Filter {
+  double centre[3];
+  double half;
+  const uint32_t* in;
+  uint32_t n;
+  uint32_t* out;      // room for n
+  float* scratch;     // room for 8 n
+};
+
+struct Filtered {
+  uint32_t n;
+  double distance;  // of the centre to the nearest primitive [m]
+};
+
+struct Code {
+  const char* name;
+  Filtered (*filter)(const Store&, const Filter&);
+  void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Feet&);
+  void (*pass)(const Store&, const View&, int64_t first, int64_t last, const double* T, double gate2, Pass, Kept*, Sums&);
+};
+
+const Code& code_base();
+#if defined(AVS_HAS_V3)
+const Code& code_v3();
+#endif
+// The fastest code this machine runs; the baseline where `portable`. Both give the same bits.
+const Code& code(bool portable);
+
+}  // namespace avs

@@ -1,0 +1,41 @@
+// The whole hot code of one instruction set. AVS_ISA names it and AVS_CODE its door.
+#include <cmath>
+#include <cstring>
+#include <limits>
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+#include "hot.hpp"
+
+namespace avs {
+namespace AVS_ISA {
+#include "simd.hpp"
+
+#include "primitive.hpp"
+
+#include "search.hpp"
+
+#include "filter.hpp"
+
+#include "pass.hpp"
+
+static Filtered filter(const Store& s, const Filter& f) {
+  return s.mesh ? filter_kind<Triangles, TrianglePivots>(s, f) : filter_kind<Points, PointPivots>(s, f);
+}
+
+static void closest(const Store& s, const View& v, int64_t first, int64_t last, const Feet& out) {
+  s.mesh ? closest_kind<Triangles>(s, v, first, last, out) : closest_kind<Points>(s, v, first, last, out);
+}
+
+static void pass(const Store& s, const View& v, int64_t first, int64_t last, const double* T, double gate2, Pass kind,
+                 Kept* kept, Sums& out) {
+  s.mesh ? pass_kind<Triangles>(s, v, first, last, T, gate2, kind, kept, out)
+         : pass_kind<Points>(s, v, first, last, T, gate2, kind, kept, out);
+}
+}  // namespace AVS_ISA
+
+const Code& AVS_CODE() {
+  static const Code code{AVS_NAME, AVS_ISA::filter, AVS_ISA::closest, AVS_ISA::pass};
+  return code;
+}
+}  // namespace avs

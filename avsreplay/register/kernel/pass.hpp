@@ -1,0 +1,192 @@
+// One chunk of a pass: move, search, sum. Included inside a namespace named after the instruction set.
+//
+// The chunk is taken in sweeps so that the cache misses of many points overlap: moved points and their cells first, then
+// the words, then the lists, then the blocks a few points ahead of the search.
+static_assert(CHUNK % 4 == 0, "sums run over four points at a time");
+
+struct Chunk {
+  alignas(32) double p[3][CHUNK];   // moved, relative to the model's centre
+  alignas(32) double f[3][CHUNK];   // foot, the same
+  alignas(32) double n[3][CHUNK];   // normal
+  alignas(32) double d2[CHUNK];
+  alignas(32) double take[CHUNK];   // 1: an inlier, 0: not
+  double c[3][CHUNK];               // moved, in {C}
+  Place cell[CHUNK];
+  uint32_t word[CHUNK];
+  uint8_t search[CHUNK];
+};
+
+static inline bool finite(const double* p) { return std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]); }
+
+template <class Number>
+static inline void read(const View& v, int64_t i, double* p) {
+  for (int k = 0; k < 3; ++k) {
+    Number x;
+    std::memcpy(&x, v.data + i * v.row + k * v.column, sizeof x);
+    p[k] = (double)x;
+  }
+}
+
+static inline void read(const View& v, int64_t i, double* p) { v.single ? read<float>(v, i, p) : read<double>(v, i, p); }
+
+static inline void move(const double* T, const double* p, double* q) {
+  for (int k = 0; k < 3; ++k) q[k] = T[4 * k] * p[0] + T[4 * k + 1] * p[1] + T[4 * k + 2] * p[2] + T[4 * k + 3];
+}
+
+static inline bool still_near(const Kept& k, const double* q) {
+  const double x = q[0] - k.x, y = q[1] - k.y, z = q[2] - k.z;
+  return x * x + y * y + z * z < (double)k.radius2;
+}
+
+static void gather(const Store& s, const View& v, int64_t first, int n, const double* T, const Kept* kept, Chunk& c,
+                   Sums& out) {
+  for (int i = 0; i < n; ++i) {
+    double p[3], q[3];
+    read(v, first + i, p);
+    c.search[i] = finite(p);
+    c.cell[i].inside = false;
+    if (!c.search[i]) {
+      out.v[2] += 1;
+      continue;
+    }
+    move(T, p, q);
+    for (int k = 0; k < 3; ++k) c.c[k][i] = q[k];
+    if (kept && still_near(kept[first + i], q)) {
+      c.search[i] = 2;
+      continue;
+    }
+    c.cell[i] = place(s, q[0], q[1], q[2]);
+    if (c.cell[i].inside) fetch(&s.top[top_slot(s, c.cell[i])]);
+  }
+}
+
+static void look_up(const Store& s, int n, Chunk& c) {
+  for (int i = 0; i < n; ++i) {
+    c.word[i] = c.cell[i].inside ? s.top[top_slot(s, c.cell[i])] : EMPTY;
+    if (c.word[i] & IS_BRICK) fetch(&s.bricks[brick_slot(c.word[i], c.cell[i], 0)]);
+  }
+  for (int level = 0; level < LEVELS; ++level)
+    for (int i = 0; i < n; ++i) {
+      if (c.word[i] & IS_BRICK) c.word[i] = s.bricks[brick_slot(c.word[i], c.cell[i], level)];
+      if (c.word[i] & IS_BRICK)
+        fetch(&s.bricks[brick_slot(c.word[i], c.cell[i], level + 1)]);
+      else if (c.word[i])
+        fetch(&s.lists[c.word[i]]);
+    }
+}
+
+constexpr int AHEAD = 4;
+
+template <class Kind>
+static inline void fetch_blocks(const Store& s, uint32_t word) {
+  if (word == EMPTY) return;
+  const uint32_t* list = s.lists.data() + word;
+  if (*list == TOO_MANY) return;
+  for (uint32_t k = 1; k <= *list && k <= 4; ++k) Kind::prefetch(s, list[k]);
+}
+
+static inline void enter(const Store& s, Chunk& c, int i, const Foot& f, int32_t lane, bool inlier, bool normals) {
+  c.take[i] = inlier ? 1 : 0;
+  c.d2[i] = inlier ? f.d2 : 0;
+  c.p[0][i] = inlier ? c.c[0][i] - s.centre.x : 0, c.f[0][i] = inlier ? f.x - s.centre.x : 0;
+  c.p[1][i] = inlier ? c.c[1][i] - s.centre.y : 0, c.f[1][i] = inlier ? f.y - s.centre.y : 0;
+  c.p[2][i] = inlier ? c.c[2][i] - s.centre.z : 0, c.f[2][i] = inlier ? f.z - s.centre.z : 0;
+  if (!normals) return;
+  const Vec3 n = inlier ? s.normals[(size_t)lane] : Vec3{0, 0, 0};
+  c.n[0][i] = n.x, c.n[1][i] = n.y, c.n[2][i] = n.z;
+}
+
+template <class Kind>
+static void search(const Store& s, int64_t first, int n, double gate2, bool normals, Kept* kept, Chunk& c, Sums& out) {
+  alignas(32) float scratch[LANES * LONGEST_LIST];
+  for (int i = 0; i < n; ++i) {
+    if (i + AHEAD < n) fetch_blocks<Kind>(s, c.word[i + AHEAD]);
+    if (!c.search[i]) {
+      enter(s, c, i, {}, -1, false, normals);
+      continue;
+    }
+    const Query q = query(s, c.c[0][i], c.c[1][i], c.c[2][i]);
+    Best best = nothing(s.reach * s.reach);
+    if (c.search[i] == 2) {
+      best.lane = kept[first + i].lane;
+      if (best.lane >= 0) best.foot = Kind::foot(s, (uint32_t)best.lane, q);
+    } else {
+      best = nearest<Kind>(s, q, c.word[i], scratch);
+      out.v[3] += 1;
+      if (kept) kept[first + i] = {q.x, q.y, q.z, 0.f, best.lane};
+    }
+    enter(s, c, i, best.foot, best.lane, best.lane >= 0 && best.foot.d2 < gate2, normals);
+  }
+}
+
+static void clear_tail(int n, Chunk& c) {
+  for (int i = n; i < (n + 3) / 4 * 4; ++i) {
+    c.take[i] = c.d2[i] = 0;
+    for (int k = 0; k < 3; ++k) c.p[k][i] = c.f[k][i] = c.n[k][i] = 0;
+  }
+}
+
+static void sum_point(int n, const Chunk& c, Sums& out) {
+  D4 a[18] = {};
+  for (int i = 0; i < n; i += 4) {
+    const D4 p[3] = {load4(c.p[0] + i), load4(c.p[1] + i), load4(c.p[2] + i)};
+    const D4 f[3] = {load4(c.f[0] + i), load4(c.f[1] + i), load4(c.f[2] + i)};
+    a[0] = a[0] + load4(c.take + i), a[1] = a[1] + load4(c.d2 + i);
+    for (int k = 0; k < 3; ++k) a[2 + k] = a[2 + k] + p[k], a[5 + k] = a[5 + k] + f[k];
+    for (int k = 0; k < 9; ++k) a[8 + k] = a[8 + k] + p[k / 3] * f[k % 3];
+  }
+  out.v[0] = sum_in_order(a[0]), out.v[1] = sum_in_order(a[1]);
+  for (int k = 0; k < 15; ++k) out.v[4 + k] = sum_in_order(a[2 + k]);
+}
+
+static void sum_plane(int n, const Chunk& c, Sums& out) {
+  D4 a[33] = {};
+  for (int i = 0; i < n; i += 4) {
+    const D4 p[3] = {load4(c.p[0] + i), load4(c.p[1] + i), load4(c.p[2] + i)};
+    const D4 m[3] = {load4(c.n[0] + i), load4(c.n[1] + i), load4(c.n[2] + i)};
+    const D4 e = (load4(c.f[0] + i) - p[0]) * m[0] + (load4(c.f[1] + i) - p[1]) * m[1] + (load4(c.f[2] + i) - p[2]) * m[2];
+    const D4 j[6] = {p[1] * m[2] - p[2] * m[1], p[2] * m[0] - p[0] * m[2], p[0] * m[1] - p[1] * m[0], m[0], m[1], m[2]};
+    a[0] = a[0] + load4(c.take + i), a[1] = a[1] + load4(c.d2 + i);
+    for (int k = 0; k < 3; ++k) a[2 + k] = a[2 + k] + p[k];
+    int t = 5;
+    for (int r = 0; r < 6; ++r)
+      for (int q = 0; q <= r; ++q, ++t) a[t] = a[t] + j[r] * j[q];
+    for (int r = 0; r < 6; ++r, ++t) a[t] = a[t] + j[r] * e;
+    a[t] = a[t] + e * e;
+  }
+  out.v[0] = sum_in_order(a[0]), out.v[1] = sum_in_order(a[1]);
+  for (int k = 0; k < 31; ++k) out.v[4 + k] = sum_in_order(a[2 + k]);
+}
+
+template <class Kind>
+static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last, const double* T, double gate2,
+                      Pass kind, Kept* kept, Sums& out) {
+  Chunk c;
+  const int n = (int)(last - first);
+  for (double& x : out.v) x = 0;
+  gather(s, v, first, n, T, kept, c, out);
+  look_up(s, n, c);
+  search<Kind>(s, first, n, gate2, kind == Pass::plane, kept, c, out);
+  clear_tail(n, c);
+  kind == Pass::plane ? sum_plane(n, c, out) : sum_point(n, c, out);
+}
+
+template <class Kind>
+static void closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const Feet& out) {
+  alignas(32) float scratch[LANES * LONGEST_LIST];
+  const double nan = std::numeric_limits<double>::quiet_NaN();
+  for (int64_t i = first; i < last; ++i) {
+    double p[3];
+    read(v, i, p);
+    const Place at = place(s, p[0], p[1], p[2]);
+    Best best = nothing(0);
+    if (at.inside) best = nearest<Kind>(s, query(s, p[0], p[1], p[2]), word_at(s, at), scratch);
+    const bool found = best.lane >= 0;
+    const Vec3 n = found ? s.normals[(size_t)best.lane] : Vec3{nan, nan, nan};
+    const Vec3 f = found ? Vec3{best.foot.x, best.foot.y, best.foot.z} : Vec3{nan, nan, nan};
+    out.id[i] = found ? s.id[(size_t)best.lane] : -1;
+    out.d2[i] = found ? best.foot.d2 : std::numeric_limits<double>::infinity();
+    out.foot[3 * i] = f.x, out.foot[3 * i + 1] = f.y, out.foot[3 * i + 2] = f.z;
+    out.normal[3 * i] = n.x, out.normal[3 * i + 1] = n.y, out.normal[3 * i + 2] = n.z;
+  }
+}

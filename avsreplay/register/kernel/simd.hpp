@@ -1,0 +1,143 @@
+// Eight floats and four doubles at a time, in operations that round alike on every machine.
+// Included inside a namespace named after the instruction set, so that two builds of it can stand in one program.
+struct F8 {
+#if defined(__GNUC__)
+  typedef float Raw __attribute__((vector_size(32)));
+  typedef int32_t Mask __attribute__((vector_size(32)));
+  Raw v;
+#else
+  struct Mask {
+    int32_t v[8];
+  };
+  float v[8];
+#endif
+};
+
+struct D4 {
+#if defined(__GNUC__)
+  typedef double Raw __attribute__((vector_size(32)));
+  Raw v;
+#else
+  double v[4];
+#endif
+};
+
+#if defined(__GNUC__)
+static inline F8 f8(float x) { return {x - F8::Raw{}}; }
+static inline F8 operator+(F8 a, F8 b) { return {a.v + b.v}; }
+static inline F8 operator-(F8 a, F8 b) { return {a.v - b.v}; }
+static inline F8 operator*(F8 a, F8 b) { return {a.v * b.v}; }
+static inline F8 operator/(F8 a, F8 b) { return {a.v / b.v}; }
+static inline F8::Mask operator<(F8 a, F8 b) { return a.v < b.v; }
+static inline F8::Mask both(F8::Mask a, F8::Mask b) { return a & b; }
+static inline F8::Mask none() { return F8::Mask{}; }
+static inline F8::Mask either(F8::Mask a, F8::Mask b) { return a | b; }
+static inline F8 select(F8::Mask m, F8 a, F8 b) { return {m ? a.v : b.v}; }
+static inline D4 operator+(D4 a, D4 b) { return {a.v + b.v}; }
+static inline D4 operator-(D4 a, D4 b) { return {a.v - b.v}; }
+static inline D4 operator*(D4 a, D4 b) { return {a.v * b.v}; }
+#else
+#define AVS_LANES8(expression) \
+  F8 r;                        \
+  for (int k = 0; k < 8; ++k) r.v[k] = expression; \
+  return r;
+#define AVS_MASK8(expression) \
+  F8::Mask r;                 \
+  for (int k = 0; k < 8; ++k) r.v[k] = (expression) ? -1 : 0; \
+  return r;
+#define AVS_LANES4(expression) \
+  D4 r;                        \
+  for (int k = 0; k < 4; ++k) r.v[k] = expression; \
+  return r;
+static inline F8 f8(float x) { AVS_LANES8(x) }
+static inline F8 operator+(F8 a, F8 b) { AVS_LANES8(a.v[k] + b.v[k]) }
+static inline F8 operator-(F8 a, F8 b) { AVS_LANES8(a.v[k] - b.v[k]) }
+static inline F8 operator*(F8 a, F8 b) { AVS_LANES8(a.v[k] * b.v[k]) }
+static inline F8 operator/(F8 a, F8 b) { AVS_LANES8(a.v[k] / b.v[k]) }
+static inline F8::Mask operator<(F8 a, F8 b) { AVS_MASK8(a.v[k] < b.v[k]) }
+static inline F8::Mask both(F8::Mask a, F8::Mask b) { AVS_MASK8(a.v[k] && b.v[k]) }
+static inline F8::Mask none() { AVS_MASK8(false) }
+static inline F8::Mask either(F8::Mask a, F8::Mask b) { AVS_MASK8(a.v[k] || b.v[k]) }
+static inline F8 select(F8::Mask m, F8 a, F8 b) { AVS_LANES8(m.v[k] ? a.v[k] : b.v[k]) }
+static inline D4 operator+(D4 a, D4 b) { AVS_LANES4(a.v[k] + b.v[k]) }
+static inline D4 operator-(D4 a, D4 b) { AVS_LANES4(a.v[k] - b.v[k]) }
+static inline D4 operator*(D4 a, D4 b) { AVS_LANES4(a.v[k] * b.v[k]) }
+#undef AVS_LANES8
+#undef AVS_MASK8
+#undef AVS_LANES4
+#endif
+
+static inline F8 load8(const float* p) {
+  F8 r;
+  std::memcpy(&r, p, sizeof r);
+  return r;
+}
+static inline void store8(float* p, F8 a) { std::memcpy(p, &a, sizeof a); }
+static inline D4 load4(const double* p) {
+  D4 r;
+  std::memcpy(&r, p, sizeof r);
+  return r;
+}
+static inline F8 min8(F8 a, F8 b) { return select(a < b, a, b); }
+static inline F8 max8(F8 a, F8 b) { return select(b < a, a, b); }
+static inline F8 clamp8(F8 x, F8 lo, F8 hi) { return min8(max8(x, lo), hi); }
+
+static inline F8 sqrt8(F8 a) {
+#if defined(__AVX__)
+  return {(F8::Raw)_mm256_sqrt_ps((__m256)a.v)};
+#else
+  float t[8];
+  store8(t, a);
+  for (int k = 0; k < 8; ++k) t[k] = std::sqrt(t[k]);
+  return load8(t);
+#endif
+}
+
+// Bit k is set where lane k of the mask is.
+static inline unsigned bits(F8::Mask m) {
+#if defined(__AVX__)
+  return (unsigned)_mm256_movemask_ps((__m256)m);
+#elif defined(__SSE2__) && defined(__GNUC__)
+  __m128 half[2];
+  std::memcpy(half, &m, sizeof m);
+  return (unsigned)(_mm_movemask_ps(half[0]) | _mm_movemask_ps(half[1]) << 4);
+#else
+  int32_t t[8];
+  std::memcpy(t, &m, sizeof t);
+  unsigned r = 0;
+  for (int k = 0; k < 8; ++k) r |= (t[k] ? 1u : 0u) << k;
+  return r;
+#endif
+}
+
+static inline float least(F8 a) {
+  float t[8];
+  store8(t, a);
+  float m = t[0];
+  for (int k = 1; k < 8; ++k) m = t[k] < m ? t[k] : m;
+  return m;
+}
+
+static inline double sum_in_order(D4 a) {
+  double t[4];
+  std::memcpy(t, &a, sizeof t);
+  return ((t[0] + t[1]) + t[2]) + t[3];
+}
+
+static inline int lowest_bit(unsigned m) {
+#if defined(__GNUC__)
+  return __builtin_ctz(m);
+#else
+  int k = 0;
+  while (!(m >> k & 1u)) ++k;
+  return k;
+#endif
+}
+
+static inline void fetch(const void* p) {
+#if defined(__GNUC__)
+  __builtin_prefetch(p);
+#else
+  (void)p;
+#endif
+}

@@ -1,0 +1,18 @@
+// One step of the pose from the sums of a pass. Coordinates are relative to the model's centre.
+#pragma once
+#include "hot.hpp"
+
+namespace avs {
+
+struct Step {
+  double D[12];       // rows of [R t]: the new pose is D T
+  double turn, move;  // angle [rad]; how far the inliers' centroid moves [m]
+};
+
+// Horn 1987 (equations section 6): M of the cross-covariance, scalar first; its largest eigenvector.
+Step horn_step(const Sums& sums);
+// One Gauss-Newton step of sum (n . (foot - D p))^2 about the inliers' centroid; false where the normal matrix is singular.
+bool plane_step(const Sums& sums, Step& step);
+void compose(const double* D, double* T);  // T = D T, both rows of [R t]
+
+}  // namespace avs

@@ -1,0 +1,51 @@
+#include "team.hpp"
+
+namespace avs {
+
+Team::Team(int threads) {
+  for (int k = 1; k < threads; ++k) threads_.emplace_back([this] { serve(); });
+}
+
+Team::~Team() {
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    stop_ = true;
+  }
+  wake_.notify_all();
+  for (std::thread& t : threads_) t.join();
+}
+
+void Team::each(int64_t n, const std::function<void(int64_t)>& work) {
+  if (threads_.empty() || n < 2) {
+    for (int64_t k = 0; k < n; ++k) work(k);
+    return;
+  }
+  {
+    const std::lock_guard<std::mutex> lock(mutex_);
+    work_ = &work, n_ = n, next_ = 0, busy_ = (int)threads_.size(), ++round_;
+  }
+  wake_.notify_all();
+  take();
+  std::unique_lock<std::mutex> lock(mutex_);
+  done_.wait(lock, [this] { return busy_ == 0; });
+}
+
+void Team::serve() {
+  uint64_t seen = 0;
+  std::unique_lock<std::mutex> lock(mutex_);
+  for (;;) {
+    wake_.wait(lock, [&] { return stop_ || round_ != seen; });
+    if (stop_) return;
+    seen = round_;
+    lock.unlock();
+    take();
+    lock.lock();
+    if (--busy_ == 0) done_.notify_one();
+  }
+}
+
+void Team::take() {
+  for (int64_t k; (k = next_.fetch_add(1)) < n_;) (*work_)(k);
+}
+
+}  // namespace avs
