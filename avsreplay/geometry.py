@@ -25,6 +25,7 @@ __all__ = [
     "multiply",
     "normalise",
     "quaternion",
+    "rotate",
     "skew",
     "slerp",
 ]
@@ -79,9 +80,17 @@ def conjugate(q_ab: ArrayLike) -> Array:
 def matrix(q_ab: ArrayLike) -> Array:
     """R_ab = I + 2 w [v x] + 2 [v x]^2 (paper, eq:R): active. (..., 4) -> (..., 3, 3)."""
     q: Array = np.asarray(q_ab, dtype=np.float64)
-    s = skew(q[..., :3])
-    R: Array = np.eye(3) + 2.0 * q[..., 3, None, None] * s + 2.0 * (s @ s)
+    v = q[..., :3]
+    square = v[..., :, None] * v[..., None, :] - np.sum(v * v, axis=-1)[..., None, None] * np.eye(3)  # [v x]^2
+    R: Array = np.eye(3) + 2.0 * q[..., 3, None, None] * skew(v) + 2.0 * square
     return R
+
+
+def rotate(R_ab: ArrayLike, v_b: ArrayLike) -> Array:
+    """R_ab v_b term by term: no fused library call, so the same bits on any processor. (..., 3, 3) x (..., 3)."""
+    R, v = np.asarray(R_ab, dtype=np.float64), np.asarray(v_b, dtype=np.float64)
+    out: Array = R[..., :, 0] * v[..., :1] + R[..., :, 1] * v[..., 1:2] + R[..., :, 2] * v[..., 2:]
+    return out
 
 
 def quaternion(R_ab: ArrayLike) -> Array:
@@ -176,11 +185,11 @@ class Pose:
     def inverse(self) -> Pose:
         """T_ba."""
         q_ba = conjugate(self.q)
-        return Pose(q_ba, -matrix(q_ba) @ self.t)
+        return Pose(q_ba, -rotate(matrix(q_ba), self.t))
 
     def __matmul__(self, other: Pose) -> Pose:
         """T_ab @ T_bc = T_ac."""
-        return Pose(multiply(self.q, other.q), self.R @ other.t + self.t)
+        return Pose(multiply(self.q, other.q), rotate(self.R, other.t) + self.t)
 
     def apply(self, points_b: ArrayLike) -> Array:
         """Points (..., 3) from b to a."""

@@ -142,12 +142,14 @@ class State:
     @property
     def T_ac(self) -> Pose:
         """Pose of the fixture in the camera: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho."""
-        return Pose(geometry.multiply(self.q_ab, self.q_bc), self.r_a + geometry.matrix(self.q_ab) @ self.c_b)
+        return Pose(
+            geometry.multiply(self.q_ab, self.q_bc), self.r_a + geometry.rotate(geometry.matrix(self.q_ab), self.c_b)
+        )
 
     @property
     def fixture_velocity(self) -> Array:
         """(3,) velocity of {C}'s origin in {A} [m/s] (section 8)."""
-        return self.v_a + geometry.matrix(self.q_ab) @ np.cross(self.w_b, self.c_b)
+        return self.v_a + geometry.rotate(geometry.matrix(self.q_ab), np.cross(self.w_b, self.c_b))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
