@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avsreplay.errors import UsageError
-from avsreplay.log import LogWriter, Loss, SourceOptions, read_surface
+from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface
 from avsreplay.simulate import Scenario, builtin_surface, load_scenario, simulate
 
@@ -103,8 +103,6 @@ def record_source(
     """Take over the scans, truth, labels and model of ``source``; stamps are those the clock rule chose."""
     if output.exists() and source.exists() and output.samefile(source):
         raise UsageError("the output is the source", where=str(output), hint="name another output")
-    from avsreplay.log import open_source
-
     reading = replace(
         reading, model=options.model or reading.model, cloud_model=options.cloud_model or reading.cloud_model
     )

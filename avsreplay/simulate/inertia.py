@@ -38,7 +38,7 @@ class Body:
     @property
     def c_b(self) -> Array:
         """(3,) fixture in {B}, varrho [m]: p_b = A(mu) p_c + varrho puts the mass centre at zero."""
-        return -geometry.matrix(self.q_bc) @ self.centre_c
+        return -geometry.rotate(geometry.matrix(self.q_bc), self.centre_c)
 
     @property
     def sigma(self) -> Array:

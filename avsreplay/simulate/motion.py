@@ -21,7 +21,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
 from avsreplay.simulate.inertia import Body
 
-__all__ = ["Motion", "MotionParams", "rotate"]
+__all__ = ["Motion", "MotionParams"]
 
 ORDER = 22
 STEP_RAD = 0.25
@@ -79,7 +79,7 @@ class Motion:
         """Rotations R_ac (n, 3, 3) and fixture positions (n, 3) in {A} at times (n,) [s]."""
         q_ac, _, centre, _ = self.states(times_s)
         R_ac = geometry.matrix(q_ac)
-        return R_ac, centre - rotate(R_ac, self._body.centre_c)
+        return R_ac, centre - geometry.rotate(R_ac, self._body.centre_c)
 
     def pose(self, t_s: float) -> Pose:
         """T_ac at an instant [s]."""
@@ -91,18 +91,13 @@ class Motion:
         body = self._body
         return State(
             q_ab=geometry.normalise(geometry.multiply(q_ac, geometry.conjugate(body.q_bc))),
-            w_b=rotate(geometry.matrix(body.q_bc), w_c),
+            w_b=geometry.rotate(geometry.matrix(body.q_bc), w_c),
             r_a=centre,
             v_a=velocity,
             sigma=body.sigma,
             c_b=body.c_b,
             q_bc=body.q_bc,
         )
-
-
-def rotate(R_ab: Array, v_b: Array) -> Array:
-    """R v term by term for batches (..., 3, 3) and (..., 3): no fused library call, so the same bits everywhere."""
-    return R_ab[..., :, 0] * v_b[..., :1] + R_ab[..., :, 1] * v_b[..., 1:2] + R_ab[..., :, 2] * v_b[..., 2:]
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,10 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.geometry import Array, frozen
+from avsreplay.geometry import Array, frozen, rotate
 from avsreplay.records import Surface
 from avsreplay.simulate.caster import Caster, Engine
-from avsreplay.simulate.motion import Motion, rotate
+from avsreplay.simulate.motion import Motion
 
 __all__ = ["Pattern", "Returns", "Scanner", "ScannerParams", "View"]
 
