@@ -25,10 +25,11 @@ from avsreplay.errors import UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 
-__all__ = ["Closest", "Engine", "IcpParams", "IcpResult", "Model", "NormalEquations"]
+__all__ = ["Closest", "Engine", "IcpParams", "IcpResult", "Model", "NormalEquations", "Rule"]
 
 Engine = Literal["kernel", "reference"]
-MIN_INLIERS = 6
+Rule = tuple[int, int, float, float, float, float, float]
+"""n_max, n_plane, gate, tighten, floor, eps_rad, eps_m: IcpParams with its autos resolved."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +50,7 @@ class IcpParams:
     eps_rad: float = 1e-5  # stop below this turn [rad]
     eps_m: float | None = None  # and below this move of the centroid [m]; auto: 1e-6 of the model's extent
     threads: int = 1  # the result is the same, to the bit, for any number
+    keep: bool = True  # keep a neighbour while it provably cannot change; the result is the same, to the bit
 
     def __post_init__(self) -> None:
         if self.n_max < 1 or not 0 <= self.n_plane <= self.n_max:
@@ -120,7 +122,10 @@ class _Index(Protocol):
 
     def closest(self, points: NDArray[Any], threads: int) -> tuple[Array, Array, NDArray[np.int32], Array]: ...
 
-    def icp(self, points: NDArray[Any], T_ca: Array, rule: tuple[float, ...], threads: int) -> tuple[Any, ...]: ...
+    @property
+    def bytes(self) -> int: ...
+
+    def icp(self, points: NDArray[Any], T_ca: Array, rule: Rule, threads: int, keep: bool) -> tuple[Any, ...]: ...
 
     def normal_equations(
         self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int
@@ -159,6 +164,11 @@ class Model:
         size = len(kept) if len(faces) else len(vertices)
         return cls(float(reach_m), surface.extent, engine, size, len(faces) - len(kept), index)
 
+    @property
+    def bytes(self) -> int:
+        """Memory of the index [B]; 0 for the reference engine, which does not count."""
+        return self._index.bytes
+
     def closest(self, points: NDArray[Any], *, threads: int = 1) -> Closest:
         """Feet of ``points`` (n, 3) [m] in {C}; a point that is not finite has none."""
         return Closest(*self._index.closest(_points(points), threads))
@@ -174,7 +184,7 @@ class Model:
         floor = self.extent_m / 500.0 if params.floor_m is None else params.floor_m
         eps_m = 1e-6 * self.extent_m if params.eps_m is None else params.eps_m
         rule = (params.n_max, params.n_plane, gate, params.tighten, floor, params.eps_rad, eps_m)
-        return IcpResult(*self._index.icp(_points(points), _rigid(T_ca), rule, params.threads))
+        return IcpResult(*self._index.icp(_points(points), _rigid(T_ca), rule, params.threads, params.keep))
 
     def normal_equations(
         self, points: NDArray[Any], T_ca: ArrayLike | Pose, gate_m: float | None = None, *, threads: int = 1

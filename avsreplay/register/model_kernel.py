@@ -11,6 +11,8 @@ from avsreplay.errors import MissingBackend
 from avsreplay.geometry import Array
 from avsreplay.register.model_reference import cloud_normals
 
+Rule = tuple[int, int, float, float, float, float, float]
+
 __all__ = ["KernelIndex"]
 
 
@@ -32,10 +34,14 @@ class KernelIndex:
         foot, d2, ids, normal = self._index.closest(points, threads)
         return foot, d2, ids, normal
 
-    def icp(self, points: NDArray[Any], T_ca: Array, rule: tuple[float, ...], threads: int) -> tuple[Any, ...]:
-        """The loop of ``Model.icp``; ``rule`` is (n_max, n_plane, gate, tighten, floor, eps_rad, eps_m)."""
-        result: tuple[Any, ...] = self._index.icp(points, T_ca, *rule, threads)
-        return result
+    @property
+    def bytes(self) -> int:
+        """Memory of the index [B]."""
+        return self._index.bytes
+
+    def icp(self, points: NDArray[Any], T_ca: Array, rule: Rule, threads: int, keep: bool) -> tuple[Any, ...]:
+        """The loop of ``Model.icp``."""
+        return self._index.icp(points, T_ca, *rule, threads, keep)
 
     def normal_equations(
         self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int

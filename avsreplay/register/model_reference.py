@@ -40,6 +40,8 @@ class ReferenceIndex:
             self._search = _CloudSearch(vertices)
             self._ids = np.arange(len(vertices), dtype=np.int32)
 
+    bytes = 0
+
     def closest(self, points: NDArray[Any], threads: int) -> tuple[Array, Array, NDArray[np.int32], Array]:
         """Feet (n, 3), squared distances (n,), ids (n,), normals (n, 3)."""
         del threads
@@ -53,9 +55,16 @@ class ReferenceIndex:
         foot[rows], d2[rows], ids[rows], normal[rows] = f[near], d[near], self._ids[i[near]], self._normals[i[near]]
         return foot, d2, ids, normal
 
-    def icp(self, points: NDArray[Any], T_ca: Array, rule: tuple[float, ...], threads: int) -> tuple[Any, ...]:
+    def icp(
+        self,
+        points: NDArray[Any],
+        T_ca: Array,
+        rule: tuple[int, int, float, float, float, float, float],
+        threads: int,
+        keep: bool,
+    ) -> tuple[Any, ...]:
         """The loop of ``Model.icp``; ``rule`` is (n_max, n_plane, gate, tighten, floor, eps_rad, eps_m)."""
-        del threads
+        del threads, keep
         n_max, n_plane, gate, tighten, floor, eps_rad, eps_m = rule
         finite = np.isfinite(points).all(axis=1)
         scan = points[finite].astype(np.float64)

@@ -90,11 +90,11 @@ class Index {
     return nb::make_tuple(foot, d2, id, normal);
   }
 
-  nb::tuple icp(const Cloud& points, const Doubles& T_ca, double n_max, double n_plane, double gate, double tighten,
+  nb::tuple icp(const Cloud& points, const Doubles& T_ca, int n_max, int n_plane, double gate, double tighten,
                 double floor, double eps_rad, double eps_m, int threads, bool keep) const {
     const View v = view(points);
     const Rows T = rows(T_ca);
-    const Rule rule{(int)n_max, (int)n_plane, gate, tighten, floor, eps_rad, eps_m};
+    const Rule rule{n_max, n_plane, gate, tighten, floor, eps_rad, eps_m};
     Outcome o;
     {
       nb::gil_scoped_release release;

@@ -1,0 +1,336 @@
+"""Registration against a fixed model: ours and the peers on the same inputs, one process, in turn, medians of ratios.
+
+    python tests/benchmarks/registration.py [--quick] [--model 100000] [--scan 10000] [--reps 7] [--only index,passes]
+
+The target is the built-in satellite; the scan is ray-cast from one side with 1 cm noise and a share of outliers.
+Model-side structures are built beforehand; GICP's scan covariances are part of its work. Peers that are not installed
+are left out and said so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from avsreplay.geometry import Array, Pose, exp
+from avsreplay.records import Surface
+from avsreplay.register.model import IcpParams, Model
+from avsreplay.register.quaternion_fit import best_motion
+from avsreplay.simulate import builtin_surface
+
+REACH_M = 0.3
+NOISE_M = 0.01
+EPS_RAD, EPS_M = 1e-5, 1e-5
+NO_FACES = np.zeros((0, 3), dtype=np.int32)
+
+
+def sample(surface: Surface, n: int, seed: int) -> Surface:
+    """A cloud of n points on the surface, spread evenly over its area; coordinates rounded to single precision."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    corners = surface.vertices[surface.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    k = np.searchsorted(np.cumsum(area) / area.sum(), (np.arange(n) + rng.random(n)) / n).clip(0, len(area) - 1)
+    a, b = rng.random(n), rng.random(n)
+    flip = a + b > 1
+    a[flip], b[flip] = 1 - a[flip], 1 - b[flip]
+    p = corners[k, 0] + a[:, None] * (corners[k, 1] - corners[k, 0]) + b[:, None] * (corners[k, 2] - corners[k, 0])
+    return Surface(p.astype(np.float32).astype(np.float64), NO_FACES, f"{n} points", "")
+
+
+def look(surface: Surface, n: int, outliers: float, seed: int) -> tuple[Array, Pose]:
+    """A scan (n, 3) float32 in {A} from a random side, 6 extents away in angle terms, and the true T_ca."""
+    import trimesh
+
+    rng = np.random.Generator(np.random.PCG64(seed))
+    T_ca = Pose(exp(rng.standard_normal(3)), np.zeros(3))
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    centre = (surface.vertices.max(0) + surface.vertices.min(0)) / 2
+    eye = centre - 2.0 * surface.extent * T_ca.R[:, 2]
+    T_ca = Pose(T_ca.q, eye)
+    seen = (surface.vertices - eye) @ T_ca.R
+    lo, hi = (seen[:, :2] / seen[:, 2:]).min(0), (seen[:, :2] / seen[:, 2:]).max(0)
+    hits = np.empty((0, 3))
+    while len(hits) < n:
+        xy = rng.uniform(lo, hi, (2 * n, 2))
+        d = np.column_stack([xy, np.ones(2 * n)])
+        d /= np.linalg.norm(d, axis=1, keepdims=True)
+        at, ray, _ = mesh.ray.intersects_location(np.tile(eye, (2 * n, 1)), d @ T_ca.R.T, multiple_hits=False)
+        distance = np.linalg.norm(at - eye, axis=1) + NOISE_M * rng.standard_normal(len(at))
+        hits = np.concatenate([hits, d[ray] * distance[:, None]])
+    hits = hits[:n]
+    hits = hits[np.lexsort((np.floor(hits[:, 0] / hits[:, 2] * 300), np.floor(hits[:, 1] / hits[:, 2] * 300)))]
+    wrong = rng.choice(n, int(outliers * n), replace=False)
+    hits[wrong] = rng.uniform(hits.min(0) - 0.5, hits.max(0) + 0.5, (len(wrong), 3))
+    return hits.astype(np.float32), T_ca
+
+
+def off(T_ca: Pose, deg: float, metres: float, seed: int) -> Pose:
+    """T_ca with its error: `deg` about the target's middle and `metres` of shift, in random directions."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    a, b = rng.standard_normal(3), rng.standard_normal(3)
+    return Pose(exp(np.radians(deg) * a / np.linalg.norm(a)), metres * b / np.linalg.norm(b)) @ T_ca
+
+
+def error(T_ca: Array, truth: Pose) -> tuple[float, float]:
+    """Degrees, and millimetres at the target's origin."""
+    d = Pose.from_matrix(T_ca) @ truth.inverse()
+    return float(np.degrees(2 * np.arcsin(min(1.0, np.linalg.norm(d.q[:3]))))), float(1e3 * np.linalg.norm(d.t))
+
+
+@dataclass
+class Case:
+    """One candidate: what it does, how long each turn took [s], where it ended."""
+
+    run: Callable[[], tuple[Array, int]]
+    seconds: list[float] = field(default_factory=list)
+    T_ca: Array = field(default_factory=lambda: np.eye(4))
+    passes: int = 0
+
+    @property
+    def ms(self) -> float:
+        return 1e3 * statistics.median(self.seconds)
+
+
+def in_turn(cases: dict[str, Case], reps: int) -> None:
+    """A B C A B C ...: every candidate once a round, the first round not counted."""
+    for turn in range(reps + 1):
+        for case in cases.values():
+            start = time.perf_counter()
+            case.T_ca, case.passes = case.run()
+            if turn:
+                case.seconds.append(time.perf_counter() - start)
+
+
+def table(title: str, cases: dict[str, Case], truth: Pose, ours: str) -> None:
+    """Times, where each ended, and how many times slower than ours, turn by turn."""
+    print(f"\n{title}")
+    print(f"{'method':44} {'ms':>9} {'x ours':>8} {'passes':>7} {'deg':>8} {'mm':>8}")
+    for name, case in cases.items():
+        ratio = statistics.median(a / b for a, b in zip(case.seconds, cases[ours].seconds, strict=True))
+        deg, mm = error(case.T_ca, truth)
+        print(f"{name:44} {case.ms:9.2f} {ratio:8.2f} {case.passes:7d} {deg:8.4f} {mm:8.3f}", flush=True)
+
+
+def ours(model: Model, scan: Array, guess: Pose, rule: IcpParams) -> Callable[[], tuple[Array, int]]:
+    def run() -> tuple[Array, int]:
+        r = model.icp(scan, guess, rule)
+        return r.T_ca, r.iterations
+
+    return run
+
+
+def scipy_horn(points: Array, scan: Array, guess: Pose, n_max: int, eps: float) -> Callable[[], tuple[Array, int]]:
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(points)
+
+    def run() -> tuple[Array, int]:
+        T, passes, p = guess, 0, scan.astype(np.float64)
+        while passes < n_max:
+            passes += 1
+            q = T.apply(p)
+            d, i = tree.query(q, distance_upper_bound=REACH_M)
+            ok = np.isfinite(d)
+            D = best_motion(q[ok], points[i[ok]])
+            T = D @ T
+            c = q[ok].mean(axis=0)
+            if 2 * np.linalg.norm(D.q[:3]) < eps and np.linalg.norm(D.apply(c) - c) < eps:
+                break
+        return T.matrix, passes
+
+    return run
+
+
+def small_gicp(
+    points: Array, scan: Array, guess: Pose, kind: str, n_max: int, eps: float, threads: int = 1
+) -> Callable[[], tuple[Array, int]]:
+    import small_gicp as sg
+
+    target = sg.PointCloud(points)
+    tree = sg.KdTree(target)
+    sg.estimate_normals_covariances(target, tree, 10, 1)
+    scan64, T0 = scan.astype(np.float64), guess.matrix
+
+    def run() -> tuple[Array, int]:
+        source = sg.PointCloud(scan64)
+        if kind == "GICP":
+            sg.estimate_covariances(source, sg.KdTree(source, num_threads=threads), 10, threads)
+        r = sg.align(
+            target,
+            source,
+            tree,
+            T0,
+            registration_type=kind,
+            max_correspondence_distance=REACH_M,
+            num_threads=threads,
+            max_iterations=n_max,
+            rotation_epsilon=eps,
+            translation_epsilon=eps,
+        )
+        return r.T_target_source, r.iterations
+
+    return run
+
+
+def open3d_plane(points: Array, normals: Array, scan: Array, guess: Pose) -> Callable[[], tuple[Array, int]]:
+    import open3d as o3d
+
+    reg = o3d.pipelines.registration
+    target = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    target.normals = o3d.utility.Vector3dVector(normals)
+    scan64 = scan.astype(np.float64)
+
+    def run() -> tuple[Array, int]:
+        source = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(scan64))
+        rule = reg.ICPConvergenceCriteria(1e-7, 1e-7, 200)
+        estimate = reg.TransformationEstimationPointToPlane()
+        r = reg.registration_icp(source, target, REACH_M, guess.matrix, estimate, rule)
+        return np.array(r.transformation), 0
+
+    return run
+
+
+def peers(make: dict[str, Callable[[], Callable[[], tuple[Array, int]]]]) -> Iterator[tuple[str, Case]]:
+    for name, build in make.items():
+        try:
+            yield name, Case(build())
+        except ImportError as missing:
+            print(f"left out: {name} ({missing})")
+
+
+def fixed(n_max: int, n_plane: int = 0, **more: Any) -> IcpParams:
+    return IcpParams(n_max=n_max, n_plane=n_plane, tighten=0.0, eps_rad=0.0, eps_m=0.0, **more)
+
+
+def settled(n_plane: int = 6, **more: Any) -> IcpParams:
+    return IcpParams(n_max=200, n_plane=n_plane, eps_rad=EPS_RAD, eps_m=EPS_M, **more)
+
+
+def index(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
+    """Build time and memory."""
+    print(f"\nindex, reach {REACH_M} m")
+    jobs: list[tuple[str, Surface, float]] = [("built-in mesh", surface, REACH_M), (cloud.name, cloud, REACH_M)]
+    if not args.quick:
+        jobs.append(("500000 points", sample(surface, 500_000, 1), REACH_M))
+    hubble = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "spacecraft-meshes" / "HST.obj"
+    if hubble.exists():
+        import trimesh
+
+        mesh = trimesh.load(hubble, force="mesh")
+        hst = Surface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32), "HST mesh", "")
+        jobs.append((f"HST mesh ({len(hst.faces)} triangles)", hst, 0.05 * hst.extent))
+    for name, target, reach in jobs:
+        seconds = []
+        for _ in range(1 if args.quick else 3):
+            start = time.perf_counter()
+            model = Model.build(target, reach)
+            seconds.append(time.perf_counter() - start)
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        print(f"{name:28} {statistics.median(seconds):7.3f} s {model.bytes / 1e6:8.1f} MB  (peak {peak:.0f} MB)")
+
+
+def passes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
+    """The same 20 point-to-point passes, with and without outliers."""
+    model, mesh = Model.build(cloud, REACH_M), Model.build(surface, REACH_M)
+    points = cloud.vertices
+    for outliers, deg, metres in ((0.05, 3.0, 0.05), (0.0, 3.0, 0.05), (0.0, 0.5, 0.01)):
+        scan, truth = look(surface, args.scan, outliers, 3)
+        guess = off(truth, deg, metres, 4)
+        cases = {
+            "ours, cloud": Case(ours(model, scan, guess, fixed(20))),
+            "ours, cloud, every search made": Case(ours(model, scan, guess, fixed(20, keep=False))),
+            "ours, mesh": Case(ours(mesh, scan, guess, fixed(20))),
+            "ours, mesh, every search made": Case(ours(mesh, scan, guess, fixed(20, keep=False))),
+        }
+        makers = {
+            "scipy cKDTree + Horn": partial(scipy_horn, points, scan, guess, 20, 0.0),
+            "small_gicp ICP": partial(small_gicp, points, scan, guess, "ICP", 20, 0.0),
+        }
+        cases.update(peers(makers))
+        in_turn(cases, args.reps)
+        case = f"model {len(points)}, scan {len(scan)}, outliers {outliers:.0%}, start {deg} deg"
+        table(f"20 point-to-point passes: {case}", cases, truth, "ours, cloud")
+
+
+def converged(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
+    """To converged: ours with the default rule, the peers with theirs."""
+    model, mesh = Model.build(cloud, REACH_M), Model.build(surface, REACH_M)
+    points = cloud.vertices
+    normals = model.closest(points).normal
+    for outliers, deg, metres in ((0.0, 0.5, 0.01), (0.05, 3.0, 0.05)):
+        scan, truth = look(surface, args.scan, outliers, 3)
+        guess = off(truth, deg, metres, 4)
+        cases = {
+            "ours, mesh": Case(ours(mesh, scan, guess, settled())),
+            "ours, mesh, gate not tightened": Case(ours(mesh, scan, guess, settled(tighten=0.0))),
+            "ours, mesh, Horn only": Case(ours(mesh, scan, guess, settled(0))),
+            "ours, cloud": Case(ours(model, scan, guess, settled())),
+        }
+        makers = {
+            "small_gicp GICP": partial(small_gicp, points, scan, guess, "GICP", 200, EPS_RAD),
+            "small_gicp PLANE_ICP": partial(small_gicp, points, scan, guess, "PLANE_ICP", 200, EPS_RAD),
+            "Open3D point-to-plane (its own threads)": partial(open3d_plane, points, normals, scan, guess),
+        }
+        cases.update(peers(makers))
+        in_turn(cases, args.reps)
+        case = f"model {len(points)}, scan {len(scan)}, outliers {outliers:.0%}, start {deg} deg"
+        table(f"to converged: {case}", cases, truth, "ours, mesh")
+
+
+def speed(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
+    """Nanoseconds a point of one fused pass, searched and kept, and what a second thread gives at 50k points."""
+    print("\nfused pass, ns a point, one thread (start 0.5 deg, no outliers)")
+    scan, truth = look(surface, args.scan, 0.0, 3)
+    guess = off(truth, 0.5, 0.01, 4)
+    for name, target in (("cloud", cloud), ("mesh", surface)):
+        model = Model.build(target, REACH_M)
+        still = Pose.from_matrix(model.icp(scan, guess, fixed(60)).T_ca)
+        cases = {}
+        for kind, n_plane in (("point", 0), ("plane", 20)):
+            cases[f"{kind}, searched"] = Case(ours(model, scan, guess, fixed(20, n_plane, keep=False)))
+            cases[f"{kind}, kept (from the fixed point)"] = Case(ours(model, scan, still, fixed(20, n_plane)))
+        in_turn(cases, args.reps)
+        for kind, case in cases.items():
+            print(f"{name:6} {kind:36} {1e9 * statistics.median(case.seconds) / 20 / len(scan):7.1f}")
+    many, truth = look(surface, 50_000, 0.05, 3)
+    guess = off(truth, 3.0, 0.05, 4)
+    for name, target in (("cloud", cloud), ("mesh", surface)):
+        model = Model.build(target, REACH_M)
+        cases = {f"{t} threads": Case(ours(model, many, guess, fixed(20, threads=t))) for t in (1, 2)}
+        in_turn(cases, args.reps)
+        gain = statistics.median(a / b for a, b in zip(*(c.seconds for c in cases.values()), strict=True))
+        same = np.array_equal(cases["1 threads"].T_ca, cases["2 threads"].T_ca)
+        print(f"{name:6} 50000 points: 2 threads {gain:.2f}x one, poses bit-identical: {same}")
+
+
+PARTS = {"index": index, "speed": speed, "passes": passes, "converged": converged}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small and few: does it run")
+    parser.add_argument("--model", type=int, default=100_000)
+    parser.add_argument("--scan", type=int, default=10_000)
+    parser.add_argument("--reps", type=int, default=7)
+    parser.add_argument("--only", default=",".join(PARTS))
+    args = parser.parse_args()
+    if args.quick:
+        args.model, args.scan, args.reps = min(args.model, 20_000), min(args.scan, 2_000), 1
+    surface = builtin_surface()
+    cloud = sample(surface, args.model, 1)
+    print(f"{surface.name}: {len(surface.faces)} triangles, extent {surface.extent:.2f} m")
+    for name in args.only.split(","):
+        PARTS[name](cloud, surface, args)
+
+
+if __name__ == "__main__":
+    main()
