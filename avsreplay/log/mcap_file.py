@@ -8,7 +8,6 @@ channels whose first chunk is lost and messages that nothing else tells of.
 from __future__ import annotations
 
 import zlib
-from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,8 +16,8 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.log import mcap_records as mcap
 from avsreplay.log.byte_file import ByteFile
 from avsreplay.log.cursor import BadMessage, Cursor
-from avsreplay.log.inflate import inflate
-from avsreplay.log.mcap_records import Channel, ChunkHead, Fields
+from avsreplay.log.mcap_chunks import ChunkStore
+from avsreplay.log.mcap_records import Channel, Fields
 from avsreplay.log.mcap_resync import hides_chunk, next_record
 from avsreplay.log.mcap_summary import Summary, read_summary
 from avsreplay.log.options import Loss, TopicInfo
@@ -27,7 +26,6 @@ from avsreplay.log.text import shown
 
 __all__ = ["McapFile"]
 
-_COMPRESSIONS = ("", "zstd", "lz4")
 _MODELS = (".ply", ".stl", ".obj", ".off", ".glb")
 
 
@@ -54,13 +52,13 @@ class McapFile:
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
         self._topics: dict[str, TopicCount] = {}
         self._clouds: dict[str, CloudIndex] = {}
-        self._chunks = tuple(array("q") for _ in range(4))  # data offset, data size, compression, inflated size
-        self._cache: dict[int, bytes] = {}
         self._model: tuple[str, int, int] | None = None
         self._bad_chunk: Loss | None = None
+        self._resume: int | None = None
         self._orphans = self._seen = 0
         self._file = ByteFile(path)
         self._size = self._file.size
+        self._chunks = ChunkStore(self._file, limit)
         try:
             self._survey()
         except BaseException:
@@ -89,7 +87,7 @@ class McapFile:
         chunk, offset, size = index.container[place], index.offset[place], index.size[place]
         if chunk < 0:
             return self._file.read(offset, size)
-        return memoryview(self._chunk(chunk))[offset : offset + size]
+        return memoryview(self._chunks[chunk])[offset : offset + size]
 
     def attachment(self) -> tuple[str, bytes] | None:
         """The model the file carries: the first attachment that is a mesh file."""
@@ -101,14 +99,6 @@ class McapFile:
     def close(self) -> None:
         """Let go of the file."""
         self._file.close()
-
-    def _chunk(self, number: int) -> bytes:
-        if number not in self._cache:
-            if len(self._cache) > 1:
-                self._cache.pop(next(iter(self._cache)))
-            offset, size, compression, inflated = (column[number] for column in self._chunks)
-            self._cache[number] = inflate(self._file.read(offset, size), _COMPRESSIONS[compression], inflated)
-        return self._cache[number]
 
     def _survey(self) -> None:
         if self._size == 0:
@@ -142,7 +132,8 @@ class McapFile:
             self._take(opcode, at, end)
         except BadMessage as error:
             return self._resync(at, summary, str(error))
-        return end
+        resume, self._resume = self._resume or end, None
+        return resume
 
     def _cut(self, at: int) -> int:
         self._lose(Loss("the file is cut inside a record", at, self._size - at))
@@ -154,7 +145,7 @@ class McapFile:
             handler(self, at, end)
         elif opcode < 0x80:
             raise BadMessage(f"a record of unknown kind 0x{opcode:02x}")
-        elif hides_chunk(self._file, at, end):
+        elif hides_chunk(self._file, at, end) or self._swallowed(at, end) is not None:
             raise BadMessage("a chunk whose kind is damaged")
 
     def _content(self, at: int, end: int) -> Fields:
@@ -174,7 +165,10 @@ class McapFile:
 
     def _take_metadata(self, at: int, end: int) -> None:
         fields = self._content(at, end)
-        self.metadata.setdefault(fields.text(), fields.mapping())
+        name, values = fields.text(), fields.mapping()
+        if fields.at != len(fields.view):
+            raise BadMessage("a metadata record with bytes left over")
+        self.metadata.setdefault(name, values)
 
     def _take_message(self, at: int, end: int) -> None:
         if end - at < 31:
@@ -183,10 +177,15 @@ class McapFile:
         self._message(payload, 0, len(payload), -1, at + 9)
 
     def _take_message_index(self, at: int, end: int) -> None:
+        fields = Fields(memoryview(self._file.upto(at + 9, min(6, end - at - 9))))
+        fields.take(2)
+        size = fields.number(4)
+        if size % 16 or size != end - at - 15:
+            raise BadMessage("a message index whose lengths contradict each other")
         if self._bad_chunk is None:
             return
-        count = (end - at - 15) // 16
-        self._bad_chunk = replace(self._bad_chunk, messages=(self._bad_chunk.messages or 0) + max(count, 0))
+        count = size // 16
+        self._bad_chunk = replace(self._bad_chunk, messages=(self._bad_chunk.messages or 0) + count)
 
     def _take_attachment(self, at: int, end: int) -> None:
         fields = self._content(at, end)
@@ -198,6 +197,8 @@ class McapFile:
         checked = fields.view[: fields.at]
         crc = fields.number(4)
         if crc and zlib.crc32(checked) != crc:
+            if self._swallowed(at, end) is not None:
+                raise BadMessage("an attachment whose length is damaged")
             self._lose(Loss(f"the checksum of attachment '{shown(name)}' does not hold", at, end - at))
         elif self._model is None and name.lower().endswith(_MODELS):
             self._model = (name, start, size)
@@ -210,19 +211,14 @@ class McapFile:
     def _take_chunk(self, at: int, end: int) -> None:
         head = mcap.chunk_head(self._file.upto(at, min(mcap.CHUNK_PREFIX, end - at)), end - at)
         try:
-            data = self._inflated(at, head)
+            data = self._chunks.check(at, head)
             walked = [(op, b, e) for op, b, e in mcap.records(memoryview(data))]
         except BadMessage as error:
             start_ns, end_ns = (min(t, 2**63 - 1) for t in (head.start_ns, head.end_ns))
-            self._bad_chunk = Loss(str(error), at, end - at, 1, None, start_ns, end_ns)
+            self._resume = self._swallowed(at, end)
+            self._bad_chunk = Loss(str(error), at, (self._resume or end) - at, 1, None, start_ns, end_ns)
             return
-        number = len(self._chunks[0])
-        for column, value in zip(
-            self._chunks,
-            (at + head.data_at, head.data_size, _COMPRESSIONS.index(head.compression), head.size),
-            strict=True,
-        ):
-            column.append(value)
+        number = self._chunks.add(at, head)
         view = memoryview(data)
         for opcode, begin, stop in walked:
             if opcode == mcap.MESSAGE:
@@ -232,13 +228,17 @@ class McapFile:
             elif opcode == mcap.CHANNEL:
                 self._channel(Fields(view[begin:stop]))
 
-    def _inflated(self, at: int, head: ChunkHead) -> bytes:
-        if max(head.size, head.data_size) > self._limit:
-            raise BadMessage(f"a chunk of {head.size} bytes is over the limit of {self._limit}")
-        data = inflate(self._file.read(at + head.data_at, head.data_size), head.compression, head.size)
-        if head.crc and zlib.crc32(data) != head.crc:
-            raise BadMessage("the checksum of a chunk does not hold")
-        return data
+    def _swallowed(self, at: int, end: int) -> int | None:
+        """Where a whole chunk begins inside a bad one: bytes were taken out, and its frame reaches too far."""
+        inner = next_record(self._file, at + 1, self._size, frozenset(), True)
+        if inner is None or inner >= end:
+            return None
+        head = mcap.chunk_head(self._file.upto(inner, mcap.CHUNK_PREFIX))
+        try:
+            self._chunks.check(inner, head)
+        except BadMessage:
+            return None
+        return inner
 
     def _schema(self, fields: Fields) -> None:
         number, name, encoding = fields.number(2), fields.text(), fields.text()
@@ -284,7 +284,7 @@ class McapFile:
     def _resync(self, at: int, summary: Summary, why: str) -> int:
         """The next place after ``at`` where the file makes sense again."""
         stop = summary.start - 13 if summary.start else self._size
-        chunked = bool(self._chunks[0]) or not self._seen
+        chunked = bool(len(self._chunks)) or not self._seen
         found = next_record(self._file, at + 1, stop, frozenset(self._channels), chunked)
         resume = found if found is not None else max(stop, at + 1)
         self._lose(Loss(why, at, resume - at))
