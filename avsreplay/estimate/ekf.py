@@ -23,8 +23,7 @@ def innovate(P: Array, H: Array, alpha: Array, R: Array) -> Innovation:
 
 def gain(P: Array, H: Array, S: Array) -> Array:
     """K^u (20, 6) = P H' S^-1, solved."""
-    K: Array = np.linalg.solve(S, H @ P).T
-    return K
+    return np.asarray(np.linalg.solve(S, H @ P).T, dtype=np.float64)
 
 
 def update(prior: Belief, H: Array, seen: Innovation, margin: float) -> tuple[Belief, int]:

@@ -109,7 +109,7 @@ def _given(value: float | None) -> float:
 def block_1s(P: Array) -> dict[str, float]:
     """Root of the trace of each block of P (20, 20), in its own units (half angles)."""
     variances = np.diagonal(P)
-    return {name: math.sqrt(max(0.0, float(variances[where].sum()))) for name, where in BLOCKS.items()}
+    return {name: float(np.sqrt(np.maximum(variances[where].sum(), 0.0))) for name, where in BLOCKS.items()}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,78 @@
+"""The 24 names of the principal axes: the same motion, the same pose, the same NEES."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tumbling
+
+from avsreplay import geometry
+from avsreplay.estimate import motion
+from avsreplay.estimate.layout import boxminus, boxplus
+from avsreplay.estimate.relabel import NAMINGS, Naming, nearest, nees, relabel, relabel_covariance
+from avsreplay.records import Belief, State
+
+EACH = pytest.mark.parametrize("naming", NAMINGS, ids=lambda n: "".join(map(str, n.perm)))
+
+
+@pytest.fixture
+def world() -> tumbling.World:
+    return tumbling.draw(4, seconds=1.0)
+
+
+def test_there_are_24_proper_rotations() -> None:
+    assert len({tuple(n.R_bn.ravel()) for n in NAMINGS}) == 24
+    assert all(np.linalg.det(n.R_bn) == pytest.approx(1.0) for n in NAMINGS)
+
+
+@EACH
+def test_sigma_is_that_of_the_permuted_moments(world: tumbling.World, naming: Naming) -> None:
+    moments = world.moments[list(naming.perm)]
+    assert relabel(world.states[0], naming).sigma == pytest.approx(tumbling.ratios(moments), abs=1e-14)
+
+
+@EACH
+def test_the_motion_is_the_same(world: tumbling.World, naming: Naming) -> None:
+    x = world.states[0]
+    for h in (0.0, 7.0):
+        step = motion.flow(x.w_b, x.sigma, h)
+        y = relabel(x, naming)
+        far = motion.advance(y, motion.flow(y.w_b, y.sigma, h), h)
+        want = motion.advance(x, step, h)
+        assert np.abs(far.T_ac.matrix - want.T_ac.matrix).max() < 1e-12
+        assert np.abs(far.fixture_velocity - want.fixture_velocity).max() < 1e-13
+
+
+@EACH
+def test_the_covariance_follows(world: tumbling.World, naming: Naming) -> None:
+    x, eps = world.states[0], 1e-6
+    P = np.diag(np.linspace(1.0, 2.0, 20))
+    J = np.empty((20, 20))
+    for k in range(20):
+        d = np.zeros(20)
+        d[k] = eps
+        J[:, k] = boxminus(relabel(boxplus(x, d), naming), relabel(boxplus(x, -d), naming)) / (2 * eps)
+    assert np.abs(relabel_covariance(P, x, naming) - J @ P @ J.T).max() < 1e-7
+
+
+@EACH
+def test_nees_does_not_know_the_names(world: tumbling.World, naming: Naming) -> None:
+    x = world.states[0]
+    d = np.random.Generator(np.random.PCG64(0)).normal(size=20) * 1e-3
+    belief = Belief(0, boxplus(x, d), np.eye(20) * 1e-6)
+    named, size = nearest(belief, relabel(x, naming))
+    assert size == pytest.approx(float(d @ d) * 1e6, rel=1e-9)
+    assert np.abs(boxminus(named, x)).max() < 1e-12
+
+
+def test_a_wrong_body_is_not_excused(world: tumbling.World) -> None:
+    x = world.states[0]
+    other = State(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma + 0.1, x.c_b, x.q_bc)
+    assert nees(Belief(0, other, np.eye(20) * 1e-6), x) > 1e4
+
+
+def test_a_half_turned_fixture_is_told_apart(world: tumbling.World) -> None:
+    """A relabelling keeps the pose; turning the fixture on the body does not."""
+    x = world.states[0]
+    turned = State(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, geometry.multiply([1.0, 0, 0, 0], x.q_bc))
+    assert nees(Belief(0, turned, np.eye(20) * 1e-4), x) > 5e3

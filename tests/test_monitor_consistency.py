@@ -1,0 +1,85 @@
+"""Chi-square bands that a right filter stays in and a wrong one leaves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from avsreplay.monitor.consistency import Consistency, ConsistencyParams, block_nees, mean_band
+from avsreplay.records import BLOCKS, Innovation
+
+STRICT = ConsistencyParams(slack=1.0)
+
+
+def watch(alphas: np.ndarray, S: np.ndarray, params: ConsistencyParams = STRICT, gammas=None):
+    watcher = Consistency(params)
+    track = watcher.initial()
+    for k, alpha in enumerate(alphas):
+        seen = Innovation(alpha, S, S, float(alpha @ np.linalg.solve(S, alpha)), 0.0, 0.0)
+        track = watcher.observe(track, seen, 1 if gammas is None else gammas[k])
+    return watcher.judge(track)
+
+
+def draws(seed: int, n: int = 60, factor: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.Generator(np.random.PCG64(seed))
+    root = rng.normal(size=(6, 6)) * np.geomspace(1e-3, 1, 6)[:, None]
+    return factor * rng.normal(size=(n, 6)) @ root.T, root @ root.T
+
+
+def test_band_is_the_chi_square_of_the_sum() -> None:
+    low, high = mean_band(6, 30, 0.99)
+    assert (low, high) == pytest.approx(tuple(chi2.ppf([0.005, 0.995], 180) / 30))
+
+
+def test_a_right_filter_stays_in_its_band() -> None:
+    inside, white = 0, 0
+    for seed in range(200):
+        verdict = watch(*draws(seed))
+        inside += verdict.band[0] < verdict.nis_mean < verdict.band[1]
+        white += abs(verdict.autocorrelation) < verdict.autocorrelation_band
+        assert verdict.consistent or verdict.nis_mean > verdict.band[1]
+    assert inside >= 198
+    assert white >= 198
+
+
+def test_an_over_confident_filter_is_found_and_a_cautious_one_let_be() -> None:
+    assert not any(watch(*draws(seed, factor=1.6)).consistent for seed in range(50))
+    cautious = watch(*draws(0, factor=0.5))
+    assert cautious.consistent
+    assert cautious.nis_mean < cautious.band[0]
+
+
+def test_correlated_innovations_are_seen() -> None:
+    white, S = draws(1)
+    red = white.copy()
+    for k in range(1, len(red)):
+        red[k] = 0.8 * red[k - 1] + 0.6 * white[k]
+    assert watch(red, S).autocorrelation > 0.5
+    assert watch(red, S).autocorrelation > watch(red, S).autocorrelation_band
+
+
+def test_nothing_is_said_too_early_and_faulty_scans_say_nothing() -> None:
+    alphas, S = draws(2, n=20)
+    assert watch(alphas[:14], S).consistent is None
+    assert watch(alphas, S, gammas=[0] * 20).consistent is None
+    assert watch(alphas[:15], S).consistent is True
+
+
+def test_nees_by_block() -> None:
+    rng = np.random.Generator(np.random.PCG64(3))
+    root = rng.normal(size=(20, 20))
+    P = root @ root.T
+    found = [block_nees(root @ rng.normal(size=20), P) for _ in range(400)]
+    for name, where in BLOCKS.items():
+        dof = where.stop - where.start
+        low, high = mean_band(dof, 400, 0.9999)
+        assert low < np.mean([f[name] for f in found]) < high
+    assert list(found[0]) == [*BLOCKS, "all"]
+
+
+def test_params_refuse() -> None:
+    with pytest.raises(ValueError, match="window"):
+        ConsistencyParams(window=5, least=9)
+    with pytest.raises(ValueError, match="slack"):
+        ConsistencyParams(slack=0.5)

@@ -1,0 +1,103 @@
+"""t_1: thresholds by block, the dwell, both criteria, and that an inconsistent filter may not claim it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from avsreplay.monitor.convergence import Convergence, ConvergenceParams, Criterion, block_1s
+from avsreplay.records import BLOCKS, Belief, Forecast, State
+
+X = State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, np.zeros(2), np.zeros(3), [0, 0, 0, 1.0])
+PAPER = ConvergenceParams(criterion=Criterion.COVARIANCE)
+TIMES = np.array([5.0, 30.0])
+
+
+def belief(t_s: float, **wide: float) -> Belief:
+    """Every block well inside its limit for an 8 m target, but the named ones."""
+    variances = np.full(20, 1e-10)
+    for name, one_sigma in wide.items():
+        variances[BLOCKS[name]] = one_sigma**2
+    return Belief(round(t_s * 1e9), X, np.diag(variances))
+
+
+def ahead(pos: float = 1e-3, vel: float = 1e-4, rot: float = 1e-3) -> Forecast:
+    return Forecast(TIMES, *(np.array([v / 2, v]) for v in (pos, vel, rot)))
+
+
+def fold(convergence: Convergence, steps):
+    track = convergence.initial()
+    for args in steps:
+        track = convergence.judge(track, *args)
+    return track
+
+
+def test_t1_is_the_first_epoch_of_the_dwell() -> None:
+    convergence = Convergence(PAPER, 8.0)
+    steps = [(belief(t, **({"sigma": 1.0} if t < 10 else {})),) for t in range(30)]
+    assert not fold(convergence, steps[:12]).converged
+    track = fold(convergence, steps)
+    assert track.converged
+    assert track.t1_ns == 10_000_000_000
+
+
+def test_a_break_starts_the_dwell_again_but_t1_stays() -> None:
+    convergence = Convergence(PAPER, 8.0)
+    bad = {3, 10}
+    steps = [(belief(t, **({"rate": 1.0} if t in bad else {})),) for t in range(20)]
+    assert fold(convergence, steps[:4]).t1_ns == 0
+    assert not fold(convergence, steps[:5]).converged
+    assert fold(convergence, steps[:7]).converged
+    track = fold(convergence, steps)
+    assert track.t1_ns == 0
+    assert track.since_ns == 11_000_000_000
+
+
+@pytest.mark.parametrize("block", list(BLOCKS))
+def test_every_block_counts(block: str) -> None:
+    track = fold(Convergence(PAPER, 8.0), [(belief(t, **{block: 0.5}),) for t in range(9)])
+    assert not track.converged
+    assert track.unknown == (block,)
+
+
+def test_predictive_test_lets_an_unknowable_parameter_pass() -> None:
+    """A nearly axisymmetric body: sigma and mu wide, the grasp point's motion known."""
+    steps = [(belief(t, sigma=0.5, mu=0.5), ahead()) for t in range(9)]
+    assert fold(Convergence(ConvergenceParams(), 8.0), steps).converged
+    track = fold(Convergence(PAPER, 8.0), steps)
+    assert not track.converged
+    assert track.predictive_holds
+    assert track.unknown == ("sigma", "mu")
+
+
+@pytest.mark.parametrize("wide", [{"pos": 0.2}, {"vel": 0.1}, {"rot": 0.1}])
+def test_predictive_test_counts_each_of_three(wide: dict[str, float]) -> None:
+    assert not fold(Convergence(ConvergenceParams(), 8.0), [(belief(t), ahead(**wide)) for t in range(9)]).converged
+
+
+def test_an_inconsistent_filter_is_not_converged() -> None:
+    convergence = Convergence(ConvergenceParams(), 8.0)
+    steps = [(belief(t), ahead(), t < 10) for t in range(20)]
+    assert fold(convergence, steps[:10]).converged
+    assert not fold(convergence, steps).converged
+
+
+def test_not_a_number_is_not_converged() -> None:
+    P = np.full((20, 20), np.nan)
+    nothing = Belief(0, X, P)
+    assert not fold(Convergence(PAPER, 8.0), [(nothing,)] * 3).covariance_holds
+    assert not fold(Convergence(ConvergenceParams(), 8.0), [(belief(t), ahead(np.nan)) for t in range(9)]).converged
+
+
+def test_blocks_are_roots_of_traces() -> None:
+    assert block_1s(np.diag(np.arange(20.0)))["sigma"] == pytest.approx(5.0)
+    assert list(block_1s(np.eye(20))) == list(BLOCKS)
+
+
+def test_params() -> None:
+    assert ConvergenceParams(horizon_s=20.0, horizon_steps=4).times_s == pytest.approx([5.0, 10.0, 15.0, 20.0])
+    assert ConvergenceParams().resolved(8.0).grasp_pos_m == pytest.approx(0.08)
+    with pytest.raises(ValueError, match="dwell_s"):
+        ConvergenceParams(dwell_s=-1.0)
+    with pytest.raises(ValueError, match="horizon_steps"):
+        ConvergenceParams(horizon_steps=0)
