@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
+from avsreplay.register.facing import View
 from avsreplay.register.freedom import free_directions
 from avsreplay.register.model import Model
 from avsreplay.register.params import Limits, RegisterParams
@@ -29,7 +30,8 @@ class Evidence:
     """What the inliers at a pose say, all in {C}.
 
     Attributes:
-        points: of the scan.  inliers: nearer to the model than the gate.  rms_m: of their distances.
+        points: of the scan.  inliers: nearer to the model than the gate, on a side that
+            the camera can see.  rms_m: of their distances.
         J: (k, 6) rows [p x n, n].  e: (k,) n . (p - foot) [m].  centre: (3,) centroid of the inliers.
         noise_m: 1 sigma of e, robust.
     """
@@ -43,11 +45,13 @@ class Evidence:
     noise_m: float
 
 
-def evidence(model: Model, points: NDArray[Any], T_ca: Pose, gate_m: float, noise_m: float | None = None) -> Evidence:
+def evidence(
+    model: Model, view: View, points: NDArray[Any], T_ca: Pose, gate_m: float, noise_m: float | None = None
+) -> Evidence:
     """Gather it: ``points`` (n, 3) in {A} [m]; ``noise_m`` None estimates it from the residuals."""
     moved = T_ca.apply(points)
     found = model.closest(moved)
-    near = found.d2 < gate_m**2
+    near = (found.d2 < gate_m**2) & view.seen(found, T_ca)
     p, n = moved[near], found.normal[near]
     e = np.einsum("ij,ij->i", n, p - found.foot[near])
     count = len(p)
@@ -75,11 +79,13 @@ def covariance(found: Evidence) -> Array:
     return 0.5 * (P + P.T)
 
 
-def assess(model: Model, points: NDArray[Any], fit: Fit, limits: Limits, params: RegisterParams) -> Alignment:
+def assess(
+    model: Model, view: View, points: NDArray[Any], fit: Fit, limits: Limits, params: RegisterParams
+) -> Alignment:
     """Grade a back end's pose. No or too few inliers is NO_OVERLAP whatever the back end's flag says."""
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return nothing(len(points), AlignStatus.FAILED)
-    found = evidence(model, points, fit.T_ca, limits.gate_m, params.noise_m)
+    found = evidence(model, view, points, fit.T_ca, limits.gate_m, params.noise_m)
     info = frozen(found.J.T @ found.J / found.noise_m**2)
     overlap = found.inliers >= max(params.min_inliers, params.min_inlier_ratio * found.points)
     weakest = free_directions(found.J, found.centre) if overlap else ()

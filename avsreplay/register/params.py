@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from avsreplay.register.facing import Camera
+
 __all__ = ["Limits", "RegisterParams"]
 
 REACH_OF_EXTENT = 0.15  # a guess off by 24 deg moves a surface's far points by about this much
@@ -44,6 +46,7 @@ class RegisterParams:
     noise_m: float | None = None  # 1 sigma of a point across the surface [m]; auto: from each scan's residuals
     min_inliers: int = 30  # fewer points on the model: no overlap
     min_inlier_ratio: float = 0.02  # a smaller share of the scan on the model: no overlap
+    camera: Camera = Camera.AUTO  # where the scans were taken from: auto, origin or none
     subsample_m: float = 0.0  # keep one point a voxel of this size [m]; 0: keep all
     threads: int = 1  # threads of a back end that gives the same bits for any number
 

@@ -19,6 +19,7 @@ from avsreplay.geometry import Pose
 from avsreplay.records import Fit, Surface
 
 if TYPE_CHECKING:
+    from avsreplay.register.facing import View
     from avsreplay.register.model import Model
     from avsreplay.register.params import Limits
 
@@ -29,11 +30,12 @@ GROUP = "avsreplay.backends"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """What a back end is built from: the surface in {C}, its exact index, and the limits."""
+    """What a back end is built from: the surface in {C}, its exact index, the limits, and where the camera was."""
 
     surface: Surface
     model: Model
     limits: Limits
+    view: View
 
 
 class Backend(Protocol):

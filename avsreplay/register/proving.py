@@ -38,10 +38,11 @@ def proving_pose(scale: float = 1.0) -> Pose:
     return Pose(exp([0.3, -0.7, 2.0]), scale * np.array([0.2, 0.1, 6.0]))
 
 
-def view(surface: Surface, count: int, direction: Array) -> Array:
-    """(n, 3) exact points of the faces that look towards ``direction``, in {C}; faces do not hide each other."""
+def view(surface: Surface, count: int, camera_c: Array) -> Array:
+    """(n, 3) exact points of the faces that look at a camera there, in {C}; faces do not hide each other."""
     points, normals = sample(surface, count)
-    return points[normals @ direction > 0.1 * np.linalg.norm(direction)]
+    sight = camera_c - points
+    return points[np.einsum("ij,ij->i", normals, sight) > 0.1 * np.linalg.norm(sight, axis=1)]
 
 
 def plate_scan(scale: float = 1.0) -> Array:

@@ -11,6 +11,7 @@ from avsreplay.errors import MissingBackend
 from avsreplay.geometry import Pose
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register.assess import assess, nothing
+from avsreplay.register.facing import View
 from avsreplay.register.model import Model
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.port import Target, load
@@ -32,7 +33,8 @@ class Registrar:
         self.limits = self.params.limits(surface.extent)
         factory = load(self.params.backend)
         self._model = _indexed(surface, self.limits.reach_m)
-        self._backend = factory(Target(surface, self._model, self.limits))
+        self._view = View(surface, self.params.camera)
+        self._backend = factory(Target(surface, self._model, self.limits, self._view))
 
     def register(self, points: NDArray[Any], guess: Pose) -> Alignment:
         """The pose of the model in the camera.
@@ -51,7 +53,7 @@ class Registrar:
         fit = self._align(scan, guess.inverse())
         if fit is None:
             return nothing(len(scan), AlignStatus.FAILED, guess)
-        return assess(self._model, scan, fit, self.limits, self.params)
+        return assess(self._model, self._view, scan, fit, self.limits, self.params)
 
     def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
         finite = np.isfinite(points).all(axis=1)

@@ -20,6 +20,7 @@ __all__ = ["SmallGicpBackend"]
 
 SURFACE_POINTS = 100_000
 NEIGHBOURS = 20
+SETTLED = 10.0  # its steps jitter at this many eps: the scan's covariances are not smooth in the pose
 LEAST_POINTS = 20  # fewer cannot give a neighbourhood of NEIGHBOURS
 
 
@@ -57,8 +58,8 @@ class SmallGicpBackend:
                 max_correspondence_distance=reach,
                 num_threads=1,
                 max_iterations=self._limits.n_max,
-                rotation_epsilon=self._limits.eps_rad,
-                translation_epsilon=self._limits.eps_m,
+                rotation_epsilon=SETTLED * self._limits.eps_rad,
+                translation_epsilon=SETTLED * self._limits.eps_m,
             )
             T_ca, passes = Pose.from_matrix(found.T_target_source), passes + int(found.iterations)
         return Fit(T_ca, passes, found is not None and bool(found.converged) and int(found.num_inliers) > 0)
