@@ -1,0 +1,193 @@
+"""``avsreplay run``: replay a log, print the tables, write the result, gate it with a golden file."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from avsreplay.errors import DataLost, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from avsreplay.job import Job, Run
+    from avsreplay.report import Summary
+    from avsreplay.results import Beliefs
+    from avsreplay.rows import Row
+
+__all__ = ["command"]
+
+EPILOG = """\b
+Examples:
+  avsreplay run tumble.mcap
+  avsreplay run y.mcap --model m.ply --topic /points --truth-topic /truth/pose --init truth -o results/
+  avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
+  avsreplay run tumble.mcap --set faults.policy=all --set plan.a_max_mps2=0.02 --json
+
+\b
+Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
+            3 unreadable input, 4 finished but data was lost."""
+
+ASSIGNED = {"backend": "register.backend", "policy": "faults.policy", "guess": "guess", "init": "init"}
+
+
+class _Start(click.ParamType[str | float]):
+    """``cold``, ``near``, ``paper`` (how the estimate begins) or a number (seconds after the first scan)."""
+
+    name = "mode|seconds"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if value in ("cold", "near", "paper"):
+            return value
+        try:
+            return float(value)
+        except ValueError:
+            self.fail(f"'{value}' is neither cold, near, paper nor a number of seconds", param, ctx)
+
+
+@click.command("run", epilog=EPILOG)
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option("--backend", help="Registration back end; 'avsreplay backends' lists them.")
+@click.option("--model", type=click.Path(path_type=Path), help="Model of the target, in place of the log's own.")
+@click.option("--cloud-model", is_flag=True, help="The model may be a bare cloud, without faces.")
+@click.option("--topic", help="Cloud topic, where there are several.")
+@click.option("--truth-topic", help="Topic of the true poses.")
+@click.option("--truth", "truth_file", type=click.Path(path_type=Path), help="File of the true poses.")
+@click.option("--init", metavar="log|truth|auto|POSE", help="First pose; POSE is x,y,z,qx,qy,qz,qw of {C} in {A}.")
+@click.option("--guess", type=click.Choice(["predicted", "last"]), help="Registration's guess: closed or open loop.")
+@click.option("--policy", type=click.Choice(["any", "all"]), help="How the fault tests are joined.")
+@click.option("--config", "config_file", type=click.Path(path_type=Path), help="TOML with settings, a table a stage.")
+@click.option("--set", "assignments", multiple=True, metavar="A.B=C", help="One setting; may be repeated.")
+@click.option("--clock", type=click.Choice(["header", "log", "publish"]), help="Clock the scans are placed by.")
+@click.option("--start", "starts", type=_Start(), multiple=True, help="How the estimate begins, or where the log does.")
+@click.option("--end", "end_s", type=float, help="Leave out what is after, seconds after the first scan.")
+@click.option("--duration", "duration_s", type=float, help="Length of what is replayed [s].")
+@click.option("--start-offset", "start_offset_s", type=float, help="The same as --start SECONDS.")
+@click.option("--n-scans", type=click.IntRange(1), help="At most so many scans.")
+@click.option("--every-scan", "every", type=click.IntRange(1), help="Take every N-th scan, each at its own time.")
+@click.option("--rate", "rate_hz", type=float, help="Scans a second of a folder of scans.")
+@click.option("--strict", is_flag=True, default=None, help="Any damage of the log is an error (exit 3).")
+@click.option("--max-message-mib", type=click.IntRange(1), help="Largest message read.")
+@click.option("--golden", type=click.Path(path_type=Path), help="Rows that must come out; exit 1 if they do not.")
+@click.option("--update-golden", type=click.Path(path_type=Path), help="Write the golden rows anew.")
+@click.option("-o", "--output", type=click.Path(path_type=Path), help="Directory for rows, trajectories and run facts.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+@click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
+@click.option("--all", "table_all", is_flag=True, help="Print every scan.")
+def command(
+    log: Path,
+    golden: Path | None,
+    update_golden: Path | None,
+    output: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    table_every: int | None,
+    table_all: bool,
+    **flags: Any,
+) -> None:
+    """Replay LOG through registration, filter, fault detector and planner, and print the tables.
+
+    LOG is an MCAP, a ROS bag or a folder of scans. A log written by 'avsreplay record' runs with no flag.
+    """
+    from avsreplay.job import Run
+    from avsreplay.results import Beliefs, ResultDirectory
+
+    if golden and update_golden:
+        raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
+    target = ResultDirectory(output, overwrite=overwrite) if output else None
+    beliefs = Beliefs()
+    with Run(_job(log, flags)) as run:
+        rows, seconds = _replayed(run, beliefs)
+        summary = run.summary()
+        record = _record(run, summary)
+        if target:
+            with target:
+                target.write(rows, beliefs, record)
+        _print(rows, summary, record, as_json, table_every, table_all, len(rows) / seconds)
+        _gate(rows, golden, update_golden, as_json)
+        _own_up(run)
+
+
+def _job(log: Path, flags: dict[str, Any]) -> Job:
+    from avsreplay.job import Job
+
+    assignments = [f"{key}={flags[name]}" for name, key in ASSIGNED.items() if flags.pop(name) is not None]
+    config_file, more, starts = flags.pop("config_file"), flags.pop("assignments"), flags.pop("starts")
+    return Job(source=log, options=_options(flags, starts), config_file=config_file, assignments=(*more, *assignments))
+
+
+def _options(flags: dict[str, Any], starts: tuple[Any, ...]) -> Any:
+    from avsreplay.log import ClockChoice, SourceOptions
+
+    given = {name: value for name, value in flags.items() if value is not None}
+    if "clock" in given:
+        given["clock"] = ClockChoice(given["clock"])
+    for start in starts:
+        if isinstance(start, float):
+            given["start_s"] = start
+    try:
+        return SourceOptions(**given)
+    except ValueError as error:
+        raise UsageError(str(error), hint="correct the flag") from None
+
+
+def _replayed(run: Run, beliefs: Beliefs) -> tuple[list[Row], float]:
+    from avsreplay.cli.progress import tracked
+
+    begun = time.perf_counter()
+    rows = list(tracked(run.rows([beliefs]), len(run), "replaying"))
+    return rows, max(time.perf_counter() - begun, 1e-9)
+
+
+def _record(run: Run, summary: Summary) -> dict[str, Any]:
+    from avsreplay.cli.version import versions
+    from avsreplay.report.result import facts_record
+
+    header = run.source.header
+    labels = header.labels if header.labels or header.seed is not None else None
+    facts = facts_record(labels=labels, truth=header.truth, counts=dict(summary.counts))
+    return {**run.facts(), "facts": facts, "versions": versions()}
+
+
+def _print(
+    rows: Sequence[Row],
+    summary: Summary,
+    record: dict[str, Any],
+    as_json: bool,
+    every: int | None,
+    all_rows: bool,
+    scans_per_s: float,
+) -> None:
+    from avsreplay import report
+
+    if as_json:
+        click.echo(report.dump_document(rows, summary, record), nl=False)
+        return
+    console = report.make_console()
+    report.print_tables(console, rows, summary, every=every, all=all_rows, scans_per_s=scans_per_s)
+
+
+def _gate(rows: Sequence[Row], golden: Path | None, update: Path | None, as_json: bool) -> None:
+    from avsreplay import report
+
+    if update:
+        report.update_golden(update, rows)
+        click.echo(f"golden rows written: {update} ({len(rows)} scans)", err=True)
+    if golden:
+        result = report.compare_golden(golden, rows)
+        if not result.ok:
+            stream = click.get_text_stream("stderr" if as_json else "stdout")
+            report.print_golden(report.make_console(stream), result)
+        result.check(str(golden))
+        click.echo(f"golden rows agree: {golden} ({result.rows} scans)", err=True)
+
+
+def _own_up(run: Run) -> None:
+    losses = run.source.losses
+    if losses:
+        what = f"{len(losses)} damaged places were left out, the first: {losses[0].what}"
+        raise DataLost(what, where=str(run.job.source), hint="see 'avsreplay doctor'")

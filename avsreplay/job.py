@@ -1,0 +1,140 @@
+"""One run, whole: open the log, wire the stages, fold the scans, sum up, write the result directory.
+
+The command line, the Python API and a sweep all go through here.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from avsreplay import replay as path
+from avsreplay import settings
+from avsreplay.config import RunConfig, load_config
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.log import Source, SourceOptions, open_source
+from avsreplay.records import Belief, Scan, Surface
+from avsreplay.replay import Memory
+from avsreplay.report import Summary
+from avsreplay.report.summary import SummaryFold
+from avsreplay.rows import Row
+from avsreplay.wire import first_memory, stages
+
+__all__ = ["Job", "Listener", "Run"]
+
+Listener = Callable[[Scan, Belief], None]
+"""Called after each scan with the scan and the belief after it: what writes beliefs, truth and clouds beside rows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """What to run.
+
+    Attributes:
+        source: log, bag or folder.  options: how to read it.
+        config_file: TOML of a RunConfig.  assignments: ``a.b=c`` over it, from flags.
+        prefetch: scans decoded ahead while one registers; never changes a result.
+    """
+
+    source: Path
+    options: SourceOptions = field(default_factory=SourceOptions)
+    config_file: Path | None = None
+    assignments: tuple[str, ...] = ()
+    prefetch: int = 2
+
+
+class Run:
+    """An open run; a context manager. ``rows`` may be taken once.
+
+    Attributes:
+        source: the open log.  config: the effective configuration.  surface: the model in force.
+    """
+
+    def __init__(self, job: Job) -> None:
+        """Open and wire.
+
+        Raises:
+            UnreadableInput: the log or the model cannot be read.  UsageError: a key, flag or topic is wrong.
+        """
+        self.job = job
+        self.source: Source = open_source(job.source, job.options)
+        try:
+            header = self.source.header
+            self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
+            self.surface: Surface = self._model()
+            self._stages = stages(self.config, header, self.surface)
+        except BaseException:
+            self.source.close()
+            raise
+        labelled = bool(header.labels) or header.seed is not None
+        self._fold = SummaryFold(labels=header.labels if labelled else None, truth=header.truth)
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.source.close()
+
+    def __len__(self) -> int:
+        """How many scans are due."""
+        return len(self.source)
+
+    def rows(self, listeners: Iterable[Listener] = ()) -> Iterator[Row]:
+        """The replay, row by row. Raises UnreadableInput where the log holds no scan."""
+        if not len(self.source):
+            hint = "widen the selection, or see 'avsreplay info'"
+            raise UnreadableInput("no scan to replay", where=str(self.job.source), hint=hint)
+        listeners = tuple(listeners)
+        heard: list[Scan] = []
+        for memory, row in path.replay(self._stages, first_memory(self._stages), self._overheard(heard)):
+            self._fold.add(row)
+            for listener in listeners:
+                listener(heard[-1], _belief(memory))
+            yield row
+
+    def summary(self) -> Summary:
+        """The summary of the rows taken so far."""
+        clock, losses = self.source.clock, self.source.losses
+        counts = {"losses": len(losses), "lost_messages": sum(loss.messages or 0 for loss in losses)}
+        counts |= {"stamps_unset": clock.unset, "stamps_jumped": clock.jumps}
+        counts |= {"stamps_equal": clock.equal, "stamps_back": clock.back}
+        return replace(self._fold.result(), counts=counts)
+
+    def facts(self) -> dict[str, Any]:
+        """What stands in ``run.json`` but for versions: the effective configuration and the hashes of what was read."""
+        return {
+            "log": {"name": self.job.source.name, "sha256": self.source.sha256, "scans": len(self.source)},
+            "model": {"name": Path(self.surface.name).name, "sha256": self.surface.sha256},
+            "clock": settings.dump(self.source.clock),
+            "selection": settings.dump(self.job.options),
+            "config": settings.dump(self.config),
+        }
+
+    def _overheard(self, heard: list[Scan]) -> Iterator[Scan]:
+        for scan in self.source.scans(self.job.prefetch):
+            heard[:] = [scan]
+            yield scan
+
+    def _model(self) -> Surface:
+        surface = self.source.header.surface
+        if surface is None:
+            raise UsageError("the log holds no model", where=str(self.job.source), hint="name one with --model FILE")
+        return surface
+
+
+def _run_table(scenario: str) -> Mapping[str, Any]:
+    """The ``[run]`` table of the log's own scenario."""
+    table: Mapping[str, Any] = tomllib.loads(scenario).get("run", {}) if scenario else {}
+    return table
+
+
+def _belief(memory: Memory) -> Belief:
+    if memory.track is None:
+        raise RuntimeError("a scan was replayed without a track")
+    return memory.track.belief
