@@ -42,7 +42,8 @@ def view(surface: Surface, count: int, camera_c: Array) -> Array:
     """(n, 3) exact points of the faces that look at a camera there, in {C}; faces do not hide each other."""
     points, normals = sample(surface, count)
     sight = camera_c - points
-    return points[np.einsum("ij,ij->i", normals, sight) > 0.1 * np.linalg.norm(sight, axis=1)]
+    facing: Array = points[np.einsum("ij,ij->i", normals, sight) > 0.1 * np.linalg.norm(sight, axis=1)]
+    return facing
 
 
 def plate_scan(scale: float = 1.0) -> Array:

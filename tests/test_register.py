@@ -1,0 +1,341 @@
+"""Registration by its laws: signs, frames, grading, what a view leaves free, what the camera can see."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from avsreplay import geometry
+from avsreplay.geometry import Pose, exp
+from avsreplay.records import AlignStatus, Fit, Surface
+from avsreplay.register import RegisterParams, Registrar
+from avsreplay.register.assess import assess, covariance, evidence
+from avsreplay.register.facing import Camera, View, is_outward
+from avsreplay.register.freedom import free_directions
+from avsreplay.register.model import Model
+from avsreplay.register.proving import plate_scan, proving_pose, proving_surface, view
+from avsreplay.register.quaternion_fit import best_motion, horn_matrix
+from avsreplay.register.sampling import sample, thin
+
+RNG_SEED = 11
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(RNG_SEED)
+
+
+@pytest.fixture(scope="module")
+def surface() -> Surface:
+    return proving_surface()
+
+
+@pytest.fixture(scope="module")
+def registrar(surface: Surface) -> Registrar:
+    return Registrar(surface)
+
+
+@pytest.fixture(scope="module")
+def scan(surface: Surface) -> np.ndarray:
+    T_ac = proving_pose()
+    return T_ac.apply(view(surface, 6000, T_ac.inverse().t))
+
+
+# --- Horn's closed form
+
+
+def test_horn_recovers_any_motion_exactly() -> None:
+    rng = _rng()
+    for _ in range(50):
+        truth = Pose(rng.normal(size=4), rng.normal(size=3))
+        moving = rng.normal(size=(8, 3))
+        found = best_motion(moving, truth.apply(moving))
+        np.testing.assert_allclose(found.matrix, truth.matrix, atol=1e-12)
+
+
+def test_horn_agrees_with_the_singular_value_solution() -> None:
+    rng = _rng()
+    for _ in range(20):
+        moving, fixed = rng.normal(size=(30, 3)), rng.normal(size=(30, 3))
+        oracle = Rotation.align_vectors(fixed - fixed.mean(0), moving - moving.mean(0))[0].as_matrix()
+        np.testing.assert_allclose(best_motion(moving, fixed).R, oracle, atol=1e-9)
+
+
+def test_horn_matrix_is_scalar_first() -> None:
+    """No motion must give [1 0 0 0] as the largest eigenvector; read scalar last it would be a half turn (errata)."""
+    points = _rng().normal(size=(20, 3))
+    centred = points - points.mean(axis=0)
+    vector = np.linalg.eigh(horn_matrix(centred.T @ centred / 20))[1][:, -1]
+    np.testing.assert_allclose(np.abs(vector), [1, 0, 0, 0], atol=1e-12)
+
+
+# --- the registrar
+
+
+@pytest.mark.parametrize("backend", ["horn", "reference"])
+def test_exact_scan_comes_back_to_rounding(surface: Surface, scan: np.ndarray, backend: str) -> None:
+    T_ac = proving_pose()
+    guess = T_ac @ Pose(exp(np.radians([2.0, -3.0, 1.5])), np.array([0.04, -0.05, 0.03]))
+    params = RegisterParams(backend=backend, eps_rad=1e-7, eps_m=1e-7, n_max=1000)  # Horn alone settles slowly
+    found = Registrar(surface, params).register(scan, guess)
+    assert found.status is AlignStatus.ALIGNED
+    step = T_ac.inverse() @ found.T_ac
+    assert float(geometry.angle(step.q)) < 1e-5
+    assert np.linalg.norm(step.t) < 2e-5
+    assert found.inliers == len(scan) == found.points
+
+
+def test_horn_and_reference_end_at_the_same_pose(surface: Surface, scan: np.ndarray) -> None:
+    """Plane passes first or not, kernel or numpy: the fixed point of Horn's pass is one."""
+    rng = _rng()
+    noisy = scan + rng.normal(0.0, 0.008, scan.shape)
+    guess = proving_pose() @ Pose(exp([0.01, 0.02, -0.01]), np.array([0.02, 0.0, -0.02]))
+    params = RegisterParams(camera=Camera.NONE, eps_rad=1e-7, eps_m=1e-7, n_max=1000)
+    first = Registrar(surface, params).register(noisy, guess)
+    second = Registrar(surface, replace(params, backend="reference")).register(noisy, guess)
+    step = first.T_ac.inverse() @ second.T_ac
+    assert float(geometry.angle(step.q)) < 2e-5
+    assert np.linalg.norm(step.t) < 5e-5
+
+
+def test_empty_and_missing_points_keep_the_guess(registrar: Registrar) -> None:
+    guess = proving_pose()
+    for points in (np.empty((0, 3)), np.full((4, 3), np.nan, dtype=np.float32)):
+        found = registrar.register(points, guess)
+        assert found.status is AlignStatus.NO_POINTS
+        assert found.T_ac.t.tobytes() == guess.t.tobytes()
+        assert found.inlier_ratio == 0.0
+
+
+def test_subsampling_keeps_the_pose(surface: Surface, scan: np.ndarray) -> None:
+    found = Registrar(surface, RegisterParams(subsample_m=0.1)).register(scan, proving_pose())
+    assert 100 < found.points < len(scan) / 1.5
+    assert np.linalg.norm(found.T_ac.t - proving_pose().t) < 1e-4
+
+
+class _Raising:
+    name = "raising"
+
+    def __init__(self, target) -> None:
+        pass
+
+    def align(self, points, guess):
+        raise ZeroDivisionError
+
+
+class _NotFinite(_Raising):
+    def align(self, points, guess):
+        return Fit(Pose(guess.q, np.array([np.nan, 0.0, 0.0])), 1, True)
+
+
+@pytest.mark.parametrize("fake", [_Raising, _NotFinite])
+def test_a_back_ends_trouble_is_a_status(monkeypatch, surface: Surface, scan: np.ndarray, fake) -> None:
+    monkeypatch.setattr("avsreplay.register.registrar.load", lambda name: fake)
+    found = Registrar(surface).register(scan, proving_pose())
+    assert found.status is AlignStatus.FAILED
+    assert np.isfinite(found.T_ac.matrix).all()
+
+
+# --- the ruler
+
+
+def test_information_is_the_curvature_of_the_cost(surface: Surface, registrar: Registrar, scan: np.ndarray) -> None:
+    """J of the ruler against finite differences of the residuals, in d of T_ac_true = T_ac @ Exp(d)."""
+    T_ac = proving_pose()
+    model = Model.build(surface, 0.5)
+    base = evidence(model, View(surface), scan, T_ac.inverse(), 0.05)
+    h = 1e-6
+    for k in range(6):
+        d = np.zeros(6)
+        d[k] = h
+        moved = T_ac @ Pose(exp(-d[:3]), -d[3:])  # the measured pose that is off by d (first order)
+        shifted = evidence(model, View(surface), scan, moved.inverse(), 0.05)
+        if shifted.inliers != base.inliers:
+            pytest.fail("the step changed the inliers")
+        slope = (shifted.e - base.e) / h
+        inside = np.abs(slope - base.J[:, k]) < 1e-3
+        assert inside.mean() > 0.97  # the rest have their foot on an edge, where the foot slides to another face
+
+
+def test_covariance_shrinks_with_points_and_grows_with_noise(surface: Surface, registrar: Registrar) -> None:
+    T_ac, rng = proving_pose(), _rng()
+    exact = {n: T_ac.apply(view(surface, n, T_ac.inverse().t)) for n in (3000, 12000)}
+
+    def trace(n: int, sigma: float) -> float:
+        found = registrar.register(exact[n] + rng.normal(0, sigma, exact[n].shape), T_ac)
+        return float(np.trace(found.covariance))
+
+    assert trace(3000, 0.01) / trace(12000, 0.01) == pytest.approx(4.0, rel=0.5)
+    assert trace(3000, 0.01) / trace(3000, 0.005) == pytest.approx(4.0, rel=0.5)
+
+
+def test_no_overlap_whatever_the_flag_says(surface: Surface, scan: np.ndarray) -> None:
+    params = RegisterParams()
+    far = Fit(Pose(proving_pose().inverse().q, np.full(3, 1e3)), 1, True)
+    found = assess(Model.build(surface, 0.5), View(surface), scan, far, params.limits(surface.extent), params)
+    assert found.status is AlignStatus.NO_OVERLAP
+    assert (found.inliers, found.covariance) == (0, None)
+
+
+def test_not_converged_is_said_and_graded(surface: Surface, scan: np.ndarray) -> None:
+    guess = proving_pose() @ Pose(exp([0.05, 0.0, 0.0]), np.zeros(3))
+    found = Registrar(surface, RegisterParams(n_max=2)).register(scan, guess)
+    assert found.status is AlignStatus.NOT_CONVERGED
+    assert found.iterations == 2
+    assert found.inliers > 0
+
+
+# --- what a view leaves free
+
+
+def _plane(normal: np.ndarray, about: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    rng = _rng()
+    u, v = np.linalg.svd(normal[None])[2][1:]
+    points = about + rng.uniform(-1, 1, (500, 1)) * u + rng.uniform(-1, 1, (500, 1)) * v
+    n = np.broadcast_to(normal, points.shape)
+    return np.hstack([np.cross(points, n), n]), points.mean(axis=0)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_plane_slides_along_two_axes_and_turns_about_the_third(axis: int) -> None:
+    names = "xyz"
+    found = free_directions(*_plane(np.eye(3)[axis], np.array([3.0, -2.0, 1.0])))
+    others = [f"slides along {names[k]}" for k in range(3) if k != axis]
+    assert sorted(found) == sorted([*others, f"turns about {names[axis]}"])
+
+
+def test_a_cylinder_slides_along_and_turns_about_its_axis() -> None:
+    rng = _rng()
+    angle, z = rng.uniform(0, 2 * np.pi, 2000), rng.uniform(-1, 1, 2000)
+    n = np.stack([np.cos(angle), np.sin(angle), np.zeros(2000)], axis=1)
+    points = 0.5 * n + np.array([0, 0, 1.0]) * z[:, None]
+    assert sorted(free_directions(np.hstack([np.cross(points, n), n]), points.mean(0))) == [
+        "slides along z",
+        "turns about z",
+    ]
+
+
+def test_a_sphere_turns_about_everything_and_a_full_view_about_nothing(surface: Surface) -> None:
+    n = _rng().normal(size=(3000, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    assert sorted(free_directions(np.hstack([np.cross(n, n), n]), np.zeros(3))) == [
+        f"turns about {axis}" for axis in "xyz"
+    ]
+    points, normals = sample(surface, 3000)
+    assert free_directions(np.hstack([np.cross(points, normals), normals]), points.mean(0)) == ()
+
+
+def test_a_slanted_slide_is_named_by_its_direction() -> None:
+    found = free_directions(*_plane(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.zeros(3)))
+    assert "slides along z" in found
+    assert any(words.startswith("slides along (") for words in found)
+
+
+def test_a_degenerate_view_has_no_covariance(registrar: Registrar) -> None:
+    T_ac = proving_pose()
+    found = registrar.register(T_ac.apply(plate_scan()), T_ac)
+    assert found.status is AlignStatus.DEGENERATE
+    assert found.covariance is None
+    assert "slides along x" in found.weakest
+
+
+# --- what the camera can see
+
+
+def test_outward_is_told_from_inward_open_and_cloud(surface: Surface) -> None:
+    assert is_outward(surface)
+    assert not is_outward(replace(surface, faces=surface.faces[:, ::-1]))
+    assert not is_outward(replace(surface, faces=surface.faces[::2]))
+    assert not is_outward(replace(surface, faces=np.empty((0, 3), dtype=np.int32)))
+    soup = replace(
+        surface,
+        vertices=surface.vertices[surface.faces].reshape(-1, 3),
+        faces=np.arange(surface.faces.size, dtype=np.int32).reshape(-1, 3),
+    )
+    assert is_outward(soup)
+
+
+def test_seen_is_the_side_towards_the_camera(surface: Surface) -> None:
+    model = Model.build(surface, 0.5)
+    T_ca = proving_pose().inverse()
+    points, normals = sample(surface, 4000)
+    towards = np.einsum("ij,ij->i", normals, T_ca.t - points)
+    clear = np.abs(towards) > 0.05
+    inside_faces = model.closest(points + 0.001 * normals)
+    seen = View(surface, Camera.ORIGIN).seen(inside_faces, T_ca)
+    agree = seen[clear] == (towards[clear] > 0.0)
+    assert agree.mean() > 0.99
+    assert View(surface, Camera.NONE).seen(inside_faces, T_ca).all()
+
+
+def test_a_camera_inside_the_model_is_not_believed(surface: Surface) -> None:
+    found = Model.build(surface, 0.5).closest(sample(surface, 500)[0])
+    assert View(surface, Camera.AUTO).seen(found, Pose.identity()).all()
+
+
+@pytest.mark.parametrize("offset", [0.06, -0.06])
+def test_a_thin_panel_is_not_laid_on_its_back(offset: float) -> None:
+    """Half a panel's thickness off along the sight, either way: only one side of it can have been measured."""
+    surface = proving_surface()
+    T_ac = proving_pose()
+    scan = T_ac.apply(view(surface, 6000, T_ac.inverse().t)) + _rng().normal(0, 0.004, (1, 3))
+    sight = T_ac.t / np.linalg.norm(T_ac.t)
+    found = Registrar(surface).register(scan, Pose(T_ac.q, T_ac.t + offset * sight))
+    assert np.linalg.norm(found.T_ac.t - T_ac.t) < 0.01
+
+
+# --- sampling
+
+
+def test_samples_lie_on_the_surface_evenly_and_repeat(surface: Surface) -> None:
+    points, normals = sample(surface, 5000)
+    found = Model.build(surface, 0.5).closest(points)
+    assert found.d2.max() < 1e-20
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    counts = np.bincount(found.id, minlength=len(area))
+    big = area > 0.02 * area.sum()
+    np.testing.assert_allclose(counts[big] / 5000, area[big] / area.sum(), rtol=0.1)
+    assert sample(surface, 5000)[0].tobytes() == points.tobytes()
+
+
+def test_thin_keeps_one_point_a_voxel_in_order() -> None:
+    points = _rng().uniform(-1, 1, (2000, 3))
+    kept = thin(points, 0.5)
+    cells = {tuple(row) for row in np.floor(points / 0.5).astype(int)}
+    assert len(kept) == len(cells)
+    rows = [int(np.flatnonzero((points == row).all(axis=1))[0]) for row in kept]
+    assert rows == sorted(rows)
+
+
+# --- parameters
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("reach_m", 0.0), ("gate_m", -1.0), ("n_max", 0), ("threads", 0), ("min_inlier_ratio", 1.5), ("eps_rad", np.nan)],
+)
+def test_a_value_that_cannot_be_right_is_named(key: str, value: float) -> None:
+    with pytest.raises(ValueError, match=key):
+        RegisterParams(**{key: value})
+
+
+def test_lengths_scale_with_the_model() -> None:
+    small, large = RegisterParams().limits(0.25), RegisterParams().limits(8.0)
+    assert large.reach_m / small.reach_m == large.gate_m / small.gate_m == large.eps_m / small.eps_m == 32.0
+    assert RegisterParams(gate_m=0.5).limits(1.0).reach_m >= 0.5
+
+
+def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:
+    """White noise across the surface: the sandwich must agree with s^2 (J'J)^-1."""
+    from avsreplay.register.assess import Evidence
+
+    rng = _rng()
+    J = rng.normal(size=(20000, 6))
+    e = rng.normal(0.0, 0.3, 20000)
+    P = covariance(Evidence(20000, 20000, 0.3, J, e, np.zeros(3), 0.3))
+    oracle = 0.09 * np.linalg.inv(J.T @ J)
+    np.testing.assert_allclose(P, oracle, atol=0.1 * oracle[0, 0])
