@@ -7,7 +7,7 @@ to registration as its guess, the only loop.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
@@ -28,7 +28,7 @@ _UNMEASURED = (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stages:
-    """The parts of the chain, ready. ``first_pose`` gives T_ac to begin with, from the first scan."""
+    """The parts of the chain, ready. ``first_pose``: first scan -> T_ac to begin with, and where it comes from."""
 
     registrar: Registrar
     estimator: Estimator
@@ -36,7 +36,7 @@ class Stages:
     monitors: Monitors
     plan: PlanParams
     guess: Guess
-    first_pose: Callable[[Scan], Pose]
+    first_pose: Callable[[Scan], tuple[Pose, str]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -45,20 +45,21 @@ class Memory:
 
     Attributes:
         watch: the monitors' memory.  mission: the plan in force.  track: the estimate, None before the first scan.
-        last: last healthy measured pose.  since_ns: instant of the first scan.
+        last: last healthy measured pose, None before one.  origin: where the first pose came from.
+        since_ns: instant of the first scan.
     """
 
     watch: Watch
     mission: Mission
     track: Track | None = None
     last: Pose | None = None
+    origin: str = ""
     since_ns: int = 0
 
 
 def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
     """One scan through the whole chain. A scan that goes wrong still leaves a row."""
-    since_ns = scan.t_ns if memory.track is None else memory.since_ns
-    track = memory.track or stages.estimator.initial(scan.t_ns, stages.first_pose(scan))
+    memory, track = _track(stages, memory, scan)
     prediction = stages.estimator.predict(track, scan.t_ns)
     guess, origin = _guess(stages, memory, prediction)
 
@@ -73,7 +74,7 @@ def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
     row = row_of(
         Findings(
             scan=scan,
-            since_ns=since_ns,
+            since_ns=memory.since_ns,
             guess=origin,
             alignment=alignment,
             verdict=verdict,
@@ -86,7 +87,7 @@ def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
         )
     )
     last = alignment.T_ac if verdict.gamma else memory.last
-    return Memory(watch, mission, track, last, since_ns), row
+    return replace(memory, watch=watch, mission=mission, track=track, last=last), row
 
 
 def replay(stages: Stages, memory: Memory, scans: Iterable[Scan]) -> Iterator[tuple[Memory, Row]]:
@@ -96,10 +97,18 @@ def replay(stages: Stages, memory: Memory, scans: Iterable[Scan]) -> Iterator[tu
         yield memory, row
 
 
+def _track(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Track]:
+    """The track so far; at the first scan a new one, with its origin noted."""
+    if memory.track is not None:
+        return memory, memory.track
+    pose, origin = stages.first_pose(scan)
+    return replace(memory, origin=origin, since_ns=scan.t_ns), stages.estimator.initial(scan.t_ns, pose)
+
+
 def _guess(stages: Stages, memory: Memory, prediction: Prediction) -> tuple[Pose, str]:
-    if memory.track is None:
-        return prediction.belief.x.T_ac, "init"
-    if stages.guess is Guess.LAST and memory.last is not None:
+    if memory.last is None:
+        return prediction.belief.x.T_ac, memory.origin
+    if stages.guess is Guess.LAST:
         return memory.last, "last"
     return prediction.belief.x.T_ac, "predicted"
 

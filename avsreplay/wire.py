@@ -51,21 +51,19 @@ def first_memory(ready: Stages) -> Memory:
     return Memory(watch, Mission())
 
 
-def _first_pose(config: RunConfig, header: LogHeader) -> Callable[[Scan], Pose]:
+def _first_pose(config: RunConfig, header: LogHeader) -> Callable[[Scan], tuple[Pose, str]]:
+    """Where the first pose comes from; "log" is the log's first belief, else its truth."""
     if config.init == "truth":
         return _truth
-    if config.init != "log":
-        pose = parse_pose(config.init)
-        return lambda _scan: pose
-    if header.start is None:
-        hint = "give --init truth or --init x,y,z,qx,qy,qz,qw"
-        raise UsageError("the log says no first pose of the target", where="--init", hint=hint)
-    pose = header.start.x.T_ac
-    return lambda _scan: pose
+    if config.init == "log":
+        start = header.start
+        return _truth if start is None else lambda _scan: (start.x.T_ac, "start")
+    pose = parse_pose(config.init)
+    return lambda _scan: (pose, "given")
 
 
-def _truth(scan: Scan) -> Pose:
+def _truth(scan: Scan) -> tuple[Pose, str]:
     if scan.truth is None:
-        hint = "name it with --truth-topic, or give --init x,y,z,qx,qy,qz,qw"
-        raise UsageError("the log has no true pose at its first scan", where="--init truth", hint=hint)
-    return scan.truth
+        hint = "name its truth with --truth-topic, or give --init x,y,z,qx,qy,qz,qw"
+        raise UsageError("the log says no first pose of the target", where="--init", hint=hint)
+    return scan.truth, "truth"

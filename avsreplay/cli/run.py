@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,7 +116,8 @@ def command(
 def _job(log: Path, flags: dict[str, Any]) -> Job:
     from avsreplay.job import Job
 
-    assignments = [f"{key}={flags[name]}" for name, key in ASSIGNED.items() if flags.pop(name) is not None]
+    named = {key: flags.pop(name) for name, key in ASSIGNED.items()}
+    assignments = [f"{key}={value}" for key, value in named.items() if value is not None]
     config_file, more, starts = flags.pop("config_file"), flags.pop("assignments"), flags.pop("starts")
     return Job(source=log, options=_options(flags, starts), config_file=config_file, assignments=(*more, *assignments))
 
@@ -180,8 +182,7 @@ def _gate(rows: Sequence[Row], golden: Path | None, update: Path | None, as_json
     if golden:
         result = report.compare_golden(golden, rows)
         if not result.ok:
-            stream = click.get_text_stream("stderr" if as_json else "stdout")
-            report.print_golden(report.make_console(stream), result)
+            report.print_golden(report.make_console(sys.stderr if as_json else sys.stdout), result)
         result.check(str(golden))
         click.echo(f"golden rows agree: {golden} ({result.rows} scans)", err=True)
 
