@@ -301,3 +301,20 @@ def test_a_model_is_named_beside_the_scenario(tmp_path):
     assert load_scenario(path).model == tmp_path / "m.stl"
     assert load_scenario().model is None
     assert isinstance(load_scenario(path).folder, Path)
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parent.parent / "docs" / "scenarios").glob("*.toml")), ids=lambda p: p.stem
+)
+def test_the_ready_scenarios_see_their_target(path):
+    loaded = load_scenario(path)
+    simulation = simulate(loaded, builtin_surface(loaded.params.target.shape))
+    first = next(simulation.scans())
+    assert len(first.points) > 300
+    assert loaded.params.name == path.stem
+
+
+def test_the_three_strengths_of_faults_hold_every_kind():
+    for level in ("weak", "medium", "strong"):
+        params = load_scenario(Path(__file__).parent.parent / "docs" / "scenarios" / f"faults-{level}.toml").params
+        assert {f.kind for f in params.fault} == set(Kind)
