@@ -1,0 +1,150 @@
+"""Bad input: one line (what, where, what to do), the documented exit code, no traceback, nothing half-written."""
+
+import struct
+
+import pytest
+
+GOOD_PLY = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+FACES = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 %s\n3 0 1 2\n"
+
+
+def one_line(done, code, *words):
+    assert done.code == code, done.out + done.err
+    assert done.out == ""
+    lines = done.err.strip().splitlines()
+    assert "Traceback" not in done.err
+    assert len([line for line in lines if line.startswith("avsreplay: ")]) == 1, done.err
+    assert len(lines) == 1, done.err
+    for word in words:
+        assert word in done.err
+
+
+@pytest.fixture
+def log(fixtures_folder):
+    return fixtures_folder / "tumble.mcap"
+
+
+@pytest.mark.parametrize("verb", ["run", "info"])
+def test_a_file_that_is_not_there(verb, cli, tmp_path):
+    one_line(cli(verb, tmp_path / "none.mcap"), 3, "none.mcap")
+
+
+@pytest.mark.parametrize("verb", ["run", "info"])
+@pytest.mark.parametrize("content", [b"", b"hello, this is no log", b"\x00" * 4096, b"\x89MCAP0\r\n"])
+def test_a_file_that_is_no_log(verb, content, cli, tmp_path):
+    path = tmp_path / "x.mcap"
+    path.write_bytes(content)
+    one_line(cli(verb, path), 3, "x.mcap")
+
+
+def test_a_folder_without_scans(cli, tmp_path):
+    one_line(cli("run", tmp_path), 3)
+
+
+def test_a_log_without_a_cloud_topic(cli, shared_data):
+    bag = shared_data / "mcap-rosbag2" / "cdr_test"
+    one_line(cli("run", bag), 3, "PointCloud2")
+
+
+def test_no_model(cli, shared_data, tmp_path):
+    out = tmp_path / "d.mcap"
+    assert cli("record", shared_data / "stanford-dragon", "-o", out, "--n-scans", 1).code == 0
+    one_line(cli("run", out), 2, "no model", "--model")
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        (GOOD_PLY + FACES % b"nan", "not finite"),
+        (GOOD_PLY + b"end_header\n0 0 0\n1 0 0\n0 1 0\n", "no faces"),
+        (b"ply\nnot really", "m.ply"),
+        (b"", "m.ply"),
+    ],
+)
+def test_a_model_that_cannot_be_right(text, word, cli, log, tmp_path):
+    model = tmp_path / "m.ply"
+    model.write_bytes(text)
+    one_line(cli("run", log, "--model", model), 3, word)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "word"),
+    [
+        ("duration_s = 10\nrate = 5\n", 2, "did you mean"),
+        ('duration_s = "ten"\n', 1, "a number"),
+        ("[[fault]]\nkind = 'oclusion'\nstart_s = 1\nduration_s = 1\n", 2, "one of"),
+        ("[target\n", None, "not valid TOML"),
+    ],
+)
+def test_a_scenario_with_a_wrong_key(text, line, word, cli, tmp_path):
+    path = tmp_path / "s.toml"
+    path.write_text(text)
+    done = cli("record", path, "-o", tmp_path / "x.mcap")
+    one_line(done, 2, word, f"s.toml:{line}" if line else "s.toml")
+    assert not (tmp_path / "x.mcap").exists()
+
+
+@pytest.mark.parametrize(
+    ("flags", "word"),
+    [
+        (("--backend", "nonesuch"), "horn"),
+        (("--init", "1,2,3"), "seven numbers"),
+        (("--init", "0,0,0,1,1,1,1"), "unit length"),
+        (("--set", "faults.polcy=any"), "did you mean"),
+        (("--set", "plan.a_max_mps2=-1"), "a_max_mps2"),
+        (("--topic", "/nothing"), "/points"),
+        (("--golden", "a", "--update-golden", "b"), "exclude"),
+    ],
+)
+def test_a_flag_that_cannot_be_right(flags, word, cli, log):
+    one_line(cli("run", log, *flags), 2, word)
+
+
+def test_a_config_file_with_a_wrong_key(cli, log, tmp_path):
+    config = tmp_path / "c.toml"
+    config.write_text("[plan]\n\nhorizon = 3\n")
+    one_line(cli("run", log, "--config", config), 2, "c.toml:3")
+
+
+def test_an_existing_log_is_not_overwritten(cli, tmp_path):
+    out = tmp_path / "x.mcap"
+    out.write_bytes(b"precious")
+    one_line(cli("record", "-o", out), 2, "--overwrite")
+    assert out.read_bytes() == b"precious"
+
+
+def test_output_into_a_folder_that_is_not_there(cli, tmp_path):
+    done = cli("record", "-o", tmp_path / "no" / "x.mcap")
+    assert done.code in (2, 3)
+    assert "Traceback" not in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_cloud_in_an_encoding_that_is_not_known(cli, tmp_path):
+    from mcap.writer import Writer
+
+    path = tmp_path / "json.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="", library="test")
+        schema = writer.register_schema("foxglove.PointCloud", "jsonschema", b"{}")
+        channel = writer.register_channel("/points", "json", schema)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    one_line(cli("run", path), 3, "json.mcap")
+
+
+def test_terminal_escapes_in_names_are_shown_not_sent(cli, tmp_path):
+    from mcap.writer import Writer
+
+    path = tmp_path / "esc.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channel = writer.register_channel("/a\x1b[2J\x07b", "cdr", schema)
+        writer.add_message(channel, 1, struct.pack("<4sI2s", b"\0\1\0\0", 2, b"x\0"), 1)
+        writer.finish()
+    done = cli("run", path)
+    assert done.code == 3
+    assert "\x1b" not in done.err + done.out

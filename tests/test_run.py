@@ -1,0 +1,102 @@
+"""``avsreplay run`` as a user has it: tables, JSON, result directory, precedence of settings."""
+
+import json
+
+import numpy as np
+import pytest
+
+from avsreplay.results import MEAN_COLUMNS, read_beliefs
+
+
+@pytest.fixture(scope="module")
+def result(cli, fixtures_folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run") / "result"
+    done = cli("run", fixtures_folder / "tumble.mcap", "-o", out, "--json")
+    assert done.code == 0, done.err
+    return out, json.loads(done.out)
+
+
+def test_json_is_one_document_with_summary_and_rows(result):
+    _, document = result
+    assert document["format"] == "avsreplay-run/1"
+    assert len(document["rows"]) == document["summary"]["scans"]
+    assert document["header"]["config"]["register"]["backend"] == "horn"
+    assert len(document["header"]["log"]["sha256"]) == 64
+
+
+def test_result_directory_holds_what_it_promises(result):
+    out, document = result
+    names = {p.name for p in out.iterdir()}
+    assert {"rows.jsonl", "run.json", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz"} <= names
+    rows = [json.loads(line) for line in (out / "rows.jsonl").read_text().splitlines()]
+    assert rows == document["rows"]
+    estimate = np.loadtxt(out / "estimate.tum")
+    truth = np.loadtxt(out / "truth.tum")
+    assert estimate.shape == truth.shape == (len(rows), 8)
+    healthy = [r["gamma"] == 1 for r in rows]
+    distance = np.linalg.norm(estimate[:, 1:4] - truth[:, 1:4], axis=1)
+    np.testing.assert_allclose(distance, [r["pos_err_m"] for r in rows], atol=1e-12)
+    assert sum(healthy) > len(rows) / 2
+
+
+def test_beliefs_read_back_as_written(result):
+    out, document = result
+    beliefs = read_beliefs(out / "beliefs.npz")
+    assert [b.t_ns for b in beliefs] == [r["t_ns"] for r in document["rows"]]
+    assert len(MEAN_COLUMNS) == 22
+    last, row = beliefs[-1], document["rows"][-1]
+    np.testing.assert_allclose(last.x.T_ac.t, [row["x_m"], row["y_m"], row["z_m"]], atol=1e-12)
+    np.testing.assert_allclose(last.x.sigma, [row["sigma1"], row["sigma2"]], atol=0)
+    assert np.linalg.eigvalsh(last.P).min() > 0.0
+
+
+def test_an_existing_result_is_left_alone(result, cli, fixtures_folder):
+    out, _ = result
+    before = (out / "rows.jsonl").read_bytes()
+    done = cli("run", fixtures_folder / "tumble.mcap", "-o", out, "--n-scans", 3)
+    assert done.code == 2
+    assert "--overwrite" in done.err
+    assert (out / "rows.jsonl").read_bytes() == before
+
+
+def test_overwrite_never_removes_what_is_no_result(cli, fixtures_folder, tmp_path):
+    precious = tmp_path / "precious"
+    precious.mkdir()
+    (precious / "thesis.txt").write_text("years of work")
+    done = cli("run", fixtures_folder / "tumble.mcap", "-o", precious, "--overwrite", "--n-scans", 3)
+    assert done.code == 2
+    assert (precious / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_failed_run_leaves_no_half_result(cli, fixtures_folder, tmp_path):
+    done = cli("run", fixtures_folder / "tumble.mcap", "-o", tmp_path / "r", "--start", 1e9)
+    assert done.code == 3
+    assert "no scan to replay" in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_flags_beat_the_file_and_the_file_beats_the_default(cli, fixtures_folder, tmp_path):
+    config = tmp_path / "c.toml"
+    config.write_text('[faults]\npolicy = "all"\n[plan]\na_max_mps2 = 0.07\n')
+    done = cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 2, "--json", "--config", config, "--policy", "any")
+    effective = json.loads(done.out)["header"]["config"]
+    assert effective["faults"]["policy"] == "any"
+    assert effective["plan"]["a_max_mps2"] == 0.07
+    by_environment = cli(
+        "run", fixtures_folder / "tumble.mcap", "--n-scans", 2, "--json", env={"AVSREPLAY_RUN_POLICY": "all"}
+    )
+    assert json.loads(by_environment.out)["header"]["config"]["faults"]["policy"] == "all"
+
+
+def test_start_takes_a_time_too(cli, fixtures_folder):
+    whole = json.loads(cli("run", fixtures_folder / "tumble.mcap", "--json").out)["rows"]
+    late = json.loads(cli("run", fixtures_folder / "tumble.mcap", "--json", "--start", 2.0, "--n-scans", 3).out)["rows"]
+    assert len(late) == 3
+    assert late[0]["t_ns"] == next(r["t_ns"] for r in whole if r["t_s"] >= 2.0)
+
+
+def test_off_a_terminal_nothing_but_results_is_printed(cli, fixtures_folder):
+    done = cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 4)
+    assert done.err == ""
+    assert "\x1b" not in done.out
+    assert max(map(len, done.out.splitlines())) <= 80
