@@ -4,8 +4,11 @@ Two engines stand behind the same methods. ``kernel`` is the C++ extension; ``re
 plain, and is what the tests compare the kernel with. A model is built once for one reach and then only read.
 
 What is closest
-    The foot of a query is the nearest point of the closed surface, on a face, an edge or a vertex; of two primitives at
-    the same computed distance the lower index wins. At ``reach_m`` or farther there is none: id -1, d2 inf, else NaN.
+    The foot of a query is the nearest point of the closed surface, on a face, an edge or a vertex. At ``reach_m`` or
+    farther there is none: id -1, d2 inf, else NaN.
+Who owns it
+    Of faces at the same distance (to 1e-10, rounding: a foot on an edge or a vertex) the one that faces the query most
+    squarely, then the lower index; of points, the lower index.
 Which normal
     The face normal (winding, right hand) of the triangle that owns the foot, also where the foot lies on an edge or a
     vertex; of a cloud, the least direction of its ``NORMAL_NEIGHBOURS`` nearest points, its sign free.
@@ -149,8 +152,13 @@ class Model:
     _index: _Index
 
     @classmethod
-    def build(cls, surface: Surface, reach_m: float, *, engine: Engine = "kernel") -> Model:
+    def build(
+        cls, surface: Surface, reach_m: float, *, engine: Engine = "kernel", threads: int = 1, portable: bool = False
+    ) -> Model:
         """Index ``surface`` for queries up to ``reach_m`` [m] from it.
+
+        ``threads`` build it; ``portable`` keeps the kernel to the instructions every machine of its kind has. Neither
+        shows in any result.
 
         Raises:
             UsageError: a surface with no primitive, a coordinate that is not finite, a face that names a vertex that is
@@ -160,7 +168,7 @@ class Model:
         kept = _with_area(vertices, faces)
         if len(faces) and not len(kept):
             raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
-        index = _engine(engine, surface.name)(vertices, faces, kept, float(reach_m))
+        index = _engine(engine, surface.name)(vertices, faces, kept, float(reach_m), threads, portable)
         size = len(kept) if len(faces) else len(vertices)
         return cls(float(reach_m), surface.extent, engine, size, len(faces) - len(kept), index)
 

@@ -19,7 +19,15 @@ __all__ = ["KernelIndex"]
 class KernelIndex:
     """Closest points, the ICP loop and the normal equations in C++."""
 
-    def __init__(self, vertices: Array, faces: NDArray[np.int32], kept: NDArray[np.int32], reach_m: float) -> None:
+    def __init__(
+        self,
+        vertices: Array,
+        faces: NDArray[np.int32],
+        kept: NDArray[np.int32],
+        reach_m: float,
+        threads: int,
+        portable: bool,
+    ) -> None:
         try:
             import avsreplay.register._kernel as _kernel
         except ImportError as error:
@@ -27,7 +35,7 @@ class KernelIndex:
                 "the C++ kernel is not built", where="avsreplay.register._kernel", hint="install a compiler and run pip"
             ) from error
         normals = np.empty((0, 3)) if len(faces) else cloud_normals(vertices)
-        self._index = _kernel.Index(vertices, faces, kept, normals, reach_m)
+        self._index = _kernel.Index(vertices, faces, kept, normals, reach_m, threads, portable)
 
     def closest(self, points: NDArray[Any], threads: int) -> tuple[Array, Array, NDArray[np.int32], Array]:
         """Feet (n, 3), squared distances (n,), ids (n,), normals (n, 3)."""

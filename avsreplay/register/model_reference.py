@@ -27,13 +27,23 @@ _Search = Callable[[Array], tuple[Array, Array, NDArray[np.int32]]]
 class ReferenceIndex:
     """Closest points, the ICP loop and the normal equations in numpy."""
 
-    def __init__(self, vertices: Array, faces: NDArray[np.int32], kept: NDArray[np.int32], reach_m: float) -> None:
+    def __init__(
+        self,
+        vertices: Array,
+        faces: NDArray[np.int32],
+        kept: NDArray[np.int32],
+        reach_m: float,
+        threads: int,
+        portable: bool,
+    ) -> None:
+        del threads, portable
         self._reach = reach_m
         if len(faces):
             corners = vertices[faces[kept]]
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-            self._search: _Search = _MeshSearch(corners)
+            tie = 1e-10 * (float(np.linalg.norm(np.ptp(vertices, axis=0))) + reach_m)
+            self._search: _Search = _MeshSearch(corners, self._normals, tie)
             self._ids = kept
         else:
             self._normals = cloud_normals(vertices)
@@ -121,8 +131,8 @@ class _CloudSearch:
 
 
 class _MeshSearch:
-    def __init__(self, corners: Array) -> None:
-        self._corners = corners
+    def __init__(self, corners: Array, normals: Array, tie_m: float) -> None:
+        self._corners, self._normals, self._tie = corners, normals, tie_m
         self._centroids = corners.mean(axis=1)
         self._radius = np.linalg.norm(corners - self._centroids[:, None], axis=2).max(axis=1)
 
@@ -141,7 +151,11 @@ class _MeshSearch:
         row, tri = np.nonzero(bound <= reach[:, None] * (1.0 + 1e-9))
         foot = foot_on_triangles(p[row], self._corners[tri])
         d2 = np.sum((foot - p[row]) ** 2, axis=1)
-        order = np.lexsort((tri, d2, row))
+        least = np.full(len(p), np.inf)
+        np.minimum.at(least, row, d2)
+        farther = d2 > least[row] * (1.0 + 1e-10) + self._tie**2
+        height = np.abs(np.sum((p[row] - self._corners[tri, 0]) * self._normals[tri], axis=1))
+        order = np.lexsort((tri, -np.round(height / self._tie), farther, row))
         _, starts = np.unique(row[order], return_index=True)
         best = order[starts]
         return foot[best], d2[best], tri[best].astype(np.int32)

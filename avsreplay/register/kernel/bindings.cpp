@@ -18,20 +18,38 @@ namespace {
 
 using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Ints = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
-using Cloud = nb::ndarray<nb::ro, nb::ndim<2>, nb::device::cpu>;
 using Numpy = nb::ndarray<nb::numpy, double>;
 
 void require(bool good, const char* what) {
   if (!good) throw std::invalid_argument(what);
 }
 
-View view(const Cloud& c) {
-  const bool single = c.dtype() == nb::dtype<float>();
-  require(single || c.dtype() == nb::dtype<double>(), "points must be float32 or float64");
-  require(c.shape(1) == 3, "points must be (n, 3)");
-  const int64_t size = single ? 4 : 8;
-  return {static_cast<const char*>(c.data()), (int64_t)c.shape(0), c.stride(0) * size, c.stride(1) * size, single};
-}
+// A view of a Python buffer with any strides, also such as are no multiple of a number (packed point records).
+class Cloud {
+ public:
+  explicit Cloud(nb::handle array) {
+    if (PyObject_GetBuffer(array.ptr(), &buffer_, PyBUF_RECORDS_RO) != 0) throw nb::python_error();
+    const char* format = buffer_.format ? buffer_.format : "B";
+    if (*format == '=' || *format == '@') ++format;
+    const bool good = buffer_.ndim == 2 && buffer_.shape[1] == 3 && (!std::strcmp(format, "f") || !std::strcmp(format, "d"));
+    single_ = *format == 'f';
+    if (!good) {
+      PyBuffer_Release(&buffer_);
+      throw std::invalid_argument("points must be (n, 3), float32 or float64");
+    }
+  }
+  ~Cloud() { PyBuffer_Release(&buffer_); }
+  Cloud(const Cloud&) = delete;
+  Cloud& operator=(const Cloud&) = delete;
+
+  View view() const {
+    return {static_cast<const char*>(buffer_.buf), buffer_.shape[0], buffer_.strides[0], buffer_.strides[1], single_};
+  }
+
+ private:
+  Py_buffer buffer_;
+  bool single_;
+};
 
 struct Rows {
   double v[12];
@@ -73,8 +91,9 @@ class Index {
     build(store_, s, reach, threads);
   }
 
-  nb::tuple closest(const Cloud& points, int threads) const {
-    const View v = view(points);
+  nb::tuple closest(nb::handle points, int threads) const {
+    const Cloud cloud(points);
+    const View v = cloud.view();
     Feet out;
     auto foot = array<double>({(size_t)v.n, 3}, &out.foot), normal = array<double>({(size_t)v.n, 3}, &out.normal);
     auto d2 = array<double>({(size_t)v.n}, &out.d2);
@@ -90,9 +109,10 @@ class Index {
     return nb::make_tuple(foot, d2, id, normal);
   }
 
-  nb::tuple icp(const Cloud& points, const Doubles& T_ca, int n_max, int n_plane, double gate, double tighten,
+  nb::tuple icp(nb::handle points, const Doubles& T_ca, int n_max, int n_plane, double gate, double tighten,
                 double floor, double eps_rad, double eps_m, int threads, bool keep) const {
-    const View v = view(points);
+    const Cloud cloud(points);
+    const View v = cloud.view();
     const Rows T = rows(T_ca);
     const Rule rule{n_max, n_plane, gate, tighten, floor, eps_rad, eps_m};
     Outcome o;
@@ -105,8 +125,9 @@ class Index {
                           o.searched);
   }
 
-  nb::tuple normal_equations(const Cloud& points, const Doubles& T_ca, double gate, int threads) const {
-    const View v = view(points);
+  nb::tuple normal_equations(nb::handle points, const Doubles& T_ca, double gate, int threads) const {
+    const Cloud cloud(points);
+    const View v = cloud.view();
     const Rows T = rows(T_ca);
     Sums s;
     {

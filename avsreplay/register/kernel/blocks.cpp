@@ -151,6 +151,7 @@ void set_frame(Store& s, const Surface& from) {
   s.extent = std::sqrt(dot(hi - lo, hi - lo));
   // About 20 roundings of 6e-8 of the largest coordinate, doubled.
   s.slack = (float)(2e-6 * (s.extent + s.reach));
+  s.tie = 1e-10 * (s.extent + s.reach), s.tie2 = s.tie * s.tie;
   const double grown = s.reach + 4.0 * s.slack;
   s.low = {lo.x - grown, lo.y - grown, lo.z - grown};
 }

@@ -49,6 +49,7 @@ struct Store {
   double reach = 0, extent = 0;
   Vec3 centre{};
   float slack = 0;  // bound of the error of any single-precision distance here [m]
+  double tie = 0, tie2 = 0;  // distances nearer each other than this are equal [m], and its square
 
   uint32_t blocks = 0;
   std::vector<int32_t> id;          // of the caller's faces or points, LANES a block

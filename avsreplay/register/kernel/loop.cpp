@@ -12,6 +12,10 @@ namespace {
 
 constexpr int64_t MIN_INLIERS = 6;
 
+// Neighbours are kept once a step moves every point by less than this part of a cell: before, they would only be lost.
+constexpr double KEEP_UNDER = 1.0;
+constexpr Kept UNKNOWN{0, 0, 0, -1.f, -1};
+
 double worst() { return std::numeric_limits<double>::infinity(); }
 
 
@@ -48,13 +52,15 @@ Sums run_pass(const Store& s, const Code& code, const View& v, const double* T, 
 }
 
 Outcome icp(const Store& s, const Code& code, const View& v, const double* T, const Rule& rule, bool keep, Team& team) {
-  std::vector<Kept> kept(keep ? (size_t)v.n : 0, Kept{0, 0, 0, -1.f, -1});
+  std::vector<Kept> memory;
   Outcome o{};
   std::memcpy(o.T, T, sizeof o.T);
   o.gate = rule.gate, o.turn = o.move = worst(), o.rms = std::numeric_limits<double>::quiet_NaN();
   bool plane = rule.n_plane > 0;
   while (o.passes < rule.n_max && !o.converged) {
-    const Sums sums = run_pass(s, code, v, o.T, o.gate, plane ? Pass::plane : Pass::point, keep ? kept.data() : nullptr, team);
+    if (keep && memory.empty() && o.move + o.turn * s.extent < KEEP_UNDER * s.cell) memory.assign((size_t)v.n, UNKNOWN);
+    Kept* kept = memory.empty() ? nullptr : memory.data();
+    const Sums sums = run_pass(s, code, v, o.T, o.gate, plane ? Pass::plane : Pass::point, kept, team);
     ++o.passes;
     o.inliers = (int64_t)sums.v[0], o.ignored = (int64_t)sums.v[2], o.searched += (int64_t)sums.v[3];
     o.rms = o.inliers ? std::sqrt(sums.v[1] / sums.v[0]) : std::numeric_limits<double>::quiet_NaN();

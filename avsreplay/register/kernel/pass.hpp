@@ -4,6 +4,8 @@
 // the words, then the lists, then the blocks a few points ahead of the search.
 static_assert(CHUNK % 4 == 0, "sums run over four points at a time");
 
+enum Treat : uint8_t { IGNORED, SEARCHED, KEPT };
+
 struct Chunk {
   alignas(32) double p[3][CHUNK];   // moved, relative to the model's centre
   alignas(32) double f[3][CHUNK];   // foot, the same
@@ -13,7 +15,8 @@ struct Chunk {
   double c[3][CHUNK];               // moved, in {C}
   Place cell[CHUNK];
   uint32_t word[CHUNK];
-  uint8_t search[CHUNK];
+  uint8_t level[CHUNK];  // of the word
+  Treat search[CHUNK];
 };
 
 static inline bool finite(const double* p) { return std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]); }
@@ -43,16 +46,16 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
   for (int i = 0; i < n; ++i) {
     double p[3], q[3];
     read(v, first + i, p);
-    c.search[i] = finite(p);
     c.cell[i].inside = false;
-    if (!c.search[i]) {
+    c.search[i] = finite(p) ? SEARCHED : IGNORED;
+    if (c.search[i] == IGNORED) {
       out.v[2] += 1;
       continue;
     }
     move(T, p, q);
     for (int k = 0; k < 3; ++k) c.c[k][i] = q[k];
     if (kept && still_near(kept[first + i], q)) {
-      c.search[i] = 2;
+      c.search[i] = KEPT;
       continue;
     }
     c.cell[i] = place(s, q[0], q[1], q[2]);
@@ -63,11 +66,15 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
 static void look_up(const Store& s, int n, Chunk& c) {
   for (int i = 0; i < n; ++i) {
     c.word[i] = c.cell[i].inside ? s.top[top_slot(s, c.cell[i])] : EMPTY;
+    c.level[i] = 0;
     if (c.word[i] & IS_BRICK) fetch(&s.bricks[brick_slot(c.word[i], c.cell[i], 0)]);
   }
   for (int level = 0; level < LEVELS; ++level)
     for (int i = 0; i < n; ++i) {
-      if (c.word[i] & IS_BRICK) c.word[i] = s.bricks[brick_slot(c.word[i], c.cell[i], level)];
+      if (c.word[i] & IS_BRICK) {
+        c.word[i] = s.bricks[brick_slot(c.word[i], c.cell[i], level)];
+        ++c.level[i];
+      }
       if (c.word[i] & IS_BRICK)
         fetch(&s.bricks[brick_slot(c.word[i], c.cell[i], level + 1)]);
       else if (c.word[i])
@@ -97,24 +104,35 @@ static inline void enter(const Store& s, Chunk& c, int i, const Foot& f, int32_t
 }
 
 template <class Kind>
+static inline Best search_one(const Store& s, const Query& q, const Chunk& c, int i, Kept* kept, float* scratch) {
+  if (!kept) return nearest<Kind>(s, q, c.word[i], scratch, nullptr);
+  float room = 0;
+  const Best best = nearest<Kind>(s, q, c.word[i], scratch, &room);
+  const float wall = c.cell[i].inside ? to_wall(s, q, c.cell[i], c.level[i]) : 0.f;
+  room = wall < room ? wall : room;
+  *kept = {q.x, q.y, q.z, room > 0 ? room * room * 0.9999f : 0.f, best.lane};
+  return best;
+}
+
+template <class Kind>
+static inline Best keep_one(const Store& s, const Query& q, const Kept& kept) {
+  if (kept.lane < 0) return nothing(0);
+  return {Kind::foot(s, (uint32_t)kept.lane, q), kept.lane};
+}
+
+template <class Kind>
 static void search(const Store& s, int64_t first, int n, double gate2, bool normals, Kept* kept, Chunk& c, Sums& out) {
   alignas(32) float scratch[LANES * LONGEST_LIST];
   for (int i = 0; i < n; ++i) {
-    if (i + AHEAD < n) fetch_blocks<Kind>(s, c.word[i + AHEAD]);
-    if (!c.search[i]) {
+    if (i + AHEAD < n && c.search[i + AHEAD] == SEARCHED) fetch_blocks<Kind>(s, c.word[i + AHEAD]);
+    if (c.search[i] == IGNORED) {
       enter(s, c, i, {}, -1, false, normals);
       continue;
     }
     const Query q = query(s, c.c[0][i], c.c[1][i], c.c[2][i]);
-    Best best = nothing(s.reach * s.reach);
-    if (c.search[i] == 2) {
-      best.lane = kept[first + i].lane;
-      if (best.lane >= 0) best.foot = Kind::foot(s, (uint32_t)best.lane, q);
-    } else {
-      best = nearest<Kind>(s, q, c.word[i], scratch);
-      out.v[3] += 1;
-      if (kept) kept[first + i] = {q.x, q.y, q.z, 0.f, best.lane};
-    }
+    Kept* memory = kept ? kept + first + i : nullptr;
+    const Best best = c.search[i] == KEPT ? keep_one<Kind>(s, q, *memory) : search_one<Kind>(s, q, c, i, memory, scratch);
+    out.v[3] += c.search[i] == SEARCHED ? 1 : 0;
     enter(s, c, i, best.foot, best.lane, best.lane >= 0 && best.foot.d2 < gate2, normals);
   }
 }
@@ -180,7 +198,7 @@ static void closest_kind(const Store& s, const View& v, int64_t first, int64_t l
     read(v, i, p);
     const Place at = place(s, p[0], p[1], p[2]);
     Best best = nothing(0);
-    if (at.inside) best = nearest<Kind>(s, query(s, p[0], p[1], p[2]), word_at(s, at), scratch);
+    if (at.inside) best = nearest<Kind>(s, query(s, p[0], p[1], p[2]), word_at(s, at).word, scratch, nullptr);
     const bool found = best.lane >= 0;
     const Vec3 n = found ? s.normals[(size_t)best.lane] : Vec3{nan, nan, nan};
     const Vec3 f = found ? Vec3{best.foot.x, best.foot.y, best.foot.z} : Vec3{nan, nan, nan};

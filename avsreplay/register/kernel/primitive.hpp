@@ -2,6 +2,7 @@
 // Included inside a namespace named after the instruction set.
 struct Foot {
   double d2, x, y, z;
+  double height;  // distance of the query from the triangle's plane: how squarely it faces
 };
 
 struct Query {
@@ -23,8 +24,11 @@ struct Points {
   static Foot foot(const Store& s, uint32_t lane, const Query& q) {
     const Vec3& p = s.points[lane];
     const double dx = p.x - q.x, dy = p.y - q.y, dz = p.z - q.z;
-    return {dx * dx + dy * dy + dz * dz, p.x, p.y, p.z};
+    return {dx * dx + dy * dy + dz * dz, p.x, p.y, p.z, 0};
   }
+
+  // Squared distances that differ by no more are a tie.
+  static double tie(const Store&, double) { return 0; }
 
   static void prefetch(const Store& s, uint32_t block) {
     const char* p = reinterpret_cast<const char*>(s.point_blocks.data() + block);
@@ -80,8 +84,11 @@ struct Triangles {
     const double bx = t.length - t.cx, rx = t.length - x;
     if (y < 0 || x * t.cy - y * t.cx < 0 || rx * t.cy - y * bx < 0) e = on_sides(t, x, y, fx, fy);
     return {z * z + e, t.a.x + fx * t.u.x + fy * t.w.x, t.a.y + fx * t.u.y + fy * t.w.y,
-            t.a.z + fx * t.u.z + fy * t.w.z};
+            t.a.z + fx * t.u.z + fy * t.w.z, std::fabs(z)};
   }
+
+  // Rounding sets the distances to the faces of a common side apart; this is well above it.
+  static double tie(const Store& s, double d2) { return 1e-10 * d2 + s.tie2; }
 
   static double unit(double t) { return t < 0 ? 0 : t > 1 ? 1 : t; }
 

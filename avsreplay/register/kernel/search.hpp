@@ -5,16 +5,27 @@ struct Best {
   int32_t lane;  // 8 block + lane, -1: none within the bound
 };
 
-static inline Best nothing(double bound2) { return {{bound2, 0, 0, 0}, -1}; }
+static inline Best nothing(double bound2) { return {{bound2, 0, 0, 0, 0}, -1}; }
 
-// Of two at the same computed distance the lower id wins.
+// Of two at the same distance the one that faces the query more squarely wins, then the lower id.
+static inline bool wins_tie(const Store& s, const Foot& f, uint32_t lane, const Best& best) {
+  if (std::fabs(f.height - best.foot.height) > s.tie) return f.height > best.foot.height;
+  return s.id[lane] < s.id[(size_t)best.lane];
+}
+
+template <class Kind>
+static inline bool nearer(const Store& s, const Foot& f, uint32_t lane, const Best& best) {
+  const double tie = Kind::tie(s, best.foot.d2);
+  if (f.d2 < best.foot.d2 - tie) return true;
+  return f.d2 <= best.foot.d2 + tie && wins_tie(s, f, lane, best);
+}
+
 template <class Kind>
 static inline void consider(const Store& s, const Query& q, uint32_t block, unsigned lanes, Best& best) {
   for (; lanes; lanes &= lanes - 1) {
     const uint32_t lane = LANES * block + (uint32_t)lowest_bit(lanes);
     const Foot f = Kind::foot(s, lane, q);
-    const bool tie = f.d2 == best.foot.d2 && best.lane >= 0 && s.id[lane] < s.id[(size_t)best.lane];
-    if (f.d2 < best.foot.d2 || tie) best = {f, (int32_t)lane};
+    if (best.lane < 0 ? f.d2 < best.foot.d2 : nearer<Kind>(s, f, lane, best)) best = {f, (int32_t)lane};
   }
 }
 
@@ -24,20 +35,50 @@ static inline float lenient(const Store& s, float d2) {
   return d * d * 1.00001f;
 }
 
+// The least and the second least of all the lanes seen.
+struct TwoLeast {
+  F8 first = f8(3e38f), second = f8(3e38f);
+
+  void add(F8 d) {
+    second = min8(second, max8(first, d));
+    first = min8(first, d);
+  }
+
+  float runner_up() const {
+    float a[8], b[8];
+    store8(a, first), store8(b, second);
+    float m = 3e38f, n = 3e38f;
+    for (int k = 0; k < 8; ++k) {
+      const float larger = a[k] < m ? m : a[k];
+      n = larger < n ? larger : n;
+      n = b[k] < n ? b[k] : n;
+      m = a[k] < m ? a[k] : m;
+    }
+    return n;
+  }
+};
+
+// `room`: how far the query may move before another primitive can be the nearest, or any come within reach.
 template <class Kind>
-static inline Best in_list(const Store& s, const Query& q, const uint32_t* list, float* d2) {
+static inline Best in_list(const Store& s, const Query& q, const uint32_t* list, float* d2, float* room) {
   const uint32_t n = *list++;
-  F8 m = f8(3e38f);
+  TwoLeast two;
   for (uint32_t k = 0; k < n; ++k) {
     const F8 d = Kind::distance2(s, list[k], q);
     store8(d2 + LANES * k, d);
-    m = min8(m, d);
+    two.add(d);
   }
-  const F8 limit = f8(lenient(s, least(m)));
+  const float m = least(two.first);
+  const F8 limit = f8(lenient(s, m));
   Best best = nothing(s.reach * s.reach);
   for (uint32_t k = 0; k < n; ++k) {
     const unsigned lanes = bits(load8(d2 + LANES * k) < limit);
     if (lanes) consider<Kind>(s, q, list[k], lanes, best);
+  }
+  if (room) {
+    const float d = std::sqrt(m);
+    *room = best.lane < 0 ? d - (float)s.reach : 0.5f * (std::sqrt(two.runner_up()) - d);
+    *room -= 2.f * s.slack;
   }
   return best;
 }
@@ -107,16 +148,35 @@ static inline size_t brick_slot(uint32_t word, const Place& p, int level) {
   return (size_t)(word & ~IS_BRICK) * 64 + (part(0) * 4 + part(1)) * 4 + part(2);
 }
 
-static inline uint32_t word_at(const Store& s, const Place& p) {
-  uint32_t word = s.top[top_slot(s, p)];
-  for (int level = 0; word & IS_BRICK; ++level) word = s.bricks[brick_slot(word, p, level)];
-  return word;
+struct Found {
+  uint32_t word;
+  int level;  // bricks passed on the way: the word's cell has the side cell * 4^(LEVELS - level)
+};
+
+static inline Found word_at(const Store& s, const Place& p) {
+  Found f{s.top[top_slot(s, p)], 0};
+  for (; f.word & IS_BRICK; ++f.level) f.word = s.bricks[brick_slot(f.word, p, f.level)];
+  return f;
+}
+
+// Distance from a place to the walls of its word's cell.
+static inline float to_wall(const Store& s, const Query& q, const Place& p, int level) {
+  const int shift = 2 * (LEVELS - level);
+  const double side = s.cell * (double)(1 << shift), at[3] = {q.x - s.low.x, q.y - s.low.y, q.z - s.low.z};
+  double least = side;
+  for (int k = 0; k < 3; ++k) {
+    const double into = at[k] - (double)(p.cell[k] >> shift) * side, left = side - into;
+    least = into < least ? into : least;
+    least = left < least ? left : least;
+  }
+  return (float)least - s.slack;
 }
 
 template <class Kind>
-static inline Best nearest(const Store& s, const Query& q, uint32_t word, float* scratch) {
+static inline Best nearest(const Store& s, const Query& q, uint32_t word, float* scratch, float* room) {
   const double reach2 = s.reach * s.reach;
+  if (room) *room = word == EMPTY ? 3e38f : 0.f;
   if (word == EMPTY) return nothing(reach2);
   const uint32_t* list = s.lists.data() + word;
-  return *list == TOO_MANY ? in_tree<Kind>(s, q, reach2) : in_list<Kind>(s, q, list, scratch);
+  return *list == TOO_MANY ? in_tree<Kind>(s, q, reach2) : in_list<Kind>(s, q, list, scratch, room);
 }

@@ -1,0 +1,285 @@
+"""The C++ kernel: exact against independent searches, the same bits for any thread count and instruction set."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from avsreplay.geometry import Array, Pose, exp
+from avsreplay.records import Surface
+from avsreplay.register.model import IcpParams, Model
+
+kernel = pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
+scipy_spatial = pytest.importorskip("scipy.spatial")
+
+NO_FACES = np.zeros((0, 3), dtype=np.int32)
+
+
+def surface(vertices: Array, faces: object = NO_FACES) -> Surface:
+    return Surface(np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int32).reshape(-1, 3), "test", "")
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(seed))
+
+
+def soup(n: int, seed: int, size: float = 0.3) -> Surface:
+    """n triangles anywhere in a box, of sizes over two decades, some of them slivers."""
+    r = rng(seed)
+    corners = r.uniform(-1, 1, (n, 1, 3)) + size * r.standard_normal((n, 3, 3)) * 10 ** r.uniform(-2, 0, (n, 1, 1))
+    thin = r.random(n) < 0.2
+    along = corners[thin, 0] + 0.7 * (corners[thin, 1] - corners[thin, 0])
+    corners[thin, 2] = along + 1e-7 * r.standard_normal(along.shape)
+    return surface(corners.reshape(-1, 3), np.arange(3 * n).reshape(-1, 3))
+
+
+def distances(q: Array, corners: Array) -> Array:
+    """Distance from q (3,) to each triangle (m, 3, 3), by barycentric coordinates and the sides, in long double."""
+    a, b, c, q = (x.astype(np.longdouble) for x in (corners[:, 0], corners[:, 1], corners[:, 2], q))
+    sides = np.min([_to_side(q, a, b), _to_side(q, b, c), _to_side(q, c, a)], axis=0)
+    ab, ac, aq = b - a, c - a, q - a
+    m = np.cross(ab, ac)
+    v, w = _dot(np.cross(aq, ac), m) / _dot(m, m), _dot(np.cross(ab, aq), m) / _dot(m, m)
+    inside = (v >= 0) & (w >= 0) & (v + w <= 1)
+    return np.where(inside, np.minimum(sides, np.abs(_dot(aq, m)) / np.sqrt(_dot(m, m))), sides).astype(np.float64)
+
+
+def _dot(u: Array, v: Array) -> Array:
+    return np.sum(u * v, axis=-1)
+
+
+def _to_side(q: Array, u: Array, v: Array) -> Array:
+    t = np.clip(_dot(q - u, v - u) / np.maximum(_dot(v - u, v - u), 1e-300), 0, 1)
+    return np.linalg.norm(u + t[:, None] * (v - u) - q, axis=1)
+
+
+def adversarial(vertices: Array, seed: int, n: int) -> Array:
+    """Queries where a search goes wrong if it can: on vertices, halfway between them, a rounding beside, far off."""
+    r = rng(seed)
+    i, j = r.integers(len(vertices), size=(2, n))
+    t = r.random((n, 1))
+    return np.concatenate(
+        [
+            vertices[i],
+            0.5 * (vertices[i] + vertices[j]),
+            np.nextafter(vertices[i], np.inf),
+            vertices[i] + 1e-9 * r.standard_normal((n, 3)),
+            (1 - t) * vertices[i] + t * vertices[j],
+            vertices[i] + 10 ** r.uniform(-6, 1, (n, 1)) * r.standard_normal((n, 3)),
+            np.round(vertices[i], 1),
+        ]
+    )
+
+
+def clouds() -> dict[str, Array]:
+    r = rng(1)
+    sphere = r.standard_normal((4000, 3))
+    lattice = np.stack(np.meshgrid(*[np.arange(12.0)] * 3), -1).reshape(-1, 3)
+    angle = np.linspace(0, 2 * np.pi, 3000, endpoint=False)
+    return {
+        "sphere, its middle equally far from all": sphere / np.linalg.norm(sphere, axis=1, keepdims=True),
+        "lattice, ties everywhere": lattice,
+        "ring, a whole axis of ties": np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]),
+        "one point": np.array([[0.1, 0.2, 0.3]]),
+        "doubled points": np.repeat(r.standard_normal((300, 3)), 5, axis=0),
+        "flat": np.column_stack([r.random((2000, 2)), np.zeros(2000)]),
+        "far from the origin": 1e4 + r.standard_normal((2000, 3)),
+        "two scales": np.concatenate([1e-3 * r.standard_normal((2000, 3)), 5 + r.standard_normal((500, 3))]),
+    }
+
+
+@pytest.mark.parametrize("name", clouds())
+def test_nearest_point_is_that_of_a_kd_tree(name: str) -> None:
+    points = clouds()[name]
+    extent = max(float(np.linalg.norm(np.ptp(points, axis=0))), 0.1)
+    reach = 0.4 * extent
+    model = Model.build(surface(points), reach)
+    low, high = points.min(0) - 1.2 * reach, points.max(0) + 1.2 * reach
+    q = np.concatenate([rng(2).uniform(low, high, (8000, 3)), adversarial(points, 3, 300)])
+    found = model.closest(q)
+    d, _ = scipy_spatial.cKDTree(points).query(q)
+    sure = np.abs(d - reach) > 1e-9 * extent
+    assert np.array_equal((found.id >= 0)[sure], (d < reach)[sure])
+    near = found.id >= 0
+    assert np.allclose(np.sqrt(found.d2[near]), d[near], rtol=1e-14, atol=0)
+    assert np.array_equal(found.foot[near], points[found.id[near]])
+
+
+def test_the_lower_index_wins_a_tie() -> None:
+    points = np.repeat(rng(4).standard_normal((500, 3)), 3, axis=0)[rng(5).permutation(1500)]
+    found = Model.build(surface(points), 1.0).closest(points)
+    first = np.array([np.flatnonzero((points == p).all(1))[0] for p in points])
+    assert np.array_equal(found.id, first)
+
+
+@pytest.mark.parametrize(("n", "size"), [(1, 1.0), (7, 0.5), (300, 0.3), (2500, 0.05)])
+def test_nearest_triangle_is_that_of_a_full_search(n: int, size: float) -> None:
+    mesh = soup(n, seed=n, size=size)
+    reach = 0.35
+    model = Model.build(mesh, reach)
+    corners = mesh.vertices[mesh.faces]
+    q = np.concatenate([rng(6).uniform(-1.6, 1.6, (500, 3)), adversarial(mesh.vertices, 7, 60)])
+    found = model.closest(q)
+    for k, query in enumerate(q):
+        each = distances(query, corners)
+        d = each.min()
+        if abs(d - reach) < 1e-9:
+            continue
+        assert (found.id[k] >= 0) == (d < reach)
+        if d < reach:
+            assert np.sqrt(found.d2[k]) == pytest.approx(d, abs=1e-9)
+            assert each[found.id[k]] == pytest.approx(d, abs=1e-9)
+            assert np.linalg.norm(found.foot[k] - query) == pytest.approx(d, abs=1e-9)
+
+
+def test_the_foot_is_on_its_triangle_and_nowhere_nearer_point_is_found() -> None:
+    """Optimality: no random convex combination of any triangle's corners is nearer."""
+    mesh = soup(200, seed=8)
+    model = Model.build(mesh, 1.0)
+    q = rng(9).uniform(-1.5, 1.5, (300, 3))
+    found = model.closest(q)
+    inside = rng(10).dirichlet(np.ones(3), size=(200, 50))
+    spread = np.einsum("tpk,tki->tpi", inside, mesh.vertices[mesh.faces]).reshape(-1, 3)
+    near = np.flatnonzero(found.id >= 0)
+    assert len(near) > 200
+    least = scipy_spatial.cKDTree(spread).query(q[near])[0]
+    assert (np.sqrt(found.d2[near]) <= least + 1e-12).all()
+
+
+def test_both_engines_find_the_same_feet_on_the_built_in_like_mesh() -> None:
+    mesh = soup(400, seed=11)
+    q = np.concatenate([rng(12).uniform(-1.5, 1.5, (3000, 3)), adversarial(mesh.vertices, 13, 100)])
+    ours, plain = (Model.build(mesh, 0.5, engine=e).closest(q) for e in ("kernel", "reference"))
+    near = (ours.id >= 0) & (plain.id >= 0)
+    unsure = np.abs(np.sqrt(np.minimum(ours.d2, plain.d2)) - 0.5) < 1e-9
+    assert np.array_equal((ours.id >= 0) | unsure, (plain.id >= 0) | unsure)
+    assert np.abs(np.sqrt(ours.d2[near]) - np.sqrt(plain.d2[near])).max() < 1e-7  # the slivers' normals
+    assert np.median(np.abs(np.sqrt(ours.d2[near]) - np.sqrt(plain.d2[near]))) < 1e-15
+
+
+def scan_of(mesh: Surface, n: int, seed: int, noise: float = 0.003) -> Array:
+    r = rng(seed)
+    corners = mesh.vertices[mesh.faces][r.integers(len(mesh.faces), size=n)]
+    return np.einsum("nk,nki->ni", r.dirichlet(np.ones(3), size=n), corners) + noise * r.standard_normal((n, 3))
+
+
+RULE = IcpParams(n_max=40)
+GUESS = Pose(exp([0.03, -0.02, 0.04]), [0.02, -0.03, 0.01])
+
+
+def everything(model: Model, scan: Array, rule: IcpParams = RULE) -> bytes:
+    """All bits of an alignment and of the sums at its end."""
+    r = model.icp(scan, GUESS, rule)
+    n = model.normal_equations(scan, r.T_ca, 0.2, threads=rule.threads)
+    c = model.closest(scan, threads=rule.threads)
+    numbers = [r.iterations, r.inliers, r.rms_m, r.gate_m, r.step_rad, r.step_m, n.inliers, n.sum_e2, n.sum_d2]
+    arrays = [r.T_ca, n.info, n.gradient, c.foot, c.d2, c.normal]
+    return np.concatenate([np.array(numbers, dtype=np.float64), *(a.ravel() for a in arrays)]).tobytes()
+
+
+@pytest.fixture(params=["mesh", "cloud"])
+def target(request: pytest.FixtureRequest) -> Surface:
+    mesh = soup(600, seed=14)
+    return mesh if request.param == "mesh" else surface(scan_of(mesh, 20_000, 15, 0.0))
+
+
+@pytest.mark.parametrize("threads", [2, 3, 7])
+def test_any_number_of_threads_gives_the_same_bits(target: Surface, threads: int) -> None:
+    scan = scan_of(soup(600, seed=14), 5003, 16)
+    model = Model.build(target, 0.4)
+    rule = IcpParams(n_max=40, threads=threads)
+    assert everything(model, scan, rule) == everything(model, scan)
+
+
+def test_keeping_neighbours_gives_the_same_bits(target: Surface) -> None:
+    scan = scan_of(soup(600, seed=14), 5003, 17)
+    model = Model.build(target, 0.4)
+    kept, searched = model.icp(scan, GUESS, RULE), model.icp(scan, GUESS, IcpParams(n_max=40, keep=False))
+    assert everything(model, scan) == everything(model, scan, IcpParams(n_max=40, keep=False))
+    assert kept.searched < searched.searched == searched.iterations * len(scan)
+
+
+def test_any_instruction_set_gives_the_same_bits(target: Surface) -> None:
+    scan = scan_of(soup(600, seed=14), 5003, 18)
+    fast, plain = Model.build(target, 0.4), Model.build(target, 0.4, portable=True)
+    assert everything(fast, scan) == everything(plain, scan)
+
+
+def test_building_twice_gives_the_same_bits(target: Surface) -> None:
+    scan = scan_of(soup(600, seed=14), 2000, 19)
+    assert everything(Model.build(target, 0.4), scan) == everything(Model.build(target, 0.4, threads=3), scan)
+
+
+def test_strided_and_single_precision_views_are_read_where_they_lie(target: Surface) -> None:
+    scan = scan_of(soup(600, seed=14), 3000, 20).astype(np.float32)
+    model = Model.build(target, 0.4)
+    want = everything(model, scan)
+    record = np.zeros(3000, dtype=[("pad", "u1", 3), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("i", "u2")])
+    for k, name in enumerate("xyz"):
+        record[name] = scan[:, k]
+    offsets = [record.dtype.fields[n][1] for n in "xyz"]
+    odd = np.ndarray((3000, 3), "f4", record.data, offsets[0], (record.dtype.itemsize, 4))
+    wide = np.zeros((6000, 5), dtype=np.float64)
+    wide[::2, 4::-2] = scan
+    backwards = np.ascontiguousarray(scan[::-1])[::-1]
+    for view in (odd, wide[::2, 4::-2], np.asfortranarray(scan), backwards, scan.astype(np.float64)):
+        assert everything(model, view) == want
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, -1e300, 1e30])
+def test_points_that_are_no_measurement_change_nothing(target: Surface, bad: float) -> None:
+    scan = scan_of(soup(600, seed=14), 1536, 21)
+    model = Model.build(target, 0.4)
+    dirty = np.insert(scan, [1536, 1536, 1536], bad, axis=0)
+    dirty[-1, 0] = 0.0
+    a, b = model.icp(scan, GUESS, RULE), model.icp(dirty, GUESS, RULE)
+    assert np.array_equal(a.T_ca, b.T_ca)
+    assert b.ignored == (0 if np.isfinite(bad) else 3)
+    assert (model.closest(dirty).id[-3:] == -1).all()
+    sums = model.normal_equations(dirty, np.eye(4))
+    assert (sums.points, sums.ignored) == (len(dirty) - b.ignored, b.ignored)
+
+
+def test_no_points_at_all(target: Surface) -> None:
+    model = Model.build(target, 0.4)
+    empty = np.zeros((0, 3), dtype=np.float32)
+    r = model.icp(empty, GUESS)
+    assert (r.converged, r.inliers, r.iterations) == (False, 0, 1)
+    assert np.isnan(r.rms_m)
+    assert np.array_equal(r.T_ca, GUESS.matrix)
+    assert len(model.closest(empty).id) == 0
+    assert model.normal_equations(empty, GUESS).inliers == 0
+
+
+def test_a_scan_far_away_stays_where_it_is(target: Surface) -> None:
+    model = Model.build(target, 0.4)
+    r = model.icp(scan_of(soup(600, seed=14), 500, 22) + 100.0, GUESS)
+    assert (r.converged, r.inliers) == (False, 0)
+    assert np.array_equal(r.T_ca, GUESS.matrix)
+
+
+def test_many_threads_may_share_a_model(target: Surface) -> None:
+    scan = scan_of(soup(600, seed=14), 2000, 23)
+    model = Model.build(target, 0.4)
+    want, got = everything(model, scan), []
+    workers = [threading.Thread(target=lambda: got.append(everything(model, scan))) for _ in range(4)]
+    for w in workers:
+        w.start()
+    for w in workers:
+        w.join()
+    assert got == [want] * 4
+
+
+def test_the_door_refuses_what_it_cannot_read() -> None:
+    model = Model.build(soup(5, seed=24), 0.5)
+    with pytest.raises(ValueError, match=r"\(n, 3\)"):
+        model.closest(np.zeros((4, 2)))
+    with pytest.raises(ValueError, match=r"\(n, 3\)"):
+        model.closest(np.zeros(3))
+    index = model._index._index  # type: ignore[attr-defined]
+    with pytest.raises((ValueError, TypeError)):
+        index.closest(np.zeros((4, 3), dtype=np.int64))
+    with pytest.raises((ValueError, TypeError)):
+        index.icp(np.zeros((4, 3)), np.zeros((3, 3)), 5, 0, 1.0, 3.0, 0.1, 1e-5, 1e-5)

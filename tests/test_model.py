@@ -1,0 +1,238 @@
+"""The model's contract, for both engines: recovery, invariance, the sums' meaning, what it refuses."""
+
+from __future__ import annotations
+
+import dataclasses
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from avsreplay.errors import UsageError
+from avsreplay.geometry import Array, Pose, exp, skew
+from avsreplay.records import Surface
+from avsreplay.register.model import Engine, IcpParams, Model
+from avsreplay.register.model_reference import cloud_normals
+
+NO_FACES = np.zeros((0, 3), dtype=np.int32)
+MOVE = Pose(exp([0.05, -0.08, 0.06]), [0.03, -0.02, 0.04])
+
+
+@pytest.fixture(params=["kernel", "reference"])
+def engine(request: pytest.FixtureRequest) -> Engine:
+    if request.param == "kernel":
+        pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
+    return request.param
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(seed))
+
+
+def shape() -> Surface:
+    """Three boxes in a heap without symmetry: 36 triangles, wound outwards."""
+    vertices, faces = [], []
+    for centre, size in (
+        ((0, 0, 0), (1.0, 0.7, 0.4)),
+        ((0.6, 0.2, 0.3), (0.5, 0.2, 0.3)),
+        ((-0.3, 0.5, 0.1), (0.2, 0.6, 0.5)),
+    ):
+        corner = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * np.array(size) / 2
+        quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+        faces += [[len(vertices) * 8 + q[k] for k in t] for q in quads for t in ((0, 1, 2), (0, 2, 3))]
+        vertices.append(corner + np.array(centre))
+    return Surface(np.concatenate(vertices), np.array(faces, dtype=np.int32), "boxes", "")
+
+
+def on(mesh: Surface, n: int, seed: int) -> Array:
+    r = rng(seed)
+    corners = mesh.vertices[mesh.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    pick = corners[r.choice(len(corners), n, p=area / area.sum())]
+    return np.einsum("nk,nki->ni", r.dirichlet(np.ones(3), size=n), pick)
+
+
+def test_a_moved_surface_is_brought_back_exactly(engine: Engine) -> None:
+    mesh = shape()
+    model = Model.build(mesh, 0.5, engine=engine)
+    r = model.icp(MOVE.apply(on(mesh, 1500, 1)), Pose.identity())
+    assert r.converged
+    assert np.abs(r.T_ca - MOVE.inverse().matrix).max() < 1e-6
+    assert r.inliers == 1500
+    assert r.rms_m < 1e-6
+
+
+def test_a_moved_cloud_is_brought_back_exactly(engine: Engine) -> None:
+    points = on(shape(), 3000, 2)
+    small = Pose(exp([0.004, -0.006, 0.005]), [0.002, -0.003, 0.001])
+    model = Model.build(Surface(points, NO_FACES, "cloud", ""), 0.3, engine=engine)
+    r = model.icp(small.apply(points), Pose.identity(), IcpParams(n_max=300))
+    assert r.converged
+    assert np.abs(r.T_ca - small.inverse().matrix).max() < 1e-9
+
+
+def test_moving_scan_and_guess_together_moves_the_answer(engine: Engine) -> None:
+    mesh = shape()
+    model = Model.build(mesh, 0.5, engine=engine)
+    scan = on(mesh, 1000, 3) + 0.004 * rng(4).standard_normal((1000, 3))
+    other = Pose(exp([1.0, -2.0, 0.5]), [3.0, -4.0, 5.0])
+    a = model.icp(MOVE.apply(scan), Pose.identity())
+    b = model.icp((other @ MOVE).apply(scan), other.inverse())
+    assert np.abs(b.T_ca @ other.matrix - a.T_ca).max() < 2e-5
+
+
+def test_the_order_of_the_points_does_not_matter(engine: Engine) -> None:
+    mesh = shape()
+    model = Model.build(mesh, 0.5, engine=engine)
+    scan = MOVE.apply(on(mesh, 1200, 5) + 0.004 * rng(6).standard_normal((1200, 3)))
+    a, b = model.icp(scan, Pose.identity()), model.icp(scan[rng(7).permutation(1200)], Pose.identity())
+    assert np.abs(a.T_ca - b.T_ca).max() < 1e-9
+
+
+def test_outliers_are_rejected_by_the_shrinking_gate(engine: Engine) -> None:
+    mesh = shape()
+    model = Model.build(mesh, 0.5, engine=engine)
+    r = rng(8)
+    scan = on(mesh, 1500, 9) + 0.003 * r.standard_normal((1500, 3))
+    scan = np.concatenate([scan, r.uniform(-1.2, 1.2, (300, 3))])
+    free, tight = (model.icp(MOVE.apply(scan), Pose.identity(), IcpParams(n_max=200, tighten=t)) for t in (0.0, 3.0))
+    wrong = [np.abs(x.T_ca - MOVE.inverse().matrix).max() for x in (free, tight)]
+    assert wrong[1] < 2e-3 < wrong[0]
+    assert tight.gate_m < 0.02
+    assert free.gate_m == 0.5
+
+
+def test_the_gate_never_grows_nor_passes_its_floor(engine: Engine) -> None:
+    mesh = shape()
+    model = Model.build(mesh, 0.5, engine=engine)
+    scan = MOVE.apply(on(mesh, 800, 10) + 0.004 * rng(11).standard_normal((800, 3)))
+    gates = [
+        model.icp(scan, Pose.identity(), IcpParams(n_max=n, n_plane=min(n, 6), floor_m=0.02)).gate_m
+        for n in range(1, 12)
+    ]
+    assert all(a >= b for a, b in pairwise(gates))
+    assert gates[-1] == 0.02
+
+
+def test_both_engines_walk_the_same_way() -> None:
+    pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
+    mesh = shape()
+    scan = MOVE.apply(on(mesh, 1000, 12) + 0.004 * rng(13).standard_normal((1000, 3)))
+    for rule in (IcpParams(), IcpParams(n_plane=0), IcpParams(n_max=9, tighten=0.0, gate_m=0.1)):
+        a, b = (Model.build(mesh, 0.5, engine=e).icp(scan, Pose.identity(), rule) for e in ("kernel", "reference"))
+        assert np.abs(a.T_ca - b.T_ca).max() < 1e-9
+        assert (a.iterations, a.converged, a.inliers) == (b.iterations, b.converged, b.inliers)
+        assert a.rms_m == pytest.approx(b.rms_m, rel=1e-9)
+        assert a.gate_m == pytest.approx(b.gate_m, rel=1e-9)
+
+
+def test_horn_passes_lower_the_rms_every_time(engine: Engine) -> None:
+    """With the gate held wide enough to take every point, a pass of ICP never raises the mean square."""
+    mesh = shape()
+    model = Model.build(mesh, 2.0, engine=engine)
+    scan = MOVE.apply(on(mesh, 600, 14) + 0.004 * rng(15).standard_normal((600, 3)))
+    rms = [model.icp(scan, Pose.identity(), IcpParams(n_max=n, n_plane=0, tighten=0.0)).rms_m for n in range(1, 25)]
+    assert all(b <= a * (1 + 1e-12) for a, b in pairwise(rms))
+
+
+def test_information_is_the_residuals_curvature(engine: Engine) -> None:
+    """J = de/dd for T_ac_true = T_ac Exp(d): the residual at the moved pose, feet and normals held, against J d."""
+    mesh = shape()
+    model = Model.build(mesh, 0.5, engine=engine)
+    T_ca = MOVE.inverse()
+    scan = MOVE.apply(on(mesh, 500, 16) + 0.01 * rng(17).standard_normal((500, 3)))
+    got = model.normal_equations(scan, T_ca)
+    found = model.closest(T_ca.apply(scan))
+
+    def residual(d: Array) -> Array:
+        E = np.eye(4)
+        E[:3, :3], E[:3, 3] = np.eye(3) + skew(d[:3]), d[3:]
+        p = T_ca.apply(scan) @ np.linalg.inv(E)[:3, :3].T + np.linalg.inv(E)[:3, 3]
+        return np.sum((found.foot - p) * found.normal, axis=1)
+
+    h = 1e-6
+    J = np.column_stack([(residual(h * u) - residual(-h * u)) / (2 * h) for u in np.eye(6)])
+    e = residual(np.zeros(6))
+    assert got.info == pytest.approx(J.T @ J, rel=1e-6, abs=1e-6)
+    assert got.gradient == pytest.approx(J.T @ e, rel=1e-6, abs=1e-6)
+    assert got.sum_e2 == pytest.approx(e @ e)
+    assert got.sum_d2 == pytest.approx(found.d2.sum())
+    assert (got.inliers, got.points, got.ignored) == (500, 500, 0)
+    assert np.array_equal(got.info, got.info.T)
+
+
+def test_the_gate_counts_inliers(engine: Engine) -> None:
+    mesh = shape()
+    model = Model.build(mesh, 0.5, engine=engine)
+    scan = on(mesh, 400, 18) + 0.05 * rng(19).standard_normal((400, 3))
+    d2 = model.closest(scan).d2
+    for gate in (0.0, 0.01, 0.03, 10.0):
+        assert model.normal_equations(scan, np.eye(4), gate).inliers == np.sum(d2 < min(gate, 0.5) ** 2)
+
+
+def test_normals_look_out_of_the_face(engine: Engine) -> None:
+    mesh = shape()
+    model = Model.build(mesh, 0.5, engine=engine)
+    found = model.closest(np.array([[0.0, 0.0, -0.5], [-0.7, 0.0, 0.0]]))
+    assert found.normal == pytest.approx(np.array([[0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]))
+    assert found.foot == pytest.approx(np.array([[0.0, 0.0, -0.2], [-0.5, 0.0, 0.0]]))
+
+
+def test_ids_are_those_of_the_given_faces_where_some_have_no_area(engine: Engine) -> None:
+    mesh = shape()
+    faces = np.insert(mesh.faces, [0, 5, 20], [[0, 0, 1], [2, 2, 2], [3, 4, 3]], axis=0).astype(np.int32)
+    plain = Model.build(mesh, 0.5, engine=engine)
+    model = Model.build(dataclasses.replace(mesh, faces=faces), 0.5, engine=engine)
+    q = rng(20).uniform(-1, 1, (300, 3))
+    a, b = plain.closest(q), model.closest(q)
+    assert (model.dropped, model.primitives) == (3, 36)
+    near = a.id >= 0
+    assert np.array_equal(mesh.faces[a.id[near]], faces[b.id[near]])
+
+
+def test_cloud_normals_of_a_sphere() -> None:
+    p = rng(21).standard_normal((5000, 3))
+    p /= np.linalg.norm(p, axis=1, keepdims=True)
+    assert np.abs(np.sum(cloud_normals(p) * p, axis=1)).min() > 0.99
+
+
+BAD = {
+    "no point": Surface(np.zeros((0, 3)), NO_FACES, "m", ""),
+    "not finite": Surface(np.array([[0.0, 0.0, np.nan]]), NO_FACES, "m", ""),
+    "not there": Surface(np.eye(3), np.array([[0, 1, 3]], dtype=np.int32), "m", ""),
+    "no face has an area": Surface(np.eye(3), np.array([[0, 1, 1]], dtype=np.int32), "m", ""),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+def test_a_surface_that_is_none_is_refused(what: str, engine: Engine) -> None:
+    with pytest.raises(UsageError, match=what):
+        Model.build(BAD[what], 0.5, engine=engine)
+
+
+@pytest.mark.parametrize("reach", [0.0, -1.0, np.nan, np.inf])
+def test_a_reach_must_be_positive(reach: float, engine: Engine) -> None:
+    with pytest.raises(UsageError, match="reach"):
+        Model.build(shape(), reach, engine=engine)
+
+
+def test_an_unknown_engine_is_refused() -> None:
+    with pytest.raises(UsageError, match="kernel or reference"):
+        Model.build(shape(), 0.5, engine="magic")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"n_max": 0},
+        {"n_plane": -1},
+        {"n_plane": 101},
+        {"gate_m": -1.0},
+        {"tighten": np.nan},
+        {"threads": 0},
+        {"eps_m": np.inf},
+    ],
+)
+def test_parameters_are_checked(wrong: dict[str, float]) -> None:
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        IcpParams(**wrong)  # type: ignore[arg-type]
