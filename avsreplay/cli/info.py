@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 __all__ = ["command", "document", "loss_line"]
 
+WIDTH = 120  # off a terminal, so that the text does not depend on where it goes
+
 
 @click.command(name="info")
 @click.argument("source", type=click.Path(path_type=Path))
@@ -32,7 +34,7 @@ def command(source: Path, topic: str | None, as_json: bool, max_message_mib: int
         options = SourceOptions(topic=topic, max_message_mib=max_message_mib)
     except ValueError as error:
         raise UsageError(str(error), where="--max-message-mib", hint="give a whole number of MiB") from None
-    with open_source(source, options) as opened:
+    with open_source(source, options, look=True) as opened:
         info = opened.info()
     if as_json:
         click.echo(json.dumps(document(info), indent=2))
@@ -78,6 +80,8 @@ def _print(info: LogInfo) -> None:
     from avsreplay.log.text import shown
 
     console = Console(highlight=False, soft_wrap=True)
+    if not console.is_terminal:
+        console = Console(highlight=False, soft_wrap=True, width=WIDTH)
     facts = Table.grid(padding=(0, 2))
     for name, value in _facts(info):
         facts.add_row(name, Text(shown(value)))

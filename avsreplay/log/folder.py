@@ -48,7 +48,7 @@ class FolderFeed:
             size = path.stat().st_size
             if size > self._limit:
                 raise BadMessage(f"{shown(path.name)}: {size} bytes are over the limit of {self._limit}")
-            points = read_points(path)
+            points = read_points(path, self._limit)
         except OSError as error:
             raise BadMessage(f"{shown(path.name)}: {error.strerror}") from None
         except ValueError as error:

@@ -17,6 +17,8 @@ def inflate(data: bytes, compression: str, size: int) -> bytes:
         out = _zstd(data, size)
     elif compression == "lz4":
         out = _lz4(data, size)
+    elif compression == "bz2":
+        out = _bz2(data, size)
     else:
         raise BadMessage(f"unknown compression '{compression}'")
     if len(out) != size:
@@ -46,3 +48,12 @@ def _lz4(data: bytes, size: int) -> bytes:
     except (RuntimeError, EOFError, ValueError, MemoryError) as error:
         raise BadMessage(f"a chunk does not inflate: {error}") from None
     return out
+
+
+def _bz2(data: bytes, size: int) -> bytes:
+    import bz2
+
+    try:
+        return bz2.BZ2Decompressor().decompress(data, max_length=size + 1)
+    except (OSError, EOFError, ValueError, MemoryError) as error:
+        raise BadMessage(f"a chunk does not inflate: {error}") from None

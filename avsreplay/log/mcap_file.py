@@ -7,6 +7,7 @@ channels whose first chunk is lost and messages that nothing else tells of.
 
 from __future__ import annotations
 
+import struct
 import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -15,17 +16,18 @@ from pathlib import Path
 from avsreplay.errors import UnreadableInput
 from avsreplay.log import mcap_records as mcap
 from avsreplay.log.byte_file import ByteFile
-from avsreplay.log.cursor import BadMessage, Cursor
-from avsreplay.log.mcap_chunks import ChunkStore
+from avsreplay.log.chunks import ChunkStore
+from avsreplay.log.cursor import BadMessage
 from avsreplay.log.mcap_records import Channel, Fields
 from avsreplay.log.mcap_resync import hides_chunk, next_record
 from avsreplay.log.mcap_summary import Summary, read_summary
 from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.recording import CLOUD_TYPES, CloudIndex, Sink, TopicCount, canonical_type
+from avsreplay.log.recording import MAX_NS, CloudIndex, MessageTable, Sink, canonical_type
 from avsreplay.log.text import shown
 
 __all__ = ["McapFile"]
 
+_TIMES = struct.Struct("<QQ")
 _MODELS = (".ply", ".stl", ".obj", ".off", ".glb")
 
 
@@ -47,11 +49,9 @@ class McapFile:
         self.metadata: dict[str, dict[str, str]] = {}
         self.profile = self.library = ""
         self.closed_properly = False
-        self._limit, self._sinks = limit, dict(sinks or {})
+        self._limit, self._table = limit, MessageTable(sinks)
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
-        self._topics: dict[str, TopicCount] = {}
-        self._clouds: dict[str, CloudIndex] = {}
         self._model: tuple[str, int, int] | None = None
         self._bad_chunk: Loss | None = None
         self._resume: int | None = None
@@ -67,7 +67,7 @@ class McapFile:
 
     def topics(self) -> list[TopicInfo]:
         """Every topic that has a message or a channel, by name."""
-        return sorted((count.info() for count in self._topics.values()), key=lambda t: t.name)
+        return self._table.topics()
 
     def channels(self) -> dict[int, Channel]:
         """Channels by id."""
@@ -75,15 +75,15 @@ class McapFile:
 
     def clouds(self, topic: str) -> CloudIndex:
         """The index of a cloud topic."""
-        return self._clouds.get(topic, CloudIndex())
+        return self._table.clouds(topic)
 
     def encoding(self, topic: str) -> str:
         """The message encoding of a topic."""
-        return self._topics[topic].encoding
+        return self._table.encoding(topic)
 
     def read(self, topic: str, place: int) -> bytes | memoryview:
         """The payload of a cloud. Raises BadMessage where it cannot be had."""
-        index = self._clouds[topic]
+        index = self._table.clouds(topic)
         chunk, offset, size = index.container[place], index.offset[place], index.size[place]
         if chunk < 0:
             return self._file.read(offset, size)
@@ -214,7 +214,7 @@ class McapFile:
             data = self._chunks.check(at, head)
             walked = [(op, b, e) for op, b, e in mcap.records(memoryview(data))]
         except BadMessage as error:
-            start_ns, end_ns = (min(t, 2**63 - 1) for t in (head.start_ns, head.end_ns))
+            start_ns, end_ns = (min(t, MAX_NS) for t in (head.start_ns, head.end_ns))
             self._resume = self._swallowed(at, end)
             self._bad_chunk = Loss(str(error), at, (self._resume or end) - at, 1, None, start_ns, end_ns)
             return
@@ -252,7 +252,7 @@ class McapFile:
         if number in self._channels:
             return
         self._channels[number] = channel
-        self._topics.setdefault(topic, TopicCount(topic, channel.type, encoding))
+        self._table.declare(topic, channel.type, encoding)
 
     def _message(self, view: memoryview, begin: int, end: int, container: int, offset: int) -> None:
         if end - begin < 22:
@@ -263,14 +263,11 @@ class McapFile:
         if channel is None:
             self._orphans += 1
             return
-        log_ns = min(int.from_bytes(view[begin + 6 : begin + 14], "little"), 2**63 - 1)
-        self._topics[channel.topic].saw(log_ns)
-        if channel.type in CLOUD_TYPES:
-            clocks = (log_ns, int.from_bytes(view[begin + 14 : begin + 22], "little"), _stamp(view[begin + 22 : end]))
-            index = self._clouds.setdefault(channel.topic, CloudIndex())
-            index.add(clocks, container, offset + 22, end - begin - 22)
-        if channel.topic in self._sinks:
-            self._sinks[channel.topic](channel.type, channel.encoding, log_ns, view[begin + 22 : end])
+        times = (
+            int.from_bytes(view[begin + 6 : begin + 14], "little"),
+            int.from_bytes(view[begin + 14 : begin + 22], "little"),
+        )
+        self._table.add(channel.topic, times, view[begin + 22 : end], (container, offset + 22))
 
     def _lose(self, loss: Loss) -> None:
         self.losses.append(replace(loss, file=self.path.name))
@@ -306,14 +303,6 @@ class McapFile:
             self.losses[self.losses.index(blind[0])] = replace(blind[0], messages=missing)
         elif missing > 0:
             self._lose(Loss("messages that the summary counts and the file does not hold", 0, 0, messages=missing))
-
-
-def _stamp(payload: memoryview) -> int:
-    """The header stamp of a CDR message, 0 where it is too short to have one."""
-    try:
-        return Cursor(payload).stamp()
-    except BadMessage:
-        return 0
 
 
 _HANDLERS: dict[int, Callable[[McapFile, int, int], None]] = {

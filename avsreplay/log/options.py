@@ -24,6 +24,7 @@ class SourceOptions:
     Attributes:
         topic: the cloud topic; None picks the only one.
         truth_topic: PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped; None: ``/truth/pose``.
+        truth_frame: truth is the pose of this frame by the log's /tf chain, in the cloud's (or the fixed) frame.
         truth_file: poses beside the log (TUM, KITTI, EuRoC, Stanford ``.conf``).
         truth_gap_s: widest gap between two truth poses that is interpolated across.
         model: a model file, in place of the log's own.  cloud_model: it may be without faces.
@@ -40,6 +41,7 @@ class SourceOptions:
 
     topic: str | None = None
     truth_topic: str | None = None
+    truth_frame: str | None = None
     truth_file: Path | None = None
     truth_gap_s: float = 1.0
     model: Path | None = None

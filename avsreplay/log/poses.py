@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from avsreplay.log.cursor import BadMessage, Cursor
 
-__all__ = ["POSE_TYPES", "Transform", "read_pose", "read_transforms"]
+__all__ = ["POSE_TYPES", "Transform", "checked", "read_pose", "read_transforms"]
 
 _MAX_TRANSFORMS = 4096
 
@@ -26,9 +26,12 @@ class Transform:
 
 def read_pose(kind: str, payload: bytes | memoryview, encoding: str = "cdr") -> Transform:
     """A pose of one of ``POSE_TYPES``. Raises BadMessage where it is cut, not finite, or no unit quaternion."""
-    out = POSE_TYPES[kind](Cursor(payload, encoding))
-    norm = math.hypot(*out.pose[3:])
-    if not all(map(math.isfinite, out.pose)) or not 0.5 < norm < 2.0:
+    return checked(POSE_TYPES[kind](Cursor(payload, encoding)))
+
+
+def checked(out: Transform) -> Transform:
+    """The transform itself. Raises BadMessage where it is not finite or its quaternion not of unit length."""
+    if not all(map(math.isfinite, out.pose)) or not 0.5 < math.hypot(*out.pose[3:]) < 2.0:
         raise BadMessage("a pose that is no pose")
     return out
 

@@ -7,10 +7,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from avsreplay.log.cursor import BadMessage, Cursor
 from avsreplay.log.options import Loss, TopicInfo
 
-__all__ = ["CLOUD_TYPES", "CloudIndex", "Recording", "Sink", "TopicCount", "canonical_type"]
+__all__ = ["CLOUD_TYPES", "MAX_NS", "CloudIndex", "MessageTable", "Recording", "Sink", "TopicCount", "canonical_type"]
 
+MAX_NS = 2**63 - 1
 CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2",)
 Sink = Callable[[str, str, int, bytes | memoryview], None]
 """Takes (type, encoding, log time [ns], payload) of each message of a topic, in file order."""
@@ -68,6 +70,57 @@ class TopicCount:
     def info(self) -> TopicInfo:
         """What was counted."""
         return TopicInfo(self.name, self.type, self.encoding, self.count, self.first_ns, self.last_ns)
+
+
+class MessageTable:
+    """What a survey learns: topics with their counts, where the clouds are; truth goes to its sinks at once.
+
+    Args:
+        sinks: who takes the messages of a topic.
+    """
+
+    def __init__(self, sinks: Mapping[str, Sink] | None = None) -> None:
+        self._sinks = dict(sinks or {})
+        self._topics: dict[str, TopicCount] = {}
+        self._clouds: dict[str, CloudIndex] = {}
+
+    def declare(self, topic: str, kind: str, encoding: str) -> None:
+        """A topic that may have messages; the first type it is declared with holds."""
+        self._topics.setdefault(topic, TopicCount(topic, kind, encoding))
+
+    def add(self, topic: str, times: tuple[int, int], payload: memoryview, place: tuple[int, int]) -> None:
+        """A message of a declared topic: its (log, publish) times [ns], bytes and (container, offset)."""
+        known = self._topics[topic]
+        log_ns = min(times[0], MAX_NS)
+        known.saw(log_ns)
+        if known.type in CLOUD_TYPES:
+            clocks = (log_ns, times[1], _stamp(payload, known.encoding))
+            self._clouds.setdefault(topic, CloudIndex()).add(clocks, *place, len(payload))
+        if topic in self._sinks:
+            self._sinks[topic](known.type, known.encoding, log_ns, payload)
+
+    def topics(self) -> list[TopicInfo]:
+        """Every topic, by name."""
+        return sorted((count.info() for count in self._topics.values()), key=lambda t: t.name)
+
+    def clouds(self, topic: str) -> CloudIndex:
+        """The index of a cloud topic."""
+        return self._clouds.get(topic, CloudIndex())
+
+    def encoding(self, topic: str) -> str:
+        """The message encoding of a topic."""
+        return self._topics[topic].encoding
+
+
+def _stamp(payload: memoryview, encoding: str) -> int:
+    """The header stamp of a message, 0 where it is too short to have one."""
+    try:
+        cursor = Cursor(payload, encoding)
+        if cursor.ros1:
+            cursor.u32()
+        return cursor.stamp()
+    except BadMessage:
+        return 0
 
 
 class Recording(Protocol):

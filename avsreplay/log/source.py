@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -11,15 +11,14 @@ from types import TracebackType
 import numpy as np
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.geometry import Pose
 from avsreplay.log.clock import Placed, place
 from avsreplay.log.cursor import BadMessage
 from avsreplay.log.feed import Feed
+from avsreplay.log.guides import Guides
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import Cloud
 from avsreplay.log.prefetch import ahead
 from avsreplay.log.text import shown
-from avsreplay.log.truth import PoseTrack
 from avsreplay.records import LogHeader, Scan, ScanStatus, State
 
 __all__ = ["Source"]
@@ -41,15 +40,13 @@ class Source:
         feed: Feed,
         header: LogHeader,
         options: SourceOptions,
+        guides: Guides,
         *,
-        truth: PoseTrack | None = None,
-        body: PoseTrack | None = None,
-        sensor: Callable[[int, str], Pose | None] | None = None,
         extra: dict[str, str] | None = None,
         losses: tuple[Loss, ...] = (),
     ) -> None:
         self.path, self.header, self.options = path, header, options
-        self._feed, self._truth, self._body, self._sensor = feed, truth, body, sensor
+        self._feed, self._guides = feed, guides
         self._extra = extra or {}
         self._placed, self._clock = place(feed.log_ns, feed.publish_ns, feed.header_ns, options.clock)
         self._lost = losses
@@ -118,7 +115,7 @@ class Source:
             model_extent_m=None if surface is None else surface.extent,
             scenario=bool(self.header.scenario),
             seed=self.header.seed,
-            truth=bool(self._truth),
+            truth=self._guides.truth is not None,
             faults=tuple((k, (a - origin) * 1e-9, (b - origin) * 1e-9, h) for k, a, b, h in labels),
             clock=self._clock,
             losses=tuple(self.losses),
@@ -143,14 +140,16 @@ class Source:
         return inside[:: self.options.every][: self.options.n_scans]
 
     def _scan(self, seq: int, place: int) -> Scan:
-        placed, log_ns = self._placed[place], self._feed.log_ns[place]
+        placed = self._placed[place]
         try:
             cloud = self._taken(self._feed.load(place), placed.t_ns)
         except BadMessage as error:
-            return self._finish(seq, placed, log_ns, None, shown(error))
-        return self._finish(seq, placed, log_ns, cloud, placed.note)
+            return self._finish(seq, place, None, shown(error))
+        return self._finish(seq, place, cloud, placed.note)
 
-    def _finish(self, seq: int, placed: Placed, log_ns: int, cloud: Cloud | None, note: str | None) -> Scan:
+    def _finish(self, seq: int, place: int, cloud: Cloud | None, note: str | None) -> Scan:
+        placed, log_ns = self._placed[place], self._feed.log_ns[place]
+        frame = "" if cloud is None else cloud.frame
         return Scan(
             seq=seq,
             t_ns=placed.t_ns,
@@ -158,7 +157,7 @@ class Source:
             status=_status(cloud, placed),
             times_s=None if cloud is None else cloud.times_s,
             dropped_points=0 if cloud is None else cloud.dropped,
-            truth=None if self._truth is None else self._truth.pose(placed.t_ns),
+            truth=None if self._guides.truth is None else self._guides.truth(placed.t_ns, place, frame),
             body=self._body_at(placed.t_ns),
             fault=self._fault(log_ns),
             note=note,
@@ -166,8 +165,8 @@ class Source:
         )
 
     def _body_at(self, t_ns: int) -> State | None:
-        constants = self.header.truth
-        return None if self._body is None or constants is None else self._body.body(t_ns, constants)
+        constants, track = self.header.truth, self._guides.body
+        return None if track is None or constants is None else track.body(t_ns, constants)
 
     def _fault(self, log_ns: int) -> str | None:
         """The label whose window [start, end) holds the instant; the latest begun where several do."""
@@ -177,9 +176,9 @@ class Source:
     def _taken(self, cloud: Cloud, t_ns: int) -> Cloud:
         """Cropped, and brought to the fixed frame where one is asked for. Raises BadMessage without a pose for it."""
         cloud = _cropped(cloud, self.options)
-        if self._sensor is None:
+        if self._guides.sensor is None:
             return cloud
-        pose = self._sensor(t_ns, cloud.frame)
+        pose = self._guides.sensor(t_ns, cloud.frame)
         if pose is None:
             raise BadMessage("no pose of the sensor at the time of the scan")
         return Cloud(cloud.stamp_ns, cloud.frame, pose.apply(cloud.points), cloud.times_s, cloud.dropped)

@@ -1,4 +1,4 @@
-"""The intact chunks of an MCAP file: where they are, and the last two of them inflated."""
+"""The intact chunks of a log file: where they are, and the last two of them inflated."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from avsreplay.log.mcap_records import ChunkHead
 
 __all__ = ["ChunkStore"]
 
-_COMPRESSIONS = ("", "zstd", "lz4")
+_COMPRESSIONS = ("", "zstd", "lz4", "bz2")
 _KEPT = 2
 
 

@@ -1,0 +1,158 @@
+"""Reading of rosbag2's sqlite3 storage, through Python's own sqlite3, read-only.
+
+The database has no checksums. A damaged page makes a query fail part of the way: the pass then goes on behind it, and
+counts what it skips.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from avsreplay.errors import UnreadableInput
+from avsreplay.log.cursor import BadMessage
+from avsreplay.log.options import Loss, TopicInfo
+from avsreplay.log.recording import CloudIndex, MessageTable, Sink, canonical_type
+from avsreplay.log.text import shown
+
+__all__ = ["SQLITE_MAGIC", "Db3File"]
+
+SQLITE_MAGIC = b"SQLite format 3\x00"
+_HEAD = 64  # bytes of a cloud that tell its header stamp
+_STRIDE = 256
+
+
+class Db3File:
+    """One sqlite3 file of a ROS 2 bag, surveyed; a Recording.
+
+    Args:
+        path: the file.  limit: most bytes a message may take.
+        sinks: who takes the messages of a topic while the survey passes over them.
+
+    Raises:
+        UnreadableInput: not there, or not a bag's database.
+    """
+
+    kind = "ros2 bag"
+    profile, library = "ros2", ""
+
+    def __init__(self, path: Path, limit: int, sinks: Mapping[str, Sink] | None = None) -> None:
+        self.path, self.losses = path, list[Loss]()
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._limit, self._table, self._sinks = limit, MessageTable(sinks), frozenset(sinks or ())
+        self._topics: dict[int, str] = {}
+        self._db = _connected(path, limit)
+        try:
+            self._survey()
+        except (sqlite3.Error, OverflowError, ValueError) as error:
+            self._db.close()
+            raise _unreadable(path, error) from None
+
+    def topics(self) -> list[TopicInfo]:
+        """Every topic, by name."""
+        return self._table.topics()
+
+    def clouds(self, topic: str) -> CloudIndex:
+        """The index of a cloud topic."""
+        return self._table.clouds(topic)
+
+    def encoding(self, topic: str) -> str:
+        """The serialisation a topic is stored in."""
+        return self._table.encoding(topic)
+
+    def read(self, topic: str, place: int) -> bytes | memoryview:
+        """The payload of a cloud. Raises BadMessage where it cannot be had."""
+        row_id = self._table.clouds(topic).offset[place]
+        try:
+            row = self._db.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone()
+        except (sqlite3.Error, OverflowError) as error:
+            raise BadMessage(f"the database is damaged: {error}") from None
+        if row is None or not isinstance(row[0], bytes):
+            raise BadMessage("the message is not in the database any more")
+        return row[0]
+
+    def attachment(self) -> tuple[str, bytes] | None:
+        """A bag carries no model."""
+        return None
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._db.close()
+
+    def _survey(self) -> None:
+        for row_id, name, kind, encoding in self._db.execute(
+            "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
+        ):
+            self._topics[int(row_id)] = str(name)
+            self._table.declare(str(name), canonical_type(str(kind)), str(encoding))
+        last = self._last()
+        lost = skipped = 0
+        for row in self._rows(last):
+            if row is None:
+                skipped += 1
+            elif not self._take(row):
+                lost += 1
+        if skipped or lost:
+            what = "the database is damaged" if skipped else "messages without a topic, a time or bytes"
+            self.losses.append(Loss(what, 0, 0, messages=lost or None, file=self.path.name))
+
+    def _last(self) -> int:
+        row = self._db.execute("SELECT max(id) FROM messages").fetchone()
+        return int(row[0]) if row and row[0] is not None else 0
+
+    def _rows(self, last: int) -> Iterator[tuple[object, ...] | None]:
+        """Messages by id; None for a stretch that cannot be read."""
+        query = "SELECT id, topic_id, timestamp, substr(data, 1, ?) FROM messages WHERE id > ? AND id <= ? ORDER BY id"
+        at = -1
+        stride = _STRIDE
+        while at < last:
+            done = at
+            try:
+                for row in self._db.execute(query, (_HEAD, at, last)):
+                    yield row
+                    done = max(done, row[0] if isinstance(row[0], int) else 0)
+                return
+            except sqlite3.DatabaseError:
+                yield None
+                at = done + (1 if done > at else stride)
+                stride *= 2
+
+    def _take(self, row: tuple[object, ...]) -> bool:
+        row_id, topic_id, log_ns, head = row
+        if not (isinstance(row_id, int) and isinstance(topic_id, int) and isinstance(log_ns, int)):
+            return False
+        topic = self._topics.get(topic_id)
+        if topic is None or not isinstance(head, bytes):
+            return False
+        payload = memoryview(head)
+        if topic in self._sinks:
+            whole = self._db.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone()[0]
+            payload = memoryview(whole if isinstance(whole, bytes) else b"")
+        self._table.add(topic, (max(log_ns, 0), max(log_ns, 0)), payload, (0, row_id))
+        return True
+
+
+def _connected(path: Path, limit: int) -> sqlite3.Connection:
+    # A write-ahead log beside the file holds messages of a recorder that was stopped hard: sqlite must see it.
+    alone = not path.with_name(path.name + "-wal").exists()
+    uri = f"{path.resolve().as_uri()}?mode=ro" + ("&immutable=1" if alone else "")
+    try:
+        db = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        db.execute("PRAGMA trusted_schema = OFF")
+        db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit)
+        found = {
+            str(name): str(sql).upper()
+            for name, sql in db.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+        }
+    except (sqlite3.Error, OverflowError) as error:
+        raise _unreadable(path, error) from None
+    for name in ("topics", "messages"):
+        if name not in found or "VIRTUAL" in found[name] or "GENERATED" in found[name]:
+            db.close()
+            raise UnreadableInput(f"a database without the table '{name}'", where=shown(path), hint="give a ROS 2 bag")
+    return db
+
+
+def _unreadable(path: Path, error: Exception) -> UnreadableInput:
+    return UnreadableInput(f"not a readable ROS 2 bag: {shown(error)}", where=shown(path), hint="check the file")

@@ -1,0 +1,120 @@
+"""What goes with a scan beside its points: the truth, the full state, the pose of a moving sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from avsreplay.errors import UsageError
+from avsreplay.geometry import Pose
+from avsreplay.log.options import ClockChoice, SourceOptions, TopicInfo
+from avsreplay.log.pose_files import TimedPoses, read_poses
+from avsreplay.log.poses import POSE_TYPES
+from avsreplay.log.recording import Sink
+from avsreplay.log.text import shown
+from avsreplay.log.tf import TF_TYPE, TfBuffer
+from avsreplay.log.truth import PoseTrack
+from avsreplay.log.writer import BODY_TOPIC, TRUTH_TOPIC
+
+__all__ = ["Guides", "MessageGuides", "file_truth"]
+
+TruthLookup = Callable[[int, int, str], Pose | None]
+"""(instant [ns], place in the feed, frame of the cloud) -> T_ac, None where there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class Guides:
+    """Lookups for one source; None where it has none."""
+
+    truth: TruthLookup | None = None
+    body: PoseTrack | None = None
+    sensor: Callable[[int, str], Pose | None] | None = None
+
+
+@dataclass(slots=True)
+class MessageGuides:
+    """Collects truth, state and transforms while a log is surveyed.
+
+    Args:
+        options: how the log is read.
+    """
+
+    options: SourceOptions
+    _truth: PoseTrack = field(init=False)
+    _body: PoseTrack = field(init=False)
+    _sensor: PoseTrack = field(init=False)
+    _tf: TfBuffer = field(init=False)
+
+    def __post_init__(self) -> None:
+        gap, by_log = self.options.truth_gap_s, self.options.clock is ClockChoice.LOG
+        self._truth, self._body, self._sensor = (PoseTrack(gap, by_log) for _ in range(3))
+        self._tf = TfBuffer(gap, by_log)
+
+    def sinks(self) -> dict[str, Sink]:
+        """Who takes which topic."""
+        out = {self.options.truth_topic or TRUTH_TOPIC: _poses_only(self._truth), BODY_TOPIC: _poses_only(self._body)}
+        if self.options.sensor_topic is not None:
+            out[self.options.sensor_topic] = _poses_only(self._sensor)
+        if self._wants_tf:
+            out.update({"/tf": self._tf.sink(static=False), "/tf_static": self._tf.sink(static=True)})
+        return out
+
+    def check(self, topics: Sequence[TopicInfo], where: str) -> None:
+        """Raise UsageError where a topic or frame that was asked for is not there."""
+        for role, name in (("truth", self.options.truth_topic), ("sensor", self.options.sensor_topic)):
+            found = next((t for t in topics if t.name == name), None)
+            if name is not None and (found is None or found.type not in POSE_TYPES):
+                what = f"no such {role} topic" if found is None else f"{role} topic of type {shown(found.type)}"
+                hint = f"pose topics here: {_poses_of(topics) or 'none'}"
+                raise UsageError(f"{what}: '{shown(name)}'", where=where, hint=hint)
+        for frame in (self.options.truth_frame, self.options.fixed_frame):
+            if frame is not None and frame.lstrip("/") not in self._tf.frames():
+                hint = f"frames of its {TF_TYPE}: {', '.join(map(shown, self._tf.frames()[:20])) or 'none'}"
+                raise UsageError(f"no frame '{shown(frame)}'", where=where, hint=hint)
+
+    def guides(self) -> Guides:
+        """The lookups, once the survey is done."""
+        return Guides(self._truth_lookup(), self._body if len(self._body) else None, self._sensor_lookup())
+
+    @property
+    def _wants_tf(self) -> bool:
+        return self.options.truth_frame is not None or self.options.fixed_frame is not None
+
+    def _truth_lookup(self) -> TruthLookup | None:
+        child, fixed = self.options.truth_frame, self.options.fixed_frame
+        if self.options.truth_file is not None:
+            return file_truth(read_poses(self.options.truth_file), self.options.truth_gap_s)
+        if child is not None:
+            return lambda t_ns, _place, frame: self._tf.pose(fixed or frame, child, t_ns)
+        return (lambda t_ns, _place, _frame: self._truth.pose(t_ns)) if len(self._truth) else None
+
+    def _sensor_lookup(self) -> Callable[[int, str], Pose | None] | None:
+        fixed = self.options.fixed_frame
+        if self.options.sensor_topic is not None:
+            return lambda t_ns, _frame: self._sensor.pose(t_ns)
+        if fixed is not None:
+            return lambda t_ns, frame: self._tf.pose(fixed, frame, t_ns)
+        return None
+
+
+def file_truth(found: TimedPoses, gap_s: float) -> TruthLookup:
+    """A lookup in a pose file: by time where it has times, else line by scan."""
+    if found.t_ns is None:
+        poses = found.poses
+        return lambda _t_ns, place, _frame: poses[place] if place < len(poses) else None
+    track = PoseTrack(gap_s)
+    for t_ns, pose in zip(found.t_ns, found.poses, strict=True):
+        track.add(t_ns, (*pose.t.tolist(), *pose.q.tolist()))
+    return lambda t_ns, _place, _frame: track.pose(t_ns)
+
+
+def _poses_of(topics: Sequence[TopicInfo]) -> str:
+    return ", ".join(f"{shown(t.name)} ({t.type})" for t in topics if t.type in POSE_TYPES)
+
+
+def _poses_only(track: PoseTrack) -> Sink:
+    def take(kind: str, encoding: str, log_ns: int, payload: bytes | memoryview) -> None:
+        if kind in POSE_TYPES:
+            track.take(kind, encoding, log_ns, payload)
+
+    return take

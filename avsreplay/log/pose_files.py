@@ -1,0 +1,110 @@
+"""Pose files beside a log: TUM, KITTI and EuRoC; each line is T_ac, the pose of the model in the camera.
+
+TUM: ``t tx ty tz qx qy qz qw`` [s].  KITTI: the twelve numbers of [R | t] by row, one line a scan, without times.
+EuRoC: ``t[ns],px,py,pz,qw,qx,qy,qz,...``: scalar first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from avsreplay.errors import UnreadableInput
+from avsreplay.geometry import Pose
+from avsreplay.log.text import shown
+
+__all__ = ["TimedPoses", "read_poses", "read_times", "seconds_to_ns"]
+
+_MAX_BYTES = 256 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class TimedPoses:
+    """Poses in the file's order, with their instants where the format has them."""
+
+    poses: tuple[Pose, ...]
+    t_ns: tuple[int, ...] | None
+
+
+def read_poses(path: Path) -> TimedPoses:
+    """Read a pose file; the first line tells the format. Raises UnreadableInput with file and line."""
+    poses, times = list[Pose](), list[int]()
+    for where, words, commas in _lines(path):
+        t_ns, pose = _line(words, commas, where)
+        poses.append(pose)
+        if t_ns is not None:
+            times.append(t_ns)
+    if not poses:
+        raise UnreadableInput("no pose in this file", where=shown(path), hint="give TUM, KITTI or EuRoC poses")
+    if times and len(times) != len(poses):
+        raise UnreadableInput("some lines have a time and some have none", where=shown(path), hint="check the file")
+    return TimedPoses(tuple(poses), tuple(times) or None)
+
+
+def read_times(path: Path) -> list[int]:
+    """One time [s] a line, as [ns]. Raises UnreadableInput with file and line."""
+    out = []
+    for where, words, _ in _lines(path):
+        t_ns = seconds_to_ns(words[0])
+        if t_ns is None:
+            raise UnreadableInput("not a time in seconds", where=where, hint="one number a line")
+        out.append(t_ns)
+    return out
+
+
+def seconds_to_ns(text: str) -> int | None:
+    """Decimal seconds to nanoseconds without a detour through binary fractions; None where it is no number."""
+    try:
+        value = Decimal(text)
+        return int((value * 1_000_000_000).to_integral_value()) if abs(value) < 9_000_000_000 else None
+    except (InvalidOperation, ValueError):
+        return None
+
+
+def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
+    """(where, words, were there commas) of each line that says something."""
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise UnreadableInput("larger than 256 MiB, not a pose file", where=shown(path), hint="check the file")
+        text = path.read_bytes().decode("utf-8", "backslashreplace")
+    except OSError as error:
+        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+    for number, line in enumerate(text.splitlines(), 1):
+        stripped = line.strip()
+        if stripped and not stripped.startswith("#"):
+            yield f"{shown(path)}:{number}", stripped.replace(",", " ").split(), "," in stripped
+
+
+def _line(words: list[str], commas: bool, where: str) -> tuple[int | None, Pose]:
+    try:
+        if commas:  # EuRoC: nanoseconds, scalar first
+            values = [float(w) for w in words[1:8]]
+            return int(words[0]), _pose(values[:3], [*values[4:7], values[3]])
+        if len(words) == 12:
+            return None, _from_rows([float(w) for w in words])
+        t_ns, values = seconds_to_ns(words[0]), [float(w) for w in words[1:8]]
+        if t_ns is None or len(words) != 8:
+            raise ValueError
+        return t_ns, _pose(values[:3], values[3:])
+    except (ValueError, IndexError, OverflowError):
+        hint = "TUM: t tx ty tz qx qy qz qw; KITTI: twelve numbers; EuRoC: t[ns],x,y,z,qw,qx,qy,qz"
+        raise UnreadableInput("not a pose line", where=where, hint=hint) from None
+
+
+def _pose(t: list[float], q: list[float]) -> Pose:
+    if len(t) != 3 or len(q) != 4 or not all(map(math.isfinite, (*t, *q))) or not 0.5 < math.hypot(*q) < 2.0:
+        raise ValueError
+    return Pose(np.array(q), np.array(t))
+
+
+def _from_rows(values: list[float]) -> Pose:
+    T = np.vstack([np.array(values).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    R = T[:3, :3]
+    if not np.isfinite(T).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+        raise ValueError
+    return Pose.from_matrix(T)

@@ -1,0 +1,276 @@
+"""Reading of ROS 1 bags (format 2.0) by one linear pass, so that a bag without an index or cut short is read as well.
+
+Own, not rosbags: that reader wants a whole index and reserves what lengths promise. The format has no checksums; what
+tells of damage is a frame that does not fit and a compressed chunk that does not inflate.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from avsreplay.log.byte_file import ByteFile
+from avsreplay.log.chunks import ChunkStore
+from avsreplay.log.cursor import BadMessage
+from avsreplay.log.mcap_records import ChunkHead, Fields
+from avsreplay.log.options import Loss, TopicInfo
+from avsreplay.log.recording import CloudIndex, MessageTable, Sink, canonical_type
+
+__all__ = ["ROS1_MAGIC", "Ros1Bag"]
+
+ROS1_MAGIC = b"#ROSBAG V2.0\n"
+_MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
+_CHUNK_OP = re.compile(rb"\x04\x00\x00\x00op=\x05")
+_WINDOW, _MARGIN = 1 << 20, 128
+_MAX_HEAD = 1 << 16
+_COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Record:
+    """A record's fields and where its data stand in its container."""
+
+    op: int
+    fields: dict[str, bytes]
+    data_at: int
+    data_size: int
+
+    @property
+    def end(self) -> int:
+        return self.data_at + self.data_size
+
+    def number(self, name: str) -> int:
+        """A little-endian field. Raises BadMessage where it is missing."""
+        if name not in self.fields or len(self.fields[name]) > 8:
+            raise BadMessage(f"a record without a sound '{name}'")
+        return int.from_bytes(self.fields[name], "little")
+
+
+class Ros1Bag:
+    """One ROS 1 bag, surveyed; a Recording.
+
+    Args:
+        path: the file.  limit: most bytes a message or chunk may take.
+        sinks: who takes the messages of a topic while the survey passes over them.
+
+    Raises:
+        UnreadableInput: not there or not to be read.
+    """
+
+    kind = "ros1 bag"
+    profile, library = "ros1", ""
+
+    def __init__(self, path: Path, limit: int, sinks: Mapping[str, Sink] | None = None) -> None:
+        self.path, self.losses = path, list[Loss]()
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._limit, self._table = limit, MessageTable(sinks)
+        self._topics: dict[int, str] = {}
+        self._bad_chunk: Loss | None = None
+        self._orphans = 0
+        self._file = ByteFile(path)
+        self._chunks = ChunkStore(self._file, limit)
+        try:
+            self._survey()
+        except BaseException:
+            self._file.close()
+            raise
+
+    def topics(self) -> list[TopicInfo]:
+        """Every topic, by name."""
+        return self._table.topics()
+
+    def clouds(self, topic: str) -> CloudIndex:
+        """The index of a cloud topic."""
+        return self._table.clouds(topic)
+
+    def encoding(self, topic: str) -> str:
+        """Always ``ros1``."""
+        return self._table.encoding(topic)
+
+    def read(self, topic: str, place: int) -> bytes | memoryview:
+        """The payload of a cloud. Raises BadMessage where it cannot be had."""
+        index = self._table.clouds(topic)
+        offset, size = index.offset[place], index.size[place]
+        if index.container[place] < 0:
+            return self._file.read(offset, size)
+        return memoryview(self._chunks[index.container[place]])[offset : offset + size]
+
+    def attachment(self) -> tuple[str, bytes] | None:
+        """A bag carries no model."""
+        return None
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self._file.close()
+
+    def _survey(self) -> None:
+        stop = self._index_at()
+        self._adopt(stop)
+        at, end = len(ROS1_MAGIC), stop or self._file.size
+        while at < end:
+            at = self._step(at, end)
+        self._settle()
+        if stop is None:
+            self._lose(Loss("the bag was not closed: what its recorder still held is lost", self._file.size, 0))
+        if self._orphans:
+            self._lose(Loss("messages of a connection whose definition is lost", 0, 0, messages=self._orphans))
+
+    def _index_at(self) -> int | None:
+        """Where the index begins, None where the bag was not closed or its head is damaged."""
+        try:
+            head = self._record(len(ROS1_MAGIC))
+            place = head.number("index_pos") if head.op == _BAG else 0
+        except BadMessage:
+            return None
+        return place if head.end <= place < self._file.size else None
+
+    def _adopt(self, at: int | None) -> None:
+        """Connections from the index, in case the chunk that defines them is lost."""
+        while at is not None and at < self._file.size:
+            try:
+                record = self._record(at)
+                if record.op == _CONNECTION:
+                    self._connection(record, self._data(record))
+            except BadMessage:
+                return
+            at = record.end
+
+    def _step(self, at: int, end: int) -> int:
+        try:
+            record = self._record(at)
+            if record.end > end:
+                raise BadMessage("a record ends past the file")
+            if record.op != _INDEX:
+                self._settle()
+            self._take(at, record)
+        except BadMessage as error:
+            return self._resync(at, end, str(error))
+        return record.end
+
+    def _take(self, at: int, record: _Record) -> None:
+        if record.op == _CHUNK:
+            self._take_chunk(at, record)
+        elif record.op == _MESSAGE:
+            data = self._data(record)
+            self._message(record, data, -1, record.data_at)
+        elif record.op == _CONNECTION:
+            self._connection(record, self._data(record))
+        elif record.op == _INDEX and self._bad_chunk is not None:
+            messages = (self._bad_chunk.messages or 0) + record.number("count")
+            self._bad_chunk = replace(self._bad_chunk, messages=messages)
+        elif record.op not in (_BAG, _INDEX, _CHUNK_INFO):
+            raise BadMessage(f"a record of unknown kind {record.op}")
+
+    def _take_chunk(self, at: int, record: _Record) -> None:
+        name = record.fields.get("compression", b"").decode("ascii", "replace")
+        if name not in _COMPRESSIONS:
+            raise BadMessage("a chunk names no known compression")
+        head = ChunkHead(0, 0, record.number("size"), 0, _COMPRESSIONS[name], record.data_at - at, record.data_size)
+        try:
+            data = memoryview(self._chunks.check(at, head))
+            inner = list(_records(data))
+        except BadMessage as error:
+            self._bad_chunk = Loss(str(error), at, record.end - at, 1)
+            return
+        number = self._chunks.add(at, head)
+        for found in inner:
+            body = data[found.data_at : found.end]
+            if found.op == _CONNECTION:
+                self._connection(found, body)
+            elif found.op == _MESSAGE:
+                self._message(found, body, number, found.data_at)
+
+    def _connection(self, record: _Record, data: memoryview) -> None:
+        number, topic = record.number("conn"), _text(record.fields.get("topic", b""))
+        kind = canonical_type(_text(_fields(data).get("type", b"")))
+        self._topics.setdefault(number, topic)
+        self._table.declare(topic, kind, "ros1")
+
+    def _message(self, record: _Record, payload: memoryview, container: int, offset: int) -> None:
+        topic = self._topics.get(record.number("conn"))
+        if topic is None:
+            self._orphans += 1
+            return
+        time = record.number("time")
+        log_ns = (time & 0xFFFFFFFF) * 1_000_000_000 + (time >> 32)
+        self._table.add(topic, (log_ns, log_ns), payload, (container, offset))
+
+    def _data(self, record: _Record) -> memoryview:
+        if record.data_size > self._limit:
+            raise BadMessage(f"a record of {record.data_size} bytes is over the limit of {self._limit}")
+        return memoryview(self._file.read(record.data_at, record.data_size))
+
+    def _record(self, at: int) -> _Record:
+        size = int.from_bytes(self._file.read(at, 4), "little")
+        if size > _MAX_HEAD:
+            raise BadMessage("a record head that is too long")
+        raw = self._file.read(at + 4, size + 4)
+        return _parsed(memoryview(raw)[:size], at + 8 + size, int.from_bytes(raw[size:], "little"))
+
+    def _resync(self, at: int, end: int, why: str) -> int:
+        found = self._next_chunk(at + 1, end)
+        resume = end if found is None else found
+        self._lose(Loss(why, at, resume - at))
+        return resume
+
+    def _next_chunk(self, at: int, end: int) -> int | None:
+        start = at
+        while at < end:
+            window = self._file.upto(at, _WINDOW + _MARGIN)
+            for match in _CHUNK_OP.finditer(window):
+                for place in range(max(at + match.start() - _MARGIN, start), at + match.start()):
+                    if self._is_chunk(place, end):
+                        return place
+            at += _WINDOW
+        return None
+
+    def _is_chunk(self, at: int, end: int) -> bool:
+        if not 8 <= int.from_bytes(self._file.upto(at, 4), "little") <= _MARGIN:
+            return False
+        try:
+            record = self._record(at)
+        except BadMessage:
+            return False
+        return record.op == _CHUNK and record.end <= end
+
+    def _settle(self) -> None:
+        if self._bad_chunk is not None:
+            self._lose(self._bad_chunk)
+            self._bad_chunk = None
+
+    def _lose(self, loss: Loss) -> None:
+        self.losses.append(replace(loss, file=self.path.name))
+
+
+def _records(view: memoryview) -> Iterator[_Record]:
+    """The records of a chunk. Raises BadMessage where the last one is cut."""
+    walk = Fields(view)
+    while walk.at < len(view):
+        head = walk.take(walk.number(4))
+        size = walk.number(4)
+        yield _parsed(head, walk.at, size)
+        walk.take(size)
+
+
+def _parsed(head: memoryview, data_at: int, data_size: int) -> _Record:
+    fields = _fields(head)
+    if len(fields.get("op", b"")) != 1:
+        raise BadMessage("a record without a kind")
+    return _Record(fields["op"][0], fields, data_at, data_size)
+
+
+def _fields(view: memoryview) -> dict[str, bytes]:
+    """``name=value`` fields. Raises BadMessage."""
+    walk, out = Fields(view), dict[str, bytes]()
+    while walk.at < len(view):
+        name, equals, value = bytes(walk.take(walk.number(4))).partition(b"=")
+        if not equals:
+            raise BadMessage("a field without a value")
+        out[_text(name)] = value
+    return out
+
+
+def _text(raw: bytes) -> str:
+    return raw.decode("utf-8", "backslashreplace")
