@@ -1,14 +1,19 @@
-"""What tests share: the command line as a user calls it, the built-in cases, the real data where it is."""
+"""What tests share: the command line as a user calls it, the built-in cases, the real data where it is, made-up rows."""
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from avsreplay.rows import Row
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"
@@ -52,3 +57,78 @@ def shared_data():
     if not DATA.is_dir():
         pytest.skip("../shared/data is not here")
     return DATA
+
+
+STEP_NS = 200_000_000
+START_NS = 1_700_000_000_123_456_789
+
+
+@pytest.fixture
+def make_rows() -> Callable[..., list[Row]]:
+    """``make_rows(n, seed=0, blackout=range(...), **columns)``: a seeded run whose blackout has no scan to use."""
+
+    def build(n: int = 40, seed: int = 0, blackout: range = range(20, 26), **changes: object) -> list[Row]:
+        rng = np.random.Generator(np.random.PCG64(seed))
+        return [_row(k, rng, k in blackout, changes) for k in range(n)]
+
+    return build
+
+
+def _row(k: int, rng: np.random.Generator, blind: bool, changes: dict[str, object]) -> Row:
+    position = [1.0 + 0.01 * k, 0.2, 5.0]
+    half = 0.01 * k
+    attitude = {"qx": 0.0, "qy": 0.0, "qz": math.sin(half), "qw": math.cos(half)}
+    noise = rng.uniform(size=4)
+    values: dict[str, object] = {
+        "seq": k,
+        "t_ns": START_NS + k * STEP_NS,
+        "t_s": k * STEP_NS * 1e-9,
+        "status": "empty" if blind else "aligned",
+        "gamma": 0 if blind else 1,
+        "reason": "no_scan" if blind else "ok",
+        "guess": "predicted",
+        "fault": "full_occlusion" if blind else None,
+        "points": 0 if blind else 4000,
+        "estimator": "filter",
+        "converged": k >= 10,
+        **dict(zip(("x_m", "y_m", "z_m"), position, strict=True)),
+        **attitude,
+        "pos_err_m": 0.002 + 0.001 * float(noise[0]),
+        "rot_err_deg": 0.1 + 0.05 * float(noise[1]),
+        "nees": float(rng.chisquare(20)),
+        "sigma1": 0.3 + 0.001 * float(noise[2]),
+        "sigma2": -0.4,
+        "sigma1_1s": 0.01,
+        "sigma2_1s": 0.01,
+        "cx_m": 0.5,
+        "cy_m": 0.6,
+        "cz_m": -0.7,
+        "c_1s_m": 0.01,
+        "mux": 0.0,
+        "muy": 0.0,
+        "muz": math.sin(0.1),
+        "muw": math.cos(0.1),
+        "mu_1s_deg": 0.2,
+        "sigma_hits": 2,
+        "r_floors": 0,
+        "ogm_rank": min(k, 20),
+        "ogm_log10_cond": None if k < 20 else 9.0,
+        "ogm_log10_cond_scaled": None if k < 20 else 4.0,
+        "plan_status": "optimal" if k >= 10 else None,
+        "capture_time_s": 30.0 + 0.1 * (k // 10) if k >= 10 else None,
+    }
+    if not blind:
+        values |= {
+            "iterations": 6,
+            "inliers": 3900,
+            "inlier_ratio": 0.975,
+            "rms_m": 0.008 + 0.001 * float(noise[3]),
+            "nis": float(rng.chisquare(6)),
+            "innov_m": 0.002,
+            "innov_deg": 0.1,
+            "reg_pos_err_m": 0.003,
+            "reg_rot_err_deg": 0.15,
+            **{f"reg_{n}": v for n, v in zip(("x_m", "y_m", "z_m"), position, strict=True)},
+            **{f"reg_{n}": v for n, v in attitude.items()},
+        }
+    return Row(**(values | changes))  # type: ignore[arg-type]
