@@ -1,4 +1,4 @@
-"""What tests share: the command line as a user calls it, the built-in cases, the real data where it is, made-up rows."""
+"""What tests share: the command line as a user calls it, built-in cases, real data where it is, made-up rows."""
 
 from __future__ import annotations
 

@@ -150,7 +150,7 @@ def test_parquet_keeps_types_units_and_values(tmp_path, make_rows):
 
 def test_parquet_without_its_extra_is_one_line(tmp_path, make_rows, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(MissingBackend, match="avsreplay\\[sweep\\]"):
+    with pytest.raises(MissingBackend, match="avsreplay\\[report\\]"):
         report.write_parquet(tmp_path / "a.parquet", make_rows(1))
 
 

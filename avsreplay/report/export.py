@@ -89,7 +89,7 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
         pa: Any = import_module("pyarrow")
         pq: Any = import_module("pyarrow.parquet")
     except ModuleNotFoundError:
-        raise MissingBackend("pyarrow is not installed", where="Parquet", hint="install avsreplay[sweep]") from None
+        raise MissingBackend("pyarrow is not installed", where="Parquet", hint="install avsreplay[report]") from None
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
     types = field_types()
     schema = pa.schema(

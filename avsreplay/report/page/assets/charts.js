@@ -1,0 +1,271 @@
+"use strict";
+// Time charts on one linked axis: hover, zoom and the chosen scan are shared by all of them.
+const Packed = (() => {
+  const kinds = { f8: Float64Array, f4: Float32Array, i4: Int32Array, i2: Int16Array, u4: Uint32Array, u1: Uint8Array };
+  function unpack(packed) {
+    const text = atob(packed.data), bytes = new Uint8Array(text.length);
+    for (let i = 0; i < text.length; i++) bytes[i] = text.charCodeAt(i);
+    return new kinds[packed.type](bytes.buffer);
+  }
+  return { unpack };
+})();
+
+const Charts = (() => {
+  const HEIGHT = 150, STRIP = 96;
+  const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  let theme = {};
+  function readTheme() {
+    theme = { ink: css("--ink"), faint: css("--faint"), line: css("--line"), flag: css("--flag"), colours: [] };
+    for (let k = 0; k < 6; k++) theme.colours.push(css("--c" + k));
+  }
+  const colour = (k) => theme.colours[k % theme.colours.length];
+  const alpha = (k, a) => colour(k) + Math.round(a * 255).toString(16).padStart(2, "0");
+
+  function figures(v) {
+    if (v === null || v === undefined) return "–";
+    const size = Math.abs(v);
+    return size !== 0 && (size < 1e-4 || size >= 1e6) ? v.toExponential(2) : String(+v.toPrecision(4));
+  }
+
+  // All runs on one time axis: undefined where a run has no scan, null where a scan has no value.
+  function timeline(runs) {
+    if (runs.length === 1) return { t: Array.from(runs[0].t), place: null };
+    const t = Array.from(new Set(runs.flatMap((r) => Array.from(r.t)))).sort((a, b) => a - b);
+    const at = new Map(t.map((v, k) => [v, k]));
+    return { t, place: runs.map((r) => Array.from(r.t, (v) => at.get(v))) };
+  }
+  function spread(line, run, values, log) {
+    const usable = (v) => Number.isFinite(v) && (!log || v > 0) ? v : null;
+    if (!line.place) return Array.from(values, usable);
+    const out = new Array(line.t.length);
+    line.place[run].forEach((k, i) => { out[k] = usable(values[i]); });
+    return out;
+  }
+
+  function axes(u) {
+    const axis = { stroke: () => theme.faint, font: "11px system-ui, sans-serif", grid: { stroke: () => theme.line, width: 1 }, ticks: { stroke: () => theme.line, width: 1, size: 4 } };
+    return [
+      { ...axis, size: 26, values: (_, ticks) => ticks.map((v) => +v.toFixed(6) + " s") },
+      { ...axis, size: 62, values: (_, ticks) => ticks.map((v) => v === null ? "" : String(+v.toPrecision(6))) },
+    ];
+  }
+
+  // The y range follows the lines and levels; a band may widen it to at most three times that.
+  function yRange(spec, main) {
+    return (u, low, high) => {
+      const [i0, i1] = u.series[0].idxs || [0, u.data[0].length - 1];
+      let a = Infinity, b = -Infinity;
+      for (const s of main) {
+        if (!u.series[s].show) continue;
+        for (let i = i0; i <= i1; i++) { const v = u.data[s][i]; if (v !== null && v !== undefined) { if (v < a) a = v; if (v > b) b = v; } }
+      }
+      for (const level of spec.levels) if (level.label !== "truth" || spec.bands.length) { a = Math.min(a, level.y); b = Math.max(b, level.y); }
+      if (a > b) return spec.log ? [0.1, 1] : [0, 1];
+      if (spec.log) return uPlot.rangeLog(a, b, 10, false);
+      if (a === b) { const pad = Math.abs(a) * 0.05 || 0.5; a -= pad; b += pad; }
+      const room = b - a;
+      if (low !== null && room > 0) { a = Math.max(Math.min(a, low), a - room); b = Math.min(Math.max(b, high), b + room); }
+      return uPlot.rangeNum(a, b, 0.08, true);
+    };
+  }
+
+  function background(shared) {
+    return (u) => {
+      const { ctx, bbox } = u;
+      ctx.save();
+      ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
+      ctx.fillStyle = theme.flag;
+      for (const s of shared.spans) if (s.lane === "flagged") {
+        const x0 = u.valToPos(s.from - shared.half, "x", true), x1 = u.valToPos(s.to + shared.half, "x", true);
+        ctx.fillRect(x0, bbox.top, Math.max(x1 - x0, 1), bbox.height);
+      }
+      ctx.restore();
+    };
+  }
+  function foreground(spec, shared) {
+    return (u) => {
+      const { ctx, bbox } = u, px = devicePixelRatio;
+      ctx.save();
+      ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
+      ctx.lineWidth = px; ctx.font = 11 * px + "px system-ui, sans-serif"; ctx.setLineDash([3 * px, 3 * px]);
+      for (const level of spec.levels) {
+        const y = Math.round(u.valToPos(level.y, "y", true));
+        ctx.strokeStyle = ctx.fillStyle = colour(level.colour);
+        ctx.beginPath(); ctx.moveTo(bbox.left, y); ctx.lineTo(bbox.left + bbox.width, y); ctx.stroke();
+        ctx.textAlign = "right"; ctx.textBaseline = "bottom";
+        ctx.fillText(level.label, bbox.left + bbox.width - 4 * px, y - 1);
+      }
+      ctx.strokeStyle = ctx.fillStyle = theme.ink;
+      for (const mark of shared.marks) {
+        const x = Math.round(u.valToPos(mark.t, "x", true));
+        ctx.beginPath(); ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height); ctx.stroke();
+        ctx.textAlign = "left"; ctx.textBaseline = "top";
+        ctx.fillText(mark.label, x + 3 * px, bbox.top + 2 * px);
+      }
+      ctx.restore();
+    };
+  }
+
+  function options(spec, shared, series, extra) {
+    return {
+      width: shared.width, height: spec.height || HEIGHT, legend: { show: false }, series, axes: axes(), padding: [6, 20, 0, 0],
+      scales: { x: { time: false }, y: spec.log ? { distr: 3, range: extra.range } : { range: extra.range } },
+      bands: extra.bands || [],
+      cursor: { sync: { key: "time", scales: ["x", null] }, drag: { x: true, y: false, dist: 4 }, y: false, focus: { prox: -1 } },
+      hooks: {
+        drawClear: [background(shared)],
+        draw: [extra.draw || foreground(spec, shared)],
+        setCursor: [(u) => shared.hover(u)],
+        setScale: [(u, key) => { if (key === "x") shared.zoomed(u); }],
+      },
+    };
+  }
+
+  function el(tag, attributes, ...children) {
+    const node = document.createElement(tag);
+    for (const [name, value] of Object.entries(attributes || {})) node.setAttribute(name, value);
+    node.append(...children);
+    return node;
+  }
+  function swatch(k, dash, points) {
+    const ns = "http://www.w3.org/2000/svg", svg = document.createElementNS(ns, "svg");
+    svg.setAttribute("viewBox", "0 0 22 10"); svg.setAttribute("aria-hidden", "true");
+    const draw = (tag, attributes) => { const n = document.createElementNS(ns, tag); for (const a in attributes) n.setAttribute(a, attributes[a]); svg.append(n); };
+    if (points) [4, 11, 18].forEach((x) => draw("circle", { cx: x, cy: 5, r: 2, style: `fill:var(--c${k % 6})` }));
+    else draw("line", { x1: 0, x2: 22, y1: 5, y2: 5, "stroke-width": 2.5, "stroke-dasharray": dash ? "5 3" : "none", style: `stroke:var(--c${k % 6})` });
+    return svg;
+  }
+
+  function figure(host, spec, shared) {
+    const unit = spec.unit ? [" ", el("span", {}, "[" + spec.unit + "]")] : [];
+    const caption = el("figcaption", {}, el("h2", {}, spec.title, ...unit));
+    const node = el("figure", { class: "chart", id: "chart-" + spec.key, tabindex: "0", role: "group", "aria-label": spec.title + " over time" }, caption);
+    host.append(node);
+    node.addEventListener("keydown", (event) => shared.key(event, node));
+    return { node, caption };
+  }
+  function finish(u, spec, outputs, shared) {
+    const pin = el("div", { class: "pin" });
+    u.over.append(pin);
+    u.over.addEventListener("click", () => { if (u.cursor.idx !== null && u.cursor.idx !== undefined) shared.choose(u.cursor.idx); });
+    return { u, pin, outputs, spec };
+  }
+
+  function lineChart(host, spec, shared) {
+    const { node, caption } = figure(host, spec, shared);
+    const data = [shared.line.t], series = [{}], bands = [], outputs = [], main = [];
+    const add = (run, column, options) => { data.push(spread(shared.line, run, shared.runs[run].columns[column], spec.log)); series.push(options); return series.length - 1; };
+    for (const b of spec.bands) {
+      const hidden = { stroke: "transparent", width: 0, points: { show: false } };
+      bands.push({ series: [add(0, b.stem + "_hi", hidden), add(0, b.stem + "_lo", hidden)], fill: () => alpha(b.colour, 0.16) });
+    }
+    for (const s of spec.series) {
+      const dots = { show: true, size: 4, width: 1, stroke: () => colour(s.colour), fill: () => colour(s.colour) };
+      const at = add(s.run || 0, s.column, { label: s.label, stroke: () => colour(s.colour), width: 1.6, dash: s.dash ? [6, 4] : undefined, points: s.points ? dots : undefined, paths: s.points ? () => null : undefined, spanGaps: false });
+      main.push(at);
+      const output = el("output", {}, "–"), key = el("button", { type: "button", class: "key", "aria-pressed": "true", title: "show or hide" }, swatch(s.colour, s.dash, s.points), s.label, output);
+      key.addEventListener("click", () => { const show = key.getAttribute("aria-pressed") !== "true"; key.setAttribute("aria-pressed", String(show)); u.setSeries(at, { show }); });
+      caption.append(key);
+      outputs.push({ at, output });
+    }
+    const u = new uPlot(options(spec, shared, series, { range: yRange(spec, main), bands }), data, node);
+    return finish(u, spec, outputs, shared);
+  }
+
+  // Two lanes: what the detector flagged, by reason, and what was injected, by kind.
+  function strip(host, shared) {
+    const spec = { key: "state", title: "Flagged and injected", unit: "", levels: [], bands: [], height: STRIP, log: false };
+    const { node, caption } = figure(host, spec, shared);
+    const words = Array.from(new Set(shared.spans.map((s) => s.lane + " " + s.word)));
+    for (const word of words) {
+      const first = shared.spans.find((s) => s.lane + " " + s.word === word);
+      const key = el("button", { type: "button", class: "key", title: "go to the first" }, swatch(words.indexOf(word), false, false), first.word.replaceAll("_", " "));
+      key.addEventListener("click", () => shared.choose(first.first));
+      caption.append(key);
+    }
+    if (!words.length) caption.append(el("span", {}, "every scan was used"));
+    const draw = (u) => {
+      foreground(spec, shared)(u);
+      const { ctx, bbox } = u, px = devicePixelRatio, tall = bbox.height / 2;
+      ctx.save();
+      ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
+      ctx.font = 11 * px + "px system-ui, sans-serif"; ctx.textBaseline = "middle"; ctx.textAlign = "left";
+      for (const s of shared.spans) {
+        const k = words.indexOf(s.lane + " " + s.word), top = bbox.top + (s.lane === "flagged" ? 0 : tall) + 2 * px;
+        const x0 = u.valToPos(s.from - shared.half, "x", true), wide = Math.max(u.valToPos(s.to + shared.half, "x", true) - x0, 2 * px);
+        ctx.fillStyle = alpha(k, 0.45); ctx.fillRect(x0, top, wide, tall - 4 * px);
+        ctx.strokeStyle = colour(k); ctx.lineWidth = px; ctx.strokeRect(x0, top, wide, tall - 4 * px);
+        const text = s.word.replaceAll("_", " ");
+        if (ctx.measureText(text).width < wide - 6 * px) { ctx.fillStyle = theme.ink; ctx.fillText(text, x0 + 4 * px, top + tall / 2 - 2 * px); }
+      }
+      ctx.restore();
+    };
+    const lanes = options(spec, shared, [{}, { show: false }], { range: () => [0, 2], draw });
+    lanes.axes[1] = { ...lanes.axes[1], splits: () => [0.5, 1.5], values: () => ["injected", "flagged"], grid: { show: false } };
+    return finish(new uPlot(lanes, [shared.line.t, shared.line.t.map(() => 0)], node), spec, [], shared);
+  }
+
+  // hooks: hover(idx or null), choose(idx).
+  function build(host, page, hooks) {
+    readTheme();
+    const runs = page.runs.map((r) => ({ name: r.name, t: Packed.unpack(r.t), columns: Object.fromEntries(Object.entries(r.columns).map(([n, p]) => [n, Packed.unpack(p)])) }));
+    const line = timeline(runs), t = line.t;
+    const all = [];
+    let chosen = 0, hovered = null, syncing = false, waiting = false;
+    const steps = t.slice(1).map((v, k) => v - t[k]).sort((a, b) => a - b);
+    const shared = { runs, line, spans: page.spans, marks: page.marks, half: (steps[steps.length >> 1] || 1) / 2, width: Math.max(host.clientWidth - 14, 240), choose: hooks.choose };
+    shared.hover = (u) => {
+      const inside = u.cursor.left >= 0 && u.cursor.idx !== null && u.cursor.idx !== undefined;
+      hovered = inside ? u.cursor.idx : null;
+      if (!waiting) { waiting = true; requestAnimationFrame(() => { waiting = false; readouts(); hooks.hover(hovered); }); }
+    };
+    shared.zoomed = (source) => {
+      if (syncing) return;
+      syncing = true;
+      const { min, max } = source.scales.x;
+      for (const c of all) if (c.u !== source) c.u.setScale("x", { min, max });
+      syncing = false;
+      pins();
+    };
+    shared.key = (event, node) => {
+      if (event.target !== node || event.ctrlKey || event.metaKey || event.altKey) return;
+      const step = event.shiftKey ? 10 : 1, last = t.length - 1;
+      const moves = { ArrowLeft: chosen - step, ArrowRight: chosen + step, Home: 0, End: last };
+      if (event.key in moves) hooks.choose(Math.min(Math.max(moves[event.key], 0), last));
+      else if (event.key === "+" || event.key === "=") zoom(0.5);
+      else if (event.key === "-") zoom(2);
+      else if (event.key === "0" || event.key === "Escape") reset();
+      else return;
+      event.preventDefault();
+    };
+    if (page.states) all.push(strip(host, shared));
+    for (const spec of page.charts) all.push(lineChart(host, spec, shared));
+
+    function readouts() {
+      const k = hovered === null ? chosen : hovered;
+      for (const c of all) for (const o of c.outputs) o.output.textContent = figures(c.u.data[o.at][k]);
+    }
+    function pins() {
+      for (const c of all) {
+        const x = c.u.valToPos(t[chosen], "x");
+        c.pin.style.transform = `translateX(${x - 1}px)`;
+        c.pin.style.display = x >= 0 && x <= c.u.over.clientWidth ? "" : "none";
+      }
+    }
+    function zoom(factor) {
+      const { min, max } = all[0].u.scales.x, half = (max - min) * factor / 2, middle = t[chosen];
+      const a = Math.max(t[0], middle - half), b = Math.min(t[t.length - 1], middle + half);
+      if (b > a) all[0].u.setScale("x", { min: a, max: b });
+    }
+    function reset() { all[0].u.setScale("x", { min: t[0], max: t[t.length - 1] }); }
+    function choose(k) { chosen = k; pins(); readouts(); }
+    function resize() {
+      const width = Math.max(host.clientWidth - 14, 240);
+      for (const c of all) if (c.u.width !== width) c.u.setSize({ width, height: c.u.height });
+      requestAnimationFrame(pins);
+    }
+    function repaint() { readTheme(); for (const c of all) c.u.redraw(false, true); }
+    return { t, runs, choose, reset, resize, repaint };
+  }
+  return { build };
+})();

@@ -1,0 +1,57 @@
+"use strict";
+// Ties the slider, the charts, the 3D view and the tables together.
+(() => {
+  const page = JSON.parse(document.getElementById("data").textContent);
+  const by = (id) => document.getElementById(id), root = document.documentElement;
+  const slider = by("slider"), now = by("now"), play = by("play"), theme = by("theme");
+
+  function paintTheme(dark) {
+    root.dataset.theme = dark ? "dark" : "light";
+    theme.setAttribute("aria-pressed", String(dark));
+    theme.textContent = dark ? "Light" : "Dark";
+  }
+  const wish = matchMedia("(prefers-color-scheme: dark)");
+  paintTheme(wish.matches);
+
+  let view = { choose() {}, resize() {} };
+  if (page.scene) document.querySelector("main").classList.add("two");
+  const charts = Charts.build(by("charts"), page, { hover: tell, choose });
+  const t = charts.t, last = t.length - 1;
+  if (page.scene) view = Scene.build(by("scene"), page.scene, t);
+  let chosen = 0, timer = null;
+  slider.max = String(last);
+
+  function words(k) {
+    if (!page.states) return `${t[k].toFixed(2)} s`;
+    const [gamma, reason, fault] = page.states[k];
+    const state = gamma === 1 ? "● used" : (reason === "no_scan" ? "~ " : "✗ ") + reason.replaceAll("_", " ");
+    return `scan ${page.scans[k]} · ${t[k].toFixed(2)} s · ${state}` + (fault ? ` · injected: ${fault.replaceAll("_", " ")}` : "");
+  }
+  function tell(hovered) { now.textContent = words(hovered === null ? chosen : hovered); }
+  function choose(k) {
+    chosen = k;
+    slider.value = String(k);
+    slider.setAttribute("aria-valuetext", words(k));
+    charts.choose(k); view.choose(k); tell(null);
+  }
+  function stop() { clearInterval(timer); timer = null; play.textContent = "Play"; play.setAttribute("aria-pressed", "false"); }
+  function start() {
+    if (chosen === last) choose(0);
+    const pace = Math.max(1, Math.round(last / 600));
+    timer = setInterval(() => { if (chosen >= last) stop(); else choose(Math.min(chosen + pace, last)); }, 50);
+    play.textContent = "Pause"; play.setAttribute("aria-pressed", "true");
+  }
+
+  slider.addEventListener("input", () => choose(Number(slider.value)));
+  play.addEventListener("click", () => timer === null ? start() : stop());
+  by("reset").addEventListener("click", () => charts.reset());
+  theme.addEventListener("click", () => { paintTheme(root.dataset.theme !== "dark"); charts.repaint(); });
+  wish.addEventListener("change", () => { paintTheme(wish.matches); charts.repaint(); });
+  document.addEventListener("click", (event) => {
+    const jump = event.target.closest(".jump");
+    if (jump) { choose(Number(jump.dataset.scan)); by("charts").scrollIntoView(); slider.focus({ preventScroll: true }); }
+  });
+  new ResizeObserver(() => { charts.resize(); view.resize(); }).observe(by("charts"));
+  choose(0);
+  root.dataset.ready = String(Math.round(performance.now()));
+})();

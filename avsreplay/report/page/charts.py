@@ -1,0 +1,200 @@
+"""Which charts a page has and what is on them: plain data, drawn by ``charts.js``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.records import State
+from avsreplay.report.page.packing import numbers, values
+from avsreplay.report.summary import NEES_BAND, NIS_BAND
+from avsreplay.rows import Row
+
+__all__ = ["Columns", "charts", "derived", "spans"]
+
+Columns = dict[str, NDArray[np.float64]]
+Chart = dict[str, Any]
+
+_DIRECT = (
+    *("pos_err_m", "rot_err_deg", "reg_pos_err_m", "reg_rot_err_deg", "pos_1s_m", "rot_1s_deg"),
+    *("rms_m", "inlier_ratio", "nis", "innov_m", "innov_deg"),
+    *("sigma1", "sigma2", "cx_m", "cy_m", "cz_m", "wx_radps", "wy_radps", "wz_radps"),
+    *("nees", "ogm_log10_cond", "ogm_log10_cond_scaled", "ogm_rank"),
+    *("r_pos_m", "r_rot_deg", "capture_time_s"),
+)
+_WINDOW = 10
+
+
+def derived(rows: Sequence[Row], misses: Mapping[int, float]) -> Columns:
+    """Every column the charts draw, (n,) each; ``misses`` is t_ns -> miss distance [m] of the plan made then."""
+    out = {name: values(rows, name) for name in _DIRECT}
+    out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
+    for name, sigma in (("sigma1", "sigma1_1s"), ("sigma2", "sigma2_1s"), *((f"c{a}_m", "c_1s_m") for a in "xyz")):
+        _band(out, name, values(rows, sigma))
+    for axis in "xyz":
+        _band(out, f"mu_{axis}_deg", values(rows, "mu_1s_deg"))
+    out["capture_time_s_lo"], out["capture_time_s_hi"] = _spread(out["capture_time_s"])
+    out["miss_m"] = numbers(misses.get(row.t_ns) for row in rows)
+    return {name: column for name, column in out.items() if np.isfinite(column).any()}
+
+
+def _attitude(rows: Sequence[Row]) -> NDArray[np.float64]:
+    """Attitude mu as a rotation vector [deg], (3, n)."""
+    q = np.stack([values(rows, f"mu{a}") for a in "xyzw"], axis=-1)
+    known = np.isfinite(q).all(axis=-1)
+    out = np.full((len(rows), 3), np.nan)
+    out[known] = np.degrees(geometry.log(q[known]))
+    return np.ascontiguousarray(out.T)
+
+
+def _band(out: Columns, name: str, sigma: NDArray[np.float64]) -> None:
+    out[f"{name}_lo"], out[f"{name}_hi"] = out[name] - sigma, out[name] + sigma
+
+
+def _spread(capture_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Least and greatest of the last ten plans that differ."""
+    low, high = np.full_like(capture_s, np.nan), np.full_like(capture_s, np.nan)
+    recent: list[float] = []
+    for k, value in enumerate(capture_s):
+        if np.isfinite(value):
+            recent = recent if recent and recent[-1] == value else [*recent, float(value)][-_WINDOW:]
+            low[k], high[k] = min(recent), max(recent)
+    return low, high
+
+
+def _line(name: str, label: str, colour: int, *, dash: bool = False, points: bool = False) -> dict[str, Any]:
+    return {"column": name, "label": label, "colour": colour, "dash": dash, "points": points}
+
+
+def _chart(
+    key: str,
+    title: str,
+    unit: str,
+    series: Sequence[dict[str, Any]],
+    *,
+    bands: Sequence[tuple[str, int]] = (),
+    levels: Sequence[tuple[float, str, int]] = (),
+    log: bool = False,
+) -> Chart:
+    """One chart; ``bands`` are column stems with ``_lo`` and ``_hi``, ``levels`` horizontal lines."""
+    return {
+        "key": key,
+        "title": title,
+        "unit": unit,
+        "log": log,
+        "series": list(series),
+        "bands": [{"stem": stem, "colour": colour} for stem, colour in bands],
+        "levels": [{"y": y, "label": label, "colour": colour} for y, label, colour in levels],
+    }
+
+
+def charts(columns: Columns, truth: State | None = None) -> list[Chart]:
+    """The charts that have anything to show, in reading order."""
+    whole = [*_error_charts(), *_measurement_charts(), *_parameter_charts(truth), *_plan_charts()]
+    kept = []
+    for chart in whole:
+        chart["series"] = [s for s in chart["series"] if s["column"] in columns]
+        chart["bands"] = [b for b in chart["bands"] if f"{b['stem']}_lo" in columns]
+        if chart["series"]:
+            kept.append(chart)
+    return kept
+
+
+def _error_charts() -> list[Chart]:
+    position = [
+        _line("pos_err_m", "estimate", 0),
+        _line("reg_pos_err_m", "registration", 1, points=True),
+        _line("pos_1s_m", "predicted 1 sigma", 2, dash=True),
+    ]
+    attitude = [
+        _line("rot_err_deg", "estimate", 0),
+        _line("reg_rot_err_deg", "registration", 1, points=True),
+        _line("rot_1s_deg", "predicted 1 sigma", 2, dash=True),
+    ]
+    return [
+        _chart("position", "Position error", "m", position, log=True),
+        _chart("attitude", "Attitude error", "deg", attitude, log=True),
+    ]
+
+
+def _measurement_charts() -> list[Chart]:
+    nis = [(NIS_BAND[0], "2.5 %", 3), (NIS_BAND[1], "97.5 %", 3)]
+    nees = [(NEES_BAND[0], "2.5 %", 3), (NEES_BAND[1], "97.5 %", 3)]
+    return [
+        _chart("fit", "Fit error", "m", [_line("rms_m", "rms over inliers", 0)]),
+        _chart("inliers", "Inlier ratio", "", [_line("inlier_ratio", "inliers / points", 0)]),
+        _chart("nis", "Innovation squared (NIS)", "", [_line("nis", "NIS", 0, points=True)], levels=nis, log=True),
+        _chart("innovation", "Position innovation", "m", [_line("innov_m", "length", 0)], log=True),
+        _chart("turn", "Attitude innovation", "deg", [_line("innov_deg", "angle", 0)], log=True),
+        _chart("nees", "Estimation error squared (NEES)", "", [_line("nees", "NEES", 0)], levels=nees, log=True),
+    ]
+
+
+def _parameter_charts(truth: State | None) -> list[Chart]:
+    sigma, c, mu = _truths(truth)
+    ratios = [_line("sigma1", "sigma1", 0), _line("sigma2", "sigma2", 1, dash=True)]
+    arm = [_line(f"c{a}_m", a, k, dash=k == 1) for k, a in enumerate("xyz")]
+    turn = [_line(f"mu_{a}_deg", a, k, dash=k == 1) for k, a in enumerate("xyz")]
+    rate = [_line(f"w{a}_radps", a, k, dash=k == 1) for k, a in enumerate("xyz")]
+    return [
+        _chart("sigma", "Inertia ratios", "", ratios, bands=[("sigma1", 0), ("sigma2", 1)], levels=sigma),
+        _chart("arm", "Fixture from the mass centre", "m", arm, bands=[(f"c{a}_m", k) for k, a in _XYZ], levels=c),
+        _chart("mu", "Fixture attitude mu", "deg", turn, bands=[(f"mu_{a}_deg", k) for k, a in _XYZ], levels=mu),
+        _chart("rate", "Angular rate", "rad/s", rate),
+    ]
+
+
+_XYZ = tuple(enumerate("xyz"))
+
+
+def _truths(truth: State | None) -> list[list[tuple[float, str, int]]]:
+    """Levels of sigma, varrho [m] and mu (rotation vector, deg)."""
+    if truth is None:
+        return [[], [], []]
+    mu = np.degrees(geometry.log(truth.q_bc))
+    return [[(float(v), "truth", k) for k, v in enumerate(vector)] for vector in (truth.sigma, truth.c_b, mu)]
+
+
+def _plan_charts() -> list[Chart]:
+    condition = [
+        _line("ogm_log10_cond", "raw", 0),
+        _line("ogm_log10_cond_scaled", "scaled by the prior", 1, dash=True),
+    ]
+    return [
+        _chart("gramian", "Gramian condition, log10", "", condition),
+        _chart("rank", "Gramian rank of 20", "", [_line("ogm_rank", "rank", 0)]),
+        _chart("noise", "Adapted noise, position", "m", [_line("r_pos_m", "1 sigma", 0)]),
+        _chart("noise_turn", "Adapted noise, attitude", "deg", [_line("r_rot_deg", "1 sigma", 0)]),
+        _chart(
+            "capture",
+            "Planned capture time",
+            "s",
+            [_line("capture_time_s", "since the first scan", 0)],
+            bands=[("capture_time_s", 0)],
+        ),
+        _chart("miss", "Miss distance in hindsight", "m", [_line("miss_m", "of the plan made then", 1, points=True)]),
+    ]
+
+
+def spans(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Runs of flagged scans (lane ``flagged``, by reason) and of labelled ones (lane ``injected``, by kind)."""
+    flagged = [None if row.gamma == 1 else row.reason for row in rows]
+    return _runs(rows, flagged, "flagged") + _runs(rows, [row.fault for row in rows], "injected")
+
+
+def _runs(rows: Sequence[Row], words: Sequence[str | None], lane: str) -> list[dict[str, Any]]:
+    out: list[dict[str, Any]] = []
+    for k, word in enumerate(words):
+        if word is None:
+            continue
+        if k and words[k - 1] == word:
+            out[-1]["last"] = k
+        else:
+            out.append({"lane": lane, "word": word, "first": k, "last": k})
+    for span in out:
+        span["from"], span["to"] = rows[span["first"]].t_s, rows[span["last"]].t_s
+    return out

@@ -1,0 +1,439 @@
+"""The HTML page: self-contained, safe, small; and, in a real browser, alive."""
+
+from __future__ import annotations
+
+import base64
+import html.parser
+import json
+import re
+import shutil
+import time
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from avsreplay import report
+from avsreplay.cli.report import command
+from avsreplay.errors import AvsError
+from avsreplay.geometry import Pose, exp
+from avsreplay.records import Label, State
+from avsreplay.report.page import build_page
+from avsreplay.report.page.charts import charts, derived, spans
+from avsreplay.report.page.packing import embed
+from avsreplay.report.page.scene import scene
+
+TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.3, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))
+BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 2)], dtype=np.float32)
+FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]], np.int32)
+
+
+def _view(rows):
+    rng = np.random.Generator(np.random.PCG64(1))
+    clouds = [
+        report.thin_cloud(r.seq, rng.normal([1, 0, 5], 1.0, (400, 3)), np.abs(rng.normal(size=400)) * 0.01)
+        for r in rows
+        if r.gamma
+    ]
+    path = report.PathView(
+        rows[min(12, len(rows) - 1)].t_ns, np.linspace([0, 0, 0], [1, 0, 5], 20).astype(np.float32), 0.02
+    )
+    return report.View(BOX, FACES, tuple(clouds), (path,))
+
+
+def _labels(rows):
+    return [Label("full_occlusion", rows[min(20, len(rows) - 1)].t_ns, rows[min(25, len(rows) - 1)].t_ns)]
+
+
+def _page(rows, **more):
+    poses = [(r.t_ns, Pose(exp([0, 0, 0.02 * r.seq]), [1.0, 0.2, 5.0])) for r in rows]
+    summary = report.Summary.fold(rows, labels=_labels(rows), truth=TRUTH)
+    given = {"truth": TRUTH, "poses": poses, "view": _view(rows), "title": "tumble"} | more
+    return build_page(rows, summary, {"config": {"backend": "horn"}}, **given)
+
+
+def _data(page):
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page, re.S)[1])
+
+
+def _floats(packed, kind):
+    return np.frombuffer(base64.b64decode(packed["data"]), kind)
+
+
+def test_nothing_is_asked_of_the_network(make_rows):
+    page = _page(make_rows(30))
+    assert "default-src 'none'" in page
+    outside = re.findall(
+        r"""(?:src|href)\s*=\s*["']([^"'#]+)["']|url\(|@import|fetch\(|XMLHttpRequest|WebSocket""", page
+    )
+    assert set(outside) <= {"data:,"}
+
+
+def test_every_element_is_closed(make_rows):
+    class Checker(html.parser.HTMLParser):
+        void = frozenset({"meta", "link", "input", "br"})
+
+        def __init__(self):
+            super().__init__()
+            self.open = []
+
+        def handle_starttag(self, tag, attrs):
+            if tag not in self.void:
+                self.open.append(tag)
+
+        def handle_endtag(self, tag):
+            assert self.open.pop() == tag
+
+    checker = Checker()
+    checker.feed(_page(make_rows(30)))
+    assert checker.open == []
+
+
+EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\u2028\"'"
+
+
+def test_words_from_files_cannot_become_markup(make_rows):
+    rows = make_rows(30, fault=EVIL, reason=EVIL, gamma=0)
+    summary = report.Summary.fold(rows, counts={EVIL: 1})
+    page = build_page(rows, summary, {EVIL: EVIL}, title=EVIL)
+    assert "<img" not in page
+    assert "alert(1)</script>" not in page
+    assert _data(page)["states"][0] == [0, EVIL, EVIL]
+
+
+def test_embedded_json_has_no_markup_and_no_nan():
+    assert json.loads(embed({"a": EVIL})) == {"a": EVIL}
+    assert not set("<>&\u2028") & set(embed({"a": EVIL}))
+    with pytest.raises(ValueError):
+        embed({"a": float("nan")})
+
+
+def test_the_same_run_gives_the_same_page(make_rows):
+    assert _page(make_rows(30)) == _page(make_rows(30))
+
+
+def test_columns_are_packed_as_they_are(make_rows):
+    rows = make_rows(40)
+    run = _data(_page(rows))["runs"][0]
+    np.testing.assert_array_equal(_floats(run["t"], "<f8"), [r.t_s for r in rows])
+    nis = _floats(run["columns"]["nis"], "<f4")
+    np.testing.assert_array_equal(nis, np.array([np.nan if r.nis is None else r.nis for r in rows], np.float32))
+
+
+def test_points_survive_packing_to_half_a_step(make_rows):
+    rows = make_rows(30)
+    view = _view(rows)
+    packed = scene(rows, {}, view)["clouds"]
+    step, centre = _floats(packed["step"], "<f4"), _floats(packed["centre"], "<f4").reshape(-1, 3)
+    sizes = _floats(packed["size"], "<i4")
+    points = _floats(packed["points"], "<i2").reshape(-1, 3)
+    back = points * np.repeat(step, sizes)[:, None] + np.repeat(centre, sizes, axis=0)
+    np.testing.assert_allclose(back, np.concatenate([c.points for c in view.clouds]), atol=2e-4)
+    assert step.max() < 1.5e-4
+
+
+def test_a_scan_far_away_or_of_one_point_can_be_packed(make_rows):
+    rows = make_rows(3)
+    view = report.View(BOX, FACES, (report.thin_cloud(0, [[1e6, 0, 0]]), report.thin_cloud(9, [[0, 0, 0]])))
+    packed = scene(rows, {}, view)["clouds"]
+    assert _floats(packed["scan"], "<i4").tolist() == [0]
+    assert packed["cap_m"] is None
+
+
+def test_spans_are_runs_of_one_word(make_rows):
+    found = [(s["lane"], s["word"], s["first"], s["last"]) for s in spans(make_rows(40))]
+    assert found == [("flagged", "no_scan", 20, 25), ("injected", "full_occlusion", 20, 25)]
+
+
+def test_charts_with_nothing_to_show_are_left_out(make_rows):
+    rows = make_rows(10, pos_err_m=None, reg_pos_err_m=None, capture_time_s=None, rms_m=None)
+    keys = [c["key"] for c in charts(derived(rows, {}))]
+    assert not {"position", "capture", "fit", "miss"} & set(keys)
+    assert {"attitude", "sigma", "nees"} <= set(keys)
+
+
+def test_bands_are_the_value_and_its_sigma(make_rows):
+    columns = derived(make_rows(10), {})
+    np.testing.assert_allclose(columns["sigma1_hi"] - columns["sigma1_lo"], 0.02)
+    assert columns["mu_z_deg"] == pytest.approx(np.degrees(0.2))
+
+
+def test_the_spread_of_the_capture_is_over_recent_plans(make_rows):
+    columns = derived(make_rows(40), {})
+    assert columns["capture_time_s_lo"][-1] == 30.1
+    assert columns["capture_time_s_hi"][-1] == 30.3
+    assert np.isnan(columns["capture_time_s_lo"][5])
+
+
+def test_the_size_stays_small_and_building_quick(make_rows):
+    rows = make_rows(600, blackout=range(300, 360))
+    begun = time.process_time()
+    page = _page(rows)
+    assert time.process_time() - begun < 3.0
+    assert len(page) < 5e6
+
+
+def test_a_long_run_is_thinned_in_clouds_not_in_columns(make_rows):
+    rows = make_rows(6000)
+    page = _page(rows)
+    assert len(page) < 10e6
+    assert len(_floats(_data(page)["runs"][0]["t"], "<f8")) == 6000
+
+
+def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
+    rows = make_rows(30)
+    report.write_rows(tmp_path / "rows.jsonl", rows)
+    done = CliRunner().invoke(command, [str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert "<title>" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    again = CliRunner().invoke(command, [str(tmp_path)])
+    assert isinstance(again.exception, AvsError)
+    assert "already there" in str(again.exception)
+    assert CliRunner().invoke(command, [str(tmp_path), "--overwrite", "--title", "x"]).exit_code == 0
+    missing = CliRunner().invoke(command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")])
+    assert isinstance(missing.exception, AvsError)
+    assert not (tmp_path / "x.html").exists()
+
+
+# ---- in a browser
+
+
+@pytest.fixture(scope="module")
+def browser():
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    program = next((p for p in map(shutil.which, ("chromium", "chromium-browser", "google-chrome")) if p), None)
+    driver = shutil.which("chromedriver")
+    if not program or not driver:
+        pytest.skip("no Chromium with its driver here")
+    options = webdriver.ChromeOptions()
+    options.binary_location = program
+    flags = (
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-dev-shm-usage",
+        "--use-angle=swiftshader",
+        "--window-size=1280,900",
+    )
+    for flag in (*flags, "--enable-unsafe-swiftshader"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    chrome = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    yield chrome
+    chrome.quit()
+
+
+@pytest.fixture
+def opened(browser, tmp_path, make_rows):
+    def go(width=1280, height=900, dark=False, rows=None, **more):
+        path = tmp_path / "page.html"
+        path.write_text(_page(make_rows(60) if rows is None else rows, **more), encoding="utf-8")
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme]})
+        browser.get(path.as_uri())
+        return browser
+
+    return go
+
+
+def _text(browser, selector):
+    return browser.execute_script("return document.querySelector(arguments[0]).textContent", selector)
+
+
+def _settled(browser):
+    browser.execute_async_script(
+        "const d = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(() => d()))"
+    )
+
+
+def _slide(browser, k):
+    script = "const s = document.getElementById('slider'); s.value = arguments[0]; s.dispatchEvent(new Event('input'))"
+    browser.execute_script(script, k)
+    _settled(browser)
+
+
+def _pin(browser, chart="position"):
+    script = "return document.querySelector(arguments[0]).getBoundingClientRect().left"
+    return browser.execute_script(script, f"#chart-{chart} .pin")
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("dark", [False, True])
+def test_it_loads_without_a_word_on_the_console(opened, width, dark):
+    browser = opened(width=width, dark=dark)
+    assert browser.get_log("browser") == []
+    assert browser.execute_script("return document.documentElement.dataset.theme") == ("dark" if dark else "light")
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= width
+    assert len(browser.find_elements("css selector", ".chart canvas")) >= 12
+
+
+def test_600_scans_are_interactive_within_two_seconds(opened, make_rows):
+    browser = opened(rows=make_rows(600, blackout=range(300, 360)))
+    assert int(browser.execute_script("return document.documentElement.dataset.ready")) < 2000
+
+
+def test_the_slider_moves_the_pins_the_words_and_the_3d_view(opened):
+    browser = opened()
+    _slide(browser, 10)
+    left, words = _pin(browser), _text(browser, "#now")
+    assert words == "scan 10 · 2.00 s · ● used"
+    assert browser.execute_script("return document.querySelector('#scene canvas').dataset.painted") == "10"
+    _slide(browser, 22)
+    assert _pin(browser) > left
+    assert _pin(browser, "sigma") == pytest.approx(_pin(browser, "nees"), abs=1)
+    assert _text(browser, "#now") == "scan 22 · 4.40 s · ~ no scan · injected: full occlusion"
+    assert _text(browser, "#chart-fit output") == "\u2013"
+
+
+def test_hover_reads_every_chart_at_once_and_lets_go(opened, make_rows):
+    from selenium.webdriver import ActionChains
+
+    rows = make_rows(60)
+    browser = opened(rows=rows)
+    over = browser.find_element("css selector", "#chart-position .u-over")
+    resting = _text(browser, "#now")
+    ActionChains(browser).move_to_element(over).perform()
+    _settled(browser)
+    hovered = _text(browser, "#now")
+    k = int(re.match(r"scan (\d+)", hovered)[1])
+    assert abs(k - 30) <= 2
+    assert float(_text(browser, "#chart-position output")) == pytest.approx(rows[k].pos_err_m, rel=1e-3)
+    assert float(_text(browser, "#chart-nees output")) == pytest.approx(rows[k].nees, rel=1e-3)
+    ActionChains(browser).move_to_element(browser.find_element("id", "verdict")).perform()
+    _settled(browser)
+    assert _text(browser, "#now") == resting
+
+
+def test_a_drag_zooms_all_charts_and_reset_undoes_it(opened):
+    from selenium.webdriver import ActionChains
+
+    browser = opened()
+    _slide(browser, 30)
+    before = {c: _pin(browser, c) for c in ("position", "nees")}
+    over = browser.find_element("css selector", "#chart-position .u-over")
+    ActionChains(browser).move_to_element_with_offset(over, -20, 0).click_and_hold().move_by_offset(
+        200, 0
+    ).release().perform()
+    _settled(browser)
+    moved = {c: _pin(browser, c) for c in ("position", "nees")}
+    assert moved["position"] == pytest.approx(moved["nees"], abs=1)
+    assert abs(moved["nees"] - before["nees"]) > 50
+    browser.find_element("id", "reset").click()
+    _settled(browser)
+    assert _pin(browser, "nees") == pytest.approx(before["nees"], abs=1)
+
+
+def test_a_click_chooses_a_scan_and_jump_goes_to_a_fault(opened):
+    browser = opened()
+    browser.find_element("css selector", "#chart-position .u-over").click()
+    _settled(browser)
+    chosen = int(browser.execute_script("return document.getElementById('slider').value"))
+    assert abs(chosen - 30) <= 2
+    browser.execute_script("document.querySelector('.jump').click()")
+    assert browser.execute_script("return document.getElementById('slider').value") == "20"
+
+
+def test_keys_alone_will_do(opened):
+    from selenium.webdriver import Keys
+
+    browser = opened()
+    chart = browser.find_element("id", "chart-position")
+    value = "return document.getElementById('slider').value"
+    for keys, expected in (
+        ([Keys.ARROW_RIGHT] * 3, "3"),
+        ([Keys.SHIFT + Keys.ARROW_RIGHT + Keys.NULL], "13"),
+        ([Keys.ARROW_LEFT], "12"),
+        ([Keys.END], "59"),
+        ([Keys.HOME], "0"),
+    ):
+        chart.send_keys(*keys)
+        assert browser.execute_script(value) == expected
+    slider = browser.find_element("id", "slider")
+    slider.send_keys(Keys.ARROW_RIGHT)
+    assert browser.execute_script(value) == "1"
+    tabbed = (
+        "return [...document.querySelectorAll('button, input, figure, canvas[role], a')].every((e) => e.tabIndex >= 0)"
+    )
+    assert browser.execute_script(tabbed)
+    scene_canvas = browser.find_element("css selector", "#scene canvas")
+    before = scene_canvas.screenshot_as_png
+    scene_canvas.send_keys(Keys.ARROW_LEFT * 5)
+    _settled(browser)
+    assert scene_canvas.screenshot_as_png != before
+
+
+def test_a_legend_key_hides_its_line(opened):
+    browser = opened()
+    canvas = browser.find_element("css selector", "#chart-position canvas")
+    before = canvas.screenshot_as_png
+    key = browser.find_element("css selector", "#chart-position .key")
+    key.click()
+    _settled(browser)
+    assert key.get_attribute("aria-pressed") == "false"
+    assert canvas.screenshot_as_png != before
+
+
+def test_play_runs_to_the_end_and_stops(opened):
+    browser = opened()
+    _slide(browser, 55)
+    browser.find_element("id", "play").click()
+    deadline = time.monotonic() + 5
+    while _text(browser, "#play") == "Pause" and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert _text(browser, "#play") == "Play"
+    assert _text(browser, "#now").startswith("scan 59 ")
+
+
+def test_the_theme_button_turns_everything(opened):
+    browser = opened()
+    canvas = browser.find_element("css selector", "#chart-position canvas")
+    before = canvas.screenshot_as_png
+    browser.find_element("id", "theme").click()
+    _settled(browser)
+    assert browser.execute_script("return document.documentElement.dataset.theme") == "dark"
+    assert canvas.screenshot_as_png != before
+
+
+def test_text_stands_out_from_its_ground_in_both_themes(opened):
+    """WCAG contrast of 4.5 for text, 3 for lines."""
+    script = """const s = getComputedStyle(document.documentElement);
+    return Object.fromEntries(arguments[0].map((n) => [n, s.getPropertyValue(n).trim()]))"""
+    names = [
+        "--ground",
+        "--card",
+        "--ink",
+        "--faint",
+        "--accent",
+        "--good",
+        "--bad",
+        "--so",
+        "--c0",
+        "--c1",
+        "--c2",
+        "--c3",
+    ]
+    for dark in (False, True):
+        found = opened(dark=dark).execute_script(script, names)
+        for name in names[2:]:
+            for ground in ("--ground", "--card"):
+                least = 3.0 if name.startswith("--c") else 4.5
+                assert _contrast(found[name], found[ground]) >= least, (dark, name, ground)
+
+
+def _contrast(one, two):
+    def luminance(text):
+        channels = np.array([int(text[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+        linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    high, low = sorted((luminance(one), luminance(two)), reverse=True)
+    return (high + 0.05) / (low + 0.05)
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_a_tiny_run_without_anything_else_loads(opened, make_rows, n):
+    rows = make_rows(n, pos_err_m=None, rot_err_deg=None)
+    browser = opened(rows=rows, truth=None, poses=(), view=None) if n == 1 else opened(rows=rows, view=None)
+    assert browser.get_log("browser") == []
+    assert _text(browser, "#now").startswith("scan 0 ")
