@@ -21,7 +21,7 @@ from avsreplay.register import Registrar
 from avsreplay.rows import Row
 from avsreplay.watch import Monitors, Watch, look
 
-__all__ = ["Memory", "Stages", "replay", "step"]
+__all__ = ["Memory", "Stages", "fold", "step"]
 
 _UNMEASURED = (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED)
 
@@ -90,7 +90,7 @@ def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
     return replace(memory, watch=watch, mission=mission, track=track, last=last), row
 
 
-def replay(stages: Stages, memory: Memory, scans: Iterable[Scan]) -> Iterator[tuple[Memory, Row]]:
+def fold(stages: Stages, memory: Memory, scans: Iterable[Scan]) -> Iterator[tuple[Memory, Row]]:
     """Fold ``step`` over the scans, one at a time: what is held is one scan, not one log."""
     for scan in scans:
         memory, row = step(stages, memory, scan)
