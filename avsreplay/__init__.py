@@ -22,4 +22,23 @@ Importing the package does nothing; the public names are loaded when they are fi
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from avsreplay.config import RunConfig
+    from avsreplay.errors import AvsError
+    from avsreplay.job import Job, Run, replay
+    from avsreplay.rows import Row
+
 __version__ = "0.1.0"
+__all__ = ["AvsError", "Job", "Row", "Run", "RunConfig", "__version__", "replay"]
+
+_HOME = {"AvsError": "errors", "Job": "job", "Row": "rows", "Run": "job", "RunConfig": "config", "replay": "job"}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)

@@ -12,19 +12,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from avsreplay import replay as path
-from avsreplay import settings
+from avsreplay import chain, settings
+from avsreplay.chain import Memory
 from avsreplay.config import RunConfig, load_config
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log import Source, SourceOptions, open_source
 from avsreplay.records import Belief, Scan, Surface
-from avsreplay.replay import Memory
 from avsreplay.report import Summary
 from avsreplay.report.summary import SummaryFold
 from avsreplay.rows import Row
 from avsreplay.wire import first_memory, stages
 
-__all__ = ["Job", "Listener", "Run"]
+__all__ = ["Job", "Listener", "Run", "replay"]
 
 Listener = Callable[[Scan, Belief], None]
 """Called after each scan with the scan and the belief after it: what writes beliefs, truth and clouds beside rows."""
@@ -92,7 +91,7 @@ class Run:
             raise UnreadableInput("no scan to replay", where=str(self.job.source), hint=hint)
         listeners = tuple(listeners)
         heard: list[Scan] = []
-        for memory, row in path.replay(self._stages, first_memory(self._stages), self._overheard(heard)):
+        for memory, row in chain.fold(self._stages, first_memory(self._stages), self._overheard(heard)):
             self._fold.add(row)
             for listener in listeners:
                 listener(heard[-1], _belief(memory))
@@ -138,3 +137,18 @@ def _belief(memory: Memory) -> Belief:
     if memory.track is None:
         raise RuntimeError("a scan was replayed without a track")
     return memory.track.belief
+
+
+def replay(source: str | Path, *assignments: str, **options: Any) -> Iterator[Row]:
+    """Replay a log, row by row: ``for row in avsreplay.replay("log.mcap", "faults.policy=all", n_scans=100)``.
+
+    Args:
+        source: log, bag or folder of scans.
+        *assignments: settings ``a.b=c`` as for ``--set``.
+        **options: how to read the log, see log.SourceOptions.
+
+    Raises:
+        AvsError: where the log, the model or a setting cannot be used; its ``str`` is one line.
+    """
+    with Run(Job(source=Path(source), options=SourceOptions(**options), assignments=assignments)) as run:
+        yield from run.rows()

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from avsreplay.chain import Memory, Stages
 from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
@@ -17,7 +18,6 @@ from avsreplay.monitor.faults import FaultDetector
 from avsreplay.monitor.observability import gramian
 from avsreplay.records import LogHeader, Scan, Surface
 from avsreplay.register import Registrar
-from avsreplay.replay import Memory, Stages
 from avsreplay.watch import Monitors, Watch
 
 __all__ = ["first_memory", "stages"]
