@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.estimate.measure import sensitivity
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import BLOCKS, Alignment, Belief, Innovation, Plan, Scan, ScanStatus, Verdict
 from avsreplay.rows import Row
@@ -107,18 +108,10 @@ def _estimate(belief: Belief | None) -> dict[str, Any]:
 
 
 def _pose_sigma(belief: Belief) -> tuple[float, float]:
-    """1 sigma of the fixture's position [m] and attitude [deg], through H of section 3."""
-    R_ab = geometry.matrix(belief.x.q_ab)
-    position = np.zeros((3, 20))
-    position[:, BLOCKS["attitude"]] = -2.0 * R_ab @ geometry.skew(belief.x.c_b)
-    position[:, BLOCKS["position"]] = np.eye(3)
-    position[:, BLOCKS["varrho"]] = R_ab
-    attitude = np.zeros((3, 20))
-    attitude[:, BLOCKS["attitude"]] = attitude[:, BLOCKS["mu"]] = np.eye(3)
-    return (
-        float(np.sqrt(max(np.trace(position @ belief.P @ position.T), 0.0))),
-        _half_angle_deg(np.trace(attitude @ belief.P @ attitude.T)),
-    )
+    """1 sigma of the fixture's position [m] and attitude [deg]."""
+    H = sensitivity(belief.x)
+    variance = np.diag(H @ belief.P @ H.T)
+    return float(np.sqrt(max(variance[:3].sum(), 0.0))), _half_angle_deg(variance[3:].sum())
 
 
 def _errors(belief: Belief | None, truth: Pose | None) -> dict[str, Any]:

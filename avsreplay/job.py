@@ -17,7 +17,7 @@ from avsreplay.chain import Memory
 from avsreplay.config import RunConfig, load_config
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log import Source, SourceOptions, open_source
-from avsreplay.records import Belief, Scan, Surface
+from avsreplay.records import Scan, Surface
 from avsreplay.report import Summary
 from avsreplay.report.summary import SummaryFold
 from avsreplay.rows import Row
@@ -25,8 +25,8 @@ from avsreplay.wire import first_memory, stages
 
 __all__ = ["Job", "Listener", "Run", "replay"]
 
-Listener = Callable[[Scan, Belief], None]
-"""Called after each scan with the scan and the belief after it: what writes beliefs, truth and clouds beside rows."""
+Listener = Callable[[Scan, Memory, Row], None]
+"""Called after each scan: what keeps beliefs, truth, clouds and plans beside the rows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +94,7 @@ class Run:
         for memory, row in chain.fold(self._stages, first_memory(self._stages), self._overheard(heard)):
             self._fold.add(row)
             for listener in listeners:
-                listener(heard[-1], _belief(memory))
+                listener(heard[-1], memory, row)
             yield row
 
     def summary(self) -> Summary:
@@ -131,12 +131,6 @@ def _run_table(scenario: str) -> Mapping[str, Any]:
     """The ``[run]`` table of the log's own scenario."""
     table: Mapping[str, Any] = tomllib.loads(scenario).get("run", {}) if scenario else {}
     return table
-
-
-def _belief(memory: Memory) -> Belief:
-    if memory.track is None:
-        raise RuntimeError("a scan was replayed without a track")
-    return memory.track.belief
 
 
 def replay(source: str | Path, *assignments: str, **options: Any) -> Iterator[Row]:

@@ -17,16 +17,24 @@ from typing import Any
 
 import numpy as np
 
+from avsreplay.chain import Memory
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, Scan, State
 from avsreplay.report import row_poses, write_rows, write_tum
 from avsreplay.rows import Row
 
-__all__ = ["MEAN_COLUMNS", "Beliefs", "ResultDirectory", "mean_vector", "read_beliefs"]
+__all__ = ["MEAN_COLUMNS", "Beliefs", "ResultDirectory", "belief_of", "mean_vector", "read_beliefs"]
 
 _BLOCKS = (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4))
 MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in _BLOCKS for k in range(size))
+
+
+def belief_of(memory: Memory) -> Belief:
+    """The belief after a scan."""
+    if memory.track is None:
+        raise RuntimeError("nothing was replayed yet")
+    return memory.track.belief
 
 
 def mean_vector(x: State) -> Array:
@@ -43,8 +51,9 @@ class Beliefs:
         self.P: list[Array] = []
         self.truth: list[tuple[int, Pose]] = []
 
-    def __call__(self, scan: Scan, belief: Belief) -> None:
-        """Take one scan and the belief after it."""
+    def __call__(self, scan: Scan, memory: Memory, row: Row) -> None:  # noqa: ARG002 (a listener's form)
+        """Take one scan and what is remembered after it."""
+        belief = belief_of(memory)
         self.t_ns.append(belief.t_ns)
         self.x.append(mean_vector(belief.x))
         self.P.append(belief.P)

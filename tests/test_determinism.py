@@ -4,7 +4,7 @@ import filecmp
 
 import pytest
 
-RESULTS = ("rows.jsonl", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz", "run.json")
+RESULTS = ("rows.jsonl", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz", "result.mcap", "view.npz", "run.json")
 ELSEWHERE = {"PYTHONHASHSEED": "77", "OMP_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "3", "MKL_NUM_THREADS": "2"}
 
 

@@ -100,3 +100,36 @@ def test_off_a_terminal_nothing_but_results_is_printed(cli, fixtures_folder):
     assert done.err == ""
     assert "\x1b" not in done.out
     assert max(map(len, done.out.splitlines())) <= 80
+
+
+def test_result_log_opens_in_rosbags_with_every_message(result):
+    from rosbags.highlevel import AnyReader
+
+    out, document = result
+    count, healthy = len(document["rows"]), sum(r["gamma"] for r in document["rows"])
+    seen = {}
+    with AnyReader([out / "result.mcap"]) as reader:
+        for connection, _, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            seen.setdefault(connection.topic, []).append(message)
+    assert {t: len(m) for t, m in seen.items() if t in ("/tf", "/points_aligned", "/diagnostics")} == {
+        "/tf": count,
+        "/points_aligned": count,
+        "/diagnostics": count,
+    }
+    assert len(seen["/registration/pose"]) >= healthy
+    assert [s.status[0].message for s in seen["/diagnostics"]] == [r["reason"] for r in document["rows"]]
+    first, row = seen["/estimate/pose"][0], document["rows"][0]
+    assert first.pose.pose.position.x == row["x_m"]
+    assert np.linalg.eigvalsh(first.pose.covariance.reshape(6, 6)).min() > 0.0
+    assert len(seen["/model"][0].points) % 3 == 0
+
+
+def test_the_covariance_in_the_result_log_is_that_of_the_rows(result):
+    from avsreplay.keepers import pose_covariance
+
+    out, document = result
+    for belief, row in zip(read_beliefs(out / "beliefs.npz"), document["rows"], strict=True):
+        covariance = pose_covariance(belief)
+        assert np.sqrt(np.trace(covariance[:3, :3])) == pytest.approx(row["pos_1s_m"], rel=1e-9)
+        assert np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))) == pytest.approx(row["rot_1s_deg"], rel=1e-9)

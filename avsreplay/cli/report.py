@@ -6,7 +6,9 @@ from pathlib import Path
 
 import click
 
-__all__ = ["command"]
+from avsreplay.errors import UsageError
+
+__all__ = ["command", "write_page"]
 
 EPILOG = """\b
 Examples:
@@ -29,14 +31,18 @@ def command(result: Path, output: Path | None, title: str | None, overwrite: boo
     The page needs no network and opens from disk: charts on one linked time axis, a 3D view with a time slider, faults
     with jump-to, the effective configuration.
     """
-    from avsreplay.errors import UsageError
+    target = output or (result if result.is_dir() else result.parent) / "report.html"
+    if target.exists() and not overwrite:
+        raise UsageError("is already there", where=str(target), hint="name another with -o, or add --overwrite")
+    click.echo(write_page(result, target, title))
+
+
+def write_page(result: Path, target: Path, title: str | None = None) -> str:
+    """Build the page of ``result``, write it to ``target`` whole or not at all, and say so in one line."""
     from avsreplay.report import load_result
     from avsreplay.report.atomic import atomic_text
     from avsreplay.report.page import build_page
 
-    target = output or (result if result.is_dir() else result.parent) / "report.html"
-    if target.exists() and not overwrite:
-        raise UsageError("is already there", where=str(target), hint="name another with -o, or add --overwrite")
     found = load_result(result)
     page = build_page(
         found.rows,
@@ -49,4 +55,4 @@ def command(result: Path, output: Path | None, title: str | None, overwrite: boo
     )
     with atomic_text(target) as stream:
         stream.write(page)
-    click.echo(f"{target} ({len(page) / 1e6:.2f} MB)")
+    return f"{target} ({len(page) / 1e6:.2f} MB)"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
     from avsreplay.job import Job, Run
     from avsreplay.report import Summary
-    from avsreplay.results import Beliefs
+    from avsreplay.results import ResultDirectory
     from avsreplay.rows import Row
 
 __all__ = ["command"]
@@ -75,6 +76,7 @@ class _Start(click.ParamType[str | float]):
 @click.option("--golden", type=click.Path(path_type=Path), help="Rows that must come out; exit 1 if they do not.")
 @click.option("--update-golden", type=click.Path(path_type=Path), help="Write the golden rows anew.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Directory for rows, trajectories and run facts.")
+@click.option("--report", "page", is_flag=True, help="Add the HTML page, report.html, to the result directory.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
@@ -84,6 +86,7 @@ def command(
     golden: Path | None,
     update_golden: Path | None,
     output: Path | None,
+    page: bool,
     overwrite: bool,
     as_json: bool,
     table_every: int | None,
@@ -95,20 +98,18 @@ def command(
     LOG is an MCAP, a ROS bag or a folder of scans. A log written by 'avsreplay record' runs with no flag.
     """
     from avsreplay.job import Run
-    from avsreplay.results import Beliefs, ResultDirectory
+    from avsreplay.results import ResultDirectory
 
     if golden and update_golden:
         raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
+    if page and output is None:
+        raise UsageError("--report needs a result directory to stand in", hint="add -o DIR")
     target = ResultDirectory(output, overwrite=overwrite) if output else None
-    beliefs = Beliefs()
     with Run(_job(log, flags)) as run:
-        rows, seconds = _replayed(run, beliefs)
-        summary = run.summary()
-        record = _record(run, summary)
-        if target:
-            with target:
-                target.write(rows, beliefs, record)
-        _print(rows, summary, record, as_json, table_every, table_all, len(rows) / seconds)
+        rows, summary, record, scans_per_s = _replayed(run, target)
+        _print(rows, summary, record, as_json, table_every, table_all, scans_per_s)
+        if page and output:
+            _page(output)
         _gate(rows, golden, update_golden, as_json)
         _own_up(run)
 
@@ -137,12 +138,27 @@ def _options(flags: dict[str, Any], starts: tuple[Any, ...]) -> Any:
         raise UsageError(str(error), hint="correct the flag") from None
 
 
-def _replayed(run: Run, beliefs: Beliefs) -> tuple[list[Row], float]:
+def _replayed(run: Run, target: ResultDirectory | None) -> tuple[list[Row], Summary, dict[str, Any], float]:
+    """Rows, summary, run facts and scans a second; with a target everything is kept there."""
     from avsreplay.cli.progress import tracked
+    from avsreplay.keepers import ResultKeeper
 
-    begun = time.perf_counter()
-    rows = list(tracked(run.rows([beliefs]), len(run), "replaying"))
-    return rows, max(time.perf_counter() - begun, 1e-9)
+    keeper = ResultKeeper(target, run.surface) if target else None
+    with keeper or nullcontext():
+        begun = time.perf_counter()
+        rows = list(tracked(run.rows(keeper.listeners if keeper else ()), len(run), "replaying"))
+        seconds = max(time.perf_counter() - begun, 1e-9)
+        summary = run.summary()
+        record = _record(run, summary)
+        if keeper:
+            keeper.finish(rows, record)
+    return rows, summary, record, len(rows) / seconds
+
+
+def _page(result: Path) -> None:
+    from avsreplay.cli.report import write_page
+
+    click.echo(write_page(result, result / "report.html"), err=True)
 
 
 def _record(run: Run, summary: Summary) -> dict[str, Any]:

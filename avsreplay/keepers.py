@@ -1,0 +1,142 @@
+"""Listeners that keep what pictures need: the result log for viewers, the thinned view for the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.chain import Memory
+from avsreplay.estimate.measure import sensitivity
+from avsreplay.geometry import Array, Pose
+from avsreplay.job import Listener
+from avsreplay.log.result_log import ResultFrame, ResultLog
+from avsreplay.plan import Flight
+from avsreplay.records import Belief, Scan, Surface
+from avsreplay.report import CloudView, PathView, View, thin_cloud, thin_surface, write_view
+from avsreplay.results import Beliefs, ResultDirectory, belief_of
+from avsreplay.rows import Row
+
+__all__ = ["LogKeeper", "ResultKeeper", "ViewKeeper", "pose_covariance"]
+
+PATH_POINTS = 41
+_VALUES = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
+
+
+def pose_covariance(belief: Belief) -> Array:
+    """(6, 6) of the fixture's (position in {A} [m], rotation vector in {A} [rad])."""
+    H = sensitivity(belief.x)
+    to_a = np.zeros((6, 6))
+    to_a[:3, :3] = np.eye(3)
+    to_a[3:, 3:] = 2.0 * geometry.matrix(belief.x.q_ab)  # half angle in {B} -> full angle in {A}
+    return np.asarray(to_a @ H @ belief.P @ H.T @ to_a.T)
+
+
+class _Paths:
+    """Tells a new plan from the one before and samples it."""
+
+    def __init__(self) -> None:
+        self._known: Flight | None = None
+
+    def new(self, memory: Memory) -> tuple[Array, Array] | None:
+        """(times (n,), positions (n, 3)) of a plan not seen before."""
+        flight = memory.mission.flight
+        if flight is None or flight is self._known:
+            return None
+        self._known = flight
+        times = np.linspace(0.0, flight.t_go_s, PATH_POINTS)
+        return times, flight.at(times)[0]
+
+
+class LogKeeper:
+    """Writes each scan's outcome to ``result.mcap``; ``close`` finishes the file."""
+
+    def __init__(self, path: Path, surface: Surface) -> None:
+        self._log, self._paths = ResultLog(path, surface), _Paths()
+
+    def close(self) -> None:
+        """Finish the file."""
+        self._log.close()
+
+    def __call__(self, scan: Scan, memory: Memory, row: Row) -> None:
+        """Take one scan."""
+        belief = belief_of(memory)
+        values = {name: value for name in _VALUES if (value := getattr(row, name)) is not None}
+        self._log.write(
+            ResultFrame(
+                t_ns=row.t_ns,
+                points=scan.points,
+                estimate=belief.x.T_ac,
+                covariance=pose_covariance(belief),
+                registration=_registered(row),
+                truth=scan.truth,
+                path=self._paths.new(memory),
+                healthy=row.gamma == 1,
+                message=row.reason,
+                values=values,
+            )
+        )
+
+
+class ViewKeeper:
+    """Keeps a thinned model, thinned clouds and planned paths for the page."""
+
+    def __init__(self, surface: Surface) -> None:
+        self._surface, self._paths = surface, _Paths()
+        self._clouds: list[CloudView] = []
+        self._plans: list[PathView] = []
+
+    def __call__(self, scan: Scan, memory: Memory, row: Row) -> None:
+        """Take one scan."""
+        self._clouds.append(thin_cloud(scan.seq, scan.points))
+        path = self._paths.new(memory)
+        if path is not None:
+            self._plans.append(PathView(row.t_ns, np.asarray(path[1], np.float32)))
+
+    def view(self) -> View:
+        """Everything kept so far."""
+        vertices, faces = thin_surface(self._surface)
+        return View(vertices, faces, tuple(self._clouds), tuple(self._plans))
+
+
+class ResultKeeper:
+    """Everything a run leaves in a result directory; a context manager around the replay.
+
+    The directory appears when the block ends well, after ``finish``, and not otherwise.
+    """
+
+    def __init__(self, directory: ResultDirectory, surface: Surface) -> None:
+        self._directory, self._surface = directory, surface
+        self._beliefs, self._view = Beliefs(), ViewKeeper(surface)
+
+    def __enter__(self) -> ResultKeeper:
+        self._directory.__enter__()
+        self._log = LogKeeper(self._directory.file("result.mcap"), self._surface)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self._log.close()
+        self._directory.__exit__(kind, error, traceback)
+
+    @property
+    def listeners(self) -> tuple[Listener, ...]:
+        """What must hear every scan."""
+        return self._beliefs, self._view, self._log
+
+    def finish(self, rows: Sequence[Row], record: Mapping[str, Any]) -> None:
+        """Write what needs the whole run; ``record`` is ``run.json``."""
+        self._directory.write(rows, self._beliefs, record)
+        write_view(self._directory.file("view.npz"), self._view.view())
+
+
+def _registered(row: Row) -> Pose | None:
+    if row.reg_x_m is None:
+        return None
+    q = [getattr(row, f"reg_q{axis}") for axis in "xyzw"]
+    return Pose(np.array(q), np.array([row.reg_x_m, row.reg_y_m, row.reg_z_m]))
