@@ -437,3 +437,22 @@ def test_a_tiny_run_without_anything_else_loads(opened, make_rows, n):
     browser = opened(rows=rows, truth=None, poses=(), view=None) if n == 1 else opened(rows=rows, view=None)
     assert browser.get_log("browser") == []
     assert _text(browser, "#now").startswith("scan 0 ")
+
+
+def test_a_comparison_overlays_and_reads_runs_of_different_rates(browser, tmp_path, make_rows):
+    from avsreplay.report.page.comparison import build_comparison
+
+    for name, rows in (("one", make_rows(60)), ("two", make_rows(60)[::2])):
+        (tmp_path / name).mkdir()
+        report.write_rows(tmp_path / name / "rows.jsonl", rows)
+    results = [report.load_result(tmp_path / name) for name in ("one", "two")]
+    path = tmp_path / "c.html"
+    path.write_text(build_comparison(results), encoding="utf-8")
+    browser.get(path.as_uri())
+    assert browser.get_log("browser") == []
+    outputs = "return [...document.querySelectorAll('#chart-sigma1 output')].map((o) => o.textContent)"
+    _slide(browser, 4)
+    one, two = browser.execute_script(outputs)
+    assert one == two != "\u2013"
+    _slide(browser, 5)
+    assert browser.execute_script(outputs)[1] == "\u2013"

@@ -13,7 +13,16 @@ if TYPE_CHECKING:
     from avsreplay.report.result import Result, facts_record, load_result, read_tum
     from avsreplay.report.summary import Summary, SummaryFold
     from avsreplay.report.table import make_console, print_golden, print_tables
-    from avsreplay.report.view import CloudView, PathView, View, read_view, thin_cloud, thin_surface, write_view
+    from avsreplay.report.view import (
+        CloudView,
+        PathView,
+        View,
+        ViewFold,
+        read_view,
+        thin_cloud,
+        thin_surface,
+        write_view,
+    )
 
 _HOME = {
     "CloudView": "view",
@@ -24,6 +33,7 @@ _HOME = {
     "Summary": "summary",
     "SummaryFold": "summary",
     "View": "view",
+    "ViewFold": "view",
     "compare_golden": "golden",
     "document": "json_document",
     "dump_document": "json_document",
@@ -56,6 +66,7 @@ __all__ = [
     "Summary",
     "SummaryFold",
     "View",
+    "ViewFold",
     "compare_golden",
     "document",
     "dump_document",

@@ -78,13 +78,13 @@ def new_table(console: Console, title: str, *, tight: bool = False) -> Table:
     )
 
 
-def decimals(values: Iterable[float], least: int) -> int:
-    """Decimals that leave three figures of the middle value: a 0.2 m target needs more than an 8 m one."""
+def decimals(values: Iterable[float], least: int, *, figures: int = 3) -> int:
+    """Decimals that leave some figures of the middle value: a 0.2 m target needs more than an 8 m one."""
     sizes = sorted(abs(v) for v in values if v)
     if not sizes:
         return least
-    figures = 2 - math.floor(math.log10(sizes[len(sizes) // 2]))
-    return min(max(least, figures), 8)
+    wanted = figures - 1 - math.floor(math.log10(sizes[len(sizes) // 2]))
+    return min(max(least, wanted), 8)
 
 
 def head(column: Column) -> str:

@@ -91,7 +91,7 @@ def _format(column: Column, rows: Sequence[Row]) -> str:
     if column.unit != "m" or not column.fmt.endswith("f"):
         return column.fmt
     values = (getattr(row, column.name) for row in rows)
-    return f".{decimals((v for v in values if v is not None), int(column.fmt[1:-1]))}f"
+    return f".{decimals((v for v in values if v is not None), int(column.fmt[1:-1]), figures=2)}f"
 
 
 def _cell(row: Row, column: Column, fmt: str, palette: Palette) -> Text:

@@ -12,6 +12,7 @@ from avsreplay.report.spread import Spread
 from avsreplay.report.summary import Parameter, Summary
 from avsreplay.report.table.console import Palette, decimals, new_table
 from avsreplay.report.table.scans import scan_table
+from avsreplay.report.table.sparks import print_sparks
 from avsreplay.report.words import fact_lines
 from avsreplay.rows import Row
 
@@ -35,11 +36,17 @@ def print_tables(
     every: int | None = None,
     all: bool = False,
     scans_per_s: float | None = None,
+    plain: bool = False,
 ) -> None:
-    """The per-scan table, then the summary. ``scans_per_s`` is the clock's word and stands in no file."""
+    """The per-scan table, sparklines on a wide terminal unless ``plain``, the summary.
+
+    ``scans_per_s`` is the clock's word and stands in no file.
+    """
     if rows:
         console.print(scan_table(console, rows, every=every, all=all))
         console.print()
+        if not plain:
+            print_sparks(console, rows)
     print_summary(console, summary, scans_per_s=scans_per_s)
 
 
@@ -61,22 +68,23 @@ def print_summary(console: Console, summary: Summary, *, scans_per_s: float | No
 def _errors(console: Console, summary: Summary) -> Table:
     table = new_table(console, "Errors")
     table.add_column("of", no_wrap=True)
-    table.add_column("unit")
+    table.add_column("unit", no_wrap=True)
     for name in ("n", *(name for name, _ in _STATISTICS)):
         table.add_column(name, justify="right", no_wrap=True)
-    lines: list[tuple[str, str, Spread | None, int]] = []
+    lines: list[tuple[str, str, Spread | None]] = []
     for name, errors in (
         ("pose, healthy", summary.pose_healthy),
         ("pose, coasting", summary.pose_coasting),
         ("registration", summary.registration_healthy),
     ):
-        lines.append((name, "m", errors.position_m, 4))
-        lines.append((name, "deg", errors.rotation_deg, 3))
-    lines.append(("fit error rms", "m", summary.fit_error_m, 5))
-    for name, unit, spread, least in lines:
+        lines.append((name, "m", errors.position_m))
+        lines.append((name, "deg", errors.rotation_deg))
+    lines.append(("fit error rms", "m", summary.fit_error_m))
+    for name, unit, spread in lines:
         if spread is not None:
-            fmt = f".{decimals([spread.rmse], least)}f"
-            table.add_row(name, unit, str(spread.count), *(format(get(spread), fmt) for _, get in _STATISTICS))
+            unit, factor = ("mm", 1000.0) if unit == "m" and spread.rmse < 1.0 else (unit, 1.0)
+            fmt = f".{decimals([factor * spread.rmse], 2)}f"
+            table.add_row(name, unit, str(spread.count), *(format(factor * get(spread), fmt) for _, get in _STATISTICS))
     return table
 
 

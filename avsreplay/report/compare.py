@@ -1,0 +1,122 @@
+"""Several runs side by side: their figures, and where two of them first part."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from avsreplay.report.golden import GoldenResult, compare_records
+from avsreplay.report.jsonl import plain
+from avsreplay.report.spread import Spread
+from avsreplay.report.summary import Errors, Summary
+from avsreplay.rows import Row, columns
+
+__all__ = ["METRICS", "Metric", "first_divergence", "metrics"]
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """One figure of a run: name with its unit as suffix, unit, meaning, and how to get it (None where it has none)."""
+
+    name: str
+    unit: str
+    doc: str
+    of: Callable[[Summary], float | None]
+
+
+def _spread(pick: Callable[[Summary], Spread | None], figure: str) -> Callable[[Summary], float | None]:
+    def get(summary: Summary) -> float | None:
+        spread = pick(summary)
+        return None if spread is None else float(getattr(spread, figure))
+
+    return get
+
+
+def _errors(prefix: str, words: str, pick: Callable[[Summary], Errors]) -> list[Metric]:
+    out = []
+    for figure in ("rmse", "median", "max"):
+        position = _spread(lambda s: pick(s).position_m, figure)
+        rotation = _spread(lambda s: pick(s).rotation_deg, figure)
+        out.append(Metric(f"{prefix}_pos_{figure}_m", "m", f"{figure} position error, {words}", position))
+        out.append(Metric(f"{prefix}_rot_{figure}_deg", "deg", f"{figure} attitude error, {words}", rotation))
+    return out
+
+
+def _coast(field: str) -> Callable[[Summary], float | None]:
+    def get(summary: Summary) -> float | None:
+        coast = summary.longest_coast
+        return None if coast is None else getattr(coast, field)
+
+    return get
+
+
+def _parameter(name: str) -> Callable[[Summary], float | None]:
+    def get(summary: Summary) -> float | None:
+        return next((p.error for p in summary.parameters if p.name == name), None)
+
+    return get
+
+
+def _known(pick: Callable[[Summary], float]) -> Callable[[Summary], float | None]:
+    """A figure of the fault account, None where the log does not say what was injected."""
+
+    def get(summary: Summary) -> float | None:
+        return pick(summary) if summary.faults.known else None
+
+    return get
+
+
+METRICS: tuple[Metric, ...] = (
+    Metric("scans", "", "scans replayed", lambda s: s.scans),
+    Metric("healthy", "", "scans used by the filter", lambda s: s.healthy),
+    Metric("healthy_ratio", "", "scans used over scans replayed", lambda s: s.healthy / s.scans if s.scans else None),
+    *_errors("pose", "healthy scans", lambda s: s.pose_healthy),
+    *_errors("coast", "coasting scans", lambda s: s.pose_coasting),
+    *_errors("reg", "of the registration, healthy scans", lambda s: s.registration_healthy),
+    Metric("coast_end_pos_m", "m", "position error at the end of the longest coast", _coast("pos_err_m")),
+    Metric("coast_end_rot_deg", "deg", "attitude error at the end of the longest coast", _coast("rot_err_deg")),
+    Metric("fit_median_m", "m", "median fit error, healthy scans", _spread(lambda s: s.fit_error_m, "median")),
+    Metric("iterations_median", "", "median passes of the registration", _spread(lambda s: s.iterations, "median")),
+    Metric("faults_missed", "", "harmful faults not detected", _known(lambda s: s.faults.missed)),
+    Metric("scans_missed", "", "harmful scans used", _known(lambda s: s.faults.missed_scans)),
+    Metric("false_alarms", "", "flagged scans without a fault", _known(lambda s: s.faults.false_alarms)),
+    Metric("false_alarm_rate", "", "of scans without a fault", _known(lambda s: s.faults.false_alarm_rate)),
+    Metric("recovery_s", "s", "longest time to recover", lambda s: s.faults.longest_recovery_s),
+    Metric("sigma1_err", "", "error of sigma1 at the last scan", _parameter("sigma1")),
+    Metric("sigma2_err", "", "error of sigma2 at the last scan", _parameter("sigma2")),
+    Metric("c_err_m", "m", "error of varrho at the last scan", _parameter("c (varrho)")),
+    Metric("mu_err_deg", "deg", "error of mu at the last scan", _parameter("mu")),
+    Metric("sigma_hits", "", "times a sigma bound cut the gain", lambda s: s.sigma_hits),
+    Metric("nis_median", "", "median NIS (5.35 expected)", lambda s: s.nis.median if s.nis else None),
+    Metric("nis_inside", "", "share of NIS inside its 95 % band", lambda s: s.nis.inside if s.nis else None),
+    Metric("nees_median", "", "median NEES (19.34 expected)", lambda s: s.nees.median if s.nees else None),
+    Metric("nees_inside", "", "share of NEES inside its 95 % band", lambda s: s.nees.inside if s.nees else None),
+    Metric("ogm_log10_cond", "", "log10 condition of the Gramian, at the end", lambda s: s.observability.log10_cond),
+    Metric("ogm_rank", "", "rank of the Gramian, at the end", lambda s: s.observability.rank),
+    Metric("t1_s", "s", "first scan the planner may rely on", lambda s: s.convergence.t1_s),
+    Metric("withdrawn", "", "times convergence was taken back", lambda s: s.convergence.withdrawn),
+    Metric("capture_s", "s", "planned instant of capture, last plan", lambda s: s.capture.last_s),
+    Metric("capture_std_s", "s", "its spread over the replans", lambda s: s.capture.std_s),
+    Metric("gaps", "", "intervals longer than 1.5 times the median", lambda s: s.gaps),
+    Metric("losses", "", "damaged places of the log", lambda s: s.counts.get("losses")),
+)
+
+
+def metrics(summary: Summary) -> dict[str, float | None]:
+    """Every figure by name, None where the run has none."""
+    return {m.name: _finite(m.of(summary)) for m in METRICS}
+
+
+def _finite(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else value
+
+
+def first_divergence(baseline: Sequence[Row], other: Sequence[Row], *, first: int = 20) -> GoldenResult:
+    """Where the rows of two runs first differ by more than the columns' golden tolerances."""
+    return compare_records(_records(baseline), _records(other), first=first)
+
+
+def _records(rows: Sequence[Row]) -> Mapping[int, Mapping[str, object]]:
+    names = [c.name for c in columns()]
+    return {row.seq: {name: plain(getattr(row, name)) for name in names} for row in rows}

@@ -1,0 +1,172 @@
+"""Rules a run must keep, from a TOML file, and their outcomes for people and for CI."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from avsreplay.errors import CheckFailed, UsageError
+from avsreplay.report.compare import METRICS
+from avsreplay.settings import build, load
+
+__all__ = ["GateRules", "Outcome", "Rule", "check_gate", "github_lines", "judge", "junit", "load_rules"]
+
+_LIMITS = ("min", "max", "min_ratio", "max_ratio", "max_increase", "max_decrease")
+_RELATIVE = _LIMITS[2:]
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One rule on one metric; all limits given must hold.
+
+    A run without the metric breaks the rule, unless ``optional``.
+    """
+
+    metric: str
+    min: float | None = None  # least value
+    max: float | None = None  # greatest value
+    min_ratio: float | None = None  # least multiple of the baseline's value
+    max_ratio: float | None = None  # greatest multiple of the baseline's value
+    max_increase: float | None = None  # most above the baseline's value
+    max_decrease: float | None = None  # most below the baseline's value
+    optional: bool = False  # pass where the run has no such figure
+    note: str = ""  # why; printed with the outcome
+
+    def __post_init__(self) -> None:
+        known = [m.name for m in METRICS]
+        if self.metric not in known:
+            raise ValueError(f"unknown metric '{self.metric}'; known: {', '.join(known)}")
+        if not self.limits:
+            raise ValueError(f"the rule on '{self.metric}' has no limit; give one of {', '.join(_LIMITS)}")
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """The limits given, by name."""
+        return {name: getattr(self, name) for name in _LIMITS if getattr(self, name) is not None}
+
+    @property
+    def relative(self) -> bool:
+        """Does it need a baseline?"""
+        return any(name in _RELATIVE for name in self.limits)
+
+    @property
+    def text(self) -> str:
+        """The rule in one line."""
+        return f"{self.metric}: " + ", ".join(f"{name} {value:g}" for name, value in self.limits.items())
+
+
+@dataclass(frozen=True, slots=True)
+class GateRules:
+    """The file: ``[[rule]]`` tables."""
+
+    rule: tuple[Rule, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.rule:
+            raise ValueError("no [[rule]] in the file")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What one rule says of one run; ``why`` is the limit that was broken, with both numbers."""
+
+    run: str
+    rule: Rule
+    value: float | None
+    ok: bool
+    why: str = ""
+
+
+def load_rules(path: str | Path) -> tuple[Rule, ...]:
+    """The rules in a TOML file. Raises UnreadableInput, or UsageError with the line."""
+    return build(GateRules, load(path)).rule
+
+
+def judge(
+    rules: Sequence[Rule], runs: Sequence[tuple[str, Mapping[str, float | None]]], *, baseline: bool = True
+) -> list[Outcome]:
+    """Every rule on every run but the baseline, which is the first; without a baseline, absolute rules on all.
+
+    Raises UsageError for a relative rule without a baseline.
+    """
+    if not baseline or len(runs) == 1:
+        needy = next((rule for rule in rules if rule.relative), None)
+        if needy is not None:
+            raise UsageError(f"'{needy.text}' needs a baseline", where="--gate", hint="name the baseline first")
+        return [_outcome(rule, name, figures, {}) for name, figures in runs for rule in rules]
+    base = runs[0][1]
+    return [_outcome(rule, name, figures, base) for name, figures in runs[1:] for rule in rules]
+
+
+def _outcome(rule: Rule, run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]) -> Outcome:
+    value = figures.get(rule.metric)
+    if value is None:
+        return Outcome(run, rule, None, rule.optional, "" if rule.optional else "the run has no such figure")
+    reference = base.get(rule.metric)
+    if rule.relative and reference is None:
+        return Outcome(run, rule, value, rule.optional, "" if rule.optional else "the baseline has no such figure")
+    for name, limit in rule.limits.items():
+        low, high = _bounds(name, limit, reference or 0.0)
+        if not low <= value <= high:
+            bound = high if value > high else low
+            sign = ">" if value > high else "<"
+            from_base = f" (baseline {reference:.6g})" if name in _RELATIVE else ""
+            return Outcome(run, rule, value, False, f"{value:.6g} {sign} {bound:.6g}, {name} {limit:g}{from_base}")
+    return Outcome(run, rule, value, True)
+
+
+def _bounds(name: str, limit: float, reference: float) -> tuple[float, float]:
+    infinity = float("inf")
+    return {
+        "min": (limit, infinity),
+        "max": (-infinity, limit),
+        "min_ratio": (limit * reference, infinity),
+        "max_ratio": (-infinity, limit * reference),
+        "max_increase": (-infinity, reference + limit),
+        "max_decrease": (reference - limit, infinity),
+    }[name]
+
+
+def check_gate(outcomes: Sequence[Outcome]) -> None:
+    """Raise CheckFailed naming the first broken rule."""
+    broken = [o for o in outcomes if not o.ok]
+    if broken:
+        o = broken[0]
+        what = f"{len(broken)} of {len(outcomes)} rules broken, the first by {o.run}: {o.rule.metric} {o.why}"
+        raise CheckFailed(what, where="--gate", hint=o.rule.note or None)
+
+
+def junit(outcomes: Sequence[Outcome]) -> str:
+    """JUnit XML: a suite a run, a case a rule. No times in it: the same outcomes give the same bytes."""
+    root = ET.Element("testsuites", name="avsreplay gate")
+    for run in dict.fromkeys(o.run for o in outcomes):
+        mine = [o for o in outcomes if o.run == run]
+        failures = sum(not o.ok for o in mine)
+        suite = ET.SubElement(root, "testsuite", name=run, tests=str(len(mine)), failures=str(failures))
+        for o in mine:
+            case = ET.SubElement(suite, "testcase", classname=run, name=o.rule.text)
+            if not o.ok:
+                ET.SubElement(case, "failure", message=o.why).text = o.rule.note
+    ET.indent(root)
+    return ET.tostring(root, encoding="unicode", xml_declaration=False) + "\n"
+
+
+def github_lines(outcomes: Sequence[Outcome]) -> list[str]:
+    """GitHub workflow commands: an error a broken rule, one notice where all hold."""
+    broken = [o for o in outcomes if not o.ok]
+    if not broken:
+        return [f"::notice title=avsreplay gate::{len(outcomes)} rules hold"]
+    return [
+        f"::error title={_property(f'avsreplay gate: {o.run}')}::{_message(f'{o.rule.metric}: {o.why}')}"
+        for o in broken
+    ]
+
+
+def _message(text: str) -> str:
+    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _message(text).replace(":", "%3A").replace(",", "%2C")
