@@ -9,7 +9,6 @@ class Index:
         vertices: NDArray[np.float64],
         faces: NDArray[np.int32],
         kept: NDArray[np.int32],
-        normals: NDArray[np.float64],
         reach_m: float,
         threads: int = 1,
         portable: bool = False,

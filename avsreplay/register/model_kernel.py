@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import MissingBackend
 from avsreplay.geometry import Array
-from avsreplay.register.model_reference import cloud_normals
 
 Rule = tuple[int, int, float, float, float, float, float]
 
@@ -34,8 +33,7 @@ class KernelIndex:
             raise MissingBackend(
                 "the C++ kernel is not built", where="avsreplay.register._kernel", hint="install a compiler and run pip"
             ) from error
-        normals = np.empty((0, 3)) if len(faces) else cloud_normals(vertices)
-        self._index = _kernel.Index(vertices, faces, kept, normals, reach_m, threads, portable)
+        self._index = _kernel.Index(vertices, faces, kept, reach_m, threads, portable)
 
     def closest(self, points: NDArray[Any], threads: int) -> tuple[Array, Array, NDArray[np.int32], Array]:
         """Feet (n, 3), squared distances (n,), ids (n,), normals (n, 3)."""

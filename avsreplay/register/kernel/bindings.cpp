@@ -81,14 +81,13 @@ Numpy matrix(const double* rows34) {
 
 class Index {
  public:
-  Index(Doubles vertices, Ints faces, Ints kept, Doubles normals, double reach, int threads, bool portable)
+  Index(Doubles vertices, Ints faces, Ints kept, double reach, int threads, bool portable)
       : portable_(portable) {
     require(vertices.ndim() == 2 && vertices.shape(1) == 3 && vertices.shape(0) > 0, "vertices must be (n, 3), n > 0");
-    require(kept.shape(0) > 0 || normals.size() == vertices.size(), "a cloud needs its normals, (n, 3)");
-    const Surface s{vertices.data(), (int64_t)vertices.shape(0), faces.data(), kept.data(), (int64_t)kept.shape(0),
-                    normals.data()};
+    const Surface s{vertices.data(), (int64_t)vertices.shape(0), faces.data(), kept.data(), (int64_t)kept.shape(0)};
     nb::gil_scoped_release release;
-    build(store_, s, reach, threads);
+    Team team(threads);
+    build(store_, s, reach, code(), team);
   }
 
   nb::tuple closest(nb::handle points, int threads) const {
@@ -187,8 +186,8 @@ class Index {
 
 NB_MODULE(_kernel, m) {
   nb::class_<Index>(m, "Index")
-      .def(nb::init<Doubles, Ints, Ints, Doubles, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
-           nb::arg("kept"), nb::arg("normals"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
+      .def(nb::init<Doubles, Ints, Ints, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
+           nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
       .def("closest", &Index::closest, nb::arg("points"), nb::arg("threads") = 1)
       .def("icp", &Index::icp, nb::arg("points"), nb::arg("T_ca"), nb::arg("n_max"), nb::arg("n_plane"),
            nb::arg("gate_m"), nb::arg("tighten"), nb::arg("floor_m"), nb::arg("eps_rad"), nb::arg("eps_m"),

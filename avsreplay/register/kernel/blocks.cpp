@@ -82,7 +82,7 @@ void put(float (&to)[3][LANES], int lane, const Vec3& v) {
 void add_point(Store& s, const Surface& from, size_t block, int lane, int32_t i) {
   const Vec3 p = vertex(from, i), q = p - s.centre;
   s.points.push_back(p);
-  s.normals.push_back({from.normals[3 * (int64_t)i], from.normals[3 * (int64_t)i + 1], from.normals[3 * (int64_t)i + 2]});
+  s.normals.push_back({0, 0, 0});
   s.id.push_back(i);
   PointBlock& b = s.point_blocks[block];
   b.x[lane] = (float)q.x, b.y[lane] = (float)q.y, b.z[lane] = (float)q.z;

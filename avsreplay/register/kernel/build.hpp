@@ -1,6 +1,7 @@
 // From vertices and faces to a Store.
 #pragma once
 #include "hot.hpp"
+#include "team.hpp"
 
 namespace avs {
 
@@ -10,11 +11,11 @@ struct Surface {
   const int32_t* faces;    // (m, 3)
   const int32_t* kept;     // (k): which faces have an area
   int64_t n_kept;          // 0: a cloud
-  const double* normals;   // (n, 3) of a cloud
 };
 
-void build(Store& store, const Surface& surface, double reach, int threads);
-void build_blocks(Store& store, const Surface& surface);  // primitives, blocks, tree
-void build_cells(Store& store, const Code& code, int threads);
+void build(Store& store, const Surface& surface, double reach, const Code& code, Team& team);
+void build_blocks(Store& store, const Surface& surface);             // primitives, blocks, tree
+void build_normals(Store& store, const Code& code, Team& team);      // a cloud's, from each point's neighbours
+void build_cells(Store& store, const Code& code, Team& team);        // the grid of lists
 
 }  // namespace avs

@@ -53,16 +53,19 @@ struct Filtered {
   double distance;  // of the centre to the nearest primitive [m]
 };
 
+constexpr int NEIGHBOURS = 10;  // of a cloud's point, itself among them, that give its normal
+
 struct Code {
   const char* name;
   Filtered (*filter)(const Store&, const Filter&);
   void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Feet&);
+  void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
   void (*pass)(const Store&, const View&, int64_t first, int64_t last, const double* T, double gate2, Pass, Kept*, Sums&);
 };
 
 const Code& code_base();
-#if defined(AVS_HAS_V3)
-const Code& code_v3();
+#if defined(AVS_HAS_AVX2)
+const Code& code_avx2();
 #endif
 // The fastest code this machine runs; the baseline where `portable`. Both give the same bits.
 const Code& code(bool portable);

@@ -17,6 +17,8 @@ namespace AVS_ISA {
 
 #include "filter.hpp"
 
+#include "neighbours.hpp"
+
 #include "pass.hpp"
 
 static Filtered filter(const Store& s, const Filter& f) {
@@ -27,6 +29,10 @@ static void closest(const Store& s, const View& v, int64_t first, int64_t last, 
   s.mesh ? closest_kind<Triangles>(s, v, first, last, out) : closest_kind<Points>(s, v, first, last, out);
 }
 
+static void normals(const Store& s, int64_t first, int64_t last, Vec3* out) {
+  for (int64_t lane = first; lane < last; ++lane) out[lane] = normal_at(s, (uint32_t)lane);
+}
+
 static void pass(const Store& s, const View& v, int64_t first, int64_t last, const double* T, double gate2, Pass kind,
                  Kept* kept, Sums& out) {
   s.mesh ? pass_kind<Triangles>(s, v, first, last, T, gate2, kind, kept, out)
@@ -35,7 +41,7 @@ static void pass(const Store& s, const View& v, int64_t first, int64_t last, con
 }  // namespace AVS_ISA
 
 const Code& AVS_CODE() {
-  static const Code code{AVS_NAME, AVS_ISA::filter, AVS_ISA::closest, AVS_ISA::pass};
+  static const Code code{AVS_NAME, AVS_ISA::filter, AVS_ISA::closest, AVS_ISA::normals, AVS_ISA::pass};
   return code;
 }
 }  // namespace avs

@@ -12,9 +12,32 @@ namespace {
 
 constexpr int64_t MIN_INLIERS = 6;
 
-// Neighbours are kept once a step moves every point by less than this part of a cell: before, they would only be lost.
-constexpr double KEEP_UNDER = 1.0;
-constexpr Kept UNKNOWN{0, 0, 0, -1.f, -1};
+// Decides pass by pass whether neighbours are remembered; it shows in the time, never in the result. They are once a
+// step moves no point by more than KEEP_UNDER of a cell, and no longer where most were searched for all the same, until
+// the steps are half as long.
+class Memory {
+ public:
+  Memory(const Store& s, int64_t n, bool allowed) : extent_(s.extent), longest_(allowed ? KEEP_UNDER * s.cell : 0), n_(n) {}
+
+  Kept* for_step(double turn, double move) {
+    length_ = move + 0.5 * turn * extent_;
+    if (length_ >= longest_) return nullptr;
+    if (kept_.empty()) kept_.assign((size_t)n_, Kept{0, 0, 0, -1.f, -1});
+    return kept_.data();
+  }
+
+  void was_searched(int64_t searched) {
+    if (used_ && searched > (int64_t)(TOO_OFTEN * (double)n_)) longest_ = 0.5 * length_;
+    used_ = !kept_.empty();
+  }
+
+ private:
+  static constexpr double KEEP_UNDER = 0.5, TOO_OFTEN = 0.6;
+  double extent_, longest_, length_ = 0;
+  int64_t n_;
+  bool used_ = false;
+  std::vector<Kept> kept_;
+};
 
 double worst() { return std::numeric_limits<double>::infinity(); }
 
@@ -52,15 +75,15 @@ Sums run_pass(const Store& s, const Code& code, const View& v, const double* T, 
 }
 
 Outcome icp(const Store& s, const Code& code, const View& v, const double* T, const Rule& rule, bool keep, Team& team) {
-  std::vector<Kept> memory;
+  Memory memory(s, v.n, keep);
   Outcome o{};
   std::memcpy(o.T, T, sizeof o.T);
   o.gate = rule.gate, o.turn = o.move = worst(), o.rms = std::numeric_limits<double>::quiet_NaN();
   bool plane = rule.n_plane > 0;
   while (o.passes < rule.n_max && !o.converged) {
-    if (keep && memory.empty() && o.move + o.turn * s.extent < KEEP_UNDER * s.cell) memory.assign((size_t)v.n, UNKNOWN);
-    Kept* kept = memory.empty() ? nullptr : memory.data();
+    Kept* kept = memory.for_step(o.turn, o.move);
     const Sums sums = run_pass(s, code, v, o.T, o.gate, plane ? Pass::plane : Pass::point, kept, team);
+    if (kept) memory.was_searched((int64_t)sums.v[3]);
     ++o.passes;
     o.inliers = (int64_t)sums.v[0], o.ignored = (int64_t)sums.v[2], o.searched += (int64_t)sums.v[3];
     o.rms = o.inliers ? std::sqrt(sums.v[1] / sums.v[0]) : std::numeric_limits<double>::quiet_NaN();

@@ -14,22 +14,18 @@ void rotation(const double* q, double* D) {
   D[8] = 2 * (x * z - w * y), D[9] = 2 * (y * z + w * x), D[10] = 1 - 2 * (x * x + y * y);
 }
 
+void turn(double& u, double& v, double c, double s) {
+  const double x = c * u - s * v;
+  v = s * u + c * v, u = x;
+}
+
 void rotate_pair(double (&A)[4][4], double (&V)[4][4], int i, int j) {
   const double theta = (A[j][j] - A[i][i]) / (2 * A[i][j]);
   const double t = (theta < 0 ? -1 : 1) / (std::fabs(theta) + std::sqrt(theta * theta + 1));
   const double c = 1 / std::sqrt(t * t + 1), s = t * c;
-  for (int k = 0; k < 4; ++k) {
-    const double u = A[k][i], v = A[k][j];
-    A[k][i] = c * u - s * v, A[k][j] = s * u + c * v;
-  }
-  for (int k = 0; k < 4; ++k) {
-    const double u = A[i][k], v = A[j][k];
-    A[i][k] = c * u - s * v, A[j][k] = s * u + c * v;
-  }
-  for (int k = 0; k < 4; ++k) {
-    const double u = V[k][i], v = V[k][j];
-    V[k][i] = c * u - s * v, V[k][j] = s * u + c * v;
-  }
+  for (int k = 0; k < 4; ++k) turn(A[k][i], A[k][j], c, s);
+  for (int k = 0; k < 4; ++k) turn(A[i][k], A[j][k], c, s);
+  for (int k = 0; k < 4; ++k) turn(V[k][i], V[k][j], c, s);
 }
 
 // Unit eigenvector of the largest eigenvalue of a symmetric matrix, by Jacobi's rotations.
