@@ -1,7 +1,9 @@
 """Rendezvous with a moving grasp point in least time, under a supervisor, and what it would have done."""
 
-from avsreplay.plan.flight import Flight
+from avsreplay.plan.constrained import constrained
+from avsreplay.plan.flight import Flight, Path, StepFlight, path_of
 from avsreplay.plan.hindsight import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
+from avsreplay.plan.limits import Limits, Scene
 from avsreplay.plan.pilot import Pilot, PilotMemory, Sight
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.supervisor import (
@@ -21,18 +23,24 @@ __all__ = [
     "Execution",
     "Facts",
     "Flight",
+    "Limits",
     "Miss",
     "Motion",
+    "Path",
     "Pilot",
     "PilotMemory",
     "PlanParams",
+    "Scene",
     "Sight",
+    "StepFlight",
     "Supervisor",
     "SupervisorMemory",
     "SupervisorParams",
     "Tolerance",
+    "constrained",
     "execute",
     "interpolated",
     "miss",
+    "path_of",
     "rendezvous",
 ]

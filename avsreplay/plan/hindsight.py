@@ -14,7 +14,7 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
-from avsreplay.plan.flight import Flight
+from avsreplay.plan.flight import Path
 from avsreplay.plan.pilot import Pilot, PilotMemory, Sight
 from avsreplay.plan.supervisor import Action
 
@@ -81,7 +81,7 @@ class Execution:
         return self.ended.value
 
 
-def miss(flight: Flight, t_s: float, truth: Motion, attitude: Array | None = None) -> Miss:
+def miss(flight: Path, t_s: float, truth: Motion, attitude: Array | None = None) -> Miss:
     """A flight begun at ``t_s`` against the truth at its end; ``attitude`` (4,) is the planned q_ac there."""
     position, velocity = flight.at(np.array([flight.t_go_s]))
     return _miss_at(t_s + flight.t_go_s, flight.t_go_s, position[0], velocity[0], truth, attitude)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from avsreplay.geometry import Array
-from avsreplay.plan.flight import Flight
+from avsreplay.plan.flight import Path, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
 from avsreplay.records import Forecast, Plan, Trajectory
@@ -50,7 +50,7 @@ class Leg:
     t_ns: int
     r0: Array
     v0: Array
-    flight: Flight | None = None
+    flight: Path | None = None
     before: Leg | None = None
 
     def at(self, t_ns: int) -> tuple[Array, Array]:
@@ -163,7 +163,7 @@ class Pilot:
             return plan, None
         begin_ns = t_ns + round(wait_s * 1e9)
         before = leg if t_ns < leg.t_ns else replace(leg, before=None)
-        flown = Leg(begin_ns, r0, v0, Flight.of(plan, r0, v0), before)
+        flown = Leg(begin_ns, r0, v0, path_of(plan, r0, v0), before)
         return replace(plan, t_go_s=plan.t_go_s + wait_s, lower_bound_s=plan.lower_bound_s + wait_s), flown
 
     def _facts(self, memory: PilotMemory, sight: Sight, plan: Plan | None, leg: Leg) -> Facts:

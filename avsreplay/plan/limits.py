@@ -1,0 +1,117 @@
+"""The constraints that the paper's abstract names, and the target as they see it.
+
+Line of sight: the robot stays in a cone at the grasp point that turns with the target. Smooth capture: equal velocity,
+and a bounded acceleration relative to the grasp point at contact. Physical: thrust, speed. And a sphere to stay out of.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from avsreplay.geometry import Array
+from avsreplay.records import Trajectory
+
+__all__ = ["Limits", "SampledScene", "Scene"]
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a plan must respect besides thrust. None switches a limit off, unless its comment says auto."""
+
+    # half-angle of the approach cone at the grasp point [deg], below 90
+    cone_deg: float | None = None
+    # the cone holds within this distance of the grasp point [m]; auto: 0.25 of the extent
+    cone_range_m: float | None = None
+    # half-angle in the last metres, along the fixture's axis [deg], below 90
+    final_deg: float | None = None
+    # how long the last metres are [m]; auto: 0.06 of the extent
+    final_range_m: float | None = None
+    # radius of both cones at the grasp point itself [m]; auto: 0.00125 of the extent
+    mouth_m: float | None = None
+    # largest speed of the robot in {A} [m/s]
+    speed_max_mps: float | None = None
+    # largest acceleration relative to the grasp point at contact [m/s2]
+    contact_accel_mps2: float | None = None
+    # radius of the sphere round the mass centre to keep out of [m]
+    keepout_m: float | None = None
+    # within this distance of the grasp point the sphere does not hold [m]; auto: 0.06 of the extent
+    keepout_release_m: float | None = None
+    # thrust intervals of a constrained plan
+    nodes: int = 100
+    # step of the search over the capture time [s]
+    scan_s: float = 0.25
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if value is not None and not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{f.name} is {value}, must be a finite number above 0")
+        for name in ("cone_deg", "final_deg"):
+            if (getattr(self, name) or 0.0) >= 90.0:
+                raise ValueError(f"{name} is {getattr(self, name)}, must be below 90")
+        if self.nodes < 8:
+            raise ValueError(f"nodes is {self.nodes}, must be at least 8")
+
+    @property
+    def any(self) -> bool:
+        """Is there a limit at all?"""
+        named = (self.cone_deg, self.final_deg, self.speed_max_mps, self.contact_accel_mps2, self.keepout_m)
+        return any(value is not None for value in named)
+
+    def resolved(self, extent_m: float) -> Limits:
+        """With every length taken from the target's extent [m] where it was left out."""
+        shares = {"cone_range_m": 0.25, "final_range_m": 0.06, "mouth_m": 0.00125, "keepout_release_m": 0.06}
+        left_out = {name: share * extent_m for name, share in shares.items() if getattr(self, name) is None}
+        return replace(self, **left_out)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Scene:
+    """The target after the instant of planning.
+
+    Attributes:
+        goal: the grasp point.
+        axis: times (n,) -> (n, 3) unit vectors in {A}, outward along the fixture; the cones open along it.
+        centre: times (n,) -> (n, 3) mass centre [m]; the sphere stands round it.
+    """
+
+    goal: Trajectory
+    axis: Callable[[Array], Array] | None = None
+    centre: Callable[[Array], Array] | None = None
+
+    def check(self, limits: Limits) -> None:
+        """Raises ValueError where a limit needs what the scene does not know."""
+        if self.axis is None and (limits.cone_deg is not None or limits.final_deg is not None):
+            raise ValueError("cone_deg and final_deg need the fixture's axis, and the scene has none")
+        if limits.keepout_m is not None:
+            self._check_sphere(limits.keepout_m, limits.keepout_release_m or 0.0)
+
+    def _check_sphere(self, radius: float, release: float) -> None:
+        if self.centre is None:
+            raise ValueError("keepout_m needs the mass centre, and the scene has none")
+        now = np.zeros(1)
+        arm = float(np.linalg.norm(self.goal(now)[0] - self.centre(now)))
+        if radius >= arm + release:
+            raise ValueError(f"keepout_m is {radius}, must be below {arm + release:.3f}: arm and keepout_release_m")
+
+
+class SampledScene:
+    """A scene called once on a grid and joined by cubic splines, for the many instants between nodes."""
+
+    def __init__(self, scene: Scene, horizon_s: float, step_s: float) -> None:
+        from scipy.interpolate import CubicSpline
+
+        times = np.linspace(0.0, horizon_s, max(math.ceil(horizon_s / step_s), 4) + 1)
+        zero = np.zeros((len(times), 3))
+        columns = [scene.goal(times)[0], scene.axis(times) if scene.axis else zero]
+        columns.append(scene.centre(times) if scene.centre else zero)
+        self._spline = CubicSpline(times, np.concatenate(columns, axis=1))
+
+    def at(self, times: Array) -> tuple[Array, Array, Array]:
+        """Grasp point, axis and mass centre, each (n, 3), at times (n,)."""
+        values: Array = self._spline(times)
+        return values[:, :3], values[:, 3:6], values[:, 6:]

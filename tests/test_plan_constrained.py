@@ -1,0 +1,166 @@
+"""Plans under limits: the limits hold between the nodes too, and what does not act changes nothing."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from avsreplay.plan import Limits, PlanParams, Scene, StepFlight, constrained, path_of, rendezvous
+from avsreplay.records import PlanStatus
+
+ORIGIN = np.zeros(3)
+PARAMS = PlanParams(a_max_mps2=0.05)
+CENTRE = np.array([0.0, 0.0, 5.0])
+
+
+def body(rate=0.03, arm=1.0, phase=0.5):
+    """A target that turns about y at ``rate``, its grasp point out on an arm, the fixture's axis along the arm."""
+
+    def axis(t):
+        return np.stack([np.sin(rate * t + phase), 0 * t, -np.cos(rate * t + phase)], 1)
+
+    def turn(t):
+        return rate * np.stack([np.cos(rate * t + phase), 0 * t, np.sin(rate * t + phase)], 1)
+
+    return Scene(lambda t: (CENTRE + arm * axis(t), arm * turn(t)), axis, lambda t: np.tile(CENTRE, (len(t), 1)))
+
+
+def flown(plan, scene, per_second=2000):
+    """Times, path, velocity, and the target along a plan."""
+    path = path_of(plan, ORIGIN, ORIGIN)
+    times = np.linspace(0.0, plan.t_go_s, int(plan.t_go_s * per_second))
+    return times, *path.at(times), scene.goal(times)[0], scene.axis(times)
+
+
+def across(r, apex, axis):
+    along = np.sum((r - apex) * axis, axis=1)
+    return along, np.linalg.norm(r - apex - along[:, None] * axis, axis=1), np.linalg.norm(r - apex, axis=1)
+
+
+def test_no_limit_is_the_certified_plan():
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        scene = body(rng.uniform(0.02, 0.2), rng.uniform(0.5, 1.5), rng.uniform(0, 6))
+        free = rendezvous(scene.goal, ORIGIN, ORIGIN, PARAMS)
+        plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, Limits())
+        assert plan.status is PlanStatus.OPTIMAL
+        assert 0.0 <= plan.t_go_s - free.t_go_s < 1e-3
+        assert plan.u_max <= PARAMS.a_max_mps2 * (1 + 1e-6)
+
+
+def test_a_limit_that_does_not_act_changes_nothing():
+    plan = constrained(body(), ORIGIN, ORIGIN, PARAMS, Limits(speed_max_mps=5.0))
+    free = rendezvous(body().goal, ORIGIN, ORIGIN, PARAMS)
+    assert plan.status is PlanStatus.OPTIMAL
+    assert plan.t_go_s == pytest.approx(free.t_go_s, abs=1e-3)
+
+
+def test_speed_limit_from_rest_to_rest_in_closed_form():
+    goal = lambda t: (np.tile([5.0, 0, 0], (len(t), 1)), np.zeros((len(t), 3)))  # noqa: E731
+    plan = constrained(Scene(goal), ORIGIN, ORIGIN, PARAMS, Limits(speed_max_mps=0.3))
+    exact = 5.0 / 0.3 + 0.3 / 0.05  # up, along, down
+    assert plan.t_go_s == pytest.approx(exact, abs=5e-3)
+    assert plan.t_go_s >= exact - 1e-6
+    assert plan.status is PlanStatus.FEASIBLE
+    assert np.linalg.norm(path_of(plan, ORIGIN, ORIGIN).nodes()[1], axis=1).max() <= 0.3 * (1 + 1e-6)
+
+
+def test_cone_holds_between_nodes_and_costs_time():
+    scene, limits = body(), Limits(cone_deg=25.0, cone_range_m=2.0, mouth_m=0.01)
+    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits)
+    free = rendezvous(scene.goal, ORIGIN, ORIGIN, PARAMS)
+    assert plan.status is PlanStatus.FEASIBLE
+    assert plan.t_go_s > free.t_go_s + 0.1
+    assert plan.lower_bound_s == pytest.approx(free.lower_bound_s)
+    _, r, _, apex, axis = flown(plan, scene)
+    along, off, distance = across(r, apex, axis)
+    near = distance <= 2.0
+    assert near.sum() > 100
+    assert np.max((off - math.tan(math.radians(25.0)) * along - 0.01)[near]) <= 1e-6
+
+
+def test_last_metres_go_along_the_axis():
+    scene = body()
+    limits = Limits(cone_deg=40.0, final_deg=5.0, final_range_m=0.6, mouth_m=0.01)
+    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits)
+    _, r, _, apex, axis = flown(plan, scene)
+    along, off, distance = across(r, apex, axis)
+    last = distance <= 0.6
+    assert np.max((off - math.tan(math.radians(5.0)) * along - 0.01)[last]) <= 1e-6
+
+
+def test_contact_is_smooth():
+    scene, bound = body(0.1), 0.02
+    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, Limits(contact_accel_mps2=bound))
+    end, e = plan.t_go_s, 1e-3
+    pull = (scene.goal(np.array([end]))[1] - scene.goal(np.array([end - e]))[1])[0] / e
+    u = path_of(plan, ORIGIN, ORIGIN).thrust(np.array([end]))[0]
+    assert np.linalg.norm(u - pull) <= bound + 1e-5
+    assert plan.velocity_error_mps < 1e-8
+    assert plan.position_error_m < 1e-8
+
+
+def test_sphere_is_kept_out_of_and_only_claimed_feasible():
+    scene = body(0.03, phase=2.6)  # the grasp point is on the far side
+    limits = Limits(keepout_m=1.2, keepout_release_m=0.5)
+    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits)
+    assert plan.status is PlanStatus.FEASIBLE
+    _, r, _, apex, _ = flown(plan, scene)
+    away = np.linalg.norm(r - apex, axis=1) > 0.5
+    assert np.linalg.norm(r - CENTRE, axis=1)[away].min() >= 1.2 - 1e-6
+    free = path_of(rendezvous(scene.goal, ORIGIN, ORIGIN, PARAMS), ORIGIN, ORIGIN)
+    through = free.at(np.linspace(0, free.t_go_s, 500))[0]
+    assert np.linalg.norm(through - CENTRE, axis=1).min() < 1.1  # without the limit it would have gone through
+
+
+def test_steps_are_flown_as_an_integrator_would():
+    rng = np.random.default_rng(4)
+    u, r0, v0 = 0.05 * rng.normal(size=(12, 3)), rng.normal(size=3), 0.1 * rng.normal(size=3)
+    flight = StepFlight(r0, v0, u, 0.7, 6.7)
+    y, at = np.r_[r0, v0], 0.0
+    for stop in (0.7, *(0.7 + 0.5 * (k + 1) for k in range(12)), 8.0):
+        push = flight.thrust(np.array([0.5 * (at + stop)]))[0]
+        y = solve_ivp(lambda t, y, push=push: np.r_[y[3:], push], [at, stop], y, method="DOP853", rtol=1e-12).y[:, -1]
+        at = stop
+        got = np.concatenate([x[0] for x in flight.at(np.array([stop]))])
+        assert np.allclose(got, y, atol=1e-12)
+
+
+def test_latency_coasts_first():
+    v0 = np.array([0.02, 0.0, 0.03])
+    plan = constrained(body(), ORIGIN, v0, PlanParams(latency_s=2.0), Limits(speed_max_mps=0.4))
+    path = path_of(plan, ORIGIN, v0)
+    assert np.allclose(path.at(np.array([1.5]))[0][0], 1.5 * v0)
+    assert plan.position_error_m < 1e-8
+
+
+def test_what_cannot_be_met_is_infeasible():
+    plan = constrained(body(0.1), ORIGIN, ORIGIN, PlanParams(horizon_s=30.0), Limits(speed_max_mps=0.05))
+    assert plan.status is PlanStatus.INFEASIBLE
+    assert not plan.found
+    assert math.isnan(plan.t_go_s)
+
+
+@pytest.mark.parametrize(
+    ("limits", "says"),
+    [
+        ({"cone_deg": 95.0}, "cone_deg is 95"),
+        ({"speed_max_mps": 0.0}, "speed_max_mps is 0"),
+        ({"nodes": 2}, "nodes is 2"),
+        ({"keepout_m": math.nan}, "keepout_m is nan"),
+    ],
+)
+def test_bad_limits_are_named(limits, says):
+    with pytest.raises(ValueError, match=says):
+        Limits(**limits)
+
+
+def test_a_limit_without_what_it_needs_is_named():
+    bare = Scene(body().goal)
+    with pytest.raises(ValueError, match="axis"):
+        constrained(bare, ORIGIN, ORIGIN, PARAMS, Limits(cone_deg=20.0))
+    with pytest.raises(ValueError, match="mass centre"):
+        constrained(bare, ORIGIN, ORIGIN, PARAMS, Limits(keepout_m=0.5))
+    with pytest.raises(ValueError, match=r"keepout_m is 3\.0, must be below"):
+        constrained(body(), ORIGIN, ORIGIN, PARAMS, Limits(keepout_m=3.0))
