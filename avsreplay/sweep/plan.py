@@ -1,0 +1,248 @@
+"""A campaign unrolled into runs. Each is a task that holds all it needs and a name made of just that.
+
+A task's name is the hash of its scenario, settings and inputs: a run that is done stays done whatever is added to the
+campaign, and two equal runs are one. Seeds belong to the repeat, so all combinations of one repeat meet the same
+noise and the same draws: differences between combinations are not differences of luck.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import zlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import avsreplay
+from avsreplay import geometry, settings
+from avsreplay.config import RunConfig
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.simulate import scenario_of
+from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
+from avsreplay.sweep.toml_text import toml_text, toml_value
+
+__all__ = ["Plan", "Point", "Task", "expand"]
+
+FORMAT = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What a worker needs for one run; ``id`` is the hash of all else but the folder names.
+
+    Attributes:
+        scenario: TOML text, empty where a log is replayed.  folder: where its relative names start.
+        log, model: files, or empty.  assignments: ``a.b=c`` of the replay.  scans: keep a line a scan.
+    """
+
+    id: str
+    scenario: str
+    folder: str
+    log: str
+    model: str
+    assignments: tuple[str, ...]
+    scans: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One run of the plan.
+
+    Attributes:
+        index: its row.  cell: which combination.  repeat: which repeat of it.  values: what was set, by key.
+    """
+
+    index: int
+    cell: int
+    repeat: int
+    values: Mapping[str, Any]
+    task: Task
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """All runs of a campaign, made one by one.
+
+    Attributes:
+        cells: the combinations, each by key; what is drawn is not among them.
+    """
+
+    loaded: LoadedCampaign
+    cells: tuple[Mapping[str, Any], ...]
+    _base: Mapping[str, Any]
+    _run: tuple[str, ...]
+    _inputs: Mapping[str, str]
+
+    def __len__(self) -> int:
+        return len(self.cells) * self.loaded.campaign.repeats
+
+    def points(self) -> Iterator[Point]:
+        """The runs in the order of their rows: repeat by repeat, so that an early stop leaves whole repeats."""
+        campaign = self.loaded.campaign
+        for repeat in range(campaign.repeats):
+            drawn = _draws(campaign, repeat)
+            for cell, chosen in enumerate(self.cells):
+                index = repeat * len(self.cells) + cell
+                yield Point(index, cell, repeat, {**chosen, **drawn}, self._task({**chosen, **drawn}, repeat))
+
+    def _task(self, values: Mapping[str, Any], repeat: int) -> Task:
+        campaign, folder = self.loaded.campaign, self.loaded.folder
+        of_case: Mapping[str, Any] = next((case.set for case in campaign.case if case.name == values.get("case")), {})
+        every = {**campaign.set, **of_case, **{k: v for k, v in values.items() if k not in ("log", "case")}}
+        scenario = "" if campaign.logs else self._scenario(every, repeat)
+        run = (f"{k[4:]}={toml_value(v)}" for k, v in every.items() if k.startswith("run."))
+        log = str(folder / values["log"]) if campaign.logs else ""
+        model = str(folder / campaign.model) if campaign.model else ""
+        assignments = (*self._run, *run)
+        inputs = [self._inputs.get(name, "") for name in (log, model or self._scenario_model(scenario))]
+        content = [FORMAT, avsreplay.__version__, scenario, inputs, assignments, campaign.scans]
+        digest = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:24]
+        return Task(digest, scenario, str(self._scenario_folder()), log, model, assignments, campaign.scans)
+
+    def _scenario(self, every: Mapping[str, Any], repeat: int) -> str:
+        table = dict(self._base)
+        table["seed"] = _seed(self.loaded.campaign, repeat)
+        for key, value in every.items():
+            if key.startswith("scenario."):
+                table = _placed(table, key.split(".")[1:], value, key, self.loaded.name)
+        return toml_text(table)
+
+    def _scenario_folder(self) -> Path:
+        return (self.loaded.folder / self.loaded.campaign.scenario).parent
+
+    def _scenario_model(self, text: str) -> str:
+        model = settings.parse(text, "scenario").table.get("target", {}).get("model") if text else None
+        return str(self._scenario_folder() / model) if model else ""
+
+
+def expand(loaded: LoadedCampaign) -> Plan:
+    """The plan of a campaign; every value of every axis is tried for its key and kind before anything runs.
+
+    Raises UsageError naming the campaign's key, UnreadableInput for a file that is not there.
+    """
+    campaign = loaded.campaign
+    axes: list[list[tuple[str, Any]]] = [[(axis.key, value) for value in axis.values] for axis in campaign.grid]
+    if campaign.case:
+        axes.insert(0, [("case", case.name) for case in campaign.case])
+    if campaign.logs:
+        axes.insert(0, [("log", log) for log in campaign.logs])
+    cells = tuple(dict(chosen) for chosen in itertools.product(*axes))
+    plan = Plan(loaded, cells, _base_table(loaded), _base_run(loaded), _inputs(loaded))
+    _try_all(plan, axes)
+    return plan
+
+
+def _base_table(loaded: LoadedCampaign) -> Mapping[str, Any]:
+    from avsreplay.simulate import load_scenario
+
+    campaign = loaded.campaign
+    if campaign.logs:
+        return {}
+    path = loaded.folder / campaign.scenario if campaign.scenario else None
+    scenario = load_scenario(path)
+    return settings.parse(scenario.text, str(path or "built-in scenario")).table
+
+
+def _base_run(loaded: LoadedCampaign) -> tuple[str, ...]:
+    if not loaded.campaign.config:
+        return ()
+    document = settings.load(loaded.folder / loaded.campaign.config)
+    settings.build(RunConfig, document)
+    return tuple(f"{key}={toml_value(value)}" for key, value in _leaves(document.table))
+
+
+def _inputs(loaded: LoadedCampaign) -> dict[str, str]:
+    """Hashes of the files that runs read, by name."""
+    campaign = loaded.campaign
+    names = [loaded.folder / name for name in (*campaign.logs, *([campaign.model] if campaign.model else []))]
+    base = loaded.folder / campaign.scenario if campaign.scenario else None
+    model = settings.load(base).table.get("target", {}).get("model") if base else None
+    if model and base:
+        names.append(base.parent / model)
+    return {str(path): _sha256(path) for path in names}
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise UnreadableInput(error.strerror or "cannot be read", where=str(path), hint="check the path") from None
+
+
+def _try_all(plan: Plan, axes: list[list[tuple[str, Any]]]) -> None:
+    """Build the scenario and the settings once for every value of every axis, the others at their first."""
+    first = {axis[0][0]: axis[0][1] for axis in axes}
+    drawn = _draws(plan.loaded.campaign, 0)
+    for key, value in [(None, None), *(pair for axis in axes for pair in axis)]:
+        chosen = {**first, **({key: value} if key else {}), **drawn}
+        task = plan._task(chosen, 0)
+        try:
+            if task.scenario:
+                scenario_of(settings.parse(task.scenario, plan.loaded.name))
+            settings.build(RunConfig, settings.override(settings.Document("", {}), task.assignments))
+        except UsageError as error:
+            at = f"{plan.loaded.name}, {key} = {value}" if key else plan.loaded.name
+            raise UsageError(error.what, where=at, hint=error.hint) from None
+
+
+def _seed(campaign: Campaign, repeat: int) -> int:
+    state = np.random.SeedSequence(campaign.seed, spawn_key=(0, repeat)).generate_state(1, np.uint64)
+    return int(state[0] >> np.uint64(1))
+
+
+def _draws(campaign: Campaign, repeat: int) -> dict[str, Any]:
+    """What is drawn for a repeat: each key from a stream of its own, so that adding a draw changes no other."""
+    drawn = {}
+    for draw in campaign.draw:
+        stream = np.random.SeedSequence(campaign.seed, spawn_key=(1, repeat, zlib.crc32(draw.key.encode())))
+        drawn[draw.key] = _drawn(draw, np.random.Generator(np.random.PCG64(stream)))
+    return drawn
+
+
+def _drawn(draw: Draw, rng: np.random.Generator) -> Any:
+    low, high = draw.low, draw.high
+    match draw.kind:
+        case DrawKind.UNIFORM:
+            return float(rng.uniform(low, high))
+        case DrawKind.LOG_UNIFORM:
+            return math.exp(float(rng.uniform(math.log(low), math.log(high))))
+        case DrawKind.NORMAL:
+            return float(rng.normal(low, high))
+        case DrawKind.INTEGER:
+            return int(rng.integers(math.ceil(low), math.floor(high), endpoint=True))
+        case DrawKind.CHOICE:
+            return draw.values[int(rng.integers(len(draw.values)))]
+        case DrawKind.DIRECTION:
+            towards = rng.standard_normal(3)
+            return [float(x) for x in towards / np.linalg.norm(towards[None], axis=1) * rng.uniform(low, high)]
+        case DrawKind.ATTITUDE:
+            return [float(x) for x in geometry.normalise(rng.standard_normal(4))]
+
+
+def _placed(node: Any, path: list[str], value: Any, key: str, where: str) -> Any:
+    """``node`` with ``value`` at ``path``; what lies beside it is shared, not copied."""
+    head, rest = path[0], path[1:]
+    if isinstance(node, list):
+        if not head.isdigit() or int(head) >= len(node):
+            raise UsageError(f"'{key}' does not lead to a place", where=where, hint=f"the list has {len(node)} entries")
+        changed = list(node)
+        changed[int(head)] = _placed(node[int(head)], rest, value, key, where) if rest else value
+        return changed
+    if not isinstance(node, Mapping):
+        raise UsageError(f"'{key}' does not lead to a place", where=where, hint="check the key")
+    return {**node, head: _placed(node.get(head, {}), rest, value, key, where) if rest else value}
+
+
+def _leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value

@@ -1,0 +1,211 @@
+"""Campaigns run for real: the same bytes with any number of workers, taken up after a kill, workers that die."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from avsreplay.cli import sweep as command
+from avsreplay.errors import DataLost, MissingBackend, UnreadableInput, UsageError
+from avsreplay.sweep import Journal, execute, expand, load_campaign, write_results
+from avsreplay.sweep.execute import _crashed
+from avsreplay.sweep.plan import Task
+
+pytest.importorskip("pyarrow", reason="pyarrow is not installed")
+pytest.importorskip("distributed", reason="Dask is not installed")
+
+FIXTURES = Path(__file__).parent.parent / "fixtures"
+SMALL = """
+name = "small"
+seed = 8
+repeats = 3
+[set]
+"scenario.duration_s" = 3.0
+"scenario.rate_hz" = 2.0
+"scenario.scanner.rays" = [40, 40]
+"scenario.fault" = [{ kind = "empty", start_s = 1.0, duration_s = 0.6 }]
+[[grid]]
+key = "scenario.scanner.noise_m"
+values = [0.004, 0.016]
+[[success]]
+name = "close"
+metric = "pose_healthy.position_m.rmse"
+max = 0.05
+"""
+RESULTS = ("results.parquet", "scans.parquet", "summary.json")
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL)
+    return path
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    """The results of one process without Dask."""
+    folder = tmp_path_factory.mktemp("reference")
+    (folder / "small.toml").write_text(SMALL)
+    done = sweep(folder / "small.toml", folder / "out", "--workers", "0")
+    assert done.exit_code == 0, done.output
+    return {name: (folder / "out" / name).read_bytes() for name in RESULTS}
+
+
+def sweep(path, output, *more):
+    return CliRunner().invoke(command.command, [str(path), "-o", str(output), *more])
+
+
+def results(output):
+    return {name: (output / name).read_bytes() for name in RESULTS}
+
+
+def test_the_results_say_what_was_run(reference, tmp_path):
+    import pyarrow.parquet as pq
+
+    for name, data in reference.items():
+        (tmp_path / name).write_bytes(data)
+    table = pq.read_table(tmp_path / "results.parquet").to_pydict()
+    assert table["index"] == list(range(6))
+    assert table["set:scenario.scanner.noise_m"] == [0.004, 0.016] * 3
+    assert table["status"] == ["ok"] * 6
+    assert table["faults.missed"] == [0.0] * 6
+    assert all(0 < x < 0.05 for x in table["pose_healthy.position_m.rmse"])
+    scans = pq.read_table(tmp_path / "scans.parquet").to_pydict()
+    assert len(scans["id"]) == 36
+    assert sum(scans["harmful"]) == 12
+    assert [g for g, h in zip(scans["gamma"], scans["harmful"], strict=True) if h] == [0] * 12
+    said = json.loads((tmp_path / "summary.json").read_text())
+    assert (said["planned"], said["done"], said["status"]) == (6, 6, {"ok": 6})
+    assert [cell["rates"]["close"]["successes"] for cell in said["cells"]] == [3, 3]
+    assert said["detector"]["detected"]["share"] == 1.0
+
+
+def test_noise_matters_in_every_repeat(reference, tmp_path):
+    """Repeats share their seed across combinations, so the noisier one fits worse each time, not only on average."""
+    import pyarrow.parquet as pq
+
+    (tmp_path / "results.parquet").write_bytes(reference["results.parquet"])
+    fit = pq.read_table(tmp_path / "results.parquet").to_pydict()["fit_error_m.rmse"]
+    assert all(2.0 < noisy / quiet < 6.0 for quiet, noisy in zip(fit[::2], fit[1::2], strict=True))
+
+
+@pytest.mark.parametrize("workers", [1, 3])
+def test_any_number_of_workers_gives_the_same_bytes(campaign, reference, tmp_path, workers):
+    done = sweep(campaign, tmp_path / "out", "--workers", str(workers))
+    assert done.exit_code == 0, done.output
+    assert "small: 6 of 6 runs done (6 ok)" in done.output
+    assert results(tmp_path / "out") == reference
+
+
+def test_a_limit_is_taken_up_where_it_ended(campaign, reference, tmp_path):
+    first = sweep(campaign, tmp_path / "out", "--workers", "0", "--limit", "4")
+    assert "4 of 6 runs done" in first.output
+    journal = (tmp_path / "out" / "journal.txt").read_bytes()
+    assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
+    assert (tmp_path / "out" / "journal.txt").read_bytes().startswith(journal)
+    assert results(tmp_path / "out") == reference
+    before = (tmp_path / "out" / "journal.txt").read_bytes()
+    assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
+    assert (tmp_path / "out" / "journal.txt").read_bytes() == before  # nothing was run again
+
+
+def test_a_killed_campaign_is_taken_up_again(campaign, reference, tmp_path):
+    args = [sys.executable, "-m", "avsreplay", "sweep", str(campaign), "-o", str(tmp_path / "out"), "--workers", "0"]
+    process = subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    journal = tmp_path / "out" / "journal.txt"
+    while process.poll() is None and (not journal.exists() or journal.read_bytes().count(b"\n") < 2):
+        time.sleep(0.005)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert 2 <= len(Journal(journal).status) < 6
+    assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
+    assert results(tmp_path / "out") == reference
+
+
+def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, reference, tmp_path):
+    """A cluster of our own, reached by its address as a remote one would be; its first worker is killed mid-run."""
+    from distributed import Client, LocalCluster
+
+    plan = expand(load_campaign(campaign))
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster) as client,
+        Journal(tmp_path / "out" / "journal.txt") as journal,
+    ):
+        victims = list(client.run(os.getpid).values())
+        seen = []
+        for outcome in execute((p.task for p in plan.points()), scheduler=cluster.scheduler_address):
+            seen.append(outcome.id)
+            journal.add(outcome)
+            if len(seen) == 1:
+                os.kill(victims[0], signal.SIGKILL)
+    assert sorted(seen) == sorted(p.task.id for p in plan.points())
+    write_results(plan, journal, tmp_path / "out")
+    assert results(tmp_path / "out") == reference
+
+
+def test_a_run_that_fails_is_a_row_and_exit_4(campaign, tmp_path):
+    text = SMALL.replace("repeats = 3", "repeats = 1")
+    text += '[[case]]\nname = "good"\n[[case]]\nname = "cold"\nset = { "run.init" = "9,9,9,0,0,0,1" }\n'
+    text += '[[case]]\nname = "no back end"\nset = { "run.register.backend" = "nobody" }\n'
+    campaign.write_text(text)
+    done = sweep(campaign, tmp_path / "out", "--workers", "0")
+    assert isinstance(done.exception, DataLost)
+    assert "2 of 6 runs failed" in str(done.exception)
+    assert "6 of 6 runs done (2 failed, 4 ok)" in done.output
+    again = sweep(campaign, tmp_path / "out", "--workers", "0")
+    assert isinstance(again.exception, DataLost)
+    assert len(Journal(tmp_path / "out" / "journal.txt").status) == 6
+    retried = sweep(campaign, tmp_path / "out", "--workers", "0", "--retry-failed", "--limit", "0")
+    assert "4 of 6 runs done (4 ok)" in retried.output
+
+
+def test_a_run_that_breaks_is_a_row_too(monkeypatch):
+    def broken(task):
+        raise ZeroDivisionError("by nought\nsecond line")
+
+    monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "run_task", broken)
+    task = Task("ab", "", "", "", "", (), True)
+    (outcome,) = execute([task])
+    assert (outcome.status, outcome.error) == ("crashed", "ZeroDivisionError: by nought")
+    killed = type("KilledWorker", (Exception,), {})("tcp://10.0.0.1:5000")
+    assert "10.0.0.1" not in _crashed("ab", killed).error
+
+
+def test_recorded_logs_are_swept_as_well(tmp_path):
+    path = tmp_path / "logs.toml"
+    path.write_text(
+        f'logs = ["{FIXTURES / "tumble.mcap"}"]\n[[grid]]\nkey = "run.guess"\nvalues = ["predicted", "last"]\n'
+    )
+    done = sweep(path, tmp_path / "out", "--workers", "0", "--json")
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.output)
+    assert [cell["values"]["run.guess"] for cell in said["cells"]] == ["predicted", "last"]
+    assert said["status"] == {"ok": 2}
+
+
+def test_a_plan_is_only_told(campaign, tmp_path):
+    done = CliRunner().invoke(command.command, [str(campaign), "--plan"])
+    assert done.output.startswith("small: 6 runs, 2 combinations x 3 repeats\n  scanner.noise_m=0.004\n")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["small.toml"]
+
+
+def test_bad_input_is_one_line(campaign, tmp_path, monkeypatch):
+    assert isinstance(CliRunner().invoke(command.command, [str(campaign)]).exception, UsageError)
+    monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "CONNECT_S", 1)
+    done = sweep(campaign, tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
+    assert isinstance(done.exception, UnreadableInput)
+    assert "does not answer" in str(done.exception)
+    assert "\n" not in str(done.exception)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    done = sweep(campaign, tmp_path / "out2", "--workers", "2")
+    assert isinstance(done.exception, MissingBackend)
+    assert threading.active_count() < 50
