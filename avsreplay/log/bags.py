@@ -20,7 +20,7 @@ from avsreplay.log.text import shown
 __all__ = ["is_bag_folder", "open_recording"]
 
 _STORAGE = (".mcap", ".db3")
-_LISTED = re.compile(r"^\s*-\s*[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE)
+_LISTED = re.compile(r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE)
 _MAX_METADATA = 4 << 20
 
 

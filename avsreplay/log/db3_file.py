@@ -20,7 +20,8 @@ __all__ = ["SQLITE_MAGIC", "Db3File"]
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
 _HEAD = 64  # bytes of a cloud that tell its header stamp
-_STRIDE = 256
+_STEPS = 4096  # rows tried one by one behind a damaged page, before strides double
+_MAX_ID = 1 << 62  # where the last one cannot be told: strides double, so it takes few steps
 
 
 class Db3File:
@@ -98,14 +99,16 @@ class Db3File:
             self.losses.append(Loss(what, 0, 0, messages=lost or None, file=self.path.name))
 
     def _last(self) -> int:
-        row = self._db.execute("SELECT max(id) FROM messages").fetchone()
+        try:
+            row = self._db.execute("SELECT max(id) FROM messages").fetchone()
+        except sqlite3.DatabaseError:
+            return _MAX_ID
         return int(row[0]) if row and row[0] is not None else 0
 
     def _rows(self, last: int) -> Iterator[tuple[object, ...] | None]:
         """Messages by id; None for a stretch that cannot be read."""
         query = "SELECT id, topic_id, timestamp, substr(data, 1, ?) FROM messages WHERE id > ? AND id <= ? ORDER BY id"
-        at = -1
-        stride = _STRIDE
+        at, failures = -1, 0
         while at < last:
             done = at
             try:
@@ -115,8 +118,8 @@ class Db3File:
                 return
             except sqlite3.DatabaseError:
                 yield None
-                at = done + (1 if done > at else stride)
-                stride *= 2
+                failures = 1 if done > at else failures + 1
+                at = done + (1 if failures <= _STEPS else 1 << min(failures - _STEPS, 62))
 
     def _take(self, row: tuple[object, ...]) -> bool:
         row_id, topic_id, log_ns, head = row
@@ -155,4 +158,5 @@ def _connected(path: Path, limit: int) -> sqlite3.Connection:
 
 
 def _unreadable(path: Path, error: Exception) -> UnreadableInput:
-    return UnreadableInput(f"not a readable ROS 2 bag: {shown(error)}", where=shown(path), hint="check the file")
+    hint = "the sqlite3 program's .recover may save part of it"
+    return UnreadableInput(f"not a readable ROS 2 bag: {shown(error)}", where=shown(path), hint=hint)

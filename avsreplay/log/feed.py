@@ -43,6 +43,9 @@ class Feed(Protocol):
     def load(self, place: int) -> Cloud:
         """The cloud at a place. Raises BadMessage where it cannot be decoded."""
 
+    def payload(self, place: int) -> tuple[bytes | memoryview, str] | None:
+        """The message as it stands in the log and its encoding; None where it is a file."""
+
     def topics(self) -> list[TopicInfo]:
         """Every topic, by name."""
 
@@ -80,7 +83,11 @@ class MessageFeed:
 
     def load(self, place: int) -> Cloud:
         """The cloud at a place. Raises BadMessage where it cannot be decoded."""
-        return decode_cloud(self.recording.read(self.topic or "", self._places[place]), self._encoding)
+        return decode_cloud(*self.payload(place))
+
+    def payload(self, place: int) -> tuple[bytes | memoryview, str]:
+        """The message as it stands in the log, and its encoding. Raises BadMessage."""
+        return self.recording.read(self.topic or "", self._places[place]), self._encoding
 
     def topics(self) -> list[TopicInfo]:
         """Every topic, by name."""

@@ -39,7 +39,8 @@ class FolderFeed:
         self._files, self._limit = files, limit
         steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(files))]
         self.log_ns: list[int] = times_ns or steady
-        self.publish_ns = self.header_ns = self.log_ns
+        self.publish_ns: list[int] = self.log_ns
+        self.header_ns: list[int] = self.log_ns
 
     def load(self, place: int) -> Cloud:
         """Read one file. Raises BadMessage where it cannot be decoded."""
@@ -54,6 +55,9 @@ class FolderFeed:
         except ValueError as error:
             raise BadMessage(f"{shown(path.name)}: {error}") from None
         return _cloud(self.header_ns[place], points)
+
+    def payload(self, place: int) -> None:
+        """A folder has files, not messages."""
 
     def topics(self) -> list[TopicInfo]:
         """A folder has files, not topics."""

@@ -24,9 +24,10 @@ TruthLookup = Callable[[int, int, str], Pose | None]
 
 @dataclass(frozen=True, slots=True)
 class Guides:
-    """Lookups for one source; None where it has none."""
+    """Lookups for one source; None where it has none. ``track`` is the whole of the truth where it is one track."""
 
     truth: TruthLookup | None = None
+    track: PoseTrack | None = None
     body: PoseTrack | None = None
     sensor: Callable[[int, str], Pose | None] | None = None
 
@@ -74,19 +75,20 @@ class MessageGuides:
 
     def guides(self) -> Guides:
         """The lookups, once the survey is done."""
-        return Guides(self._truth_lookup(), self._body if len(self._body) else None, self._sensor_lookup())
+        truth, track = self._truth_lookup()
+        return Guides(truth, track, self._body if len(self._body) else None, self._sensor_lookup())
 
     @property
     def _wants_tf(self) -> bool:
         return self.options.truth_frame is not None or self.options.fixed_frame is not None
 
-    def _truth_lookup(self) -> TruthLookup | None:
+    def _truth_lookup(self) -> tuple[TruthLookup | None, PoseTrack | None]:
         child, fixed = self.options.truth_frame, self.options.fixed_frame
         if self.options.truth_file is not None:
             return file_truth(read_poses(self.options.truth_file), self.options.truth_gap_s)
         if child is not None:
-            return lambda t_ns, _place, frame: self._tf.pose(fixed or frame, child, t_ns)
-        return (lambda t_ns, _place, _frame: self._truth.pose(t_ns)) if len(self._truth) else None
+            return (lambda t_ns, _place, frame: self._tf.pose(fixed or frame, child, t_ns)), None
+        return _by_time(self._truth) if len(self._truth) else (None, None)
 
     def _sensor_lookup(self) -> Callable[[int, str], Pose | None] | None:
         fixed = self.options.fixed_frame
@@ -97,15 +99,19 @@ class MessageGuides:
         return None
 
 
-def file_truth(found: TimedPoses, gap_s: float) -> TruthLookup:
-    """A lookup in a pose file: by time where it has times, else line by scan."""
+def file_truth(found: TimedPoses, gap_s: float) -> tuple[TruthLookup, PoseTrack | None]:
+    """A lookup in a pose file, by time where it has times, else line by scan; and its track where it has times."""
     if found.t_ns is None:
         poses = found.poses
-        return lambda _t_ns, place, _frame: poses[place] if place < len(poses) else None
+        return (lambda _t_ns, place, _frame: poses[place] if place < len(poses) else None), None
     track = PoseTrack(gap_s)
     for t_ns, pose in zip(found.t_ns, found.poses, strict=True):
         track.add(t_ns, (*pose.t.tolist(), *pose.q.tolist()))
-    return lambda t_ns, _place, _frame: track.pose(t_ns)
+    return _by_time(track)
+
+
+def _by_time(track: PoseTrack) -> tuple[TruthLookup, PoseTrack]:
+    return (lambda t_ns, _place, _frame: track.pose(t_ns)), track
 
 
 def _poses_of(topics: Sequence[TopicInfo]) -> str:

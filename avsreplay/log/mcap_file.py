@@ -18,7 +18,7 @@ from avsreplay.log import mcap_records as mcap
 from avsreplay.log.byte_file import ByteFile
 from avsreplay.log.chunks import ChunkStore
 from avsreplay.log.cursor import BadMessage
-from avsreplay.log.mcap_records import Channel, Fields
+from avsreplay.log.mcap_records import Channel, Fields, Tap
 from avsreplay.log.mcap_resync import hides_chunk, next_record
 from avsreplay.log.mcap_summary import Summary, read_summary
 from avsreplay.log.options import Loss, TopicInfo
@@ -28,6 +28,7 @@ from avsreplay.log.text import shown
 __all__ = ["McapFile"]
 
 _TIMES = struct.Struct("<QQ")
+_BLOCK = 1 << 20
 _MODELS = (".ply", ".stl", ".obj", ".off", ".glb")
 
 
@@ -37,6 +38,11 @@ class McapFile:
     Args:
         path: the file.  limit: most bytes a message, chunk or attachment may take.
         sinks: who takes the messages of a topic while the survey passes over them.
+        tap: who takes every intact record besides (for a repair).
+
+    Attributes:
+        closed_properly: is there an end of data?  summary: the section behind it, as far as it can be trusted.
+        data_end: (offset, checksum) of the end of data.  unchecked: chunks that carry no checksum.
 
     Raises:
         UnreadableInput: not there, empty, or not MCAP.
@@ -44,11 +50,15 @@ class McapFile:
 
     kind = "mcap"
 
-    def __init__(self, path: Path, limit: int, sinks: Mapping[str, Sink] | None = None) -> None:
+    def __init__(self, path: Path, limit: int, sinks: Mapping[str, Sink] | None = None, tap: Tap | None = None) -> None:
+        self._tap = tap
         self.path, self.losses = path, list[Loss]()
         self.metadata: dict[str, dict[str, str]] = {}
         self.profile = self.library = ""
         self.closed_properly = False
+        self.summary = Summary()
+        self.data_end = (0, 0)
+        self.unchecked = 0
         self._limit, self._table = limit, MessageTable(sinks)
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
@@ -89,6 +99,15 @@ class McapFile:
             return self._file.read(offset, size)
         return memoryview(self._chunks[chunk])[offset : offset + size]
 
+    def data_checksum_holds(self) -> bool:
+        """Does the checksum over all records, which covers what no other one does, hold? True where there is none."""
+        end, expected = self.data_end
+        crc, at = 0, 0
+        while expected and at < end:
+            block = self._file.read(at, min(_BLOCK, end - at))
+            crc, at = zlib.crc32(block, crc), at + len(block)
+        return crc == expected
+
     def attachment(self) -> tuple[str, bytes] | None:
         """The model the file carries: the first attachment that is a mesh file."""
         if self._model is None:
@@ -107,7 +126,7 @@ class McapFile:
             raise UnreadableInput(
                 "not an MCAP file", where=shown(self.path), hint="give an MCAP, a ROS bag or a folder"
             )
-        summary = read_summary(self._file, self._limit)
+        summary = self.summary = read_summary(self._file, self._limit)
         self._adopt(summary)
         at = 8
         while at < self._size and not self.closed_properly:
@@ -169,6 +188,8 @@ class McapFile:
         if fields.at != len(fields.view):
             raise BadMessage("a metadata record with bytes left over")
         self.metadata.setdefault(name, values)
+        if self._tap is not None:
+            self._tap.metadata(name, values)
 
     def _take_message(self, at: int, end: int) -> None:
         if end - at < 31:
@@ -189,24 +210,28 @@ class McapFile:
 
     def _take_attachment(self, at: int, end: int) -> None:
         fields = self._content(at, end)
-        fields.take(16)
-        name, _ = fields.text(), fields.text()
+        times = _TIMES.unpack(fields.take(16))
+        name, media = fields.text(), fields.text()
         size = fields.number(8)
         start = at + 9 + fields.at
-        fields.take(size)
+        data = fields.take(size)
         checked = fields.view[: fields.at]
         crc = fields.number(4)
         if crc and zlib.crc32(checked) != crc:
             if self._swallowed(at, end) is not None:
                 raise BadMessage("an attachment whose length is damaged")
             self._lose(Loss(f"the checksum of attachment '{shown(name)}' does not hold", at, end - at))
-        elif self._model is None and name.lower().endswith(_MODELS):
+            return
+        if self._model is None and name.lower().endswith(_MODELS):
             self._model = (name, start, size)
+        if self._tap is not None:
+            self._tap.attachment(name, media, times, data)
 
     def _take_data_end(self, at: int, end: int) -> None:
         if end - at != 13:
             raise BadMessage("the end of data is malformed")
         self.closed_properly = True
+        self.data_end = (at, int.from_bytes(self._file.read(at + 9, 4), "little"))
 
     def _take_chunk(self, at: int, end: int) -> None:
         head = mcap.chunk_head(self._file.upto(at, min(mcap.CHUNK_PREFIX, end - at)), end - at)
@@ -219,6 +244,7 @@ class McapFile:
             self._bad_chunk = Loss(str(error), at, (self._resume or end) - at, 1, None, start_ns, end_ns)
             return
         number = self._chunks.add(at, head)
+        self.unchecked += head.crc == 0
         view = memoryview(data)
         for opcode, begin, stop in walked:
             if opcode == mcap.MESSAGE:
@@ -248,7 +274,7 @@ class McapFile:
         number, schema = fields.number(2), fields.number(2)
         topic, encoding = fields.text(), fields.text()
         name, schema_encoding, text = self._schemas.get(schema, ("", "", b""))
-        channel = Channel(number, topic, canonical_type(name), encoding, schema_encoding, text)
+        channel = Channel(number, topic, canonical_type(name), encoding, schema_encoding, text, fields.mapping())
         if number in self._channels:
             return
         self._channels[number] = channel
@@ -268,6 +294,9 @@ class McapFile:
             int.from_bytes(view[begin + 14 : begin + 22], "little"),
         )
         self._table.add(channel.topic, times, view[begin + 22 : end], (container, offset + 22))
+        if self._tap is not None:
+            sequence = int.from_bytes(view[begin + 2 : begin + 6], "little")
+            self._tap.message(channel, sequence, times, view[begin + 22 : end])
 
     def _lose(self, loss: Loss) -> None:
         self.losses.append(replace(loss, file=self.path.name))

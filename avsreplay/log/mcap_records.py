@@ -5,7 +5,9 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
 
 from avsreplay.log.cursor import BadMessage
 
@@ -26,8 +28,10 @@ __all__ = [
     "Channel",
     "ChunkHead",
     "Fields",
+    "Tap",
     "chunk_candidates",
     "chunk_head",
+    "is_mcap",
     "records",
 ]
 
@@ -50,6 +54,7 @@ class Channel:
     encoding: str
     schema_encoding: str = ""
     schema: bytes = b""
+    metadata: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,3 +142,24 @@ def chunk_head(view: memoryview | bytes, record_size: int | None = None) -> Chun
 def chunk_candidates(window: bytes) -> Iterator[int]:
     """Places in ``window`` where a chunk record may begin."""
     return (match.start() for match in _SIGNATURE.finditer(window))
+
+
+def is_mcap(path: Path) -> bool:
+    """Does a file begin as MCAP does?"""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(8) == MAGIC
+
+
+class Tap(Protocol):
+    """Takes every intact record of a file, in file order; times are (log, publish or creation) [ns]."""
+
+    def message(self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview) -> None:
+        """A message."""
+
+    def attachment(self, name: str, media: str, times: tuple[int, int], data: memoryview) -> None:
+        """An attachment whose checksum holds."""
+
+    def metadata(self, name: str, values: dict[str, str]) -> None:
+        """A metadata record."""

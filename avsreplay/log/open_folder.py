@@ -9,7 +9,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log.conf import read_conf
 from avsreplay.log.folder import FolderFeed, scan_files
-from avsreplay.log.guides import Guides, TruthLookup, file_truth
+from avsreplay.log.guides import Guides, file_truth
 from avsreplay.log.options import SourceOptions
 from avsreplay.log.pose_files import TimedPoses, read_poses, read_times, seconds_to_ns
 from avsreplay.log.source import Source
@@ -46,7 +46,7 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     feed = FolderFeed(files, options.rate_hz, options.max_message_mib << 20, times)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     notes = {"source": "folder", "times": "given" if times else f"steady at {options.rate_hz!r} Hz"}
-    guides = Guides(truth=_truth(files, by_name, found, options))
+    guides = _guides(files, feed.header_ns, by_name, found, options)
     return Source(path, feed, LogHeader(surface=surface, notes=notes), options, guides)
 
 
@@ -71,9 +71,10 @@ def _times(path: Path, files: list[Path], found: TimedPoses | None) -> list[int]
     return list(found.t_ns) if found is not None and found.t_ns is not None and len(found.t_ns) == len(files) else None
 
 
-def _truth(
-    files: list[Path], by_name: dict[str, Pose], found: TimedPoses | None, options: SourceOptions
-) -> TruthLookup | None:
-    if by_name:
-        return lambda _t_ns, place, _frame: by_name.get(files[place].name)
-    return file_truth(found, options.truth_gap_s) if found is not None else None
+def _guides(
+    files: list[Path], times: list[int], by_name: dict[str, Pose], found: TimedPoses | None, options: SourceOptions
+) -> Guides:
+    if found is None and by_name:
+        named = [(t, by_name[f.name]) for t, f in zip(times, files, strict=True)]
+        found = TimedPoses(tuple(pose for _, pose in named), tuple(t for t, _ in named))
+    return Guides() if found is None else Guides(*file_truth(found, options.truth_gap_s))

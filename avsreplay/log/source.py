@@ -11,6 +11,7 @@ from types import TracebackType
 import numpy as np
 
 from avsreplay.errors import UnreadableInput
+from avsreplay.geometry import Pose
 from avsreplay.log.clock import Placed, place
 from avsreplay.log.cursor import BadMessage
 from avsreplay.log.feed import Feed
@@ -73,6 +74,15 @@ class Source:
         """How the scans' instants were found."""
         return self._clock
 
+    def truth_poses(self) -> list[tuple[int, Pose]]:
+        """The true pose T_ac at every scan that has one and whose stamp is sound, by instant, ascending."""
+        truth = self._guides.truth
+        if truth is None:
+            return []
+        sound = [(p.t_ns, place) for place, p in enumerate(self._placed) if not p.note]
+        found = {t_ns: truth(t_ns, place, "") for t_ns, place in sound}
+        return [(t_ns, pose) for t_ns, pose in sorted(found.items(), key=lambda item: item[0]) if pose is not None]
+
     @cached_property
     def sha256(self) -> str:
         """Of the file's bytes; of a folder or a split log, of its files' names and bytes in order."""
@@ -89,6 +99,16 @@ class Source:
         """The scans one by one; with ``prefetch`` so many are decoded ahead on a thread of their own."""
         scans = (self._scan(seq, i) for seq, i in enumerate(self._selected))
         return ahead(scans, prefetch) if prefetch else scans
+
+    def payloads(self) -> Iterator[tuple[bytes | memoryview, str]]:
+        """The clouds as they stand in the log, with their encoding; none for a folder of files."""
+        for at in self._selected:
+            try:
+                found = self._feed.payload(at)
+            except BadMessage:
+                continue
+            if found is not None:
+                yield found
 
     def info(self) -> LogInfo:
         """What ``avsreplay info`` prints."""

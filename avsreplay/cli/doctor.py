@@ -1,0 +1,98 @@
+"""``avsreplay doctor``: everything a log can tell of itself, and a clean copy of what is intact."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from avsreplay.log.doctor import Finding
+    from avsreplay.log.repair import Repaired
+
+__all__ = ["command"]
+
+
+@click.command(name="doctor")
+@click.argument("source", type=click.Path(path_type=Path))
+@click.option("--topic", help="The cloud topic, where there are several.")
+@click.option("--repair", "output", type=click.Path(path_type=Path), help="Write every intact record to this file.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing output.")
+@click.option("--strict", is_flag=True, help="Exit 3 where anything is lost.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
+@click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message read.")
+def command(
+    source: Path, topic: str | None, output: Path | None, overwrite: bool, strict: bool, as_json: bool,
+    max_message_mib: int,
+) -> None:  # fmt: skip
+    """Examine SOURCE: structure, checksums, clocks, gaps, duplicates, points, layout, truth.
+
+    Exit code 0 where nothing is lost, 4 where something is (3 with --strict).
+    """
+    from avsreplay.errors import UsageError
+    from avsreplay.log import SourceOptions
+    from avsreplay.log.doctor import examine
+    from avsreplay.log.repair import repair
+
+    try:
+        options = SourceOptions(topic=topic, max_message_mib=max_message_mib)
+    except ValueError as error:
+        raise UsageError(str(error), where="--max-message-mib", hint="give a whole number of MiB") from None
+    _, findings = examine(source, options)
+    done = None
+    if output is not None:
+        done = repair(source, output, overwrite=overwrite, max_message_mib=max_message_mib)
+    if as_json:
+        click.echo(json.dumps(_document(source, findings, output, done), indent=2))
+    else:
+        _print(source, findings, output, done)
+    _judge(source, findings, strict)
+
+
+def _judge(source: Path, findings: list[Finding], strict: bool) -> None:
+    from avsreplay.errors import DataLost, UnreadableInput
+    from avsreplay.log.doctor import Severity
+
+    errors = [f for f in findings if f.severity is Severity.ERROR]
+    if errors:
+        what = f"{len(errors)} error(s), the first: {errors[0].about}: {errors[0].text}"
+        if strict:
+            raise UnreadableInput(what, where=str(source), hint="repair it with --repair OUT")
+        raise DataLost(what, where=str(source), hint="--repair OUT writes what is intact")
+
+
+def _document(source: Path, findings: list[Finding], output: Path | None, done: Repaired | None) -> dict[str, Any]:
+    import dataclasses
+
+    listed = [{**dataclasses.asdict(f), "severity": f.severity.value} for f in findings]
+    repaired = None if done is None else {"output": str(output), **dataclasses.asdict(done)}
+    return {"source": str(source), "findings": listed, "repaired": repaired}
+
+
+def _print(source: Path, findings: list[Finding], output: Path | None, done: Repaired | None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from avsreplay.cli.info import WIDTH
+    from avsreplay.log.text import shown
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=WIDTH)
+    table = Table(title=Text(shown(source)), title_justify="left")
+    for head in ("severity", "about", "finding", "at"):
+        table.add_column(head, overflow="fold")
+    colours = {"error": "red", "warning": "yellow", "note": "cyan", "ok": "green"}
+    for finding in findings:
+        value = finding.severity.value
+        places = ", ".join(map(str, finding.places))
+        table.add_row(Text(value, colours[value]), finding.about, Text(shown(finding.text)), places)
+    console.print(table)
+    if done is not None:
+        kept = f"{done.messages} messages, {done.attachments} attachments, {done.records} metadata records"
+        console.print(Text(shown(f"repaired: {output}: {kept}")))
+        for line in done.dropped:
+            console.print(Text(shown(f"left out: {line}")))

@@ -1,0 +1,227 @@
+"""Examination of a log: structure, checksums, clocks, gaps, duplicates, points, truth; each finding with a severity."""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+
+from avsreplay.geometry import Array
+from avsreplay.log.cursor import BadMessage
+from avsreplay.log.mcap_file import McapFile
+from avsreplay.log.mcap_records import is_mcap
+from avsreplay.log.opening import open_source
+from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
+from avsreplay.log.point_cloud2 import read_layout
+from avsreplay.log.source import Source
+from avsreplay.log.text import shown
+from avsreplay.records import Scan, ScanStatus
+
+__all__ = ["Finding", "Severity", "examine"]
+
+_GAP_PERIODS, _GAP_FLOOR_S = 3.0, 0.5
+_NAMED = 5
+_APART_S = 1.0
+
+
+class Severity(Enum):
+    """How bad a finding is."""
+
+    OK = "ok"  # looked at and found good
+    NOTE = "note"  # worth knowing
+    WARNING = "warning"  # the log can be used, with care
+    ERROR = "error"  # part of the log is lost or cannot be read
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing found: how bad, about what, in one sentence, and the bytes or scans it is about."""
+
+    severity: Severity
+    about: str
+    text: str
+    places: tuple[int, ...] = ()
+
+
+@dataclass(slots=True)
+class _Tally:
+    """What one pass over the scans counts."""
+
+    scans: int = 0
+    points: int = 0
+    dropped: int = 0
+    with_truth: int = 0
+    damaged: list[tuple[int, str]] = field(default_factory=list)
+    empty: list[int] = field(default_factory=list)
+    repeated: list[int] = field(default_factory=list)
+
+
+def examine(path: Path, options: SourceOptions | None = None) -> tuple[LogInfo, list[Finding]]:
+    """Look at everything a log can tell.
+
+    Raises:
+        UnreadableInput: it cannot be opened at all.  UsageError: several cloud topics and none asked for.
+    """
+    options = options or SourceOptions()
+    with open_source(path, options, look=True) as source:
+        info = source.info()
+        findings = [*_losses(info.losses), *_structure(path, options), *_content(info)]
+        if info.scans:
+            tally, times = _pass(source)
+            findings += [*_clocks(source.clock), *_gaps(times), *_scans(tally), *_layout(source)]
+    return info, findings
+
+
+def _losses(losses: tuple[Loss, ...]) -> Iterator[Finding]:
+    if not losses:
+        yield Finding(Severity.OK, "damage", "nothing is lost")
+    for loss in losses:
+        span = ""
+        if loss.start_ns is not None and loss.end_ns is not None:
+            span = f", {(loss.end_ns - loss.start_ns) * 1e-9:.3f} s"
+        messages = "" if loss.messages is None else f", {loss.messages} messages"
+        where = f"{shown(loss.file)}: " if loss.file else ""
+        text = f"{where}{shown(loss.what)}: {loss.bytes} bytes{messages}{span} lost"
+        yield Finding(Severity.ERROR, "damage", text, (loss.offset,))
+
+
+def _structure(path: Path, options: SourceOptions) -> Iterator[Finding]:
+    if not is_mcap(path):
+        yield Finding(Severity.NOTE, "checksums", "this format has none: damage inside a message cannot be seen")
+        return
+    file = McapFile(path, options.max_message_mib << 20)
+    try:
+        if file.closed_properly and file.summary.trouble:
+            text = f"not to be trusted: {file.summary.trouble}; other readers may refuse the file"
+            yield Finding(Severity.ERROR, "summary", text)
+        elif file.closed_properly and not file.summary.start:
+            yield Finding(Severity.WARNING, "summary", "none: other readers are slow or refuse the file")
+        if file.unchecked:
+            yield Finding(Severity.WARNING, "checksums", f"{file.unchecked} chunks carry none")
+        if file.closed_properly and not file.data_checksum_holds():
+            text = "the checksum over the whole of the data does not hold"
+            yield Finding(Severity.ERROR, "checksums", text)
+        elif not file.unchecked and not file.losses:
+            yield Finding(Severity.OK, "checksums", "all hold")
+        if file.profile != "ros2":
+            yield Finding(Severity.NOTE, "profile", f"'{shown(file.profile)}', not ros2: some readers will not open it")
+        yield from _schemas(file)
+    finally:
+        file.close()
+
+
+def _schemas(file: McapFile) -> Iterator[Finding]:
+    for channel in file.channels().values():
+        if channel.encoding not in ("cdr", "ros1"):
+            text = f"{shown(channel.topic)} is encoded as '{shown(channel.encoding)}', which is not read"
+            yield Finding(Severity.NOTE, "encoding", text)
+        elif not channel.schema:
+            yield Finding(Severity.NOTE, "schema", f"{shown(channel.topic)} has no message definition")
+
+
+def _content(info: LogInfo) -> Iterator[Finding]:
+    if not info.scans:
+        yield Finding(Severity.WARNING, "scans", "no cloud topic with a message, or several and none was asked for")
+    if info.model is None:
+        yield Finding(Severity.NOTE, "model", "none inside: give --model to run it")
+    elif not info.model_faces:
+        yield Finding(Severity.NOTE, "model", f"{shown(info.model)} has no faces: it serves as a cloud")
+
+
+def _pass(source: Source) -> tuple[_Tally, list[int]]:
+    tally, times, last = _Tally(), list[int](), b""
+    for scan in source.scans(prefetch=1):
+        times.append(scan.t_ns)
+        last = _count(tally, scan, last)
+    return tally, times
+
+
+def _count(tally: _Tally, scan: Scan, last: bytes) -> bytes:
+    tally.scans += 1
+    tally.points += len(scan.points)
+    tally.dropped += scan.dropped_points
+    tally.with_truth += scan.truth is not None
+    if scan.status is ScanStatus.DAMAGED:
+        tally.damaged.append((scan.seq, scan.note or ""))
+    elif not len(scan.points):
+        tally.empty.append(scan.seq)
+    data = np.ascontiguousarray(scan.points).tobytes()
+    mark = zlib.crc32(data).to_bytes(4, "little") + len(data).to_bytes(8, "little") if data else b""
+    if data and mark == last:
+        tally.repeated.append(scan.seq)
+    return mark
+
+
+def _clocks(clock: ClockSummary) -> Iterator[Finding]:
+    if clock.note:
+        yield Finding(Severity.WARNING, "clock", clock.note)
+    elif abs(clock.offset_s) > _APART_S:
+        text = f"header and log clock are {clock.offset_s:+.3f} s apart; scans go by the {clock.clock} clock"
+        yield Finding(Severity.NOTE, "clock", text)
+    for name, words in (
+        ("unset", "stamps are unset"),
+        ("jumps", "stamps jump"),
+        ("equal", "stamps are equal to the one before"),
+        ("back", "stamps lie before the one before"),
+        ("header_steps", "lasting steps of the header clock"),
+        ("log_steps", "lasting steps of the log clock"),
+    ):
+        if count := getattr(clock, name):
+            yield Finding(Severity.WARNING, "clock", f"{count} {words}")
+    if not clock.placed and not clock.note:
+        yield Finding(Severity.OK, "clock", f"every stamp is plausible; median period {clock.period_s:.4f} s")
+
+
+def _gaps(times: list[int]) -> Iterator[Finding]:
+    steps: Array = np.diff(np.array(times, dtype=np.int64)).astype(np.float64) * 1e-9
+    if not len(steps):
+        return
+    limit = max(_GAP_PERIODS * float(np.median(steps)), _GAP_FLOOR_S)
+    wide = [int(i) for i in np.flatnonzero(steps > limit)]
+    if wide:
+        longest = max(float(steps[i]) for i in wide)
+        text = f"{len(wide)} wider than {limit:.3f} s, the widest {longest:.3f} s"
+        yield Finding(Severity.WARNING, "gaps", text, tuple(wide[:_NAMED]))
+    else:
+        yield Finding(Severity.OK, "gaps", f"none wider than {limit:.3f} s")
+
+
+def _scans(tally: _Tally) -> Iterator[Finding]:
+    if tally.damaged:
+        seqs, first = tuple(seq for seq, _ in tally.damaged[:_NAMED]), tally.damaged[0][1]
+        text = f"{len(tally.damaged)} of {tally.scans} cannot be decoded, the first: {first}"
+        yield Finding(Severity.ERROR, "scans", text, seqs)
+    if tally.empty:
+        text = f"{len(tally.empty)} of {tally.scans} have no finite point"
+        yield Finding(Severity.WARNING, "scans", text, tuple(tally.empty[:_NAMED]))
+    if tally.repeated:
+        text = f"{len(tally.repeated)} are the same bytes as the one before"
+        yield Finding(Severity.WARNING, "duplicates", text, tuple(tally.repeated[:_NAMED]))
+    total = tally.points + tally.dropped
+    share = tally.dropped / total if total else 0.0
+    text = f"{total} in {tally.scans} scans, {100 * share:.2f} % not finite"
+    yield Finding(Severity.NOTE if tally.dropped else Severity.OK, "points", text)
+    if 0 < tally.with_truth < tally.scans:
+        text = f"{tally.scans - tally.with_truth} of {tally.scans} scans have none"
+        yield Finding(Severity.NOTE, "truth", text)
+
+
+def _layout(source: Source) -> Iterator[Finding]:
+    """The fields of the clouds, and whether they stay the same."""
+    layouts: Counter[str] = Counter()
+    for payload, encoding in source.payloads():
+        try:
+            layout = read_layout(payload, encoding)
+        except BadMessage:
+            continue
+        fields = " ".join(f"{shown(f.name)}:{f.kind}@{f.offset}" for f in layout.fields)
+        order = "little" if layout.order == "<" else "big"
+        layouts[f"{fields}, {layout.point_step} bytes a point, {order} endian, frame '{shown(layout.frame)}'"] += 1
+    for text, count in layouts.most_common(_NAMED):
+        severity = Severity.OK if len(layouts) == 1 else Severity.WARNING
+        yield Finding(severity, "layout", text if len(layouts) == 1 else f"{count} scans: {text}")

@@ -1,0 +1,126 @@
+"""A clean file from a damaged one: every intact record, nothing else, in a structure that all readers open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.log.cursor import BadMessage
+from avsreplay.log.header import HEADER_RECORD, decode_header
+from avsreplay.log.mcap_file import McapFile
+from avsreplay.log.mcap_records import Channel, is_mcap
+from avsreplay.log.point_cloud2 import decode_cloud
+from avsreplay.log.recording import CLOUD_TYPES, MAX_NS
+from avsreplay.log.text import shown
+from avsreplay.log.writer import LIBRARY
+
+__all__ = ["Repaired", "repair"]
+
+_CHUNK_BYTES = 1 << 20
+
+
+@dataclass(slots=True)
+class Repaired:
+    """What a repair kept and left out."""
+
+    messages: int = 0
+    attachments: int = 0
+    records: int = 0
+    dropped: list[str] = field(default_factory=list)
+
+
+class _Copier:
+    """Writes what the survey of the damaged file hands it; a Tap."""
+
+    def __init__(self, stream: BinaryIO, profile: str) -> None:
+        from mcap.writer import Writer
+
+        self.done = Repaired()
+        self._writer: Any = Writer(stream, _CHUNK_BYTES, enable_data_crcs=True)
+        self._writer.start(profile=profile, library=LIBRARY)
+        self._schemas: dict[tuple[str, str, bytes], int] = {}
+        self._channels: dict[int, int] = {}
+
+    def message(self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview) -> None:
+        """Copy a message, unless it is a cloud that cannot be decoded or its time is past what readers take."""
+        if channel.type in CLOUD_TYPES:
+            try:
+                decode_cloud(payload, channel.encoding)
+            except BadMessage as error:
+                self.done.dropped.append(f"a cloud on {shown(channel.topic)}: {shown(error)}")
+                return
+        if times[0] > MAX_NS:
+            self.done.dropped.append(f"a message on {shown(channel.topic)} of an impossible time")
+            return
+        number = self._channel(channel)
+        self._writer.add_message(number, times[0], bytes(payload), min(times[1], MAX_NS), sequence)
+        self.done.messages += 1
+
+    def attachment(self, name: str, media: str, times: tuple[int, int], data: memoryview) -> None:
+        """Copy an attachment."""
+        self._writer.add_attachment(times[1], times[0], name, media, bytes(data))
+        self.done.attachments += 1
+
+    def metadata(self, name: str, values: dict[str, str]) -> None:
+        """Copy a metadata record, unless it is a header of ours whose checksum does not hold."""
+        if name == HEADER_RECORD:
+            try:
+                decode_header(values)
+            except ValueError as error:
+                self.done.dropped.append(f"the header record: {shown(error)}")
+                return
+        self._writer.add_metadata(name, values)
+        self.done.records += 1
+
+    def finish(self) -> None:
+        """Write the index and the end."""
+        self._writer.finish()
+
+    def _channel(self, channel: Channel) -> int:
+        if channel.id not in self._channels:
+            key = (channel.type, channel.schema_encoding, channel.schema)
+            if key not in self._schemas:
+                self._schemas[key] = self._writer.register_schema(*key)
+            new = self._writer.register_channel(channel.topic, channel.encoding, self._schemas[key], channel.metadata)
+            self._channels[channel.id] = new
+        return self._channels[channel.id]
+
+
+def repair(path: Path, output: Path, *, overwrite: bool = False, max_message_mib: int = 128) -> Repaired:
+    """Write every intact record of an MCAP file to ``output``.
+
+    Raises:
+        UsageError: the output exists, is the input, or the input is no MCAP file.
+        UnreadableInput: the input cannot be opened, or the output cannot be written.
+    """
+    _check(path, output, overwrite)
+    partial = output.with_name(output.name + ".partial")
+    probe = McapFile(path, max_message_mib << 20)
+    probe.close()
+    try:
+        with partial.open("wb") as stream:
+            copier = _Copier(stream, probe.profile)
+            McapFile(path, max_message_mib << 20, tap=copier).close()
+            copier.finish()
+        partial.replace(output)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        what = f"cannot be written: {error.strerror}"
+        raise UnreadableInput(what, where=shown(output), hint="name another output") from None
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+    return copier.done
+
+
+def _check(path: Path, output: Path, overwrite: bool) -> None:
+    if not path.exists():
+        raise UnreadableInput("no such file", where=shown(path), hint="check the path")
+    if output.exists() and (output.samefile(path) or not overwrite):
+        hint = "name another output" if output.samefile(path) else "name another output or add --overwrite"
+        raise UsageError("exists already", where=shown(output), hint=hint)
+    if not is_mcap(path):
+        hint = "take it over with 'avsreplay record' instead"
+        raise UsageError("only MCAP files are repaired", where=shown(path), hint=hint)

@@ -1,0 +1,412 @@
+"""Logs that others wrote: ROS 1 and ROS 2 bags, split files, several topics, moving sensors, truth in every form."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from log_cases import SECOND, header, scans, write
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag1 import Writer as Ros1Writer
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Ros2Writer
+from rosbags.typesys import Stores, get_typestore
+
+from avsreplay import geometry
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.geometry import Pose
+from avsreplay.log import ClockChoice, SourceOptions, open_source
+from avsreplay.log.cursor import Packer
+from avsreplay.log.encode import point_cloud2, pose_stamped
+from avsreplay.log.schemas import schema_text
+from avsreplay.records import LogHeader, Scan, ScanStatus
+
+CLOUDS = scans(12, 150)
+CLOUD, POSE, TF = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
+
+
+def pose(i: int) -> Pose:
+    return Pose(geometry.exp([0.1 * i, -0.2, 0.05 * i]), np.array([0.1 * i, 1.0, -0.3]))
+
+
+def mcap(path: Path, messages: list[tuple[str, str, int, bytes]], encoding: str = "cdr") -> Path:
+    """(topic, type, log time, payload) into an MCAP by the library's own writer."""
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start("ros2")
+        channels: dict[str, int] = {}
+        for topic, kind, log_ns, payload in messages:
+            if topic not in channels:
+                schema = writer.register_schema(kind, "ros2msg", schema_text(kind))
+                channels[topic] = writer.register_channel(topic, encoding, schema)
+            writer.add_message(channels[topic], log_ns, payload, log_ns)
+        writer.finish()
+    return path
+
+
+def clouds(topic: str = "/points", frame: str = "camera") -> list[tuple[str, str, int, bytes]]:
+    return [(topic, CLOUD, c.log_ns, point_cloud2(c.t_ns, frame, c.points, None)) for c in CLOUDS]
+
+
+def text1(text: str) -> bytes:
+    return struct.pack("<I", len(text)) + text.encode()
+
+
+def header1(c: Scan, frame: str) -> bytes:
+    return struct.pack("<III", c.seq, c.t_ns // SECOND, c.t_ns % SECOND) + text1(frame)
+
+
+def cloud1(c: Scan) -> bytes:
+    """The wire form of ROS 1, by hand."""
+    fields = b"".join(text1(name) + struct.pack("<IBI", 4 * i, 7, 1) for i, name in enumerate("xyz"))
+    data = np.ascontiguousarray(c.points).tobytes()
+    sizes = struct.pack("<?II", False, 12, len(data)) + struct.pack("<I", len(data))
+    return header1(c, "camera") + struct.pack("<III", 1, len(c.points), 3) + fields + sizes + data + b"\x01"
+
+
+def bag1(path: Path, compression: Ros1Writer.CompressionFormat | None = None, chunk: int = 1 << 20) -> Path:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = Ros1Writer(path)
+    if compression is not None:
+        writer.set_compression(compression)
+    writer.chunk_threshold = chunk
+    with writer:
+        cloud = writer.add_connection("/points", CLOUD, typestore=store)
+        truth = writer.add_connection("/gt", POSE, typestore=store)
+        for i, c in enumerate(CLOUDS):
+            writer.write(cloud, c.log_ns, cloud1(c))
+            writer.write(truth, c.log_ns, header1(c, "camera") + struct.pack("<7d", *pose(i).t, *pose(i).q))
+    return path
+
+
+def bag2(path: Path, plugin: StoragePlugin) -> Path:
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    with Ros2Writer(path, version=9, storage_plugin=plugin) as writer:
+        cloud = writer.add_connection("/points", CLOUD, typestore=store)
+        truth = writer.add_connection("/gt", POSE, typestore=store)
+        for i, c in enumerate(CLOUDS):
+            writer.write(cloud, c.log_ns, point_cloud2(c.t_ns, "camera", c.points, None))
+            writer.write(truth, c.log_ns, pose_stamped(c.t_ns, "camera", pose(i)))
+    return path
+
+
+def read(path: Path, **options: object) -> list[Scan]:
+    with open_source(path, SourceOptions(**options)) as source:  # type: ignore[arg-type]
+        assert not source.losses
+        return list(source.scans())
+
+
+def check(found: list[Scan], with_truth: bool = True) -> None:
+    assert [s.t_ns for s in found] == [c.t_ns for c in CLOUDS]
+    assert [s.log_ns for s in found] == [c.log_ns for c in CLOUDS]
+    for i, (scan, c) in enumerate(zip(found, CLOUDS, strict=True)):
+        assert scan.points.tobytes() == c.points.tobytes()
+        if with_truth:
+            np.testing.assert_allclose(scan.truth.matrix, pose(i).matrix, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("compression", [None, *Ros1Writer.CompressionFormat])
+def test_ros1_bags(tmp_path: Path, compression: Ros1Writer.CompressionFormat | None) -> None:
+    check(read(bag1(tmp_path / "a.bag", compression), truth_topic="/gt"))
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+@pytest.mark.parametrize("lone", [False, True])
+def test_ros2_bags_as_a_folder_and_as_a_lone_file(tmp_path: Path, plugin: StoragePlugin, lone: bool) -> None:
+    folder = bag2(tmp_path / "bag", plugin)
+    path = next(p for p in folder.iterdir() if p.suffix in (".db3", ".mcap")) if lone else folder
+    check(read(path, truth_topic="/gt"))
+
+
+def test_a_split_bag_is_one_log_in_the_order_of_its_numbers(tmp_path: Path) -> None:
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    parts = clouds()
+    for number, start in enumerate(range(0, 12, 1)):
+        mcap(folder / f"bag_{number}.mcap", parts[start : start + 1])
+    check(read(folder), with_truth=False)
+    (folder / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  relative_file_paths:\n" + "".join(f"    - bag_{n}.mcap\n" for n in range(13))
+    )
+    with open_source(folder) as source:
+        assert len(source) == 12
+        assert [loss.file for loss in source.losses] == ["bag_12.mcap"]
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.98])
+def test_a_ros1_bag_cut_short_gives_its_whole_chunks(tmp_path: Path, share: float) -> None:
+    data = bag1(tmp_path / "a.bag", chunk=3000).read_bytes()
+    (tmp_path / "x.bag").write_bytes(data[: int(share * len(data))])
+    with open_source(tmp_path / "x.bag") as source:
+        found = list(source.scans())
+        assert bool(source.losses) == (share < 0.95)  # behind that only the index is cut
+    assert len(found) >= int(12 * share) - 3
+    assert all(s.points.tobytes() == c.points.tobytes() for s, c in zip(found, CLOUDS, strict=False))
+
+
+def test_a_damaged_chunk_of_a_ros1_bag_costs_no_other(tmp_path: Path) -> None:
+    path = bag1(tmp_path / "a.bag", Ros1Writer.CompressionFormat.LZ4, 4000)
+    data = bytearray(path.read_bytes())
+    starts = [i for i in range(len(data)) if data.startswith(b"compression=lz4", i)]
+    assert len(starts) > 3
+    data[starts[1] + 60 : starts[1] + 90] = bytes(30)
+    path.write_bytes(data)
+    with open_source(path) as source:
+        found = [s.t_ns for s in source.scans()]
+        assert source.losses[0].chunks == 1
+        assert source.losses[0].messages == 2 * (12 - len(found))
+    assert 0 < 12 - len(found) <= 4
+
+
+@pytest.mark.parametrize("leaf", [0, 2, -1])
+def test_a_database_with_damaged_pages_gives_what_can_be_read(tmp_path: Path, leaf: int) -> None:
+    path = next(bag2(tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3"))
+    data = bytearray(path.read_bytes())
+    rows = [at for at in range(6 * 4096, len(data), 4096) if data[at] == 0x0D]  # leaves of the table of messages
+    data[rows[leaf] : rows[leaf] + 4096] = bytes(4096)
+    path.write_bytes(data)
+    with open_source(path) as source:
+        found = list(source.scans())
+        assert source.losses[0].what == "the database is damaged"
+    known = {c.points.tobytes() for c in CLOUDS}
+    assert 8 < len(found) < 12
+    assert all(s.points.tobytes() in known for s in found)
+
+
+def test_a_database_cut_short_is_named_with_what_helps(tmp_path: Path) -> None:
+    path = next(bag2(tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3"))
+    path.write_bytes(path.read_bytes()[:20_000])
+    with pytest.raises(UnreadableInput, match="recover"):
+        open_source(path)
+
+
+@pytest.mark.parametrize("schema", [
+    "CREATE VIEW messages AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x+1 FROM c)"
+    " SELECT x AS id, 1 AS topic_id, x AS timestamp, x AS data FROM c",
+    "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT,"
+    " data BLOB GENERATED ALWAYS AS (zeroblob(id)))",
+    "CREATE TABLE something_else(id INTEGER)",
+])  # fmt: skip
+def test_a_database_that_is_no_bag(tmp_path: Path, schema: str) -> None:
+    with sqlite3.connect(tmp_path / "x.db3") as db:
+        db.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+        db.execute(schema)
+    with pytest.raises(UnreadableInput, match="without the table 'messages'"):
+        open_source(tmp_path / "x.db3")
+
+
+def test_several_cloud_topics_are_listed_and_one_can_be_chosen(tmp_path: Path) -> None:
+    path = mcap(tmp_path / "a.mcap", [*clouds("/left"), *clouds("/right\x1b[31m")])
+    with pytest.raises(UsageError) as caught:
+        open_source(path)
+    assert caught.value.exit_code == 2
+    assert "/left" in str(caught.value)
+    assert "\\x1b[31m" in str(caught.value)
+    assert "\x1b" not in str(caught.value)
+    check(read(path, topic="/left"), with_truth=False)
+    with pytest.raises(UsageError, match="no PointCloud2 topic '/middle'"):
+        open_source(path, SourceOptions(topic="/middle"))
+
+
+def test_no_cloud_topic_names_what_there_is(tmp_path: Path) -> None:
+    path = mcap(tmp_path / "a.mcap", [("/gt", POSE, 5, pose_stamped(5, "c", pose(0)))])
+    with pytest.raises(UnreadableInput, match=r"/gt \(geometry_msgs/msg/PoseStamped\)") as caught:
+        open_source(path)
+    assert caught.value.exit_code == 3
+
+
+def test_an_unknown_encoding_is_named(tmp_path: Path) -> None:
+    path = mcap(tmp_path / "a.mcap", clouds(), encoding="protobuf")
+    with pytest.raises(UnreadableInput, match="unknown encoding 'protobuf'"):
+        open_source(path)
+
+
+def test_a_truth_topic_that_is_not_there_or_no_pose(tmp_path: Path) -> None:
+    path = mcap(tmp_path / "a.mcap", clouds())
+    with pytest.raises(UsageError, match="no such truth topic"):
+        open_source(path, SourceOptions(truth_topic="/gt"))
+    with pytest.raises(UsageError, match="truth topic of type"):
+        open_source(path, SourceOptions(truth_topic="/points"))
+
+
+def test_truth_between_its_stamps_is_interpolated_and_past_a_gap_is_not(tmp_path: Path) -> None:
+    start, half = CLOUDS[0].t_ns, SECOND // 4
+    a, b = pose(0), pose(3)
+    messages = [*clouds(), ("/gt", POSE, 1, pose_stamped(start - half, "c", a)),
+                ("/gt", POSE, 2, pose_stamped(start + half, "c", b)),
+                ("/gt", POSE, 3, pose_stamped(start + 9 * SECOND, "c", b))]  # fmt: skip
+    found = read(mcap(tmp_path / "a.mcap", messages), truth_topic="/gt", truth_gap_s=0.6)
+    middle = Pose(geometry.slerp(a.q, b.q, 0.5), 0.5 * (a.t + b.t))
+    np.testing.assert_allclose(found[0].truth.matrix, middle.matrix, atol=1e-15)
+    assert all(s.truth is None for s in found[1:])
+
+
+def covariance(i: int, c: Scan) -> bytes:
+    p = pose(i)
+    return Packer().header(c.t_ns, "c").f64s(*p.t, *p.q, *([0.0] * 36)).bytes()
+
+
+def odometry(i: int, c: Scan) -> bytes:
+    p = pose(i)
+    return Packer().header(c.t_ns, "c").string("t").f64s(*p.t, *p.q, *([0.0] * 36), *([0.0] * 42)).bytes()
+
+
+def stamped(i: int, c: Scan) -> bytes:
+    p = pose(i)
+    return Packer().header(c.t_ns, "c").string("target").f64s(*p.t, *p.q).bytes()
+
+
+@pytest.mark.parametrize(("kind", "make"), [
+    ("geometry_msgs/msg/PoseWithCovarianceStamped", covariance),
+    ("nav_msgs/msg/Odometry", odometry),
+    ("geometry_msgs/msg/TransformStamped", stamped),
+])  # fmt: skip
+def test_truth_of_every_message_type(tmp_path: Path, kind: str, make) -> None:  # type: ignore[no-untyped-def]
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = McapWriter(file)
+        writer.start("ros2")
+        one = writer.register_channel("/points", "cdr", writer.register_schema(CLOUD, "ros2msg", schema_text(CLOUD)))
+        two = writer.register_channel("/gt", "cdr", writer.register_schema(kind, "ros2msg", b""))
+        for i, (c, (_, _, log_ns, payload)) in enumerate(zip(CLOUDS, clouds(), strict=True)):
+            writer.add_message(one, log_ns, payload, log_ns)
+            writer.add_message(two, log_ns, make(i, c), log_ns)
+        writer.finish()
+    check(read(tmp_path / "a.mcap", truth_topic="/gt"))
+
+
+def transforms(*links: tuple[str, str, Pose], t_ns: int) -> bytes:
+    packer = Packer().u32(len(links))
+    for parent, child, p in links:
+        packer.header(t_ns, parent).string(child).f64s(*p.t, *p.q)
+    return packer.bytes()
+
+
+def moving_sensor() -> list[tuple[str, str, int, bytes]]:
+    mount = pose(2)
+    out = [("/tf_static", TF, 1, transforms(("base", "lidar", mount), t_ns=0))]
+    for i, c in enumerate(CLOUDS):
+        links = (("map", "base", pose(i)), ("map", "target", pose(20 - i)))
+        out.append(("/tf", TF, c.log_ns, transforms(*links, t_ns=c.t_ns)))
+    return [*clouds(frame="/lidar"), *out]
+
+
+def test_clouds_of_a_moving_sensor_are_taken_to_a_fixed_frame(tmp_path: Path) -> None:
+    found = read(mcap(tmp_path / "a.mcap", moving_sensor()), fixed_frame="map", truth_frame="target")
+    for i, (scan, c) in enumerate(zip(found, CLOUDS, strict=True)):
+        T_map_lidar = pose(i).matrix @ pose(2).matrix
+        want = c.points.astype(np.float64) @ T_map_lidar[:3, :3].T + T_map_lidar[:3, 3]
+        np.testing.assert_allclose(scan.points, want, atol=1e-12)
+        np.testing.assert_allclose(scan.truth.matrix, pose(20 - i).matrix, atol=1e-14)
+
+
+def test_truth_from_a_chain_in_the_sensors_own_frame(tmp_path: Path) -> None:
+    found = read(mcap(tmp_path / "a.mcap", moving_sensor()), truth_frame="target")
+    for i, scan in enumerate(found):
+        want = np.linalg.inv(pose(i).matrix @ pose(2).matrix) @ pose(20 - i).matrix
+        np.testing.assert_allclose(scan.truth.matrix, want, atol=1e-14)
+
+
+def test_a_sensor_topic_does_the_same(tmp_path: Path) -> None:
+    poses = [("/cam", POSE, c.log_ns, pose_stamped(c.t_ns, "map", pose(i))) for i, c in enumerate(CLOUDS[:-1])]
+    found = read(mcap(tmp_path / "a.mcap", [*clouds(), *poses]), sensor_topic="/cam")
+    np.testing.assert_allclose(found[4].points, pose(4).apply(CLOUDS[4].points), atol=1e-12)
+    assert found[-1].status is ScanStatus.DAMAGED
+    assert "no pose of the sensor" in found[-1].note
+
+
+def test_a_loop_of_transforms_ends(tmp_path: Path) -> None:
+    loop = transforms(("a", "b", pose(1)), ("b", "a", pose(2)), ("b", "camera", pose(0)), ("x", "map", pose(0)), t_ns=0)
+    path = mcap(tmp_path / "a.mcap", [*clouds(), ("/tf_static", TF, 1, loop)])
+    assert all(s.status is ScanStatus.DAMAGED for s in read(path, fixed_frame="map"))
+    with pytest.raises(UsageError, match="no frame 'mars'"):
+        open_source(path, SourceOptions(fixed_frame="mars"))
+
+
+def test_pose_files_beside_a_log(tmp_path: Path) -> None:
+    path = mcap(tmp_path / "a.mcap", clouds())
+    tum, kitti, euroc = tmp_path / "t.tum", tmp_path / "k.txt", tmp_path / "e.csv"
+    rows = [(c.t_ns, pose(i)) for i, c in enumerate(CLOUDS)]
+    lines = [f"{t // SECOND}.{t % SECOND:09d} {' '.join(repr(float(v)) for v in (*p.t, *p.q))}\n" for t, p in rows]
+    tum.write_text("# t x y z qx qy qz qw\n" + "".join(lines))
+    kitti.write_text("".join(" ".join(repr(float(v)) for v in p.matrix[:3].reshape(-1)) + "\n" for _, p in rows))
+    euroc.write_text("#timestamp [ns],p,q\n" + "".join(
+        f"{t},{','.join(repr(float(v)) for v in (*p.t, p.q[3], *p.q[:3]))},0,0,0\n" for t, p in rows))  # fmt: skip
+    for file in (tum, kitti, euroc):
+        for i, scan in enumerate(read(path, truth_file=file)):
+            np.testing.assert_allclose(scan.truth.matrix, pose(i).matrix, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "1 2 3",
+        "a b c d e f g h",
+        "1 0 0 0 0 0 0 0",
+        "1 nan 0 0 0 0 0 1",
+        "1 0 0 0 0 0 0 1 9",
+        "1 0 0 0 2 0 0 0 0 1 0 0",
+        "1,2",
+        "",
+    ],
+)
+def test_a_pose_file_that_is_none(tmp_path: Path, line: str) -> None:
+    path = mcap(tmp_path / "a.mcap", clouds())
+    (tmp_path / "p.txt").write_text("0 0 0 0 0 0 0 1\n" * bool(line) + line + "\n")
+    with pytest.raises(UnreadableInput) as caught:
+        open_source(path, SourceOptions(truth_file=tmp_path / "p.txt"))
+    assert ("p.txt:2" in str(caught.value)) == bool(line)
+
+
+def test_a_cloud_that_cannot_be_decoded_is_a_damaged_scan(tmp_path: Path) -> None:
+    messages = clouds()
+    messages[4] = (*messages[4][:3], messages[4][3][:200])
+    messages[5] = (*messages[5][:3], b"")
+    found = read(mcap(tmp_path / "a.mcap", messages))
+    assert [s.status for s in found][3:7] == [ScanStatus.OK, ScanStatus.DAMAGED, ScanStatus.DAMAGED, ScanStatus.OK]
+    assert len(found) == 12
+
+
+def test_an_empty_cloud_is_an_empty_scan(tmp_path: Path) -> None:
+    empty = np.zeros((0, 3), np.float32)
+    nothing = np.full((7, 3), np.nan, np.float32)
+    messages = [
+        ("/p", CLOUD, SECOND + i, point_cloud2(SECOND + i, "c", p, None)) for i, p in enumerate((empty, nothing))
+    ]
+    found = read(mcap(tmp_path / "a.mcap", messages))
+    assert [(s.status, s.dropped_points) for s in found] == [(ScanStatus.EMPTY, 0), (ScanStatus.EMPTY, 7)]
+
+
+def test_the_log_clock_can_be_chosen(tmp_path: Path) -> None:
+    write(tmp_path / "a.mcap", header(np.random.Generator(np.random.PCG64(1))), CLOUDS)
+    assert [s.t_ns for s in read(tmp_path / "a.mcap", clock=ClockChoice.LOG)] == [c.log_ns for c in CLOUDS]
+
+
+def test_a_conversion_to_ros1_and_to_sqlite_and_back_keeps_every_bit(tmp_path: Path) -> None:
+    from rosbags.convert.converter import convert
+
+    write(tmp_path / "a.mcap", LogHeader(), CLOUDS)
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    options = {"exclude_topics": ["/faults", "/tf_static"], "include_topics": [], "exclude_msgtypes": [],
+               "include_msgtypes": []}  # fmt: skip
+    convert(
+        [tmp_path / "a.mcap"],
+        tmp_path / "a.bag",
+        "",
+        9,
+        None,
+        "none",
+        store,
+        get_typestore(Stores.ROS1_NOETIC),
+        **options,
+    )
+    convert([tmp_path / "a.mcap"], tmp_path / "db", "sqlite3", 9, None, "none", store, store, **options)
+    convert([tmp_path / "db"], tmp_path / "back", "mcap", 9, None, "none", store, store, **options)
+    first = read(tmp_path / "a.mcap")
+    for path in ("a.bag", "db", "back"):
+        for one, two in zip(first, read(tmp_path / path), strict=True):
+            assert one.points.tobytes() == two.points.tobytes()
+            assert (one.t_ns, one.log_ns) == (two.t_ns, two.log_ns)
+            assert one.truth.matrix.tobytes() == two.truth.matrix.tobytes()
