@@ -18,7 +18,7 @@ from avsreplay.plan.flight import Path
 from avsreplay.plan.pilot import Pilot, PilotMemory, Sight
 from avsreplay.plan.supervisor import Action
 
-__all__ = ["Execution", "Miss", "Motion", "Tolerance", "execute", "interpolated", "miss"]
+__all__ = ["Execution", "Miss", "Motion", "Tolerance", "closed_miss", "execute", "interpolated", "miss"]
 
 Motion = Callable[[Array], tuple[Array, Array, Array]]
 """Instants (n,) [s, on the log's clock] -> positions (n, 3), velocities (n, 3), attitudes (n, 4) of {C} in {A}."""
@@ -95,11 +95,27 @@ def _miss_at(at_s: float, lead_s: float, r: Array, v: Array, truth: Motion, atti
     return Miss(lead_s, at_s, float(np.linalg.norm(rho[0] - r)), float(np.linalg.norm(rate[0] - v)), turn)
 
 
+def closed_miss(memory: PilotMemory, since_ns: int, truth: Motion, attitude: Array | None = None) -> Miss:
+    """The miss when the gripper closes, at the end of the leg that was committed to.
+
+    Args:
+        memory: of a pilot whose action is ``capture``.
+        since_ns: instant that the truth counts its seconds from.
+        truth: where the grasp point really was.
+        attitude: (4,) q_ac that the gripper is turned to.
+    """
+    end_ns = memory.leg.end_ns
+    made_ns = end_ns if memory.plan is None else memory.plan.t_ns
+    r, v = memory.leg.at(end_ns)
+    return _miss_at((end_ns - since_ns) * 1e-9, (end_ns - made_ns) * 1e-9, r, v, truth, attitude)
+
+
 def execute(
     pilot: Pilot,
     sights: Iterable[Sight],
     truth: Motion,
     attitude: Callable[[Sight, float], Array] | None = None,
+    since_ns: int = 0,
 ) -> Execution:
     """Fly the log: the pilot sees one sight after another, the truth judges the end.
 
@@ -108,35 +124,29 @@ def execute(
         sights: what was known after each scan.
         truth: where the grasp point really was.
         attitude: the q_ac (4,) a sight predicts for a time after it [s]; what the gripper is turned to.
+        since_ns: instant that the truth counts its seconds from.
+
+    Raises:
+        ValueError: there is no sight.
     """
     changes: list[tuple[float, str, str]] = []
-    last: tuple[Sight, PilotMemory] | None = None
+    memory: PilotMemory | None = None
     committed: Sight | None = None
     for sight, memory in pilot.fly(sights):
         decided = (memory.decision.action.value, memory.decision.rule)
         if not changes or changes[-1][1:] != decided:
-            changes.append((sight.t_ns * 1e-9, *decided))
+            changes.append(((sight.t_ns - since_ns) * 1e-9, *decided))
         if memory.decision.action is Action.CAPTURE and committed is None:
             committed = sight
-        last = (sight, memory)
         if memory.captured_ns is not None:
             break
-    if last is None:
+    if memory is None:
         raise ValueError("there is no scan to fly by")
-    memory = last[1]
-    if committed is None or memory.decision.action is not Action.CAPTURE:
-        return Execution(False, None, tuple(changes), memory.decision.action)
-    return Execution(True, _closed(memory, committed, truth, attitude), tuple(changes), Action.CAPTURE)
-
-
-def _closed(
-    memory: PilotMemory, committed: Sight, truth: Motion, attitude: Callable[[Sight, float], Array] | None
-) -> Miss:
-    """The miss when the gripper closes, at the end of the leg that was committed to."""
-    lead_s = (memory.leg.end_ns - committed.t_ns) * 1e-9
-    r, v = memory.leg.at(memory.leg.end_ns)
-    q = attitude(committed, lead_s) if attitude else None
-    return _miss_at(memory.leg.end_ns * 1e-9, lead_s, r, v, truth, q)
+    action = memory.decision.action
+    if committed is None or action is not Action.CAPTURE:
+        return Execution(False, None, tuple(changes), action)
+    turned = attitude(committed, (memory.leg.end_ns - committed.t_ns) * 1e-9) if attitude else None
+    return Execution(True, closed_miss(memory, since_ns, truth, turned), tuple(changes), action)
 
 
 def interpolated(times_s: Array, poses: Sequence[geometry.Pose]) -> Motion:
