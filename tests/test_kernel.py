@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -166,13 +167,14 @@ def scan_of(mesh: Surface, n: int, seed: int, noise: float = 0.003) -> Array:
 
 
 RULE = IcpParams(n_max=40)
+FACING = IcpParams(n_max=40, facing=True)
 GUESS = Pose(exp([0.03, -0.02, 0.04]), [0.02, -0.03, 0.01])
 
 
 def everything(model: Model, scan: Array, rule: IcpParams = RULE) -> bytes:
     """All bits of an alignment and of the sums at its end."""
     r = model.icp(scan, GUESS, rule)
-    n = model.normal_equations(scan, r.T_ca, 0.2, threads=rule.threads)
+    n = model.normal_equations(scan, r.T_ca, 0.2, threads=rule.threads, facing=rule.facing)
     c = model.closest(scan, threads=rule.threads)
     numbers = [r.iterations, r.inliers, r.rms_m, r.gate_m, r.step_rad, r.step_m, n.inliers, n.sum_e2, n.sum_d2]
     arrays = [r.T_ca, n.info, n.gradient, c.foot, c.d2, c.normal]
@@ -191,6 +193,7 @@ def test_any_number_of_threads_gives_the_same_bits(target: Surface, threads: int
     model = Model.build(target, 0.4)
     rule = IcpParams(n_max=40, threads=threads)
     assert everything(model, scan, rule) == everything(model, scan)
+    assert everything(model, scan, replace(rule, facing=True)) == everything(model, scan, FACING)
 
 
 def test_keeping_neighbours_gives_the_same_bits(target: Surface) -> None:
@@ -199,12 +202,14 @@ def test_keeping_neighbours_gives_the_same_bits(target: Surface) -> None:
     kept, searched = model.icp(scan, GUESS, RULE), model.icp(scan, GUESS, IcpParams(n_max=40, keep=False))
     assert everything(model, scan) == everything(model, scan, IcpParams(n_max=40, keep=False))
     assert kept.searched < searched.searched == searched.iterations * len(scan)
+    assert everything(model, scan, FACING) == everything(model, scan, replace(FACING, keep=False))
 
 
 def test_any_instruction_set_gives_the_same_bits(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 5003, 18)
     fast, plain = Model.build(target, 0.4), Model.build(target, 0.4, portable=True)
     assert everything(fast, scan) == everything(plain, scan)
+    assert everything(fast, scan, FACING) == everything(plain, scan, FACING)
 
 
 def test_building_twice_gives_the_same_bits(target: Surface) -> None:

@@ -236,3 +236,37 @@ def test_an_unknown_engine_is_refused() -> None:
 def test_parameters_are_checked(wrong: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(wrong))):
         IcpParams(**wrong)  # type: ignore[arg-type]
+
+
+def test_only_faces_that_look_at_the_camera_count(engine: Engine) -> None:
+    mesh = shape()
+    camera = np.array([3.0, -2.0, 4.0])
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    seen = np.sum((camera - corners[:, 0]) * normals, axis=1) > 0
+    q = rng(30).uniform(-1, 1, (800, 3))
+    found = Model.build(mesh, 0.5, engine=engine).closest(q, camera_c=camera)
+    alone = Model.build(dataclasses.replace(mesh, faces=mesh.faces[seen]), 0.5, engine=engine).closest(q)
+    near = found.id >= 0
+    assert seen[found.id[near]].all()
+    assert np.array_equal(near, alone.id >= 0)
+    assert found.d2[near] == pytest.approx(alone.d2[near], abs=1e-14)
+
+
+def test_a_thin_plate_is_not_pulled_to_its_far_side(engine: Engine) -> None:
+    """Half the noise of the near side lies nearer to the far one: all faces bias the pose, those seen do not."""
+    mesh = shape()
+    thin = dataclasses.replace(mesh, vertices=mesh.vertices * [1, 1, 0.02])
+    r = rng(31)
+    camera = Pose(exp([0.0, 0.0, 0.3]), [0.0, 0.0, 5.0])
+    corners = thin.vertices[thin.faces]
+    up = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] > 1e-9
+    scan = camera.inverse().apply(on(dataclasses.replace(thin, faces=thin.faces[up]), 3000, 32))
+    scan += [0, 0, 1] * (0.006 * r.standard_normal((3000, 1)))
+    model = Model.build(thin, 0.3, engine=engine)
+    z = [model.icp(scan, camera, IcpParams(facing=f, tighten=0.0)).T_ca[2, 3] - 5.0 for f in (True, False)]
+    sums = model.normal_equations(scan, camera, facing=True)
+    assert abs(z[0]) < 2e-4
+    assert abs(z[1]) > 5 * abs(z[0])
+    assert sums.inliers == 3000
+    assert np.sqrt(sums.sum_e2 / 3000) == pytest.approx(0.006, rel=0.1)

@@ -13,7 +13,9 @@ class Index:
         threads: int = 1,
         portable: bool = False,
     ) -> None: ...
-    def closest(self, points: NDArray[Any], threads: int = 1) -> tuple[Any, ...]: ...
+    def closest(
+        self, points: NDArray[Any], threads: int = 1, camera_c: tuple[float, ...] | None = None
+    ) -> tuple[Any, ...]: ...
     def icp(
         self,
         points: NDArray[Any],
@@ -27,9 +29,15 @@ class Index:
         eps_m: float,
         threads: int = 1,
         keep: bool = False,
+        facing: bool = False,
     ) -> tuple[Any, ...]: ...
     def normal_equations(
-        self, points: NDArray[Any], T_ca: NDArray[np.float64], gate_m: float, threads: int = 1
+        self,
+        points: NDArray[Any],
+        T_ca: NDArray[np.float64],
+        gate_m: float,
+        threads: int = 1,
+        facing: bool = False,
     ) -> tuple[Any, ...]: ...
     @property
     def bytes(self) -> int: ...

@@ -53,6 +53,7 @@ class IcpParams:
     eps_rad: float = 1e-5  # stop below this turn [rad]
     eps_m: float | None = None  # and below this move of the centroid [m]; auto: 1e-6 of the model's extent
     threads: int = 1  # the result is the same, to the bit, for any number
+    facing: bool = False  # match only faces that look at the camera, {A}'s origin: for meshes wound outwards
     keep: bool = True  # keep a neighbour while it provably cannot change; the result is the same, to the bit
 
     def __post_init__(self) -> None:
@@ -123,15 +124,19 @@ class NormalEquations:
 class _Index(Protocol):
     """What an engine offers; shapes and units as in :class:`Model`."""
 
-    def closest(self, points: NDArray[Any], threads: int) -> tuple[Array, Array, NDArray[np.int32], Array]: ...
+    def closest(
+        self, points: NDArray[Any], threads: int, camera_c: Array | None
+    ) -> tuple[Array, Array, NDArray[np.int32], Array]: ...
 
     @property
     def bytes(self) -> int: ...
 
-    def icp(self, points: NDArray[Any], T_ca: Array, rule: Rule, threads: int, keep: bool) -> tuple[Any, ...]: ...
+    def icp(
+        self, points: NDArray[Any], T_ca: Array, rule: Rule, threads: int, keep: bool, facing: bool
+    ) -> tuple[Any, ...]: ...
 
     def normal_equations(
-        self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int
+        self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int, facing: bool
     ) -> tuple[Array, Array, int, float, float, int, int]: ...
 
 
@@ -177,9 +182,13 @@ class Model:
         """Memory of the index [B]; 0 for the reference engine, which does not count."""
         return self._index.bytes
 
-    def closest(self, points: NDArray[Any], *, threads: int = 1) -> Closest:
-        """Feet of ``points`` (n, 3) [m] in {C}; a point that is not finite has none."""
-        return Closest(*self._index.closest(_points(points), threads))
+    def closest(self, points: NDArray[Any], *, threads: int = 1, camera_c: ArrayLike | None = None) -> Closest:
+        """Feet of ``points`` (n, 3) [m] in {C}; a point that is not finite has none.
+
+        With ``camera_c`` (3,) [m] given only faces that look at it count; a cloud has no sides and counts whole.
+        """
+        camera = None if camera_c is None else np.asarray(camera_c, dtype=np.float64).reshape(3)
+        return Closest(*self._index.closest(_points(points), threads, camera))
 
     def icp(self, points: NDArray[Any], T_ca: ArrayLike | Pose, params: IcpParams | None = None) -> IcpResult:
         """Lay the scan ``points`` (n, 3) [m] in {A} on the model from the guess ``T_ca`` (4, 4).
@@ -192,14 +201,25 @@ class Model:
         floor = self.extent_m / 500.0 if params.floor_m is None else params.floor_m
         eps_m = 1e-6 * self.extent_m if params.eps_m is None else params.eps_m
         rule = (params.n_max, params.n_plane, gate, params.tighten, floor, params.eps_rad, eps_m)
-        return IcpResult(*self._index.icp(_points(points), _rigid(T_ca), rule, params.threads, params.keep))
+        return IcpResult(
+            *self._index.icp(_points(points), _rigid(T_ca), rule, params.threads, params.keep, params.facing)
+        )
 
     def normal_equations(
-        self, points: NDArray[Any], T_ca: ArrayLike | Pose, gate_m: float | None = None, *, threads: int = 1
+        self,
+        points: NDArray[Any],
+        T_ca: ArrayLike | Pose,
+        gate_m: float | None = None,
+        *,
+        threads: int = 1,
+        facing: bool = False,
     ) -> NormalEquations:
-        """Point-to-plane information, gradient and residual sums of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4)."""
+        """Point-to-plane information, gradient and residual sums of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4).
+
+        ``facing``: as in :class:`IcpParams`.
+        """
         gate = self.reach_m if gate_m is None else min(gate_m, self.reach_m)
-        return NormalEquations(*self._index.normal_equations(_points(points), _rigid(T_ca), gate, threads))
+        return NormalEquations(*self._index.normal_equations(_points(points), _rigid(T_ca), gate, threads, facing))
 
 
 def _points(points: NDArray[Any]) -> NDArray[Any]:

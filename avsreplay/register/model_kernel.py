@@ -35,9 +35,12 @@ class KernelIndex:
             ) from error
         self._index = _kernel.Index(vertices, faces, kept, reach_m, threads, portable)
 
-    def closest(self, points: NDArray[Any], threads: int) -> tuple[Array, Array, NDArray[np.int32], Array]:
+    def closest(
+        self, points: NDArray[Any], threads: int, camera_c: Array | None
+    ) -> tuple[Array, Array, NDArray[np.int32], Array]:
         """Feet (n, 3), squared distances (n,), ids (n,), normals (n, 3)."""
-        foot, d2, ids, normal = self._index.closest(points, threads)
+        camera = None if camera_c is None else tuple(camera_c.tolist())
+        foot, d2, ids, normal = self._index.closest(points, threads, camera)
         return foot, d2, ids, normal
 
     @property
@@ -45,15 +48,17 @@ class KernelIndex:
         """Memory of the index [B]."""
         return self._index.bytes
 
-    def icp(self, points: NDArray[Any], T_ca: Array, rule: Rule, threads: int, keep: bool) -> tuple[Any, ...]:
+    def icp(
+        self, points: NDArray[Any], T_ca: Array, rule: Rule, threads: int, keep: bool, facing: bool
+    ) -> tuple[Any, ...]:
         """The loop of ``Model.icp``."""
-        return self._index.icp(points, T_ca, *rule, threads, keep)
+        return self._index.icp(points, T_ca, *rule, threads, keep, facing)
 
     def normal_equations(
-        self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int
+        self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int, facing: bool
     ) -> tuple[Array, Array, int, float, float, int, int]:
         """Sums of ``Model.normal_equations``."""
         info, gradient, inliers, sum_e2, sum_d2, seen, ignored = self._index.normal_equations(
-            points, T_ca, gate_m, threads
+            points, T_ca, gate_m, threads, facing
         )
         return info, gradient, inliers, sum_e2, sum_d2, seen, ignored

@@ -42,24 +42,28 @@ class ReferenceIndex:
             corners = vertices[faces[kept]]
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-            tie = 1e-10 * (float(np.linalg.norm(np.ptp(vertices, axis=0))) + reach_m)
-            self._search: _Search = _MeshSearch(corners, self._normals, tie)
+            self._corners: Array | None = corners
+            self._tie = 1e-10 * (float(np.linalg.norm(np.ptp(vertices, axis=0))) + reach_m)
+            self._search: _Search = _MeshSearch(corners, self._normals, self._tie)
             self._ids = kept
         else:
+            self._corners = None
             self._normals = cloud_normals(vertices)
             self._search = _CloudSearch(vertices)
             self._ids = np.arange(len(vertices), dtype=np.int32)
 
     bytes = 0
 
-    def closest(self, points: NDArray[Any], threads: int) -> tuple[Array, Array, NDArray[np.int32], Array]:
+    def closest(
+        self, points: NDArray[Any], threads: int, camera_c: Array | None
+    ) -> tuple[Array, Array, NDArray[np.int32], Array]:
         """Feet (n, 3), squared distances (n,), ids (n,), normals (n, 3)."""
         del threads
         n = len(points)
         foot, normal = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
         d2, ids = np.full(n, np.inf), np.full(n, -1, dtype=np.int32)
         good = np.flatnonzero(np.isfinite(points).all(axis=1))
-        f, d, i = self._near(points[good].astype(np.float64))
+        f, d, i = self._near(points[good].astype(np.float64), camera_c)
         near = np.flatnonzero(i >= 0)
         rows = good[near]
         foot[rows], d2[rows], ids[rows], normal[rows] = f[near], d[near], self._ids[i[near]], self._normals[i[near]]
@@ -72,6 +76,7 @@ class ReferenceIndex:
         rule: tuple[int, int, float, float, float, float, float],
         threads: int,
         keep: bool,
+        facing: bool,
     ) -> tuple[Any, ...]:
         """The loop of ``Model.icp``; ``rule`` is (n_max, n_plane, gate, tighten, floor, eps_rad, eps_m)."""
         del threads, keep
@@ -81,7 +86,7 @@ class ReferenceIndex:
         T, plane, done, passes = T_ca.copy(), n_plane > 0, False, 0
         inliers, rms, turn, move = 0, float("nan"), float("inf"), float("inf")
         while passes < n_max and not done:
-            p, foot, normal, d2 = self._matched(scan, T, gate)
+            p, foot, normal, d2 = self._matched(scan, T, gate, facing)
             passes += 1
             inliers = len(p)
             rms = float(np.sqrt(np.mean(d2))) if inliers else float("nan")
@@ -97,23 +102,30 @@ class ReferenceIndex:
         return T, passes, done, inliers, rms, gate, turn, move, len(points) - len(scan), searched
 
     def normal_equations(
-        self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int
+        self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int, facing: bool
     ) -> tuple[Array, Array, int, float, float, int, int]:
         """Sums of ``Model.normal_equations``."""
         del threads
         scan = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-        p, foot, normal, d2 = self._matched(scan, T_ca, gate_m)
+        p, foot, normal, d2 = self._matched(scan, T_ca, gate_m, facing)
         J, e = np.hstack([np.cross(p, normal), normal]), np.sum((foot - p) * normal, axis=1)
         return J.T @ J, J.T @ e, len(p), float(e @ e), float(np.sum(d2)), len(scan), len(points) - len(scan)
 
-    def _near(self, p: Array) -> tuple[Array, Array, NDArray[np.int32]]:
+    def _near(self, p: Array, camera_c: Array | None) -> tuple[Array, Array, NDArray[np.int32]]:
         """Foot, d2 and index into the primitives; -1 at the reach or farther."""
-        foot, d2, i = self._search(p)
+        if camera_c is None or self._corners is None:
+            foot, d2, i = self._search(p)
+        else:
+            seen = np.flatnonzero(np.sum((camera_c - self._corners[:, 0]) * self._normals, axis=1) > 0.0)
+            if not len(seen):
+                return np.zeros_like(p), np.full(len(p), np.inf), np.full(len(p), -1, dtype=np.int32)
+            foot, d2, i = _MeshSearch(self._corners[seen], self._normals[seen], self._tie)(p)
+            i = seen[i].astype(np.int32)
         return foot, d2, np.where(d2 < self._reach**2, i, -1).astype(np.int32)
 
-    def _matched(self, scan: Array, T_ca: Array, gate: float) -> tuple[Array, Array, Array, Array]:
+    def _matched(self, scan: Array, T_ca: Array, gate: float, facing: bool) -> tuple[Array, Array, Array, Array]:
         p = scan @ T_ca[:3, :3].T + T_ca[:3, 3]
-        foot, d2, i = self._near(p)
+        foot, d2, i = self._near(p, T_ca[:3, 3] if facing else None)
         take = (i >= 0) & (d2 < gate**2)
         return p[take], foot[take], self._normals[i[take]], d2[take]
 

@@ -1,8 +1,8 @@
 // The door to Python: checks shapes, keeps the arrays alive, lets go of the interpreter while it works.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
-#include <nanobind/stl/string.h>
-#include <nanobind/stl/tuple.h>
+#include <nanobind/stl/array.h>
+#include <nanobind/stl/optional.h>
 
 #include <algorithm>
 #include <cstring>
@@ -90,9 +90,10 @@ class Index {
     build(store_, s, reach, code(), team);
   }
 
-  nb::tuple closest(nb::handle points, int threads) const {
+  nb::tuple closest(nb::handle points, int threads, std::optional<std::array<double, 3>> camera) const {
     const Cloud cloud(points);
     const View v = cloud.view();
+    const Vec3 eye = camera ? Vec3{(*camera)[0], (*camera)[1], (*camera)[2]} : Vec3{0, 0, 0};
     Feet out;
     auto foot = array<double>({(size_t)v.n, 3}, &out.foot), normal = array<double>({(size_t)v.n, 3}, &out.normal);
     auto d2 = array<double>({(size_t)v.n}, &out.d2);
@@ -102,29 +103,29 @@ class Index {
       Team team(threads);
       const Code& code = this->code();
       team.each((v.n + CHUNK - 1) / CHUNK, [&](int64_t k) {
-        code.closest(store_, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), out);
+        code.closest(store_, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), camera ? &eye : nullptr, out);
       });
     }
     return nb::make_tuple(foot, d2, id, normal);
   }
 
   nb::tuple icp(nb::handle points, const Doubles& T_ca, int n_max, int n_plane, double gate, double tighten,
-                double floor, double eps_rad, double eps_m, int threads, bool keep) const {
+                double floor, double eps_rad, double eps_m, int threads, bool keep, bool facing) const {
     const Cloud cloud(points);
     const View v = cloud.view();
     const Rows T = rows(T_ca);
-    const Rule rule{n_max, n_plane, gate, tighten, floor, eps_rad, eps_m};
+    const Rule rule{n_max, n_plane, gate, tighten, floor, eps_rad, eps_m, facing, keep};
     Outcome o;
     {
       nb::gil_scoped_release release;
       Team team(threads);
-      o = avs::icp(store_, code(), v, T.v, rule, keep, team);
+      o = avs::icp(store_, code(), v, T.v, rule, team);
     }
     return nb::make_tuple(matrix(o.T), o.passes, o.converged, o.inliers, o.rms, o.gate, o.turn, o.move, o.ignored,
                           o.searched);
   }
 
-  nb::tuple normal_equations(nb::handle points, const Doubles& T_ca, double gate, int threads) const {
+  nb::tuple normal_equations(nb::handle points, const Doubles& T_ca, double gate, int threads, bool facing) const {
     const Cloud cloud(points);
     const View v = cloud.view();
     const Rows T = rows(T_ca);
@@ -132,7 +133,7 @@ class Index {
     {
       nb::gil_scoped_release release;
       Team team(threads);
-      s = run_pass(store_, code(), v, T.v, gate, Pass::plane, nullptr, team);
+      s = run_pass(store_, code(), v, {T.v, gate * gate, Pass::plane, facing}, nullptr, team);
     }
     double *H, *b;
     auto info = array<double>({6, 6}, &H), gradient = array<double>({6}, &b);
@@ -188,12 +189,13 @@ NB_MODULE(_kernel, m) {
   nb::class_<Index>(m, "Index")
       .def(nb::init<Doubles, Ints, Ints, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
            nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
-      .def("closest", &Index::closest, nb::arg("points"), nb::arg("threads") = 1)
+      .def("closest", &Index::closest, nb::arg("points"), nb::arg("threads") = 1,
+           nb::arg("camera_c").none() = nb::none())
       .def("icp", &Index::icp, nb::arg("points"), nb::arg("T_ca"), nb::arg("n_max"), nb::arg("n_plane"),
            nb::arg("gate_m"), nb::arg("tighten"), nb::arg("floor_m"), nb::arg("eps_rad"), nb::arg("eps_m"),
-           nb::arg("threads") = 1, nb::arg("keep") = false)
+           nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false)
       .def("normal_equations", &Index::normal_equations, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"),
-           nb::arg("threads") = 1)
+           nb::arg("threads") = 1, nb::arg("facing") = false)
       .def_prop_ro("bytes", &Index::bytes)
       .def_prop_ro("isa", &Index::isa)
       .def_prop_ro("shape", &Index::shape);

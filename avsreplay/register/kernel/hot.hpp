@@ -16,6 +16,14 @@ constexpr int SUMS = 32;
 
 enum class Pass { point, plane };
 
+// What one pass does.
+struct Look {
+  const double* T;  // rows of [R t], scan into {C}; t is also where the camera is
+  double gate2;
+  Pass kind;
+  bool facing;  // only primitives that face the camera count
+};
+
 // Sums of one chunk, coordinates relative to the model's centre.
 //   always: [0] inliers, [1] sum d2, [2] points not finite, [3] searches, [4..6] sum p
 //   point:  [7..9] sum foot, [10..18] sum p foot'
@@ -58,9 +66,9 @@ constexpr int NEIGHBOURS = 10;  // of a cloud's point, itself among them, that g
 struct Code {
   const char* name;
   Filtered (*filter)(const Store&, const Filter&);
-  void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Feet&);
+  void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Vec3* eye, const Feet&);
   void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
-  void (*pass)(const Store&, const View&, int64_t first, int64_t last, const double* T, double gate2, Pass, Kept*, Sums&);
+  void (*pass)(const Store&, const View&, int64_t first, int64_t last, const Look&, Kept*, Sums&);
 };
 
 const Code& code_base();

@@ -25,18 +25,17 @@ static Filtered filter(const Store& s, const Filter& f) {
   return s.mesh ? filter_kind<Triangles, TrianglePivots>(s, f) : filter_kind<Points, PointPivots>(s, f);
 }
 
-static void closest(const Store& s, const View& v, int64_t first, int64_t last, const Feet& out) {
-  s.mesh ? closest_kind<Triangles>(s, v, first, last, out) : closest_kind<Points>(s, v, first, last, out);
+static void closest(const Store& s, const View& v, int64_t first, int64_t last, const Vec3* eye, const Feet& out) {
+  s.mesh ? closest_kind<Triangles>(s, v, first, last, eye, out) : closest_kind<Points>(s, v, first, last, eye, out);
 }
 
 static void normals(const Store& s, int64_t first, int64_t last, Vec3* out) {
   for (int64_t lane = first; lane < last; ++lane) out[lane] = normal_at(s, (uint32_t)lane);
 }
 
-static void pass(const Store& s, const View& v, int64_t first, int64_t last, const double* T, double gate2, Pass kind,
-                 Kept* kept, Sums& out) {
-  s.mesh ? pass_kind<Triangles>(s, v, first, last, T, gate2, kind, kept, out)
-         : pass_kind<Points>(s, v, first, last, T, gate2, kind, kept, out);
+static void pass(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, Kept* kept, Sums& out) {
+  s.mesh ? pass_kind<Triangles>(s, v, first, last, look, kept, out)
+         : pass_kind<Points>(s, v, first, last, look, kept, out);
 }
 }  // namespace AVS_ISA
 

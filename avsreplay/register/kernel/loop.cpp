@@ -61,12 +61,11 @@ bool advance(const Store& s, const Sums& sums, bool plane, Outcome& o) {
 
 }  // namespace
 
-Sums run_pass(const Store& s, const Code& code, const View& v, const double* T, double gate, Pass kind, Kept* kept,
-              Team& team) {
+Sums run_pass(const Store& s, const Code& code, const View& v, const Look& look, Kept* kept, Team& team) {
   const int64_t chunks = (v.n + CHUNK - 1) / CHUNK;
   std::vector<Sums> part((size_t)chunks);
   team.each(chunks, [&](int64_t k) {
-    code.pass(s, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), T, gate * gate, kind, kept, part[(size_t)k]);
+    code.pass(s, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), look, kept, part[(size_t)k]);
   });
   Sums total{};
   for (const Sums& p : part)
@@ -74,15 +73,16 @@ Sums run_pass(const Store& s, const Code& code, const View& v, const double* T, 
   return total;
 }
 
-Outcome icp(const Store& s, const Code& code, const View& v, const double* T, const Rule& rule, bool keep, Team& team) {
-  Memory memory(s, v.n, keep);
+Outcome icp(const Store& s, const Code& code, const View& v, const double* T, const Rule& rule, Team& team) {
+  Memory memory(s, v.n, rule.keep);
   Outcome o{};
   std::memcpy(o.T, T, sizeof o.T);
   o.gate = rule.gate, o.turn = o.move = worst(), o.rms = std::numeric_limits<double>::quiet_NaN();
   bool plane = rule.n_plane > 0;
   while (o.passes < rule.n_max && !o.converged) {
     Kept* kept = memory.for_step(o.turn, o.move);
-    const Sums sums = run_pass(s, code, v, o.T, o.gate, plane ? Pass::plane : Pass::point, kept, team);
+    const Look look{o.T, o.gate * o.gate, plane ? Pass::plane : Pass::point, rule.facing};
+    const Sums sums = run_pass(s, code, v, look, kept, team);
     if (kept) memory.was_searched((int64_t)sums.v[3]);
     ++o.passes;
     o.inliers = (int64_t)sums.v[0], o.ignored = (int64_t)sums.v[2], o.searched += (int64_t)sums.v[3];

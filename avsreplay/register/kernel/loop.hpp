@@ -8,6 +8,7 @@ namespace avs {
 struct Rule {
   int n_max, n_plane;
   double gate, tighten, floor, eps_rad, eps_m;
+  bool facing, keep;
 };
 
 struct Outcome {
@@ -18,10 +19,8 @@ struct Outcome {
   double rms, gate, turn, move;
 };
 
+Sums run_pass(const Store& store, const Code& code, const View& points, const Look& look, Kept* kept, Team& team);
 // T: rows of [R t], scan into {C}.
-Sums run_pass(const Store& store, const Code& code, const View& points, const double* T, double gate, Pass kind,
-              Kept* kept, Team& team);
-Outcome icp(const Store& store, const Code& code, const View& points, const double* T, const Rule& rule, bool keep,
-            Team& team);
+Outcome icp(const Store& store, const Code& code, const View& points, const double* T, const Rule& rule, Team& team);
 
 }  // namespace avs

@@ -121,8 +121,10 @@ static inline Best keep_one(const Store& s, const Query& q, const Kept& kept) {
 }
 
 template <class Kind>
-static void search(const Store& s, int64_t first, int n, double gate2, bool normals, Kept* kept, Chunk& c, Sums& out) {
+static void search(const Store& s, int64_t first, int n, const Look& look, Kept* kept, Chunk& c, Sums& out) {
   alignas(32) float scratch[LANES * LONGEST_LIST];
+  const Vec3 eye{look.T[3], look.T[7], look.T[11]};
+  const bool normals = look.kind == Pass::plane;
   for (int i = 0; i < n; ++i) {
     if (i + AHEAD < n && c.search[i + AHEAD] == SEARCHED) fetch_blocks<Kind>(s, c.word[i + AHEAD]);
     if (c.search[i] == IGNORED) {
@@ -131,9 +133,10 @@ static void search(const Store& s, int64_t first, int n, double gate2, bool norm
     }
     const Query q = query(s, c.c[0][i], c.c[1][i], c.c[2][i]);
     Kept* memory = kept ? kept + first + i : nullptr;
-    const Best best = c.search[i] == KEPT ? keep_one<Kind>(s, q, *memory) : search_one<Kind>(s, q, c, i, memory, scratch);
+    Best best = c.search[i] == KEPT ? keep_one<Kind>(s, q, *memory) : search_one<Kind>(s, q, c, i, memory, scratch);
+    if (look.facing) best = nearest_facing<Kind>(s, q, best, look.gate2, eye);
     out.v[3] += c.search[i] == SEARCHED ? 1 : 0;
-    enter(s, c, i, best.foot, best.lane, best.lane >= 0 && best.foot.d2 < gate2, normals);
+    enter(s, c, i, best.foot, best.lane, best.lane >= 0 && best.foot.d2 < look.gate2, normals);
   }
 }
 
@@ -177,20 +180,20 @@ static void sum_plane(int n, const Chunk& c, Sums& out) {
 }
 
 template <class Kind>
-static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last, const double* T, double gate2,
-                      Pass kind, Kept* kept, Sums& out) {
+static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, Kept* kept,
+                      Sums& out) {
   Chunk c;
   const int n = (int)(last - first);
   for (double& x : out.v) x = 0;
-  gather(s, v, first, n, T, kept, c, out);
+  gather(s, v, first, n, look.T, kept, c, out);
   look_up(s, n, c);
-  search<Kind>(s, first, n, gate2, kind == Pass::plane, kept, c, out);
+  search<Kind>(s, first, n, look, kept, c, out);
   clear_tail(n, c);
-  kind == Pass::plane ? sum_plane(n, c, out) : sum_point(n, c, out);
+  look.kind == Pass::plane ? sum_plane(n, c, out) : sum_point(n, c, out);
 }
 
 template <class Kind>
-static void closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const Feet& out) {
+static void closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const Vec3* eye, const Feet& out) {
   alignas(32) float scratch[LANES * LONGEST_LIST];
   const double nan = std::numeric_limits<double>::quiet_NaN();
   for (int64_t i = first; i < last; ++i) {
@@ -198,7 +201,11 @@ static void closest_kind(const Store& s, const View& v, int64_t first, int64_t l
     read(v, i, p);
     const Place at = place(s, p[0], p[1], p[2]);
     Best best = nothing(0);
-    if (at.inside) best = nearest<Kind>(s, query(s, p[0], p[1], p[2]), word_at(s, at).word, scratch, nullptr);
+    if (at.inside) {
+      const Query q = query(s, p[0], p[1], p[2]);
+      best = nearest<Kind>(s, q, word_at(s, at).word, scratch, nullptr);
+      if (eye) best = nearest_facing<Kind>(s, q, best, s.reach * s.reach, *eye);
+    }
     const bool found = best.lane >= 0;
     const Vec3 n = found ? s.normals[(size_t)best.lane] : Vec3{nan, nan, nan};
     const Vec3 f = found ? Vec3{best.foot.x, best.foot.y, best.foot.z} : Vec3{nan, nan, nan};

@@ -30,6 +30,8 @@ struct Points {
   // Squared distances that differ by no more are a tie.
   static double tie(const Store&, double) { return 0; }
 
+  static bool faces(const Store&, uint32_t, const Vec3&) { return true; }  // a cloud has no sides
+
   static void prefetch(const Store& s, uint32_t block) {
     const char* p = reinterpret_cast<const char*>(s.point_blocks.data() + block);
     fetch(p);
@@ -89,6 +91,11 @@ struct Triangles {
 
   // Rounding sets the distances to the faces of a common side apart; this is well above it.
   static double tie(const Store& s, double d2) { return 1e-10 * d2 + s.tie2; }
+
+  static bool faces(const Store& s, uint32_t lane, const Vec3& eye) {
+    const Triangle& t = s.triangles[lane];
+    return (eye.x - t.a.x) * t.n.x + (eye.y - t.a.y) * t.n.y + (eye.z - t.a.z) * t.n.z > 0;
+  }
 
   static double unit(double t) { return t < 0 ? 0 : t > 1 ? 1 : t; }
 

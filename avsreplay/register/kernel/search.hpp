@@ -20,10 +20,12 @@ static inline bool nearer(const Store& s, const Foot& f, uint32_t lane, const Be
   return f.d2 <= best.foot.d2 + tie && wins_tie(s, f, lane, best);
 }
 
+// `eye`: only primitives that face it count; null: all.
 template <class Kind>
-static inline void consider(const Store& s, const Query& q, uint32_t block, unsigned lanes, Best& best) {
+static inline void consider(const Store& s, const Query& q, uint32_t block, unsigned lanes, const Vec3* eye, Best& best) {
   for (; lanes; lanes &= lanes - 1) {
     const uint32_t lane = LANES * block + (uint32_t)lowest_bit(lanes);
+    if (eye && !Kind::faces(s, lane, *eye)) continue;
     const Foot f = Kind::foot(s, lane, q);
     if (best.lane < 0 ? f.d2 < best.foot.d2 : nearer<Kind>(s, f, lane, best)) best = {f, (int32_t)lane};
   }
@@ -73,7 +75,7 @@ static inline Best in_list(const Store& s, const Query& q, const uint32_t* list,
   Best best = nothing(s.reach * s.reach);
   for (uint32_t k = 0; k < n; ++k) {
     const unsigned lanes = bits(load8(d2 + LANES * k) < limit);
-    if (lanes) consider<Kind>(s, q, list[k], lanes, best);
+    if (lanes) consider<Kind>(s, q, list[k], lanes, nullptr, best);
   }
   if (room) {
     const float d = std::sqrt(m);
@@ -95,7 +97,7 @@ static inline float box_distance2(const Box& b, const float* q) {
 
 // Branch and bound over the tree; boxes are in single precision, so the bound is lenient.
 template <class Kind>
-static Best in_tree(const Store& s, const Query& q, double bound2) {
+static Best in_tree(const Store& s, const Query& q, double bound2, const Vec3* eye) {
   struct Todo {
     uint32_t node, first, last;
     float d2;
@@ -109,7 +111,7 @@ static Best in_tree(const Store& s, const Query& q, double bound2) {
     const float limit = lenient(s, (float)best.foot.d2);
     if (t.d2 > limit) continue;
     if (t.last - t.first == 1) {
-      consider<Kind>(s, q, t.first, bits(Kind::distance2(s, t.first, q) < f8(limit)), best);
+      consider<Kind>(s, q, t.first, bits(Kind::distance2(s, t.first, q) < f8(limit)), eye, best);
       continue;
     }
     const uint32_t left = (t.last - t.first + 1) / 2, mid = t.first + left;
@@ -178,5 +180,12 @@ static inline Best nearest(const Store& s, const Query& q, uint32_t word, float*
   if (room) *room = word == EMPTY ? 3e38f : 0.f;
   if (word == EMPTY) return nothing(reach2);
   const uint32_t* list = s.lists.data() + word;
-  return *list == TOO_MANY ? in_tree<Kind>(s, q, reach2) : in_list<Kind>(s, q, list, scratch, room);
+  return *list == TOO_MANY ? in_tree<Kind>(s, q, reach2, nullptr) : in_list<Kind>(s, q, list, scratch, room);
+}
+
+// The nearest of the primitives that face the eye, given the nearest of all; within the bound.
+template <class Kind>
+static inline Best nearest_facing(const Store& s, const Query& q, const Best& best, double bound2, const Vec3& eye) {
+  if (best.lane < 0 || best.foot.d2 >= bound2) return nothing(bound2);
+  return Kind::faces(s, (uint32_t)best.lane, eye) ? best : in_tree<Kind>(s, q, bound2, &eye);
 }
