@@ -7,18 +7,18 @@ to registration as its guess, the only loop.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
 from avsreplay.fill import Findings, row_of
-from avsreplay.geometry import Pose
-from avsreplay.mission import Mission, replan
+from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.faults import FaultDetector
-from avsreplay.plan import PlanParams
+from avsreplay.plan import Pilot, PilotMemory
 from avsreplay.records import Alignment, AlignStatus, Innovation, Scan
 from avsreplay.register import Registrar
 from avsreplay.rows import Row
+from avsreplay.sight import Aim, Hindsight, aim_columns, plan_columns, see
 from avsreplay.watch import Monitors, Watch, look
 
 __all__ = ["Memory", "Stages", "fold", "step"]
@@ -28,13 +28,21 @@ _UNMEASURED = (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Stages:
-    """The parts of the chain, ready. ``first_pose``: first scan -> T_ac to begin with, and where it comes from."""
+    """The parts of the chain, ready.
+
+    Attributes:
+        hindsight: the only part that knows the truth; nothing it says goes back into the chain.
+        standoff_c: (3,) approach point in {C} [m].
+        first_pose: first scan -> T_ac to begin with, and where it comes from.
+    """
 
     registrar: Registrar
     estimator: Estimator
     detector: FaultDetector
     monitors: Monitors
-    plan: PlanParams
+    pilot: Pilot
+    hindsight: Hindsight
+    standoff_c: Array
     guess: Guess
     first_pose: Callable[[Scan], tuple[Pose, str]]
 
@@ -44,13 +52,15 @@ class Memory:
     """What is carried from scan to scan.
 
     Attributes:
-        watch: the monitors' memory.  mission: the plan in force.  track: the estimate, None before the first scan.
+        watch: the monitors' memory.  pilot: plan in force and robot.  aim: the leg that closes in.
+        track: the estimate, None before the first scan.
         last: last healthy measured pose, None before one.  origin: where the first pose came from.
         since_ns: instant of the first scan.
     """
 
     watch: Watch
-    mission: Mission
+    pilot: PilotMemory | None = None
+    aim: Aim = field(default_factory=Aim)
     track: Track | None = None
     last: Pose | None = None
     origin: str = ""
@@ -70,7 +80,12 @@ def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
 
     watch, columns = look(stages.monitors, memory.watch, stages.estimator, prediction, seen, verdict.gamma, track)
     converged = watch.convergence.converged
-    mission = replan(memory.mission, stages.plan, scan.t_ns, converged, stages.estimator.motion(track.belief))
+    sight = see(stages.estimator, track, scan.t_ns, verdict.gamma, converged, stages.standoff_c)
+    before = memory.pilot or stages.pilot.initial(scan.t_ns)
+    pilot = stages.pilot.step(before, sight)
+    aim = memory.aim.follow(pilot, stages.estimator, track, stages.hindsight)
+    columns |= plan_columns(pilot, memory.since_ns, scan.t_ns)
+    columns |= aim_columns(memory.aim, aim, pilot.captured_ns is not before.captured_ns)
     row = row_of(
         Findings(
             scan=scan,
@@ -81,13 +96,12 @@ def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
             innovation=seen,
             belief=track.belief,
             estimator=track.mode,
-            plan=mission.plan,
             converged=converged,
-            monitors=columns,
+            columns=columns,
         )
     )
     last = alignment.T_ac if verdict.gamma else memory.last
-    return replace(memory, watch=watch, mission=mission, track=track, last=last), row
+    return replace(memory, watch=watch, pilot=pilot, aim=aim, track=track, last=last), row
 
 
 def fold(stages: Stages, memory: Memory, scans: Iterable[Scan]) -> Iterator[tuple[Memory, Row]]:

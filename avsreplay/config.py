@@ -6,6 +6,7 @@ configuration is saved with every result.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
@@ -19,7 +20,7 @@ from avsreplay.geometry import Pose
 from avsreplay.monitor.consistency import ConsistencyParams
 from avsreplay.monitor.convergence import ConvergenceParams
 from avsreplay.monitor.faults import FaultParams
-from avsreplay.plan import PlanParams
+from avsreplay.plan import PlanParams, SupervisorParams
 from avsreplay.register import RegisterParams
 
 __all__ = ["Guess", "RunConfig", "load_config", "parse_pose"]
@@ -46,10 +47,15 @@ class RunConfig:
     consistency: ConsistencyParams = field(default_factory=ConsistencyParams)
     convergence: ConvergenceParams = field(default_factory=ConvergenceParams)
     plan: PlanParams = field(default_factory=PlanParams)
+    supervisor: SupervisorParams = field(default_factory=SupervisorParams)
+    # the fixture's outward axis in {C}: the robot comes in along it
+    fixture_axis_c: tuple[float, float, float] = (1.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.init not in ("log", "truth", "auto"):
             parse_pose(self.init)
+        if abs(math.hypot(*self.fixture_axis_c) - 1.0) > 1e-6:
+            raise ValueError(f"fixture_axis_c is {self.fixture_axis_c}, must be of unit length")
 
 
 def parse_pose(text: str) -> Pose:

@@ -9,8 +9,9 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate.measure import sensitivity
+from avsreplay.estimate.relabel import nees
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import BLOCKS, Alignment, Belief, Innovation, Plan, Scan, ScanStatus, Verdict
+from avsreplay.records import BLOCKS, Alignment, Belief, Innovation, Scan, ScanStatus, Verdict
 from avsreplay.rows import Row
 
 __all__ = ["Findings", "row_of"]
@@ -25,7 +26,7 @@ class Findings:
     Attributes:
         since_ns: instant of the log's first scan.  guess: where the registration's guess came from.
         belief: after the update, None before the first pose.  estimator: who speaks.
-        monitors: row fields that the monitors fill, by column name.
+        columns: row fields that monitors and pilot fill, by column name.
     """
 
     scan: Scan
@@ -36,9 +37,8 @@ class Findings:
     innovation: Innovation | None
     belief: Belief | None
     estimator: str
-    plan: Plan | None
     converged: bool
-    monitors: dict[str, Any]
+    columns: dict[str, Any]
 
 
 def row_of(found: Findings) -> Row:
@@ -58,9 +58,8 @@ def row_of(found: Findings) -> Row:
         **_registration(found.alignment, scan),
         **_innovation(found.innovation),
         **_estimate(found.belief),
-        **_errors(found.belief, scan.truth),
-        **_plan(found.plan, found.since_ns, scan.t_ns),
-        **found.monitors,
+        **_errors(found.belief, scan),
+        **found.columns,
     )
 
 
@@ -114,20 +113,11 @@ def _pose_sigma(belief: Belief) -> tuple[float, float]:
     return float(np.sqrt(max(variance[:3].sum(), 0.0))), _half_angle_deg(variance[3:].sum())
 
 
-def _errors(belief: Belief | None, truth: Pose | None) -> dict[str, Any]:
-    if belief is None or truth is None:
+def _errors(belief: Belief | None, scan: Scan) -> dict[str, Any]:
+    if belief is None or scan.truth is None:
         return {}
-    return dict(zip(("pos_err_m", "rot_err_deg"), _distance(belief.x.T_ac, truth), strict=True))
-
-
-def _plan(plan: Plan | None, since_ns: int, t_ns: int) -> dict[str, Any]:
-    if plan is None:
-        return {}
-    fields: dict[str, Any] = {"plan_status": plan.status.value}
-    if plan.found:
-        fields["capture_time_s"] = (plan.t_ns - since_ns) * 1e-9 + plan.t_go_s
-        fields["t_go_s"] = plan.t_go_s - (t_ns - plan.t_ns) * 1e-9
-    return fields
+    fields = dict(zip(("pos_err_m", "rot_err_deg"), _distance(belief.x.T_ac, scan.truth), strict=True))
+    return fields if scan.body is None else {**fields, "nees": _finite(nees(belief, scan.body))}
 
 
 def _distance(pose: Pose, truth: Pose) -> tuple[float, float]:

@@ -65,7 +65,7 @@ class Run:
             header = self.source.header
             self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
             self.surface: Surface = self._model()
-            self._stages = stages(self.config, header, self.surface)
+            self._stages = stages(self.config, header, self.surface, self.source.truth_poses())
         except BaseException:
             self.source.close()
             raise

@@ -15,7 +15,7 @@ from avsreplay.estimate.measure import sensitivity
 from avsreplay.geometry import Array, Pose
 from avsreplay.job import Listener
 from avsreplay.log.result_log import ResultFrame, ResultLog
-from avsreplay.plan import Flight
+from avsreplay.plan.pilot import Leg
 from avsreplay.records import Belief, Scan, Surface
 from avsreplay.report import CloudView, PathView, View, thin_cloud, thin_surface, write_view
 from avsreplay.results import Beliefs, ResultDirectory, belief_of
@@ -40,16 +40,16 @@ class _Paths:
     """Tells a new plan from the one before and samples it."""
 
     def __init__(self) -> None:
-        self._known: Flight | None = None
+        self._known: Leg | None = None
 
     def new(self, memory: Memory) -> tuple[Array, Array] | None:
         """(times (n,), positions (n, 3)) of a plan not seen before."""
-        flight = memory.mission.flight
-        if flight is None or flight is self._known:
+        leg = memory.aim.leg
+        if leg is None or leg is self._known or leg.flight is None:
             return None
-        self._known = flight
-        times = np.linspace(0.0, flight.t_go_s, PATH_POINTS)
-        return times, flight.at(times)[0]
+        self._known = leg
+        times = np.linspace(0.0, leg.flight.t_go_s, PATH_POINTS)
+        return times, leg.flight.at(times)[0]
 
 
 class LogKeeper:
@@ -95,7 +95,7 @@ class ViewKeeper:
         self._clouds.append(thin_cloud(scan.seq, scan.points))
         path = self._paths.new(memory)
         if path is not None:
-            self._plans.append(PathView(row.t_ns, np.asarray(path[1], np.float32)))
+            self._plans.append(PathView(row.t_ns, np.asarray(path[1], np.float32), row.hindsight_m))
 
     def view(self) -> View:
         """Everything kept so far."""

@@ -149,6 +149,15 @@ class Row:
         "s", ".2f", 1e-4, 1e-3, "planned instant of capture, since the first scan", True
     )
     t_go_s: float | None = column("s", ".2f", 1e-4, 1e-3, "time from this scan to the planned capture")
+    plan_bound_s: float | None = column("s", ".2f", 1e-4, 1e-3, "certified: no capture before, since the first scan")
+    hindsight_m: float | None = column("m", ".4f", 1e-3, 1e-5, "plan made at this scan: miss of the true grasp point")
+    hindsight_mps: float | None = column("m/s", ".4f", 1e-3, 1e-5, "the same: true relative speed at its end")
+    hindsight_deg: float | None = column("deg", ".3f", 1e-3, 1e-3, "the same: error of the predicted attitude there")
+    action: str = _flag("what the supervisor tells the robot", table=True)
+    rule: str = _flag("the supervisor's rule that fired")
+    capture_miss_m: float | None = column("m", ".4f", 1e-3, 1e-5, "gripper closed since the last scan: true distance")
+    capture_miss_mps: float | None = column("m/s", ".4f", 1e-3, 1e-5, "the same: true relative speed")
+    capture_miss_deg: float | None = column("deg", ".3f", 1e-3, 1e-3, "the same: attitude error")
 
 
 def columns() -> tuple[Column, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -11,32 +11,36 @@ from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
 from avsreplay.geometry import Pose
-from avsreplay.mission import Mission
 from avsreplay.monitor.consistency import Consistency
 from avsreplay.monitor.convergence import Convergence
 from avsreplay.monitor.faults import FaultDetector
 from avsreplay.monitor.observability import gramian
+from avsreplay.plan import Pilot, Supervisor
 from avsreplay.records import LogHeader, Scan, Surface
 from avsreplay.register import Registrar
+from avsreplay.sight import Hindsight
 from avsreplay.watch import Monitors, Watch
 
 __all__ = ["first_memory", "stages"]
 
 
-def stages(config: RunConfig, header: LogHeader, surface: Surface) -> Stages:
-    """The chain for one log.
+def stages(config: RunConfig, header: LogHeader, surface: Surface, truth: Sequence[tuple[int, Pose]] = ()) -> Stages:
+    """The chain for one log; ``truth`` (T_ac by instant) is for hindsight alone.
 
     Raises:
         UsageError: no first pose is to be had.  MissingBackend: the back end is not installed.
     """
     registrar = Registrar(surface, config.register)
     start = header.start if config.init == "log" else None
+    supervision = config.supervisor.resolved(surface.extent)
     return Stages(
         registrar=registrar,
         estimator=Estimator(config.estimator, start, surface.extent),
         detector=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
-        plan=config.plan,
+        pilot=Pilot(config.plan, Supervisor(supervision)),
+        hindsight=Hindsight(truth),
+        standoff_c=(supervision.standoff_m or 0.0) * np.array(config.fixture_axis_c),
         guess=config.guess,
         first_pose=_first_pose(config, header),
     )
@@ -48,7 +52,7 @@ def first_memory(ready: Stages) -> Memory:
     prior_1s = ready.estimator.params.start_1s if start is None else np.sqrt(np.diag(start.P))
     monitors = ready.monitors
     watch = Watch(gramian(prior_1s), monitors.consistency.initial(), monitors.convergence.initial())
-    return Memory(watch, Mission())
+    return Memory(watch)
 
 
 def _first_pose(config: RunConfig, header: LogHeader) -> Callable[[Scan], tuple[Pose, str]]:
