@@ -6,6 +6,7 @@ from avsreplay.plan.hindsight import Execution, Miss, Motion, Tolerance, execute
 from avsreplay.plan.limits import Limits, Scene
 from avsreplay.plan.pilot import Pilot, PilotMemory, Sight
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.spread import Future, Spread, draws, sigma_points, spread
 from avsreplay.plan.supervisor import (
     RULES,
     Action,
@@ -23,6 +24,7 @@ __all__ = [
     "Execution",
     "Facts",
     "Flight",
+    "Future",
     "Limits",
     "Miss",
     "Motion",
@@ -32,15 +34,19 @@ __all__ = [
     "PlanParams",
     "Scene",
     "Sight",
+    "Spread",
     "StepFlight",
     "Supervisor",
     "SupervisorMemory",
     "SupervisorParams",
     "Tolerance",
     "constrained",
+    "draws",
     "execute",
     "interpolated",
     "miss",
     "path_of",
     "rendezvous",
+    "sigma_points",
+    "spread",
 ]

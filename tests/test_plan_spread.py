@@ -1,0 +1,103 @@
+"""A plan over a belief: moments where they are known in closed form, quantiles that hold."""
+
+import math
+
+import numpy as np
+import pytest
+
+from avsreplay.geometry import exp, multiply
+from avsreplay.plan import Future, PlanParams, Tolerance, draws, path_of, rendezvous, sigma_points, spread
+
+ORIGIN = np.zeros(3)
+PARAMS = PlanParams()
+
+
+def fixed(point):
+    return lambda t: (np.tile(point, (len(t), 1)), np.zeros((len(t), 3)))
+
+
+def plan():
+    return path_of(rendezvous(fixed([4.0, 0, 0]), ORIGIN, ORIGIN, PARAMS), ORIGIN, ORIGIN)
+
+
+def covariance(rng, n=20):
+    A = rng.normal(size=(n, n))
+    scale = 10.0 ** rng.uniform(-6, 0, n)
+    return scale[:, None] * (A @ A.T + 0.1 * np.eye(n)) * scale
+
+
+def test_sigma_points_have_the_moments_they_stand_for():
+    P = covariance(np.random.default_rng(1))
+    points, weights = sigma_points(P)
+    assert weights.sum() == pytest.approx(1.0)
+    assert np.allclose(weights @ points, 0.0, atol=1e-12)
+    assert np.allclose((points * weights[:, None]).T @ points, P, rtol=1e-8, atol=1e-20)
+
+
+def test_draws_have_the_covariance_asked_for():
+    rng = np.random.default_rng(2)
+    P = covariance(rng, 6)
+    got = draws(P, 20_000, rng)
+    scale = np.sqrt(np.diag(P))
+    difference = ((got.T @ got) / len(got) - P) / np.outer(scale, scale)
+    assert np.abs(difference).max() < 5.0 * math.sqrt(2.0 / 20_000)
+
+
+def test_a_singular_covariance_is_drawn_from_a_negative_one_refused():
+    flat = np.diag([1.0, 0.0, 2.0])
+    assert np.all(draws(flat, 10, np.random.default_rng(0))[:, 1] == 0.0)
+    with pytest.raises(ValueError, match="covariance is not positive"):
+        sigma_points(np.array([[1.0, 2.0], [2.0, 1.0]]))
+    with pytest.raises(ValueError, match="finite square"):
+        sigma_points(np.full((2, 2), math.nan))
+    with pytest.raises(ValueError, match="count is 0"):
+        draws(flat, 0, np.random.default_rng(0))
+
+
+def test_no_doubt_no_spread():
+    found = spread(plan(), [Future(fixed([4.0, 0, 0]))] * 5, (ORIGIN, ORIGIN), PARAMS, Tolerance())
+    assert found.probability == 1.0
+    assert found.miss_m.p95 < 1e-9
+    assert found.t_go_s.std == pytest.approx(0.0, abs=1e-12)
+    assert found.t_go_s.mean == pytest.approx(2 * math.sqrt(4 / 0.05))
+    assert math.isnan(found.angle_deg.mean)
+
+
+def test_miss_and_probability_follow_the_normal_law():
+    rng = np.random.default_rng(3)
+    sigma, count = 0.01, 4000
+    futures = [Future(fixed([4.0, *(sigma * z)])) for z in rng.standard_normal((count, 2))]
+    quick = PlanParams(grid_s=5.0)
+    found = spread(plan(), futures, (ORIGIN, ORIGIN), quick, Tolerance(position_m=0.02))
+    expected = 1.0 - math.exp(-0.5 * 2.0**2)  # Rayleigh
+    assert found.probability == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / count))
+    assert found.miss_m.mean == pytest.approx(sigma * math.sqrt(math.pi / 2), rel=0.05)
+    assert found.miss_m.p95 == pytest.approx(sigma * math.sqrt(-2 * math.log(0.05)), rel=0.06)
+
+
+def test_end_time_spreads_as_its_slope_says():
+    P, base = np.diag([0.02**2]), 4.0
+    points, weights = sigma_points(P)
+    futures = [Future(fixed([base + d[0], 0, 0]), weight=w) for d, w in zip(points, weights, strict=True)]
+    found = spread(plan(), futures, (ORIGIN, ORIGIN), PARAMS, Tolerance())
+    slope = 1.0 / math.sqrt(base * 0.05)  # d(2 sqrt(x/a))/dx
+    assert found.t_go_s.std == pytest.approx(0.02 * slope, rel=1e-3)
+    assert math.isnan(found.probability)
+
+
+def test_attitude_counts():
+    q = exp([0.1, 0.2, 0.3])
+    off = multiply(q, exp([0.0, math.radians(3.0), 0.0]))
+    futures = [Future(fixed([4.0, 0, 0]), lambda t: q), Future(fixed([4.0, 0, 0]), lambda t: off)]
+    found = spread(plan(), futures, (ORIGIN, ORIGIN), PARAMS, Tolerance(angle_deg=2.0), q)
+    assert found.probability == 0.5
+    assert found.angle_deg.mean == pytest.approx(1.5, abs=1e-6)
+
+
+def test_a_future_out_of_reach_is_counted():
+    away = Future(lambda t: (np.tile([900.0, 0, 0], (len(t), 1)), np.zeros((len(t), 3))))
+    found = spread(plan(), [away, Future(fixed([4.0, 0, 0]))], (ORIGIN, ORIGIN), PARAMS, Tolerance())
+    assert found.infeasible == 1
+    assert found.probability == 0.5
+    with pytest.raises(ValueError, match="no future"):
+        spread(plan(), [], (ORIGIN, ORIGIN), PARAMS, Tolerance())
