@@ -91,6 +91,7 @@ def _row(k: int, rng: np.random.Generator, blind: bool, changes: dict[str, objec
         "points": 0 if blind else 4000,
         "estimator": "filter",
         "converged": k >= 10,
+        **({"action": "approach", "rule": "track"} if hasattr(Row, "action") else {}),
         **dict(zip(("x_m", "y_m", "z_m"), position, strict=True)),
         **attitude,
         "pos_err_m": 0.002 + 0.001 * float(noise[0]),

@@ -142,24 +142,35 @@ def test_a_scan_far_away_or_of_one_point_can_be_packed(make_rows):
 
 def test_spans_are_runs_of_one_word(make_rows):
     found = [(s["lane"], s["word"], s["first"], s["last"]) for s in spans(make_rows(40))]
-    assert found == [("flagged", "no_scan", 20, 25), ("injected", "full_occlusion", 20, 25)]
+    expected = [("flagged", "no_scan", 20, 25), ("injected", "full_occlusion", 20, 25), ("action", "approach", 0, 39)]
+    assert found == expected
+
+
+def test_a_label_that_left_no_scan_is_drawn_too(make_rows):
+    rows = [r for r in make_rows(40) if r.seq != 12]
+    dropped = Label("dropped", rows[11].t_ns + 1, rows[12].t_ns - 1)
+    found = spans(rows, report.Summary.fold(rows, labels=[*_labels(rows), dropped]).faults.episodes)
+    assert [(s["word"], s["first"]) for s in found if s["lane"] == "injected"] == [
+        ("full_occlusion", 19),
+        ("dropped", 11),
+    ]
 
 
 def test_charts_with_nothing_to_show_are_left_out(make_rows):
     rows = make_rows(10, pos_err_m=None, reg_pos_err_m=None, capture_time_s=None, rms_m=None)
-    keys = [c["key"] for c in charts(derived(rows, {}))]
+    keys = [c["key"] for c in charts(derived(rows))]
     assert not {"position", "capture", "fit", "miss"} & set(keys)
     assert {"attitude", "sigma", "nees"} <= set(keys)
 
 
 def test_bands_are_the_value_and_its_sigma(make_rows):
-    columns = derived(make_rows(10), {})
+    columns = derived(make_rows(10))
     np.testing.assert_allclose(columns["sigma1_hi"] - columns["sigma1_lo"], 0.02)
     assert columns["mu_z_deg"] == pytest.approx(np.degrees(0.2))
 
 
 def test_the_spread_of_the_capture_is_over_recent_plans(make_rows):
-    columns = derived(make_rows(40), {})
+    columns = derived(make_rows(40))
     assert columns["capture_time_s_lo"][-1] == 30.1
     assert columns["capture_time_s_hi"][-1] == 30.3
     assert np.isnan(columns["capture_time_s_lo"][5])

@@ -56,9 +56,19 @@ def test_every_float_reads_back_to_itself(value):
 
 
 def _bare() -> Row:
-    return Row(
-        seq=0, t_ns=0, t_s=0.0, status="ok", gamma=1, reason="ok", guess="", points=0, estimator="", converged=False
-    )
+    blank = {str: "", int: 0, float: 0.0, bool: False}
+    return Row(**{name: blank[kind] for name, (kind, nullable) in field_types().items() if not nullable})
+
+
+def test_an_older_result_lacks_words_and_nulls_only(make_rows):
+    record = json.loads(dump_row(make_rows(1)[0]))
+    del record["action"], record["rms_m"]
+    row = parse_row(record, "x")
+    assert (row.action, row.rms_m) == ("", None)
+    with pytest.raises(UnreadableInput, match="'points' is missing"):
+        parse_row({k: v for k, v in record.items() if k != "points"}, "x")
+    with pytest.raises(UnreadableInput, match="'action' is missing or null"):
+        parse_row(record | {"action": None}, "x")
 
 
 def test_a_failed_write_leaves_what_was_there(tmp_path, make_rows):

@@ -10,7 +10,7 @@ import pytest
 from avsreplay import report
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Pose, exp
-from avsreplay.records import Label, Scan, State, Surface
+from avsreplay.records import Label, State, Surface
 
 TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.25, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))
 
@@ -144,28 +144,3 @@ def test_a_view_with_a_part_missing_or_wrong(folder, missing):
     np.savez(path, **arrays, **{missing: np.array([[0, 1, 10**6]], np.int32)})
     with pytest.raises(UnreadableInput):
         report.read_view(path)
-
-
-class _Belief:
-    class x:  # noqa: N801 (named as in records)
-        T_ac = Pose(exp([0, 0, 0.3]), [1, 2, 3])
-
-
-def test_a_listener_keeps_clouds_residuals_and_paths():
-    pose, surface = _Belief.x.T_ac, _ball(10)
-    heard = []
-
-    def residual(points):
-        heard.append(points)
-        return np.abs(np.linalg.norm(points, axis=1) - 1.0)
-
-    fold = report.ViewFold(surface, residual)
-    scan = Scan(seq=4, t_ns=7, points=pose.apply(surface.vertices * 1.5))
-    fold(scan, _Belief)
-    fold(Scan(seq=5, t_ns=8, points=np.zeros((0, 3))), _Belief)
-    fold.plan(7, [[0, 0, 0], [1, 1, 1]], 0.5)
-    view = fold.view()
-    np.testing.assert_allclose(heard[0], surface.vertices * 1.5, atol=1e-6)
-    assert [c.seq for c in view.clouds] == [4]
-    np.testing.assert_allclose(view.clouds[0].residual_m, 0.5, atol=1e-6)
-    assert (view.paths[0].t_ns, view.paths[0].miss_m) == (7, 0.5)

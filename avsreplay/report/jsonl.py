@@ -114,7 +114,7 @@ def _refuse(constant: str) -> Any:
 
 
 def parse_row(record: Mapping[str, Any], where: str) -> Row:
-    """A row from its JSON object. A column that may be null may be missing.
+    """A row from its JSON object. A column that may be null, or a word, may be missing (an older result lacks some).
 
     Raises UnreadableInput for an unknown or a missing column or a value of the wrong type.
     """
@@ -122,7 +122,9 @@ def parse_row(record: Mapping[str, Any], where: str) -> Row:
     for name in record:
         if name not in types:
             raise UnreadableInput(f"unknown column '{name}'", where=where, hint="was it written by another version?")
-    return Row(**{name: _checked(record.get(name), name, *types[name], where) for name in types})
+    words: dict[str, Any] = {name: "" for name, (kind, nullable) in types.items() if kind is str and not nullable}
+    values = words | dict(record)
+    return Row(**{name: _checked(values.get(name), name, *types[name], where) for name in types})
 
 
 def _checked(value: Any, name: str, kind: type, nullable: bool, where: str) -> Any:

@@ -7,7 +7,7 @@ are thinned by even strides, the model by clustering its vertices on a grid.
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array
-from avsreplay.records import Belief, Scan, Surface
+from avsreplay.records import Surface
 from avsreplay.report.atomic import atomic_path
 
 __all__ = [
@@ -99,39 +99,6 @@ def _clustered(vertices: Array, faces: Faces, size: float) -> tuple[Array, Faces
     mapped = mapped[whole]
     _, first = np.unique(np.sort(mapped, axis=1), axis=0, return_index=True)
     return merged, mapped[np.sort(first)].astype(np.int32)
-
-
-class ViewFold:
-    """Listens to a run and keeps a thinned cloud of each scan; called with the scan and the belief after it.
-
-    Args:
-        surface: the model in force.
-        residual: distance of points (n, 3) in {C} to the model, (n,) [m]; None leaves the points without colour.
-    """
-
-    def __init__(self, surface: Surface, residual: Callable[[Array], ArrayLike] | None = None) -> None:
-        self._surface, self._residual = surface, residual
-        self._clouds: list[CloudView] = []
-        self._paths: list[PathView] = []
-
-    def __call__(self, scan: Scan, belief: Belief) -> None:
-        """Take one scan; an empty one leaves nothing."""
-        cloud = thin_cloud(scan.seq, scan.points)
-        if len(cloud.points) and self._residual is not None:
-            in_model = belief.x.T_ac.inverse().apply(cloud.points)
-            distance = np.asarray(self._residual(in_model), dtype=np.float32)
-            cloud = CloudView(cloud.seq, cloud.points, distance)
-        if len(cloud.points):
-            self._clouds.append(cloud)
-
-    def plan(self, t_ns: int, points: ArrayLike, miss_m: float | None = None) -> None:
-        """Keep the path planned at ``t_ns``: positions (n, 3) in {A} [m]."""
-        self._paths.append(PathView(t_ns, np.asarray(points, dtype=np.float32), miss_m))
-
-    def view(self) -> View:
-        """All of it."""
-        vertices, faces = thin_surface(self._surface)
-        return View(vertices, faces, tuple(self._clouds), tuple(self._paths))
 
 
 def write_view(path: str | Path, view: View) -> None:

@@ -54,12 +54,11 @@ def build_page(
         poses: true poses of {C} in {A}.
         view: model, clouds and paths for the 3D part.
     """
-    misses = {p.t_ns: p.miss_m for p in view.paths if p.miss_m is not None} if view else {}
-    columns = derived(rows, misses)
+    columns = derived(rows)
     data = {
         "runs": [{"name": title, "t": pack(values(rows, "t_s"), "f8"), "columns": _packed(columns)}],
         "charts": charts(columns, truth),
-        "spans": spans(rows),
+        "spans": spans(rows, summary.faults.episodes),
         "marks": _marks(summary),
         "states": [[row.gamma, row.reason, row.fault or ""] for row in rows],
         "scans": [row.seq for row in rows],

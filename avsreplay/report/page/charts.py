@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.records import State
-from avsreplay.report.page.packing import numbers, values
+from avsreplay.report.episodes import Episode
+from avsreplay.report.page.packing import values
 from avsreplay.report.summary import NEES_BAND, NIS_BAND
 from avsreplay.rows import Row
 
@@ -24,13 +25,13 @@ _DIRECT = (
     *("rms_m", "inlier_ratio", "nis", "innov_m", "innov_deg"),
     *("sigma1", "sigma2", "cx_m", "cy_m", "cz_m", "wx_radps", "wy_radps", "wz_radps"),
     *("nees", "ogm_log10_cond", "ogm_log10_cond_scaled", "ogm_rank"),
-    *("r_pos_m", "r_rot_deg", "capture_time_s"),
+    *("r_pos_m", "r_rot_deg", "capture_time_s", "hindsight_m"),
 )
 _WINDOW = 10
 
 
-def derived(rows: Sequence[Row], misses: Mapping[int, float]) -> Columns:
-    """Every column the charts draw, (n,) each; ``misses`` is t_ns -> miss distance [m] of the plan made then."""
+def derived(rows: Sequence[Row]) -> Columns:
+    """Every column the charts draw, (n,) each; those that are empty are left out."""
     out = {name: values(rows, name) for name in _DIRECT}
     out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
     for name, sigma in (("sigma1", "sigma1_1s"), ("sigma2", "sigma2_1s"), *((f"c{a}_m", "c_1s_m") for a in "xyz")):
@@ -38,7 +39,6 @@ def derived(rows: Sequence[Row], misses: Mapping[int, float]) -> Columns:
     for axis in "xyz":
         _band(out, f"mu_{axis}_deg", values(rows, "mu_1s_deg"))
     out["capture_time_s_lo"], out["capture_time_s_hi"] = _spread(out["capture_time_s"])
-    out["miss_m"] = numbers(misses.get(row.t_ns) for row in rows)
     return {name: column for name, column in out.items() if np.isfinite(column).any()}
 
 
@@ -176,14 +176,27 @@ def _plan_charts() -> list[Chart]:
             [_line("capture_time_s", "since the first scan", 0)],
             bands=[("capture_time_s", 0)],
         ),
-        _chart("miss", "Miss distance in hindsight", "m", [_line("miss_m", "of the plan made then", 1, points=True)]),
+        _chart(
+            "miss", "Miss distance in hindsight", "m", [_line("hindsight_m", "of the plan made then", 1, points=True)]
+        ),
     ]
 
 
-def spans(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Runs of flagged scans (lane ``flagged``, by reason) and of labelled ones (lane ``injected``, by kind)."""
+def spans(rows: Sequence[Row], episodes: Sequence[Episode] = ()) -> list[dict[str, Any]]:
+    """Runs of flagged scans (lane ``flagged``, by reason), of labelled ones (``injected``), of one ``action``.
+
+    Of ``episodes`` only those that left no scan are drawn, over their window.
+    """
     flagged = [None if row.gamma == 1 else row.reason for row in rows]
-    return _runs(rows, flagged, "flagged") + _runs(rows, [row.fault for row in rows], "injected")
+    bare = [_bare(e, rows) for e in episodes if not e.scans and rows]
+    actions = _runs(rows, [row.action or None for row in rows], "action")
+    return _runs(rows, flagged, "flagged") + _runs(rows, [row.fault for row in rows], "injected") + bare + actions
+
+
+def _bare(episode: Episode, rows: Sequence[Row]) -> dict[str, Any]:
+    near = min(range(len(rows)), key=lambda k: abs(rows[k].t_s - episode.start_s))
+    window = {"from": episode.start_s, "to": episode.end_s, "first": near, "last": near}
+    return {"lane": "injected", "word": episode.kind, **window}
 
 
 def _runs(rows: Sequence[Row], words: Sequence[str | None], lane: str) -> list[dict[str, Any]]:

@@ -18,7 +18,7 @@ __all__ = ["build_comparison"]
 
 def build_comparison(results: Sequence[Result], outcomes: Sequence[Outcome] = ()) -> str:
     """The page as text. The first run is the baseline; shaded are its flagged scans."""
-    columns = [derived(r.rows, {}) for r in results]
+    columns = [derived(r.rows) for r in results]
     data = {
         "runs": [
             {

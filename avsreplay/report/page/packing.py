@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from avsreplay.rows import Row
 
-__all__ = ["embed", "numbers", "pack", "values"]
+__all__ = ["embed", "pack", "values"]
 
 _TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "u4": "<u4", "u1": "u1"}
 
@@ -25,12 +25,8 @@ def pack(array: ArrayLike, kind: str) -> dict[str, str]:
 
 def values(rows: Iterable[Row], name: str) -> NDArray[np.float64]:
     """A column as floats (n,), NaN where a row has nothing to say."""
-    return numbers(getattr(row, name) for row in rows)
-
-
-def numbers(items: Iterable[float | None]) -> NDArray[np.float64]:
-    """Floats (n,), NaN for None."""
-    return np.array([np.nan if v is None else float(v) for v in items], dtype=np.float64)
+    found = (getattr(row, name) for row in rows)
+    return np.array([np.nan if v is None else float(v) for v in found], dtype=np.float64)
 
 
 def embed(value: Any) -> str:

@@ -51,7 +51,10 @@ def _figure(value: float | None) -> str:
 def _change(base: float | None, value: float | None) -> str:
     if base is None or value is None or base == value:
         return ""
-    return f"{value - base:+.3g}" if base == 0 else f"{100 * (value - base) / abs(base):+.1f} %"
+    if base == 0:
+        return f"{value - base:+.3g}"
+    times = value / base
+    return f"x {times:.3g}" if times >= 10.0 else f"{100 * (value - base) / abs(base):+.1f} %"
 
 
 def print_divergence(console: Console, baseline: str, other: str, found: GoldenResult) -> None:

@@ -11,7 +11,7 @@ const Packed = (() => {
 })();
 
 const Charts = (() => {
-  const HEIGHT = 150, STRIP = 96;
+  const HEIGHT = 150, LANE = 30;
   const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
   let theme = {};
   function readTheme() {
@@ -42,11 +42,13 @@ const Charts = (() => {
     return out;
   }
 
-  function axes(u) {
+  function axes(log) {
+    const tens = (_, splits) => splits.map((v) => Math.abs(Math.log10(v) % 1) < 1e-9 ? v : null);
+    const lines = log ? { filter: tens } : {};
     const axis = { stroke: () => theme.faint, font: "11px system-ui, sans-serif", grid: { stroke: () => theme.line, width: 1 }, ticks: { stroke: () => theme.line, width: 1, size: 4 } };
     return [
       { ...axis, size: 26, values: (_, ticks) => ticks.map((v) => +v.toFixed(6) + " s") },
-      { ...axis, size: 62, values: (_, ticks) => ticks.map((v) => v === null ? "" : String(+v.toPrecision(6))) },
+      { ...axis, size: 62, grid: { ...axis.grid, ...lines }, ticks: { ...axis.ticks, ...lines }, values: (_, ticks) => ticks.map((v) => v === null ? "" : String(+v.toPrecision(6))) },
     ];
   }
 
@@ -108,7 +110,7 @@ const Charts = (() => {
 
   function options(spec, shared, series, extra) {
     return {
-      width: shared.width, height: spec.height || HEIGHT, legend: { show: false }, series, axes: axes(), padding: [6, 20, 0, 0],
+      width: shared.width, height: spec.height || HEIGHT, legend: { show: false }, series, axes: axes(spec.log), padding: [6, 20, 0, 0],
       scales: { x: { time: false }, y: spec.log ? { distr: 3, range: extra.range } : { range: extra.range } },
       bands: extra.bands || [],
       cursor: { sync: { key: "time", scales: ["x", null] }, drag: { x: true, y: false, dist: 4 }, y: false, focus: { prox: -1 } },
@@ -172,9 +174,10 @@ const Charts = (() => {
     return finish(u, spec, outputs, shared);
   }
 
-  // Two lanes: what the detector flagged, by reason, and what was injected, by kind.
+  // Lanes: what the detector flagged, by reason; what was injected, by kind; what the robot was told to do.
   function strip(host, shared) {
-    const spec = { key: "state", title: "Flagged and injected", unit: "", levels: [], bands: [], height: STRIP, log: false };
+    const names = ["flagged", "injected", "action"].filter((n) => n !== "action" || shared.spans.some((s) => s.lane === n));
+    const spec = { key: "state", title: "Flagged and injected", unit: "", levels: [], bands: [], height: 36 + LANE * names.length, log: false };
     const { node, caption } = figure(host, spec, shared);
     const words = Array.from(new Set(shared.spans.map((s) => s.lane + " " + s.word)));
     for (const word of words) {
@@ -186,12 +189,12 @@ const Charts = (() => {
     if (!words.length) caption.append(el("span", {}, "every scan was used"));
     const draw = (u) => {
       foreground(spec, shared)(u);
-      const { ctx, bbox } = u, px = devicePixelRatio, tall = bbox.height / 2;
+      const { ctx, bbox } = u, px = devicePixelRatio, tall = bbox.height / names.length;
       ctx.save();
       ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
       ctx.font = 11 * px + "px system-ui, sans-serif"; ctx.textBaseline = "middle"; ctx.textAlign = "left";
       for (const s of shared.spans) {
-        const k = words.indexOf(s.lane + " " + s.word), top = bbox.top + (s.lane === "flagged" ? 0 : tall) + 2 * px;
+        const k = words.indexOf(s.lane + " " + s.word), top = bbox.top + tall * names.indexOf(s.lane) + 2 * px;
         const x0 = u.valToPos(s.from - shared.half, "x", true), wide = Math.max(u.valToPos(s.to + shared.half, "x", true) - x0, 2 * px);
         ctx.fillStyle = alpha(k, 0.45); ctx.fillRect(x0, top, wide, tall - 4 * px);
         ctx.strokeStyle = colour(k); ctx.lineWidth = px; ctx.strokeRect(x0, top, wide, tall - 4 * px);
@@ -200,8 +203,8 @@ const Charts = (() => {
       }
       ctx.restore();
     };
-    const lanes = options(spec, shared, [{}, { show: false }], { range: () => [0, 2], draw });
-    lanes.axes[1] = { ...lanes.axes[1], splits: () => [0.5, 1.5], values: () => ["injected", "flagged"], grid: { show: false } };
+    const lanes = options(spec, shared, [{}, { show: false }], { range: () => [0, names.length], draw });
+    lanes.axes[1] = { ...lanes.axes[1], splits: () => names.map((_, k) => k + 0.5), values: () => [...names].reverse(), grid: { show: false } };
     return finish(new uPlot(lanes, [shared.line.t, shared.line.t.map(() => 0)], node), spec, [], shared);
   }
 

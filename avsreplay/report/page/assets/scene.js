@@ -120,7 +120,7 @@ const Scene = (() => {
     bar.append(note);
     const entry = (colour, text) => { const li = document.createElement("li"), i = document.createElement("i"); i.style.background = colour; li.append(i, text); legend.append(li); };
     if (faces.length) entry("#56b4e9", "model at the estimate");
-    if (truth.some(Number.isFinite)) entry("#2fc39a", "model at the true pose (edges)");
+    if (truth.some(Number.isFinite)) entry("#2fc39a", faces.length ? "model at the true pose (edges)" : "true pose");
     if (paths.length) entry("#ff8f4a", "planned path");
     entry("#8c99ad", "line of sight");
     if (clouds.cap) { const li = document.createElement("li"); li.className = "ramp"; li.append("residual 0", document.createElement("b"), (clouds.cap * 1000).toPrecision(3) + " mm"); legend.append(li); }
