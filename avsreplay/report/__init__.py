@@ -17,7 +17,6 @@ if TYPE_CHECKING:
         CloudView,
         PathView,
         View,
-        ViewFold,
         read_view,
         thin_cloud,
         thin_surface,

@@ -24,7 +24,6 @@ __all__ = [
     "Faces",
     "PathView",
     "View",
-    "ViewFold",
     "read_view",
     "thin_cloud",
     "thin_surface",
