@@ -252,7 +252,7 @@ def test_start_takes_the_rate_from_the_first_poses() -> None:
         track = estimator.update(track, prediction, estimator.innovate(prediction, alignment), 1)
     assert errors[1] == pytest.approx(24.0, abs=0.5)
     assert max(errors[2:]) < 1.0
-    assert track.mode == "filter"
+    assert track.mode == "fit"
 
 
 def test_start_is_honest_about_rate_and_velocity() -> None:
@@ -275,7 +275,7 @@ def test_start_is_honest_about_rate_and_velocity() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "value"), [("r_floor", 0.0), ("window", 3), ("start_poses", 1), ("sigma_margin", 0.7)]
+    ("name", "value"), [("r_floor", 0.0), ("window", 3), ("refit_growth", 2.0), ("sigma_margin", 0.7)]
 )
 def test_params_refuse_by_name(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=name):

@@ -9,7 +9,8 @@ import tumbling
 from avsreplay import geometry
 from avsreplay.estimate import motion
 from avsreplay.estimate.layout import boxminus, boxplus
-from avsreplay.estimate.relabel import NAMINGS, Naming, nearest, nees, relabel, relabel_covariance
+from avsreplay.estimate.naming import NAMINGS, Naming
+from avsreplay.estimate.relabel import nearest, nees, relabel, relabel_covariance
 from avsreplay.records import Belief, State
 
 EACH = pytest.mark.parametrize("naming", NAMINGS, ids=lambda n: "".join(map(str, n.perm)))
@@ -63,6 +64,8 @@ def test_nees_does_not_know_the_names(world: tumbling.World, naming: Naming) -> 
     named, size = nearest(belief, relabel(x, naming))
     assert size == pytest.approx(float(d @ d) * 1e6, rel=1e-9)
     assert np.abs(boxminus(named, x)).max() < 1e-12
+    assert nees(belief, relabel(x, naming)) == pytest.approx(nees(belief, x), rel=1e-9)
+    assert nees(belief, x) == pytest.approx(size, rel=0.05)
 
 
 def test_a_wrong_body_is_not_excused(world: tumbling.World) -> None:

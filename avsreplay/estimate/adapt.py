@@ -14,7 +14,7 @@ import numpy as np
 
 from avsreplay.geometry import Array, frozen
 
-__all__ = ["NoiseWindow", "at_floor", "factors", "floored", "matrix_noise", "push"]
+__all__ = ["NoiseWindow", "at_floor", "factors", "filled", "floored", "matrix_noise", "push"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +65,13 @@ def factors(window: NoiseWindow, length: int) -> Array:
     if len(window.ratios) < length:
         return np.ones(6)
     return np.repeat(np.sqrt(window.ratios.mean(axis=0)), 3)
+
+
+def filled(base: Array, factors: Array, length: int) -> NoiseWindow:
+    """A full window that says what a fit found: ``factors`` (2,) of attitude and position on ``base`` (6, 6)."""
+    s = np.repeat(factors[::-1], 3)
+    outer, ratios = base * np.outer(s, s), factors[::-1] ** 2
+    return NoiseWindow(frozen(np.broadcast_to(outer, (length, 6, 6))), frozen(np.broadcast_to(ratios, (length, 2))))
 
 
 def floored(R: Array, R0: Array, fraction: float) -> Array:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from avsreplay.estimate.chart import retract
 from avsreplay.estimate.constrain import shrink
 from avsreplay.estimate.layout import SIGMA, boxplus
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation
 
-__all__ = ["gain", "innovate", "update"]
+__all__ = ["gain", "innovate", "update", "update_in_chart"]
 
 
 def innovate(P: Array, H: Array, alpha: Array, R: Array) -> Innovation:
@@ -37,3 +38,12 @@ def update(prior: Belief, H: Array, seen: Innovation, margin: float) -> tuple[Be
     L.flat[::21] += 1.0
     P = L @ prior.P @ L.T + K @ seen.R @ K.T
     return Belief(prior.t_ns, boxplus(prior.x, K @ seen.alpha), 0.5 * (P + P.T)), hits
+
+
+def update_in_chart(prior: Belief, H: Array, seen: Innovation) -> Belief:
+    """The same update displaced through the chart, where inertia cannot leave its bounds and beta has nothing to do."""
+    K = gain(prior.P, H, seen.S)
+    L = -K @ H
+    L.flat[::21] += 1.0
+    x, P = retract(prior.x, L @ prior.P @ L.T + K @ seen.R @ K.T, K @ seen.alpha)
+    return Belief(prior.t_ns, x, P)

@@ -1,6 +1,7 @@
 """The estimator as the replay uses it: one frozen track in, one out.
 
-``near`` speaks from a given start until the first healthy scan, ``start`` from the first poses, ``filter`` afterwards.
+Modes: ``near`` speaks from a given start until the first healthy scan, ``start`` from the first poses of a cold one,
+``fit`` from the maximum-likelihood fit over all poses so far, ``filter`` afterwards.
 """
 
 from __future__ import annotations
@@ -9,17 +10,21 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from avsreplay.errors import UsageError
 from avsreplay.estimate import adapt, ekf, horizon
 from avsreplay.estimate.adapt import NoiseWindow
-from avsreplay.estimate.measure import innovation, measured_pose, noise_of, sensitivity
+from avsreplay.estimate.cold import ColdFit, refit
+from avsreplay.estimate.fit import FitParams
+from avsreplay.estimate.measure import in_fixture, innovation, measured_pose, noise_of, sensitivity
 from avsreplay.estimate.motion import propagate
-from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource
+from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource, Start
 from avsreplay.estimate.start import PoseFix, first_belief, guessed_belief
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, State, Trajectory
 
 __all__ = ["Estimator", "Prediction", "Track"]
 
+_FEWEST_TO_FIT = 3
 _FREE_RAD = 1.0  # standard deviation of an attitude direction the view leaves free
 
 
@@ -28,9 +33,11 @@ class Track:
     """What the estimator carries from scan to scan.
 
     Attributes:
-        belief: after the last scan.  mode: 'near', 'start' or 'filter'.  window: residuals of the noise adaptation.
+        belief: after the last scan.  mode: 'near', 'start', 'fit' or 'filter'.  window: of the noise adaptation.
         sigma_hits: sigma bounds that cut the gain so far.  r_floors: eigenvalues of R raised so far.
-        R: (6, 6) noise of the last healthy scan [m, half-angle], None before it.  fixes: first poses, mode 'start'.
+        R: (6, 6) noise of the last healthy scan [m, half-angle], None before it.
+        fixes: healthy poses, cold: the last fit to them, both of modes 'start' and 'fit' only.
+        charted: does the filter move through the chart (after a fit), or as the paper's.
     """
 
     belief: Belief
@@ -40,6 +47,8 @@ class Track:
     r_floors: int = 0
     R: Array | None = None
     fixes: tuple[PoseFix, ...] = ()
+    cold: ColdFit | None = None
+    charted: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -62,12 +71,19 @@ class Estimator:
 
     Args:
         params: settings; lengths left out are taken from ``extent_m``, the target's bounding diagonal [m].
-        start: the first belief where one is given (near start).
+        start: the first belief where one is given.
+
+    Raises:
+        UsageError: a near start is asked for and none is given.
     """
 
     def __init__(self, params: EstimatorParams, start: Belief | None, extent_m: float) -> None:
         self.params = params.resolved(extent_m)
-        self.start = start
+        if params.start is Start.NEAR and start is None:
+            hint = "use start = cold, or a log whose scenario has a [start] table"
+            raise UsageError("a near start is asked for and the log gives none", where="estimator.start", hint=hint)
+        self.start = start if params.start in (Start.AUTO, Start.NEAR) else None
+        self.fit = FitParams(rescale=params.adapt is not Adaptation.OFF)
         self._R0 = self.params.R0
         self._free = (_FREE_RAD, 0.5 * extent_m)
 
@@ -75,7 +91,8 @@ class Estimator:
         """The track before the first scan: the given start, else a body at rest at the pose ``T_ac``."""
         if self.start is not None:
             return Track(self.start, "near")
-        return Track(guessed_belief(t_ns, T_ac, self.params), "start")
+        mode = "filter" if self.params.start is Start.PAPER else "start"
+        return Track(guessed_belief(t_ns, T_ac, self.params), mode)
 
     def predict(self, track: Track, t_ns: int) -> Prediction:
         """The prior at ``t_ns`` (eq:KF_propagate)."""
@@ -92,9 +109,12 @@ class Estimator:
         """The posterior; with gamma 0 or nothing seen the prior stands, exactly."""
         if seen is None or gamma == 0:
             return replace(track, belief=prediction.belief)
-        if track.mode == "start":
+        if track.mode in ("start", "fit"):
             return self._begin(track, prediction, seen)
-        belief, hits = ekf.update(prediction.belief, prediction.H, seen, self.params.sigma_margin)
+        if track.charted:
+            belief, hits = ekf.update_in_chart(prediction.belief, prediction.H, seen), 0
+        else:
+            belief, hits = ekf.update(prediction.belief, prediction.H, seen, self.params.sigma_margin)
         window = self._remember(track.window, prediction, seen, belief)
         return replace(
             track,
@@ -135,13 +155,31 @@ class Estimator:
         """The window with this epoch's a posteriori residual z - h(x+), its ratios against the base R."""
         residual = innovation(posterior.x, measured_pose(prediction.belief.x, seen.alpha))
         HPH = prediction.H @ posterior.P @ prediction.H.T
-        s = adapt.factors(window, self.params.window)
+        s = self._factors(window)
         return adapt.push(window, residual, HPH, seen.R / np.outer(s, s), self.params.window)
 
     def _begin(self, track: Track, prediction: Prediction, seen: Innovation) -> Track:
-        fix = PoseFix(prediction.belief.t_ns, measured_pose(prediction.belief.x, seen.alpha), seen.R)
-        fixes = (*track.fixes, fix)
-        belief = first_belief(fixes, self.params)
-        if len(fixes) < self.params.start_poses:
+        """Another healthy pose of a cold start: fit them all when enough have come, else carry the last fit along."""
+        fixes = (*track.fixes, self._fix(prediction, seen))
+        if len(fixes) < _FEWEST_TO_FIT:
+            return replace(track, belief=first_belief(fixes, self.params), fixes=fixes, R=seen.R)
+        count = 0 if track.cold is None else track.cold.count
+        if len(fixes) < count + max(1.0, self.params.refit_growth * count):
+            belief = ekf.update_in_chart(prediction.belief, prediction.H, seen)
             return replace(track, belief=belief, fixes=fixes, R=seen.R)
-        return replace(track, belief=belief, fixes=(), mode="filter", R=seen.R)
+        cold = refit(fixes, track.cold, self.params, self.fit)
+        window = adapt.filled(seen.R / np.outer(s := self._factors(track.window), s), cold.factors, self.params.window)
+        track = replace(track, belief=cold.belief, window=window, R=seen.R)
+        if cold.settled:
+            return replace(track, mode="filter", fixes=(), cold=None, charted=True)
+        return replace(track, mode="fit", fixes=fixes, cold=cold, charted=True)
+
+    def _fix(self, prediction: Prediction, seen: Innovation) -> PoseFix:
+        x = prediction.belief.x
+        pose = measured_pose(x, seen.alpha)
+        s = self._factors(prediction.window)
+        return PoseFix(prediction.belief.t_ns, pose, in_fixture(seen.R / np.outer(s, s), pose.q, x.q_bc))
+
+    def _factors(self, window: NoiseWindow) -> Array:
+        """(6,) factors of the base R in force."""
+        return adapt.factors(window, self.params.window) if self.params.adapt is Adaptation.SCALE else np.ones(6)

@@ -14,7 +14,7 @@ from avsreplay.estimate.layout import DIM, hamilton
 from avsreplay.geometry import Array, Pose, matrix
 from avsreplay.records import Alignment, State
 
-__all__ = ["innovation", "measured_pose", "noise_of", "sensitivity"]
+__all__ = ["in_camera", "in_fixture", "innovation", "measured_pose", "noise_of", "sensitivity"]
 
 
 def sensitivity(x: State) -> Array:
@@ -47,7 +47,7 @@ def measured_pose(x: State, alpha: Array) -> Pose:
 def noise_of(alignment: Alignment, x: State, free: tuple[float, float]) -> Array | None:
     """R (6, 6) [m, half-angle] from the registration's own word on d = [theta; v] in {C}, None if it says nothing.
 
-    dq-block A(mu) theta / 2 in {B}, position R_ac v in {A}: both of one sign, so the cross terms stay. Where the view
+    Attitude A(mu) theta / 2 in {B}, position R_ac v in {A}: both of one sign, so the cross terms stay. Where the view
     is degenerate the covariance is taken from ``info``, its free directions at the standard deviations ``free``
     (rad, m): the scan then still tells what it does see.
     """
@@ -57,10 +57,23 @@ def noise_of(alignment: Alignment, x: State, free: tuple[float, float]) -> Array
         C = np.asarray(np.linalg.inv(alignment.info + np.diag(np.repeat(np.asarray(free) ** -2.0, 3))))
     else:
         return None
+    return in_camera(C, alignment.T_ac.q, x.q_bc)
+
+
+def in_camera(C: Array, q_ac: Array, q_bc: Array) -> Array:
+    """R (6, 6) in metres in {A} and half angles in {B} from C (6, 6) of d = [theta; v] in {C}."""
     J = np.zeros((6, 6))
-    J[:3, 3:], J[3:, :3] = alignment.T_ac.R, 0.5 * matrix(x.q_bc)
+    J[:3, 3:], J[3:, :3] = matrix(q_ac), 0.5 * matrix(q_bc)
     R: Array = J @ C @ J.T
     return 0.5 * (R + R.T)
+
+
+def in_fixture(R: Array, q_ac: Array, q_bc: Array) -> Array:
+    """``in_camera``'s inverse."""
+    J = np.zeros((6, 6))
+    J[:3, 3:], J[3:, :3] = 2.0 * matrix(q_bc).T, matrix(q_ac).T
+    C: Array = J @ R @ J.T
+    return 0.5 * (C + C.T)
 
 
 def _inverse(q: Array) -> tuple[float, float, float, float]:

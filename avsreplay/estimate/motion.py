@@ -19,6 +19,8 @@ from avsreplay.geometry import Array, matrix
 from avsreplay.records import Belief, State
 
 __all__ = [
+    "GENERATORS",
+    "SUBSTEP_RAD",
     "Flow",
     "advance",
     "disturbance",
@@ -27,6 +29,7 @@ __all__ = [
     "process_noise",
     "propagate",
     "rate_series",
+    "series_order",
     "sigma3",
     "sigma_join",
     "transition",
@@ -103,7 +106,7 @@ def _join(first: Flow, then: Flow) -> Flow:
 def _piece(w: tuple[float, ...], ratios: tuple[float, ...], h: float, push: tuple[float, ...]) -> Flow:
     """One sub-step: ``push`` is the rate variance it gets from the torque [rad2/s2]."""
     u = (w[0] * h, w[1] * h, w[2] * h)
-    order = _order(math.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]))
+    order = series_order(math.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]))
     rates, products = rate_series(u, ratios, order)
     Y = _linear_series(np.array(rates), np.array(products), ratios, np.array(push) * (h * h))
     S, Q = Y[:, :9], Y[:, 9:]
@@ -112,7 +115,7 @@ def _piece(w: tuple[float, ...], ratios: tuple[float, ...], h: float, push: tupl
     return Flow(end, _relative(S), S, 0.5 * (Q + Q.T))
 
 
-def _order(theta: float) -> int:
+def series_order(theta: float) -> int:
     """Terms needed for a tail below TAIL; four at least, which the noise of a body at rest needs."""
     return 4 if theta < 1e-3 else max(4, math.ceil(math.log(TAIL) / math.log(theta / _POLE)))
 
@@ -147,13 +150,13 @@ def _generators() -> Array:
     return E.reshape(4, 108)
 
 
-_GENERATORS = _generators()
+GENERATORS = _generators()
 
 
 def _linear_series(rates: Array, products: Array, ratios: tuple[float, ...], push: Array) -> Array:
     """(6, 15): the sum of the series of [sensitivity (6, 9) | noise (6, 6)] at the end of a step of length 1."""
     order = len(products)
-    E = (np.array((1.0, *ratios)) @ _GENERATORS).reshape(3, 36)
+    E = (np.array((1.0, *ratios)) @ GENERATORS).reshape(3, 36)
     terms = (rates[order - 1 :: -1] @ E).reshape(order, 6, 6)
     terms[-1, :3, 3:] = 0.5 * _I6[:3, :3]
     N = terms.transpose(1, 0, 2).reshape(6, 6 * order)  # newest coefficient first, to meet Y's oldest

@@ -11,7 +11,7 @@ import numpy as np
 
 from avsreplay.geometry import Array
 
-__all__ = ["Adaptation", "EstimatorParams", "NoiseSource"]
+__all__ = ["Adaptation", "EstimatorParams", "NoiseSource", "Start"]
 
 _POSITIVE = (
     "torque_noise_radps15",
@@ -24,6 +24,7 @@ _POSITIVE = (
     "start_rate_1s_radps",
     "start_vel_1s_mps",
     "start_sigma_1s",
+    "start_log_inertia_1s",
     "start_varrho_1s_m",
     "start_mu_1s_deg",
 )
@@ -34,6 +35,15 @@ class NoiseSource(Enum):
 
     REGISTRATION = "registration"  # the alignment's own covariance, R0 where it has none
     R0 = "r0"
+
+
+class Start(Enum):
+    """Where the first belief comes from."""
+
+    AUTO = "auto"  # near where the log or the caller gives one, else cold
+    NEAR = "near"  # the given belief
+    COLD = "cold"  # rate from the first poses, then the fit over all of them
+    PAPER = "paper"  # the plain filter from zero, everything wide
 
 
 class Adaptation(Enum):
@@ -66,8 +76,10 @@ class EstimatorParams:
     r_floor: float = 1e-6
     # |sigma| stays below 1 minus this
     sigma_margin: float = 0.01
-    # healthy poses the first rate is taken from
-    start_poses: int = 2
+    # how it begins: a given belief (near), the fit (cold), the paper's filter from zero (paper); auto: near where given
+    start: Start = Start.AUTO
+    # cold: the fit is repeated when the healthy poses have grown by this share
+    refit_growth: float = 0.1
     # 1 sigma of the pose that is handed in before any scan [m]; auto: 0.05 of the extent
     start_pos_1s_m: float | None = None
     # the same, attitude about each axis [deg]
@@ -76,11 +88,13 @@ class EstimatorParams:
     start_rate_1s_radps: float = 0.5
     # 1 sigma of the unknown velocity [m/s]; auto: 0.05 of the extent per second
     start_vel_1s_mps: float | None = None
-    # 1 sigma of each unknown inertia ratio
+    # paper: 1 sigma of each unknown inertia ratio
     start_sigma_1s: float = 0.5
+    # cold: 1 sigma of each of the five numbers of the logarithm of the mass moments
+    start_log_inertia_1s: float = 1.0
     # 1 sigma of the unknown fixture position in {B} [m]; auto: 0.25 of the extent
     start_varrho_1s_m: float | None = None
-    # 1 sigma of the unknown misalignment about each axis [deg]
+    # paper: 1 sigma of the unknown misalignment about each axis [deg]
     start_mu_1s_deg: float = 20.0
 
     def __post_init__(self) -> None:
@@ -90,8 +104,8 @@ class EstimatorParams:
                 raise ValueError(f"{name} is {value}, must be positive and finite")
         if not 0.0 < self.sigma_margin < 0.5:
             raise ValueError(f"sigma_margin is {self.sigma_margin}, must be in (0, 0.5)")
-        if self.window < 6 or self.start_poses < 2:
-            raise ValueError(f"window is {self.window} (6 at least), start_poses is {self.start_poses} (2 at least)")
+        if self.window < 6 or not 0.0 <= self.refit_growth <= 1.0:
+            raise ValueError(f"window is {self.window} (6 at least), refit_growth is {self.refit_growth} (0 to 1)")
 
     def resolved(self, extent_m: float) -> EstimatorParams:
         """The same with every auto value filled in from the target's extent [m]."""
@@ -110,6 +124,10 @@ class EstimatorParams:
     def R0(self) -> Array:
         """(6, 6) noise for (metres, half angle); auto values must be filled in."""
         return np.diag(np.repeat([_given(self.r0_pos_m), 0.5 * math.radians(self.r0_rot_deg)], 3) ** 2)
+
+    def length(self, name: str) -> float:
+        """An auto length, filled in."""
+        return _given(getattr(self, name))
 
     @property
     def force(self) -> float:

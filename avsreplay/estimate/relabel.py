@@ -6,43 +6,17 @@ sigma follows the permutation and, for an odd one, changes its sign: s'_i = pari
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import permutations, product
-
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.layout import DIM, DMU, DQ, SIGMA, VARRHO, W, boxminus
 from avsreplay.estimate.motion import sigma3, sigma_join
+from avsreplay.estimate.naming import NAMINGS, Naming
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 
-__all__ = ["NAMINGS", "Naming", "nearest", "nees", "relabel", "relabel_covariance"]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Naming:
-    """One of the 24: R_bn (3, 3), its quaternion, new axis i is old axis perm[i] up to sign, parity of perm."""
-
-    R_bn: Array
-    q_bn: Array
-    perm: tuple[int, int, int]
-    parity: float
-
-
-def _namings() -> tuple[Naming, ...]:
-    found = []
-    for perm in permutations(range(3)):
-        for signs in product((1.0, -1.0), repeat=3):
-            R = np.zeros((3, 3))
-            R[perm, (0, 1, 2)] = signs
-            if np.linalg.det(R) > 0.0:
-                parity = float(np.sign(np.linalg.det(np.abs(R))))
-                found.append(Naming(R, geometry.quaternion(R), (perm[0], perm[1], perm[2]), parity))
-    return tuple(found)
-
-
-NAMINGS = _namings()
+__all__ = ["nearest", "nees", "relabel", "relabel_covariance"]
 
 
 def relabel(x: State, naming: Naming) -> State:
@@ -74,6 +48,14 @@ def nearest(estimate: Belief, truth: State) -> tuple[State, float]:
     return named[best], float(sizes[best])
 
 
-def nees(estimate: Belief, truth: State) -> float:
-    """Normalised estimation error squared over the 20 states, modulo the naming of the axes."""
-    return nearest(estimate, truth)[1]
+def nees(belief: Belief, truth: State) -> float:
+    """Normalised estimation error squared over the 20 states, in the chart: free of the names of the principal axes.
+
+    Where two moments are nearly equal, sigma and mu are no coordinates and their errors mean nothing; here they are one
+    smooth matrix, and what cannot be known is only a wide direction.
+    """
+    here = to_chart(belief.x)
+    T = to_errors(here)
+    P = np.linalg.solve(T, np.linalg.solve(T, belief.P).T)
+    y = to_chart(truth).minus(here)
+    return float(y @ np.linalg.solve(0.5 * (P + P.T), y))

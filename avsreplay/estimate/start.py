@@ -14,22 +14,26 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate.layout import hamilton
-from avsreplay.estimate.measure import sensitivity
+from avsreplay.estimate.measure import in_camera, sensitivity
 from avsreplay.estimate.motion import advance, flow, transition
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
 
-__all__ = ["PoseFix", "first_belief", "guessed_belief"]
+__all__ = ["PoseFix", "first_belief", "guessed_belief", "rates"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseFix:
-    """A healthy pose T_ac at an instant with its noise R (6, 6) [m, half-angle]."""
+    """A healthy pose T_ac at an instant.
+
+    Attributes:
+        C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
+    """
 
     t_ns: int
     T_ac: Pose
-    R: Array
+    C: Array
 
 
 def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
@@ -40,18 +44,18 @@ def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
 def first_belief(fixes: tuple[PoseFix, ...], params: EstimatorParams) -> Belief:
     """The belief at the last of the poses: rate and velocity from the last two, at rest from a single one."""
     last = fixes[-1]
-    x = _state(last.T_ac, *_rates(fixes))
+    x = _state(last.T_ac, *rates(fixes))
     info = np.diag(params.start_1s**-2.0)
     for fix in fixes:
         h = (fix.t_ns - last.t_ns) * 1e-9
         step = flow(x.w_b, x.sigma, h)
         H = sensitivity(advance(x, step, h)) @ transition(step, x.sigma, h)
-        info += H.T @ np.linalg.solve(fix.R, H)
+        info += H.T @ np.linalg.solve(in_camera(fix.C, fix.T_ac.q, x.q_bc), H)
     P = np.linalg.inv(info)
     return Belief(last.t_ns, x, 0.5 * (P + P.T))
 
 
-def _rates(fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
+def rates(fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
     """Rate in {C} [rad/s] and velocity in {A} [m/s], mean over the poses; zero for one pose or no time between."""
     h = (fixes[-1].t_ns - fixes[0].t_ns) * 1e-9
     if h <= 0.0:

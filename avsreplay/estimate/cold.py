@@ -1,0 +1,92 @@
+"""Start without a belief: the rate from the first poses, then the fit over all of them, until the filter may go on.
+
+The fit is repeated each time the poses have grown by a stated share; in between the filter's update carries its belief
+along, in the chart's coordinates. The filter takes over, with the fit's own mean and covariance, once the likelihood is
+normal (``spread`` finds no bent direction) and the poses, not the prior, tell every direction. A body of which
+something can never be told stays with the fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.estimate.chart import Chart, to_chart
+from avsreplay.estimate.fit import FitParams, Fitted, Poses, Prior, fit
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.spread import Spread, belief_at, spread
+from avsreplay.estimate.start import PoseFix, rates
+from avsreplay.geometry import Array
+from avsreplay.records import Belief, State
+
+__all__ = ["ColdFit", "poses_of", "prior_of", "refit", "rough_state"]
+
+_TOLD = 0.5  # of the prior's sigma: what is known no better is told by the prior
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ColdFit:
+    """The last fit: its values at the epoch (the first pose), how many poses it had, and what came of it.
+
+    Attributes:
+        chart: where the next one starts.  count: poses.  factors: (2,) noise factors, attitude and position.
+        belief: at the last pose.  settled: may the filter take over.
+    """
+
+    chart: Chart
+    count: int
+    factors: Array
+    belief: Belief
+    settled: bool
+
+
+def poses_of(fixes: tuple[PoseFix, ...]) -> Poses:
+    """The fixes as the fit takes them, times from the first."""
+    t0 = fixes[0].t_ns
+    return Poses(
+        np.array([(f.t_ns - t0) * 1e-9 for f in fixes]),
+        np.array([f.T_ac.q for f in fixes]),
+        np.array([f.T_ac.t for f in fixes]),
+        np.array([f.C for f in fixes]),
+    )
+
+
+def prior_of(poses: Poses, params: EstimatorParams) -> Prior:
+    """The weak belief: a sphere at rest at the first pose, centred at its fixture, everything wide."""
+    mean = Chart(poses.q[0], np.zeros(3), poses.t[0], np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.eye(3))
+    arm = params.length("start_varrho_1s_m")
+    speed = params.length("start_vel_1s_mps") + params.start_rate_1s_radps * arm
+    widths = [2.0, params.start_rate_1s_radps, 4.0 * arm, speed, params.start_log_inertia_1s, arm]
+    return Prior(mean, np.repeat(widths, [3, 3, 3, 3, 5, 3]))
+
+
+def rough_state(fixes: tuple[PoseFix, ...]) -> State:
+    """A sphere spinning about its fixture at the mean rate of the first poses, over a radian at most."""
+    few = 2
+    while few < len(fixes) and float(geometry.angle(_turn(fixes[0], fixes[few - 1]))) < 0.5:
+        few += 1
+    w, v = rates(fixes[:few])
+    first = fixes[0].T_ac
+    return State(first.q, w, first.t, v, np.zeros(2), np.zeros(3), geometry.IDENTITY_QUAT)
+
+
+def _turn(a: PoseFix, b: PoseFix) -> Array:
+    return geometry.multiply(geometry.conjugate(a.T_ac.q), b.T_ac.q)
+
+
+def refit(fixes: tuple[PoseFix, ...], last: ColdFit | None, params: EstimatorParams, rules: FitParams) -> ColdFit:
+    """Fit all poses, from the last fit's values where there is one."""
+    poses = poses_of(fixes)
+    prior = prior_of(poses, params)
+    start = to_chart(rough_state(fixes)) if last is None else last.chart
+    fitted = fit(poses, start, prior, rules, None if last is None else last.factors)
+    found = spread(poses, fitted, prior, rules)
+    belief = belief_at(found, fixes[-1].t_ns, float(poses.times_s[-1]))
+    return ColdFit(fitted.chart, len(poses), fitted.factors, belief, _settled(found, fitted, prior))
+
+
+def _settled(found: Spread, fitted: Fitted, prior: Prior) -> bool:
+    told = np.linalg.eigvalsh(fitted.P_chart / np.outer(prior.one_sigma, prior.one_sigma))[-1] < _TOLD**2
+    return found.settled and bool(told) and fitted.converged
