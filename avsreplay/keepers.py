@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.chain import Memory
@@ -17,6 +18,7 @@ from avsreplay.job import Listener
 from avsreplay.log.result_log import ResultFrame, ResultLog
 from avsreplay.plan.pilot import Leg
 from avsreplay.records import Belief, Scan, Surface
+from avsreplay.register.model import Model
 from avsreplay.report import CloudView, PathView, View, thin_cloud, thin_surface, write_view
 from avsreplay.results import Beliefs, ResultDirectory, belief_of
 from avsreplay.rows import Row
@@ -24,6 +26,7 @@ from avsreplay.rows import Row
 __all__ = ["LogKeeper", "ResultKeeper", "ViewKeeper", "pose_covariance"]
 
 PATH_POINTS = 41
+VIEW_REACH = 0.05  # of the model's extent: points farther off all look alike
 _VALUES = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 
 
@@ -87,15 +90,23 @@ class ViewKeeper:
 
     def __init__(self, surface: Surface) -> None:
         self._surface, self._paths = surface, _Paths()
+        self._model = Model.build(surface, VIEW_REACH * surface.extent)
         self._clouds: list[CloudView] = []
         self._plans: list[PathView] = []
 
     def __call__(self, scan: Scan, memory: Memory, row: Row) -> None:
         """Take one scan."""
-        self._clouds.append(thin_cloud(scan.seq, scan.points))
+        thin = thin_cloud(scan.seq, scan.points)
+        self._clouds.append(CloudView(thin.seq, thin.points, self._residual(thin.points, belief_of(memory).x.T_ac)))
         path = self._paths.new(memory)
         if path is not None:
             self._plans.append(PathView(row.t_ns, np.asarray(path[1], np.float32), row.hindsight_m))
+
+    def _residual(self, points: NDArray[np.float32], T_ac: Pose) -> NDArray[np.float32]:
+        """Distance (n,) [m] of points (n, 3) in {A} to the model at the estimated pose, the reach at most."""
+        T_ca = T_ac.inverse()
+        found = self._model.closest(T_ca.apply(points), camera_c=T_ca.t)
+        return np.sqrt(np.minimum(found.d2, self._model.reach_m**2)).astype(np.float32)
 
     def view(self) -> View:
         """Everything kept so far."""
