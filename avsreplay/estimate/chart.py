@@ -1,10 +1,10 @@
 """Coordinates in which the fit is nearly linear: everything in {C}, and inertia as a traceless symmetric matrix.
 
-The mass moments of a body about its centre, E = tr(I)/2 1 - I, are positive definite exactly where the moments obey
-the triangle inequalities. Its logarithm M, traceless as scale does not matter, is any symmetric 3x3 matrix: five
-numbers for (sigma, mu) that need no bounds, no naming of axes, and have no singular point where two moments are
-equal. With the eigenvalues m of M, sigma1 = tanh((mz - my) / 2), sigma2 = tanh((mx - mz) / 2), sigma3 = tanh((my - mx) / 2); the
-eigenvectors are the principal axes, A(mu)'.
+The mass moments of a body about its centre, E = tr(I)/2 1 - I, are positive definite exactly where the moments obey the
+triangle inequalities. Its logarithm M, traceless as scale does not matter, is any symmetric 3x3 matrix: five numbers
+for (sigma, mu) that need no bounds, no naming of axes, and have no singular point where two moments are equal.
+With the eigenvalues m of M, sigma1 = tanh((mz - my) / 2), sigma2 = tanh((mx - mz) / 2), sigma3 = tanh((my - mx) / 2);
+the eigenvectors are the principal axes, A(mu)'.
 
 Chart step y (20): half angle of eta in {C}, rate in {C}, position and velocity of the fixture in {A}, M (5), arm (3)
 from the centre of mass to the fixture in {C}. Pose and twist are what is measured; the arm and M are what is inferred.
