@@ -1,9 +1,12 @@
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+LAYOUT: int
+
 class Index:
+    @overload
     def __init__(
         self,
         vertices: NDArray[np.float64],
@@ -13,6 +16,9 @@ class Index:
         threads: int = 1,
         portable: bool = False,
     ) -> None: ...
+    @overload
+    def __init__(self, saved: bytes, primitives: int, ids: int, mesh: bool, portable: bool = False) -> None: ...
+    def save(self) -> bytes: ...
     def closest(
         self, points: NDArray[Any], threads: int = 1, camera_c: tuple[float, ...] | None = None
     ) -> tuple[Any, ...]: ...
@@ -40,7 +46,7 @@ class Index:
         facing: bool = False,
     ) -> tuple[Any, ...]: ...
     @property
-    def bytes(self) -> int: ...
+    def nbytes(self) -> int: ...
     @property
     def isa(self) -> str: ...
     @property

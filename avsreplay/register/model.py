@@ -19,6 +19,7 @@ Triangles without area
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -129,7 +130,9 @@ class _Index(Protocol):
     ) -> tuple[Array, Array, NDArray[np.int32], Array]: ...
 
     @property
-    def bytes(self) -> int: ...
+    def nbytes(self) -> int: ...
+
+    restored: bool
 
     def icp(
         self, points: NDArray[Any], T_ca: Array, rule: Rule, threads: int, keep: bool, facing: bool
@@ -158,12 +161,20 @@ class Model:
 
     @classmethod
     def build(
-        cls, surface: Surface, reach_m: float, *, engine: Engine = "kernel", threads: int = 1, portable: bool = False
+        cls,
+        surface: Surface,
+        reach_m: float,
+        *,
+        engine: Engine = "kernel",
+        threads: int = 1,
+        portable: bool = False,
+        saved_in: Path | None = None,
     ) -> Model:
         """Index ``surface`` for queries up to ``reach_m`` [m] from it.
 
         ``threads`` build it; ``portable`` keeps the kernel to the instructions every machine of its kind has. Neither
-        shows in any result.
+        shows in any result. ``saved_in``, a folder: the kernel's index is read from there where a sound file under this
+        surface's hash lies, else built and written there.
 
         Raises:
             UsageError: a surface with no primitive, a coordinate that is not finite, a face that names a vertex that is
@@ -173,14 +184,19 @@ class Model:
         kept = _with_area(vertices, faces)
         if len(faces) and not len(kept):
             raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
-        index = _engine(engine, surface.name)(vertices, faces, kept, float(reach_m), threads, portable)
+        index = _engine(engine, surface.name)(vertices, faces, kept, float(reach_m), threads, portable, saved_in)
         size = len(kept) if len(faces) else len(vertices)
         return cls(float(reach_m), surface.extent, engine, size, len(faces) - len(kept), index)
 
     @property
-    def bytes(self) -> int:
+    def restored(self) -> bool:
+        """Was the index read from a file instead of built?"""
+        return self._index.restored
+
+    @property
+    def nbytes(self) -> int:
         """Memory of the index [B]; 0 for the reference engine, which does not count."""
-        return self._index.bytes
+        return self._index.nbytes
 
     def closest(self, points: NDArray[Any], *, threads: int = 1, camera_c: ArrayLike | None = None) -> Closest:
         """Feet of ``points`` (n, 3) [m] in {C}; a point that is not finite has none.

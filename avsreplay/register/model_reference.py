@@ -7,6 +7,7 @@ under the exact distance of the best-bounded one is measured, and no other.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,9 @@ class ReferenceIndex:
         reach_m: float,
         threads: int,
         portable: bool,
+        saved_in: Path | None,
     ) -> None:
-        del threads, portable
+        del threads, portable, saved_in
         self._reach = reach_m
         if len(faces):
             corners = vertices[faces[kept]]
@@ -52,7 +54,8 @@ class ReferenceIndex:
             self._search = _CloudSearch(vertices)
             self._ids = np.arange(len(vertices), dtype=np.int32)
 
-    bytes = 0
+    nbytes = 0
+    restored = False
 
     def closest(
         self, points: NDArray[Any], threads: int, camera_c: Array | None

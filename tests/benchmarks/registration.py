@@ -235,7 +235,7 @@ def index(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
             model = Model.build(target, reach)
             seconds.append(time.perf_counter() - start)
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"{name:28} {statistics.median(seconds):7.3f} s {model.bytes / 1e6:8.1f} MB  (peak {peak:.0f} MB)")
+        print(f"{name:28} {statistics.median(seconds):7.3f} s {model.nbytes / 1e6:8.1f} MB  (peak {peak:.0f} MB)")
 
 
 def passes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@
 
 #include "build.hpp"
 #include "loop.hpp"
+#include "save.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -88,6 +89,17 @@ class Index {
     nb::gil_scoped_release release;
     Team team(threads);
     build(store_, s, reach, code(), team);
+  }
+
+  // From what `save` gave; the caller has checked that it is for this model and whole.
+  Index(nb::bytes saved, int64_t primitives, int64_t ids, bool mesh, bool portable) : portable_(portable) {
+    const bool sound = restore(saved.c_str(), saved.size(), primitives, ids, mesh, store_);
+    require(sound, "not a sound index");
+  }
+
+  nb::bytes save() const {
+    const std::string bytes = avs::save(store_);
+    return nb::bytes(bytes.data(), bytes.size());
   }
 
   nb::tuple closest(nb::handle points, int threads, std::optional<std::array<double, 3>> camera) const {
@@ -186,9 +198,13 @@ class Index {
 }  // namespace
 
 NB_MODULE(_kernel, m) {
+  m.attr("LAYOUT") = LAYOUT;
   nb::class_<Index>(m, "Index")
       .def(nb::init<Doubles, Ints, Ints, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
            nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
+      .def(nb::init<nb::bytes, int64_t, int64_t, bool, bool>(), nb::arg("saved"), nb::arg("primitives"), nb::arg("ids"),
+           nb::arg("mesh"), nb::arg("portable") = false)
+      .def("save", &Index::save)
       .def("closest", &Index::closest, nb::arg("points"), nb::arg("threads") = 1,
            nb::arg("camera_c").none() = nb::none())
       .def("icp", &Index::icp, nb::arg("points"), nb::arg("T_ca"), nb::arg("n_max"), nb::arg("n_plane"),
@@ -196,7 +212,7 @@ NB_MODULE(_kernel, m) {
            nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false)
       .def("normal_equations", &Index::normal_equations, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"),
            nb::arg("threads") = 1, nb::arg("facing") = false)
-      .def_prop_ro("bytes", &Index::bytes)
+      .def_prop_ro("nbytes", &Index::bytes)
       .def_prop_ro("isa", &Index::isa)
       .def_prop_ro("shape", &Index::shape);
 }
