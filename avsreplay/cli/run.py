@@ -81,6 +81,7 @@ class _Start(click.ParamType[str | float]):
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
+@click.option("--plain", is_flag=True, help="No pictures between the tables.")
 def command(
     log: Path,
     golden: Path | None,
@@ -91,6 +92,7 @@ def command(
     as_json: bool,
     table_every: int | None,
     table_all: bool,
+    plain: bool,
     **flags: Any,
 ) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
@@ -107,7 +109,7 @@ def command(
     target = ResultDirectory(output, overwrite=overwrite) if output else None
     with Run(_job(log, flags)) as run:
         rows, summary, record, scans_per_s = _replayed(run, target)
-        _print(rows, summary, record, as_json, table_every, table_all, scans_per_s)
+        _print(rows, summary, record, as_json, table_every, table_all, plain, scans_per_s)
         if page and output:
             _page(output)
         _gate(rows, golden, update_golden, as_json)
@@ -178,6 +180,7 @@ def _print(
     as_json: bool,
     every: int | None,
     all_rows: bool,
+    plain: bool,
     scans_per_s: float,
 ) -> None:
     from avsreplay import report
@@ -186,7 +189,7 @@ def _print(
         click.echo(report.dump_document(rows, summary, record), nl=False)
         return
     console = report.make_console()
-    report.print_tables(console, rows, summary, every=every, all=all_rows, scans_per_s=scans_per_s)
+    report.print_tables(console, rows, summary, every=every, all=all_rows, scans_per_s=scans_per_s, plain=plain)
 
 
 def _gate(rows: Sequence[Row], golden: Path | None, update: Path | None, as_json: bool) -> None:

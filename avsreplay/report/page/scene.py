@@ -82,10 +82,10 @@ def _quantised(points: NDArray[np.float32]) -> tuple[NDArray[np.int16], NDArray[
 
 
 def _cap(residuals: Sequence[NDArray[np.float32]]) -> float | None:
-    """The residual at the top of the colour scale: 95 % of all points are below it."""
+    """The residual at the top of the colour scale: twice the 90 % point of the middle scan, blind ones or not."""
     if not residuals:
         return None
-    return float(np.quantile(np.concatenate(residuals), 0.95)) or 1e-9
+    return 2.0 * float(np.median([np.quantile(r, 0.9) for r in residuals])) or 1e-9
 
 
 def _levels(cloud: CloudView, cap: float | None) -> NDArray[np.uint8]:

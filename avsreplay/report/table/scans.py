@@ -15,7 +15,6 @@ from avsreplay.rows import Column, Row, columns
 __all__ = ["choose_rows", "scan_table"]
 
 FEW = 24
-_STATE = ("gamma", "reason")
 _ORDER = (  # what is kept first where the width is short
     "seq",
     "t_s",
@@ -31,6 +30,7 @@ _ORDER = (  # what is kept first where the width is short
     "ogm_rank",
     "sigma1",
     "sigma2",
+    "action",
     "converged",
     "ogm_log10_cond",
     "status",
@@ -69,7 +69,7 @@ def scan_table(console: Console, rows: Sequence[Row], *, every: int | None = Non
     fitting = _fit(cells, declared, console.width)
     table = new_table(console, f"Scans: {words}", tight=True)
     for name in fitting:
-        justify = "left" if name in ("reason", "fault", "status") else "right"
+        justify = "left" if name in ("reason", "fault", "action", "status") else "right"
         label = "state" if name == "reason" else head(declared[name])
         table.add_column(label, justify=justify, no_wrap=True, vertical="bottom")  # type: ignore[arg-type]
     for k in range(len(chosen)):

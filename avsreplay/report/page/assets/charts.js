@@ -177,7 +177,7 @@ const Charts = (() => {
   // Lanes: what the detector flagged, by reason; what was injected, by kind; what the robot was told to do.
   function strip(host, shared) {
     const names = ["flagged", "injected", "action"].filter((n) => n !== "action" || shared.spans.some((s) => s.lane === n));
-    const spec = { key: "state", title: "Flagged and injected", unit: "", levels: [], bands: [], height: 36 + LANE * names.length, log: false };
+    const spec = { key: "state", title: "States", unit: "", levels: [], bands: [], height: 36 + LANE * names.length, log: false };
     const { node, caption } = figure(host, spec, shared);
     const words = Array.from(new Set(shared.spans.map((s) => s.lane + " " + s.word)));
     for (const word of words) {
