@@ -257,22 +257,28 @@ def test_outward_is_told_from_inward_open_and_cloud(surface: Surface) -> None:
     assert is_outward(soup)
 
 
-def test_seen_is_the_side_towards_the_camera(surface: Surface) -> None:
-    model = Model.build(surface, 0.5)
-    T_ca = proving_pose().inverse()
-    points, normals = sample(surface, 4000)
-    towards = np.einsum("ij,ij->i", normals, T_ca.t - points)
-    clear = np.abs(towards) > 0.05
-    inside_faces = model.closest(points + 0.001 * normals)
-    seen = View(surface, Camera.ORIGIN).seen(inside_faces, T_ca)
-    agree = seen[clear] == (towards[clear] > 0.0)
-    assert agree.mean() > 0.99
-    assert View(surface, Camera.NONE).seen(inside_faces, T_ca).all()
+def test_the_camera_is_the_origin_where_it_can_be(surface: Surface, scan: np.ndarray) -> None:
+    model, T_ca = Model.build(surface, 0.5), proving_pose().inverse()
+    np.testing.assert_array_equal(View(surface).camera_c(model, scan, T_ca), T_ca.t)
+    np.testing.assert_array_equal(View(surface, Camera.ORIGIN).camera_c(model, scan, T_ca), T_ca.t)
+    assert View(surface, Camera.NONE).camera_c(model, scan, T_ca) is None
+    inward = replace(surface, faces=surface.faces[:, ::-1])
+    assert View(inward).camera_c(model, scan, T_ca) is None
 
 
-def test_a_camera_inside_the_model_is_not_believed(surface: Surface) -> None:
-    found = Model.build(surface, 0.5).closest(sample(surface, 500)[0])
-    assert View(surface, Camera.AUTO).seen(found, Pose.identity()).all()
+def test_a_camera_inside_the_model_or_behind_the_measured_sides_is_not_believed(surface: Surface) -> None:
+    model, T_ca = Model.build(surface, 0.5), proving_pose().inverse()
+    near = view(surface, 3000, T_ca.t)
+    assert View(surface).camera_c(model, near, Pose.identity()) is None
+    behind = view(surface, 3000, -T_ca.t)  # the sides that a camera on the other side would see
+    assert View(surface).camera_c(model, proving_pose().apply(behind), T_ca) is None
+
+
+def test_sight_points_from_the_scan_to_the_camera(surface: Surface, scan: np.ndarray) -> None:
+    sight = View(surface).sight(scan)
+    assert sight @ (-proving_pose().t / np.linalg.norm(proving_pose().t)) > 0.95
+    assert View(surface).sight(proving_pose().inverse().apply(scan)) is None
+    assert View(surface, Camera.NONE).sight(scan) is None
 
 
 @pytest.mark.parametrize("offset", [0.06, -0.06])

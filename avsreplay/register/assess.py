@@ -30,8 +30,8 @@ class Evidence:
     """What the inliers at a pose say, all in {C}.
 
     Attributes:
-        points: of the scan.  inliers: nearer to the model than the gate, on a side that
-            the camera can see.  rms_m: of their distances.
+        points: of the scan.  inliers: nearer than the gate to the model, or to its sides
+            that face the camera where its place is known.  rms_m: of their distances.
         J: (k, 6) rows [p x n, n].  e: (k,) n . (p - foot) [m].  centre: (3,) centroid of the inliers.
         noise_m: 1 sigma of e, robust.
     """
@@ -50,8 +50,8 @@ def evidence(
 ) -> Evidence:
     """Gather it: ``points`` (n, 3) in {A} [m]; ``noise_m`` None estimates it from the residuals."""
     moved = T_ca.apply(points)
-    found = model.closest(moved)
-    near = (found.d2 < gate_m**2) & view.seen(found, T_ca)
+    found = model.closest(moved, camera_c=view.camera_c(model, points, T_ca))
+    near = found.d2 < gate_m**2
     p, n = moved[near], found.normal[near]
     e = np.einsum("ij,ij->i", n, p - found.foot[near])
     count = len(p)

@@ -17,7 +17,7 @@ from avsreplay.register.registrar import Registrar
 
 __all__ = ["LAWS", "Bench", "Finding", "check"]
 
-POINTS = 6000
+POINTS = 3000
 NEAR_RAD, NEAR_OF_EXTENT = np.radians(0.1), 1e-3  # half the point spacing of the coarsest sampled map (kiss)
 SAME_RAD, SAME_OF_EXTENT = np.radians(0.01), 5e-5  # equal but for rounding and the stopping rule
 MOVE = Pose(exp([0.9, 0.4, -1.3]), np.array([-3.0, 2.0, 1.0]))

@@ -7,19 +7,22 @@ the model's back, and plain ICP settles there: on the built-in target begun 3 de
 from __future__ import annotations
 
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
-from avsreplay.register.model import Closest
+from avsreplay.register.model import Model
 
 __all__ = ["Camera", "View", "is_outward"]
 
 CLEARANCE_OF_EXTENT = 0.25
 LEAST_FACING = 0.4
 PAIRED_EDGES = 0.95
+FAR_OF_EXTENT = 0.5  # a scan's middle this far from the origin was taken from there
+ASKED_POINTS = 500
 
 
 class Camera(Enum):
@@ -34,26 +37,35 @@ class View:
     """The facing test for one surface.
 
     AUTO applies it where the mesh is closed and wound outwards (19 of 20 edges paired, volume positive) and the origin
-    of {A} is a quarter of the extent or more outside the model's box. Where under 40 % of the matches face the origin
-    the camera is taken to have been elsewhere and all matches count.
+    of {A} is a quarter of the extent or more outside the model's box. Where under 40 % of the scan's plain closest
+    faces look at the origin, the camera is taken to have been elsewhere and both sides count.
     """
 
     def __init__(self, surface: Surface, camera: Camera = Camera.AUTO) -> None:
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         clear = CLEARANCE_OF_EXTENT * surface.extent if camera is Camera.AUTO else -np.inf
         self._box = (low, high, clear)
-        self._on = camera is Camera.ORIGIN or (camera is Camera.AUTO and is_outward(surface))
+        self._extent = surface.extent
+        self.sided = camera is Camera.ORIGIN or (camera is Camera.AUTO and is_outward(surface))
 
-    def seen(self, found: Closest, T_ca: Pose) -> NDArray[np.bool_]:
-        """(n,) True where the foot's face looks at the camera, where there is no foot, or where nothing can be told."""
-        camera_c = T_ca.t  # the origin of {A} in {C}
-        if not (self._on and self._clear(camera_c)):
-            return np.ones(len(found.id), dtype=bool)
+    def camera_c(self, model: Model, points: NDArray[Any], T_ca: Pose) -> Array | None:
+        """(3,) the camera in {C} [m] where the test applies to this scan (n, 3) in {A} at this pose, else None."""
+        if not (self.sided and self._clear(T_ca.t)):
+            return None
+        few = points[:: max(1, len(points) // ASKED_POINTS)]
+        found = model.closest(T_ca.apply(few))
         foot = found.id >= 0
-        faces = np.ones(len(foot), dtype=bool)
-        faces[foot] = np.einsum("ij,ij->i", found.normal[foot], camera_c - found.foot[foot]) > 0.0
-        elsewhere = faces[foot].sum() < LEAST_FACING * foot.sum()
-        return np.ones_like(faces) if elsewhere else faces
+        faces = np.einsum("ij,ij->i", found.normal[foot], T_ca.t - found.foot[foot]) > 0.0
+        return T_ca.t if faces.sum() >= LEAST_FACING * foot.sum() else None
+
+    def sight(self, points: NDArray[Any]) -> Array | None:
+        """(3,) unit direction from a scan (n, 3) in {A} to the camera; None where the camera's place is not known."""
+        centre = np.median(points, axis=0).astype(np.float64)
+        distance = float(np.linalg.norm(centre))
+        if not self.sided or distance < FAR_OF_EXTENT * self._extent:
+            return None
+        towards: Array = -centre / distance
+        return towards
 
     def _clear(self, camera_c: Array) -> bool:
         low, high, clear = self._box

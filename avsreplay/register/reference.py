@@ -37,30 +37,27 @@ class ReferenceBackend:
     about: ClassVar[str] = "Horn's quaternion ICP on the mesh itself, numpy and scipy: slow and plain"
 
     def __init__(self, target: Target) -> None:
-        self._limits = target.limits
+        self._limits, self._view = target.limits, target.view
         self._model = Model.build(target.surface, target.limits.reach_m, engine="reference")
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """See :class:`avsreplay.register.port.Backend`."""
         scan = np.ascontiguousarray(points, dtype=np.float64)
         T_ca, gate = guess, self._limits.reach_m
+        facing = self._view.camera_c(self._model, scan, guess) is not None
         for passes in range(1, self._limits.n_max + 1):
             moved = T_ca.apply(scan)
-            feet, d2 = self._feet(moved)
-            inlier = d2 < gate**2
+            found = self._model.closest(moved, camera_c=T_ca.t if facing else None)
+            inlier = found.d2 < gate**2
             if inlier.sum() < MIN_INLIERS:
                 return Fit(T_ca, passes, False)
-            step = best_motion(moved[inlier], feet[inlier])
+            step = best_motion(moved[inlier], found.foot[inlier])
             T_ca = step @ T_ca
-            tighter = min(gate, max(self._limits.gate_m, TIGHTEN * float(np.sqrt(d2[inlier].mean()))))
+            tighter = min(gate, max(self._limits.gate_m, TIGHTEN * float(np.sqrt(found.d2[inlier].mean()))))
             if self._small(step, moved[inlier].mean(axis=0)) and gate - tighter <= SETTLED_GATE * gate:
                 return Fit(T_ca, passes, True)
             gate = tighter
         return Fit(T_ca, self._limits.n_max, False)
-
-    def _feet(self, points_c: Array) -> tuple[Array, Array]:
-        found = self._model.closest(points_c)
-        return found.foot, found.d2
 
     def _small(self, step: Pose, centroid: Array) -> bool:
         moved = float(np.linalg.norm(step.apply(centroid) - centroid))
