@@ -39,7 +39,7 @@ name = "close"
 metric = "pose_healthy.position_m.rmse"
 max = 0.05
 """
-RESULTS = ("results.parquet", "scans.parquet", "summary.json")
+RESULTS = ("results.parquet", "scans.parquet", "summary.json", "report.html")
 
 
 @pytest.fixture

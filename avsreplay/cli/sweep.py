@@ -60,7 +60,8 @@ def command(
     """Run a CAMPAIGN (a TOML file): a grid, a list of cases or random draws over scenarios, logs and settings.
 
     Done runs are kept as they come: the same command takes up where it was stopped or killed. Results are one row a
-    run (results.parquet), one row a scan (scans.parquet) and summary.json; they do not depend on the workers.
+    run (results.parquet), one row a scan (scans.parquet), summary.json and report.html, and do not depend on the
+    workers.
     """
     from avsreplay.sweep import Journal, execute, expand, load_campaign, write_results
 
@@ -105,16 +106,12 @@ def _tracked(items: Iterator[Outcome], total: int) -> Iterator[Outcome]:
 
 def _plan_text(plan: Plan) -> str:
     campaign = plan.loaded.campaign
+    from avsreplay.sweep.page import words
+
     lines = [f"{campaign.name}: {len(plan)} runs, {len(plan.cells)} combinations x {campaign.repeats} repeats"]
-    lines += [f"  {_words(cell)}" for cell in plan.cells]
+    lines += [f"  {words(cell)}" for cell in plan.cells]
     lines += [f"  drawn for every repeat: {draw.key} ({draw.kind.value})" for draw in campaign.draw]
     return "\n".join(lines)
-
-
-def _words(values: object) -> str:
-    if not isinstance(values, dict) or not values:
-        return "as it is"
-    return ", ".join(f"{key.removeprefix('scenario.').removeprefix('run.')}={value}" for key, value in values.items())
 
 
 def _print(summary: SweepSummary) -> None:
@@ -134,9 +131,10 @@ def _cell_table(number: int, cell: Cell) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
+    from avsreplay.sweep.page import words
     from avsreplay.sweep.summary import HEADLINES
 
-    table = Table(title=escape(f"{number}: {_words(cell.values)} ({cell.runs} runs)"), title_justify="left")
+    table = Table(title=escape(f"{number}: {words(cell.values)} ({cell.runs} runs)"), title_justify="left")
     for name in ("", "runs", "5 %", "median", "95 %", "95 % interval"):
         table.add_column(name, justify="left" if not name else "right")
     for name, found in cell.metrics.items():

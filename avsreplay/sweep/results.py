@@ -14,6 +14,7 @@ from typing import Any
 from avsreplay import __version__
 from avsreplay.errors import MissingBackend
 from avsreplay.sweep.journal import Journal
+from avsreplay.sweep.page import build_page
 from avsreplay.sweep.plan import Plan, Point
 from avsreplay.sweep.summary import SweepSummary, summarise
 from avsreplay.sweep.worker import SCAN_COLUMNS, Outcome
@@ -24,7 +25,7 @@ SCAN_BATCH = 200_000
 
 
 def write_results(plan: Plan, journal: Journal, folder: Path) -> SweepSummary:
-    """Write ``results.parquet``, ``scans.parquet`` (where kept) and ``summary.json`` into ``folder``.
+    """Write ``results.parquet``, ``scans.parquet`` (where kept), ``summary.json`` and ``report.html`` into ``folder``.
 
     Raises MissingBackend where pyarrow is not installed.
     """
@@ -37,6 +38,7 @@ def write_results(plan: Plan, journal: Journal, folder: Path) -> SweepSummary:
     summary = summarise(plan, done, journal.outcomes())
     text = json.dumps({"version": __version__, **summary.document()}, indent=1, allow_nan=False)
     _replace(folder / "summary.json", text.encode() + b"\n")
+    _replace(folder / "report.html", build_page(summary).encode())
     return summary
 
 

@@ -1,0 +1,75 @@
+"""500 short runs on one worker and on two: wall time, speed-up, and what the machinery costs beside the runs.
+
+python tests/benchmarks/sweep_speed.py [--runs 500] [--quick]
+
+The overhead is what one worker spends on a run beyond the same run called directly in one process.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+
+from avsreplay.sweep import Journal, execute, expand, load_campaign, write_results
+from avsreplay.sweep.worker import run_task
+
+CAMPAIGN = """
+name = "speed"
+seed = 1
+repeats = {runs}
+[set]
+"scenario.duration_s" = 6.0
+"scenario.rate_hz" = 2.0
+"scenario.scanner.rays" = [72, 72]
+"scenario.fault" = []
+[[draw]]
+key = "scenario.motion.attitude_xyzw"
+kind = "attitude"
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--runs", type=int, default=500)
+    parser.add_argument("--quick", action="store_true", help="40 runs")
+    args = parser.parse_args()
+    runs = 40 if args.quick else args.runs
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "c.toml").write_text(CAMPAIGN.format(runs=runs))
+        plan = expand(load_campaign(folder / "c.toml"))
+        direct = _direct(plan, min(runs, 60))
+        print(f"one run by itself: {1e3 * direct:.1f} ms")
+        took = {workers: _swept(plan, workers, folder / str(workers)) for workers in (1, 2)}
+    for workers, (up, seconds, results) in took.items():
+        print(f"{workers} workers: {runs} runs in {seconds:.2f} s (start {up:.2f} s, results {results:.2f} s)")
+    print(f"speed-up of 2 over 1: {took[1][1] / took[2][1]:.2f}")
+    print(f"overhead of the machinery at 1 worker: {took[1][1] / runs / direct - 1.0:.1%} of run time")
+
+
+def _direct(plan, count: int) -> float:
+    tasks = [point.task for point, _ in zip(plan.points(), range(count), strict=False)]
+    run_task(tasks[0])
+    start = time.perf_counter()
+    for task in tasks:
+        run_task(task)
+    return (time.perf_counter() - start) / count
+
+
+def _swept(plan, workers: int, folder: Path) -> tuple[float, float, float]:
+    """Seconds to the first outcome, from it to the last, and for the result files."""
+    start = time.perf_counter()
+    first = 0.0
+    with Journal(folder / "journal.txt") as journal:
+        for outcome in execute((p.task for p in plan.points()), workers):
+            first = first or time.perf_counter()
+            journal.add(outcome)
+        last = time.perf_counter()
+    write_results(plan, journal, folder)
+    return first - start, last - first, time.perf_counter() - last
+
+
+if __name__ == "__main__":
+    main()
