@@ -151,3 +151,16 @@ def test_forecast_is_the_spread_of_displaced_motions() -> None:
         )
     for values, claimed in ((poses, seen.pos_1s_m), (speeds, seen.vel_1s_mps), (turns, seen.rot_1s_rad)):
         assert np.sqrt(np.var(values, axis=0).sum(axis=1)) == pytest.approx(claimed, rel=0.09)
+
+
+def test_forecast_adds_the_disturbance_of_every_step() -> None:
+    """Quadrature over the horizon against the covariance stepped through it."""
+    x, _ = some_state(7)
+    torque, force, P0 = 1e-3, 2e-3, np.eye(20) * 1e-12
+    times = np.array([5.0, 30.0])
+    seen = horizon.forecast(Belief(0, x, P0), times, torque, force)
+    for i, t in enumerate(times):
+        then, _ = motion.propagate(Belief(0, x, P0), round(t * 1e9), torque, force)
+        J = motion.grasp_rows(then.x)
+        want = np.sqrt(np.diag(J @ then.P @ J.T).reshape(3, 3).sum(axis=1)) * [1, 1, 2]
+        assert (seen.pos_1s_m[i], seen.vel_1s_mps[i], seen.rot_1s_rad[i]) == pytest.approx(tuple(want), rel=1e-5)

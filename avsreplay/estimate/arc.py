@@ -18,7 +18,7 @@ from avsreplay.estimate.motion import GENERATORS, SUBSTEP_RAD, rate_series, seri
 from avsreplay.geometry import Array
 from avsreplay.records import State
 
-__all__ = ["Arc", "arc"]
+__all__ = ["Arc", "Path", "arc"]
 
 _SLOWEST = 1e-4  # rad in a piece that holds the whole path of a body almost at rest
 
@@ -50,18 +50,33 @@ class _Pieces:
 def arc(x: State, times_s: Array) -> Arc:
     """The motion from ``x`` at 0 to each of ``times_s`` (n,) >= 0 [s], in any order."""
     times = np.asarray(times_s, dtype=np.float64)
-    ratios = np.array((float(x.sigma[0]), float(x.sigma[1]), sigma3(x.sigma)))
-    pieces = _lay_out(x.w_b, ratios, float(times.max(initial=0.0)))
-    Y = _sensitivities(pieces, ratios)
-    where = np.clip(np.searchsorted(pieces.start, times, side="right") - 1, 0, len(pieces.start) - 1)
-    tau = (times - pieces.start[where]) / pieces.length[where]
-    powers = tau[:, None] ** np.arange(Y.shape[1])
-    inside = _at(Y, powers, where, pieces.length)
-    q_knots, chain = _join(x.q_ab, _at(Y, np.ones((len(Y), Y.shape[1])), np.arange(len(Y)), pieces.length))
-    S9 = inside @ chain[where]
-    S = np.concatenate([S9[:, :, :6], S9[:, :, 6:] @ sigma_join(x.sigma)], axis=2)
-    w = np.einsum("nk,nkj->nj", powers, pieces.rates[where]) / pieces.length[where, None]
-    return Arc(geometry.multiply(q_knots[where], _relative(inside)), w, S)
+    return Path(x, float(times.max(initial=0.0))).at(times)
+
+
+class Path:
+    """A motion laid out up to ``end_s``, to be asked many times."""
+
+    def __init__(self, x: State, end_s: float) -> None:
+        self.end_s = end_s
+        ratios = np.array((float(x.sigma[0]), float(x.sigma[1]), sigma3(x.sigma)))
+        self._pieces = _lay_out(x.w_b, ratios, end_s)
+        self._Y = _sensitivities(self._pieces, ratios)
+        m, terms = self._Y.shape[:2]
+        whole = _at(self._Y, np.ones((m, terms)), np.arange(m), self._pieces.length)
+        self._q, self._chain = _join(x.q_ab, whole)
+        self._sigma_join = sigma_join(x.sigma)
+
+    def at(self, times: Array) -> Arc:
+        """The motion at ``times`` (n,) in [0, end_s]."""
+        p = self._pieces
+        where = np.clip(np.searchsorted(p.start, times, side="right") - 1, 0, len(p.start) - 1)
+        tau = (times - p.start[where]) / p.length[where]
+        powers = tau[:, None] ** np.arange(self._Y.shape[1])
+        inside = _at(self._Y, powers, where, p.length)
+        S9 = inside @ self._chain[where]
+        S = np.concatenate([S9[:, :, :6], S9[:, :, 6:] @ self._sigma_join], axis=2)
+        w = np.einsum("nk,nkj->nj", powers, p.rates[where]) / p.length[where, None]
+        return Arc(geometry.multiply(self._q[where], _relative(inside)), w, S)
 
 
 def _lay_out(w: Array, ratios: Array, end: float) -> _Pieces:

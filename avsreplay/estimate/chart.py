@@ -39,6 +39,7 @@ def _basis() -> Array:
 
 
 _BASIS = _basis()
+_NAMED = np.array([naming.R_bn for naming in NAMINGS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,8 +93,7 @@ def _axes(M: Array, near: Array) -> Array:
     """R_cb: eigenvectors of M in the order and with the signs nearest to ``near``, right-handed."""
     V = np.linalg.eigh(M)[1]
     V = V if np.linalg.det(V) > 0.0 else -V
-    agreement = [float(np.sum(near * (V @ naming.R_bn))) for naming in NAMINGS]
-    out: Array = V @ NAMINGS[int(np.argmax(agreement))].R_bn
+    out: Array = V @ _NAMED[int(np.argmax(np.tensordot(_NAMED, V.T @ near, 2)))]
     return out
 
 

@@ -9,7 +9,7 @@ rescaled by two factors, attitude and position, taken from the residuals themsel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,7 @@ __all__ = ["FitParams", "Fitted", "Pin", "Poses", "Prior", "cost", "fit", "pinne
 
 _GATE = 27.86  # chi-square with 6 degrees of freedom, 99.99 %
 _FEWEST_FOR_FACTORS = 12
+_PIN_TOL = 0.02  # half chi-square: how well a held fit needs to be known
 
 
 @dataclass(frozen=True, slots=True)
@@ -257,8 +258,9 @@ def cost(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: A
 
 def pinned(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Array, pin: Pin) -> Chart:
     """The fit with one direction held."""
-    problem = _Problem(poses, prior, params, factors, pin)
-    return _descend(problem, problem.at(start), params.max_steps)[0].chart
+    rough = replace(params, gain_tol=max(params.gain_tol, _PIN_TOL))
+    problem = _Problem(poses, prior, rough, factors, pin)
+    return _descend(problem, problem.at(start), rough.max_steps)[0].chart
 
 
 def _descend(problem: _Problem, here: _Here, max_steps: int) -> tuple[_Here, int, bool]:

@@ -5,71 +5,88 @@ from __future__ import annotations
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.estimate.motion import SUBSTEP_RAD, advance, flow, grasp_rows, process_noise, transition
+from avsreplay.estimate.arc import Path
+from avsreplay.estimate.layout import DIM, SIGMA
+from avsreplay.estimate.motion import disturbance, grasp_rows
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Forecast, State, Trajectory
 
 __all__ = ["forecast", "trajectory"]
 
+_FIRST_S = 64.0
+_CELL_RAD = 0.5  # turn per cell of the disturbance's quadrature
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(3)
+
 
 def trajectory(x: State) -> Trajectory:
     """Times (n,) >= 0 [s after now] -> positions and velocities (n, 3) of the grasp point in {A}, without disturbance.
 
-    The path is laid out once, in pieces the rotation's series spans, and grows as later times are asked for.
+    The path is laid out when it is first asked for, and again to twice the time when later ones are.
     """
-    knots = [x]
-    piece = _piece_s(x)
+    laid: list[Path] = []
 
     def at(times: Array) -> tuple[Array, Array]:
         times = np.asarray(times, dtype=np.float64)
-        if times.size and not (float(times.min()) >= 0.0 and float(times.max()) < np.inf):
+        last = float(times.max(initial=0.0))
+        if times.size and not (float(times.min()) >= 0.0 and last < np.inf):
             raise ValueError("times must be finite and not before now")
-        cell = np.floor_divide(times, piece).astype(int)
-        while len(knots) <= (int(cell.max()) if times.size else 0):
-            knots.append(advance(knots[-1], flow(knots[-1].w_b, x.sigma, piece), piece))
-        states = [_within(knots[c], t - c * piece) for c, t in zip(cell.tolist(), times.tolist(), strict=True)]
-        return _grasp(x, times, states)
+        if not laid or laid[-1].end_s < last:
+            laid[:] = [Path(x, _FIRST_S if last <= _FIRST_S else 2.0 * last)]
+        here = laid[-1].at(times)
+        A = geometry.matrix(here.q)
+        position = x.r_a + times[:, None] * x.v_a + A @ x.c_b
+        velocity = x.v_a + np.einsum("nij,nj->ni", A, np.cross(here.w, x.c_b))
+        return position, velocity
 
     return at
 
 
-def _piece_s(x: State) -> float:
-    rate = float(np.linalg.norm(x.w_b))
-    return SUBSTEP_RAD / rate if rate > 1e-3 * SUBSTEP_RAD else 1e3
-
-
-def _within(x: State, h: float) -> tuple[Array, Array]:
-    """Attitude and rate h seconds on."""
-    step = flow(x.w_b, x.sigma, h)
-    return geometry.multiply(x.q_ab, step.q), step.w
-
-
-def _grasp(x: State, times: Array, states: list[tuple[Array, Array]]) -> tuple[Array, Array]:
-    if not states:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    A = geometry.matrix(np.array([q for q, _ in states]))
-    w = np.array([rate for _, rate in states])
-    position = x.r_a + times[:, None] * x.v_a + A @ x.c_b
-    velocity = x.v_a + np.einsum("nij,nj->ni", A, np.cross(w, x.c_b))
-    return position, velocity
-
-
 def forecast(belief: Belief, times_s: Array, torque: float, force: float) -> Forecast:
-    """Predicted 1 sigma of the grasp point at ``times_s`` (n,) >= 0, ascending [s after now]."""
+    """Predicted 1 sigma of the grasp point at ``times_s`` (n,) >= 0, ascending [s after now].
+
+    The disturbance torque's share is summed by Gauss-Legendre over cells of half a radian of turn.
+    """
     times = np.asarray(times_s, dtype=np.float64)
     if times.ndim != 1 or np.any(np.diff(times, prepend=0.0) < 0.0):
         raise ValueError("times must ascend from 0")
-    x, P = belief.x, belief.P
+    x = belief.x
+    path = Path(x, float(times.max(initial=0.0)))
+    here = path.at(times)
+    pushed = _pushed(x, path, times, torque)
     variances = np.empty((len(times), 3))
-    for i, h in enumerate(np.diff(times, prepend=0.0)):
-        x, P = _on(x, P, float(h), torque, force)
-        J = grasp_rows(x)
+    for i, t in enumerate(times.tolist()):
+        Phi = _transition(here.S[i], t)
+        P = Phi @ belief.P @ Phi.T
+        P[:6, :6] += here.S[i, :, :6] @ pushed[i] @ here.S[i, :, :6].T
+        then = State(here.q[i], here.w[i], x.r_a + t * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+        J = grasp_rows(then)
         variances[i] = np.einsum("ij,jk,ik->i", J, P, J).reshape(3, 3).sum(axis=1)
+        variances[i, :2] += 3.0 * force**2 * np.array([t**3 / 3.0, t])
     pos, vel, half = np.sqrt(np.maximum(variances, 0.0)).T
     return Forecast(times, pos, vel, 2.0 * half)
 
 
-def _on(x: State, P: Array, h: float, torque: float, force: float) -> tuple[State, Array]:
-    step = flow(x.w_b, x.sigma, h, torque)
-    Phi = transition(step, x.sigma, h)
-    return advance(x, step, h), Phi @ P @ Phi.T + process_noise(step, h, force)
+def _transition(S: Array, h: float) -> Array:
+    Phi = np.eye(DIM)
+    Phi[:6, :6], Phi[:6, SIGMA] = S[:, :6], S[:, 6:]
+    Phi[(6, 7, 8), (9, 10, 11)] = h
+    return Phi
+
+
+def _pushed(x: State, path: Path, times: Array, torque: float) -> Array:
+    """(n, 6, 6) covariance the torque has added by each time, carried back to now: sum of Phi^-1 G G' Phi^-1'."""
+    rate = float(np.linalg.norm(x.w_b))
+    out = np.zeros((len(times), 6, 6))
+    total, start = np.zeros((6, 6)), 0.0
+    G = np.zeros((6, 3))
+    G[3:] = np.diag(np.array(disturbance(x.sigma)) * torque)
+    for i, end in enumerate(times.tolist()):
+        cells = max(1, int(np.ceil(rate * (end - start) / _CELL_RAD)))
+        edges = np.linspace(start, end, cells + 1)
+        half = 0.5 * np.diff(edges)
+        nodes = (edges[:-1, None] + half[:, None] * (1.0 + _NODES)).ravel()
+        back = np.linalg.solve(path.at(nodes).S[:, :, :6], np.broadcast_to(G, (len(nodes), 6, 3)))
+        weights = (half[:, None] * _WEIGHTS).ravel()
+        total = total + np.einsum("n,nij,nkj->ik", weights, back, back)
+        out[i], start = total, end
+    return out
