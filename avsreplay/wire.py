@@ -10,6 +10,7 @@ from avsreplay.chain import Memory, Stages
 from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
+from avsreplay.estimate.params import Start
 from avsreplay.geometry import Pose
 from avsreplay.monitor.consistency import Consistency
 from avsreplay.monitor.convergence import Convergence
@@ -31,7 +32,7 @@ def stages(config: RunConfig, header: LogHeader, surface: Surface, truth: Sequen
         UsageError: no first pose is to be had.  MissingBackend: the back end is not installed.
     """
     registrar = Registrar(surface, config.register)
-    start = header.start if config.init == "log" else None
+    start = header.start if config.init == "log" or config.estimator.start is Start.NEAR else None
     supervision = config.supervisor.resolved(surface.extent)
     return Stages(
         registrar=registrar,

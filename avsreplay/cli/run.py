@@ -120,8 +120,9 @@ def _job(log: Path, flags: dict[str, Any]) -> Job:
     from avsreplay.job import Job
 
     named = {key: flags.pop(name) for name, key in ASSIGNED.items()}
-    assignments = [f"{key}={value}" for key, value in named.items() if value is not None]
     config_file, more, starts = flags.pop("config_file"), flags.pop("assignments"), flags.pop("starts")
+    assignments = [f"{key}={value}" for key, value in named.items() if value is not None]
+    assignments += [f"estimator.start={mode}" for mode in starts if isinstance(mode, str)]
     return Job(source=log, options=_options(flags, starts), config_file=config_file, assignments=(*more, *assignments))
 
 
