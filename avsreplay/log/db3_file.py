@@ -142,6 +142,7 @@ def _connected(path: Path, limit: int) -> sqlite3.Connection:
     uri = f"{path.resolve().as_uri()}?mode=ro" + ("&immutable=1" if alone else "")
     try:
         db = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        db.text_factory = lambda raw: raw.decode("utf-8", "backslashreplace")
         db.execute("PRAGMA trusted_schema = OFF")
         db.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit)
         found = {

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log.bags import is_bag_folder, open_recording
+from avsreplay.log.cursor import BadMessage
 from avsreplay.log.feed import MessageFeed
 from avsreplay.log.guides import MessageGuides
 from avsreplay.log.header import HEADER_RECORD, decode_header
@@ -101,18 +102,24 @@ def _no_clouds(topics: Sequence[TopicInfo], path: Path) -> UnreadableInput:
 
 
 def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tuple[Loss, ...]]:
-    lost: tuple[Loss, ...] = ()
+    lost = list[Loss]()
     header = LogHeader()
     if HEADER_RECORD in recording.metadata:
         try:
             header = decode_header(recording.metadata[HEADER_RECORD])
         except ValueError as error:
-            lost = (Loss(shown(error), 0, 0),)
-    return replace(header, surface=_surface(recording, options)), lost
+            lost.append(Loss(shown(error), 0, 0))
+    surface = read_surface(options.model, options.cloud_model) if options.model is not None else None
+    if surface is None:
+        surface, trouble = _carried(recording)
+        lost += trouble
+    return replace(header, surface=surface), tuple(lost)
 
 
-def _surface(recording: Recording, options: SourceOptions) -> Surface | None:
-    if options.model is not None:
-        return read_surface(options.model, options.cloud_model)
-    carried = recording.attachment()
-    return None if carried is None else parse_surface(carried[1], carried[0])
+def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
+    """The log's own model; one that is no model is a loss, and the log can still be run with another."""
+    try:
+        found = recording.attachment()
+        return (None if found is None else parse_surface(found[1], found[0])), []
+    except (UnreadableInput, BadMessage) as error:
+        return None, [Loss(f"the model inside cannot be used: {shown(error)}", 0, 0)]

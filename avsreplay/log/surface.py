@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import logging
 import struct
 import zlib
 from pathlib import Path, PurePath
@@ -21,11 +22,12 @@ from avsreplay.records import Surface
 __all__ = ["parse_surface", "read_surface", "surface_bytes"]
 
 MAX_BYTES = 512 << 20
+_SILENT = logging.NullHandler()
 _FORMATS = ("ply", "stl", "obj", "off", "glb")
 # What a foreign parser may raise on bytes that are not what they seem; a crash of the interpreter it cannot be.
 _FOREIGN = (
     ArithmeticError, AssertionError, AttributeError, BufferError, EOFError, ImportError, LookupError, MemoryError,
-    NotImplementedError, OSError, RuntimeError, TypeError, ValueError, struct.error, zlib.error,
+    NameError, NotImplementedError, OSError, RuntimeError, TypeError, ValueError, struct.error, zlib.error,
 )  # fmt: skip
 
 
@@ -112,8 +114,12 @@ def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
             raise BadFile(f"promises {promised} triangles in a file of {len(data)} bytes")
     options: dict[str, Any] = {"skip_materials": True} if suffix in ("obj", "glb") else {}
     # process=False keeps vertices as they stand; force="mesh" puts the parts of a scene together.
+    logging.getLogger("trimesh").addHandler(_SILENT)  # it logs tracebacks of what it goes on to try otherwise
     mesh: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
-    return _merged(np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces))
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or (len(faces) and faces.shape[1] != 3):
+        raise BadFile("no triangles in space")
+    return _merged(vertices, faces)
 
 
 def _merged(vertices: Array, faces: NDArray[Any]) -> tuple[Array, NDArray[Any]]:

@@ -1,0 +1,190 @@
+"""Fuzz campaign on everything that reads bytes: ``python tests/benchmarks/fuzz_door.py [--quick] [--inputs N]``.
+
+Input i is told by (campaign, i) alone, so a finding is repeated with ``--only i``. Every input must end in scans or in
+one AvsError: a traceback, more than 10 s, more than the stated memory, a crash of the interpreter or a file written
+anywhere is a finding. Workers run in processes of their own, so that a crash costs one worker and names its input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import resource
+import signal
+import tempfile
+import time
+import traceback
+from collections import Counter
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from fuzz_inputs import case, seeds
+
+from avsreplay import settings
+from avsreplay.errors import AvsError
+from avsreplay.log import SourceOptions, open_source, parse_surface
+from avsreplay.log.conf import read_conf
+from avsreplay.log.cursor import BadMessage
+from avsreplay.log.doctor import examine
+from avsreplay.log.point_cloud2 import decode_cloud
+from avsreplay.log.pose_files import read_poses
+from avsreplay.log.repair import repair
+
+LIMIT_S, LIMIT_MIB, MESSAGE_MIB = 10, 700, 16
+LOGS, POSES = ("mcap", "bag", "db3"), ("tum", "kitti", "euroc")
+
+
+class Hang(BaseException):
+    """Raised by the alarm: no handler of the package may swallow it."""
+
+
+def check(name: str, data: bytes, folder: Path, deep: bool) -> str:
+    """Give one input to what reads it; what came of it in one word. Raises whatever is no AvsError."""
+    kind = name.rsplit(".", 1)[-1]
+    try:
+        if kind in ("cdr", "ros1"):
+            decode_cloud(data, kind)
+        elif kind == "toml":
+            settings.parse(data.decode("utf-8", "replace"), name)
+        elif name.startswith("model"):
+            parse_surface(data, name)
+        else:
+            return _file(name, kind, data, folder, deep)
+    except (AvsError, BadMessage) as error:
+        return _one_line(error)
+    return "read"
+
+
+def _one_line(error: Exception) -> str:
+    text = str(error)
+    if isinstance(error, AvsError) and ("\n" in text or "\x1b" in text):
+        raise AssertionError(f"an error of more than one line, or with controls: {text!r}")
+    return "refused"
+
+
+def _file(name: str, kind: str, data: bytes, folder: Path, deep: bool) -> str:
+    path = folder / name
+    path.write_bytes(data)
+    try:
+        if kind in POSES:
+            read_poses(path)
+        elif kind == "conf":
+            read_conf(path)
+        else:
+            lost = _scan(path if kind in LOGS else folder)
+            if deep and kind == "mcap":
+                _doctored(path, folder)
+            return "partly" if lost else "read"
+    finally:
+        for left in folder.iterdir():
+            left.unlink()
+    return "read"
+
+
+def _scan(path: Path) -> int:
+    with open_source(path, SourceOptions(max_message_mib=MESSAGE_MIB), look=True) as source:
+        source.info()
+        damaged = sum(scan.status.value == "damaged" for scan in source.scans())
+        return damaged + len(source.losses)
+
+
+def _doctored(path: Path, folder: Path) -> None:
+    examine(path, SourceOptions(max_message_mib=MESSAGE_MIB))
+    clean = folder / "clean.mcap"
+    repair(path, clean, max_message_mib=MESSAGE_MIB)
+    with open_source(clean, look=True) as source:
+        if source.losses:
+            raise AssertionError(f"a repaired file that has losses: {source.losses}")
+        if any(scan.status.value == "damaged" for scan in source.scans()):
+            raise AssertionError("a repaired file with a damaged scan")
+
+
+def work(campaign: int, numbers: list[int], pipe: Connection) -> None:
+    """A worker: says which input it begins, and what came of it."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    corpus = seeds()
+    signal.signal(signal.SIGALRM, _alarm)
+    with tempfile.TemporaryDirectory() as root:
+        folder = Path(root) / "in"
+        folder.mkdir()
+        for number in numbers:
+            name, data = case(campaign, number, corpus)
+            pipe.send(("begin", number, name))
+            signal.alarm(LIMIT_S)
+            try:
+                found = check(name, data, folder, deep=number % 5 == 0)
+            except (Exception, Hang):
+                found = "FINDING\n" + traceback.format_exc()
+            signal.alarm(0)
+            if [p.name for p in Path(root).iterdir()] != ["in"]:
+                found = "FINDING a file was written outside"
+            pipe.send(("end", number, found))
+        pipe.send(("peak", 0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024))
+    pipe.close()
+
+
+def _alarm(_signal: int, _frame: object) -> None:
+    raise Hang
+
+
+def campaign(number: int, inputs: list[int], batch: int) -> tuple[Counter[str], list[dict[str, object]], int]:
+    """Run the inputs in batches; what came of them, the findings, and the largest worker in MiB."""
+    tally: Counter[str] = Counter()
+    findings: list[dict[str, object]] = []
+    peak = 0
+    queue = [inputs[i : i + batch] for i in range(0, len(inputs), batch)]
+    while queue:
+        todo = queue.pop(0)
+        here, there = multiprocessing.Pipe(False)
+        worker = multiprocessing.get_context("fork").Process(target=work, args=(number, todo, there))
+        worker.start()
+        there.close()
+        last: tuple[int, str] | None = None
+        while True:
+            try:
+                what, at, value = here.recv()
+            except EOFError:
+                break
+            if what == "begin":
+                last = (at, str(value))
+            elif what == "end":
+                tally["finding" if str(value).startswith("FINDING") else str(value)] += 1
+                if str(value).startswith("FINDING"):
+                    findings.append({"input": at, "seed": last[1] if last else "", "what": value})
+                last = None
+            else:
+                peak = max(peak, int(value))
+        worker.join()
+        if last is not None:
+            tally["finding"] += 1
+            findings.append({"input": last[0], "seed": last[1], "what": f"crash, exit code {worker.exitcode}"})
+            queue.insert(0, todo[todo.index(last[0]) + 1 :])
+    return tally, findings, peak
+
+
+def main() -> int:
+    """Run and print one JSON document; exit 1 on any finding."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--inputs", type=int, default=100_000)
+    parser.add_argument("--campaign", type=int, default=1)
+    parser.add_argument("--only", type=int)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--quick", action="store_true", help="1,000 inputs")
+    asked = parser.parse_args()
+    count = 1000 if asked.quick else asked.inputs
+    inputs = [asked.only] if asked.only is not None else list(range(asked.first, asked.first + count))
+    start = time.monotonic()
+    tally, findings, peak = campaign(asked.campaign, inputs, 2500)
+    if peak > LIMIT_MIB:
+        findings.append({"what": f"a worker of {peak} MiB, over {LIMIT_MIB}"})
+    result = {"campaign": asked.campaign, "inputs": len(inputs), "outcomes": dict(sorted(tally.items())),
+              "largest_worker_mib": peak, "seconds": round(time.monotonic() - start, 1), "findings": findings[:40],
+              "count_of_findings": len(findings)}  # fmt: skip
+    print(json.dumps(result, indent=1))
+    return 1 if findings else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
