@@ -26,6 +26,7 @@ class HornBackend:
     """
 
     name: ClassVar[str] = "horn"
+    accuracy: ClassVar[tuple[float, float]] = (0.001, 1e-05)
     about: ClassVar[str] = "plane start, then Horn's quaternion ICP to its fixed point on the mesh itself, C++"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("avsreplay.register._kernel", "avsreplay"),)
     get: ClassVar[str] = "a C++17 compiler, then pip install ."

@@ -23,6 +23,7 @@ __all__ = ["KissBackend"]
 
 POINTS_PER_VOXEL = 20
 SURFACE_POINTS = 100_000
+SETTLED_OF_GATE = 0.01
 FAR_M = 1e9  # the map is never thinned by distance
 
 
@@ -30,10 +31,11 @@ class KissBackend:
     """Three maps, coarse to fine: voxels of ``reach_m`` to come near, of ``gate_m`` to settle, of their mean between.
 
     The iteration count is not given by the library, so ``Fit.iterations`` counts its calls. ``converged`` means that
-    one more call, begun where the last one ended, moved the pose by less than ten times eps.
+    one more call, begun where the last one ended, moved the model's far points by less than a hundredth of ``gate_m``.
     """
 
     name: ClassVar[str] = "kiss"
+    accuracy: ClassVar[tuple[float, float]] = (0.3, 0.003)
     about: ClassVar[str] = "kiss-icp against a voxel map of the model, one thread"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("kiss_icp", "kiss-icp"),)
     get: ClassVar[str] = "pip install kiss-icp"
@@ -42,7 +44,7 @@ class KissBackend:
         from kiss_icp.mapping import VoxelHashMap
         from kiss_icp.registration import Registration
 
-        self._limits = target.limits
+        self._limits, self._radius_m = target.limits, 0.5 * target.surface.extent
         points = np.ascontiguousarray(sample(target.surface, SURFACE_POINTS)[0])
         reach, gate = target.limits.reach_m, target.limits.gate_m
         self._maps: list[tuple[float, Any]] = []
@@ -69,4 +71,5 @@ class KissBackend:
     def _settled(self, before: Pose, after: Pose) -> bool:
         step = after @ before.inverse()  # in {C}: seen from the camera a turn would count as a move
         turn, move = float(geometry.angle(step.q)), float(np.linalg.norm(step.t))
-        return turn < 10.0 * self._limits.eps_rad and move < 10.0 * self._limits.eps_m
+        small = SETTLED_OF_GATE * self._limits.gate_m
+        return move < small and turn * self._radius_m < small

@@ -26,6 +26,7 @@ class Open3dBackend:
     """
 
     name: ClassVar[str] = "open3d"
+    accuracy: ClassVar[tuple[float, float]] = (0.01, 0.0001)
     about: ClassVar[str] = "Open3D's point-to-plane ICP against points drawn from the model"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("open3d", "open3d"),)
     get: ClassVar[str] = "pip install 'avsreplay[open3d]'"

@@ -34,6 +34,7 @@ class ReferenceBackend:
     """
 
     name: ClassVar[str] = "reference"
+    accuracy: ClassVar[tuple[float, float]] = (0.01, 0.0001)
     about: ClassVar[str] = "Horn's quaternion ICP on the mesh itself, numpy and scipy: slow and plain"
 
     def __init__(self, target: Target) -> None:

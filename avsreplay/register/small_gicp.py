@@ -31,6 +31,7 @@ class SmallGicpBackend:
     """
 
     name: ClassVar[str] = "small_gicp"
+    accuracy: ClassVar[tuple[float, float]] = (0.01, 0.0001)
     about: ClassVar[str] = "small_gicp's GICP against points drawn from the model, one thread"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("small_gicp", "small_gicp"),)
     get: ClassVar[str] = "pip install 'avsreplay[small_gicp]'"
