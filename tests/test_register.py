@@ -342,6 +342,6 @@ def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:
     rng = _rng()
     J = rng.normal(size=(20000, 6))
     e = rng.normal(0.0, 0.3, 20000)
-    P = covariance(Evidence(20000, 20000, 0.3, J, e, np.zeros(3), 0.3))
+    P = covariance(Evidence(20000, 20000, 0.3, J, e, np.zeros(3), 0.3, np.arange(20000)))
     oracle = 0.09 * np.linalg.inv(J.T @ J)
     np.testing.assert_allclose(P, oracle, atol=0.1 * oracle[0, 0])

@@ -21,6 +21,8 @@ from avsreplay.register.params import Limits, RegisterParams
 
 __all__ = ["Evidence", "assess", "covariance", "evidence", "nothing"]
 
+PATCH_OF_EXTENT = 0.05  # residuals of points nearer than this may agree with one another
+LEAST_PATCHES = 24
 SIGMA_PER_MEDIAN = 1.4826  # of |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 
@@ -33,7 +35,7 @@ class Evidence:
         points: of the scan.  inliers: nearer than the gate to the model, or to its sides
             that face the camera where its place is known.  rms_m: of their distances.
         J: (k, 6) rows [p x n, n].  e: (k,) n . (p - foot) [m].  centre: (3,) centroid of the inliers.
-        noise_m: 1 sigma of e, robust.
+        noise_m: 1 sigma of e, robust.  patch: (k,) number of the patch of the model that each inlier lies on.
     """
 
     points: int
@@ -43,6 +45,7 @@ class Evidence:
     e: Array
     centre: Array
     noise_m: float
+    patch: NDArray[np.intp]
 
 
 def evidence(
@@ -58,7 +61,17 @@ def evidence(
     rms = float(np.sqrt(found.d2[near].mean())) if count else float("nan")
     centre = p.mean(axis=0) if count else np.zeros(3)
     J = np.hstack([np.cross(p, n), n])
-    return Evidence(len(points), count, rms, J, e, centre, noise_m or _noise(e, gate_m))
+    noise = noise_m or _noise(e, gate_m)
+    return Evidence(len(points), count, rms, J, e, centre, noise, _patches(p, PATCH_OF_EXTENT * model.extent_m))
+
+
+def _patches(p: Array, size_m: float) -> NDArray[np.intp]:
+    """Number of the cubic cell each point lies in; each point is a patch of its own where too few cells would be."""
+    cells = np.floor(p / size_m).astype(np.int64)
+    cells -= cells.min(axis=0, initial=0)
+    code = (cells[:, 0] * (cells[:, 1].max(initial=0) + 1) + cells[:, 1]) * (cells[:, 2].max(initial=0) + 1)
+    patch = np.unique(code + cells[:, 2], return_inverse=True)[1].reshape(-1)
+    return patch if patch.max(initial=0) >= LEAST_PATCHES else np.arange(len(p))
 
 
 def _noise(e: Array, gate_m: float) -> float:
@@ -67,15 +80,19 @@ def _noise(e: Array, gate_m: float) -> float:
 
 
 def covariance(found: Evidence) -> Array:
-    """(6, 6) covariance of d = [theta; v], the sandwich N^-1 (sum e^2 J'J) N^-1 with N = J'J, corrected for six fitted.
+    """(6, 6) covariance of d = [theta; v], the sandwich N^-1 (sum over patches g'g) N^-1, N = J'J, g = sum of e J.
 
-    It holds where the noise across the surface differs from point to point (a range error seen at a slant) and where
-    some inliers are outliers.
+    Errors within a patch may agree (the model is off there, a range error seen at a slant, outliers that stick to it);
+    patches are taken as independent. Corrected for the six values fitted.
     """
     normal = found.J.T @ found.J
-    meat = found.J.T @ (found.J * (found.e**2)[:, None]) * (found.inliers / max(found.inliers - 6, 1))
+    count = int(found.patch.max(initial=-1)) + 1
+    g = np.stack(
+        [np.bincount(found.patch, weights=column, minlength=count) for column in (found.J * found.e[:, None]).T]
+    )
+    meat = g @ g.T * (count / max(count - 6, 1))
     bread = np.linalg.pinv(normal, hermitian=True)
-    P = bread @ meat @ bread
+    P: Array = bread @ meat @ bread
     return 0.5 * (P + P.T)
 
 
