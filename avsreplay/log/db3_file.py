@@ -19,6 +19,8 @@ from avsreplay.log.text import shown
 __all__ = ["SQLITE_MAGIC", "Db3File"]
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
+# A message of sqlite's own may name a damaged table in bytes that are no text.
+_SQLITE = (sqlite3.Error, OverflowError, ValueError)
 _HEAD = 64  # bytes of a cloud that tell its header stamp
 _STEPS = 4096  # rows tried one by one behind a damaged page, before strides double
 _MAX_ID = 1 << 62  # where the last one cannot be told: strides double, so it takes few steps
@@ -46,7 +48,7 @@ class Db3File:
         self._db = _connected(path, limit)
         try:
             self._survey()
-        except (sqlite3.Error, OverflowError, ValueError) as error:
+        except _SQLITE as error:
             self._db.close()
             raise _unreadable(path, error) from None
 
@@ -67,7 +69,7 @@ class Db3File:
         row_id = self._table.clouds(topic).offset[place]
         try:
             row = self._db.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone()
-        except (sqlite3.Error, OverflowError) as error:
+        except _SQLITE as error:
             raise BadMessage(f"the database is damaged: {error}") from None
         if row is None or not isinstance(row[0], bytes):
             raise BadMessage("the message is not in the database any more")
@@ -101,7 +103,7 @@ class Db3File:
     def _last(self) -> int:
         try:
             row = self._db.execute("SELECT max(id) FROM messages").fetchone()
-        except sqlite3.DatabaseError:
+        except (sqlite3.DatabaseError, UnicodeDecodeError):
             return _MAX_ID
         return int(row[0]) if row and row[0] is not None else 0
 
@@ -116,7 +118,7 @@ class Db3File:
                     yield row
                     done = max(done, row[0] if isinstance(row[0], int) else 0)
                 return
-            except sqlite3.DatabaseError:
+            except (sqlite3.DatabaseError, UnicodeDecodeError):
                 yield None
                 failures = 1 if done > at else failures + 1
                 at = done + (1 if failures <= _STEPS else 1 << min(failures - _STEPS, 62))
@@ -149,7 +151,7 @@ def _connected(path: Path, limit: int) -> sqlite3.Connection:
             str(name): str(sql).upper()
             for name, sql in db.execute("SELECT name, sql FROM sqlite_master WHERE type = 'table'")
         }
-    except (sqlite3.Error, OverflowError) as error:
+    except _SQLITE as error:
         raise _unreadable(path, error) from None
     for name in ("topics", "messages"):
         if name not in found or "VIRTUAL" in found[name] or "GENERATED" in found[name]:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 from avsreplay.log.cursor import BadMessage
 
 __all__ = ["inflate"]
+
+_PER_THREAD = threading.local()  # a decompressor is costly to make and serves one thread at a time
 
 
 def inflate(data: bytes, compression: str, size: int) -> bytes:
@@ -34,7 +37,10 @@ def _zstd(data: bytes, size: int) -> bytes:
         # The library reserves what the frame's own head promises, whatever limit it is given.
         if promised not in (size, zstandard.CONTENTSIZE_UNKNOWN):
             raise BadMessage(f"a chunk inflates to other than the {size} bytes it promises")
-        return zstandard.ZstdDecompressor().decompress(data, max_output_size=max(size, 1))
+        if not hasattr(_PER_THREAD, "zstd"):
+            _PER_THREAD.zstd = zstandard.ZstdDecompressor()
+        out: bytes = _PER_THREAD.zstd.decompress(data, max_output_size=max(size, 1))
+        return out
     except (zstandard.ZstdError, MemoryError) as error:
         raise BadMessage(f"a chunk does not inflate: {error}") from None
 

@@ -72,11 +72,19 @@ def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
     if 0 in layout.shape:
         return Cloud(layout.stamp_ns, layout.frame, np.zeros((0, 3), np.float32), None, 0)
     points, times = _points(layout), _times(layout)
-    finite = np.isfinite(points).all(axis=1)
-    dropped = len(points) - int(np.count_nonzero(finite))
-    if dropped:
-        points, times = points[finite], None if times is None else times[finite]
+    dropped = 0
+    if not _surely_finite(points):
+        finite = np.isfinite(points).all(axis=1)
+        dropped = len(points) - int(np.count_nonzero(finite))
+        if dropped:
+            points, times = points[finite], None if times is None else times[finite]
     return Cloud(layout.stamp_ns, layout.frame, points, times, dropped)
+
+
+def _surely_finite(points: NDArray[Any]) -> bool:
+    """A finite sum has finite terms; it takes a third of the time of looking at each."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        return bool(np.isfinite(points.sum(dtype=np.float64)))
 
 
 def read_layout(payload: bytes | memoryview, encoding: str = "cdr") -> Layout:

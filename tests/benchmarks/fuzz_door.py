@@ -33,6 +33,7 @@ from avsreplay.log.pose_files import read_poses
 from avsreplay.log.repair import repair
 
 LIMIT_S, LIMIT_MIB, MESSAGE_MIB = 10, 700, 16
+MAX_SEED = 512 << 10
 LOGS, POSES = ("mcap", "bag", "db3"), ("tum", "kitti", "euroc")
 
 
@@ -101,10 +102,19 @@ def _doctored(path: Path, folder: Path) -> None:
             raise AssertionError("a repaired file with a damaged scan")
 
 
-def work(campaign: int, numbers: list[int], pipe: Connection) -> None:
+def corpus_of(folders: list[Path]) -> dict[str, bytes]:
+    """The seeds, or in their place every small file of the folders that a reader here knows by its ending."""
+    kinds = {*LOGS, "ply", "pcd", "conf", "obj"}
+    files = sorted(p for folder in folders for p in folder.rglob("*") if p.suffix[1:] in kinds)
+    small = [p for p in files if p.stat().st_size <= MAX_SEED]
+    named = {("model-" if p.suffix == ".obj" else f"{i}-") + p.name: p.read_bytes() for i, p in enumerate(small)}
+    return named if folders else seeds()
+
+
+def work(campaign: int, numbers: list[int], pipe: Connection, folders: list[Path]) -> None:
     """A worker: says which input it begins, and what came of it."""
     os.environ["OMP_NUM_THREADS"] = "1"
-    corpus = seeds()
+    corpus = corpus_of(folders)
     signal.signal(signal.SIGALRM, _alarm)
     with tempfile.TemporaryDirectory() as root:
         folder = Path(root) / "in"
@@ -129,7 +139,9 @@ def _alarm(_signal: int, _frame: object) -> None:
     raise Hang
 
 
-def campaign(number: int, inputs: list[int], batch: int) -> tuple[Counter[str], list[dict[str, object]], int]:
+def campaign(
+    number: int, inputs: list[int], batch: int, folders: list[Path] | None = None
+) -> tuple[Counter[str], list[dict[str, object]], int]:
     """Run the inputs in batches; what came of them, the findings, and the largest worker in MiB."""
     tally: Counter[str] = Counter()
     findings: list[dict[str, object]] = []
@@ -138,7 +150,7 @@ def campaign(number: int, inputs: list[int], batch: int) -> tuple[Counter[str], 
     while queue:
         todo = queue.pop(0)
         here, there = multiprocessing.Pipe(False)
-        worker = multiprocessing.get_context("fork").Process(target=work, args=(number, todo, there))
+        worker = multiprocessing.get_context("fork").Process(target=work, args=(number, todo, there, folders or []))
         worker.start()
         there.close()
         last: tuple[int, str] | None = None
@@ -171,12 +183,13 @@ def main() -> int:
     parser.add_argument("--campaign", type=int, default=1)
     parser.add_argument("--only", type=int)
     parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seeds", type=Path, nargs="*", default=[], help="folders with files to mutate")
     parser.add_argument("--quick", action="store_true", help="1,000 inputs")
     asked = parser.parse_args()
     count = 1000 if asked.quick else asked.inputs
     inputs = [asked.only] if asked.only is not None else list(range(asked.first, asked.first + count))
     start = time.monotonic()
-    tally, findings, peak = campaign(asked.campaign, inputs, 2500)
+    tally, findings, peak = campaign(asked.campaign, inputs, 2500, asked.seeds)
     if peak > LIMIT_MIB:
         findings.append({"what": f"a worker of {peak} MiB, over {LIMIT_MIB}"})
     result = {"campaign": asked.campaign, "inputs": len(inputs), "outcomes": dict(sorted(tally.items())),

@@ -1,0 +1,106 @@
+"""The short fuzz campaign: mutated bytes end in scans or in one line, quickly and in little memory.
+
+The long one is ``python tests/benchmarks/fuzz_door.py``; docs/reliability.md has its figures.
+"""
+
+from __future__ import annotations
+
+import struct
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from fuzz_door import LIMIT_MIB, campaign, check
+from fuzz_inputs import case, cloud1, digest, seeds
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from log_cases import scans
+
+from avsreplay.log.cursor import BadMessage
+from avsreplay.log.encode import point_cloud2
+from avsreplay.log.pcd import read_pcd, unpack_lzf
+from avsreplay.log.ply import BadFile, read_ply
+from avsreplay.log.point_cloud2 import decode_cloud
+from avsreplay.log.poses import POSE_TYPES, read_pose, read_transforms
+
+CORPUS = seeds()
+
+
+def test_mutated_files_end_in_scans_or_in_one_line() -> None:
+    tally, findings, peak = campaign(7, list(range(800)), 800)
+    assert not findings
+    assert sum(tally.values()) == 800
+    assert min(tally["read"], tally["partly"], tally["refused"]) > 50, "each way out is taken"
+    assert peak < LIMIT_MIB
+
+
+def test_an_input_is_told_by_its_campaign_and_number_alone() -> None:
+    assert digest(CORPUS) == digest(seeds())
+    assert case(3, 14, CORPUS) == case(3, 14, seeds())
+    assert case(3, 14, CORPUS) != case(3, 15, CORPUS)
+
+
+@pytest.mark.parametrize("name", sorted(CORPUS))
+def test_the_seeds_themselves_are_read(tmp_path: Path, name: str) -> None:
+    assert check(name, CORPUS[name], tmp_path, deep=True) == "read"
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.binary(max_size=200), st.sampled_from(["cdr", "ros1"]))
+def test_any_bytes_as_a_message(data: bytes, encoding: str) -> None:
+    for prefix in (b"", b"\x00\x01\x00\x00", b"\x00\x00\x00\x00"):
+        for reader in (decode_cloud, read_transforms, *(lambda d, e, k=k: read_pose(k, d, e) for k in POSE_TYPES)):
+            try:
+                reader(prefix + data, encoding)
+            except BadMessage:
+                continue
+
+
+WORDS = st.sampled_from([0, 1, 2, 3, 12, 16, 255, 2**16, 2**31 - 1, 2**31, 2**32 - 1])
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 60), WORDS), min_size=1, max_size=4), st.booleans())
+def test_any_number_at_any_place_of_a_cloud(changes: list[tuple[int, int]], ros1: bool) -> None:
+    points = scans(1, 5)[0].points
+    data = bytearray(cloud1(points) if ros1 else point_cloud2(7, "c", points, None))
+    for place, value in changes:
+        struct.pack_into("<I", data, min(4 * place, len(data) - 4), value)
+    try:
+        cloud = decode_cloud(bytes(data), "ros1" if ros1 else "cdr")
+    except BadMessage:
+        return
+    assert cloud.points.shape[1] == 3
+    assert cloud.points.nbytes <= 64 * len(data) + 64
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(max_size=400), st.integers(0, 2000))
+def test_any_bytes_as_lzf(data: bytes, size: int) -> None:
+    with suppress(BadFile):
+        assert len(unpack_lzf(data, size)) == size
+
+
+HEADER_LINES = st.lists(
+    st.one_of(
+        st.sampled_from([
+            "format ascii 1.0", "format binary_little_endian 1.0", "element vertex 3", "element face 2", "element x 1",
+            "property float x", "property double y", "property uchar z", "property list uchar int vertex_indices",
+            "property list float double q", "VERSION 0.7", "FIELDS x y z", "SIZE 4 4 4", "TYPE F F F", "COUNT 1 1 1",
+            "WIDTH 2", "HEIGHT 1", "POINTS 2", "DATA ascii", "DATA binary", "DATA binary_compressed",
+        ]),
+        st.text(max_size=20),
+    ),
+    max_size=14,
+)  # fmt: skip
+
+
+@settings(max_examples=300, deadline=None)
+@given(HEADER_LINES, st.binary(max_size=120))
+def test_any_header_of_a_scan(lines: list[str], body: bytes) -> None:
+    text = "\n".join(lines).encode("utf-8", "replace")
+    for reader, data in ((read_ply, b"ply\n" + text + b"\nend_header\n" + body), (read_pcd, text + b"\n" + body)):
+        try:
+            reader(data)
+        except BadFile:
+            continue
