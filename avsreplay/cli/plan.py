@@ -1,0 +1,303 @@
+"""``avsreplay plan``: replan the capture from a saved result."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from avsreplay.plan import Execution, Limits, Miss, PlanParams, Spread
+    from avsreplay.records import Plan
+    from avsreplay.replanning import Replanning, Saved
+
+__all__ = ["command"]
+
+EPILOG = """\b
+Examples:
+  avsreplay plan results/                          from t_1 on, with the run's settings
+  avsreplay plan results/ --at 40 --a-max 0.02
+  avsreplay plan results/ --cone-deg 30 --final-deg 8 --speed-max 0.4
+  avsreplay plan results/ --export plan.csv --json
+
+\b
+Exit codes: 0 ok (also where no capture lies within the horizon: the status says so),
+            2 usage, 3 unreadable input."""
+
+
+@click.command("plan", epilog=EPILOG)
+@click.argument("result", type=click.Path(path_type=Path))
+@click.option("--at", "at_s", type=float, help="Plan from this time [s]; default: from convergence.")
+@click.option("--a-max", "a_max_mps2", type=float, help="Largest acceleration [m/s2].")
+@click.option("--horizon", "horizon_s", type=float, help="Latest capture looked for [s].")
+@click.option("--latency", "latency_s", type=float, help="Coasting before thrust [s].")
+@click.option("--period", "replan_period_s", type=float, help="Replanning period in flight [s].")
+@click.option("--from", "robot_position_m", metavar="X,Y,Z", help="Robot's position in {A} [m].")
+@click.option("--cone-deg", type=float, help="Half-angle of the approach cone [deg].")
+@click.option("--cone-range", "cone_range_m", type=float, help="Within this distance the cone holds [m].")
+@click.option("--final-deg", type=float, help="Half-angle in the last metres, along the fixture's axis [deg].")
+@click.option("--final-range", "final_range_m", type=float, help="How long the last metres are [m].")
+@click.option("--speed-max", "speed_max_mps", type=float, help="Largest speed [m/s].")
+@click.option(
+    "--contact-accel", "contact_accel_mps2", type=float, help="Largest relative acceleration at contact [m/s2]."
+)
+@click.option("--keepout", "keepout_m", type=float, help="Sphere round the mass centre to keep out of [m].")
+@click.option("--keepout-release", "keepout_release_m", type=float, help="Nearer the grasp point it does not hold [m].")
+@click.option("--samples", type=click.IntRange(1), default=64, show_default=True, help="Draws from the belief.")
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the draws.")
+@click.option("--every", "every_s", type=float, default=2.0, show_default=True, help="Hindsight: a plan so often [s].")
+@click.option("--extent", "extent_m", type=float, help="Target's size [m], where the result does not tell.")
+@click.option("--export", type=click.Path(path_type=Path), help="Write t, r, v, u of the plan as CSV.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing CSV.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+def command(
+    result: Path,
+    at_s: float | None,
+    samples: int,
+    seed: int,
+    every_s: float,
+    extent_m: float | None,
+    export: Path | None,
+    overwrite: bool,
+    as_json: bool,
+    **flags: Any,
+) -> None:
+    """Plan the capture anew from RESULT, a directory written by 'avsreplay run -o'.
+
+    Nothing is replayed: the saved beliefs are enough. Shown are the plan, its spread over the belief, and, where the
+    log has the truth, what each plan would have missed by and how a flight under the supervisor would have ended.
+    """
+    from avsreplay.errors import UsageError
+    from avsreplay.replanning import load_saved
+
+    for name, value in (("--every", every_s), ("--extent", extent_m)):
+        if value is not None and not 0.0 < value < float("inf"):
+            raise UsageError(f"{value} is not above 0", where=name, hint="give a finite number above 0")
+    if export and export.exists() and not overwrite:
+        raise UsageError("is already there", where=str(export), hint="name another, or add --overwrite")
+    saved = load_saved(result, extent_m)
+    planning = _planning(saved, flags)
+    index = saved.index_at(at_s)
+    made = _usable(lambda: planning.plan_at(index))
+    spread = planning.spread_at(index, made, samples, seed) if made.found else None
+    hindsight = planning.hindsight(every_s)
+    execution = planning.execute()
+    if export:
+        _export(planning, made, export)
+    if as_json:
+        click.echo(_document(planning, index, made, spread, hindsight, execution), nl=False)
+    else:
+        _print(planning, index, made, spread, hindsight, execution)
+
+
+def _usable(action: Any) -> Any:
+    """A value the planner refuses is the user's."""
+    from avsreplay.errors import UsageError
+
+    try:
+        return action()
+    except ValueError as error:
+        raise UsageError(str(error), hint="correct the flag") from None
+
+
+def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
+    from dataclasses import fields, replace
+
+    from avsreplay.plan import Limits, PlanParams
+    from avsreplay.replanning import Replanning
+
+    given = {name: value for name, value in flags.items() if value is not None}
+    if "robot_position_m" in given:
+        given["robot_position_m"] = _point(given["robot_position_m"])
+    of_plan = {f.name for f in fields(PlanParams)}
+    params: PlanParams = _usable(lambda: replace(saved.plan, **{k: v for k, v in given.items() if k in of_plan}))
+    limits: Limits = _usable(lambda: Limits(**{k: v for k, v in given.items() if k not in of_plan}))
+    return Replanning(saved, params, limits, saved.supervisor)
+
+
+def _point(text: str) -> tuple[float, ...]:
+    from avsreplay.errors import UsageError
+
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != 3:
+        raise UsageError(f"'{text}' is not three numbers", where="--from", hint="for example --from 0,0,1.5")
+    return values
+
+
+def _document(
+    planning: Replanning,
+    index: int,
+    made: Plan,
+    spread: Spread | None,
+    hindsight: list[tuple[float, Plan, Miss | None]],
+    execution: Execution | None,
+) -> str:
+    import json
+
+    from avsreplay import settings
+
+    rows, since_s = planning.saved.rows, planning.saved.rows[index].t_s
+    outcome = None if execution is None else execution.outcome(planning.tolerance)
+    document = {
+        "made_at_s": rows[index].t_s,
+        "plan": _plan_record(made, since_s),
+        "limits": settings.dump(planning.limits),
+        "params": settings.dump(planning.params),
+        "tolerance": settings.dump(planning.tolerance),
+        "spread": settings.dump(spread) if spread else None,
+        "hindsight": [
+            {"made_at_s": at_s, **_plan_record(p, at_s), "miss": settings.dump(m) if m else None}
+            for at_s, p, m in hindsight
+        ],
+        "execution": None
+        if execution is None
+        else {
+            "outcome": outcome,
+            "miss": settings.dump(execution.miss) if execution.miss else None,
+            "actions": [{"t_s": t, "action": a, "rule": r} for t, a, r in execution.actions],
+        },
+    }
+    return json.dumps(_without_nan(document), indent=1, allow_nan=False) + "\n"
+
+
+def _plan_record(made: Plan, since_s: float) -> dict[str, Any]:
+    return {
+        "status": made.status.value,
+        "t_go_s": made.t_go_s,
+        "capture_time_s": since_s + made.t_go_s,
+        "lower_bound_s": made.lower_bound_s,
+        "a_max_mps2": made.a_max,
+        "u_max_mps2": made.u_max,
+        "position_error_m": made.position_error_m,
+        "velocity_error_mps": made.velocity_error_mps,
+        "costate": made.costate.tolist(),
+        "violation_m": made.extras.get("violation_m"),
+    }
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(v) for v in value]
+    return None if isinstance(value, float) and not abs(value) < float("inf") else value
+
+
+def _print(
+    planning: Replanning,
+    index: int,
+    made: Plan,
+    spread: Spread | None,
+    hindsight: list[tuple[float, Plan, Miss | None]],
+    execution: Execution | None,
+) -> None:
+    from avsreplay.report import make_console
+
+    console = make_console()
+    _print_plan(console, planning, index, made, spread)
+    _print_hindsight(console, hindsight)
+    if execution is not None:
+        _print_execution(console, execution, planning)
+
+
+def _print_plan(console: Console, planning: Replanning, index: int, made: Plan, spread: Spread | None) -> None:
+    from avsreplay.report.table.console import new_table
+
+    at_s = planning.saved.rows[index].t_s
+    table = new_table(console, f"Plan made at {at_s:.2f} s")
+    table.add_column("what")
+    table.add_column("value")
+    table.add_row("status", made.status.value)
+    if made.found:
+        table.add_row("capture", f"at {at_s + made.t_go_s:.3f} s, {made.t_go_s:.4f} s after planning")
+        table.add_row("terminal errors", f"{made.position_error_m:.1e} m, {made.velocity_error_mps:.1e} m/s")
+        table.add_row("largest |u|", f"{made.u_max:.6g} of {made.a_max:.6g} m/s2")
+    table.add_row("no capture before", f"{made.lower_bound_s:.4f} s after planning (certified without the limits)")
+    if "violation_m" in made.extras:
+        table.add_row("limits", f"checked between nodes, worst {made.extras['violation_m']:.1e} m")
+    for name, value in _spread_rows(spread):
+        table.add_row(name, value)
+    console.print(table)
+
+
+def _spread_rows(spread: Spread | None) -> list[tuple[str, str]]:
+    if spread is None:
+        return []
+    t, m, v, a = spread.t_go_s, spread.miss_m, spread.speed_mps, spread.angle_deg
+    return [
+        (
+            "t_go over belief",
+            f"mean {t.mean:.3f} s, 5-95 % {t.p05:.3f} to {t.p95:.3f} s; {spread.infeasible} infeasible",
+        ),
+        ("miss over belief", f"mean {1e3 * m.mean:.2f} mm, 5-95 % {1e3 * m.p05:.2f} to {1e3 * m.p95:.2f} mm"),
+        ("speed over belief", f"mean {1e3 * v.mean:.2f} mm/s, 5-95 % {1e3 * v.p05:.2f} to {1e3 * v.p95:.2f} mm/s"),
+        ("angle over belief", f"mean {a.mean:.3f} deg, 5-95 % {a.p05:.3f} to {a.p95:.3f} deg"),
+        ("capture probability", f"{spread.probability:.3f} of {spread.futures} draws, flown without replanning"),
+    ]
+
+
+def _print_hindsight(console: Console, hindsight: list[tuple[float, Plan, Miss | None]]) -> None:
+    from avsreplay.report.table.console import new_table
+
+    if not any(found for _, _, found in hindsight):
+        return
+    table = new_table(console, "Hindsight: each plan against the truth at its end")
+    for name in (
+        "made at\n[s]",
+        "status",
+        "capture\n[s]",
+        "early by\n[s]",
+        "miss\n[mm]",
+        "speed\n[mm/s]",
+        "angle\n[deg]",
+    ):
+        table.add_column(name, justify="left" if name == "status" else "right")
+    for at_s, made, found in hindsight:
+        if found is not None:
+            cells = (f"{1e3 * found.distance_m:.2f}", f"{1e3 * found.speed_mps:.2f}", f"{found.angle_deg:.3f}")
+            table.add_row(f"{at_s:.2f}", made.status.value, f"{at_s + made.t_go_s:.2f}", f"{found.lead_s:.2f}", *cells)
+    console.print(table)
+    left_out = sum(1 for _, _, found in hindsight if found is None)
+    if left_out:
+        console.print(f"{left_out} further plans end after the log, or were not found")
+
+
+def _print_execution(console: Console, execution: Execution, planning: Replanning) -> None:
+    from avsreplay.report.table.console import new_table
+
+    table = new_table(console, "Flight under the supervisor")
+    for name in ("from\n[s]", "action", "rule"):
+        table.add_column(name, justify="right" if name.startswith("from") else "left")
+    for t_s, action, rule in execution.actions:
+        table.add_row(f"{t_s:.2f}", action, rule)
+    console.print(table)
+    console.print(f"outcome: {execution.outcome(planning.tolerance)}")
+    if execution.miss is not None:
+        m = execution.miss
+        console.print(
+            f"gripper closed at {m.at_s:.3f} s: {1e3 * m.distance_m:.2f} mm off, "
+            f"{1e3 * m.speed_mps:.2f} mm/s, {m.angle_deg:.3f} deg"
+        )
+
+
+def _export(planning: Replanning, made: Plan, path: Path) -> None:
+    import numpy as np
+
+    from avsreplay.errors import UsageError
+    from avsreplay.report.atomic import atomic_path
+
+    if not made.found:
+        raise UsageError("there is no plan to export", where=str(path), hint=f"its status is {made.status.value}")
+    flown = planning.path(made)
+    times = np.append(np.arange(0.0, made.t_go_s, 0.1), made.t_go_s)
+    values = np.column_stack([times, *flown.at(times), flown.thrust(times)])
+    names = ["t_s", *(f"{q}{c}_{u}" for q, u in (("r", "m"), ("v", "mps"), ("u", "mps2")) for c in "xyz")]
+    with atomic_path(path) as part:
+        lines = [",".join(names), *(",".join(repr(float(v)) for v in row) for row in values)]
+        part.write_text("\n".join(lines) + "\n", encoding="utf-8")

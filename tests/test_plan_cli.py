@@ -1,0 +1,151 @@
+"""``avsreplay plan`` on a result that is made up: what it prints, exports and refuses."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.integrate import solve_ivp
+
+from avsreplay.cli.plan import command
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.geometry import IDENTITY_QUAT
+from avsreplay.records import State
+from avsreplay.report import write_rows, write_tum
+from avsreplay.results import mean_vector
+from avsreplay.rows import Row
+
+STEP_S, SCANS = 0.5, 140
+BODY = State(
+    IDENTITY_QUAT,
+    np.array([0.02, 0.08, -0.03]),
+    np.array([0.3, -0.2, 5.0]),
+    np.array([0.002, 0.001, -0.003]),
+    np.array([0.15, -0.3]),
+    np.array([0.6, 0.1, -0.7]),
+    IDENTITY_QUAT,
+)
+
+
+def states():
+    """The body at every scan, by DOP853 on the sigma dynamics."""
+    s1, s2 = BODY.sigma
+    ratios = np.array([s1, s2, -(s1 + s2) / (1 + s1 * s2)])
+
+    def flow(_, y):
+        q, w = y[:4], y[4:7]
+        spin = np.r_[0.5 * (q[3] * w + np.cross(q[:3], w)), -0.5 * q[:3] @ w]
+        return np.r_[spin, ratios * w[[1, 0, 0]] * w[[2, 2, 1]]]
+
+    times = STEP_S * np.arange(SCANS)
+    y = solve_ivp(flow, [0, times[-1]], np.r_[BODY.q_ab, BODY.w_b], "DOP853", times, rtol=1e-12, atol=1e-13).y.T
+    for t, v in zip(times, y, strict=True):
+        yield State(v[:4], v[4:], BODY.r_a + t * BODY.v_a, BODY.v_a, BODY.sigma, BODY.c_b, BODY.q_bc)
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory):
+    """A run whose estimate is the truth, with small and honest covariances; converged from 5 s on."""
+    folder = tmp_path_factory.mktemp("made") / "result"
+    folder.mkdir()
+    bodies = list(states())
+    stamps = [1_700_000_000_000_000_000 + round(k * STEP_S * 1e9) for k in range(SCANS)]
+    rows = [
+        Row(seq=k, t_ns=t, t_s=k * STEP_S, status="aligned", gamma=1, reason="ok", guess="predicted", points=1,
+            estimator="filter", converged=k >= 10, action="stand_still", rule="not_converged")
+        for k, t in enumerate(stamps)
+    ]  # fmt: skip
+    write_rows(folder / "rows.jsonl", rows)
+    write_tum(folder / "truth.tum", [(t, x.T_ac) for t, x in zip(stamps, bodies, strict=True)])
+    P = np.diag([1e-4] * 3 + [1e-5] * 3 + [1e-3] * 3 + [1e-5] * 3 + [1e-4] * 2 + [1e-3] * 3 + [1e-4] * 3) ** 2
+    np.savez(
+        folder / "beliefs.npz", t_ns=np.array(stamps), x=np.array([mean_vector(x) for x in bodies]),
+        P=np.tile(P, (SCANS, 1, 1)),
+    )  # fmt: skip
+    header = {"model": {"name": "m.ply", "sha256": "", "extent_m": 8.0}, "config": {"plan": {"a_max_mps2": 0.06}}}
+    (folder / "run.json").write_text(json.dumps(header))
+    return folder
+
+
+def run(*args):
+    return CliRunner().invoke(command, [str(a) for a in args], catch_exceptions=True)
+
+
+def test_plan_spread_hindsight_and_flight(result):
+    done = run(result, "--json", "--samples", 16, "--every", 10)
+    assert done.exit_code == 0, done.output
+    document = json.loads(done.stdout)
+    assert document["made_at_s"] == 5.0
+    assert document["plan"]["status"] == "optimal"
+    assert document["plan"]["a_max_mps2"] == 0.06
+    assert document["plan"]["position_error_m"] < 1e-8
+    assert document["plan"]["lower_bound_s"] == pytest.approx(document["plan"]["t_go_s"], abs=1e-6)
+    assert document["spread"]["futures"] == 16
+    assert 0.0 < document["spread"]["miss_m"]["mean"] < 0.02
+    assert [h["made_at_s"] for h in document["hindsight"]] == [5.0 + 10 * k for k in range(7)]
+    seen = [h["miss"] for h in document["hindsight"] if h["miss"]]
+    assert len(seen) >= 3
+    assert max(m["distance_m"] for m in seen) < 1e-4  # the estimate is the truth; the truth is a spline through poses
+    assert document["execution"]["outcome"] == "captured"
+    assert document["execution"]["miss"]["speed_mps"] < 1e-3
+
+
+def test_same_input_same_bytes(result):
+    args = (result, "--json", "--samples", 8, "--every", 20)
+    assert run(*args).stdout == run(*args).stdout
+
+
+def test_tables_name_what_they_show(result):
+    text = run(result, "--samples", 4, "--every", 20, "--at", 12).stdout
+    for words in ("Plan made at 12.00 s", "optimal", "capture probability", "Hindsight", "outcome: captured"):
+        assert words in text
+
+
+def test_flags_override_the_run(result):
+    slow = json.loads(run(result, "--json", "--samples", 2, "--every", 99, "--a-max", 0.03, "--at", 6).stdout)
+    limited = json.loads(
+        run(result, "--json", "--samples", 2, "--every", 99, "--speed-max", 0.25, "--at", 6, "--period", 20).stdout
+    )
+    free = json.loads(run(result, "--json", "--samples", 2, "--every", 99, "--at", 6).stdout)
+    assert slow["plan"]["capture_time_s"] > free["plan"]["capture_time_s"]
+    assert limited["plan"]["status"] == "feasible"
+    assert limited["plan"]["capture_time_s"] > free["plan"]["capture_time_s"]
+
+
+def test_export_is_the_plan(result, tmp_path):
+    path = tmp_path / "plan.csv"
+    assert run(result, "--samples", 2, "--every", 99, "--export", path).exit_code == 0
+    with path.open() as stream:
+        table = [{k: float(v) for k, v in row.items()} for row in csv.DictReader(stream)]
+    assert list(table[0]) == [
+        "t_s",
+        *(f"{q}{c}_{u}" for q, u in (("r", "m"), ("v", "mps"), ("u", "mps2")) for c in "xyz"),
+    ]
+    u = np.array([[row[f"u{c}_mps2"] for c in "xyz"] for row in table])
+    assert np.allclose(np.linalg.norm(u, axis=1), 0.06)
+    again = run(result, "--samples", 2, "--every", 99, "--export", path)
+    assert isinstance(again.exception, UsageError)
+
+
+@pytest.mark.parametrize(
+    ("args", "says"),
+    [
+        (("--a-max", 0), "a_max_mps2 is 0"),
+        (("--cone-deg", 120), "cone_deg is 120"),
+        (("--horizon", 0), "horizon_s is 0"),
+        (("--at", 500), "outside the result"),
+        (("--from", "1,2"), "not three numbers"),
+        (("--every", 0), "not above 0"),
+        (("--keepout", 3.0), "keepout_m is 3.0"),
+    ],
+)
+def test_what_cannot_be_is_one_line(result, args, says):
+    done = run(result, *args)
+    assert isinstance(done.exception, UsageError)
+    assert says in str(done.exception)
+    assert "\n" not in str(done.exception)
+
+
+def test_no_result_is_unreadable(tmp_path):
+    assert isinstance(run(tmp_path / "nothing").exception, UnreadableInput)
