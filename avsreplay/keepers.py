@@ -19,7 +19,7 @@ from avsreplay.log.result_log import ResultFrame, ResultLog
 from avsreplay.plan.pilot import Leg
 from avsreplay.records import Belief, Scan, Surface
 from avsreplay.register.model import Model
-from avsreplay.report import CloudView, PathView, View, thin_cloud, thin_surface, write_view
+from avsreplay.report import CloudView, PathView, View, thin_cloud, thin_surface, write_layout, write_view
 from avsreplay.results import Beliefs, ResultDirectory, belief_of
 from avsreplay.rows import Row
 
@@ -144,6 +144,7 @@ class ResultKeeper:
         """Write what needs the whole run; ``record`` is ``run.json``."""
         self._directory.write(rows, self._beliefs, record)
         write_view(self._directory.file("view.npz"), self._view.view())
+        write_layout(self._directory.file("result.layout.json"))
 
 
 def _registered(row: Row) -> Pose | None:

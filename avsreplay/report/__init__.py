@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from avsreplay.report.golden import GoldenResult, compare_golden, update_golden
     from avsreplay.report.json_document import document, dump_document
     from avsreplay.report.jsonl import RowWriter, read_rows, write_rows
+    from avsreplay.report.layout import write_layout
     from avsreplay.report.result import Result, facts_record, load_result, read_tum
     from avsreplay.report.summary import Summary, SummaryFold
     from avsreplay.report.table import make_console, print_golden, print_tables
@@ -49,6 +50,7 @@ _HOME = {
     "update_golden": "golden",
     "write_csv": "export",
     "write_kitti": "export",
+    "write_layout": "layout",
     "write_parquet": "export",
     "write_rows": "jsonl",
     "write_tum": "export",
@@ -81,6 +83,7 @@ __all__ = [
     "update_golden",
     "write_csv",
     "write_kitti",
+    "write_layout",
     "write_parquet",
     "write_rows",
     "write_tum",

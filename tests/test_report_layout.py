@@ -1,0 +1,61 @@
+"""The viewer layout names only panels it has and topics the result log writes."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+from mcap.reader import make_reader
+
+from avsreplay.geometry import Pose
+from avsreplay.log.result_log import ResultFrame, ResultLog
+from avsreplay.records import Surface
+from avsreplay.report.layout import viewer_layout, write_layout
+
+
+def _leaves(node):
+    return [node] if isinstance(node, str) else [*_leaves(node["first"]), *_leaves(node["second"])]
+
+
+def test_the_tree_holds_every_panel_once():
+    layout = viewer_layout()
+    assert sorted(_leaves(layout["layout"])) == sorted(layout["configById"])
+
+
+def _topics(tmp_path):
+    path = tmp_path / "result.mcap"
+    surface = Surface(np.eye(3), np.array([[0, 1, 2]], np.int32), "m", "0" * 64)
+    log = ResultLog(path, surface)
+    pose = Pose.identity()
+    log.write(
+        ResultFrame(
+            t_ns=5,
+            points=np.eye(3),
+            estimate=pose,
+            covariance=np.eye(6),
+            registration=pose,
+            truth=pose,
+            path=(np.zeros(2), np.zeros((2, 3))),
+            healthy=True,
+            message="ok",
+            values={"rms_m": 0.1},
+        )
+    )
+    log.close()
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    return {channel.topic for channel in summary.channels.values()}
+
+
+def test_every_topic_it_names_is_written(tmp_path):
+    named = set(re.findall(r'"(/[a-z_/]+)', json.dumps(viewer_layout())))
+    assert named
+    assert named <= _topics(tmp_path)
+
+
+def test_it_is_json_and_always_the_same(tmp_path):
+    write_layout(tmp_path / "a.json")
+    write_layout(tmp_path / "b.json")
+    assert json.loads((tmp_path / "a.json").read_text()) == viewer_layout()
+    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
