@@ -25,9 +25,11 @@ SUMMARIES = {
     "observability": "Show what the measurements can and cannot tell.",
     "plan": "Replan the capture from a saved result.",
     "report": "Build the HTML report of a saved result.",
+    "export": "Write a saved result as CSV, Parquet, TUM or KITTI.",
     "compare": "Compare saved results; gate one against a baseline.",
     "sweep": "Run a campaign of many runs.",
     "config": "Print the effective configuration.",
+    "completion": "Print the completion script of a shell.",
 }
 
 EPILOG = """\b

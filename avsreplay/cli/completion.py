@@ -1,0 +1,28 @@
+"""``avsreplay completion``: the script that makes a shell complete commands and flags."""
+
+from __future__ import annotations
+
+import click
+from click.shell_completion import get_completion_class
+
+from avsreplay.errors import UsageError
+
+__all__ = ["command"]
+
+EPILOG = """\b
+Examples:
+  eval "$(avsreplay completion bash)"                              in ~/.bashrc
+  eval "$(avsreplay completion zsh)"                               in ~/.zshrc
+  avsreplay completion fish > ~/.config/fish/completions/avsreplay.fish"""
+
+
+@click.command("completion", epilog=EPILOG)
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def command(shell: str) -> None:
+    """Print the completion script for SHELL."""
+    from avsreplay.cli import group
+
+    found = get_completion_class(shell)
+    if found is None:
+        raise UsageError(f"no completion for {shell}", where="completion", hint="use bash, zsh or fish")
+    click.echo(found(group, {}, "avsreplay", "_AVSREPLAY_COMPLETE").source())

@@ -1,0 +1,57 @@
+"""``avsreplay export``: a saved result in the formats other tools open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from avsreplay.errors import UsageError
+
+__all__ = ["command"]
+
+EPILOG = """\b
+Examples:
+  avsreplay export results/ --to csv -o rows.csv
+  avsreplay export results/ --to parquet -o rows.parquet       (needs the extra 'sweep')
+  avsreplay export results/ --to kitti -o estimate.txt --poses registration"""
+
+POSE_FORMATS = ("tum", "kitti")
+
+
+@click.command("export", epilog=EPILOG)
+@click.argument("result", type=click.Path(path_type=Path))
+@click.option("--to", "kind", type=click.Choice(["csv", "parquet", *POSE_FORMATS]), required=True, help="Format.")
+@click.option(
+    "--poses",
+    type=click.Choice(["estimate", "registration", "truth"]),
+    default="estimate",
+    show_default=True,
+    help="Which poses go into a trajectory (tum, kitti).",
+)
+@click.option("-o", "--output", type=click.Path(path_type=Path), required=True, help="The file to write.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
+def command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) -> None:
+    """Write RESULT, a directory made by 'avsreplay run -o', as CSV, Parquet, TUM or KITTI at full precision.
+
+    CSV and Parquet hold every column of every scan, units in the heads; TUM and KITTI hold poses of {C} in {A}.
+    """
+    from avsreplay import report
+
+    if output.exists() and not overwrite:
+        raise UsageError("is already there", where=str(output), hint="name another, or add --overwrite")
+    found = report.load_result(result)
+    if kind == "csv":
+        report.write_csv(output, found.rows)
+        click.echo(f"{output}: {len(found.rows)} rows")
+        return
+    if kind == "parquet":
+        report.write_parquet(output, found.rows)
+        click.echo(f"{output}: {len(found.rows)} rows")
+        return
+    trajectory = found.poses if poses == "truth" else report.row_poses(found.rows, poses)  # type: ignore[arg-type]
+    count = (report.write_tum if kind == "tum" else report.write_kitti)(output, trajectory)
+    if not count:
+        output.unlink()
+        raise UsageError(f"the result has no {poses} poses", where=str(result), hint="choose others with --poses")
+    click.echo(f"{output}: {count} poses")

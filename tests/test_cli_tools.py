@@ -1,0 +1,95 @@
+"""The small commands: export, completion, config, version."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture(scope="module")
+def result(cli, fixtures_folder, tmp_path_factory):
+    out = tmp_path_factory.mktemp("tools") / "result"
+    assert cli("run", fixtures_folder / "tumble.mcap", "-o", out).code == 0
+    return out
+
+
+def test_csv_holds_every_value_of_the_rows(result, cli, tmp_path):
+    target = tmp_path / "rows.csv"
+    assert cli("export", result, "--to", "csv", "-o", target).code == 0
+    rows = [json.loads(line) for line in (result / "rows.jsonl").read_text().splitlines()]
+    with target.open(newline="") as stream:
+        table = list(csv.DictReader(stream))
+    assert len(table) == len(rows)
+    for line, row in zip(table, rows, strict=True):
+        assert line["x_m"] == repr(row["x_m"])
+        assert line["fault"] == (row["fault"] or "")
+
+
+def test_kitti_and_tum_hold_the_same_poses(result, cli, tmp_path):
+    from scipy.spatial.transform import Rotation
+
+    for kind in ("kitti", "tum"):
+        assert cli("export", result, "--to", kind, "--poses", "registration", "-o", tmp_path / kind).code == 0
+    kitti = np.loadtxt(tmp_path / "kitti").reshape(-1, 3, 4)
+    tum = np.loadtxt(tmp_path / "tum")
+    np.testing.assert_allclose(kitti[:, :, 3], tum[:, 1:4], atol=0)
+    np.testing.assert_allclose(kitti[:, :, :3], Rotation.from_quat(tum[:, 4:]).as_matrix(), atol=1e-14)
+
+
+def test_an_existing_export_is_left_alone(result, cli, tmp_path):
+    target = tmp_path / "rows.csv"
+    target.write_text("precious")
+    done = cli("export", result, "--to", "csv", "-o", target)
+    assert done.code == 2
+    assert target.read_text() == "precious"
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion_scripts_are_printed(shell, cli):
+    done = cli("completion", shell)
+    assert done.code == 0
+    assert "_AVSREPLAY_COMPLETE" in done.out
+
+
+def test_completion_names_the_commands(cli):
+    env = {"COMP_WORDS": "avsreplay re", "COMP_CWORD": "1", "_AVSREPLAY_COMPLETE": "bash_complete"}
+    done = cli(env=env)
+    assert {"plain,record", "plain,report"} <= set(done.out.split())
+
+
+def test_config_dump_is_a_configuration(cli, tmp_path):
+    dumped = json.loads(cli("config", "--dump", "--set", "plan.a_max_mps2=0.03").out)
+    assert dumped["plan"]["a_max_mps2"] == 0.03
+    assert set(dumped) >= {"register", "estimator", "faults", "convergence", "plan", "supervisor"}
+    assert "plan.a_max_mps2 = 0.05" in cli("config").out
+
+
+def test_version_names_what_it_stands_on(cli):
+    out = cli("--version").out
+    assert out.startswith("avsreplay 0.1.0")
+    for name in ("numpy", "mcap", "kiss-icp", "clarabel"):
+        assert name in out
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "record",
+        "run",
+        "info",
+        "doctor",
+        "backends",
+        "plan",
+        "report",
+        "export",
+        "compare",
+        "sweep",
+        "config",
+        "completion",
+    ],
+)
+def test_every_command_has_help_with_examples(name, cli):
+    done = cli(name, "--help")
+    assert done.code == 0, done.err
+    assert "Examples:" in done.out
