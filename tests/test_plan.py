@@ -12,6 +12,7 @@ from avsreplay.plan.reach import integrals, support, touch
 from avsreplay.records import PlanStatus
 
 ORIGIN = np.zeros(3)
+GAUSS = np.polynomial.legendre.leggauss(200)
 
 
 def fixed(point, rate=(0.0, 0.0, 0.0)):
@@ -55,8 +56,7 @@ def graded(P):
     """Nodes and weights over [0, 1], crowded where |P| is least."""
     D = P[2:] - P[:2]
     s0 = min(max(-(P[:2] @ D) / (D @ D), 0.0), 1.0)
-    x, w = np.polynomial.legendre.leggauss(400)
-    x, w = 0.5 * (x + 1), 0.5 * w
+    x, w = 0.5 * (GAUSS[0] + 1), 0.5 * GAUSS[1]
     s = np.r_[s0 - s0 * x**5, s0 + (1 - s0) * x**5]
     return s, np.r_[s0 * w * 5 * x**4, (1 - s0) * w * 5 * x**4]
 

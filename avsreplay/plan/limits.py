@@ -100,18 +100,29 @@ class Scene:
 
 
 class SampledScene:
-    """A scene called once on a grid and joined by cubic splines, for the many instants between nodes."""
+    """A scene called on a grid and joined by cubic splines, for the many instants between nodes; it grows as needed."""
 
     def __init__(self, scene: Scene, horizon_s: float, step_s: float) -> None:
+        self._scene, self._horizon_s, self._step_s = scene, horizon_s, step_s
+        self._end_s = 0.0
+        self._spline: Callable[[Array], Array] | None = None
+
+    def at(self, times: Array) -> tuple[Array, Array, Array]:
+        """Grasp point, axis and mass centre, each (n, 3), at times (n,) [s after planning]."""
+        last = float(times[-1])
+        if self._spline is None or last > self._end_s:
+            self._end_s = min(max(1.5 * last, 8.0 * self._step_s), max(self._horizon_s, last))
+            self._spline = self._joined(self._end_s)
+        values: Array = self._spline(times)
+        return values[:, :3], values[:, 3:6], values[:, 6:]
+
+    def _joined(self, end_s: float) -> Callable[[Array], Array]:
         from scipy.interpolate import CubicSpline
 
-        times = np.linspace(0.0, horizon_s, max(math.ceil(horizon_s / step_s), 4) + 1)
+        scene = self._scene
+        times = np.linspace(0.0, end_s, max(math.ceil(end_s / self._step_s), 4) + 1)
         zero = np.zeros((len(times), 3))
         columns = [scene.goal(times)[0], scene.axis(times) if scene.axis else zero]
         columns.append(scene.centre(times) if scene.centre else zero)
-        self._spline = CubicSpline(times, np.concatenate(columns, axis=1))
-
-    def at(self, times: Array) -> tuple[Array, Array, Array]:
-        """Grasp point, axis and mass centre, each (n, 3), at times (n,)."""
-        values: Array = self._spline(times)
-        return values[:, :3], values[:, 3:6], values[:, 6:]
+        spline: Callable[[Array], Array] = CubicSpline(times, np.concatenate(columns, axis=1))
+        return spline

@@ -142,9 +142,9 @@ class Pilot:
         return plan, leg or memory.leg
 
     def _due(self, age_s: float, left_s: float) -> bool:
-        """At the period, in the last period at every scan, and no more once a plan would come too late."""
-        period = self.params.replan_period_s
-        return (age_s >= period - 1e-6 or left_s <= period) and left_s > self.params.latency_s
+        """At the period, at every scan when the end is near, and no more once a plan would come too late."""
+        near = left_s <= 2.0 * self.supervisor.params.commit_s
+        return (age_s >= self.params.replan_period_s - 1e-6 or near) and left_s > self.params.latency_s
 
     def _plan(
         self,
