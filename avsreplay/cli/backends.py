@@ -15,7 +15,13 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-@click.command("backends")
+EPILOG = """\b
+Examples:
+  avsreplay backends
+  avsreplay backends --check horn"""
+
+
+@click.command("backends", epilog=EPILOG)
 @click.option("--check", "name", metavar="NAME", help="Run the contract's laws on this back end; exit 1 if one fails.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
 def command(name: str | None, as_json: bool) -> None:

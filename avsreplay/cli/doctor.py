@@ -15,7 +15,13 @@ if TYPE_CHECKING:
 __all__ = ["command"]
 
 
-@click.command(name="doctor")
+EPILOG = """\b
+Examples:
+  avsreplay doctor x.mcap
+  avsreplay doctor x.mcap --repair clean.mcap"""
+
+
+@click.command(name="doctor", epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--topic", help="The cloud topic, where there are several.")
 @click.option("--repair", "output", type=click.Path(path_type=Path), help="Write every intact record to this file.")

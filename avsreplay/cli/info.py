@@ -17,7 +17,13 @@ __all__ = ["command", "document", "loss_line"]
 WIDTH = 120  # off a terminal, so that the text does not depend on where it goes
 
 
-@click.command(name="info")
+EPILOG = """\b
+Examples:
+  avsreplay info tumble.mcap
+  avsreplay info drive.bag --json"""
+
+
+@click.command(name="info", epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
 @click.option("--topic", help="The cloud topic, where there are several.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
