@@ -18,6 +18,7 @@ from avsreplay.geometry import exp
 from avsreplay.records import Label, State
 from avsreplay.report.spread import Spread
 from avsreplay.report.summary import NEES_BAND, NIS_BAND
+from avsreplay.report.words import fact_lines, verdict
 
 STEP = 200_000_000
 
@@ -223,8 +224,27 @@ def test_a_planner_that_finds_nothing_has_a_word_and_no_time(make_rows):
     assert (capture.replans, capture.last_s, capture.status) == (0, None, "infeasible_within_horizon")
 
 
+def test_hindsight_gripper_and_actions_are_told(make_rows):
+    rows = make_rows(6, blackout=range(0))
+    rows[1] = dataclasses.replace(rows[1], hindsight_m=0.02)
+    rows[3] = dataclasses.replace(rows[3], hindsight_m=0.01, action="capture")
+    rows[4] = dataclasses.replace(rows[4], capture_miss_m=0.002, capture_miss_mps=0.001, capture_miss_deg=0.3)
+    summary = report.Summary.fold(rows)
+    capture = summary.capture
+    assert (capture.hindsight_m.count, capture.hindsight_m.max) == (2, 0.02)
+    assert (capture.miss.position_m, capture.miss.speed_mps, capture.miss.rotation_deg) == (0.002, 0.001, 0.3)
+    assert capture.actions == {"approach": 5, "capture": 1}
+    facts = dict(fact_lines(summary))
+    assert facts["gripper"] == "closed 2 mm, 1 mm/s, 0.3 deg from the true grasp"
+    assert facts["hindsight"] == "2 plans miss by 15 mm in the median, 20 mm at most"
+    assert "gripper closed 2 mm" in verdict(summary)
+
+
 def test_shares_count_what_is_inside(make_rows):
-    rows = [dataclasses.replace(r, nis=v) for r, v in zip(make_rows(4, blackout=range(0)), (1.0, 2.0, 14.0, 15.0), strict=True)]
+    rows = [
+        dataclasses.replace(r, nis=v)
+        for r, v in zip(make_rows(4, blackout=range(0)), (1.0, 2.0, 14.0, 15.0), strict=True)
+    ]
     nis = report.Summary.fold(rows).nis
     assert (nis.count, nis.inside, nis.median) == (4, 0.5, 8.0)
 

@@ -58,6 +58,13 @@ def _parameter(name: str) -> Callable[[Summary], float | None]:
     return get
 
 
+def _miss(field: str) -> Callable[[Summary], float | None]:
+    def get(summary: Summary) -> float | None:
+        return None if summary.capture.miss is None else getattr(summary.capture.miss, field)
+
+    return get
+
+
 def _known(pick: Callable[[Summary], float]) -> Callable[[Summary], float | None]:
     """A figure of the fault account, None where the log does not say what was injected."""
 
@@ -98,6 +105,13 @@ METRICS: tuple[Metric, ...] = (
     Metric("withdrawn", "", "times convergence was taken back", lambda s: s.convergence.withdrawn),
     Metric("capture_s", "s", "planned instant of capture, last plan", lambda s: s.capture.last_s),
     Metric("capture_std_s", "s", "its spread over the replans", lambda s: s.capture.std_s),
+    Metric(
+        "hindsight_median_m", "m", "median miss of the plans made", _spread(lambda s: s.capture.hindsight_m, "median")
+    ),
+    Metric("hindsight_max_m", "m", "largest miss of the plans made", _spread(lambda s: s.capture.hindsight_m, "max")),
+    Metric("capture_miss_m", "m", "true distance when the gripper closed", _miss("position_m")),
+    Metric("capture_miss_mps", "m/s", "true relative speed when the gripper closed", _miss("speed_mps")),
+    Metric("capture_miss_deg", "deg", "attitude error when the gripper closed", _miss("rotation_deg")),
     Metric("gaps", "", "intervals longer than 1.5 times the median", lambda s: s.gaps),
     Metric("losses", "", "damaged places of the log", lambda s: s.counts.get("losses")),
 )

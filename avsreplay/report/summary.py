@@ -13,15 +13,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-import numpy as np
-
-from avsreplay import geometry
 from avsreplay.records import Label, State
+from avsreplay.report.capture import Capture, CaptureFold
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
+from avsreplay.report.parameters import Parameter, parameters
 from avsreplay.report.spread import Spread, median
 from avsreplay.rows import Row
 
-__all__ = ["Capture", "Convergence", "Errors", "Observability", "Parameter", "Share", "Summary", "SummaryFold"]
+__all__ = ["Convergence", "Errors", "Observability", "Share", "Summary", "SummaryFold"]
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
 NEES_BAND = (9.5908, 34.1696)  # the same with 20
@@ -33,23 +32,6 @@ class Errors:
 
     position_m: Spread | None
     rotation_deg: Spread | None
-
-
-@dataclass(frozen=True, slots=True)
-class Parameter:
-    """An estimated constant at the last scan.
-
-    Attributes:
-        estimate, truth: its components, in ``unit``.  error: length of their difference (rotation angle for mu).
-        one_sigma: root of the trace of its covariance.
-    """
-
-    name: str
-    unit: str
-    estimate: tuple[float, ...]
-    truth: tuple[float, ...] | None
-    error: float | None
-    one_sigma: float | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,23 +62,6 @@ class Convergence:
     t1_s: float | None
     at_end: bool
     withdrawn: int
-
-
-@dataclass(frozen=True, slots=True)
-class Capture:
-    """Planned instants of capture, since the first scan; a replan is a row where the plan differs from the one before.
-
-    Attributes:
-        last_s, first_s: of the last and the first plan.  std_s, range_s: over all replans.
-        status: the planner's last word.
-    """
-
-    replans: int
-    first_s: float | None
-    last_s: float | None
-    std_s: float | None
-    range_s: float | None
-    status: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +146,7 @@ class SummaryFold:
         self._full_rank_s: float | None = None
         self._t1_s: float | None = None
         self._withdrawn = 0
-        self._plans: list[tuple[str | None, float | None]] = []
+        self._capture = CaptureFold()
 
     def add(self, row: Row) -> None:
         """Take the next row."""
@@ -210,9 +175,7 @@ class SummaryFold:
             self._t1_s = row.t_s
         if self._last is not None and self._last.converged and not row.converged:
             self._withdrawn += 1
-        plan = (row.plan_status, row.capture_time_s)
-        if plan != (None, None) and (not self._plans or plan != self._plans[-1]):
-            self._plans.append(plan)
+        self._capture.add(row)
 
     def result(self) -> Summary:
         """The summary of all rows so far."""
@@ -237,14 +200,14 @@ class SummaryFold:
             iterations=Spread.of(self._values.get("iterations/healthy", [])),
             faults=account(self._marks, self._labels),
             coasts=tuple(coasts(self._marks)),
-            parameters=_parameters(last, self._truth) if last else (),
+            parameters=parameters(last, self._truth) if last else (),
             sigma_hits=last.sigma_hits if last else None,
             r_floors=last.r_floors if last else None,
             nis=_share(self._values.get("nis/healthy", []), NIS_BAND),
             nees=_share(self._values.get("nees", []), NEES_BAND),
             observability=self._observability(),
             convergence=Convergence(self._t1_s, bool(last and last.converged), self._withdrawn),
-            capture=_capture(self._plans),
+            capture=self._capture.result(),
             counts=self._counts,
         )
 
@@ -264,52 +227,3 @@ def _share(values: Sequence[float], band: tuple[float, float]) -> Share | None:
         return None
     inside = sum(band[0] <= v <= band[1] for v in values) / len(values)
     return Share(len(values), median(values), inside, *band)
-
-
-def _capture(plans: Sequence[tuple[str | None, float | None]]) -> Capture:
-    times = [t for _, t in plans if t is not None]
-    spread = Spread.of(times)
-    status = plans[-1][0] if plans else None
-    if spread is None:
-        return Capture(0, None, None, None, None, status)
-    return Capture(len(times), times[0], times[-1], spread.std, spread.max - spread.min, status)
-
-
-def _parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
-    sigma = (None, None) if truth is None else ((float(truth.sigma[0]),), (float(truth.sigma[1]),))
-    found = [
-        _vector("sigma1", "", (row.sigma1,), sigma[0], row.sigma1_1s),
-        _vector("sigma2", "", (row.sigma2,), sigma[1], row.sigma2_1s),
-        _vector(
-            "c (varrho)", "m", (row.cx_m, row.cy_m, row.cz_m), None if truth is None else _tuple(truth.c_b), row.c_1s_m
-        ),
-        _attitude(row, truth),
-    ]
-    return tuple(p for p in found if p is not None)
-
-
-def _tuple(values: geometry.Array | None) -> tuple[float, ...] | None:
-    return None if values is None else tuple(float(v) for v in values)
-
-
-def _vector(
-    name: str, unit: str, values: tuple[float | None, ...], truth: tuple[float, ...] | None, one_sigma: float | None
-) -> Parameter | None:
-    estimate = tuple(v for v in values if v is not None)
-    if len(estimate) != len(values):
-        return None
-    error = None if truth is None else math.dist(estimate, truth)
-    return Parameter(name, unit, estimate, truth, error, one_sigma)
-
-
-def _attitude(row: Row, truth: State | None) -> Parameter | None:
-    """Attitude mu as a rotation vector [deg]; its error is the angle of mu_true^-1 mu."""
-    q = (row.mux, row.muy, row.muz, row.muw)
-    if None in q:
-        return None
-    estimate = _tuple(np.degrees(geometry.log(np.array(q, dtype=np.float64)))) or ()
-    if truth is None:
-        return Parameter("mu", "deg", estimate, None, None, row.mu_1s_deg)
-    apart = geometry.multiply(geometry.conjugate(truth.q_bc), np.array(q, dtype=np.float64))
-    error = math.degrees(float(geometry.angle(apart)))
-    return Parameter("mu", "deg", estimate, _tuple(np.degrees(geometry.log(truth.q_bc))), error, row.mu_1s_deg)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from avsreplay.report.capture import Capture
 from avsreplay.report.summary import Summary
 
 __all__ = ["fact_lines", "verdict"]
@@ -15,6 +16,8 @@ def verdict(summary: Summary) -> str:
     t1, capture = summary.convergence.t1_s, summary.capture.last_s
     parts.append("not converged" if t1 is None else f"converged at {t1:.1f} s")
     parts.append("no capture planned" if capture is None else f"capture planned at {capture:.2f} s")
+    miss = summary.capture.miss
+    parts += [] if miss is None else [f"gripper closed {_mm(miss.position_m)} from the true grasp"]
     return "; ".join(parts) + "."
 
 
@@ -118,4 +121,22 @@ def _plan_facts(summary: Summary) -> list[tuple[str, str]]:
     else:
         spread = f"std {capture.std_s:.3f} s, range {capture.range_s:.3f} s"
         facts.append(("capture", f"planned at {capture.last_s:.2f} s; {spread} over {capture.replans} plans"))
+    return facts + _flight_facts(capture)
+
+
+def _flight_facts(capture: Capture) -> list[tuple[str, str]]:
+    facts = []
+    if capture.hindsight_m is not None:
+        found, n = capture.hindsight_m, capture.hindsight_m.count
+        facts.append(("hindsight", f"{n} plans miss by {_mm(found.median)} in the median, {_mm(found.max)} at most"))
+    if capture.miss is not None:
+        speed = "" if capture.miss.speed_mps is None else f", {1000 * capture.miss.speed_mps:.3g} mm/s"
+        turn = "" if capture.miss.rotation_deg is None else f", {capture.miss.rotation_deg:.3g} deg"
+        facts.append(("gripper", f"closed {_mm(capture.miss.position_m)}{speed}{turn} from the true grasp"))
+    if capture.actions:
+        facts.append(("robot", ", ".join(f"{action} {count} scans" for action, count in capture.actions.items())))
     return facts
+
+
+def _mm(metres: float) -> str:
+    return f"{1000 * metres:.3g} mm"

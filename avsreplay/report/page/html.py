@@ -8,8 +8,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from avsreplay.report.episodes import Episode
+from avsreplay.report.parameters import Parameter
 from avsreplay.report.spread import Spread
-from avsreplay.report.summary import Parameter, Summary
+from avsreplay.report.summary import Summary
 from avsreplay.report.words import fact_lines
 from avsreplay.rows import Row
 

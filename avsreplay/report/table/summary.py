@@ -8,8 +8,9 @@ from rich.console import Console
 from rich.table import Table
 
 from avsreplay.report.episodes import Episode
+from avsreplay.report.parameters import Parameter
 from avsreplay.report.spread import Spread
-from avsreplay.report.summary import Parameter, Summary
+from avsreplay.report.summary import Summary
 from avsreplay.report.table.console import Palette, decimals, new_table
 from avsreplay.report.table.scans import scan_table
 from avsreplay.report.table.sparks import print_sparks
