@@ -109,11 +109,15 @@ class Run:
         """What stands in ``run.json`` but for versions: the effective configuration and the hashes of what was read."""
         return {
             "log": {"name": self.job.source.name, "sha256": self.source.sha256, "scans": len(self.source)},
-            "model": {"name": Path(self.surface.name).name, "sha256": self.surface.sha256},
+            "model": self._model_facts(),
             "clock": settings.dump(self.source.clock),
             "selection": settings.dump(self.job.options),
             "config": settings.dump(self.config),
         }
+
+    def _model_facts(self) -> dict[str, Any]:
+        surface = self.surface
+        return {"name": Path(surface.name).name, "sha256": surface.sha256, "extent_m": surface.extent}
 
     def _overheard(self, heard: list[Scan]) -> Iterator[Scan]:
         for scan in self.source.scans(self.job.prefetch):

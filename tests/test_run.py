@@ -133,3 +133,13 @@ def test_the_covariance_in_the_result_log_is_that_of_the_rows(result):
         covariance = pose_covariance(belief)
         assert np.sqrt(np.trace(covariance[:3, :3])) == pytest.approx(row["pos_1s_m"], rel=1e-9)
         assert np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))) == pytest.approx(row["rot_1s_deg"], rel=1e-9)
+
+
+def test_a_run_streams_to_rerun(fixtures_folder, tmp_path):
+    pytest.importorskip("rerun", reason="the extra 'rerun' is not installed")
+    from avsreplay.job import Job, Run
+    from avsreplay.rerun_stream import RerunStream
+
+    with Run(Job(source=fixtures_folder / "tumble.mcap")) as run:
+        rows = list(run.rows([RerunStream(run.surface, tmp_path / "x.rrd")]))
+    assert (tmp_path / "x.rrd").stat().st_size > 100 * len(rows)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from contextlib import nullcontext
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from avsreplay.errors import DataLost, UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from avsreplay.job import Job, Run
+    from avsreplay.job import Job, Listener, Run
     from avsreplay.report import Summary
     from avsreplay.results import ResultDirectory
     from avsreplay.rows import Row
@@ -81,20 +82,9 @@ class _Start(click.ParamType[str | float]):
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
-@click.option("--plain", is_flag=True, help="No pictures between the tables.")
-def command(
-    log: Path,
-    golden: Path | None,
-    update_golden: Path | None,
-    output: Path | None,
-    page: bool,
-    overwrite: bool,
-    as_json: bool,
-    table_every: int | None,
-    table_all: bool,
-    plain: bool,
-    **flags: Any,
-) -> None:
+@click.option("--plain", is_flag=True, help="No small pictures of error and gamma under the tables.")
+@click.option("--rerun", "to_rerun", is_flag=True, help="Stream the run to a Rerun viewer (extra 'rerun').")
+def command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
     LOG is an MCAP, a ROS bag or a folder of scans. A log written by 'avsreplay record' runs with no flag.
@@ -102,18 +92,39 @@ def command(
     from avsreplay.job import Run
     from avsreplay.results import ResultDirectory
 
-    if golden and update_golden:
-        raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
-    if page and output is None:
-        raise UsageError("--report needs a result directory to stand in", hint="add -o DIR")
-    target = ResultDirectory(output, overwrite=overwrite) if output else None
+    wanted = Wanted(**{field.name: flags.pop(field.name) for field in fields(Wanted)})
+    wanted.check()
+    target = ResultDirectory(wanted.output, overwrite=wanted.overwrite) if wanted.output else None
     with Run(_job(log, flags)) as run:
-        rows, summary, record, scans_per_s = _replayed(run, target)
-        _print(rows, summary, record, as_json, table_every, table_all, plain, scans_per_s)
-        if page and output:
-            _page(output)
-        _gate(rows, golden, update_golden, as_json)
+        rows, summary, record, scans_per_s = _replayed(run, target, wanted.to_rerun)
+        _print(wanted, rows, summary, record, scans_per_s)
+        if wanted.page and wanted.output:
+            _page(wanted.output)
+        _gate(wanted, rows)
         _own_up(run)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wanted:
+    """What is to come out of a run, by flag."""
+
+    golden: Path | None
+    update_golden: Path | None
+    output: Path | None
+    page: bool
+    overwrite: bool
+    as_json: bool
+    table_every: int | None
+    table_all: bool
+    plain: bool
+    to_rerun: bool
+
+    def check(self) -> None:
+        """Raise UsageError where two flags do not go together."""
+        if self.golden and self.update_golden:
+            raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
+        if self.page and self.output is None:
+            raise UsageError("--report needs a result directory to stand in", hint="add -o DIR")
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Job:
@@ -141,15 +152,20 @@ def _options(flags: dict[str, Any], starts: tuple[Any, ...]) -> Any:
         raise UsageError(str(error), hint="correct the flag") from None
 
 
-def _replayed(run: Run, target: ResultDirectory | None) -> tuple[list[Row], Summary, dict[str, Any], float]:
+def _replayed(
+    run: Run, target: ResultDirectory | None, to_rerun: bool
+) -> tuple[list[Row], Summary, dict[str, Any], float]:
     """Rows, summary, run facts and scans a second; with a target everything is kept there."""
     from avsreplay.cli.progress import tracked
     from avsreplay.keepers import ResultKeeper
+    from avsreplay.rerun_stream import RerunStream
 
     keeper = ResultKeeper(target, run.surface) if target else None
+    listeners: list[Listener] = [RerunStream(run.surface)] if to_rerun else []
     with keeper or nullcontext():
         begun = time.perf_counter()
-        rows = list(tracked(run.rows(keeper.listeners if keeper else ()), len(run), "replaying"))
+        listeners += keeper.listeners if keeper else ()
+        rows = list(tracked(run.rows(listeners), len(run), "replaying"))
         seconds = max(time.perf_counter() - begun, 1e-9)
         summary = run.summary()
         record = _record(run, summary)
@@ -174,37 +190,35 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
     return {**run.facts(), "facts": facts, "versions": versions()}
 
 
-def _print(
-    rows: Sequence[Row],
-    summary: Summary,
-    record: dict[str, Any],
-    as_json: bool,
-    every: int | None,
-    all_rows: bool,
-    plain: bool,
-    scans_per_s: float,
-) -> None:
+def _print(wanted: Wanted, rows: Sequence[Row], summary: Summary, record: dict[str, Any], scans_per_s: float) -> None:
     from avsreplay import report
 
-    if as_json:
+    if wanted.as_json:
         click.echo(report.dump_document(rows, summary, record), nl=False)
         return
-    console = report.make_console()
-    report.print_tables(console, rows, summary, every=every, all=all_rows, scans_per_s=scans_per_s, plain=plain)
+    report.print_tables(
+        report.make_console(),
+        rows,
+        summary,
+        every=wanted.table_every,
+        all=wanted.table_all,
+        plain=wanted.plain,
+        scans_per_s=scans_per_s,
+    )
 
 
-def _gate(rows: Sequence[Row], golden: Path | None, update: Path | None, as_json: bool) -> None:
+def _gate(wanted: Wanted, rows: Sequence[Row]) -> None:
     from avsreplay import report
 
-    if update:
-        report.update_golden(update, rows)
-        click.echo(f"golden rows written: {update} ({len(rows)} scans)", err=True)
-    if golden:
-        result = report.compare_golden(golden, rows)
+    if wanted.update_golden:
+        report.update_golden(wanted.update_golden, rows)
+        click.echo(f"golden rows written: {wanted.update_golden} ({len(rows)} scans)", err=True)
+    if wanted.golden:
+        result = report.compare_golden(wanted.golden, rows)
         if not result.ok:
-            report.print_golden(report.make_console(sys.stderr if as_json else sys.stdout), result)
-        result.check(str(golden))
-        click.echo(f"golden rows agree: {golden} ({result.rows} scans)", err=True)
+            report.print_golden(report.make_console(sys.stderr if wanted.as_json else sys.stdout), result)
+        result.check(str(wanted.golden))
+        click.echo(f"golden rows agree: {wanted.golden} ({result.rows} scans)", err=True)
 
 
 def _own_up(run: Run) -> None:
