@@ -136,7 +136,7 @@ def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, refer
 
     plan = expand(load_campaign(campaign))
     with (
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
         Client(cluster) as client,
         Journal(tmp_path / "out" / "journal.txt") as journal,
     ):

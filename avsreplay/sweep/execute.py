@@ -66,7 +66,9 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
             raise UnreadableInput(what, where=scheduler, hint="check the address") from None
         return
     with (
-        dask.LocalCluster(n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=None) as cluster,
+        dask.LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", memory_limit=None
+        ) as cluster,
         dask.Client(cluster) as client,
     ):
         yield client
