@@ -13,11 +13,11 @@ namespace {
 constexpr int64_t MIN_INLIERS = 6;
 
 // Decides pass by pass whether neighbours are remembered; it shows in the time, never in the result. They are once a
-// step moves no point by more than KEEP_UNDER of a cell, and no longer where most were searched for all the same, until
+// step moves no point by more than a part of a cell, and no longer where most were searched for all the same, until
 // the steps are half as long.
 class Memory {
  public:
-  Memory(const Store& s, int64_t n, bool allowed) : extent_(s.extent), longest_(allowed ? KEEP_UNDER * s.cell : 0), n_(n) {}
+  Memory(const Store& s, int64_t n, bool allowed) : extent_(s.extent), longest_(allowed ? (s.mesh ? MESH_UNDER : CLOUD_UNDER) * s.cell : 0), n_(n) {}
 
   Kept* for_step(double turn, double move) {
     length_ = move + 0.5 * turn * extent_;
@@ -32,7 +32,7 @@ class Memory {
   }
 
  private:
-  static constexpr double KEEP_UNDER = 0.5, TOO_OFTEN = 0.6;
+  static constexpr double MESH_UNDER = 0.3, CLOUD_UNDER = 0.1, TOO_OFTEN = 0.6;
   double extent_, longest_, length_ = 0;
   int64_t n_;
   bool used_ = false;
