@@ -60,9 +60,11 @@ def _client_cost() -> tuple[Outcome, float, int, int]:
 
 
 def _scheduler_cost(workers: int, tasks: int) -> float:
+    import dask
     from distributed import Client, LocalCluster, as_completed
 
     with (
+        dask.config.set({"distributed.comm.timeouts.connect": "600s", "distributed.scheduler.worker-ttl": None}),
         LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=False, dashboard_address=":0", memory_limit=None
         ) as cluster,
