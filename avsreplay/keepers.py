@@ -104,8 +104,7 @@ class ViewKeeper:
 
     def _residual(self, points: NDArray[np.float32], T_ac: Pose) -> NDArray[np.float32]:
         """Distance (n,) [m] of points (n, 3) in {A} to the model at the estimated pose, the reach at most."""
-        T_ca = T_ac.inverse()
-        found = self._model.closest(T_ca.apply(points), camera_c=T_ca.t)
+        found = self._model.closest(T_ac.inverse().apply(points))
         return np.sqrt(np.minimum(found.d2, self._model.reach_m**2)).astype(np.float32)
 
     def view(self) -> View:

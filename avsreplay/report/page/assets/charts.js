@@ -199,7 +199,8 @@ const Charts = (() => {
         ctx.fillStyle = alpha(k, 0.45); ctx.fillRect(x0, top, wide, tall - 4 * px);
         ctx.strokeStyle = colour(k); ctx.lineWidth = px; ctx.strokeRect(x0, top, wide, tall - 4 * px);
         const text = s.word.replaceAll("_", " ");
-        if (ctx.measureText(text).width < wide - 6 * px) { ctx.fillStyle = theme.ink; ctx.fillText(text, x0 + 4 * px, top + tall / 2 - 2 * px); }
+        const left = Math.max(x0, bbox.left), seen = Math.min(x0 + wide, bbox.left + bbox.width) - left;
+        if (ctx.measureText(text).width < seen - 6 * px) { ctx.fillStyle = theme.ink; ctx.fillText(text, left + 4 * px, top + tall / 2 - 2 * px); }
       }
       ctx.restore();
     };
