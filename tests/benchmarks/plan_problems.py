@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 
 class Table:
-    """Positions, velocities, accelerations on a grid, joined by quintic pieces: as exact as the integration, and cheap."""
+    """Position, velocity, acceleration on a grid joined by quintic pieces: as exact as the integration, and cheap."""
 
     def __init__(self, step, position, velocity, acceleration):
         self.step, self.p, self.v, self.a = step, position, velocity, acceleration
