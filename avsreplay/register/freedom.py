@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from avsreplay.geometry import Array
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
 
-__all__ = ["FREE_BELOW", "free_directions", "scaled_information"]
+__all__ = ["FREE_BELOW", "free_directions", "scaled_information", "turn_words"]
 
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is free
 AXIS_WITHIN = 0.966  # cosine of 15 deg: nearer than that to an axis is called by the axis' name
@@ -31,6 +32,14 @@ def free_directions(J: Array, centre: Array) -> tuple[str, ...]:
     values, vectors = np.linalg.eigh(info)
     free = vectors[:, values < FREE_BELOW].T
     return tuple(_words(row) for row in _plain_basis(free))
+
+
+def turn_words(step: Pose) -> str:
+    """A rigid step in {C} in words: "turned 180 deg about x"."""
+    degrees = float(np.degrees(geometry.angle(step.q)))
+    if degrees < 1.0:
+        return f"moved along {_axis(step.t)}"
+    return f"turned {degrees:.0f} deg about {_axis(geometry.log(step.q))}"
 
 
 def _plain_basis(rows: Array) -> Array:

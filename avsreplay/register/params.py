@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
 from avsreplay.register.facing import Camera
 
-__all__ = ["Limits", "RegisterParams"]
+__all__ = ["AcquireParams", "Limits", "RegisterParams"]
 
 REACH_OF_EXTENT = 0.15  # a guess off by 24 deg moves a surface's far points by about this much
 GATE_OF_EXTENT = 0.01
@@ -34,6 +34,31 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
+class AcquireParams:
+    """Parameters of the search for a pose without a guess. Raises ValueError naming a value that cannot be right."""
+
+    starts: int = 600  # attitudes tried; seven times as many in the second effort
+    coarse_points: int = 150  # points of the scan in the first selection
+    coarse_passes: int = 8  # plane passes a start in the first selection
+    middle_starts: int = 60  # starts kept for the second selection
+    middle_points: int = 400  # points in the second selection
+    middle_passes: int = 15  # plane passes in the second selection
+    fine_starts: int = 6  # different poses registered on the model itself
+    fine_points: int = 1500  # points they are registered and ranked with
+    enough_ratio: float = 0.85  # share of the scan on the model that ends the search at the first effort
+    least_ratio: float = 0.7  # smaller than that nothing was found
+    margin: float = 0.01  # a second pose that leaves so little more of the scan unexplained is as good
+
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            value = getattr(self, each.name)
+            if isinstance(each.default, int) and value < 1:
+                raise ValueError(f"{each.name} is {value}, it must be at least 1")
+            if isinstance(each.default, float) and not 0.0 <= value <= 1.0:
+                raise ValueError(f"{each.name} is {value}, it must be within 0 and 1")
+
+
+@dataclass(frozen=True, slots=True)
 class RegisterParams:
     """Parameters of registration. Raises ValueError naming a value that cannot be right."""
 
@@ -49,6 +74,7 @@ class RegisterParams:
     camera: Camera = Camera.AUTO  # where the scans were taken from: auto, origin or none
     subsample_m: float = 0.0  # keep one point a voxel of this size [m]; 0: keep all
     threads: int = 1  # threads of a back end that gives the same bits for any number
+    acquire: AcquireParams = field(default_factory=AcquireParams)  # the search without a guess
 
     def __post_init__(self) -> None:
         for name in ("reach_m", "gate_m", "eps_m", "noise_m", "eps_rad"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,10 @@ from numpy.typing import NDArray
 from avsreplay.errors import MissingBackend
 from avsreplay.geometry import Pose
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
+from avsreplay.register.acquire import Acquirer, Acquisition
 from avsreplay.register.assess import assess, nothing
 from avsreplay.register.facing import View
+from avsreplay.register.freedom import turn_words
 from avsreplay.register.model import Model
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.port import Target, load
@@ -34,7 +37,9 @@ class Registrar:
         factory = load(self.params.backend)
         self._model = _indexed(surface, self.limits.reach_m)
         self._view = View(surface, self.params.camera)
-        self._backend = factory(Target(surface, self._model, self.limits, self._view))
+        self._target = Target(surface, self._model, self.limits, self._view)
+        self._backend = factory(self._target)
+        self._acquirer: Acquirer | None = None
 
     def register(self, points: NDArray[Any], guess: Pose) -> Alignment:
         """The pose of the model in the camera.
@@ -54,6 +59,30 @@ class Registrar:
         if fit is None:
             return nothing(len(scan), AlignStatus.FAILED, guess)
         return assess(self._model, self._view, scan, fit, self.limits, self.params)
+
+    def acquire(self, points: NDArray[Any]) -> Alignment:
+        """The pose without a guess: the best of a search over all attitudes, then registered and graded as any other.
+
+        The status is NO_OVERLAP where no pose explains enough of the scan, and AMBIGUOUS where a second, different pose
+        explains it as well: ``weakest`` then says which turn leads there. ``search`` gives both poses.
+        """
+        scan = self._scan(points)
+        if len(scan) == 0:
+            return nothing(len(points), AlignStatus.NO_POINTS)
+        search = self.search(scan)
+        found = self.register(scan, search.best.T_ca.inverse())
+        if not search.found:
+            return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None)
+        if search.ambiguous and search.second is not None:
+            words = turn_words(search.best.T_ca @ search.second.T_ca.inverse())
+            return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, weakest=words)
+        return found
+
+    def search(self, points: NDArray[Any]) -> Acquisition:
+        """Best and second best pose of a scan (n, 3) in {A} [m], finite, n >= 1, and what can be said of them."""
+        if self._acquirer is None:
+            self._acquirer = Acquirer(self._target, self.params.acquire)
+        return self._acquirer.search(points)
 
     def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
         finite = np.isfinite(points).all(axis=1)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
 
-__all__ = ["sample", "thin"]
+__all__ = ["even", "sample", "thin", "without_strays"]
 
+EVEN_ROUNDS, EVEN_WITHIN = 10, (0.85, 1.2)
+STRAY_SHARE, STRAY_VOXELS, STRAY_POINTS = 0.15, 150, 10
 R2 = np.array([0.7548776662466927, 0.5698402909980532])  # plastic-number sequence: even over the unit square
 
 
@@ -36,3 +39,42 @@ def thin(points: Array, voxel_m: float) -> Array:
     cells = np.floor(points / voxel_m).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     return points[np.sort(first)]
+
+
+def even(points: Array, count: int) -> Array:
+    """About ``count`` of the points, the first of every voxel, its size found by halving; (n, 3) -> (k, 3)."""
+    if len(points) <= count:
+        return points
+    voxel = max(3.0 * _spread(points) / np.sqrt(count), np.finfo(float).tiny)
+    for _ in range(EVEN_ROUNDS):
+        first = _voxels(points, voxel)[0]
+        if EVEN_WITHIN[0] * count <= len(first) <= EVEN_WITHIN[1] * count:
+            break
+        voxel *= float(np.clip(np.sqrt(len(first) / count), 0.5, 2.0))
+    return points[np.sort(first)]
+
+
+def without_strays(points: Array) -> Array:
+    """The points of voxels that hold 0.15 or more of what the median point has around it; (n, 3) -> (k, 3).
+
+    A stray far from everything would fill a voxel of its own and, thinned by voxels, weigh as much as a piece of
+    surface. About 150 voxels cover the scan; a scan of fewer than ten points a voxel is left as it is.
+    """
+    if len(points) < STRAY_VOXELS * STRAY_POINTS:
+        return points
+    _, voxel, counts = _voxels(points, 3.0 * _spread(points) / np.sqrt(STRAY_VOXELS))
+    around = counts[voxel]
+    return points[around >= max(2.0, STRAY_SHARE * float(np.median(around)))]
+
+
+def _spread(points: Array) -> float:
+    return float(np.sqrt(np.median(np.sum((points - np.median(points, axis=0)) ** 2, axis=1))))
+
+
+def _voxels(points: Array, voxel_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
+    """First point of every occupied voxel, the voxel of every point, and how many each holds."""
+    cells = np.floor((points - points.min(axis=0)) / max(voxel_m, np.finfo(float).tiny)).astype(np.int64)
+    shape = cells.max(axis=0) + 1
+    keys = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
+    _, first, voxel, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
+    return first, voxel.reshape(-1), counts
