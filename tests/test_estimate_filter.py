@@ -18,7 +18,8 @@ from avsreplay.geometry import Pose
 from avsreplay.records import Belief, Innovation, State
 
 NEAR_1S = np.repeat([0.0025, 0.0025, 0.01, 0.001, 0.025, 0.025, 0.005], [3, 3, 3, 3, 2, 3, 3])
-QUIET = EstimatorParams(torque_noise_radps15=1e-9, force_noise_mps15=1e-9, adapt=Adaptation.OFF)
+WHITE = np.ones(2)
+QUIET = EstimatorParams(torque_noise_radps15=1e-9, force_noise_mps15=1e-9, adapt=Adaptation.OFF, correlated_share=0.0)
 
 
 def spread(rng: np.random.Generator, size: int = 20) -> np.ndarray:
@@ -49,7 +50,7 @@ def test_update_is_bayes_where_nothing_binds() -> None:
     x = State(x.q_ab, x.w_b, x.r_a, x.v_a, np.zeros(2), x.c_b, x.q_bc)
     P, R, H = spread(rng) * 1e-3, spread(rng, 6), sensitivity(x)
     seen = ekf.innovate(P, H, rng.normal(size=6) * 1e-3, R)
-    posterior, hits = ekf.update(Belief(0, x, P), H, seen, 0.01)
+    posterior, hits = ekf.update(Belief(0, x, P), H, seen, 0.01, WHITE)
     info = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
     assert hits == 0
     assert np.abs(posterior.P - info).max() < 1e-9 * np.abs(info).max()
@@ -64,7 +65,7 @@ def test_constrained_update_stays_symmetric_and_positive() -> None:
     P, R, H = spread(rng), 1e-4 * np.eye(6), sensitivity(x)
     K = ekf.gain(P, H, H @ P @ H.T + R)
     alpha = np.linalg.pinv(K[12:14]) @ np.array([0.5, -0.8])
-    posterior, hits = ekf.update(Belief(0, x, P), H, ekf.innovate(P, H, alpha, R), 0.01)
+    posterior, hits = ekf.update(Belief(0, x, P), H, ekf.innovate(P, H, alpha, R), 0.01, WHITE)
     assert hits == 2
     assert posterior.x.sigma == pytest.approx([0.99, -0.99])
     assert np.array_equal(posterior.P, posterior.P.T)
@@ -185,7 +186,7 @@ def test_floor_acts_on_eigenvalues_in_units_of_r0_and_is_counted() -> None:
 def test_a_wrong_noise_is_found(rule: Adaptation) -> None:
     """A registration that claims a quarter of its variance, or an R0 far off, ends near the true noise."""
     world = tumbling.draw(11, seconds=60.0, hz=5.0)
-    params = EstimatorParams(adapt=rule, window=60, r0_pos_m=0.05, r0_rot_deg=3.0)
+    params = EstimatorParams(adapt=rule, window=60, correlated_share=0.0, r0_pos_m=0.05, r0_rot_deg=3.0)
     tracks = [track for track, _ in run(world, near(world, 11), params, 11, reported=0.25)]
     R = np.mean([np.diag(t.R) for t in tracks[100:]], axis=0)
     assert np.sqrt(R[:3].mean()) == pytest.approx(0.01, rel=0.12)
@@ -196,7 +197,7 @@ def test_scale_keeps_nis_honest_where_the_registration_lies() -> None:
     nis = []
     for seed in range(4):
         world = tumbling.draw(seed, seconds=60.0, hz=5.0)
-        params = EstimatorParams(torque_noise_radps15=1e-9, force_noise_mps15=1e-9)
+        params = EstimatorParams(torque_noise_radps15=1e-9, force_noise_mps15=1e-9, correlated_share=0.0)
         nis += [seen.nis for _, seen in run(world, near(world, seed), params, seed, reported=0.04)][60:]
     assert np.mean(nis) / 6 == pytest.approx(1.0, abs=0.1)
 
@@ -204,7 +205,7 @@ def test_scale_keeps_nis_honest_where_the_registration_lies() -> None:
 def burst(level: float, seconds: float = 20.0):
     """Noise up by ``level`` from 30 s on for ``seconds``; the factor the window finds after each scan."""
     world = tumbling.draw(12, seconds=80.0, hz=5.0)
-    estimator = Estimator(EstimatorParams(), near(world, 12), 1.0)
+    estimator = Estimator(EstimatorParams(correlated_share=0.0), near(world, 12), 1.0)
     track, rng = estimator.initial(0, world.states[0].T_ac), np.random.Generator(np.random.PCG64(12))
     for t, x in zip(world.times[1:], world.states[1:], strict=True):
         k = level if 30.0 <= t < 30.0 + seconds else 1.0

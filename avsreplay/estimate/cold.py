@@ -8,7 +8,7 @@ something can never be told stays with the fit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -31,13 +31,15 @@ class ColdFit:
     """The last fit: its values at the epoch (the first pose), how many poses it had, and what came of it.
 
     Attributes:
-        chart: where the next one starts.  count: poses.  factors: (2,) noise factors, attitude and position.
+        chart: where the next one starts.  count: poses.
+        factors, colour: (2,) noise factors and time correlation, of attitude and position.
         belief: at the last pose.  settled: may the filter take over.
     """
 
     chart: Chart
     count: int
     factors: Array
+    colour: Array
     belief: Belief
     settled: bool
 
@@ -81,10 +83,18 @@ def refit(fixes: tuple[PoseFix, ...], last: ColdFit | None, params: EstimatorPar
     poses = poses_of(fixes)
     prior = prior_of(poses, params)
     start = to_chart(rough_state(fixes)) if last is None else last.chart
-    fitted = fit(poses, start, prior, rules, None if last is None else last.factors)
+    rules = replace(rules, least_colour=params.colour(_mean_turn(poses)))
+    fitted = fit(poses, start, prior, rules, None if last is None else last.factors * np.sqrt(last.colour))
     found = spread(poses, fitted, prior, rules)
     belief = belief_at(found, fixes[-1].t_ns, float(poses.times_s[-1]))
-    return ColdFit(fitted.chart, len(poses), fitted.factors, belief, _settled(found, fitted, prior))
+    settled = _settled(found, fitted, prior)
+    return ColdFit(fitted.chart, len(poses), fitted.factors, fitted.colour, belief, settled)
+
+
+def _mean_turn(poses: Poses) -> float:
+    """Rotation from one pose to the next [rad], mean."""
+    steps = geometry.multiply(geometry.conjugate(poses.q[:-1]), poses.q[1:])
+    return float(np.mean(geometry.angle(steps)))
 
 
 def _settled(found: Spread, fitted: Fitted, prior: Prior) -> bool:

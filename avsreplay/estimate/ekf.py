@@ -10,7 +10,7 @@ from avsreplay.estimate.layout import SIGMA, boxplus
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation
 
-__all__ = ["gain", "innovate", "update", "update_in_chart"]
+__all__ = ["gain", "innovate", "joseph", "update", "update_in_chart", "widened"]
 
 
 def innovate(P: Array, H: Array, alpha: Array, R: Array) -> Innovation:
@@ -27,23 +27,38 @@ def gain(P: Array, H: Array, S: Array) -> Array:
     return np.asarray(np.linalg.solve(S, H @ P).T, dtype=np.float64)
 
 
-def update(prior: Belief, H: Array, seen: Innovation, margin: float) -> tuple[Belief, int]:
-    """Posterior of a healthy epoch (gamma 1), and how many sigma bounds acted."""
-    K = gain(prior.P, H, seen.S)
+def update(prior: Belief, H: Array, seen: Innovation, margin: float, colour: Array) -> tuple[Belief, int]:
+    """Posterior of a healthy epoch (gamma 1), and how many sigma bounds acted. ``colour`` (2,) as in ``widened``."""
+    R = widened(seen.R, colour)
+    K = gain(prior.P, H, seen.S + (R - seen.R))
     betas, hits = shrink(prior.x.sigma, K[SIGMA] @ seen.alpha, margin)
     if hits:
         K[12] *= betas[0]
         K[13] *= betas[1]
-    L = -K @ H
-    L.flat[::21] += 1.0
-    P = L @ prior.P @ L.T + K @ seen.R @ K.T
+    P = joseph(prior.P, H, K, R)
     return Belief(prior.t_ns, boxplus(prior.x, K @ seen.alpha), 0.5 * (P + P.T)), hits
 
 
-def update_in_chart(prior: Belief, H: Array, seen: Innovation) -> Belief:
+def update_in_chart(prior: Belief, H: Array, seen: Innovation, colour: Array) -> Belief:
     """The same update displaced through the chart, where inertia cannot leave its bounds and beta has nothing to do."""
-    K = gain(prior.P, H, seen.S)
+    R = widened(seen.R, colour)
+    K = gain(prior.P, H, seen.S + (R - seen.R))
+    x, P = retract(prior.x, joseph(prior.P, H, K, R), K @ seen.alpha)
+    return Belief(prior.t_ns, x, P)
+
+
+def joseph(P: Array, H: Array, K: Array, R: Array) -> Array:
+    """(I - KH) P (I - KH)' + K R K', the posterior covariance under any gain."""
     L = -K @ H
     L.flat[::21] += 1.0
-    x, P = retract(prior.x, L @ prior.P @ L.T + K @ seen.R @ K.T, K @ seen.alpha)
-    return Belief(prior.t_ns, x, P)
+    out: Array = L @ P @ L.T + K @ R @ K.T
+    return out
+
+
+def widened(R: Array, colour: Array) -> Array:
+    """R times ``colour`` (2,), of attitude and position: errors that stay from scan to scan say less than white ones.
+
+    The innovation's own S is not widened: it is as wide as one scan is.
+    """
+    c = np.sqrt(np.repeat(colour[::-1], 3))
+    return np.asarray(R * np.outer(c, c))

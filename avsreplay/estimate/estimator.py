@@ -19,12 +19,13 @@ from avsreplay.estimate.measure import in_fixture, innovation, measured_pose, no
 from avsreplay.estimate.motion import propagate
 from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource, Start
 from avsreplay.estimate.start import PoseFix, first_belief, guessed_belief
-from avsreplay.geometry import Array, Pose
+from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, State, Trajectory
 
 __all__ = ["Estimator", "Prediction", "Track"]
 
 _FEWEST_TO_FIT = 3
+_WHITE = frozen(np.ones(2))
 _FREE_RAD = 1.0  # standard deviation of an attitude direction the view leaves free
 
 
@@ -38,6 +39,7 @@ class Track:
         R: (6, 6) noise of the last healthy scan [m, half-angle], None before it.
         fixes: healthy poses, cold: the last fit to them, both of modes 'start' and 'fit' only.
         charted: does the filter move through the chart (after a fit), or as the paper's.
+        colour: (2,) the fit's word on the poses' correlation in time, attitude and position.
     """
 
     belief: Belief
@@ -49,6 +51,7 @@ class Track:
     fixes: tuple[PoseFix, ...] = ()
     cold: ColdFit | None = None
     charted: bool = False
+    colour: Array = field(default_factory=lambda: _WHITE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -111,11 +114,12 @@ class Estimator:
             return replace(track, belief=prediction.belief)
         if track.mode in ("start", "fit"):
             return self._begin(track, prediction, seen)
+        colour = track.colour if track.charted else self._colour(track, prediction)
         if track.charted:
-            belief, hits = ekf.update_in_chart(prediction.belief, prediction.H, seen), 0
+            belief, hits = ekf.update_in_chart(prediction.belief, prediction.H, seen, colour), 0
         else:
-            belief, hits = ekf.update(prediction.belief, prediction.H, seen, self.params.sigma_margin)
-        window = self._remember(track.window, prediction, seen, belief)
+            belief, hits = ekf.update(prediction.belief, prediction.H, seen, self.params.sigma_margin, colour)
+        window = self._remember(track.window, prediction, seen, belief, colour)
         return replace(
             track,
             belief=belief,
@@ -150,11 +154,14 @@ class Estimator:
         return adapt.floored(base, self._R0, self.params.r_floor)
 
     def _remember(
-        self, window: NoiseWindow, prediction: Prediction, seen: Innovation, posterior: Belief
+        self, window: NoiseWindow, prediction: Prediction, seen: Innovation, posterior: Belief, colour: Array
     ) -> NoiseWindow:
-        """The window with this epoch's a posteriori residual z - h(x+), its ratios against the base R."""
+        """The window with this epoch's a posteriori residual z - h(x+), its ratios against the base R.
+
+        H P+ H' is taken without the widening: what the fit took up of one scan is what white noise would leave.
+        """
         residual = innovation(posterior.x, measured_pose(prediction.belief.x, seen.alpha))
-        HPH = prediction.H @ posterior.P @ prediction.H.T
+        HPH = prediction.H @ posterior.P @ prediction.H.T / float(colour.mean())
         s = self._factors(window)
         return adapt.push(window, residual, HPH, seen.R / np.outer(s, s), self.params.window)
 
@@ -165,11 +172,11 @@ class Estimator:
             return replace(track, belief=first_belief(fixes, self.params), fixes=fixes, R=seen.R)
         count = 0 if track.cold is None else track.cold.count
         if len(fixes) < count + max(1.0, self.params.refit_growth * count):
-            belief = ekf.update_in_chart(prediction.belief, prediction.H, seen)
+            belief = ekf.update_in_chart(prediction.belief, prediction.H, seen, track.colour)
             return replace(track, belief=belief, fixes=fixes, R=seen.R)
         cold = refit(fixes, track.cold, self.params, self.fit)
         window = adapt.filled(seen.R / np.outer(s := self._factors(track.window), s), cold.factors, self.params.window)
-        track = replace(track, belief=cold.belief, window=window, R=seen.R)
+        track = replace(track, belief=cold.belief, window=window, R=seen.R, colour=cold.colour)
         if cold.settled:
             return replace(track, mode="filter", fixes=(), cold=None, charted=True)
         return replace(track, mode="fit", fixes=fixes, cold=cold, charted=True)
@@ -179,6 +186,14 @@ class Estimator:
         pose = measured_pose(x, seen.alpha)
         s = self._factors(prediction.window)
         return PoseFix(prediction.belief.t_ns, pose, in_fixture(seen.R / np.outer(s, s), pose.q, x.q_bc))
+
+    def _colour(self, track: Track, prediction: Prediction) -> Array:
+        """(2,) how many times less than white ones the poses say; the paper's own filter takes them as white."""
+        if self.params.start is Start.PAPER:
+            return _WHITE
+        prior = prediction.belief
+        turn = float(np.linalg.norm(prior.x.w_b)) * (prior.t_ns - track.belief.t_ns) * 1e-9
+        return np.full(2, self.params.colour(turn))
 
     def _factors(self, window: NoiseWindow) -> Array:
         """(6,) factors of the base R in force."""

@@ -3,8 +3,10 @@
 The motion is taken as deterministic; each pose's residual d = [theta; v] stands in {C}, where its covariance is given.
 Jacobians are H Phi chained, in the coordinates of ``chart``, which keep the inertia physical without a bound. A weak
 prior keeps directions finite that the poses do not tell yet. A pose beyond the 99.99 % point of chi-square with 6
-degrees of freedom is weighted down, others are not touched, so honest noise costs nothing. The poses' noise may be
-rescaled by two factors, attitude and position, taken from the residuals themselves.
+degrees of freedom is weighted down (Huber's weight on the way in, Cauchy's at the end), others are not touched, so
+honest noise costs nothing. The poses' noise may be rescaled by two factors, attitude and position, taken from the
+residuals themselves; where these are correlated in time, as registration's are, the covariance is widened by their
+integrated autocorrelation.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ __all__ = ["FitParams", "Fitted", "Pin", "Poses", "Prior", "cost", "fit", "pinne
 
 _GATE = 27.86  # chi-square with 6 degrees of freedom, 99.99 %
 _FEWEST_FOR_FACTORS = 12
+_LAGS = (5, 10, 20, 40)
 _PIN_TOL = 0.02  # half chi-square: how well a held fit needs to be known
 
 
@@ -39,6 +42,8 @@ class FitParams:
     gain_tol: float = 1e-3
     # take the two noise factors from the residuals
     rescale: bool = True
+    # how many times less than white ones the poses say at least, for their errors' correlation in time
+    least_colour: float = 1.0
     # directions, weakest first, whose cost is tried for bending
     try_directions: int = 3
     # the cost two sigma away may be this many times the normal one before the direction counts as bent
@@ -85,8 +90,9 @@ class Fitted:
 
     Attributes:
         chart: initial values at the epoch.  P_chart: (20, 20) their covariance.
-        half_chi2: cost, half the weighted chi-square with the prior's share, at ``factors``.
+        half_chi2: cost, half the weighted chi-square with the prior's share, at ``effective``.
         d: (n, 6) residuals in {C} [rad, m].  weights: (n,) in (0, 1].  factors: (2,) of attitude and position noise.
+        colour: (2,) 1 + 2 sum of the residuals' autocorrelations: how many times less the poses say than if white.
         steps: taken.  converged: the last step gained too little to go on.
     """
 
@@ -96,6 +102,7 @@ class Fitted:
     d: Array
     weights: Array
     factors: Array
+    colour: Array
     steps: int
     converged: bool
 
@@ -110,6 +117,11 @@ class Fitted:
         T = to_errors(self.chart)
         P = T @ self.P_chart @ T.T
         return np.asarray(0.5 * (P + P.T))
+
+    @property
+    def effective(self) -> Array:
+        """(2,) noise factors the covariance stands on: of white noise that would say as little as the poses do."""
+        return np.asarray(self.factors * np.sqrt(self.colour))
 
     @property
     def rms(self) -> tuple[float, float]:
@@ -157,6 +169,7 @@ class _Problem:
     def __init__(self, poses: Poses, prior: Prior, params: FitParams, factors: Array, pin: Pin | None = None) -> None:
         self.poses, self.prior, self.params, self.pin = poses, prior, params, pin
         self.white = _whitener(poses.C)
+        self.redescend = True
         self.factors = factors
         self.R_ca = np.swapaxes(geometry.matrix(poses.q), -1, -2)
         self.prior_info = prior.one_sigma**-2.0
@@ -165,9 +178,7 @@ class _Problem:
         d, J = self._residuals(chart)
         e = self._whitened(d)
         chi2 = np.einsum("ni,ni->n", e, e)
-        far = chi2 > _GATE
-        weights = np.where(far, np.sqrt(_GATE / np.maximum(chi2, _GATE)), 1.0)
-        robust = np.where(far, 2.0 * np.sqrt(_GATE * np.maximum(chi2, _GATE)) - _GATE, chi2)  # Huber's
+        weights, robust = _robust(chi2, self.redescend)
         cost = 0.5 * float(robust.sum()) + 0.5 * float(self.prior_info @ chart.minus(self.prior.mean) ** 2)
         if self.pin is not None:
             cost += 0.5 * self.pin.error(chart) ** 2
@@ -194,6 +205,11 @@ class _Problem:
             size = np.einsum("ni,nij,nj->n", d, info, d) + np.einsum("nij,njk,kl,nil->n", info, J, P, J, optimize=True)
             found.append(np.sqrt(float(w @ size) / (3.0 * float(w.sum()))))
         return np.array(found)
+
+    def colour(self, here: _Here) -> Array:
+        """(2,) 1 + 2 sum of the residuals' autocorrelations, of attitude and position."""
+        e = self._whitened(here.d) * np.sqrt(here.weights)[:, None]
+        return np.array([_colour(e[:, :3]), _colour(e[:, 3:])])
 
     def _whitened(self, rows: Array) -> Array:
         scaled = rows / np.repeat(self.factors, 3).reshape((6,) + (1,) * (rows.ndim - 2))
@@ -223,6 +239,23 @@ class _Problem:
         return d, J @ to_errors(chart)
 
 
+def _robust(chi2: Array, redescend: bool) -> tuple[Array, Array]:
+    """Weights and costs (n,): plain up to the gate; beyond it Cauchy's logarithm, or Huber's root on the way in."""
+    over = np.maximum(chi2 / _GATE, 1.0)
+    if redescend:
+        return 1.0 / over, np.where(over > 1.0, _GATE * (1.0 + np.log(over)), chi2)
+    return 1.0 / np.sqrt(over), np.where(over > 1.0, _GATE * (2.0 * np.sqrt(over) - 1.0), chi2)
+
+
+def _colour(e: Array) -> float:
+    """1 + 2 sum of autocorrelations of rows e (n, 3), over the lags that show most, where three sigma do."""
+    n, total = len(e), float(np.sum(e * e))
+    lags = [k for k in _LAGS if k <= n // 8]
+    rho = [float(np.sum(e[k:] * e[:-k])) / total * n / (n - k) for k in range(1, max(lags, default=0) + 1)]
+    sums = [(sum(rho[:k]), 3.0 * np.sqrt(k / (3.0 * n))) for k in lags]
+    return 1.0 + 2.0 * max((found for found, doubt in sums if found > doubt), default=0.0)
+
+
 def _whitener(C: Array) -> _Whitener:
     root = _inverse(np.linalg.cholesky(C))
     return _Whitener(root, _inverse(C[:, :3, :3]), _inverse(C[:, 3:, 3:]))
@@ -235,20 +268,30 @@ def _inverse(A: NDArray[Any]) -> Array:
 def fit(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Array | None = None) -> Fitted:
     """Fit from ``start``. The noise factors begin at ``factors`` and are refined where ``params.rescale`` says so.
 
+    Residuals show a correlation in time only once there are many; until then ``params.least_colour`` stands for it.
+
     Raises:
         ValueError: fewer than three poses.
     """
     if len(poses) < 3:
         raise ValueError(f"{len(poses)} poses, three at least are needed")
-    problem = _Problem(poses, prior, params, np.ones(2) if factors is None else factors)
+    least = np.sqrt(np.full(2, params.least_colour))
+    problem = _Problem(poses, prior, params, least if factors is None else factors)
+    problem.redescend = False
     here, steps, done = _descend(problem, problem.at(start), params.max_steps)
+    problem.redescend = True
+    here, more, done = _descend(problem, problem.at(here.chart), params.max_steps)
+    steps += more
+    plain, colour = problem.factors / least, least**2
     if params.rescale and len(poses) >= _FEWEST_FOR_FACTORS:
         for _ in range(2):
-            problem.factors = problem.rescaled(here, _inverse(problem.normal(here)[0]))
+            plain = problem.rescaled(here, _inverse(problem.normal(here)[0]))
+            colour = np.maximum(problem.colour(here), params.least_colour)
+            problem.factors = plain * np.sqrt(colour)
             here, more, done = _descend(problem, problem.at(here.chart), params.max_steps)
             steps += more
     P = _inverse(problem.normal(here)[0])
-    return Fitted(here.chart, P, here.cost, here.d, here.weights, problem.factors, steps, done)
+    return Fitted(here.chart, P, here.cost, here.d, here.weights, plain, colour, steps, done)
 
 
 def cost(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: Array) -> float:

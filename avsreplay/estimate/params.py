@@ -13,6 +13,7 @@ from avsreplay.geometry import Array
 
 __all__ = ["Adaptation", "EstimatorParams", "NoiseSource", "Start"]
 
+_MOST_ALIKE = 50.0  # scans: a view that does not turn would never say anything new
 _POSITIVE = (
     "torque_noise_radps15",
     "force_noise_mps15",
@@ -76,6 +77,10 @@ class EstimatorParams:
     r_floor: float = 1e-6
     # |sigma| stays below 1 minus this
     sigma_margin: float = 0.01
+    # share of a registration's error that stays while the view turns little, its variance over the whole
+    correlated_share: float = 0.1
+    # how far the view turns until that share has changed [rad]
+    correlated_rad: float = 0.4
     # how it begins: a given belief (near), the fit (cold), the paper's filter from zero (paper); auto: near where given
     start: Start = Start.AUTO
     # cold: the fit is repeated when the healthy poses have grown by this share
@@ -104,6 +109,8 @@ class EstimatorParams:
                 raise ValueError(f"{name} is {value}, must be positive and finite")
         if not 0.0 < self.sigma_margin < 0.5:
             raise ValueError(f"sigma_margin is {self.sigma_margin}, must be in (0, 0.5)")
+        if not (0.0 <= self.correlated_share <= 1.0 and 0.0 <= self.correlated_rad < math.inf):
+            raise ValueError(f"correlated_share is {self.correlated_share}, correlated_rad is {self.correlated_rad}")
         if self.window < 6 or not 0.0 <= self.refit_growth <= 1.0:
             raise ValueError(f"window is {self.window} (6 at least), refit_growth is {self.refit_growth} (0 to 1)")
 
@@ -119,6 +126,14 @@ class EstimatorParams:
             "start_varrho_1s_m": 0.25,
         }
         return replace(self, **{k: f * extent_m for k, f in auto.items() if getattr(self, k) is None})
+
+    def colour(self, turn_rad: float) -> float:
+        """How many times less than white ones poses say whose view turns by ``turn_rad`` from one to the next.
+
+        Neighbours share ``correlated_share`` of their variance over ``correlated_rad``: 1 + 2 sum of correlations.
+        """
+        scans = self.correlated_rad / max(turn_rad, self.correlated_rad / _MOST_ALIKE)
+        return 1.0 + 2.0 * self.correlated_share * scans
 
     @property
     def R0(self) -> Array:

@@ -65,7 +65,7 @@ def spread(poses: Poses, fitted: Fitted, prior: Prior, params: FitParams) -> Spr
 def _bent(poses: Poses, fitted: Fitted, prior: Prior, params: FitParams, ray: Array) -> bool:
     normal = 0.5 * _TRIAL**2
     for side in (_TRIAL, -_TRIAL):
-        rise = cost(poses, fitted.chart.moved(side * ray), prior, params, fitted.factors) - fitted.half_chi2
+        rise = cost(poses, fitted.chart.moved(side * ray), prior, params, fitted.effective) - fitted.half_chi2
         if not normal / params.bend_max < rise < normal * params.bend_max:
             return True
     return False
@@ -73,7 +73,7 @@ def _bent(poses: Poses, fitted: Fitted, prior: Prior, params: FitParams, ray: Ar
 
 def _held(poses: Poses, fitted: Fitted, prior: Prior, params: FitParams, ray: Array, row: Array, side: float) -> Chart:
     pin = Pin(fitted.chart, row, side, _PIN_1S)
-    return pinned(poses, fitted.chart.moved(side * ray), prior, params, fitted.factors, pin)
+    return pinned(poses, fitted.chart.moved(side * ray), prior, params, fitted.effective, pin)
 
 
 def belief_at(found: Spread, t_ns: int, after_s: float) -> Belief:

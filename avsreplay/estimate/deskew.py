@@ -1,0 +1,59 @@
+"""Motion inside a scan: points measured at their own instants carried to the scan's instant by the predicted motion."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.estimate.arc import Path
+from avsreplay.estimate.estimator import Prediction
+from avsreplay.estimate.motion import advance, flow
+from avsreplay.geometry import Array
+from avsreplay.records import State
+
+__all__ = ["deskew"]
+
+_KNOTS = 33  # instants the motion is worked out at; between them rotation and position go straight
+
+
+def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) -> Array:
+    """Points (n, 3) in {A} as they would be if all were measured at the scan's instant.
+
+    A point on the target moves with it: p(0) = T_ac(0) T_ac(t)^-1 p(t), by the prior's motion. Its error is that of
+    the predicted rate and velocity times the span of the scan, not the motion itself.
+
+    Args:
+        points: (n, 3) [m].
+        times_s: (n,) instant of each relative to the scan's [s].
+        prediction: the scan's prior.
+
+    Raises:
+        ValueError: shapes differ, or a time is not finite.
+    """
+    points, times = np.asarray(points, dtype=np.float64), np.asarray(times_s, dtype=np.float64)
+    if points.shape != (len(times), 3) or not np.all(np.isfinite(times)):
+        raise ValueError(f"points {points.shape} and times {times.shape} do not fit, or a time is not finite")
+    if not len(times) or float(np.ptp(times)) == 0.0 == float(times[0]):
+        return points
+    knots = np.linspace(min(float(times.min()), 0.0), max(float(times.max()), 0.0), _KNOTS)
+    rotations, offsets = _back(prediction.belief.x, knots)
+    place = np.clip((times - knots[0]) / (knots[1] - knots[0]), 0.0, _KNOTS - 1.0)
+    low = np.minimum(place.astype(int), _KNOTS - 2)
+    part = (place - low)[:, None]
+    carried = [np.einsum("nij,nj->ni", rotations[k], points) + offsets[k] for k in (low, low + 1)]
+    return np.asarray((1.0 - part) * carried[0] + part * carried[1])
+
+
+def _back(x: State, knots: Array) -> tuple[Array, Array]:
+    """R (k, 3, 3) and offset (k, 3) of T_ac(0) T_ac(t)^-1 at ``knots`` about now."""
+    first = float(knots[0])
+    begin = advance(x, flow(x.w_b, x.sigma, first), first)
+    here = Path(begin, float(knots[-1] - first)).at(knots - first)
+    A_t, now = geometry.matrix(here.q), x.T_ac
+    q_ac = geometry.multiply(here.q, x.q_bc)
+    t_ac = x.r_a + knots[:, None] * x.v_a + A_t @ x.c_b
+    R = now.R @ np.swapaxes(geometry.matrix(q_ac), -1, -2)
+    return R, now.t - np.einsum("kij,kj->ki", R, t_ac)

@@ -1,0 +1,109 @@
+"""A reference for logs without truth: one fit over all poses, forward and backward, as a function of time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avsreplay.errors import UsageError
+from avsreplay.estimate.arc import Path
+from avsreplay.estimate.chart import Chart, to_chart
+from avsreplay.estimate.cold import poses_of, prior_of, rough_state
+from avsreplay.estimate.fit import FitParams, Fitted, Poses, fit
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.start import PoseFix
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import State
+
+__all__ = ["Reference", "reference_fit"]
+
+_FEWEST = 4
+_FIRST_TURN = np.pi  # the window begins at half a turn and doubles
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """The motion that fits all poses best.
+
+    Attributes:
+        fitted: the fit, residuals and all.  epoch_ns: its epoch, the first pose.  at: instant [ns] -> state.
+    """
+
+    fitted: Fitted
+    epoch_ns: int
+    at: Callable[[int], State]
+
+
+def reference_fit(
+    t_ns: Sequence[int],
+    poses: Sequence[Pose],
+    covariances: Sequence[Array] | None,
+    extent_m: float,
+    params: EstimatorParams | None = None,
+) -> Reference:
+    """Fit the whole of a log's poses T_ac, in time order.
+
+    Args:
+        t_ns: instants, ascending.
+        poses: T_ac.
+        covariances: (6, 6) each, of d = [theta; v] in {C}; None takes R0 for all (the residuals rescale it).
+        extent_m: bounding diagonal of the target [m].
+        params: the estimator's; None is the default.
+
+    Raises:
+        UsageError: fewer than four poses.
+    """
+    if len(poses) < _FEWEST:
+        hint = "a reference needs four healthy poses at least"
+        raise UsageError(f"only {len(poses)} poses to fit a reference to", where="--reference fit", hint=hint)
+    settings = (params or EstimatorParams()).resolved(extent_m)
+    fixes = tuple(
+        PoseFix(t, pose, C)
+        for t, pose, C in zip(t_ns, poses, covariances or [_plain(settings)] * len(poses), strict=True)
+    )
+    fitted = _grown(poses_of(fixes), to_chart(rough_state(fixes)), settings)
+    return Reference(fitted, fixes[0].t_ns, _motion(fitted.x, fixes[0].t_ns, fixes[-1].t_ns))
+
+
+def _plain(params: EstimatorParams) -> Array:
+    """R0 as a covariance of d = [theta; v]."""
+    variances = np.diagonal(params.R0)
+    return np.diag(np.concatenate([4.0 * variances[3:], variances[:3]]))
+
+
+def _grown(poses: Poses, start: Chart, params: EstimatorParams) -> Fitted:
+    """The fit over half a turn, a turn, two, ..., all, each from the last."""
+    prior, rules = prior_of(poses, params), FitParams(max_steps=60)
+    chart = start
+    for count in _windows(poses, start):
+        chart = fit(poses.upto(count), chart, prior, replace(rules, rescale=False)).chart
+    return fit(poses, chart, prior, rules)
+
+
+def _windows(poses: Poses, start: Chart) -> list[int]:
+    """How many poses each growing window holds, short of all."""
+    rate = float(np.linalg.norm(start.w_c))
+    span = _FIRST_TURN / rate if rate > 0.0 else np.inf
+    counts = []
+    while span < poses.times_s[-1]:
+        count = int(np.searchsorted(poses.times_s, span, side="right"))
+        if count >= _FEWEST:
+            counts.append(count)
+        span *= 2.0
+    return counts
+
+
+def _motion(x: State, first_ns: int, last_ns: int) -> Callable[[int], State]:
+    path = Path(x, (last_ns - first_ns) * 1e-9)
+
+    def at(t_ns: int) -> State:
+        """The state at an instant within the poses' span."""
+        h = (t_ns - first_ns) * 1e-9
+        if not 0 <= t_ns - first_ns <= last_ns - first_ns:
+            raise ValueError(f"t_ns is {t_ns}, outside the reference's span {first_ns} to {last_ns}")
+        here = path.at(np.array([h]))
+        return State(here.q[0], here.w[0], x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+
+    return at

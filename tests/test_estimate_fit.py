@@ -1,0 +1,304 @@
+"""The maximum-likelihood fit: its chart, its derivatives, its optimum, its covariance, its cold start, its reference."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tumbling
+from scipy.stats import chi2
+
+from avsreplay import geometry
+from avsreplay.errors import UsageError
+from avsreplay.estimate import Estimator, EstimatorParams
+from avsreplay.estimate.arc import arc
+from avsreplay.estimate.chart import Chart, retract, to_chart, to_errors, to_state
+from avsreplay.estimate.cold import poses_of, prior_of, rough_state
+from avsreplay.estimate.fit import FitParams, Pin, Poses, Prior, cost, fit, pinned
+from avsreplay.estimate.layout import boxminus
+from avsreplay.estimate.motion import flow, transition
+from avsreplay.estimate.params import Start
+from avsreplay.estimate.reference import reference_fit
+from avsreplay.estimate.relabel import nees
+from avsreplay.estimate.spread import belief_at, spread
+from avsreplay.estimate.start import PoseFix
+from avsreplay.geometry import Pose
+from avsreplay.records import Belief, State
+
+WHITE = EstimatorParams(correlated_share=0.0).resolved(2.0)
+
+
+def seen(world: tumbling.World, seed: int, pos_m: float = 0.01, rot_deg: float = 1.0) -> tuple[PoseFix, ...]:
+    rng = np.random.Generator(np.random.PCG64([seed, 7]))
+    found = [tumbling.alignment(x.T_ac, rng, pos_m, np.radians(rot_deg)) for x in world.states]
+    return tuple(
+        PoseFix(round(t * 1e9), a.T_ac, a.covariance) for t, a in zip(world.times, found, strict=True) if a is not None
+    )
+
+
+def grown(fixes: tuple[PoseFix, ...], *counts: int):
+    """The fit over growing windows; poses, fit and prior of the last."""
+    chart = to_chart(rough_state(fixes))
+    for count in counts:
+        poses = poses_of(fixes[:count])
+        prior = prior_of(poses, WHITE)
+        fitted = fit(poses, chart, prior, FitParams())
+        chart = fitted.chart
+    return poses, fitted, prior
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_chart_and_state_are_inverse(seed: int) -> None:
+    x = tumbling.draw(seed, mu_deg=80.0, seconds=1.0).states[0]
+    c = to_chart(x)
+    y = np.random.Generator(np.random.PCG64(seed)).normal(size=20) * 0.3
+    assert np.abs(boxminus(to_state(c), x)).max() < 1e-14
+    assert np.abs(c.moved(y).minus(c) - y).max() < 1e-13
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_to_errors_is_the_derivative_of_to_state(seed: int) -> None:
+    x, eps = tumbling.draw(seed, mu_deg=80.0, seconds=1.0).states[0], 1e-6
+    c = to_chart(x)
+    slope = [(boxminus(to_state(c.moved(eps * u)), x) - boxminus(to_state(c.moved(-eps * u)), x)) for u in np.eye(20)]
+    assert np.abs(np.transpose(slope) / (2 * eps) - to_errors(c)).max() < 1e-8
+
+
+def test_any_matrix_is_a_body() -> None:
+    """The triangle inequalities need no guarding: every M gives |sigma| < 1, moments that a mass could have."""
+    rng = np.random.Generator(np.random.PCG64(5))
+    base = to_chart(tumbling.draw(0, seconds=1.0).states[0])
+    for _ in range(50):
+        y = np.zeros(20)
+        y[12:17] = rng.normal(size=5) * 2.0
+        s1, s2 = to_state(base.moved(y)).sigma
+        moments = np.array([1 - s2, 1 + s1, 1 + s1 * s2])
+        assert np.all(moments > 0.0)
+        assert 2 * moments.max() < moments.sum()
+
+
+def test_equal_moments_are_no_singular_point() -> None:
+    """A sphere's chart moves smoothly through M = 0, where sigma and mu jump."""
+    sphere = Chart(
+        np.array([0, 0, 0, 1.0]), np.array([0.1, 0, 0]), *[np.zeros(3)] * 2, np.zeros((3, 3)), *[np.ones(3)], np.eye(3)
+    )
+    y = np.zeros(20)
+    y[12:17] = 1e-3
+    for side in (1.0, -1.0):
+        x = to_state(sphere.moved(side * y))
+        assert np.abs(to_chart(x).minus(sphere) - side * y).max() < 1e-3
+        assert np.all(np.isfinite(to_errors(sphere.moved(side * y))))
+
+
+def test_retraction_carries_mean_and_covariance() -> None:
+    x = tumbling.draw(2, seconds=1.0).states[0]
+    d = np.random.Generator(np.random.PCG64(1)).normal(size=20) * 1e-5
+    P = np.diag(np.linspace(1, 2, 20)) * 1e-6
+    moved, carried = retract(x, P, d)
+    assert np.abs(boxminus(moved, x) - d).max() < 1e-8
+    assert np.abs(carried - P).max() < 1e-3 * np.abs(P).max()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_arc_is_the_motion_and_its_derivative(seed: int) -> None:
+    world = tumbling.draw(seed, rate=0.3, seconds=60.0)
+    x = world.states[0]
+    path = arc(x, world.times)
+    for k in (0, 1, 50, 120):
+        there, h = world.states[k], float(world.times[k])
+        assert float(geometry.angle(geometry.multiply(geometry.conjugate(there.q_ab), path.q[k]))) < 1e-9
+        assert np.abs(path.w[k] - there.w_b).max() < 1e-10
+        Phi = transition(flow(x.w_b, x.sigma, h), x.sigma, h)
+        assert np.abs(path.S[k] - Phi[:6][:, [0, 1, 2, 3, 4, 5, 12, 13]]).max() < 1e-9 * (1 + np.abs(Phi).max())
+
+
+def test_the_step_follows_the_cost() -> None:
+    """The normal equations' right side is minus the gradient of the cost, prior and robust weights included."""
+    from avsreplay.estimate.fit import _Problem
+
+    fixes = list(seen(tumbling.draw(3, seconds=20.0), 3))
+    fixes[7] = replace(fixes[7], T_ac=fixes[7].T_ac @ Pose(geometry.exp([0.3, 0, 0]), np.array([0.2, 0, 0])))
+    poses = poses_of(tuple(fixes))
+    prior = prior_of(poses, WHITE)
+    c = to_chart(tumbling.draw(3, seconds=20.0).states[0]).moved(np.full(20, 1e-3))
+    pin = Pin(c, np.arange(20.0), 0.3, 0.5)
+    problem = _Problem(poses, prior, FitParams(), np.array([1.3, 0.7]), pin)
+    _, b = problem.normal(problem.at(c))
+    for k in range(20):
+        step = np.zeros(20)
+        step[k] = 1e-6
+        slope = (problem.at(c.moved(step)).cost - problem.at(c.moved(-step)).cost) / 2e-6
+        assert b[k] == pytest.approx(-slope, rel=2e-2, abs=2e-2 * np.abs(b).max())
+
+
+def test_exact_poses_give_the_exact_motion() -> None:
+    world = tumbling.draw(1, seconds=60.0)
+    fixes = tuple(
+        PoseFix(round(t * 1e9), x.T_ac, np.eye(6) * 1e-8) for t, x in zip(world.times, world.states, strict=True)
+    )
+    poses = poses_of(fixes)
+    flat = Prior(to_chart(rough_state(fixes)), np.full(20, 1e4))
+    start = to_chart(world.states[0]).moved(np.full(20, 2e-3))
+    fitted = fit(poses, start, flat, FitParams(rescale=False, gain_tol=1e-9))
+    assert np.abs(to_chart(world.states[0]).minus(fitted.chart)).max() < 1e-6
+    assert fitted.converged
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 4, 10, 14])
+def test_fit_from_nothing_finds_the_truth_within_its_covariance(seed: int) -> None:
+    world = tumbling.draw(seed)
+    _, fitted, _ = grown(seen(world, seed), 21, 41, 81, 141, 201)
+    assert nees(Belief(0, fitted.x, fitted.P), world.states[0]) < chi2.ppf(0.9999, 20)
+    assert fitted.factors == pytest.approx([1.0, 1.0], abs=0.12)
+    assert fitted.colour == pytest.approx([1.0, 1.0])
+
+
+def test_fit_is_the_optimum_from_any_side() -> None:
+    world = tumbling.draw(4)
+    poses, fitted, prior = grown(seen(world, 4), 21, 81, 201)
+    again = fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False), fitted.effective)
+    assert again.half_chi2 == pytest.approx(fitted.half_chi2, abs=0.02)
+    assert cost(poses, to_chart(world.states[0]), prior, FitParams(), fitted.effective) > fitted.half_chi2
+
+
+def test_false_poses_are_weighted_down() -> None:
+    world = tumbling.draw(4)
+    fixes = list(seen(world, 4))
+    for k in range(5, 200, 20):
+        fixes[k] = replace(fixes[k], T_ac=fixes[k].T_ac @ Pose(geometry.exp([2.0, 0.5, 0]), np.array([1.0, 0, 0])))
+    _, fitted, _ = grown(tuple(fixes), 21, 41, 81, 201)
+    assert np.all(fitted.weights[5:200:20] < 0.05)
+    assert np.sum(fitted.weights == 1.0) == 201 - 10
+    assert nees(Belief(0, fitted.x, fitted.P), world.states[0]) < chi2.ppf(0.9999, 20)
+
+
+def test_a_registration_that_claims_too_little_is_rescaled() -> None:
+    world = tumbling.draw(4)
+    fixes = tuple(replace(f, C=f.C * np.repeat([1 / 9, 1 / 4], 3)[:, None] * np.eye(6)) for f in seen(world, 4))
+    _, fitted, _ = grown(fixes, 21, 81, 201)
+    assert fitted.factors == pytest.approx([3.0, 2.0], rel=0.12)
+
+
+def test_residuals_that_stay_widen_the_covariance() -> None:
+    """First-order errors with a correlation of 0.8 say (1 + 0.8) / (1 - 0.8) = 9 times less."""
+    world, rng = tumbling.draw(4, hz=5.0), np.random.Generator(np.random.PCG64(2))
+    sizes, e, fixes = np.repeat([np.radians(0.5), 0.005], 3), np.zeros(6), []
+    for t, x in zip(world.times, world.states, strict=True):
+        e = 0.8 * e + 0.6 * rng.normal(size=6)
+        pose = x.T_ac @ Pose(geometry.exp(sizes[:3] * e[:3]), sizes[3:] * e[3:])
+        fixes.append(PoseFix(round(t * 1e9), pose, np.diag(sizes**2)))
+    _, fitted, _ = grown(tuple(fixes), 51, 101, 201, 501)
+    assert np.all(fitted.colour > 4.0)
+    assert nees(Belief(0, fitted.x, fitted.P), world.states[0]) < 4 * 20
+
+
+def test_a_bent_likelihood_is_seen_and_mended() -> None:
+    """Seven bodies seen for 40 s: the curvature alone is far too sure, the mended covariance is not."""
+    plain, mended = [], []
+    for seed in (3, 6, 9, 12, 15, 16, 2):
+        world = tumbling.draw(seed, seconds=40.0)
+        poses, fitted, prior = grown(seen(world, seed), 21, 41, 81)
+        found = spread(poses, fitted, prior, FitParams())
+        assert not found.settled
+        plain.append(nees(belief_at(replace(found, bends=()), 0, 40.0), world.states[-1]) / 20)
+        mended.append(nees(belief_at(found, 0, 40.0), world.states[-1]) / 20)
+    assert np.mean(plain) > 3.0
+    assert np.mean(mended) < 1.6
+    assert max(mended) < 3.0
+
+
+def test_a_long_arc_settles() -> None:
+    world = tumbling.draw(4)
+    poses, fitted, prior = grown(seen(world, 4), 21, 81, 201)
+    found = spread(poses, fitted, prior, FitParams())
+    assert found.settled
+    here = belief_at(found, 5, 100.0)
+    assert nees(here, world.states[-1]) == pytest.approx(nees(Belief(0, fitted.x, fitted.P), world.states[0]), rel=0.2)
+
+
+def test_a_pinned_fit_holds_its_direction_and_the_rest_gives() -> None:
+    world = tumbling.draw(4, seconds=60.0)
+    poses, fitted, prior = grown(seen(world, 4), 21, 81, 121)
+    row = np.zeros(20)
+    row[12] = 1.0
+    shift = 2.0 * np.sqrt(fitted.P_chart[12, 12])
+    held = pinned(
+        poses, fitted.chart, prior, FitParams(), fitted.effective, Pin(fitted.chart, row, shift, 0.01 * shift)
+    )
+    assert held.minus(fitted.chart)[12] == pytest.approx(shift, rel=0.02)
+    rise = cost(poses, held, prior, FitParams(), fitted.effective) - fitted.half_chi2
+    assert rise == pytest.approx(2.0, rel=0.5)
+
+
+def cold(seed: int, seconds: float = 100.0):
+    world = tumbling.draw(seed, seconds=seconds)
+    estimator = Estimator(replace(WHITE, start=Start.COLD), None, 2.0)
+    rng = np.random.Generator(np.random.PCG64([seed, 7]))
+    track = estimator.initial(0, world.states[0].T_ac)
+    for t, x in zip(world.times, world.states, strict=True):
+        prediction = estimator.predict(track, round(t * 1e9))
+        alignment = tumbling.alignment(x.T_ac, rng, 0.01, np.radians(1.0))
+        track = estimator.update(track, prediction, estimator.innovate(prediction, alignment), 1)
+        yield track, x
+
+
+@pytest.mark.parametrize("seed", [4, 14])
+def test_cold_start_hands_over_and_stays_honest(seed: int) -> None:
+    modes, sizes = [], []
+    for track, x in cold(seed):
+        modes.append(track.mode)
+        if len(modes) > 40:
+            sizes.append(nees(track.belief, x) / 20)
+    assert modes[:2] == ["start", "start"]
+    assert modes[2] == "fit"
+    assert modes[-1] == "filter"
+    assert modes == sorted(modes, key=["start", "fit", "filter"].index)
+    assert max(sizes) < 3.0
+    assert track.fixes == ()
+
+
+def test_reference_needs_no_truth_and_is_close_to_it() -> None:
+    world = tumbling.draw(14)
+    fixes = seen(world, 14)
+    ref = reference_fit([f.t_ns for f in fixes], [f.T_ac for f in fixes], None, 2.0)
+    gaps = [np.linalg.norm(ref.at(f.t_ns).T_ac.t - x.T_ac.t) for f, x in zip(fixes, world.states, strict=True)]
+    assert np.sqrt(np.mean(np.square(gaps))) < 0.004
+    with pytest.raises(ValueError, match="outside"):
+        ref.at(fixes[-1].t_ns + 1)
+    with pytest.raises(UsageError, match="only 3 poses"):
+        reference_fit([0, 1, 2], [fixes[0].T_ac] * 3, None, 2.0)
+
+
+def test_start_near_needs_a_belief() -> None:
+    with pytest.raises(UsageError, match="near start"):
+        Estimator(EstimatorParams(start=Start.NEAR), None, 1.0)
+
+
+def test_too_few_poses() -> None:
+    fixes = seen(tumbling.draw(0, seconds=1.0), 0)[:2]
+    poses = poses_of(fixes)
+    with pytest.raises(ValueError, match="2 poses"):
+        fit(poses, to_chart(rough_state(fixes)), prior_of(poses, WHITE), FitParams())
+
+
+def test_poses_can_be_cut_and_thinned() -> None:
+    poses = poses_of(seen(tumbling.draw(0, seconds=10.0), 0))
+    assert isinstance(poses, Poses)
+    assert len(poses.upto(5)) == 5
+    assert len(poses.every(2)) == 11
+
+
+def test_a_body_at_rest_is_no_trouble() -> None:
+    """No turn, nothing to tell inertia by: the fit stays with its prior and says so by its covariance."""
+    x = State([0, 0, 0, 1.0], np.zeros(3), [0, 0, 5.0], np.zeros(3), np.zeros(2), np.zeros(3), [0, 0, 0, 1.0])
+    rng = np.random.Generator(np.random.PCG64(0))
+    estimator = Estimator(WHITE, None, 2.0)
+    track = estimator.initial(0, x.T_ac)
+    for k in range(40):
+        prediction = estimator.predict(track, k * 500_000_000)
+        seen_pose = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, 0.01, np.radians(1.0)))
+        track = estimator.update(track, prediction, seen_pose, 1)
+    assert track.mode == "fit"
+    assert np.linalg.norm(track.belief.x.T_ac.t - x.T_ac.t) < 0.02
+    assert np.sqrt(track.belief.P[12, 12]) > 0.2
