@@ -3,6 +3,7 @@
 import json
 import math
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -125,6 +126,23 @@ def test_draws_follow_their_law_and_do_not_disturb_each_other(tmp_path):
 def test_kinds_of_draws(tmp_path, kind, more, law):
     text = f'repeats = 200\n[[draw]]\nkey = "scenario.rate_hz"\nkind = "{kind}"\n{more}\n'
     assert law([t["rate_hz"] for t in tables(plan_of(tmp_path, text))])
+
+
+def test_scenarios_are_an_axis(tmp_path):
+    (tmp_path / "sub").mkdir()
+    (tmp_path / "sub" / "m.ply").write_bytes(b"one")
+    (tmp_path / "sub" / "a.toml").write_text('rate_hz = 1.0\n[target]\nmodel = "m.ply"\n')
+    (tmp_path / "b.toml").write_text("rate_hz = 2.0\n")
+    text = 'scenarios = ["sub/a.toml", "b.toml"]\nrepeats = 2\n[set]\n"scenario.duration_s" = 4.0\n'
+    plan = plan_of(tmp_path, text)
+    points = list(plan.points())
+    assert [p.values["scenario"] for p in points] == ["sub/a.toml", "b.toml"] * 2
+    assert [t["rate_hz"] for t in tables(plan)] == [1.0, 2.0] * 2
+    assert [Path(p.task.folder).name for p in points[:2]] == ["sub", tmp_path.name]
+    before = [p.task.id for p in points]
+    (tmp_path / "sub" / "m.ply").write_bytes(b"two")
+    after = [p.task.id for p in plan_of(tmp_path, text).points()]
+    assert [a == b for a, b in zip(before, after, strict=True)] == [False, True] * 2
 
 
 def test_logs_are_an_axis(tmp_path):

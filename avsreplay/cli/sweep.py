@@ -125,6 +125,7 @@ def _print(summary: SweepSummary) -> None:
             console.print(_cell_table(number, cell))
     if summary.detector is not None and summary.detector.harmful:
         console.print(_detector_table(summary.detector))
+        console.print(_kinds_table(summary.detector))
 
 
 def _cell_table(number: int, cell: Cell) -> Table:
@@ -171,4 +172,17 @@ def _detector_table(detector: Detector) -> Table:
         if curve is not None:
             threshold, detected = curve.at_one_percent
             table.add_row(f"{name} alone", "", "", f"{curve.area:.4f}", f"{threshold:.4g}", f"{detected:.2%}")
+    return table
+
+
+def _kinds_table(detector: Detector) -> Table:
+    from rich.markup import escape
+    from rich.table import Table
+
+    heads = ("fault", "scans", "flagged", "worst position error [m]", "worst rotation error [deg]")
+    table = Table(*map(escape, heads), title="by kind of fault, over all runs", title_justify="left")
+    for name, kind in detector.kinds.items():
+        flagged = "" if kind.flagged is None else f"{kind.flagged.share:.2%}"
+        worst = ("" if v is None else f"{v:.4g}" for v in (kind.worst_pos_err_m, kind.worst_rot_err_deg))
+        table.add_row(name, str(kind.scans), flagged, *worst)
     return table

@@ -102,6 +102,8 @@ class Campaign:
     repeats: int = 1
     # scenario file beside this one; empty: the built-in scenario
     scenario: str = ""
+    # several scenario files, each one a value of the axis "scenario"
+    scenarios: tuple[str, ...] = ()
     # model of the target in place of the scenario's or the logs' own
     model: str = ""
     # recorded logs instead of a scenario, each one a value of the axis "log"
@@ -122,8 +124,8 @@ class Campaign:
             raise ValueError(f"repeats = {self.repeats} must lie between 1 and {MAX_REPEATS}")
         if not 0 <= self.seed < 1 << 63:
             raise ValueError(f"seed = {self.seed} must lie between 0 and 2^63")
-        if self.logs and self.scenario:
-            raise ValueError("scenario and logs exclude each other")
+        if sum(map(bool, (self.logs, self.scenario, self.scenarios))) > 1:
+            raise ValueError("scenario, scenarios and logs exclude each other")
         _check_set(self.set)
         self._check_names()
 

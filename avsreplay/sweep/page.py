@@ -131,7 +131,16 @@ def _detector(detector: Detector) -> str:
             rows.append([f"{name} alone", f"{detected:.2%}", "at most 1 %", f"{threshold:.4g}", f"{curve.area:.4f}"])
     heads = ["test", "harmful scans flagged", "other scans flagged", "threshold", "area under the curve"]
     said = f"<p>{detector.harmful} harmful scans, {detector.other} others, of all runs together.</p>"
-    return said + _table(heads, rows) + _roc(detector)
+    return said + _table(heads, rows) + _roc(detector) + _kinds(detector)
+
+
+def _kinds(detector: Detector) -> str:
+    heads = ["fault", "scans", "flagged", "worst position error [m]", "worst rotation error [deg]"]
+    rows = []
+    for name, kind in detector.kinds.items():
+        worst = ("" if v is None else f"{v:.4g}" for v in (kind.worst_pos_err_m, kind.worst_rot_err_deg))
+        rows.append([name, str(kind.scans), _share(kind.flagged), *worst])
+    return _table(heads, rows)
 
 
 def _roc(detector: Detector) -> str:

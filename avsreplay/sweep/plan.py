@@ -23,13 +23,14 @@ import avsreplay
 from avsreplay import geometry, settings
 from avsreplay.config import RunConfig
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.simulate import scenario_of
+from avsreplay.simulate import load_scenario, scenario_of
 from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
 from avsreplay.sweep.toml_text import toml_text, toml_value
 
 __all__ = ["Plan", "Point", "Task", "expand"]
 
 FORMAT = 1
+_NAMED = ("scenario", "log", "case")  # axes that choose a file or a case, not a key
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +76,7 @@ class Plan:
 
     loaded: LoadedCampaign
     cells: tuple[Mapping[str, Any], ...]
-    _base: Mapping[str, Any]
+    _bases: Mapping[str, Mapping[str, Any]]
     _run: tuple[str, ...]
     _inputs: Mapping[str, str]
 
@@ -94,31 +95,26 @@ class Plan:
     def _task(self, values: Mapping[str, Any], repeat: int) -> Task:
         campaign, folder = self.loaded.campaign, self.loaded.folder
         of_case: Mapping[str, Any] = next((case.set for case in campaign.case if case.name == values.get("case")), {})
-        every = {**campaign.set, **of_case, **{k: v for k, v in values.items() if k not in ("log", "case")}}
-        scenario = "" if campaign.logs else self._scenario(every, repeat)
+        every = {**campaign.set, **of_case, **{k: v for k, v in values.items() if k not in _NAMED}}
+        name = values.get("scenario", campaign.scenario)
+        home = (folder / name).parent
+        scenario = "" if campaign.logs else self._scenario(name, every, repeat)
         run = (f"{k[4:]}={toml_value(v)}" for k, v in every.items() if k.startswith("run."))
         log = str(folder / values["log"]) if campaign.logs else ""
         model = str(folder / campaign.model) if campaign.model else ""
         assignments = (*self._run, *run)
-        inputs = [self._inputs.get(name, "") for name in (log, model or self._scenario_model(scenario))]
+        inputs = [self._inputs.get(path, "") for path in (log, model or _model_of(scenario, home))]
         content = [FORMAT, avsreplay.__version__, scenario, inputs, assignments, campaign.scans]
         digest = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:24]
-        return Task(digest, scenario, str(self._scenario_folder()), log, model, assignments, campaign.scans)
+        return Task(digest, scenario, str(home), log, model, assignments, campaign.scans)
 
-    def _scenario(self, every: Mapping[str, Any], repeat: int) -> str:
-        table = dict(self._base)
+    def _scenario(self, name: str, every: Mapping[str, Any], repeat: int) -> str:
+        table = dict(self._bases[name])
         table["seed"] = _seed(self.loaded.campaign, repeat)
         for key, value in every.items():
             if key.startswith("scenario."):
                 table = _placed(table, key.split(".")[1:], value, key, self.loaded.name)
         return toml_text(table)
-
-    def _scenario_folder(self) -> Path:
-        return (self.loaded.folder / self.loaded.campaign.scenario).parent
-
-    def _scenario_model(self, text: str) -> str:
-        model = settings.parse(text, "scenario").table.get("target", {}).get("model") if text else None
-        return str(self._scenario_folder() / model) if model else ""
 
 
 def expand(loaded: LoadedCampaign) -> Plan:
@@ -130,23 +126,25 @@ def expand(loaded: LoadedCampaign) -> Plan:
     axes: list[list[tuple[str, Any]]] = [[(axis.key, value) for value in axis.values] for axis in campaign.grid]
     if campaign.case:
         axes.insert(0, [("case", case.name) for case in campaign.case])
-    if campaign.logs:
-        axes.insert(0, [("log", log) for log in campaign.logs])
+    for name, files in (("scenario", campaign.scenarios), ("log", campaign.logs)):
+        if files:
+            axes.insert(0, [(name, file) for file in files])
     cells = tuple(dict(chosen) for chosen in itertools.product(*axes))
-    plan = Plan(loaded, cells, _base_table(loaded), _base_run(loaded), _inputs(loaded))
+    bases = _base_tables(loaded)
+    plan = Plan(loaded, cells, bases, _base_run(loaded), _inputs(loaded, bases))
     _try_all(plan, axes)
     return plan
 
 
-def _base_table(loaded: LoadedCampaign) -> Mapping[str, Any]:
-    from avsreplay.simulate import load_scenario
-
+def _base_tables(loaded: LoadedCampaign) -> dict[str, Mapping[str, Any]]:
+    """The scenarios' tables by their names in the campaign; the built-in one's name is empty."""
     campaign = loaded.campaign
-    if campaign.logs:
-        return {}
-    path = loaded.folder / campaign.scenario if campaign.scenario else None
-    scenario = load_scenario(path)
-    return settings.parse(scenario.text, str(path or "built-in scenario")).table
+    names = () if campaign.logs else campaign.scenarios or (campaign.scenario,)
+    return {name: _table(loaded.folder / name if name else None) for name in names}
+
+
+def _table(path: Path | None) -> Mapping[str, Any]:
+    return settings.parse(load_scenario(path).text, str(path or "built-in scenario")).table
 
 
 def _base_run(loaded: LoadedCampaign) -> tuple[str, ...]:
@@ -157,15 +155,19 @@ def _base_run(loaded: LoadedCampaign) -> tuple[str, ...]:
     return tuple(f"{key}={toml_value(value)}" for key, value in _leaves(document.table))
 
 
-def _inputs(loaded: LoadedCampaign) -> dict[str, str]:
-    """Hashes of the files that runs read, by name."""
+def _inputs(loaded: LoadedCampaign, bases: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
+    """Hashes of the files that runs read, by path."""
     campaign = loaded.campaign
-    names = [loaded.folder / name for name in (*campaign.logs, *([campaign.model] if campaign.model else []))]
-    base = loaded.folder / campaign.scenario if campaign.scenario else None
-    model = settings.load(base).table.get("target", {}).get("model") if base else None
-    if model and base:
-        names.append(base.parent / model)
-    return {str(path): _sha256(path) for path in names}
+    paths = {str(loaded.folder / name) for name in (*campaign.logs, campaign.model) if name}
+    texts = {name: toml_text(table) for name, table in bases.items()}
+    paths |= {_model_of(text, (loaded.folder / name).parent) for name, text in texts.items()}
+    return {path: _sha256(Path(path)) for path in sorted(paths - {""})}
+
+
+def _model_of(scenario: str, folder: Path) -> str:
+    """Path of the model that a scenario's text names, empty where it names none."""
+    model = settings.parse(scenario, "scenario").table.get("target", {}).get("model") if scenario else None
+    return str(folder / model) if model else ""
 
 
 def _sha256(path: Path) -> str:

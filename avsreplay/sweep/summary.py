@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 from avsreplay import settings
 from avsreplay.sweep.campaign import Criterion
@@ -23,7 +23,7 @@ from avsreplay.sweep.statistics import (
 )
 from avsreplay.sweep.worker import SCAN_COLUMNS, Outcome
 
-__all__ = ["HEADLINES", "Cell", "Detector", "SweepSummary", "summarise"]
+__all__ = ["HEADLINES", "Cell", "Detector", "KindOfFault", "SweepSummary", "summarise"]
 
 HEADLINES = {
     "pose_healthy.position_m.rmse": "position error, healthy scans [m]",
@@ -62,11 +62,27 @@ class Cell:
 
 
 @dataclass(frozen=True, slots=True)
+class KindOfFault:
+    """The scans of one kind of fault ("none": outside every window).
+
+    Attributes:
+        scans: how many.  flagged: share with gamma 0.
+        worst_pos_err_m, worst_rot_err_deg: of the estimate, over all of them; None without truth.
+    """
+
+    scans: int
+    flagged: Rate | None
+    worst_pos_err_m: float | None
+    worst_rot_err_deg: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class Detector:
     """The fault rule over all scans of all runs.
 
     Attributes:
         harmful, other: scans.  detected, false: shares flagged by the rule in force.  curves: each score by itself.
+        kinds: by the kind of fault.
     """
 
     harmful: int
@@ -74,6 +90,7 @@ class Detector:
     detected: Rate | None
     false: Rate | None
     curves: Mapping[str, Roc | None]
+    kinds: Mapping[str, KindOfFault] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,26 +152,53 @@ def _meets(criterion: Criterion, outcome: Outcome) -> bool:
     return isinstance(value, (int, float)) and criterion.min <= value <= criterion.max
 
 
+class _DetectorFold:
+    """Counts over scans, in any order."""
+
+    PLACE: ClassVar[dict[str, int]] = {name: place for place, name in enumerate(SCAN_COLUMNS)}
+
+    def __init__(self) -> None:
+        self._curves = {name: ScoreHistogram() for name in SCORES}
+        self._flagged: Counter[tuple[bool, bool]] = Counter()
+        self._kinds: Counter[tuple[str, bool]] = Counter()
+        self._worst: dict[tuple[str, str], float] = {}
+
+    def add(self, line: Sequence[Any]) -> None:
+        harmful, flagged = bool(line[self.PLACE["harmful"]]), line[self.PLACE["gamma"]] == 0
+        kind = line[self.PLACE["fault"]] or "none"
+        self._flagged[harmful, flagged] += 1
+        self._kinds[kind, flagged] += 1
+        for name, column in SCORES.items():
+            self._curves[name].add(_score(name, line[self.PLACE[column]]), harmful)
+        for name in ("pos_err_m", "rot_err_deg"):
+            value = line[self.PLACE[name]]
+            if value is not None:
+                self._worst[kind, name] = max(value, self._worst.get((kind, name), 0.0))
+
+    def result(self) -> Detector:
+        counts = {kind: self._flagged[kind, True] + self._flagged[kind, False] for kind in (True, False)}
+        return Detector(
+            harmful=counts[True],
+            other=counts[False],
+            detected=rate(self._flagged[True, True], counts[True]),
+            false=rate(self._flagged[False, True], counts[False]),
+            curves={name: histogram.roc() for name, histogram in self._curves.items()},
+            kinds={kind: self._kind(kind) for kind in sorted({kind for kind, _ in self._kinds})},
+        )
+
+    def _kind(self, kind: str) -> KindOfFault:
+        scans = self._kinds[kind, True] + self._kinds[kind, False]
+        worst = (self._worst.get((kind, name)) for name in ("pos_err_m", "rot_err_deg"))
+        return KindOfFault(scans, rate(self._kinds[kind, True], scans), *worst)
+
+
 def _detector(outcomes: Iterable[Outcome], wanted: set[str]) -> Detector:
-    curves = {name: ScoreHistogram() for name in SCORES}
-    flagged: Counter[tuple[bool, bool]] = Counter()
-    place = {name: SCAN_COLUMNS.index(name) for name in (*SCORES.values(), "harmful", "gamma")}
+    fold = _DetectorFold()
     for outcome in outcomes:
-        if outcome.id not in wanted:
-            continue
-        for line in outcome.scans:
-            harmful = bool(line[place["harmful"]])
-            flagged[harmful, line[place["gamma"]] == 0] += 1
-            for name, column in SCORES.items():
-                curves[name].add(_score(name, line[place[column]]), harmful)
-    counts = {kind: flagged[kind, True] + flagged[kind, False] for kind in (True, False)}
-    return Detector(
-        harmful=counts[True],
-        other=counts[False],
-        detected=rate(flagged[True, True], counts[True]),
-        false=rate(flagged[False, True], counts[False]),
-        curves={name: histogram.roc() for name, histogram in curves.items()},
-    )
+        if outcome.id in wanted:
+            for line in outcome.scans:
+                fold.add(line)
+    return fold.result()
 
 
 def _score(name: str, value: float | None) -> float | None:

@@ -34,7 +34,9 @@ def main() -> None:
     print(f"an outcome: {pickled} bytes over the wire, {size} bytes in the journal")
     print(f"client: {1e3 * line_s:.3f} ms a run to unpack and note it")
     costs = {}
-    for workers, tasks in ((10, 500), (50, 500)) if args.quick else ((10, 1000), (100, 1000), (1000, 2000)):
+    for workers, tasks in (
+        ((10, 500), (50, 500)) if args.quick else ((10, 1000), (100, 1000), (300, 2000), (1000, 3000))
+    ):
         costs[workers] = _scheduler_cost(workers, tasks)
         print(f"{workers} workers: {1e3 * costs[workers]:.3f} ms a run (scheduler, client and idle workers, one core)")
     worst = max(costs.values())
@@ -63,8 +65,14 @@ def _scheduler_cost(workers: int, tasks: int) -> float:
     import dask
     from distributed import Client, LocalCluster, as_completed
 
+    quiet = {
+        "distributed.comm.timeouts.connect": "600s",
+        "distributed.scheduler.worker-ttl": None,
+        "distributed.worker.profile.enabled": False,  # a sampling thread a worker: not what is measured
+        "distributed.admin.system-monitor.interval": "60s",
+    }
     with (
-        dask.config.set({"distributed.comm.timeouts.connect": "600s", "distributed.scheduler.worker-ttl": None}),
+        dask.config.set(quiet),
         LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=False, dashboard_address=":0", memory_limit=None
         ) as cluster,
