@@ -21,21 +21,22 @@ class Memory {
 
   Kept* for_step(double turn, double move) {
     length_ = move + 0.5 * turn * extent_;
-    if (length_ >= longest_) return nullptr;
+    judged_ = filled_;
+    filled_ = length_ < longest_;
+    if (!filled_) return nullptr;
     if (kept_.empty()) kept_.assign((size_t)n_, Kept{0, 0, 0, -1.f, -1});
     return kept_.data();
   }
 
   void was_searched(int64_t searched) {
-    if (used_ && searched > (int64_t)(TOO_OFTEN * (double)n_)) longest_ = 0.5 * length_;
-    used_ = !kept_.empty();
+    if (judged_ && searched > (int64_t)(TOO_OFTEN * (double)n_)) longest_ = 0.5 * length_;
   }
 
  private:
   static constexpr double MESH_UNDER = 0.3, CLOUD_UNDER = 0.1, TOO_OFTEN = 0.6;
   double extent_, longest_, length_ = 0;
   int64_t n_;
-  bool used_ = false;
+  bool filled_ = false, judged_ = false;  // this pass fills the memory; the one before did, so this one can use it
   std::vector<Kept> kept_;
 };
 
