@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import struct
 import zlib
@@ -225,6 +226,11 @@ def test_what_is_no_log_is_one_line(tmp_path: Path, content: bytes) -> None:
 def test_no_such_file(tmp_path: Path) -> None:
     with pytest.raises(UnreadableInput, match="no such file"):
         open_source(tmp_path / "no.mcap")
+    with pytest.raises(UnreadableInput, match="too long"):
+        open_source(tmp_path / ("n" * 5000))
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UnreadableInput, match="neither a file nor a folder"):
+        open_source(tmp_path / "pipe")
 
 
 def test_other_messages_are_what_the_mcap_library_streams(whole: dict[str, Path]) -> None:

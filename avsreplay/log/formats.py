@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import io
 import math
 import re
@@ -23,6 +22,10 @@ __all__ = ["SCAN_FORMATS", "read_points"]
 
 
 _MAX_NPY_HEADER = 4096
+_NPY_HEADER = re.compile(
+    r"\{\s*'descr':\s*'(?P<descr>[^']{1,8})',\s*'fortran_order':\s*(?P<fortran>True|False),"
+    r"\s*'shape':\s*\((?P<shape>(?:\s*\d{1,18}\s*,?){0,8})\s*\),?\s*\}"
+)
 _NPY_KIND = re.compile(r"[<>|=]?(?:f[248]|[iu][1248])")
 
 
@@ -60,13 +63,11 @@ def _npy(data: bytes, _limit: int) -> NDArray[Any]:
     size = int.from_bytes(data[8:start], "little")
     if data[:6] != b"\x93NUMPY" or size > _MAX_NPY_HEADER or len(data) < start + size:
         raise BadFile("not a readable npy")
-    try:
-        header = ast.literal_eval(data[start : start + size].decode("latin-1").strip())
-        descr, fortran, shape = header["descr"], bool(header["fortran_order"]), tuple(map(int, header["shape"]))
-    except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError, KeyError, OverflowError):
-        raise BadFile("an npy whose header cannot be read") from None
-    if not isinstance(descr, str) or not _NPY_KIND.fullmatch(descr) or any(n < 0 for n in shape):
-        raise BadFile(f"an array of {str(descr)[:40]}, not of plain numbers")
+    header = _NPY_HEADER.fullmatch(data[start : start + size].decode("latin-1").strip())
+    if header is None or not _NPY_KIND.fullmatch(header["descr"]):
+        raise BadFile("an npy that is no array of plain numbers")
+    shape = tuple(int(n) for n in header["shape"].split(",") if n.strip())
+    descr, fortran = header["descr"], header["fortran"] == "True"
     dtype, count = np.dtype(descr), math.prod(shape)
     if count * dtype.itemsize > len(data) - start - size:
         raise BadFile(f"an array of shape {str(shape)[:60]}, which its bytes do not hold")

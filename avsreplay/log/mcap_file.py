@@ -23,13 +23,13 @@ from avsreplay.log.mcap_resync import hides_chunk, next_record
 from avsreplay.log.mcap_summary import Summary, read_summary
 from avsreplay.log.options import Loss, TopicInfo
 from avsreplay.log.recording import MAX_NS, CloudIndex, MessageTable, Sink, canonical_type
+from avsreplay.log.surface import MODEL_ENDINGS
 from avsreplay.log.text import shown
 
 __all__ = ["McapFile"]
 
 _TIMES = struct.Struct("<QQ")
 _BLOCK = 1 << 20
-_MODELS = (".ply", ".stl", ".obj", ".off", ".glb")
 
 
 class McapFile:
@@ -65,6 +65,7 @@ class McapFile:
         self._model: tuple[str, int, int] | None = None
         self._bad_chunk: Loss | None = None
         self._resume: int | None = None
+        self._trusted = 8  # all before is borne out by a checksum
         self._orphans = self._seen = 0
         self._file = ByteFile(path)
         self._size = self._file.size
@@ -222,7 +223,7 @@ class McapFile:
                 raise BadMessage("an attachment whose length is damaged")
             self._lose(Loss(f"the checksum of attachment '{shown(name)}' does not hold", at, end - at))
             return
-        if self._model is None and name.lower().endswith(_MODELS):
+        if self._model is None and name.lower().endswith(MODEL_ENDINGS):
             self._model = (name, start, size)
         if self._tap is not None:
             self._tap.attachment(name, media, times, data)
@@ -245,6 +246,7 @@ class McapFile:
             return
         number = self._chunks.add(at, head)
         self.unchecked += head.crc == 0
+        self._trusted = end
         view = memoryview(data)
         for opcode, begin, stop in walked:
             if opcode == mcap.MESSAGE:
@@ -309,6 +311,11 @@ class McapFile:
 
     def _resync(self, at: int, summary: Summary, why: str) -> int:
         """The next place after ``at`` where the file makes sense again."""
+        inner = self._swallowed(self._trusted - 1, at)
+        if inner is not None:  # a record before this one reached too far
+            self._lose(Loss(why, inner, 0))
+            self._trusted = inner + 1
+            return inner
         stop = summary.start - 13 if summary.start else self._size
         chunked = bool(len(self._chunks)) or not self._seen
         found = next_record(self._file, at + 1, stop, frozenset(self._channels), chunked)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from avsreplay.log import mcap_records as mcap
 from avsreplay.log.byte_file import ByteFile
@@ -13,6 +14,8 @@ from avsreplay.log.mcap_records import Fields
 __all__ = ["TAIL", "Summary", "read_summary"]
 
 TAIL = 37  # footer record (29 bytes) and closing magic
+_DATA_END = re.compile(rb"\x0f\x04\x00{7}")
+_SEARCHED = 4 << 20
 _FOOTER_HEAD = b"\x02\x14\x00\x00\x00\x00\x00\x00\x00"
 
 
@@ -22,7 +25,7 @@ class Summary:
 
     Attributes:
         start: where it begins, 0 where there is none to trust.  messages: how many the file holds, None: not said.
-        definitions: its schema and channel records.  trouble: why it is not trusted, "" where it is or is not there.
+        definitions: its schema and channel records.  trouble: what is wrong with it, "" where nothing is.
     """
 
     start: int = 0
@@ -48,12 +51,26 @@ def _read(file: ByteFile, limit: int) -> Summary:
     start, crc = int.from_bytes(tail[9:17], "little"), int.from_bytes(tail[25:29], "little")
     if start == 0:
         return Summary()
-    if not 8 < start <= file.size - TAIL or file.size - start > limit:
-        raise BadMessage("the footer points outside the file")
-    data = file.read(start, file.size - TAIL - start + 25)
-    if crc and zlib.crc32(data) != crc:
-        raise BadMessage("the checksum of the summary does not hold")
-    return _walk(start, memoryview(data)[: len(data) - 25])
+    inside = 8 < start <= file.size - TAIL and file.size - start <= limit
+    data = file.read(start, file.size - TAIL - start + 25) if inside else b""
+    if inside and (not crc or zlib.crc32(data) == crc):
+        return _walk(start, memoryview(data)[: len(data) - 25])
+    moved = _moved(file, crc)
+    if moved is not None:
+        return replace(_walk(*moved), trouble="the footer points elsewhere: bytes were put in or taken out before it")
+    raise BadMessage("the checksum of the summary does not hold" if inside else "the footer points outside the file")
+
+
+def _moved(file: ByteFile, crc: int) -> tuple[int, memoryview] | None:
+    """Where the summary is after all, when bytes before it came or went: behind an end of data, and its sum holds."""
+    begin = max(file.size - _SEARCHED, 8)
+    window = file.read(begin, file.size - begin)
+    end = len(window) - TAIL + 25
+    for match in _DATA_END.finditer(window):
+        start = match.start() + 13
+        if crc and start <= end - 25 and zlib.crc32(window[start:end]) == crc:
+            return begin + start, memoryview(window)[start : end - 25]
+    return None
 
 
 def _walk(start: int, view: memoryview) -> Summary:

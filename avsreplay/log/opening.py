@@ -36,10 +36,10 @@ def open_source(path: str | Path, options: SourceOptions | None = None, *, look:
         UsageError: several cloud topics and none asked for, or a topic asked for that is not there.
     """
     path, options = Path(path), options or SourceOptions()
-    if not path.exists():
-        raise UnreadableInput("no such file", where=shown(path), hint="check the path")
-    folder = path.is_dir() and not is_bag_folder(path)
-    source = open_folder(path, options) if folder else _messages(path, options, look)
+    try:
+        source = _opened(path, options, look)
+    except OSError as error:
+        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
     try:
         if options.strict:
             refuse_losses(source)
@@ -47,6 +47,16 @@ def open_source(path: str | Path, options: SourceOptions | None = None, *, look:
         source.close()
         raise
     return source
+
+
+def _opened(path: Path, options: SourceOptions, look: bool) -> Source:
+    if not path.exists():
+        raise UnreadableInput("no such file", where=shown(path), hint="check the path")
+    if path.is_dir() and not is_bag_folder(path):
+        return open_folder(path, options)
+    if not path.is_dir() and not path.is_file():
+        raise UnreadableInput("neither a file nor a folder", where=shown(path), hint="give a log or a folder of scans")
+    return _messages(path, options, look)
 
 
 def _messages(path: Path, options: SourceOptions, look: bool) -> Source:

@@ -13,6 +13,7 @@ from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_records import Channel, is_mcap
 from avsreplay.log.point_cloud2 import decode_cloud
 from avsreplay.log.recording import CLOUD_TYPES, MAX_NS
+from avsreplay.log.surface import MODEL_ENDINGS, parse_surface
 from avsreplay.log.text import shown
 from avsreplay.log.writer import LIBRARY
 
@@ -59,7 +60,13 @@ class _Copier:
         self.done.messages += 1
 
     def attachment(self, name: str, media: str, times: tuple[int, int], data: memoryview) -> None:
-        """Copy an attachment."""
+        """Copy an attachment, unless it is a model that cannot be used."""
+        if name.lower().endswith(MODEL_ENDINGS):
+            try:
+                parse_surface(bytes(data), name)
+            except UnreadableInput as error:
+                self.done.dropped.append(f"the model inside: {shown(error)}")
+                return
         self._writer.add_attachment(times[1], times[0], name, media, bytes(data))
         self.done.attachments += 1
 

@@ -19,11 +19,12 @@ from avsreplay.log.ply import BadFile, read_ply
 from avsreplay.log.text import shown
 from avsreplay.records import Surface
 
-__all__ = ["parse_surface", "read_surface", "surface_bytes"]
+__all__ = ["MODEL_ENDINGS", "parse_surface", "read_surface", "surface_bytes"]
 
 MAX_BYTES = 512 << 20
 _SILENT = logging.NullHandler()
 _FORMATS = ("ply", "stl", "obj", "off", "glb")
+MODEL_ENDINGS = tuple(f".{name}" for name in _FORMATS)
 # What a foreign parser may raise on bytes that are not what they seem; a crash of the interpreter it cannot be.
 _FOREIGN = (
     ArithmeticError, AssertionError, AttributeError, BufferError, EOFError, ImportError, LookupError, MemoryError,
@@ -149,8 +150,8 @@ def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> 
 def _with_area(vertices: Array, faces: NDArray[Any]) -> NDArray[np.int32]:
     """The triangles that have an area: display meshes carry some without, which have no closest normal."""
     corners = vertices[faces.reshape(-1, 3)]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    kept: NDArray[np.int32] = np.ascontiguousarray(
-        faces.reshape(-1, 3)[np.linalg.norm(normals, axis=1) > 0.0], np.int32
-    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat = ~(np.linalg.norm(normals, axis=1) > 0.0)
+    kept: NDArray[np.int32] = np.ascontiguousarray(faces.reshape(-1, 3)[~flat], np.int32)
     return kept
