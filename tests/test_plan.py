@@ -154,6 +154,19 @@ def test_first_feasible_time_of_a_tumbling_goal(seed):
     assert plan.u_max == pytest.approx(a, rel=1e-12)
 
 
+def test_the_seventh_equation_is_an_identity_and_as_printed_is_false():
+    rng = np.random.default_rng(9)
+    printed = []
+    for _ in range(50):
+        c, v0, a, end = rng.normal(size=6), rng.normal(size=3), 0.07, rng.uniform(1, 40)
+        flight = Flight(ORIGIN, v0, a, 0.0, end, c)
+        ends = np.array([0.0, end])
+        p, (_, v) = np.linalg.norm(flight.p(ends), axis=1), flight.at(ends)
+        assert a * (p[0] - p[1]) + c[:3] @ (v[1] - v[0]) == pytest.approx(0.0, abs=1e-10 * a * p.max() * end)
+        printed.append(a * (p[0] - p[1]))  # with the end met the printed velocity term is zero: this would have to be
+    assert np.min(np.abs(printed)) > 1e-4
+
+
 def test_latency_is_a_coast_and_then_the_same_problem():
     goal = tumbling(np.random.default_rng(7))
     v0 = np.array([0.03, 0.0, -0.02])

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -72,6 +73,12 @@ def test_every_rule_is_reached(rule):
     assert decision.rule == rule
     assert decision.action is next(r for r in RULES if r.name == rule).action
     assert after.action is decision.action
+
+
+def test_the_page_tells_of_every_rule():
+    page = (Path(__file__).parents[1] / "docs" / "planning.md").read_text(encoding="utf-8")
+    for rule in RULES:
+        assert f"| `{rule.name}` | {rule.action.value} |" in page
 
 
 def test_every_action_can_be_chosen():
