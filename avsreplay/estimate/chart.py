@@ -22,7 +22,7 @@ from avsreplay.estimate.naming import NAMINGS
 from avsreplay.geometry import Array
 from avsreplay.records import State
 
-__all__ = ["Chart", "retract", "to_chart", "to_errors", "to_state"]
+__all__ = ["RATE", "Chart", "retract", "to_chart", "to_errors", "to_state"]
 
 ETA, RATE, POSITION, VELOCITY = (slice(k, k + 3) for k in (0, 3, 6, 9))
 INERTIA, ARM = slice(12, 17), slice(17, 20)

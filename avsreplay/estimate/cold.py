@@ -23,6 +23,7 @@ from avsreplay.records import Belief, State
 
 __all__ = ["ColdFit", "poses_of", "prior_of", "refit", "rough_state"]
 
+_PAIR_RAD = 0.7
 _TOLD = 0.5  # of the prior's sigma: what is known no better is told by the prior
 
 
@@ -65,17 +66,23 @@ def prior_of(poses: Poses, params: EstimatorParams) -> Prior:
 
 
 def rough_state(fixes: tuple[PoseFix, ...]) -> State:
-    """A sphere spinning about its fixture at the mean rate of the first poses, over a radian at most."""
-    few = 2
-    while few < len(fixes) and float(geometry.angle(_turn(fixes[0], fixes[few - 1]))) < 0.5:
-        few += 1
-    w, v = rates(fixes[:few])
+    """A sphere spinning about its fixture at the poses' rate: medians, so that single false poses do not matter.
+
+    Neighbours give a coarse rate; pairs as far apart as turns by about 0.7 rad then give a finer one.
+    """
+    coarse = _median_rates(fixes, 1)[0]
+    step = (fixes[-1].t_ns - fixes[0].t_ns) * 1e-9 / max(1, len(fixes) - 1)
+    angle = float(np.linalg.norm(coarse)) * step
+    apart = int(np.clip(_PAIR_RAD / max(angle, 1e-3), 1, max(1, len(fixes) // 2)))
+    w, v = _median_rates(fixes[: 3 * apart], apart)
     first = fixes[0].T_ac
     return State(first.q, w, first.t, v, np.zeros(2), np.zeros(3), geometry.IDENTITY_QUAT)
 
 
-def _turn(a: PoseFix, b: PoseFix) -> Array:
-    return geometry.multiply(geometry.conjugate(a.T_ac.q), b.T_ac.q)
+def _median_rates(fixes: tuple[PoseFix, ...], apart: int) -> tuple[Array, Array]:
+    """Rate in {C} and velocity in {A}: medians over pairs of poses ``apart``."""
+    found = [rates((a, b)) for a, b in zip(fixes, fixes[apart:], strict=False)]
+    return np.median([w for w, _ in found], axis=0), np.median([v for _, v in found], axis=0)
 
 
 def refit(fixes: tuple[PoseFix, ...], last: ColdFit | None, params: EstimatorParams, rules: FitParams) -> ColdFit:

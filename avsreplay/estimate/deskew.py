@@ -16,7 +16,7 @@ from avsreplay.records import State
 
 __all__ = ["deskew"]
 
-_KNOTS = 33  # instants the motion is worked out at; between them rotation and position go straight
+_KNOTS = 65  # instants the motion is worked out at; between them rotation and position go straight
 
 
 def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) -> Array:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.estimate.arc import arc
-from avsreplay.estimate.chart import Chart, to_errors, to_state
+from avsreplay.estimate.chart import RATE, Chart, to_errors, to_state
 from avsreplay.estimate.layout import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W
 from avsreplay.geometry import Array
 from avsreplay.records import State
@@ -29,6 +29,7 @@ __all__ = ["FitParams", "Fitted", "Pin", "Poses", "Prior", "cost", "fit", "pinne
 _GATE = 27.86  # chi-square with 6 degrees of freedom, 99.99 %
 _FEWEST_FOR_FACTORS = 12
 _LAGS = (5, 10, 20, 40)
+_WILD_RADPS = 0.5  # a step that adds more to the rate than this and the rate itself is not tried
 _PIN_TOL = 0.02  # half chi-square: how well a held fit needs to be known
 
 
@@ -312,7 +313,8 @@ def _descend(problem: _Problem, here: _Here, max_steps: int) -> tuple[_Here, int
     for count in range(1, max_steps + 1):
         step = np.asarray(np.linalg.solve(A + damping * np.diag(np.diagonal(A)), b), dtype=np.float64)
         expected = float(step @ b) - 0.5 * float(step @ A @ step)
-        trial = problem.at(here.chart.moved(step))
+        wild = float(np.linalg.norm(step[RATE])) > _WILD_RADPS + float(np.linalg.norm(here.chart.w_c))
+        trial = here if wild else problem.at(here.chart.moved(step))
         gain = here.cost - trial.cost
         if gain > 0.0:
             damping = max(damping * (0.1 if gain > 0.5 * expected else 0.5), 1e-9)
@@ -320,6 +322,6 @@ def _descend(problem: _Problem, here: _Here, max_steps: int) -> tuple[_Here, int
             A, b = problem.normal(here)
         else:
             damping *= 8.0
-        if abs(expected) < problem.params.gain_tol or damping > 1e9:
+        if (abs(expected) < problem.params.gain_tol and not wild) or damping > 1e9:
             return here, count, True
     return here, max_steps, False
