@@ -23,6 +23,10 @@ __all__ = ["Evidence", "assess", "covariance", "evidence", "nothing"]
 
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer than this may agree with one another
 LEAST_PATCHES = 24
+# Measured by tests/benchmarks/registration_noise.py: what the sandwich leaves out (closest points near edges lean one
+# way), and how much of the error successive scans share while the target turns.
+UNEXPLAINED = 1.24
+ALIKE, ALIKE_RAD = 0.11, 0.6
 SIGMA_PER_MEDIAN = 1.4826  # of |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 
@@ -116,8 +120,10 @@ def assess(
         rms_m=found.rms_m,
         info=info,
         status=_status(overlap, fit.converged, bool(weakest)),
-        covariance=frozen(covariance(found)) if certain else None,
+        covariance=frozen(UNEXPLAINED * covariance(found)) if certain else None,
         weakest=", ".join(weakest),
+        alike=ALIKE,
+        alike_rad=ALIKE_RAD,
     )
 
 
