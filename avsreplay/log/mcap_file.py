@@ -177,12 +177,6 @@ class McapFile:
         fields = self._content(at, end)
         self.profile, self.library = fields.text(), fields.text()
 
-    def _take_schema(self, at: int, end: int) -> None:
-        self._schema(self._content(at, end))
-
-    def _take_channel(self, at: int, end: int) -> None:
-        self._channel(self._content(at, end))
-
     def _take_metadata(self, at: int, end: int) -> None:
         fields = self._content(at, end)
         name, values = fields.text(), fields.mapping()
@@ -195,6 +189,8 @@ class McapFile:
     def _take_message(self, at: int, end: int) -> None:
         if end - at < 31:
             raise BadMessage("a message shorter than its head")
+        if len(self._chunks):  # no writer mixes the two, and nothing vouches for it: more likely a flipped kind
+            raise BadMessage("a message outside the chunks of a file with chunks")
         payload = self._content(at, end).view
         self._message(payload, 0, len(payload), -1, at + 9)
 
@@ -343,8 +339,8 @@ class McapFile:
 
 _HANDLERS: dict[int, Callable[[McapFile, int, int], None]] = {
     mcap.HEADER: McapFile._take_header,
-    mcap.SCHEMA: McapFile._take_schema,
-    mcap.CHANNEL: McapFile._take_channel,
+    mcap.SCHEMA: lambda file, at, end: file._schema(file._content(at, end)),
+    mcap.CHANNEL: lambda file, at, end: file._channel(file._content(at, end)),
     mcap.MESSAGE: McapFile._take_message,
     mcap.CHUNK: McapFile._take_chunk,
     mcap.MESSAGE_INDEX: McapFile._take_message_index,
