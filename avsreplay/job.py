@@ -16,8 +16,9 @@ from avsreplay import chain, settings
 from avsreplay.chain import Memory
 from avsreplay.config import RunConfig, load_config
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.estimate.relabel import nearest
 from avsreplay.log import Source, SourceOptions, open_source
-from avsreplay.records import Scan, Surface
+from avsreplay.records import Scan, State, Surface
 from avsreplay.report import Summary
 from avsreplay.report.summary import SummaryFold
 from avsreplay.rows import Row
@@ -71,6 +72,7 @@ class Run:
             raise
         labelled = bool(header.labels) or header.seed is not None
         self._fold = SummaryFold(labels=header.labels if labelled else None, truth=header.truth)
+        self._end: tuple[Memory, State] | None = None
 
     def __enter__(self) -> Run:
         return self
@@ -93,9 +95,18 @@ class Run:
         heard: list[Scan] = []
         for memory, row in chain.fold(self._stages, first_memory(self._stages), self._overheard(heard)):
             self._fold.add(row)
+            if heard[-1].body is not None:
+                self._end = memory, heard[-1].body
             for listener in listeners:
                 listener(heard[-1], memory, row)
             yield row
+
+    @property
+    def truth(self) -> State | None:
+        """The true state at the last scan that has one, its principal axes named as the estimate names them."""
+        if self._end is None or self._end[0].track is None:
+            return self.source.header.truth
+        return nearest(self._end[0].track.belief, self._end[1])[0]
 
     def summary(self) -> Summary:
         """The summary of the rows taken so far."""
@@ -103,7 +114,7 @@ class Run:
         counts = {"losses": len(losses), "lost_messages": sum(loss.messages or 0 for loss in losses)}
         counts |= {"stamps_unset": clock.unset, "stamps_jumped": clock.jumps}
         counts |= {"stamps_equal": clock.equal, "stamps_back": clock.back}
-        return replace(self._fold.result(), counts=counts)
+        return replace(self._fold.result(self.truth), counts=counts)
 
     def facts(self) -> dict[str, Any]:
         """What stands in ``run.json`` but for versions: the effective configuration and the hashes of what was read."""

@@ -186,7 +186,7 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
 
     header = run.source.header
     labels = header.labels if header.labels or header.seed is not None else None
-    facts = facts_record(labels=labels, truth=header.truth, counts=dict(summary.counts))
+    facts = facts_record(labels=labels, truth=run.truth, counts=dict(summary.counts))
     return {**run.facts(), "facts": facts, "versions": versions()}
 
 

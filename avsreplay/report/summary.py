@@ -177,8 +177,8 @@ class SummaryFold:
             self._withdrawn += 1
         self._capture.add(row)
 
-    def result(self) -> Summary:
-        """The summary of all rows so far."""
+    def result(self, truth: State | None = None) -> Summary:
+        """The summary of all rows so far; ``truth`` in place of the one given at the start."""
         stamps = [m.t_ns for m in self._marks]
         steps = [b - a for a, b in pairwise(stamps) if b > a]
         last = self._last
@@ -200,7 +200,7 @@ class SummaryFold:
             iterations=Spread.of(self._values.get("iterations/healthy", [])),
             faults=account(self._marks, self._labels),
             coasts=tuple(coasts(self._marks)),
-            parameters=parameters(last, self._truth) if last else (),
+            parameters=parameters(last, truth or self._truth) if last else (),
             sigma_hits=last.sigma_hits if last else None,
             r_floors=last.r_floors if last else None,
             nis=_share(self._values.get("nis/healthy", []), NIS_BAND),
