@@ -10,7 +10,7 @@ from pathlib import Path
 from avsreplay.errors import UsageError
 from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface
-from avsreplay.simulate import Scenario, builtin_surface, load_scenario, simulate
+from avsreplay.simulate import Engine, Scenario, builtin_surface, load_scenario, simulate
 
 __all__ = ["RecordOptions", "Recorded", "Ticker", "record", "record_scenario", "record_source", "surface_for"]
 
@@ -37,6 +37,7 @@ class Recorded:
         damaged: messages of the source that could not be decoded and were left out.
         span_s: first to last scan.  bytes: of the file.  model: name of the model inside, None without.
         faults: labels as (kind, start [s], end [s] after the first scan, harmful).  losses: of the source.
+        note: what a user should know of how it was made, empty if nothing.
     """
 
     path: str
@@ -50,6 +51,7 @@ class Recorded:
     seed: int | None
     faults: tuple[tuple[str, float, float, bool], ...]
     losses: tuple[Loss, ...] = ()
+    note: str = ""
 
 
 def record(
@@ -94,7 +96,9 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
         tally = _fold(scans, writer, true_clock=True)
-    return tally.recorded(output, simulation.header)
+    by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
+    slow = "embreex is not installed: rays were cast by the exact engine, which is slower"
+    return replace(tally.recorded(output, simulation.header), note=slow if by_hand else "")
 
 
 def record_source(

@@ -165,6 +165,15 @@ def test_a_log_recorded_again_keeps_scans_truth_labels_and_model(tmp_path):
         assert np.array_equal(a.truth.matrix, b.truth.matrix)
 
 
+def test_without_embreex_the_log_is_made_and_it_is_said(scenario, tmp_path, monkeypatch):
+    from avsreplay.simulate import caster
+
+    monkeypatch.setattr(caster.importlib.util, "find_spec", lambda name: None)
+    done = CliRunner().invoke(command.command, [str(scenario), "-o", str(tmp_path / "a.mcap")])
+    assert "note: embreex is not installed" in done.output
+    assert len(read(tmp_path / "a.mcap")[1]) == 6
+
+
 def test_every_nth_scan_keeps_its_own_time(tmp_path):
     record(FIXTURES / "tumble.mcap", tmp_path / "c.mcap", reading=SourceOptions(every=5))
     _, all_scans = read(FIXTURES / "tumble.mcap")

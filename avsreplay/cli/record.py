@@ -96,7 +96,7 @@ def _sentence(done: Recorded) -> str:
         f"fault: {kind} from {start:.1f} s to {end:.1f} s, {'harmful' if harmful else 'harmless'}"
         for kind, start, end, harmful in done.faults
     ]
-    return "\n".join(lines)
+    return "\n".join([*lines, f"note: {done.note}"] if done.note else lines)
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import numpy as np
 
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface
 from avsreplay.simulate import faults
+from avsreplay.simulate.caster import Engine
 from avsreplay.simulate.faults import FaultParams, Kind
 from avsreplay.simulate.motion import Motion
 from avsreplay.simulate.scanner import Pattern, Returns, Scanner
@@ -40,6 +41,11 @@ class Simulation:
     _scenario: Scenario = field(repr=False)
     _motion: Motion = field(repr=False)
     _scanner: Scanner = field(repr=False)
+
+    @property
+    def engine(self) -> Engine:
+        """Who casts the rays."""
+        return self._scanner.engine
 
     def truth(self, log_ns: int) -> State:
         """The full true state at an instant of the log clock."""
