@@ -205,6 +205,9 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     assert CliRunner().invoke(command, [str(tmp_path), *exports]).exit_code == 0
     assert [len((tmp_path / n).read_text().splitlines()) for n in ("csv", "tum", "kitti")] == [31, 30, 30]
     assert isinstance(CliRunner().invoke(command, [str(tmp_path), exports[0]]).exception, AvsError)
+    (tmp_path / "none.jsonl").write_text("")
+    empty = CliRunner().invoke(command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")])
+    assert "holds no row" in str(empty.exception)
     missing = CliRunner().invoke(command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")])
     assert isinstance(missing.exception, AvsError)
     assert not (tmp_path / "x.html").exists()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from avsreplay.errors import UsageError
+from avsreplay.errors import UnreadableInput, UsageError
 
 __all__ = ["command", "write_page"]
 
@@ -71,6 +71,8 @@ def write_page(result: Path, target: Path, title: str | None = None) -> str:
     from avsreplay.report.page import build_page
 
     found = load_result(result)
+    if not found.rows:
+        raise UnreadableInput("holds no row", where=str(result), hint="name a result of a run that saw scans")
     page = build_page(
         found.rows,
         found.summary,

@@ -31,7 +31,7 @@ class Result:
 
     Attributes:
         name: of its folder.  header: ``run.json`` as it stands, empty where there is none.
-        truth: the true state at the first scan, its axes named as the estimate's.  poses: true poses of {C} in {A}.
+        truth: the true state at the last scan, its axes named as the estimate's.  poses: true poses of {C} in {A}.
     """
 
     name: str
