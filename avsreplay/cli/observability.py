@@ -1,0 +1,144 @@
+"""``avsreplay observability``: what the measurements of a log can and cannot tell, for three sets of parameters."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from avsreplay.estimate.reference import Reference
+    from avsreplay.job import Run
+    from avsreplay.monitor.observability import Gramian
+    from avsreplay.rows import Row
+
+__all__ = ["command"]
+
+WIDTH = 100
+HEADS = {"two": "two sigma", "three": "three sigma", "known": "all known"}
+
+EPILOG = """\b
+Examples:
+  avsreplay observability tumble.mcap
+  avsreplay observability y.mcap --model m.ply --init truth --json
+
+\b
+The log is replayed, one motion is fitted to all of its healthy poses, and the observability Gramian is summed along
+that motion: with sigma1 and sigma2 as parameters, with the three sigma apart, and with all parameters known."""
+
+
+@click.command("observability", epilog=EPILOG)
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option("--model", type=click.Path(path_type=Path), help="Model of the target, in place of the log's own.")
+@click.option("--topic", help="Cloud topic, where there are several.")
+@click.option("--truth-topic", help="Topic of the true poses (for --init truth).")
+@click.option("--init", metavar="log|truth|auto|POSE", help="First pose; POSE is x,y,z,qx,qy,qz,qw of {C} in {A}.")
+@click.option("--set", "assignments", multiple=True, metavar="A.B=C", help="One setting; may be repeated.")
+@click.option("--marks", type=click.IntRange(2, 200), default=12, show_default=True, help="Lines of the table.")
+@click.option("--weakest", type=click.IntRange(0, 20), default=3, show_default=True, help="Directions told in words.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+def command(log: Path, marks: int, weakest: int, as_json: bool, **flags: Any) -> None:
+    """Show what the measurements of LOG can and cannot tell."""
+    from avsreplay.job import Run
+
+    with Run(_job(log, flags)) as run:
+        found = _document(run, marks, weakest)
+    if as_json:
+        click.echo(json.dumps(found, indent=2))
+    else:
+        _print(found)
+
+
+def _job(log: Path, flags: dict[str, Any]) -> Any:
+    from avsreplay.job import Job
+    from avsreplay.log import SourceOptions
+
+    init, assignments = flags.pop("init"), flags.pop("assignments")
+    given = {name: value for name, value in flags.items() if value is not None}
+    more = (f"init={init}",) if init is not None else ()
+    return Job(source=log, options=SourceOptions(**given), assignments=(*assignments, *more))
+
+
+def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
+    rows = list(run.rows())
+    reference = _reference(run, rows)
+    last = rows[-1].t_ns if len(rows) == 1 else max(row.t_ns for row in rows if row.gamma)
+    lines, ends = _summed([row for row in rows if reference.epoch_ns <= row.t_ns <= last], reference, run)
+    keep = sorted({round(k * (len(lines) - 1) / (marks - 1)) for k in range(marks)})
+    from avsreplay.estimate.variants import BLOCKS_OF
+    from avsreplay.monitor.observability import weakest as in_words
+
+    return {
+        "log": Path(run.job.source).name,
+        "healthy_scans": sum(row.gamma for row in rows),
+        "lines": [lines[k] for k in keep],
+        "weakest": {name: list(in_words(end, weakest, BLOCKS_OF[name])) for name, end in ends.items()},
+    }
+
+
+def _reference(run: Run, rows: list[Row]) -> Reference:
+    from avsreplay.estimate.reference import reference_fit
+    from avsreplay.geometry import Pose
+
+    healthy = [row for row in rows if row.gamma]
+    poses = [
+        Pose([row.reg_qx, row.reg_qy, row.reg_qz, row.reg_qw], [row.reg_x_m, row.reg_y_m, row.reg_z_m])  # type: ignore[arg-type]
+        for row in healthy
+    ]
+    return reference_fit([row.t_ns for row in healthy], poses, None, run.surface.extent, run.config.estimator)
+
+
+def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[str, Any]], dict[str, Gramian]]:
+    """A line a scan, and the Gramians at the end."""
+    from avsreplay.estimate import variants
+    from avsreplay.monitor.observability import gramian, measure, observe
+
+    x, t_ns = reference.at(reference.epoch_ns), reference.epoch_ns
+    one_sigma = run.config.estimator.resolved(run.surface.extent).start_1s
+    folds = {name: gramian(scale) for name, scale in variants.prior_1s(one_sigma, x.sigma).items()}
+    lines = []
+    for row in rows:
+        x, steps = variants.step(x, (row.t_ns - t_ns) * 1e-9)
+        t_ns = row.t_ns
+        line: dict[str, Any] = {"t_s": row.t_s, "gamma": row.gamma}
+        for name, (Phi, H) in steps.items():
+            folds[name] = observe(folds[name], Phi, H, row.gamma)
+            found = measure(folds[name])
+            line[name] = {
+                "rank": found.rank,
+                "of": found.size,
+                "log10_cond": found.log10_cond,
+                "log10_cond_scaled": found.log10_cond_scaled,
+            }
+        lines.append(line)
+    return lines, folds
+
+
+def _print(found: dict[str, Any]) -> None:
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Table
+
+    title = (
+        f"Observability Gramian, {found['healthy_scans']} healthy scans: rank, log10 of its condition raw and scaled"
+    )
+    table = Table(title=title, title_justify="left", box=SIMPLE)
+    table.add_column("\nt [s]", justify="right", no_wrap=True)
+    for head in HEADS.values():
+        for column in (f"{head}\nrank", "\nraw", "\nscaled"):
+            table.add_column(column, justify="right", no_wrap=True)
+    for line in found["lines"]:
+        table.add_row(f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name])))
+    console = Console(width=WIDTH, highlight=False)
+    console.print(table)
+    for name, words in found["weakest"].items():
+        if words:
+            console.print(f"weakest, {HEADS[name]}: " + "; ".join(words))
+
+
+def _cells(found: dict[str, Any]) -> tuple[str, str, str]:
+    conditions = (found["log10_cond"], found["log10_cond_scaled"])
+    raw, scaled = ("-" if value is None else f"{value:.2f}" for value in conditions)
+    return f"{found['rank']}/{found['of']}", raw, scaled
