@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import base64
 import html.parser
+import itertools
 import json
 import re
 import shutil
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from avsreplay.report.page.charts import charts, derived, spans
 from avsreplay.report.page.packing import embed
 from avsreplay.report.page.scene import scene
 
+ROOT = Path(__file__).resolve().parents[1]
 TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.3, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))
 BOX = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 2)], dtype=np.float32)
 FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6]], np.int32)
@@ -211,6 +214,40 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     missing = CliRunner().invoke(command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")])
     assert isinstance(missing.exception, AvsError)
     assert not (tmp_path / "x.html").exists()
+
+
+# Machado, Oliveira, Fernandes 2009, severity 1: what linear RGB becomes to an eye that lacks one kind of cone.
+EYES = {
+    "all cones": np.eye(3),
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "tritanopia": [[1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602], [0.004733, 0.691367, 0.303900]],
+}
+TO_XYZ = np.array(
+    [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.119192, 0.9503041]]
+)
+
+
+def _linear(text):
+    channels = np.array([int(text[k : k + 2], 16) for k in (1, 3, 5)]) / 255
+    return np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+
+
+def _lab(linear):
+    ratio = TO_XYZ @ np.clip(linear, 0, 1) / [0.95047, 1.0, 1.08883]
+    f = np.where(ratio > 0.008856, np.cbrt(ratio), 7.787 * ratio + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+@pytest.mark.parametrize("eye", EYES)
+def test_line_colours_differ_to_every_eye(eye):
+    """Five times a just noticeable difference of about 2 in CIELAB, in both themes."""
+    style = (ROOT / "avsreplay/report/page/assets/page.css").read_text(encoding="utf-8")
+    themes = [re.findall(r"--c\d: (#\w{6})", block) for block in re.findall(r":root[^{]*\{(.*?)\}", style, re.S)]
+    assert [len(theme) for theme in themes] == [6, 6]
+    for theme in themes:
+        seen = [_lab(np.array(EYES[eye]) @ _linear(colour)) for colour in theme]
+        assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(seen, 2)) > 10
 
 
 # ---- in a browser
@@ -442,9 +479,7 @@ def test_text_stands_out_from_its_ground_in_both_themes(opened):
 
 def _contrast(one, two):
     def luminance(text):
-        channels = np.array([int(text[k : k + 2], 16) for k in (1, 3, 5)]) / 255
-        linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
-        return float(linear @ [0.2126, 0.7152, 0.0722])
+        return float(_linear(text) @ [0.2126, 0.7152, 0.0722])
 
     high, low = sorted((luminance(one), luminance(two)), reverse=True)
     return (high + 0.05) / (low + 0.05)

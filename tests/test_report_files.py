@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from avsreplay import report
 from avsreplay.errors import MissingBackend, UnreadableInput
 from avsreplay.geometry import Pose, exp
-from avsreplay.report.columns_page import columns_page, row_schema
+from avsreplay.report.columns_page import columns_page, row_schema, schema_text
 from avsreplay.report.export import stamp_text
 from avsreplay.report.jsonl import dump_row, field_types, parse_row
 from avsreplay.rows import Row, columns
@@ -180,6 +180,7 @@ def test_the_document_of_no_rows_is_json_too():
 
 def test_the_column_list_of_the_docs_is_in_step():
     assert (ROOT / "docs" / "columns.md").read_text(encoding="utf-8") == columns_page()
+    assert (ROOT / "docs" / "rows.schema.json").read_text(encoding="utf-8") == schema_text()
 
 
 def test_the_schema_knows_every_column_and_its_type(make_rows):

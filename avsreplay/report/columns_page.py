@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 from avsreplay.report.jsonl import field_types
 from avsreplay.rows import Column, columns
 
-__all__ = ["columns_page", "row_schema"]
+__all__ = ["columns_page", "row_schema", "schema_text"]
 
 _HEAD = """# Columns of a row
 
 One row a scan, in `rows.jsonl`, CSV, Parquet and `--json`. Made by `python -m avsreplay.report.columns_page`
 from `avsreplay/rows.py`; a test holds the two in step. *Golden* is the tolerance of `--golden`: a value passes where
 `|got - expected| <= absolute + relative x |expected|`. Null: there is nothing to say (no truth, no measurement,
-not converged, no fault).
+not converged, no fault). [rows.schema.json](rows.schema.json) says the same to a program (`--schema` makes it).
 
 | column | type | unit | golden | meaning |
 |---|---|---|---|---|
@@ -54,7 +55,12 @@ def row_schema() -> dict[str, Any]:
     }
 
 
+def schema_text() -> str:
+    """The schema as it stands in the docs."""
+    return json.dumps(row_schema(), indent=1, ensure_ascii=False) + "\n"
+
+
 if __name__ == "__main__":
     import sys
 
-    sys.stdout.write(columns_page())
+    sys.stdout.write(schema_text() if "--schema" in sys.argv else columns_page())
