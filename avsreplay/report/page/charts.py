@@ -25,7 +25,7 @@ _DIRECT = (
     *("rms_m", "inlier_ratio", "nis", "innov_m", "innov_deg"),
     *("sigma1", "sigma2", "cx_m", "cy_m", "cz_m", "wx_radps", "wy_radps", "wz_radps"),
     *("nees", "ogm_log10_cond", "ogm_log10_cond_scaled", "ogm_rank"),
-    *("r_pos_m", "r_rot_deg", "capture_time_s", "hindsight_m"),
+    *("r_pos_m", "r_rot_deg", "capture_time_s", "plan_bound_s", "hindsight_m"),
 )
 _WINDOW = 10
 
@@ -173,7 +173,7 @@ def _plan_charts() -> list[Chart]:
             "capture",
             "Planned capture time",
             "s",
-            [_line("capture_time_s", "since the first scan", 0)],
+            [_line("capture_time_s", "planned", 0), _line("plan_bound_s", "certified: not before", 1, dash=True)],
             bands=[("capture_time_s", 0)],
         ),
         _chart(
