@@ -90,6 +90,7 @@ class Acquirer:
         self._middle = self._points.mean(axis=0)
         brief = replace(target.limits, n_max=min(FINE_PASSES, target.limits.n_max))
         self._refine = HornBackend(replace(target, limits=brief))
+        self._settle = HornBackend(target)
 
     def search(self, points: NDArray[Any]) -> Acquisition:
         """The best poses for a scan (n, 3) in {A} [m], finite, n >= 1."""
@@ -173,8 +174,11 @@ class Acquirer:
 
     def _verdict(self, fine: Array, finals: list[Candidate], starts: int) -> Acquisition:
         ranked = sorted(finals, key=lambda final: final.unexplained)
-        best = ranked[0]
-        second = next((other for other in ranked[1:] if not self._same(best.T_ca, other.T_ca, 1.0)), None)
+        second = next((other for other in ranked[1:] if not self._same(ranked[0].T_ca, other.T_ca, 1.0)), None)
+        rivals = [ranked[0], *([second] if second else [])]  # compared only once both have settled
+        rivals = [self._graded(fine, self._settle.align(fine, rival.T_ca).T_ca) for rival in rivals]
+        best, *rest = sorted(rivals, key=lambda rival: rival.unexplained)
+        second = rest[0] if rest and not self._same(best.T_ca, rest[0].T_ca, 1.0) else None
         found = best.inlier_ratio >= self._params.least_ratio
         return Acquisition(best, second, found, second is not None and self._as_good(fine, best, second), starts)
 

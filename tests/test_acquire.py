@@ -1,0 +1,196 @@
+"""Acquisition: any attitude, no guess; sure where it can be, ambiguous where the target is symmetric."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose, matrix
+from avsreplay.log import read_surface
+from avsreplay.log.ply import read_ply
+from avsreplay.records import AlignStatus, Surface
+from avsreplay.register import RegisterParams, Registrar
+from avsreplay.register.params import AcquireParams
+from avsreplay.register.proving import proving_surface, view
+from avsreplay.register.sampling import even, without_strays
+from avsreplay.register.starts import VisibleCentres, attitudes, directions
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+SEED = 5
+
+
+def _scan(surface: Surface, T_ac: Pose, rng: np.random.Generator, sigma: float = 0.008) -> Array:
+    """Faces towards the camera, noise along the ray, 2 % strays; faces do not hide each other."""
+    points = T_ac.apply(view(surface, 9000, T_ac.inverse().t))
+    ranges = 1.0 + rng.normal(0.0, sigma, (len(points), 1)) / np.linalg.norm(points, axis=1, keepdims=True)
+    ranges[rng.random(len(points)) < 0.02] *= rng.uniform(0.5, 1.5)
+    return points * ranges
+
+
+def _any_pose(rng: np.random.Generator) -> Pose:
+    q = rng.normal(size=4)
+    return Pose(q / np.linalg.norm(q), rng.normal(0.0, 0.2, 3) + np.array([0.0, 0.0, 8.0]))
+
+
+@pytest.fixture(scope="module")
+def registrar() -> Registrar:
+    return Registrar(proving_surface())
+
+
+def test_any_attitude_is_found_without_a_guess(registrar: Registrar) -> None:
+    rng = np.random.default_rng(SEED)
+    for _ in range(10):
+        truth = _any_pose(rng)
+        found = registrar.acquire(_scan(proving_surface(), truth, rng))
+        assert found.status is AlignStatus.ALIGNED
+        step = truth.inverse() @ found.T_ac
+        assert np.degrees(geometry.angle(step.q)) < 0.5
+        assert np.linalg.norm(step.t) < 0.02
+
+
+def test_a_search_repeats_to_the_bit(registrar: Registrar) -> None:
+    scan = _scan(proving_surface(), _any_pose(np.random.default_rng(1)), np.random.default_rng(2))
+    first, again = registrar.acquire(scan), Registrar(proving_surface()).acquire(scan)
+    assert first.T_ac.matrix.tobytes() == again.T_ac.matrix.tobytes()
+
+
+def _box(size: tuple[float, float, float]) -> Surface:
+    whole = proving_surface()
+    vertices = whole.vertices[:8] / np.array([2.0, 1.6, 2.4]) * np.array(size)
+    return replace(whole, vertices=vertices, faces=whole.faces[:12], name="box")
+
+
+@pytest.mark.parametrize("size", [(1.0, 1.0, 1.0), (2.0, 1.0, 0.6)], ids=["cube", "brick"])
+def test_a_symmetric_target_is_said_to_be_ambiguous(size: tuple[float, float, float]) -> None:
+    rng = np.random.default_rng(SEED)
+    registrar = Registrar(_box(size))
+    for _ in range(4):
+        found = registrar.acquire(_scan(_box(size), _any_pose(rng), rng))
+        assert found.status is AlignStatus.AMBIGUOUS
+        assert found.covariance is None
+        assert found.weakest.startswith("turned ")
+
+
+def test_another_thing_is_not_found(registrar: Registrar) -> None:
+    rng = np.random.default_rng(SEED)
+    cloud = rng.normal(size=(3000, 3))
+    sphere = 2.5 * cloud / np.linalg.norm(cloud, axis=1, keepdims=True) + np.array([0.0, 0.0, 9.0])
+    assert registrar.acquire(sphere).status is AlignStatus.NO_OVERLAP
+
+
+def test_an_empty_scan_and_a_handful_of_points_are_answered(registrar: Registrar) -> None:
+    assert registrar.acquire(np.empty((0, 3))).status is AlignStatus.NO_POINTS
+    assert registrar.acquire(np.full((3, 3), np.nan)).status is AlignStatus.NO_POINTS
+    few = np.array([[0.0, 0.0, 5.0], [0.1, 0.0, 5.0]])
+    assert registrar.acquire(few).status is not AlignStatus.ALIGNED
+
+
+def test_a_scan_in_another_frame_than_the_cameras_is_found() -> None:
+    """The scan moved into a frame whose origin lies in the target: that is no camera, and nothing says where it was."""
+    rng = np.random.default_rng(SEED)
+    registrar = Registrar(proving_surface())
+    truth = _any_pose(rng)
+    scan = _scan(proving_surface(), truth, rng)
+    motion = Pose(np.array([0.5, 0.1, -0.4, 0.7]), np.zeros(3)) @ Pose(geometry.IDENTITY_QUAT, -truth.t)
+    found = registrar.acquire(motion.apply(scan))
+    step = (motion @ truth).inverse() @ found.T_ac
+    assert np.degrees(geometry.angle(step.q)) < 0.5
+
+
+# --- the parts
+
+
+def test_attitudes_cover_all_rotations() -> None:
+    """Every rotation is within 30 deg, less than a plane start's basin, of one of 600."""
+    quaternions = attitudes(600)
+    np.testing.assert_allclose(np.linalg.norm(quaternions, axis=1), 1.0)
+    asked = np.random.default_rng(SEED).normal(size=(2000, 4))
+    asked /= np.linalg.norm(asked, axis=1, keepdims=True)
+    nearest = 2.0 * np.arccos(np.clip(np.abs(asked @ quaternions.T).max(axis=1), 0.0, 1.0))
+    assert np.degrees(nearest.max()) < 30.0
+
+
+def test_directions_are_even() -> None:
+    found = directions(200)
+    np.testing.assert_allclose(found.mean(axis=0), 0.0, atol=1e-2)
+    np.testing.assert_allclose(found.T @ found / 200, np.eye(3) / 3.0, atol=1e-2)
+
+
+def test_the_visible_centre_of_a_sphere_is_towards_the_camera() -> None:
+    """Of a sphere seen from afar the image's centroid lies 2/3 of the radius nearer: mean cosine over a disc."""
+    normals = directions(8000)
+    centres = VisibleCentres(2.0 * normals, normals, 4.0, count=30)
+    for towards in directions(30)[::5]:
+        np.testing.assert_allclose(centres.of(towards), 4.0 / 3.0 * towards, atol=0.15)
+
+
+def test_strays_are_left_out_before_thinning() -> None:
+    rng = np.random.default_rng(SEED)
+    surface = np.concatenate([rng.uniform(-1, 1, (4000, 2)), np.zeros((4000, 1))], axis=1)
+    strays = rng.uniform(-10, 10, (80, 3))
+    kept = without_strays(np.concatenate([surface, strays]))
+    assert (np.abs(kept).max(axis=1) <= 1.0).mean() > 0.995
+    assert len(kept) > 3800
+    assert 120 <= len(even(kept, 150)) <= 190
+
+
+@pytest.mark.parametrize(("key", "value"), [("starts", 0), ("least_ratio", 1.5), ("margin", -0.1)])
+def test_a_value_that_cannot_be_right_is_named(key: str, value: float) -> None:
+    with pytest.raises(ValueError, match=key):
+        AcquireParams(**{key: value})
+
+
+# --- real scans
+
+
+def _real(folder: str, conf: str) -> list[tuple[str, Array, Pose]]:
+    """Scans and given poses T_ac: p_model = R(q)' p_scan + t (the folder's README)."""
+    if not DATA.is_dir():
+        pytest.skip("../shared/data is not here")
+    found = []
+    for line in (DATA / folder / conf).read_text().splitlines():
+        words = line.split()
+        if words and words[0] == "bmesh":
+            q = np.array(words[5:9], dtype=float)
+            T_ca = Pose(geometry.conjugate(q), np.array(words[2:5], dtype=float))
+            points = read_ply((DATA / folder / words[1]).read_bytes()).points()
+            found.append((words[1], points, T_ca.inverse()))
+    return found
+
+
+def _off_deg(truth: Pose, found: Pose) -> float:
+    return float(np.degrees(geometry.angle((truth.inverse() @ found).q)))
+
+
+def test_bunny_comes_back_from_24_degrees_and_from_nothing() -> None:
+    scans = _real("stanford-bunny", "bun.conf")
+    surface = read_surface(DATA / "stanford-bunny" / "bun_zipper_res3.ply")
+    registrar = Registrar(surface)
+    rng, middle = np.random.default_rng(SEED), surface.vertices.mean(axis=0)
+    for name, points, truth in scans:
+        axis = rng.normal(size=3)
+        for degrees in (5.0, 15.0, 24.0):
+            q = geometry.exp(np.radians(degrees) * axis / np.linalg.norm(axis))
+            guess = truth @ Pose(q, middle - matrix(q) @ middle)
+            assert _off_deg(truth, registrar.register(points[::4], guess).T_ac) < 2.0, (name, degrees)
+    for name, points, truth in scans[::3]:
+        assert _off_deg(truth, registrar.acquire(points[::4]).T_ac) < 2.0, name
+
+
+def test_dragon_is_tracked_over_24_degree_steps_within_half_a_degree_and_half_a_millimetre() -> None:
+    scans = _real("stanford-dragon", "dragonStandRight.conf")
+    surface = read_surface(DATA / "stanford-dragon" / "dragon_vrip_res3.ply")
+    registrar = Registrar(surface, RegisterParams())
+    turn = Pose(geometry.exp(np.radians([0.0, 24.0, 0.0])), np.zeros(3))
+    errors = []
+    for name, points, truth in scans[::4]:
+        found = registrar.register(points[::4], turn @ truth)
+        assert found.status is AlignStatus.ALIGNED, name
+        errors.append((_off_deg(truth, found.T_ac), np.linalg.norm(found.T_ac.t - truth.t)))
+    rms = np.sqrt(np.mean(np.square(errors), axis=0))
+    assert rms[0] < 0.5
+    assert rms[1] < 0.5e-3
