@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from avsreplay.plan import (
     SupervisorParams,
     Tolerance,
 )
+from avsreplay.plan.limits import margin
 from avsreplay.records import Belief, Plan, State
 from avsreplay.report import load_result
 from avsreplay.report.result import Result
@@ -228,7 +229,12 @@ class Replanning:
             goal=trajectory(belief.x),
             forecast=lambda times: self.saved.estimator.forecast(belief, times),
             standoff=trajectory(away),
+            margin=self._margin(belief.x) if self.limits.any else None,
         )
+
+    def _margin(self, x: State) -> Callable[[Array, Array], float]:
+        scene, limits = self.scene(x), self.limits.resolved(self.saved.extent_m)
+        return lambda r, v: margin(scene, limits, r, v)
 
 
 def _moved(x: State, by_c: Array) -> State:

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from avsreplay.plan import Limits, PlanParams, Scene, StepFlight, constrained, path_of, rendezvous
+from avsreplay.plan.limits import margin
 from avsreplay.records import PlanStatus
 
 ORIGIN = np.zeros(3)
@@ -140,6 +141,21 @@ def test_what_cannot_be_met_is_infeasible():
     assert plan.status is PlanStatus.INFEASIBLE
     assert not plan.found
     assert math.isnan(plan.t_go_s)
+
+
+def test_margin_is_positive_along_a_plan_and_negative_off_it():
+    scene = body()
+    limits = Limits(cone_deg=25.0, cone_range_m=2.0, mouth_m=0.01, speed_max_mps=0.4).resolved(8.0)
+    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits)
+    path = path_of(plan, ORIGIN, ORIGIN)
+    for t in np.linspace(0.0, plan.t_go_s, 25):
+        then = Scene(*(lambda s, f=f, t=t: f(s + t) for f in (scene.goal, scene.axis, scene.centre)))
+        r, v = (x[0] for x in path.at(np.array([t])))
+        assert margin(then, limits, r, v) > 0.0
+        assert margin(then, limits, r, v + np.array([1.0, 0, 0])) < 0.0
+    apex, axis = scene.goal(np.zeros(1))[0][0], scene.axis(np.zeros(1))[0]
+    assert margin(scene, limits, apex - 0.5 * axis, ORIGIN) < 0.0
+    assert margin(scene, Limits(cone_deg=25.0).resolved(8.0), apex - 5.0 * axis, ORIGIN) == math.inf
 
 
 @pytest.mark.parametrize(

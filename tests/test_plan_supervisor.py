@@ -222,6 +222,44 @@ def test_latency_is_flown_on_the_old_leg():
     assert execute(pilot, sights(truth), truth).miss.distance_m < 1e-6
 
 
+def test_a_broken_limit_makes_the_pilot_retreat():
+    truth = turning()
+    pilot = Pilot(PlanParams(), Supervisor(PARAMS))
+    limited = (dataclasses.replace(s, margin=lambda r, v: 0.35 - float(np.linalg.norm(v))) for s in sights(truth))
+    for sight, memory in pilot.fly(limited):  # noqa: B007
+        if memory.decision.rule == "constraint_broken":
+            break
+    assert memory.decision.action is Action.RETREAT
+    speed = [np.linalg.norm(memory.leg.at(sight.t_ns + round(s * 1e9))[1]) for s in (0.0, 2.0, 4.0)]
+    assert speed[0] > speed[1] > speed[2]
+
+
+def test_a_hold_plans_at_the_period_and_sets_out_at_once():
+    truth, made = turning(), []
+
+    def planner(goal, r0, v0, params, t_ns):
+        made.append(t_ns * 1e-9)
+        return rendezvous(goal, r0, v0, params, t_ns)
+
+    pilot = Pilot(PlanParams(replan_period_s=2.0), Supervisor(PARAMS), planner)
+    rules = [(s.t_ns * 1e-9, m.decision.rule) for s, m in pilot.fly(sights(truth, blind=[(15.0, 40.3)], growth=2.0))]
+    held = [t for t in made if 20.0 < t < 40.0]
+    assert np.diff(held).min() > 1.9
+    out = next(t for t, rule in rules if rule == "healthy" and t > 40.0)
+    assert min(abs(t - out) for t in made) < 1e-6
+
+
+def test_latency_leaves_a_costate_that_flies_the_plan():
+    truth = turning()
+    pilot = Pilot(PlanParams(latency_s=0.7), Supervisor(PARAMS))
+    for sight, memory in pilot.fly(sights(truth)):  # noqa: B007
+        if memory.plan is not None:
+            break
+    flight = Flight.of(memory.plan, np.zeros(3), np.zeros(3))  # at rest the old leg is a coast
+    assert flight.terminal_errors(sight.goal)[0] < 1e-8
+    assert memory.leg.end_ns == pytest.approx(sight.t_ns + flight.t_go_s * 1e9, abs=2)
+
+
 def test_hindsight_of_a_plan_that_was_right_is_zero():
     truth = turning()
     goal = lambda t: truth(t + 3.0)[:2]  # noqa: E731

@@ -15,7 +15,7 @@ import numpy as np
 from avsreplay.geometry import Array
 from avsreplay.records import Trajectory
 
-__all__ = ["Limits", "SampledScene", "Scene"]
+__all__ = ["Limits", "SampledScene", "Scene", "margin"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +97,28 @@ class Scene:
         arm = float(np.linalg.norm(self.goal(now)[0] - self.centre(now)))
         if radius >= arm + release:
             raise ValueError(f"keepout_m is {radius}, must be below {arm + release:.3f}: arm and keepout_release_m")
+
+
+def margin(scene: Scene, limits: Limits, r: Array, v: Array) -> float:
+    """Least margin of the limits for a robot at r, v (3,) now, below 0 where one is broken.
+
+    A plan may lie on a limit, and the target's estimate moves: lengths have the cone's mouth [m] to spare, speed a
+    twentieth of itself. ``limits`` must be resolved. Infinite where no limit holds here.
+    """
+    now, least = np.zeros(1), math.inf
+    from_apex = r - scene.goal(now)[0][0]
+    distance, spare = float(np.linalg.norm(from_apex)), limits.mouth_m or 0.0
+    cones = ((limits.cone_deg, limits.cone_range_m), (limits.final_deg, limits.final_range_m))
+    for degrees, reach in cones if scene.axis else ():
+        if degrees is not None and distance <= (reach or math.inf):
+            along = float(from_apex @ scene.axis(now)[0]) if scene.axis else 0.0
+            across = math.sqrt(max(distance * distance - along * along, 0.0))
+            least = min(least, math.tan(math.radians(degrees)) * along + 2.0 * spare - across)
+    if limits.keepout_m is not None and scene.centre and distance > (limits.keepout_release_m or 0.0):
+        least = min(least, float(np.linalg.norm(r - scene.centre(now)[0])) - limits.keepout_m + spare)
+    if limits.speed_max_mps is not None:
+        least = min(least, 1.05 * limits.speed_max_mps - float(np.linalg.norm(v)))
+    return least
 
 
 class SampledScene:

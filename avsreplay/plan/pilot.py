@@ -31,7 +31,7 @@ class Sight:
         t_ns: the scan.  gamma: was it healthy.  converged: may the planner rely on the estimate.
         goal: the grasp point after t_ns.  forecast: its 1 sigma at times after t_ns, without more vision.
         standoff: the approach point after t_ns, turning with the target; None: a hold brakes to rest.
-        margin: least margin of the planner's constraints.
+        margin: robot's position and velocity (3,) -> least margin of the planner's limits, below 0 where one is broken.
     """
 
     t_ns: int
@@ -40,7 +40,7 @@ class Sight:
     goal: Trajectory
     forecast: Callable[[Array], Forecast]
     standoff: Trajectory | None = None
-    margin: float = 1.0
+    margin: Callable[[Array, Array], float] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -122,24 +122,27 @@ class Pilot:
         facts = self._facts(memory, sight, plan, leg)
         supervisor, decision = self.supervisor.decide(memory.supervisor, facts)
         memory = replace(memory, supervisor=supervisor, decision=decision, plan=plan)
-        if decision.action in _CLOSING:
-            return replace(memory, leg=leg, made_ns=None)
-        return self._withdraw(memory, sight)
+        if decision.action not in _CLOSING:
+            return self._withdraw(memory, sight)
+        if leg is None:  # setting out again between two periods
+            plan, leg = self._plan(memory.leg, sight.goal, sight.t_ns, self.planner)
+        return replace(memory, plan=plan, leg=leg or memory.leg, made_ns=None)
 
     def _closed(self, memory: PilotMemory, t_ns: int) -> bool:
         return memory.decision.action is Action.CAPTURE and t_ns >= memory.leg.end_ns
 
-    def _replan(self, memory: PilotMemory, sight: Sight) -> tuple[Plan | None, Leg]:
-        """The capture plan in force, made anew where it is due, and the leg that flies it."""
+    def _replan(self, memory: PilotMemory, sight: Sight) -> tuple[Plan | None, Leg | None]:
+        """The capture plan in force, made anew where it is due, and the leg that flies it (None: none does)."""
+        closing = memory.decision.action in _CLOSING
+        flown = memory.leg if closing else None
         if not sight.converged or memory.decision.action in (Action.CAPTURE, Action.ABORT):
-            return memory.plan, memory.leg
-        on_plan = memory.decision.action in _CLOSING
+            return memory.plan, flown
         age_s = math.inf if memory.plan is None else (sight.t_ns - memory.plan.t_ns) * 1e-9
-        left_s = (memory.leg.end_ns - sight.t_ns) * 1e-9
-        if on_plan and not self._due(age_s, left_s):
-            return memory.plan, memory.leg
+        left_s = (memory.leg.end_ns - sight.t_ns) * 1e-9 if closing else math.inf
+        if not self._due(age_s, left_s):
+            return memory.plan, flown
         plan, leg = self._plan(memory.leg, sight.goal, sight.t_ns, self.planner)
-        return plan, leg or memory.leg
+        return plan, leg or flown
 
     def _due(self, age_s: float, left_s: float) -> bool:
         """At the period, at every scan when the end is near, and no more once a plan would come too late."""
@@ -156,7 +159,7 @@ class Pilot:
         """A plan from where the present leg will have brought the robot once computing is over."""
         wait_s = self.params.latency_s
         r0, v0 = leg.at(t_ns + round(wait_s * 1e9))
-        # the latency is flown on the old leg, so the planner is asked from its end: t_go counts from t_ns again after
+        # the latency is flown on the old leg, so the planner is asked from its end: times count from t_ns again after
         late = replace(self.params, latency_s=0.0)
         plan = planner(lambda t: goal(t + wait_s), r0, v0, late, t_ns)
         if not plan.found:
@@ -164,14 +167,14 @@ class Pilot:
         begin_ns = t_ns + round(wait_s * 1e9)
         before = leg if t_ns < leg.t_ns else replace(leg, before=None)
         flown = Leg(begin_ns, r0, v0, path_of(plan, r0, v0), before)
-        return replace(plan, t_go_s=plan.t_go_s + wait_s, lower_bound_s=plan.lower_bound_s + wait_s), flown
+        return _later(plan, wait_s), flown
 
-    def _facts(self, memory: PilotMemory, sight: Sight, plan: Plan | None, leg: Leg) -> Facts:
+    def _facts(self, memory: PilotMemory, sight: Sight, plan: Plan | None, leg: Leg | None) -> Facts:
         planned = plan is not None and plan.found
-        t_go = max((leg.end_ns - sight.t_ns) * 1e-9, 0.0) if planned else math.nan
+        t_go = _left_s(plan, leg, sight.t_ns)
         times = np.array([0.0, t_go]) if planned else np.array([0.0])
         sigma = sight.forecast(times)
-        here, _ = memory.leg.at(sight.t_ns)
+        here, speed = memory.leg.at(sight.t_ns)
         return Facts(
             t_s=sight.t_ns * 1e-9,
             gamma=sight.gamma,
@@ -183,7 +186,7 @@ class Pilot:
             rot_1s_deg=math.degrees(float(sigma.rot_1s_rad[-1])),
             distance_m=float(np.linalg.norm(sight.goal(np.zeros(1))[0][0] - here)),
             now_1s_m=float(sigma.pos_1s_m[0]),
-            margin=sight.margin,
+            margin=sight.margin(here, speed) if sight.margin else 1.0,
         )
 
     def _withdraw(self, memory: PilotMemory, sight: Sight) -> PilotMemory:
@@ -207,6 +210,25 @@ class Pilot:
         if distance <= 0.0:
             away, distance = np.array([1.0, 0.0, 0.0]), 1.0
         return _rest(target + away / distance * max(distance, self.supervisor.params.retreat_m or 0.0))
+
+
+def _left_s(plan: Plan | None, leg: Leg | None, t_ns: int) -> float:
+    """To the end of the leg, else of the plan [s], not below 0; NaN where there is no plan."""
+    if plan is None or not plan.found:
+        return math.nan
+    return max((leg.end_ns - t_ns) * 1e-9 if leg else plan.t_go_s - (t_ns - plan.t_ns) * 1e-9, 0.0)
+
+
+def _later(plan: Plan, wait_s: float) -> Plan:
+    """The plan with its times, and its costate's, counted from ``wait_s`` earlier."""
+    c = np.concatenate([plan.costate[:3], plan.costate[3:] + wait_s * plan.costate[:3]])
+    return replace(
+        plan,
+        t_go_s=plan.t_go_s + wait_s,
+        lower_bound_s=plan.lower_bound_s + wait_s,
+        costate=c / np.linalg.norm(c),
+        extras={**plan.extras, "latency_s": wait_s},
+    )
 
 
 def _rest(point: Array) -> Trajectory:
