@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import struct
+import time
 import zlib
 from pathlib import Path
 
@@ -264,3 +265,39 @@ def test_times_between_chunks_do_not_matter_to_the_order(tmp_path: Path) -> None
     assert [s.t_ns for s in found] == sorted(c.t_ns for c in shuffled)
     assert all(same(scan) for scan in found)
     assert found[0].t_ns == SECOND
+
+
+@pytest.mark.parametrize("what", ["private records", "bad chunks", "chunk heads", "index records", "noise"])
+def test_bytes_made_to_cost_time_cost_little(tmp_path: Path, what: str) -> None:
+    """Four megabytes of what makes a careless search quadratic."""
+    name = struct.pack("<I", 0)
+    empty = struct.pack("<QQQI", 0, 0, 1, 7) + name + struct.pack("<Q", 1) + b"x"
+    pieces = {
+        "private records": struct.pack("<BQ", 0x90, 0),
+        "bad chunks": struct.pack("<BQ", mcap.CHUNK, len(empty)) + empty + b"\x11",
+        "chunk heads": struct.pack("<BQ", mcap.CHUNK, 1 << 40) + empty,
+        "index records": struct.pack("<BQ", mcap.MESSAGE_INDEX, 6) + struct.pack("<HI", 1, 0),
+        "noise": np.random.Generator(np.random.PCG64(1)).integers(0, 256, 4096, dtype=np.uint8).tobytes(),
+    }
+    data = mcap.MAGIC + pieces[what] * ((4 << 20) // len(pieces[what]))
+    (tmp_path / "x.mcap").write_bytes(data)
+    start = time.process_time()
+    with open_source(tmp_path / "x.mcap", look=True) as source:
+        assert source.losses
+    assert time.process_time() - start < 10.0
+
+
+@pytest.mark.parametrize("what", ["chunk marks", "bad chunks", "noise"])
+def test_a_bag_made_to_cost_time_costs_little(tmp_path: Path, what: str) -> None:
+    fields = [b"compression=none", b"op=\x05", b"size=\x01\x00\x00\x00"]
+    head = b"".join(struct.pack("<I", len(f)) + f for f in fields)
+    pieces = {
+        "chunk marks": b"\x04\x00\x00\x00op=\x05",
+        "bad chunks": struct.pack("<I", len(head)) + head + struct.pack("<I", 3) + b"xyz" + b"\xff" * 5,
+        "noise": np.random.Generator(np.random.PCG64(1)).integers(0, 256, 4096, dtype=np.uint8).tobytes(),
+    }
+    (tmp_path / "x.bag").write_bytes(b"#ROSBAG V2.0\n" + pieces[what] * ((4 << 20) // len(pieces[what])))
+    start = time.process_time()
+    with open_source(tmp_path / "x.bag", look=True) as source:
+        assert source.losses
+    assert time.process_time() - start < 10.0

@@ -15,7 +15,7 @@ __all__ = ["READING_FLAGS", "Numbers", "reading_flags"]
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-class Numbers(click.ParamType):
+class Numbers(click.ParamType[tuple[float, ...]]):
     """So many numbers, separated by commas."""
 
     name = "numbers"

@@ -11,6 +11,8 @@ from avsreplay.log.text import shown
 
 __all__ = ["ByteFile"]
 
+_SMALL, _BLOCK = 256, 1 << 16  # heads of records are taken out of a block, not asked for one by one
+
 
 class ByteFile:
     """A file opened for reading by place.
@@ -26,6 +28,7 @@ class ByteFile:
         try:
             self._file = os.open(path, os.O_RDONLY)
             self.size = os.fstat(self._file).st_size
+            self._block = (0, b"")
         except FileNotFoundError:
             raise UnreadableInput("no such file", where=shown(path), hint="check the path") from None
         except OSError as error:
@@ -34,6 +37,14 @@ class ByteFile:
 
     def read(self, offset: int, size: int) -> bytes:
         """Exactly ``size`` bytes. Raises BadMessage where they are not there."""
+        if size > _SMALL:
+            return self._read(offset, size)
+        begin, block = self._block
+        if not begin <= offset <= offset + size <= begin + len(block):
+            begin, block = self._block = offset, self._read(offset, max(min(_BLOCK, self.size - offset), size))
+        return block[offset - begin : offset - begin + size]
+
+    def _read(self, offset: int, size: int) -> bytes:
         try:
             data = os.pread(self._file, size, offset)
             while len(data) < size:

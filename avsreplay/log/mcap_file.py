@@ -19,7 +19,7 @@ from avsreplay.log.byte_file import ByteFile
 from avsreplay.log.chunks import ChunkStore
 from avsreplay.log.cursor import BadMessage
 from avsreplay.log.mcap_records import Channel, Fields, Tap
-from avsreplay.log.mcap_resync import hides_chunk, next_record
+from avsreplay.log.mcap_resync import first_chunk, hides_chunk, next_record
 from avsreplay.log.mcap_summary import Summary, read_summary
 from avsreplay.log.options import Loss, TopicInfo
 from avsreplay.log.recording import MAX_NS, CloudIndex, MessageTable, Sink, canonical_type
@@ -30,6 +30,8 @@ __all__ = ["McapFile"]
 
 _TIMES = struct.Struct("<QQ")
 _BLOCK = 1 << 20
+_LEAST_CHUNK = 49
+_MAX_LOSSES = 10_000
 
 
 class McapFile:
@@ -56,9 +58,7 @@ class McapFile:
         self.metadata: dict[str, dict[str, str]] = {}
         self.profile = self.library = ""
         self.closed_properly = False
-        self.summary = Summary()
-        self.data_end = (0, 0)
-        self.unchecked = 0
+        self.summary, self.data_end, self.unchecked = Summary(), (0, 0), 0
         self._limit, self._table = limit, MessageTable(sinks)
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, tuple[str, str, bytes]] = {}
@@ -124,23 +124,25 @@ class McapFile:
         if self._size == 0:
             raise UnreadableInput("the file is empty", where=shown(self.path), hint="record it again")
         if self._size < 8 or self._file.read(0, 8) != mcap.MAGIC:
-            raise UnreadableInput(
-                "not an MCAP file", where=shown(self.path), hint="give an MCAP, a ROS bag or a folder"
-            )
+            hint = "give an MCAP, a ROS bag or a folder of scans"
+            raise UnreadableInput("not an MCAP file", where=shown(self.path), hint=hint)
         summary = self.summary = read_summary(self._file, self._limit)
         self._adopt(summary)
         at = 8
-        while at < self._size and not self.closed_properly:
+        while at < self._size and not self.closed_properly and len(self.losses) < _MAX_LOSSES:
             at = self._step(at, summary)
         self._settle()
-        if not self.closed_properly:
+        if len(self.losses) >= _MAX_LOSSES:
+            self._lose(Loss("damaged at too many places: the rest is not read", at, self._size - at))
+        elif not self.closed_properly:
             self._lose(Loss("the file was not closed: what its recorder still held is lost", self._size, 0))
         self._account(summary)
 
     def _step(self, at: int, summary: Summary) -> int:
         """Take one record and return where the next one begins."""
         if at + 9 > self._size:
-            return self._cut(at)
+            self._lose(Loss("the file is cut inside a record", at, self._size - at))
+            return self._size
         head = self._file.read(at, 9)
         opcode, length = head[0], int.from_bytes(head[1:], "little")
         end = at + 9 + length
@@ -155,17 +157,13 @@ class McapFile:
         resume, self._resume = self._resume or end, None
         return resume
 
-    def _cut(self, at: int) -> int:
-        self._lose(Loss("the file is cut inside a record", at, self._size - at))
-        return self._size
-
     def _take(self, opcode: int, at: int, end: int) -> None:
         handler = _HANDLERS.get(opcode)
         if handler is not None:
             handler(self, at, end)
         elif opcode < 0x80:
             raise BadMessage(f"a record of unknown kind 0x{opcode:02x}")
-        elif hides_chunk(self._file, at, end) or self._swallowed(at, end) is not None:
+        elif end - at > _LEAST_CHUNK and (hides_chunk(self._file, at, end) or self._swallowed(at, end) is not None):
             raise BadMessage("a chunk whose kind is damaged")
 
     def _content(self, at: int, end: int) -> Fields:
@@ -240,9 +238,8 @@ class McapFile:
             self._resume = self._swallowed(at, end)
             self._bad_chunk = Loss(str(error), at, (self._resume or end) - at, 1, None, start_ns, end_ns)
             return
-        number = self._chunks.add(at, head)
+        number, self._trusted = self._chunks.add(at, head), end
         self.unchecked += head.crc == 0
-        self._trusted = end
         view = memoryview(data)
         for opcode, begin, stop in walked:
             if opcode == mcap.MESSAGE:
@@ -254,8 +251,8 @@ class McapFile:
 
     def _swallowed(self, at: int, end: int) -> int | None:
         """Where a whole chunk begins inside a bad one: bytes were taken out, and its frame reaches too far."""
-        inner = next_record(self._file, at + 1, self._size, frozenset(), True)
-        if inner is None or inner >= end:
+        inner = first_chunk(self._file, at + 1, end)
+        if inner is None:
             return None
         head = mcap.chunk_head(self._file.upto(inner, mcap.CHUNK_PREFIX))
         try:
@@ -312,6 +309,7 @@ class McapFile:
             self._lose(Loss(why, inner, 0))
             self._trusted = inner + 1
             return inner
+        self._trusted = at  # searched once: never again
         stop = summary.start - 13 if summary.start else self._size
         chunked = bool(len(self._chunks)) or not self._seen
         found = next_record(self._file, at + 1, stop, frozenset(self._channels), chunked)

@@ -9,9 +9,10 @@ from avsreplay.log import mcap_records as mcap
 from avsreplay.log.byte_file import ByteFile
 from avsreplay.log.cursor import BadMessage
 
-__all__ = ["hides_chunk", "is_chunk", "next_record"]
+__all__ = ["first_chunk", "hides_chunk", "is_chunk", "next_record"]
 
 _WINDOW = 1 << 20
+_MARGIN = 64  # a candidate is told by so many bytes behind its first
 _MAX_CANDIDATES = 1_000_000
 _MESSAGE = re.compile(rb"(?=\x05[\s\S]{4}\x00{4}[\s\S]{2})")
 
@@ -32,6 +33,11 @@ def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
     except BadMessage:
         return False
     return True
+
+
+def first_chunk(file: ByteFile, at: int, last: int) -> int | None:
+    """The first place in [at, last) where a chunk may begin, wherever it ends."""
+    return _search(file, at, last, mcap.chunk_candidates, lambda place: is_chunk(file, place, file.size))
 
 
 def next_record(file: ByteFile, at: int, stop: int, channels: frozenset[int], chunked: bool) -> int | None:
@@ -64,7 +70,7 @@ def _search(
 ) -> int | None:
     tried = 0
     while at < stop:
-        window = file.upto(at, _WINDOW + 64)
+        window = file.upto(at, min(_WINDOW, stop - at) + _MARGIN)
         for place in candidates(window):
             tried += 1
             if tried > _MAX_CANDIDATES:  # bytes made to look like records everywhere

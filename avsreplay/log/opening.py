@@ -65,7 +65,7 @@ def _messages(path: Path, options: SourceOptions, look: bool) -> Source:
     try:
         topics = recording.topics()
         collected.check(topics, shown(path))
-        topic = _looked(topics, options, path) if look else _cloud_topic(topics, options, path)
+        topic = _looked(recording, options, path) if look else _cloud_topic(recording, options, path)
         header, lost = _header(recording, options)
         guides = collected.guides()
         feed = MessageFeed(recording, topic)
@@ -81,19 +81,19 @@ def _named(topics: Sequence[TopicInfo], types: Sequence[str] = ()) -> str:
     return ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in chosen[:12]) + (", ..." if len(chosen) > 12 else "")
 
 
-def _looked(topics: Sequence[TopicInfo], options: SourceOptions, path: Path) -> str | None:
-    clouds = [t for t in topics if t.type in CLOUD_TYPES and t.count]
-    return _cloud_topic(topics, options, path) if options.topic is not None or len(clouds) == 1 else None
+def _looked(recording: Recording, options: SourceOptions, path: Path) -> str | None:
+    clouds = [t for t in recording.topics() if t.type in CLOUD_TYPES and t.count]
+    return _cloud_topic(recording, options, path) if options.topic is not None or len(clouds) == 1 else None
 
 
-def _cloud_topic(topics: Sequence[TopicInfo], options: SourceOptions, path: Path) -> str:
-    wanted = options.topic
+def _cloud_topic(recording: Recording, options: SourceOptions, path: Path) -> str:
+    wanted, topics = options.topic, recording.topics()
     clouds = [t for t in topics if t.type in CLOUD_TYPES and (t.count or t.name == wanted)]
     if wanted is not None and not any(t.name == wanted for t in clouds):
         hint = f"topics here: {_named(topics) or 'none'}"
         raise UsageError(f"no PointCloud2 topic '{shown(wanted)}'", where=shown(path), hint=hint)
     if not clouds:
-        raise _no_clouds(topics, path)
+        raise _no_clouds(recording, path)
     if wanted is None and len(clouds) > 1:
         hint = f"choose one with --topic: {_named(clouds)}"
         raise UsageError(f"{len(clouds)} PointCloud2 topics", where=shown(path), hint=hint)
@@ -104,9 +104,12 @@ def _cloud_topic(topics: Sequence[TopicInfo], options: SourceOptions, path: Path
     return chosen.name
 
 
-def _no_clouds(topics: Sequence[TopicInfo], path: Path) -> UnreadableInput:
-    packets = any("packet" in t.type.lower() for t in topics)
-    advice = "these are raw sensor packets: convert them with the sensor's own driver first; " if packets else ""
+def _no_clouds(recording: Recording, path: Path) -> UnreadableInput:
+    topics, advice = recording.topics(), ""
+    if any("packet" in t.type.lower() for t in topics):
+        advice = "these are raw sensor packets: convert them with the sensor's own driver first; "
+    elif recording.losses:
+        advice = f"{len(recording.losses)} part(s) of it could not be read, 'avsreplay doctor' says which; "
     hint = f"{advice}topics here: {_named(topics) or 'none'}"
     return UnreadableInput("no PointCloud2 topic with a message", where=shown(path), hint=hint)
 

@@ -25,6 +25,7 @@ _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 _CHUNK_OP = re.compile(rb"\x04\x00\x00\x00op=\x05")
 _WINDOW, _MARGIN = 1 << 20, 128
 _MAX_HEAD = 1 << 16
+_MAX_CANDIDATES, _MAX_LOSSES = 20_000, 10_000
 _COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
 
 
@@ -68,7 +69,7 @@ class Ros1Bag:
         self._limit, self._table = limit, MessageTable(sinks)
         self._topics: dict[int, str] = {}
         self._bad_chunk: Loss | None = None
-        self._orphans = 0
+        self._orphans = self._tried = 0
         self._file = ByteFile(path)
         self._chunks = ChunkStore(self._file, limit)
         try:
@@ -109,9 +110,11 @@ class Ros1Bag:
         stop = self._index_at()
         self._adopt(stop)
         at, end = len(ROS1_MAGIC), stop or self._file.size
-        while at < end:
+        while at < end and len(self.losses) < _MAX_LOSSES:
             at = self._step(at, end)
         self._settle()
+        if len(self.losses) >= _MAX_LOSSES:
+            self._lose(Loss("damaged at too many places: the rest is not read", at, end - at))
         if stop is None:
             self._lose(Loss("the bag was not closed: what its recorder still held is lost", self._file.size, 0))
         if self._orphans:
@@ -220,6 +223,9 @@ class Ros1Bag:
         while at < end:
             window = self._file.upto(at, _WINDOW + _MARGIN)
             for match in _CHUNK_OP.finditer(window):
+                self._tried += 1
+                if self._tried > _MAX_CANDIDATES:  # bytes made to look like chunks everywhere
+                    return None
                 for place in range(max(at + match.start() - _MARGIN, start), at + match.start()):
                     if self._is_chunk(place, end):
                         return place
