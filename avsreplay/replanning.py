@@ -90,6 +90,7 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
     if not result.rows or len(beliefs) != len(result.rows):
         what = f"{len(result.rows)} rows and {len(beliefs)} beliefs"
         raise UnreadableInput(what, where=str(path), hint="run again")
+    _check_beliefs(beliefs, path)
     config = result.header.get("config", {})
     extent = extent_m or _extent(result, path)
     since_ns = result.rows[0].t_ns
@@ -108,6 +109,21 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
         axis_c=np.asarray(config.get("fixture_axis_c", (1.0, 0.0, 0.0)), dtype=np.float64),
         extent_m=extent,
     )
+
+
+def _check_beliefs(beliefs: Sequence[Belief], path: Path) -> None:
+    """Every mean finite, every covariance finite and not negative along its diagonal."""
+    for k, belief in enumerate(beliefs):
+        x = belief.x
+        finite = all(
+            np.isfinite(part).all() for part in (x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, belief.P)
+        )
+        if not finite:
+            raise UnreadableInput(f"the belief after scan {k} is not finite", where=str(path), hint="run again")
+        least = float(np.diagonal(belief.P).min())
+        if least < 0.0:
+            what = f"the covariance after scan {k} is not positive (a variance of {least:.3g})"
+            raise UnreadableInput(what, where=str(path), hint="run again")
 
 
 def _table(cls: Any, config: Mapping[str, Any], name: str) -> Any:

@@ -147,5 +147,20 @@ def test_what_cannot_be_is_one_line(result, args, says):
     assert "\n" not in str(done.exception)
 
 
+@pytest.mark.parametrize(
+    ("name", "value", "says"), [("P", -1e-6, "scan 7 is not positive"), ("x", np.nan, "scan 7 is not finite")]
+)
+def test_a_belief_that_cannot_be_is_named(result, tmp_path, name, value, says):
+    for file in result.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    with np.load(result / "beliefs.npz") as data:
+        arrays = {key: data[key].copy() for key in data.files}
+    arrays[name][(7, 5, 5) if name == "P" else (7, 5)] = value
+    np.savez(tmp_path / "beliefs.npz", **arrays)
+    done = run(tmp_path)
+    assert isinstance(done.exception, UnreadableInput)
+    assert says in str(done.exception)
+
+
 def test_no_result_is_unreadable(tmp_path):
     assert isinstance(run(tmp_path / "nothing").exception, UnreadableInput)

@@ -82,9 +82,9 @@ def command(
     planning = _planning(saved, flags)
     index = saved.index_at(at_s)
     made = _usable(lambda: planning.plan_at(index))
-    spread = planning.spread_at(index, made, samples, seed) if made.found else None
-    hindsight = planning.hindsight(every_s)
-    execution = planning.execute()
+    spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
+    hindsight = _usable(lambda: planning.hindsight(every_s))
+    execution = _usable(planning.execute)
     if export:
         _export(planning, made, export)
     if as_json:
@@ -100,7 +100,7 @@ def _usable(action: Any) -> Any:
     try:
         return action()
     except ValueError as error:
-        raise UsageError(str(error), hint="correct the flag") from None
+        raise UsageError(str(error), hint="correct the flag, or the setting in run.json") from None
 
 
 def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
