@@ -24,6 +24,7 @@ __all__ = ["KissBackend"]
 POINTS_PER_VOXEL = 20
 SURFACE_POINTS = 100_000
 SETTLED_OF_GATE = 0.01
+STEP_OF_EPS = 10.0  # 1e-4 by default, the library's own: its last steps creep from one map point to the next
 FAR_M = 1e9  # the map is never thinned by distance
 
 
@@ -52,7 +53,7 @@ class KissBackend:
             voxel_map: Any = VoxelHashMap(voxel, FAR_M, POINTS_PER_VOXEL)
             voxel_map.add_points(points)
             self._maps.append((voxel, voxel_map))
-        self._registration = Registration(target.limits.n_max, target.limits.eps_rad, 1)
+        self._registration = Registration(target.limits.n_max, STEP_OF_EPS * target.limits.eps_rad, 1)
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """See :class:`avsreplay.register.port.Backend`."""

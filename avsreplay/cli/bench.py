@@ -1,0 +1,183 @@
+"""``avsreplay bench``: registration back ends side by side, in turn, on the user's own log."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from avsreplay.geometry import Pose
+    from avsreplay.records import Alignment, Scan, Surface
+    from avsreplay.register import Registrar
+
+__all__ = ["Tally", "command", "measure"]
+
+MEMORY_SCANS = 3
+HEADS = ("back end", "build s", "ms median", "ms p95", "passes", "rot deg rms", "pos mm rms", "failures", "peak MiB")
+
+
+@dataclass(slots=True)
+class Tally:
+    """What one back end did, scan by scan. Times are wall clock; errors are against the log's truth."""
+
+    name: str
+    build_s: float = 0.0
+    peak_mib: float | None = None
+    ms: list[float] = field(default_factory=list)
+    passes: list[int] = field(default_factory=list)
+    rot_deg: list[float] = field(default_factory=list)
+    pos_mm: list[float] = field(default_factory=list)
+    failures: int = 0
+
+    def summary(self) -> dict[str, Any]:
+        """One flat record; None where there is nothing to say."""
+        import numpy as np
+
+        def rms(values: list[float]) -> float | None:
+            return float(np.sqrt(np.mean(np.square(values)))) if values else None
+
+        timed = bool(self.ms)
+        return {
+            "backend": self.name,
+            "build_s": self.build_s,
+            "scans": len(self.ms),
+            "median_ms": float(np.median(self.ms)) if timed else None,
+            "p95_ms": float(np.quantile(self.ms, 0.95)) if timed else None,
+            "median_passes": float(np.median(self.passes)) if timed else None,
+            "rot_err_rms_deg": rms(self.rot_deg),
+            "pos_err_rms_mm": rms(self.pos_mm),
+            "failures": self.failures,
+            "peak_mib": self.peak_mib,
+        }
+
+
+@click.command("bench")
+@click.argument("log", type=click.Path(path_type=Path))
+@click.option("--backends", default="horn,kiss", show_default=True, help="Names, separated by commas.")
+@click.option("--model", type=click.Path(path_type=Path), help="The target's model, where the log has none.")
+@click.option("--topic", help="The cloud topic, where there are several.")
+@click.option("--scans", default=50, show_default=True, type=click.IntRange(1), help="How many scans, from the start.")
+@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
+def command(log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool) -> None:
+    """Time registration back ends side by side on the scans of LOG, in turn.
+
+    The guess is the pose of the scan before: the truth's where the log has one, else each back end's own. The figures
+    of one run compare; the times of two runs need not.
+    """
+    from avsreplay.errors import UsageError
+    from avsreplay.log import SourceOptions, open_source
+
+    names = list(dict.fromkeys(name.strip() for name in backends.split(",") if name.strip()))
+    if not names:
+        raise UsageError("no back end is named", where="--backends", hint="for example --backends horn,kiss")
+    with open_source(log, SourceOptions(topic=topic, model=model, n_scans=scans)) as source:
+        surface, taken = source.header.surface, list(source.scans())
+    if surface is None:
+        raise UsageError("the log has no model", where=str(log), hint="name one with --model")
+    summaries = [tally.summary() for tally in measure(names, surface, taken)]
+    if as_json:
+        click.echo(json.dumps({"log": str(log), "backends": summaries}, indent=2))
+    else:
+        _print(summaries)
+
+
+def measure(names: list[str], surface: Surface, scans: list[Scan]) -> list[Tally]:
+    """Every back end on every scan that has points; all on one scan before any goes on to the next.
+
+    Raises UsageError or MissingBackend for a name that cannot be built, before anything is timed.
+    """
+    from avsreplay.cli.progress import tracked
+
+    tallies, registrars = [], []
+    for name in names:
+        begun = time.perf_counter()
+        registrars.append(_registrar(name, surface))
+        tallies.append(Tally(name, build_s=time.perf_counter() - begun))
+    usable = [scan for scan in scans if len(scan.points)]
+    last: list[Pose | None] = [None] * len(names)
+    truth: Pose | None = None
+    for scan in tracked(usable, len(usable), "bench"):
+        for k, (tally, registrar) in enumerate(zip(tallies, registrars, strict=True)):
+            last[k] = _one(tally, registrar, scan, truth if truth is not None else last[k])
+        truth = scan.truth
+    for tally in tallies:
+        tally.peak_mib = _peak_mib(tally.name, surface, usable[:MEMORY_SCANS])
+    return tallies
+
+
+def _one(tally: Tally, registrar: Registrar, scan: Scan, guess: Pose | None) -> Pose | None:
+    """Register one scan, count it, and give the next guess; the first scan is acquired and not counted."""
+    from avsreplay.records import AlignStatus
+
+    if guess is None:
+        found = registrar.acquire(scan.points)
+        return found.T_ac if found.status is AlignStatus.ALIGNED else None
+    begun = time.perf_counter()
+    found = registrar.register(scan.points, guess)
+    tally.ms.append(1e3 * (time.perf_counter() - begun))
+    tally.passes.append(found.iterations)
+    if found.status is not AlignStatus.ALIGNED:
+        tally.failures += 1
+        return guess
+    if scan.truth is not None:
+        _count_error(tally, scan.truth, found)
+    return found.T_ac
+
+
+def _count_error(tally: Tally, truth: Pose, found: Alignment) -> None:
+    import numpy as np
+
+    from avsreplay import geometry
+
+    step = truth.inverse() @ found.T_ac
+    tally.rot_deg.append(float(np.degrees(geometry.angle(step.q))))
+    tally.pos_mm.append(1e3 * float(np.linalg.norm(step.t)))
+
+
+def _registrar(name: str, surface: Surface) -> Registrar:
+    from avsreplay.register import RegisterParams, Registrar
+
+    return Registrar(surface, RegisterParams(backend=name))
+
+
+def _peak_mib(name: str, surface: Surface, scans: list[Scan]) -> float | None:
+    """Peak memory of a fresh process that builds the back end and registers three scans; None where it is not told."""
+    if sys.platform == "win32":
+        return None
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    work = [(scan.points, scan.truth) for scan in scans]
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(_peak_of_run, name, surface, work).result()
+
+
+def _peak_of_run(name: str, surface: Surface, work: list[tuple[Any, Pose | None]]) -> float:
+    import resource
+
+    registrar = _registrar(name, surface)
+    for points, truth in work:
+        if truth is not None:
+            registrar.register(points, truth)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20) if sys.platform == "darwin" else peak / 1024  # bytes there, KiB here
+
+
+def _print(summaries: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(*HEADS)
+    keys = ("build_s", "median_ms", "p95_ms", "median_passes", "rot_err_rms_deg", "pos_err_rms_mm")
+    digits = (2, 2, 2, 0, 4, 3)
+    for row in summaries:
+        cells = ["-" if row[key] is None else f"{row[key]:.{n}f}" for key, n in zip(keys, digits, strict=True)]
+        peak = "-" if row["peak_mib"] is None else f"{row['peak_mib']:.0f}"
+        table.add_row(row["backend"], *cells, f"{row['failures']} of {row['scans']}", peak)
+    Console(width=120).print(table)

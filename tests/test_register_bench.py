@@ -1,0 +1,63 @@
+"""The bench: every back end on every scan in turn, graded against the truth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from avsreplay.cli.bench import command, measure
+from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
+from avsreplay.geometry import Pose, exp
+from avsreplay.records import Scan
+from avsreplay.register.proving import proving_pose, proving_surface, view
+
+
+def _scans(count: int, truth: bool = True) -> list[Scan]:
+    surface, step = proving_surface(), Pose(exp([0.004, 0.0, 0.01]), np.zeros(3))
+    scans, pose = [], proving_pose()
+    for k in range(count):
+        points = pose.apply(view(surface, 2000, pose.inverse().t))
+        scans.append(Scan(k, k * 10**9, points, truth=pose if truth else None))
+        pose = pose @ step
+    return scans
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_every_scan_but_the_first_is_counted(monkeypatch: pytest.MonkeyPatch, truth: bool) -> None:
+    monkeypatch.setattr("avsreplay.cli.bench._peak_mib", lambda *_: 1.0)
+    tallies = measure(["horn", "small_gicp"], proving_surface(), _scans(4, truth))
+    for tally in tallies:
+        record = tally.summary()
+        assert (record["scans"], record["failures"], record["peak_mib"]) == (3, 0, 1.0)
+        assert record["median_ms"] > 0.0
+        assert (record["rot_err_rms_deg"] is None) == (not truth)
+    if truth:
+        assert tallies[0].summary()["pos_err_rms_mm"] < 0.1
+
+
+def test_a_scan_of_nothing_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avsreplay.cli.bench._peak_mib", lambda *_: None)
+    scans = _scans(3)
+    away = Scan(3, 3 * 10**9, scans[-1].points + 100.0, truth=scans[-1].truth)
+    (tally,) = measure(["horn"], proving_surface(), [*scans, away])
+    assert tally.failures == 1
+
+
+def test_bad_input_is_one_line(tmp_path: Path) -> None:
+    asked = {
+        ("nowhere.mcap",): UnreadableInput,
+        ("nowhere.mcap", "--backends", " , "): UsageError,
+    }
+    for arguments, error in asked.items():
+        assert isinstance(CliRunner().invoke(command, list(arguments)).exception, error)
+    with pytest.raises(UsageError):
+        measure(["no_such"], proving_surface(), [])
+
+
+def test_a_missing_library_is_said_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("avsreplay.register.kiss.KissBackend.requires", (("no_such_module", "kiss-icp"),))
+    with pytest.raises(MissingBackend):
+        measure(["kiss"], proving_surface(), _scans(1))
