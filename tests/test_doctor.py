@@ -6,6 +6,7 @@ import io
 import json
 import subprocess
 import sys
+from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 
+from avsreplay.cli import main
 from avsreplay.log import open_source
 from avsreplay.log.doctor import Severity, examine
 from avsreplay.log.encode import point_cloud2
@@ -27,9 +29,22 @@ CLOUD = "sensor_msgs/msg/PointCloud2"
 
 
 def run(*args: object) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "avsreplay", *map(str, args)], capture_output=True, text=True, timeout=60
-    )
+    """The command line's own entry point, in this process: the output and the exit code."""
+    out, err, before = io.StringIO(), io.StringIO(), sys.argv
+    sys.argv = ["avsreplay", *map(str, args)]
+    try:
+        with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
+            main()
+    finally:
+        sys.argv = before
+    return subprocess.CompletedProcess(sys.argv, int(ended.value.code or 0), out.getvalue(), err.getvalue())
+
+
+def test_the_command_itself(whole: Path) -> None:
+    args = [sys.executable, "-m", "avsreplay", "info", str(whole)]
+    done = subprocess.run(args, capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == run("info", whole).stdout
+    assert done.stderr == ""
 
 
 @pytest.fixture

@@ -130,6 +130,18 @@ def test_a_lost_first_chunk_keeps_the_topics_that_the_summary_tells(whole: dict[
     assert losses[0].messages == 8  # /tf_static, two clouds, two poses, two bodies, a label
 
 
+def test_a_lost_first_chunk_of_a_recording_cut_short_costs_that_chunk(whole: dict[str, Path], tmp_path: Path) -> None:
+    """Nothing defines the channels any more: clouds and truth are told by their bytes."""
+    data, spans = bytearray(whole["zstd"].read_bytes()), chunks(whole["zstd"])
+    data[sum(spans[0]) // 2] ^= 1
+    (tmp_path / "x.mcap").write_bytes(data[: spans[-2][1]])
+    found, losses = read(tmp_path / "x.mcap")
+    assert len(found) == len(CLOUDS) - 4
+    assert all(same(scan) for scan in found)
+    assert all(scan.truth is not None and scan.body is not None for scan in found)
+    assert sum("definition" in loss.what for loss in losses) == 4  # three channels taken, the labels' one not
+
+
 def test_without_a_summary_nothing_is_lost(whole: dict[str, Path], tmp_path: Path) -> None:
     data = whole["zstd"].read_bytes()
     footer = struct.pack("<BQQQI", mcap.FOOTER, 20, 0, 0, 0)

@@ -22,7 +22,7 @@ from avsreplay.log import ClockChoice, SourceOptions, open_source
 from avsreplay.log.cursor import Packer
 from avsreplay.log.encode import point_cloud2, pose_stamped
 from avsreplay.log.schemas import schema_text
-from avsreplay.records import LogHeader, Scan, ScanStatus
+from avsreplay.records import Scan, ScanStatus
 
 CLOUDS = scans(12, 150)
 CLOUD, POSE, TF = "sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
@@ -382,31 +382,3 @@ def test_an_empty_cloud_is_an_empty_scan(tmp_path: Path) -> None:
 def test_the_log_clock_can_be_chosen(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", header(np.random.Generator(np.random.PCG64(1))), CLOUDS)
     assert [s.t_ns for s in read(tmp_path / "a.mcap", clock=ClockChoice.LOG)] == [c.log_ns for c in CLOUDS]
-
-
-def test_a_conversion_to_ros1_and_to_sqlite_and_back_keeps_every_bit(tmp_path: Path) -> None:
-    from rosbags.convert.converter import convert
-
-    write(tmp_path / "a.mcap", LogHeader(), CLOUDS)
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    options = {"exclude_topics": ["/faults", "/tf_static"], "include_topics": [], "exclude_msgtypes": [],
-               "include_msgtypes": []}  # fmt: skip
-    convert(
-        [tmp_path / "a.mcap"],
-        tmp_path / "a.bag",
-        "",
-        9,
-        None,
-        "none",
-        store,
-        get_typestore(Stores.ROS1_NOETIC),
-        **options,
-    )
-    convert([tmp_path / "a.mcap"], tmp_path / "db", "sqlite3", 9, None, "none", store, store, **options)
-    convert([tmp_path / "db"], tmp_path / "back", "mcap", 9, None, "none", store, store, **options)
-    first = read(tmp_path / "a.mcap")
-    for path in ("a.bag", "db", "back"):
-        for one, two in zip(first, read(tmp_path / path), strict=True):
-            assert one.points.tobytes() == two.points.tobytes()
-            assert (one.t_ns, one.log_ns) == (two.t_ns, two.log_ns)
-            assert one.truth.matrix.tobytes() == two.truth.matrix.tobytes()

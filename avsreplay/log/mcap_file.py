@@ -18,11 +18,12 @@ from avsreplay.log import mcap_records as mcap
 from avsreplay.log.byte_file import ByteFile
 from avsreplay.log.chunks import ChunkStore
 from avsreplay.log.cursor import BadMessage
+from avsreplay.log.mcap_channels import ChannelTable
 from avsreplay.log.mcap_records import Channel, Fields, Tap
 from avsreplay.log.mcap_resync import first_chunk, hides_chunk, next_record
 from avsreplay.log.mcap_summary import Summary, read_summary
 from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.recording import MAX_NS, CloudIndex, MessageTable, Sink, canonical_type
+from avsreplay.log.recording import MAX_NS, CloudIndex, MessageTable, Sink
 from avsreplay.log.surface import MODEL_ENDINGS
 from avsreplay.log.text import shown
 
@@ -60,8 +61,7 @@ class McapFile:
         self.closed_properly = False
         self.summary, self.data_end, self.unchecked = Summary(), (0, 0), 0
         self._limit, self._table = limit, MessageTable(sinks)
-        self._channels: dict[int, Channel] = {}
-        self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        self._channels = ChannelTable(self._table)
         self._model: tuple[str, int, int] | None = None
         self._bad_chunk: Loss | None = None
         self._resume: int | None = None
@@ -82,7 +82,7 @@ class McapFile:
 
     def channels(self) -> dict[int, Channel]:
         """Channels by id."""
-        return dict(self._channels)
+        return dict(self._channels.by_id)
 
     def clouds(self, topic: str) -> CloudIndex:
         """The index of a cloud topic."""
@@ -245,9 +245,9 @@ class McapFile:
             if opcode == mcap.MESSAGE:
                 self._message(view, begin, stop, number, begin)
             elif opcode == mcap.SCHEMA:
-                self._schema(Fields(view[begin:stop]))
+                self._channels.schema(Fields(view[begin:stop]))
             elif opcode == mcap.CHANNEL:
-                self._channel(Fields(view[begin:stop]))
+                self._channels.channel(Fields(view[begin:stop]))
 
     def _swallowed(self, at: int, end: int) -> int | None:
         """Where a whole chunk begins inside a bad one: bytes were taken out, and its frame reaches too far."""
@@ -261,25 +261,11 @@ class McapFile:
             return None
         return inner
 
-    def _schema(self, fields: Fields) -> None:
-        number, name, encoding = fields.number(2), fields.text(), fields.text()
-        self._schemas.setdefault(number, (name, encoding, bytes(fields.take(fields.number(4)))))
-
-    def _channel(self, fields: Fields) -> None:
-        number, schema = fields.number(2), fields.number(2)
-        topic, encoding = fields.text(), fields.text()
-        name, schema_encoding, text = self._schemas.get(schema, ("", "", b""))
-        channel = Channel(number, topic, canonical_type(name), encoding, schema_encoding, text, fields.mapping())
-        if number in self._channels:
-            return
-        self._channels[number] = channel
-        self._table.declare(topic, channel.type, encoding)
-
     def _message(self, view: memoryview, begin: int, end: int, container: int, offset: int) -> None:
         if end - begin < 22:
             raise BadMessage("a message shorter than its head")
         channel_id = view[begin] | view[begin + 1] << 8
-        channel = self._channels.get(channel_id)
+        channel = self._channels.by_id.get(channel_id) or self._guessed(channel_id, view[begin + 22 : end])
         self._seen += 1
         if channel is None:
             self._orphans += 1
@@ -292,6 +278,12 @@ class McapFile:
         if self._tap is not None:
             sequence = int.from_bytes(view[begin + 2 : begin + 6], "little")
             self._tap.message(channel, sequence, times, view[begin + 22 : end])
+
+    def _guessed(self, number: int, payload: memoryview) -> Channel | None:
+        channel = None if self.summary.definitions else self._channels.guess(number, payload, self.library)
+        if channel is not None:
+            self._lose(Loss(f"the definition of a channel, taken by its bytes for {channel.type}", 0, 0))
+        return channel
 
     def _lose(self, loss: Loss) -> None:
         self.losses.append(replace(loss, file=self.path.name))
@@ -312,7 +304,7 @@ class McapFile:
         self._trusted = at  # searched once: never again
         stop = summary.start - 13 if summary.start else self._size
         chunked = bool(len(self._chunks)) or not self._seen
-        found = next_record(self._file, at + 1, stop, frozenset(self._channels), chunked)
+        found = next_record(self._file, at + 1, stop, frozenset(self._channels.by_id), chunked)
         resume = found if found is not None else max(stop, at + 1)
         self._lose(Loss(why, at, resume - at))
         return resume
@@ -320,7 +312,7 @@ class McapFile:
     def _adopt(self, summary: Summary) -> None:
         """Channels from a whole summary, in case the chunk that defines them is lost."""
         for opcode, fields in summary.definitions:
-            (self._schema if opcode == mcap.SCHEMA else self._channel)(fields)
+            (self._channels.schema if opcode == mcap.SCHEMA else self._channels.channel)(fields)
 
     def _account(self, summary: Summary) -> None:
         """Messages that the summary counts and nothing else tells of."""
@@ -337,8 +329,8 @@ class McapFile:
 
 _HANDLERS: dict[int, Callable[[McapFile, int, int], None]] = {
     mcap.HEADER: McapFile._take_header,
-    mcap.SCHEMA: lambda file, at, end: file._schema(file._content(at, end)),
-    mcap.CHANNEL: lambda file, at, end: file._channel(file._content(at, end)),
+    mcap.SCHEMA: lambda file, at, end: file._channels.schema(file._content(at, end)),
+    mcap.CHANNEL: lambda file, at, end: file._channels.channel(file._content(at, end)),
     mcap.MESSAGE: McapFile._take_message,
     mcap.CHUNK: McapFile._take_chunk,
     mcap.MESSAGE_INDEX: McapFile._take_message_index,
