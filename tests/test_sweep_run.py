@@ -86,6 +86,11 @@ def test_the_results_say_what_was_run(reference, tmp_path):
     assert (said["planned"], said["done"], said["status"]) == (6, 6, {"ok": 6})
     assert [cell["rates"]["close"]["successes"] for cell in said["cells"]] == [3, 3]
     assert said["detector"]["detected"]["share"] == 1.0
+    for cell in said["cells"]:
+        assert {kind: (found["scans"], found["flagged"]["share"]) for kind, found in cell["kinds"].items()} == {
+            "empty": (6, 1.0),
+            "none": (12, 0.0),
+        }
 
 
 def test_noise_matters_in_every_repeat(reference, tmp_path):

@@ -125,7 +125,7 @@ def _print(summary: SweepSummary) -> None:
             console.print(_cell_table(number, cell))
     if summary.detector is not None and summary.detector.harmful:
         console.print(_detector_table(summary.detector))
-        console.print(_kinds_table(summary.detector))
+        console.print(_kinds_table(summary))
 
 
 def _cell_table(number: int, cell: Cell) -> Table:
@@ -175,14 +175,16 @@ def _detector_table(detector: Detector) -> Table:
     return table
 
 
-def _kinds_table(detector: Detector) -> Table:
-    from rich.markup import escape
+def _kinds_table(summary: SweepSummary) -> Table:
+    """Share flagged, a row a kind of fault, a column a combination."""
     from rich.table import Table
 
-    heads = ("fault", "scans", "flagged", "worst position error [m]", "worst rotation error [deg]")
-    table = Table(*map(escape, heads), title="by kind of fault, over all runs", title_justify="left")
-    for name, kind in detector.kinds.items():
-        flagged = "" if kind.flagged is None else f"{kind.flagged.share:.2%}"
-        worst = ("" if v is None else f"{v:.4g}" for v in (kind.worst_pos_err_m, kind.worst_rot_err_deg))
-        table.add_row(name, str(kind.scans), flagged, *worst)
+    cells = [(number, cell) for number, cell in enumerate(summary.cells) if cell.kinds]
+    table = Table(title="scans flagged by kind of fault, for each combination", title_justify="left")
+    table.add_column("fault")
+    for number, _ in cells:
+        table.add_column(str(number), justify="right")
+    for name in sorted({name for _, cell in cells for name in cell.kinds}):
+        found = (cell.kinds.get(name) for _, cell in cells)
+        table.add_row(name, *("" if k is None or k.flagged is None else f"{k.flagged.share:.1%}" for k in found))
     return table

@@ -45,7 +45,7 @@ def build_page(summary: SweepSummary) -> str:
         *(_spans(title, [(n, c.metrics.get(name)) for n, c in cells]) for name, title in HEADLINES.items()),
     ]
     if summary.detector is not None and summary.detector.harmful:
-        parts += ["<h2>Fault tests</h2>", _detector(summary.detector)]
+        parts += ["<h2>Fault tests</h2>", _detector(summary.detector), "<h2>By kind of fault</h2>", _kinds(cells)]
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     head += f"<title>{escape(summary.name)}</title>"
     body = "\n".join(parts)
@@ -131,15 +131,16 @@ def _detector(detector: Detector) -> str:
             rows.append([f"{name} alone", f"{detected:.2%}", "at most 1 %", f"{threshold:.4g}", f"{curve.area:.4f}"])
     heads = ["test", "harmful scans flagged", "other scans flagged", "threshold", "area under the curve"]
     said = f"<p>{detector.harmful} harmful scans, {detector.other} others, of all runs together.</p>"
-    return said + _table(heads, rows) + _roc(detector) + _kinds(detector)
+    return said + _table(heads, rows) + _roc(detector)
 
 
-def _kinds(detector: Detector) -> str:
-    heads = ["fault", "scans", "flagged", "worst position error [m]", "worst rotation error [deg]"]
+def _kinds(cells: Sequence[tuple[int, Cell]]) -> str:
+    heads = ["combination", "fault", "scans", "flagged", "worst position error [m]", "worst rotation error [deg]"]
     rows = []
-    for name, kind in detector.kinds.items():
-        worst = ("" if v is None else f"{v:.4g}" for v in (kind.worst_pos_err_m, kind.worst_rot_err_deg))
-        rows.append([name, str(kind.scans), _share(kind.flagged), *worst])
+    for number, cell in cells:
+        for name, kind in cell.kinds.items():
+            worst = ("" if v is None else f"{v:.4g}" for v in (kind.worst_pos_err_m, kind.worst_rot_err_deg))
+            rows.append([str(number), name, str(kind.scans), _share(kind.flagged), *worst])
     return _table(heads, rows)
 
 

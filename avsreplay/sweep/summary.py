@@ -45,23 +45,6 @@ STATES = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Cell:
-    """One combination.
-
-    Attributes:
-        values: what was set.  runs: done.  status: how many ended how.  metrics: HEADLINES' quantiles.
-        rates: of the runs done, by criterion.  nees: at the last scan of each run.
-    """
-
-    values: Mapping[str, Any]
-    runs: int
-    status: Mapping[str, int]
-    metrics: Mapping[str, Quantiles | None]
-    rates: Mapping[str, Rate | None]
-    nees: Consistency | None
-
-
-@dataclass(frozen=True, slots=True)
 class KindOfFault:
     """The scans of one kind of fault ("none": outside every window).
 
@@ -77,12 +60,30 @@ class KindOfFault:
 
 
 @dataclass(frozen=True, slots=True)
+class Cell:
+    """One combination.
+
+    Attributes:
+        values: what was set.  runs: done.  status: how many ended how.  metrics: HEADLINES' quantiles.
+        rates: of the runs done, by criterion.  nees: at the last scan of each run.
+        kinds: the fault rule by kind of fault, where scans are kept.
+    """
+
+    values: Mapping[str, Any]
+    runs: int
+    status: Mapping[str, int]
+    metrics: Mapping[str, Quantiles | None]
+    rates: Mapping[str, Rate | None]
+    nees: Consistency | None
+    kinds: Mapping[str, KindOfFault] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
 class Detector:
     """The fault rule over all scans of all runs.
 
     Attributes:
         harmful, other: scans.  detected, false: shares flagged by the rule in force.  curves: each score by itself.
-        kinds: by the kind of fault.
     """
 
     harmful: int
@@ -90,7 +91,6 @@ class Detector:
     detected: Rate | None
     false: Rate | None
     curves: Mapping[str, Roc | None]
-    kinds: Mapping[str, KindOfFault] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,19 +115,27 @@ def summarise(plan: Plan, done: Sequence[tuple[Point, Outcome]], outcomes: Itera
     campaign = plan.loaded.campaign
     criteria = (*CRITERIA, *campaign.success)
     by_cell: dict[int, list[Outcome]] = {k: [] for k in range(len(plan.cells))}
+    cells_of: dict[str, list[int]] = {}
     for point, outcome in done:
         by_cell[point.cell].append(outcome)
+        cells_of.setdefault(outcome.id, []).append(point.cell)
+    detector, kinds = _detectors(outcomes if campaign.scans else (), cells_of)
     return SweepSummary(
         name=campaign.name,
         planned=len(plan),
         done=len(done),
         status=_status([outcome for _, outcome in done]),
-        cells=tuple(_cell(plan.cells[k], found, criteria) for k, found in by_cell.items()),
-        detector=_detector(outcomes, {o.id for _, o in done}) if campaign.scans else None,
+        cells=tuple(_cell(plan.cells[k], found, criteria, kinds.get(k, {})) for k, found in by_cell.items()),
+        detector=detector if campaign.scans else None,
     )
 
 
-def _cell(values: Mapping[str, Any], found: Sequence[Outcome], criteria: Sequence[Criterion]) -> Cell:
+def _cell(
+    values: Mapping[str, Any],
+    found: Sequence[Outcome],
+    criteria: Sequence[Criterion],
+    kinds: Mapping[str, KindOfFault],
+) -> Cell:
     return Cell(
         values=values,
         runs=len(found),
@@ -135,6 +143,7 @@ def _cell(values: Mapping[str, Any], found: Sequence[Outcome], criteria: Sequenc
         metrics={name: quantiles(_numbers(found, name)) for name in HEADLINES},
         rates={c.name: rate(sum(_meets(c, o) for o in found), len(found)) for c in criteria},
         nees=consistency(_numbers(found, "end.nees"), STATES),
+        kinds=kinds,
     )
 
 
@@ -183,8 +192,10 @@ class _DetectorFold:
             detected=rate(self._flagged[True, True], counts[True]),
             false=rate(self._flagged[False, True], counts[False]),
             curves={name: histogram.roc() for name, histogram in self._curves.items()},
-            kinds={kind: self._kind(kind) for kind in sorted({kind for kind, _ in self._kinds})},
         )
+
+    def kinds(self) -> dict[str, KindOfFault]:
+        return {kind: self._kind(kind) for kind in sorted({kind for kind, _ in self._kinds})}
 
     def _kind(self, kind: str) -> KindOfFault:
         scans = self._kinds[kind, True] + self._kinds[kind, False]
@@ -192,13 +203,17 @@ class _DetectorFold:
         return KindOfFault(scans, rate(self._kinds[kind, True], scans), *worst)
 
 
-def _detector(outcomes: Iterable[Outcome], wanted: set[str]) -> Detector:
-    fold = _DetectorFold()
+def _detectors(
+    outcomes: Iterable[Outcome], cells_of: Mapping[str, Sequence[int]]
+) -> tuple[Detector, dict[int, dict[str, KindOfFault]]]:
+    """The fault rule over all scans, and by kind for each combination; a run that stands twice counts once in all."""
+    total, by_cell = _DetectorFold(), {cell: _DetectorFold() for cells in cells_of.values() for cell in cells}
     for outcome in outcomes:
-        if outcome.id in wanted:
-            for line in outcome.scans:
+        folds = [total, *(by_cell[cell] for cell in cells_of[outcome.id])] if outcome.id in cells_of else []
+        for line in outcome.scans:
+            for fold in folds:
                 fold.add(line)
-    return fold.result()
+    return total.result(), {cell: fold.kinds() for cell, fold in by_cell.items()}
 
 
 def _score(name: str, value: float | None) -> float | None:
