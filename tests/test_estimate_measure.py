@@ -8,7 +8,7 @@ import tumbling
 
 from avsreplay import geometry
 from avsreplay.estimate.layout import boxminus, boxplus
-from avsreplay.estimate.measure import innovation, measured_pose, noise_of, sensitivity
+from avsreplay.estimate.measure import innovation, measured_pose, noise_of, residual, sensitivity
 from avsreplay.estimate.motion import grasp_rows
 from avsreplay.geometry import Pose
 from avsreplay.records import Alignment, AlignStatus, State
@@ -91,3 +91,9 @@ def test_grasp_rows_are_the_derivative(x: State) -> None:
         d = np.zeros(20)
         d[k] = eps
         assert np.abs((seen(boxplus(x, d)) - seen(boxplus(x, -d))) / (2 * eps) - J[:, k]).max() < 1e-9, k
+
+
+def test_residual_is_the_innovation_at_the_posterior(x: State) -> None:
+    pose = x.T_ac @ Pose(geometry.exp([0.02, -0.05, 0.01]), np.array([0.1, 0.2, 0.3]))
+    posterior = boxplus(x, np.linspace(-0.02, 0.03, 20))
+    assert np.abs(residual(posterior, x, innovation(x, pose)) - innovation(posterior, pose)).max() < 1e-14

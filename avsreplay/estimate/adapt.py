@@ -37,13 +37,14 @@ class NoiseWindow:
 def push(window: NoiseWindow, residual: Array, HPH: Array, base: Array, length: int) -> NoiseWindow:
     """The window with one more epoch: residual (6,) after the update, H P+ H' (6, 6), the base R it was given."""
     outer = np.outer(residual, residual) + HPH
-    ratios = np.array([_ratio(outer[b, b], base[b, b]) for b in (slice(0, 3), slice(3, 6))])
+    ratios = np.trace(np.linalg.solve(_blocks(base), _blocks(outer)), axis1=1, axis2=2) / 3.0
     keep = length - 1
     return NoiseWindow(_append(window.outer, outer, keep), _append(window.ratios, ratios, keep))
 
 
-def _ratio(outer: Array, base: Array) -> float:
-    return float(np.trace(np.linalg.solve(base, outer))) / 3.0
+def _blocks(A: Array) -> Array:
+    """(2, 3, 3) position and attitude blocks of (6, 6)."""
+    return np.stack([A[:3, :3], A[3:, 3:]])
 
 
 def _append(stack: Array, item: Array, keep: int) -> Array:

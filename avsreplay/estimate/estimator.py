@@ -15,7 +15,7 @@ from avsreplay.estimate import adapt, ekf, horizon
 from avsreplay.estimate.adapt import NoiseWindow
 from avsreplay.estimate.cold import ColdFit, refit
 from avsreplay.estimate.fit import FitParams
-from avsreplay.estimate.measure import in_fixture, innovation, measured_pose, noise_of, sensitivity
+from avsreplay.estimate.measure import in_fixture, innovation, measured_pose, noise_of, residual, sensitivity
 from avsreplay.estimate.motion import propagate
 from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource, Start
 from avsreplay.estimate.start import PoseFix, first_belief, guessed_belief
@@ -160,10 +160,10 @@ class Estimator:
 
         H P+ H' is taken without the widening: what the fit took up of one scan is what white noise would leave.
         """
-        residual = innovation(posterior.x, measured_pose(prediction.belief.x, seen.alpha))
+        left = residual(posterior.x, prediction.belief.x, seen.alpha)
         HPH = prediction.H @ posterior.P @ prediction.H.T / float(colour.mean())
         s = self._factors(window)
-        return adapt.push(window, residual, HPH, seen.R / np.outer(s, s), self.params.window)
+        return adapt.push(window, left, HPH, seen.R / np.outer(s, s), self.params.window)
 
     def _begin(self, track: Track, prediction: Prediction, seen: Innovation) -> Track:
         """Another healthy pose of a cold start: fit them all when enough have come, else carry the last fit along."""

@@ -52,41 +52,33 @@ def forecast(belief: Belief, times_s: Array, torque: float, force: float) -> For
     x = belief.x
     path = Path(x, float(times.max(initial=0.0)))
     here = path.at(times)
-    pushed = _pushed(x, path, times, torque)
+    Phi = np.zeros((len(times), DIM, DIM))
+    Phi[:, range(DIM), range(DIM)] = 1.0
+    Phi[:, :6, :6], Phi[:, :6, SIGMA] = here.S[:, :, :6], here.S[:, :, 6:]
+    Phi[:, (6, 7, 8), (9, 10, 11)] = times[:, None]
+    P = Phi @ belief.P @ np.swapaxes(Phi, 1, 2)
+    move = here.S[:, :, :6]
+    P[:, :6, :6] += move @ _pushed(x, path, times, torque) @ np.swapaxes(move, 1, 2)
     variances = np.empty((len(times), 3))
     for i, t in enumerate(times.tolist()):
-        Phi = _transition(here.S[i], t)
-        P = Phi @ belief.P @ Phi.T
-        P[:6, :6] += here.S[i, :, :6] @ pushed[i] @ here.S[i, :, :6].T
-        then = State(here.q[i], here.w[i], x.r_a + t * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
-        J = grasp_rows(then)
-        variances[i] = np.einsum("ij,jk,ik->i", J, P, J).reshape(3, 3).sum(axis=1)
+        J = grasp_rows(State(here.q[i], here.w[i], x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc))
+        variances[i] = np.sum((J @ P[i]) * J, axis=1).reshape(3, 3).sum(axis=1)
         variances[i, :2] += 3.0 * force**2 * np.array([t**3 / 3.0, t])
     pos, vel, half = np.sqrt(np.maximum(variances, 0.0)).T
     return Forecast(times, pos, vel, 2.0 * half)
 
 
-def _transition(S: Array, h: float) -> Array:
-    Phi = np.eye(DIM)
-    Phi[:6, :6], Phi[:6, SIGMA] = S[:, :6], S[:, 6:]
-    Phi[(6, 7, 8), (9, 10, 11)] = h
-    return Phi
-
-
 def _pushed(x: State, path: Path, times: Array, torque: float) -> Array:
     """(n, 6, 6) covariance the torque has added by each time, carried back to now: sum of Phi^-1 G G' Phi^-1'."""
     rate = float(np.linalg.norm(x.w_b))
-    out = np.zeros((len(times), 6, 6))
-    total, start = np.zeros((6, 6)), 0.0
+    starts = np.concatenate([[0.0], times[:-1]])
+    cells = np.maximum(1, np.ceil(rate * (times - starts) / _CELL_RAD)).astype(int)
+    edges = [np.linspace(a, b, n + 1) for a, b, n in zip(starts, times, cells, strict=True)]
+    low, high = np.concatenate([e[:-1] for e in edges]), np.concatenate([e[1:] for e in edges])
+    half = 0.5 * (high - low)
+    nodes = (low[:, None] + half[:, None] * (1.0 + _NODES)).ravel()
     G = np.zeros((6, 3))
     G[3:] = np.diag(np.array(disturbance(x.sigma)) * torque)
-    for i, end in enumerate(times.tolist()):
-        cells = max(1, int(np.ceil(rate * (end - start) / _CELL_RAD)))
-        edges = np.linspace(start, end, cells + 1)
-        half = 0.5 * np.diff(edges)
-        nodes = (edges[:-1, None] + half[:, None] * (1.0 + _NODES)).ravel()
-        back = np.linalg.solve(path.at(nodes).S[:, :, :6], np.broadcast_to(G, (len(nodes), 6, 3)))
-        weights = (half[:, None] * _WEIGHTS).ravel()
-        total = total + np.einsum("n,nij,nkj->ik", weights, back, back)
-        out[i], start = total, end
-    return out
+    back = np.linalg.solve(path.at(nodes).S[:, :, :6], np.broadcast_to(G, (len(nodes), 6, 3)))
+    parts = (half[:, None] * _WEIGHTS).ravel()[:, None, None] * (back @ np.swapaxes(back, 1, 2))
+    return np.asarray(np.cumsum(parts, axis=0)[3 * np.cumsum(cells) - 1])

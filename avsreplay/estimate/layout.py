@@ -13,7 +13,7 @@ import numpy as np
 from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, State
 
-__all__ = ["DIM", "DMU", "DQ", "RHO", "SIGMA", "VARRHO", "VEL", "W", "boxminus", "boxplus", "hamilton"]
+__all__ = ["DIM", "DMU", "DQ", "RHO", "SIGMA", "VARRHO", "VEL", "W", "boxminus", "boxplus", "hamilton", "rotation"]
 
 DIM = 20
 DQ, W, RHO, VEL, SIGMA, VARRHO, DMU = (BLOCKS[name] for name in BLOCKS)
@@ -30,6 +30,18 @@ def hamilton(a: Array | Quad, b: Array | Quad) -> Quad:
         aw * by + bw * ay + az * bx - ax * bz,
         aw * bz + bw * az + ax * by - ay * bx,
         aw * bw - ax * bx - ay * by - az * bz,
+    )
+
+
+def rotation(q: Array) -> Array:
+    """R (3, 3) of a unit quaternion (4,): the hot path's form of geometry.matrix."""
+    x, y, z, w = q.tolist()
+    return np.array(
+        (
+            (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)),
+            (2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)),
+            (2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)),
+        )
     )
 
 

@@ -10,21 +10,30 @@ import math
 
 import numpy as np
 
-from avsreplay.estimate.layout import DIM, hamilton
+from avsreplay.estimate.layout import DIM, DMU, DQ, RHO, hamilton, rotation
 from avsreplay.geometry import Array, Pose, matrix
 from avsreplay.records import Alignment, State
 
-__all__ = ["in_camera", "in_fixture", "innovation", "measured_pose", "noise_of", "sensitivity"]
+__all__ = ["in_camera", "in_fixture", "innovation", "measured_pose", "noise_of", "residual", "sensitivity"]
+
+
+def _constant() -> Array:
+    """The part of H (6, 20) that never changes."""
+    H = np.zeros((6, DIM))
+    H[:3, RHO] = H[3:, DQ] = H[3:, DMU] = np.eye(3)
+    return H
+
+
+_CONSTANT = _constant()
 
 
 def sensitivity(x: State) -> Array:
     """H (6, 20) at zero error: [-2A(q)[c x] 0 I 0 0 A(q) 0; I 0 0 0 0 0 I]."""
-    A = matrix(x.q_ab)
+    A = rotation(x.q_ab)
     cx, cy, cz = x.c_b.tolist()
-    H = np.zeros((6, DIM))
+    H = _CONSTANT.copy()
     H[:3, :3] = A @ np.array([[0.0, 2 * cz, -2 * cy], [-2 * cz, 0.0, 2 * cx], [2 * cy, -2 * cx, 0.0]])
     H[:3, 14:17] = A
-    H[(0, 1, 2), (6, 7, 8)] = H[(3, 4, 5), (0, 1, 2)] = H[(3, 4, 5), (17, 18, 19)] = 1.0
     return H
 
 
@@ -32,7 +41,20 @@ def innovation(x: State, T_ac: Pose) -> Array:
     """The innovation alpha (6,) = z - h at zero error: [m in {A}, half-angle vector in {B}]."""
     q = hamilton(hamilton(_inverse(x.q_ab), T_ac.q), _inverse(x.q_bc))
     s = 1.0 if q[3] >= 0.0 else -1.0
-    dx, dy, dz = (T_ac.t - x.r_a - matrix(x.q_ab) @ x.c_b).tolist()
+    dx, dy, dz = (T_ac.t - x.r_a - rotation(x.q_ab) @ x.c_b).tolist()
+    return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
+
+
+def residual(posterior: State, prior: State, alpha: Array) -> Array:
+    """Z - h(x+) (6,) of the pose that gave ``alpha`` at the prior."""
+    vx, vy, vz = alpha[3:].tolist()
+    deta = (vx, vy, vz, math.sqrt(max(0.0, 1.0 - vx * vx - vy * vy - vz * vz)))
+    left = hamilton(_inverse(posterior.q_ab), prior.q_ab)
+    right = hamilton(prior.q_bc, _inverse(posterior.q_bc))
+    q = hamilton(hamilton(left, deta), right)
+    s = 1.0 if q[3] >= 0.0 else -1.0
+    seen = prior.r_a + rotation(prior.q_ab) @ prior.c_b + alpha[:3]
+    dx, dy, dz = (seen - posterior.r_a - rotation(posterior.q_ab) @ posterior.c_b).tolist()
     return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
 
 

@@ -40,6 +40,17 @@ TAIL = 1e-12
 _POLE = 1.5  # the solutions are elliptic functions: no pole nearer than |w| h = pi / 2
 _I6 = np.eye(6)
 _I9 = np.eye(9)
+_I20 = np.eye(DIM)
+
+
+def _pattern(rows: slice, columns: slice) -> Array:
+    """(20, 20) ones on the diagonal of a 3x3 block and of its mirror."""
+    out = np.zeros((DIM, DIM))
+    out[rows, columns] = out[columns, rows] = np.eye(3)
+    return out
+
+
+_PLACE, _MIXED, _SPEED = _pattern(RHO, RHO), _pattern(RHO, VEL), _pattern(VEL, VEL)
 
 
 def sigma3(sigma: Array) -> float:
@@ -195,21 +206,18 @@ def _relative(S: Array) -> Array:
 
 def transition(step: Flow, sigma: Array, h: float) -> Array:
     """Phi (20, 20) of a step of h seconds from a state with ``sigma``."""
-    Phi = np.eye(DIM)
+    Phi = _I20.copy()
     Phi[:6, :6] = step.S[:, :6]
     Phi[:6, SIGMA] = step.S[:, 6:] @ sigma_join(sigma)
-    Phi[(6, 7, 8), (9, 10, 11)] = h
+    Phi[6, 9] = Phi[7, 10] = Phi[8, 11] = h
     return Phi
 
 
 def process_noise(step: Flow, h: float, force: float) -> Array:
     """Q_d (20, 20) of a step; ``force`` is the root density of eps_f [m/s^1.5]."""
-    Q = np.zeros((DIM, DIM))
-    Q[:6, :6] = step.Q
     density, h = force * force, abs(h)
-    Q[(6, 7, 8), (6, 7, 8)] = density * h**3 / 3.0
-    Q[(6, 7, 8), (9, 10, 11)] = Q[(9, 10, 11), (6, 7, 8)] = density * h**2 / 2.0
-    Q[(9, 10, 11), (9, 10, 11)] = density * h
+    Q: Array = (density * h**3 / 3.0) * _PLACE + (density * h**2 / 2.0) * _MIXED + (density * h) * _SPEED
+    Q[:6, :6] = step.Q
     return Q
 
 
