@@ -258,6 +258,7 @@ def violations(scene: SampledScene, limits: Limits, flight: StepFlight) -> Seque
     apex, axis, centre = scene.at(times)
     from_apex = r - apex
     distance = np.linalg.norm(from_apex, axis=1)
+    stride = float(np.abs(np.diff(distance)).max())  # a limit begins somewhere between two instants: take the earlier
     along = np.sum(from_apex * axis, axis=1)
     across = np.linalg.norm(from_apex - along[:, None] * axis, axis=1)
     zero = np.zeros(len(times))
@@ -265,10 +266,10 @@ def violations(scene: SampledScene, limits: Limits, flight: StepFlight) -> Seque
     for i, degrees, reach in ((0, limits.cone_deg, limits.cone_range_m), (1, limits.final_deg, limits.final_range_m)):
         if degrees is not None:
             excess = across - math.tan(math.radians(degrees)) * along - (limits.mouth_m or 0.0)
-            out[i] = np.where(distance <= (reach or math.inf), np.maximum(excess, 0.0), 0.0)
+            out[i] = np.where(distance <= (reach or math.inf) + stride, np.maximum(excess, 0.0), 0.0)
     if limits.keepout_m is not None:
         inside = limits.keepout_m - np.linalg.norm(r - centre, axis=1)
-        out[2] = np.where(distance > (limits.keepout_release_m or 0.0), np.maximum(inside, 0.0), 0.0)
+        out[2] = np.where(distance > (limits.keepout_release_m or 0.0) - stride, np.maximum(inside, 0.0), 0.0)
     return out
 
 
