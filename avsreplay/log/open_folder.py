@@ -47,7 +47,8 @@ def open_folder(path: Path, options: SourceOptions) -> Source:
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     notes = {"source": "folder", "times": "given" if times else f"steady at {options.rate_hz!r} Hz"}
     guides = _guides(files, feed.header_ns, by_name, found, options)
-    return Source(path, feed, LogHeader(surface=surface, notes=notes), options, guides)
+    besides = [p for p in (pose_file, path / _TIME_FILE) if p is not None and p.is_file() and p.is_relative_to(path)]
+    return Source(path, feed, LogHeader(surface=surface, notes=notes), options, guides, files=[*files, *besides])
 
 
 def _pose_file(path: Path) -> Path | None:

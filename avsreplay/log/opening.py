@@ -73,7 +73,8 @@ def _messages(path: Path, options: SourceOptions, look: bool) -> Source:
         recording.close()
         raise
     extra = {"profile": recording.profile, "library": recording.library}
-    return Source(path, feed, header, options, guides, extra=extra, losses=lost)
+    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    return Source(path, feed, header, options, guides, files=files, extra=extra, losses=lost)
 
 
 def _named(topics: Sequence[TopicInfo], types: Sequence[str] = ()) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -43,11 +43,12 @@ class Source:
         options: SourceOptions,
         guides: Guides,
         *,
+        files: Sequence[Path],
         extra: dict[str, str] | None = None,
         losses: tuple[Loss, ...] = (),
     ) -> None:
         self.path, self.header, self.options = path, header, options
-        self._feed, self._guides = feed, guides
+        self._feed, self._guides, self._files = feed, guides, tuple(files)
         self._extra = extra or {}
         self._placed, self._clock = place(feed.log_ns, feed.publish_ns, feed.header_ns, options.clock)
         self._lost = losses
@@ -85,9 +86,9 @@ class Source:
 
     @cached_property
     def sha256(self) -> str:
-        """Of the file's bytes; of a folder or a split log, of its files' names and bytes in order."""
+        """Of the file's bytes; of a folder or split log, of the names and bytes of the files read, in order."""
         digest = hashlib.sha256()
-        for path in self._files():
+        for path in self._files:
             if self.path.is_dir():
                 digest.update(path.relative_to(self.path).as_posix().encode("utf-8", "surrogateescape") + b"\0")
             with path.open("rb") as file:
@@ -121,7 +122,7 @@ class Source:
         return LogInfo(
             path=str(self.path),
             kind=self._feed.kind,
-            bytes=sum(p.stat().st_size for p in self._files()),
+            bytes=sum(p.stat().st_size for p in self._files),
             topics=topics,
             start_ns=start,
             end_ns=max(ends, default=None),
@@ -145,9 +146,6 @@ class Source:
     def close(self) -> None:
         """Let go of the files."""
         self._feed.close()
-
-    def _files(self) -> list[Path]:
-        return sorted(p for p in self.path.rglob("*") if p.is_file()) if self.path.is_dir() else [self.path]
 
     @cached_property
     def _selected(self) -> list[int]:
