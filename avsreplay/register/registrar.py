@@ -19,6 +19,7 @@ from avsreplay.register.model import Model
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.port import Target, load
 from avsreplay.register.sampling import thin
+from avsreplay.register.second_look import look_again
 
 __all__ = ["Registrar"]
 
@@ -55,10 +56,8 @@ class Registrar:
         scan = self._scan(points)
         if len(scan) == 0:
             return nothing(len(points), AlignStatus.NO_POINTS, guess)
-        fit = self._align(scan, guess.inverse())
-        if fit is None:
-            return nothing(len(scan), AlignStatus.FAILED, guess)
-        return assess(self._model, self._view, scan, fit, self.limits, self.params)
+        first = self._graded(scan, guess)
+        return look_again(first, guess, scan, self.limits.gate_m, lambda other: self._graded(scan, other))
 
     def acquire(self, points: NDArray[Any]) -> Alignment:
         """The pose without a guess: the best of a search over all attitudes, then registered and graded as any other.
@@ -88,6 +87,12 @@ class Registrar:
         finite = np.isfinite(points).all(axis=1)
         scan = points if finite.all() else points[finite]
         return thin(scan, self.params.subsample_m) if self.params.subsample_m > 0.0 else scan
+
+    def _graded(self, scan: NDArray[Any], guess: Pose) -> Alignment:
+        fit = self._align(scan, guess.inverse())
+        if fit is None:
+            return nothing(len(scan), AlignStatus.FAILED, guess)
+        return assess(self._model, self._view, scan, fit, self.limits, self.params)
 
     def _align(self, scan: NDArray[Any], guess: Pose) -> Fit | None:
         """The wall: whatever a back end raises stops here and becomes FAILED."""

@@ -1,0 +1,68 @@
+"""A second look where the first pose may be a side valley: far from its guess, and a poor fit.
+
+On the built-in target begun 4 deg and 12 cm off, 3 of 100 registrations settle 2 deg beside the truth with three times
+the fit error of the others; begun again from six small turns about the guess and six about the result, none did.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Alignment, AlignStatus
+
+__all__ = ["look_again"]
+
+TURN_RAD = np.radians(4.0)
+POOR_OF_GATE = 0.3  # of the gate: an rms above it is a poor fit
+CLEARLY = 0.9  # a second pose must leave less than this share of the first one's cost
+
+
+def look_again(
+    first: Alignment,
+    guess: Pose,
+    points: NDArray[Any],
+    gate_m: float,
+    register: Callable[[Pose], Alignment],
+) -> Alignment:
+    """The better of ``first`` and what registration finds from turned guesses; ``first`` where nothing is doubtful.
+
+    Args:
+        first: the alignment from ``guess`` (T_ac).
+        guess: where it began.
+        points: (n, 3) in {A} [m].
+        gate_m: distance beyond which a point is no inlier.
+        register: aligns from another guess.
+    """
+    if not _doubtful(first, guess, points, gate_m):
+        return first
+    found = [register(start) for start in _starts(guess, first.T_ac, points.mean(axis=0))]
+    best = min(found, key=lambda other: _cost(other, gate_m))
+    return best if _cost(best, gate_m) < CLEARLY * _cost(first, gate_m) else first
+
+
+def _doubtful(first: Alignment, guess: Pose, points: NDArray[Any], gate_m: float) -> bool:
+    if first.status in (AlignStatus.FAILED, AlignStatus.NO_POINTS) or not first.inliers:
+        return False
+    moved = first.T_ac.inverse().apply(points) - guess.inverse().apply(points)
+    return first.rms_m > POOR_OF_GATE * gate_m and float(np.linalg.norm(moved, axis=1).mean()) > gate_m
+
+
+def _cost(found: Alignment, gate_m: float) -> float:
+    """Mean of min(1, squared distance in units of the gate) over the scan."""
+    return 1.0 - found.inlier_ratio * (1.0 - (found.rms_m / gate_m) ** 2) if found.inliers else 1.0
+
+
+def _starts(guess: Pose, result: Pose, centre_a: Array) -> Iterator[Pose]:
+    """Turned either way about each axis of {C}, about the scan's middle."""
+    for base in (guess, result):
+        centre = base.inverse().apply(centre_a)
+        for axis in np.eye(3):
+            for sign in (1.0, -1.0):
+                turn = geometry.exp(sign * TURN_RAD * axis)
+                yield base @ Pose(turn, centre - geometry.matrix(turn) @ centre)

@@ -1,0 +1,50 @@
+"""Side valleys: a far guess must not leave a pose beside the truth that a better one could replace."""
+
+import numpy as np
+import pytest
+
+from avsreplay import geometry, settings
+from avsreplay.geometry import Pose
+from avsreplay.register import Registrar
+from avsreplay.simulate import builtin_surface, scenario_of, simulate
+
+SCENARIO = """
+seed = 5
+duration_s = 60.0
+rate_hz = 0.2
+[motion]
+attitude_xyzw = [0.1, 0.7, -0.1, 0.7]
+rate_radps = [0.06, 0.064, -0.048]
+position_m = [0.1, -0.1, 4.5]
+"""
+
+
+@pytest.fixture(scope="module")
+def scans():
+    simulated = simulate(scenario_of(settings.parse(SCENARIO, "second look")), builtin_surface())
+    return list(simulated.scans())
+
+
+def test_no_far_guess_ends_beside_the_truth(scans):
+    registrar, rng = Registrar(builtin_surface()), np.random.default_rng(0)
+    left = []
+    for scan in scans:
+        for _ in range(8):
+            axis, shift = rng.normal(size=(2, 3))
+            turn = geometry.exp(np.radians(4.0) * axis / np.linalg.norm(axis))
+            guess = scan.truth @ Pose(turn, 0.12 * shift / np.linalg.norm(shift))
+            found = registrar.register(scan.points, guess)
+            error = found.T_ac.inverse() @ scan.truth
+            left.append((np.degrees(geometry.angle(error.q)), np.linalg.norm(error.t)))
+    assert len(left) >= 80
+    assert np.max(left, axis=0)[0] < 0.5
+    assert np.max(left, axis=0)[1] < 0.01
+
+
+def test_a_close_guess_is_looked_at_once(scans, monkeypatch):
+    registrar, calls = Registrar(builtin_surface()), []
+    graded = registrar._graded
+    monkeypatch.setattr(registrar, "_graded", lambda scan, guess: calls.append(1) or graded(scan, guess))
+    for scan in scans:
+        registrar.register(scan.points, scan.truth)
+    assert len(calls) == len(scans)
