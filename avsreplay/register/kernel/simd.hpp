@@ -1,7 +1,14 @@
 // Eight floats and four doubles at a time, in operations that round alike on every machine.
 // Included inside a namespace named after the instruction set, so that two builds of it can stand in one program.
+// Where the compiler has no vector types (or AVS_PLAIN says so) plain loops do the same.
+#if defined(__GNUC__) && !defined(AVS_PLAIN)
+#define AVS_VECTORS 1
+#else
+#define AVS_VECTORS 0
+#endif
+
 struct F8 {
-#if defined(__GNUC__)
+#if AVS_VECTORS
   typedef float Raw __attribute__((vector_size(32)));
   typedef int32_t Mask __attribute__((vector_size(32)));
   Raw v;
@@ -14,7 +21,7 @@ struct F8 {
 };
 
 struct D4 {
-#if defined(__GNUC__)
+#if AVS_VECTORS
   typedef double Raw __attribute__((vector_size(32)));
   Raw v;
 #else
@@ -22,7 +29,7 @@ struct D4 {
 #endif
 };
 
-#if defined(__GNUC__)
+#if AVS_VECTORS
 static inline F8 f8(float x) { return {x - F8::Raw{}}; }
 static inline F8 operator+(F8 a, F8 b) { return {a.v + b.v}; }
 static inline F8 operator-(F8 a, F8 b) { return {a.v - b.v}; }
@@ -30,7 +37,6 @@ static inline F8 operator*(F8 a, F8 b) { return {a.v * b.v}; }
 static inline F8 operator/(F8 a, F8 b) { return {a.v / b.v}; }
 static inline F8::Mask operator<(F8 a, F8 b) { return a.v < b.v; }
 static inline F8::Mask both(F8::Mask a, F8::Mask b) { return a & b; }
-static inline F8::Mask none() { return F8::Mask{}; }
 static inline F8::Mask either(F8::Mask a, F8::Mask b) { return a | b; }
 static inline F8 select(F8::Mask m, F8 a, F8 b) { return {m ? a.v : b.v}; }
 static inline D4 operator+(D4 a, D4 b) { return {a.v + b.v}; }
@@ -56,7 +62,6 @@ static inline F8 operator*(F8 a, F8 b) { AVS_LANES8(a.v[k] * b.v[k]) }
 static inline F8 operator/(F8 a, F8 b) { AVS_LANES8(a.v[k] / b.v[k]) }
 static inline F8::Mask operator<(F8 a, F8 b) { AVS_MASK8(a.v[k] < b.v[k]) }
 static inline F8::Mask both(F8::Mask a, F8::Mask b) { AVS_MASK8(a.v[k] && b.v[k]) }
-static inline F8::Mask none() { AVS_MASK8(false) }
 static inline F8::Mask either(F8::Mask a, F8::Mask b) { AVS_MASK8(a.v[k] || b.v[k]) }
 static inline F8 select(F8::Mask m, F8 a, F8 b) { AVS_LANES8(m.v[k] ? a.v[k] : b.v[k]) }
 static inline D4 operator+(D4 a, D4 b) { AVS_LANES4(a.v[k] + b.v[k]) }
@@ -83,7 +88,7 @@ static inline F8 max8(F8 a, F8 b) { return select(b < a, a, b); }
 static inline F8 clamp8(F8 x, F8 lo, F8 hi) { return min8(max8(x, lo), hi); }
 
 static inline F8 sqrt8(F8 a) {
-#if defined(__AVX__)
+#if AVS_VECTORS && defined(__AVX__)
   return {(F8::Raw)_mm256_sqrt_ps((__m256)a.v)};
 #else
   float t[8];
@@ -95,9 +100,9 @@ static inline F8 sqrt8(F8 a) {
 
 // Bit k is set where lane k of the mask is.
 static inline unsigned bits(F8::Mask m) {
-#if defined(__AVX__)
+#if AVS_VECTORS && defined(__AVX__)
   return (unsigned)_mm256_movemask_ps((__m256)m);
-#elif defined(__SSE2__) && defined(__GNUC__)
+#elif AVS_VECTORS && defined(__SSE2__)
   __m128 half[2];
   std::memcpy(half, &m, sizeof m);
   return (unsigned)(_mm_movemask_ps(half[0]) | _mm_movemask_ps(half[1]) << 4);
