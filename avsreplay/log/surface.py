@@ -116,7 +116,8 @@ def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
     options: dict[str, Any] = {"skip_materials": True} if suffix in ("obj", "glb") else {}
     # process=False keeps vertices as they stand; force="mesh" puts the parts of a scene together.
     logging.getLogger("trimesh").addHandler(_SILENT)  # it logs tracebacks of what it goes on to try otherwise
-    mesh: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
+    with np.errstate(all="ignore"):
+        mesh: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or (len(faces) and faces.shape[1] != 3):
         raise BadFile("no triangles in space")
