@@ -104,8 +104,9 @@ def _las(data: bytes, limit: int) -> NDArray[Any]:
         import laspy
     except ImportError:
         raise MissingBackend("LAS needs laspy", where=".las", hint="pip install 'avsreplay[las]'") from None
+    module: Any = laspy  # its stubs leave out what its manual names
     try:
-        with laspy.open(io.BytesIO(data)) as reader:
+        with module.open(io.BytesIO(data)) as reader:
             if reader.header.point_count * 24 > limit:
                 raise BadFile(f"{reader.header.point_count} points are over the limit of {limit} bytes")
             return np.asarray(reader.read().xyz, dtype=np.float64)

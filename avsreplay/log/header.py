@@ -51,14 +51,14 @@ def decode_header(values: Mapping[str, str]) -> LogHeader:
     try:
         return LogHeader(
             scenario=values["scenario"],
-            seed=json.loads(values["seed"]),
-            labels=tuple(Label(**label) for label in json.loads(values["labels"])),
-            start=_to_belief(json.loads(values["start"])),
-            truth=_to_state(json.loads(values["truth"])),
-            notes=json.loads(values["notes"]),
+            seed=_to_seed(_loads(values["seed"])),
+            labels=tuple(_to_label(label) for label in _loads(values["labels"])),
+            start=_to_belief(_loads(values["start"])),
+            truth=_to_state(_loads(values["truth"])),
+            notes={str(name): str(text) for name, text in dict(_loads(values["notes"])).items()},
         )
-    except (KeyError, TypeError, RecursionError) as error:
-        raise ValueError(f"header record: {error}") from None
+    except (KeyError, TypeError, ValueError, OverflowError, RecursionError) as error:
+        raise ValueError(f"header record: {str(error)[:120]}") from None
 
 
 def _checksum(values: Mapping[str, str]) -> int:
@@ -81,8 +81,36 @@ def _belief(belief: Belief | None) -> dict[str, Any] | None:
     return None if belief is None else {"t_ns": belief.t_ns, "x": _state(belief.x), "P": belief.P.tolist()}
 
 
+def _loads(text: str) -> Any:
+    return json.loads(text, parse_constant=_no_number)
+
+
+def _no_number(name: str) -> None:
+    raise ValueError(f"{name} is no number")
+
+
+def _to_seed(value: Any) -> int | None:
+    if value is not None and type(value) is not int:
+        raise ValueError(f"a seed of {str(value)[:40]}")
+    return value
+
+
+def _to_label(values: Any) -> Label:
+    label = Label(**values)
+    whole = type(label.start_ns) is int and type(label.end_ns) is int and type(label.harmful) is bool
+    if not isinstance(label.kind, str) or not whole or not isinstance(label.strength, (int, float, type(None))):
+        raise ValueError("a label that is none")
+    return label
+
+
 def _to_state(values: Any) -> State | None:
-    return None if values is None else State(**{name: np.array(values[name], dtype=np.float64) for name in _STATE})
+    if values is None:
+        return None
+    state = State(**{name: np.array(values[name], dtype=np.float64) for name in _STATE})
+    lengths = np.linalg.norm(state.q_ab), np.linalg.norm(state.q_bc)
+    if not all(abs(length - 1.0) < 1e-6 for length in lengths) or np.abs(state.sigma).max() >= 1.0:
+        raise ValueError("a state that is none: its quaternions are not unit, or a sigma is not below 1")
+    return state
 
 
 def _to_belief(values: Any) -> Belief | None:
