@@ -28,6 +28,7 @@ class SampledGoal:
     Attributes:
         begin, step, end: first node, grid step and last node [s of thrust time].  times: (n,) the nodes.
         dr: (n, 3) goal minus coasting robot [m].  dv: (n, 3) its velocity [m/s].
+        pieces: (n - 1, 4, 3) coefficients of each cubic Hermite cell in powers of its share, 0 to 1.
         acceleration, jerk, snap: bounds on the goal's |d2 rho|, |d3 rho|, |d4 rho| in this stretch [SI].
     """
 
@@ -37,6 +38,7 @@ class SampledGoal:
     times: Array
     dr: Array
     dv: Array
+    pieces: Array
     acceleration: float
     jerk: float
     snap: float
@@ -44,15 +46,11 @@ class SampledGoal:
     def at(self, t: float) -> tuple[Array, Array, Array]:
         """Cubic Hermite (dr, dv, ddv) at thrust time t, each the derivative of the one before."""
         d = self.step
-        k = min(max(int((t - self.begin) / d), 0), len(self.times) - 2)
+        k = min(max(int((t - self.begin) / d), 0), len(self.pieces) - 1)
         s = (t - self.times.item(k)) / d
-        r0, v0 = self.dr[k], self.dv[k]
-        rise = self.dr[k + 1] - r0 - d * v0
-        bend = d * (self.dv[k + 1] - v0)
-        c2, c3 = 3.0 * rise - bend, bend - 2.0 * rise
-        dr = r0 + s * (d * v0 + s * (c2 + s * c3))
-        dv = v0 + (s / d) * (2.0 * c2 + 3.0 * s * c3)
-        return dr, dv, (2.0 * c2 + 6.0 * s * c3) / (d * d)
+        powers = ((1.0, s, s * s, s**3), (0.0, 1.0 / d, 2.0 * s / d, 3.0 * s * s / d), (0.0, 0.0, 2.0, 6.0 * s))
+        dr, dv, ddv = np.array(powers) @ self.pieces[k]
+        return dr, dv, ddv / (d * d)
 
     def curvature(self, n0: float, n1: float, t: Array | float) -> Array | float:
         """Bound on |d2/dt2| of P0.dr + P1.(t dv - dr) for |P0 - P1| = n0, |P1| = n1."""
@@ -86,8 +84,23 @@ def sample(
     if not math.isfinite(a + float(dr.sum())):
         raise ValueError("goal trajectory is not finite")
     return SampledGoal(
-        begin, step, end, times, dr, dv, a + step * MOTION_FACTOR * j, MOTION_FACTOR * j, MOTION_FACTOR * s
+        begin,
+        step,
+        end,
+        times,
+        dr,
+        dv,
+        _hermite(dr, dv, step),
+        a + step * MOTION_FACTOR * j,
+        MOTION_FACTOR * j,
+        MOTION_FACTOR * s,
     )
+
+
+def _hermite(dr: Array, dv: Array, step: float) -> Array:
+    rise = dr[1:] - dr[:-1] - step * dv[:-1]
+    bend = step * (dv[1:] - dv[:-1])
+    return np.stack([dr[:-1], step * dv[:-1], 3.0 * rise - bend, bend - 2.0 * rise], axis=1)
 
 
 def _largest(vectors: Array) -> float:

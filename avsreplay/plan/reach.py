@@ -20,6 +20,8 @@ from avsreplay.geometry import Array
 
 __all__ = ["Touch", "integrals", "support", "touch"]
 
+Vector = list[float]
+
 SMALL_TURN = 0.25  # |P1 - P0| / (|P0| + |P1|) below which the closed form cancels and eight Gauss nodes are exact
 MAX_NEWTON = 60
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -216,35 +218,58 @@ def touch(b0: Array, b1: Array, warm: tuple[Array, Array] | None = None, toleran
         warm: a normal found nearby.
         tolerance: on the residual; a gauge found too early is too small, by the square of the residual.
     """
-    size = math.sqrt(float(b0 @ b0 + b1 @ b1))
-    plane = _plane(b0 / size, b1 / size)
-    b = _in_plane(b0 / size, b1 / size, plane)
+    x, y, size = _scaled(b0, b1)
+    plane = _plane(x, y)
+    b = _in_plane(x, y, plane)
     start = [4 * b[0] - 2 * b[2], 4 * b[1] - 2 * b[3], 4 * b[2] - 2 * b[0], 4 * b[3] - 2 * b[1]]  # least int |w|^2
     if warm is not None:
-        tried = _in_plane(*warm, plane)
+        tried = _in_plane(warm[0].tolist(), warm[1].tolist(), plane)
         start = tried if _dot(tried, b) > 0.0 else start
     along = _dot(start, b)
     end = _descend([p / along for p in start], b, tolerance)
     p0x, p0y, p1x, p1y = (p / end.h for p in end.P)
-    return Touch(plane.T @ (p0x, p0y), plane.T @ (p1x, p1y), size / end.h, end.size)
+    return Touch(_lifted(p0x, p0y, plane), _lifted(p1x, p1y, plane), size / end.h, end.size)
 
 
-def _in_plane(b0: Array, b1: Array, plane: Array) -> list[float]:
-    return [*(plane @ b0).tolist(), *(plane @ b1).tolist()]
+def _scaled(b0: Array, b1: Array) -> tuple[Vector, Vector, float]:
+    """Both as floats, in units of their common length, and that length; scalars are quicker than arrays of three."""
+    x, y = b0.tolist(), b1.tolist()
+    size = math.sqrt(_dot3(x, x) + _dot3(y, y))
+    return [v / size for v in x], [v / size for v in y], size
 
 
-def _plane(b0: Array, b1: Array) -> Array:
-    """(2, 3) orthonormal rows that span b0 and b1, also where these are parallel or one is zero."""
-    first, second = (b0, b1) if b0 @ b0 >= b1 @ b1 else (b1, b0)
-    e0 = first / math.sqrt(float(first @ first))
-    across = second - (second @ e0) * e0
-    across = across - (across @ e0) * e0
-    norm = math.sqrt(float(across @ across))
+def _dot3(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _in_plane(b0: Vector, b1: Vector, plane: tuple[Vector, Vector]) -> list[float]:
+    e0, e1 = plane
+    return [_dot3(b0, e0), _dot3(b0, e1), _dot3(b1, e0), _dot3(b1, e1)]
+
+
+def _lifted(along: float, across: float, plane: tuple[Vector, Vector]) -> Array:
+    e0, e1 = plane
+    return np.array([along * u + across * v for u, v in zip(e0, e1, strict=True)])
+
+
+def _plane(b0: Vector, b1: Vector) -> tuple[Vector, Vector]:
+    """Two orthonormal vectors that span b0 and b1, also where these are parallel or one is zero."""
+    first, second = (b0, b1) if _dot3(b0, b0) >= _dot3(b1, b1) else (b1, b0)
+    norm = math.sqrt(_dot3(first, first))
+    e0 = [v / norm for v in first]
+    across = _without(_without(second, e0), e0)  # twice: what rounding left of e0 goes as well
+    norm = math.sqrt(_dot3(across, across))
     if norm < 1e-14:
-        across = np.eye(3)[int(np.argmin(np.abs(e0)))]
-        across = across - (across @ e0) * e0
-        norm = math.sqrt(float(across @ across))
-    return np.array((e0, across / norm))
+        least = min(range(3), key=lambda i: abs(e0[i]))
+        across = _without([float(i == least) for i in range(3)], e0)
+        norm = math.sqrt(_dot3(across, across))
+    return e0, [v / norm for v in across]
+
+
+def _without(v: Vector, e: Vector) -> Vector:
+    """The part of v across the unit vector e."""
+    k = _dot3(v, e)
+    return [v[0] - k * e[0], v[1] - k * e[1], v[2] - k * e[2]]
 
 
 def integrals(P0: Array, P1: Array) -> tuple[Array, Array]:
