@@ -33,7 +33,7 @@ class Memory {
   }
 
  private:
-  static constexpr double MESH_UNDER = 0.3, CLOUD_UNDER = 0.1, TOO_OFTEN = 0.6;
+  static constexpr double MESH_UNDER = 0.3, CLOUD_UNDER = 0.04, TOO_OFTEN = 0.6;
   double extent_, longest_, length_ = 0;
   int64_t n_;
   bool filled_ = false, judged_ = false;  // this pass fills the memory; the one before did, so this one can use it
