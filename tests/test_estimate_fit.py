@@ -24,6 +24,7 @@ from avsreplay.estimate.relabel import nees
 from avsreplay.estimate.spread import belief_at, spread
 from avsreplay.estimate.start import PoseFix
 from avsreplay.geometry import Pose
+from avsreplay.monitor.convergence import Convergence, ConvergenceParams
 from avsreplay.records import Belief, State
 
 WHITE = EstimatorParams(correlated_share=0.0).resolved(2.0)
@@ -302,3 +303,25 @@ def test_a_body_at_rest_is_no_trouble() -> None:
     assert track.mode == "fit"
     assert np.linalg.norm(track.belief.x.T_ac.t - x.T_ac.t) < 0.02
     assert np.sqrt(track.belief.P[12, 12]) > 0.2
+
+
+def test_a_nearly_axisymmetric_body_can_be_captured_though_its_parameters_stay_unknown() -> None:
+    """A spent stage: where its cross axes lie can hardly be told, where its fixture will be in 30 s can."""
+    moments, base = np.array([1.0, 1.003, 0.3]), tumbling.draw(5, seconds=1.0).states[0]
+    first = State(base.q_ab, base.w_b, base.r_a, base.v_a, tumbling.ratios(moments), base.c_b, base.q_bc)
+    times = np.arange(0.0, 60.1, 0.5)
+    states = tumbling.follow(np.append(times, 90.0), moments, first)
+    estimator, test = Estimator(WHITE, None, 2.0), Convergence(ConvergenceParams(), 2.0)
+    track, held = estimator.initial(0, first.T_ac), test.initial()
+    rng = np.random.Generator(np.random.PCG64(1))
+    for t, x in zip(times, states, strict=False):
+        prediction = estimator.predict(track, round(t * 1e9))
+        alignment = tumbling.alignment(x.T_ac, rng, 0.005, np.radians(0.3))
+        track = estimator.update(track, prediction, estimator.innovate(prediction, alignment), 1)
+        held = test.judge(held, track.belief, estimator.forecast(track.belief, test.params.times_s))
+    assert held.converged
+    assert not held.covariance_holds
+    assert "mu" in held.unknown
+    ahead = estimator.predict(track, 90_000_000_000).belief
+    off = np.linalg.norm(ahead.x.T_ac.t - states[-1].T_ac.t)
+    assert off < 3.0 * estimator.forecast(track.belief, np.array([30.0])).pos_1s_m[0]
