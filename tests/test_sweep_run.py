@@ -5,7 +5,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -213,4 +212,7 @@ def test_bad_input_is_one_line(campaign, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     done = sweep(campaign, tmp_path / "out2", "--workers", "2")
     assert isinstance(done.exception, MissingBackend)
-    assert threading.active_count() < 50
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    done = sweep(campaign, tmp_path / "out3", "--workers", "0")
+    assert isinstance(done.exception, MissingBackend)
+    assert not (tmp_path / "out3").exists()  # said before anything was run

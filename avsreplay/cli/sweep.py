@@ -64,6 +64,7 @@ def command(
     workers.
     """
     from avsreplay.sweep import Journal, execute, expand, load_campaign, write_results
+    from avsreplay.sweep.results import arrow
 
     plan = expand(load_campaign(campaign))
     if only_plan:
@@ -71,6 +72,7 @@ def command(
         return
     if output is None:
         raise UsageError("no directory for the results", where="sweep", hint="add -o DIR, or --plan to look only")
+    arrow()  # said before anything runs, not after
     journal = Journal(output / "journal.txt")
     if retry_failed:
         journal.forget(("failed", "crashed"))

@@ -19,7 +19,7 @@ from avsreplay.sweep.plan import Plan, Point
 from avsreplay.sweep.summary import SweepSummary, summarise
 from avsreplay.sweep.worker import SCAN_COLUMNS, Outcome
 
-__all__ = ["write_results"]
+__all__ = ["arrow", "write_results"]
 
 SCAN_BATCH = 200_000
 
@@ -29,7 +29,7 @@ def write_results(plan: Plan, journal: Journal, folder: Path) -> SweepSummary:
 
     Raises MissingBackend where pyarrow is not installed.
     """
-    _arrow()
+    arrow()
     by_id = {outcome.id: _without_scans(outcome) for outcome in journal.outcomes()}
     done = [(point, by_id[point.task.id]) for point in plan.points() if point.task.id in by_id]
     _write(_run_table(done), folder / "results.parquet")
@@ -42,8 +42,8 @@ def write_results(plan: Plan, journal: Journal, folder: Path) -> SweepSummary:
     return summary
 
 
-def _arrow() -> tuple[Any, Any]:
-    """The modules pyarrow and its Parquet part, which ship no types."""
+def arrow() -> tuple[Any, Any]:
+    """The modules pyarrow and its Parquet part, which ship no types. Raises MissingBackend without them."""
     try:
         return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
     except ImportError:
@@ -56,7 +56,7 @@ def _without_scans(outcome: Outcome) -> Outcome:
 
 
 def _run_table(done: Sequence[tuple[Point, Outcome]]) -> Any:
-    pa, _ = _arrow()
+    pa, _ = arrow()
 
     keys = sorted({key for point, _ in done for key in point.values})
     names = sorted({name for _, outcome in done for name in (outcome.metrics or {})})
@@ -75,7 +75,7 @@ def _run_table(done: Sequence[tuple[Point, Outcome]]) -> Any:
 
 def _column(values: Sequence[Any]) -> Any:
     """Truth values, numbers (float64) or words; anything mixed or nested as JSON text."""
-    pa, _ = _arrow()
+    pa, _ = arrow()
 
     given = [v for v in values if v is not None]
     if given and all(isinstance(v, bool) for v in given):
@@ -89,7 +89,7 @@ def _column(values: Sequence[Any]) -> Any:
 
 def _write_scans(done: Sequence[tuple[Point, Outcome]], journal: Journal, path: Path) -> None:
     """Scans in the order of the runs' names, one batch in memory."""
-    pa, pq = _arrow()
+    pa, pq = arrow()
 
     types = {"seq": pa.int64(), "fault": pa.string(), "harmful": pa.bool_(), "gamma": pa.int64()}
     schema = pa.schema([("id", pa.string()), *((name, types.get(name, pa.float64())) for name in SCAN_COLUMNS)])
@@ -114,7 +114,7 @@ def _batches(wanted: set[str], journal: Journal) -> Iterator[list[Outcome]]:
 
 
 def _write(table: Any, path: Path) -> None:
-    _, pq = _arrow()
+    _, pq = arrow()
 
     partial = path.with_name(path.name + ".partial")
     pq.write_table(table, partial, compression="zstd")
