@@ -8,14 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
+from avsreplay.estimate.deskew import deskew
 from avsreplay.fill import Findings, row_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.faults import FaultDetector
 from avsreplay.plan import Pilot, PilotMemory
-from avsreplay.records import Alignment, AlignStatus, Innovation, Scan
+from avsreplay.records import Alignment, AlignStatus, Innovation, Scan, Verdict
 from avsreplay.register import Registrar
 from avsreplay.rows import Row
 from avsreplay.sight import Aim, Hindsight, aim_columns, plan_columns, see
@@ -24,6 +29,15 @@ from avsreplay.watch import Monitors, Watch, look
 __all__ = ["Memory", "Stages", "fold", "step"]
 
 _UNMEASURED = (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED)
+_SURE_OF_REACH, _SURE_RAD = 0.25, np.radians(15.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sighted:
+    """An alignment and where its guess came from: start, truth, given, predicted, last, acquired."""
+
+    alignment: Alignment
+    origin: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +47,8 @@ class Stages:
     Attributes:
         hindsight: the only part that knows the truth; nothing it says goes back into the chain.
         standoff_c: (3,) approach point in {C} [m].
-        first_pose: first scan -> T_ac to begin with, and where it comes from.
+        reacquire: search without a guess where the prediction is no guess any more.
+        first_pose: first scan -> T_ac to begin with (None: acquire it), and where it comes from.
     """
 
     registrar: Registrar
@@ -44,7 +59,10 @@ class Stages:
     hindsight: Hindsight
     standoff_c: Array
     guess: Guess
-    first_pose: Callable[[Scan], tuple[Pose, str]]
+    deskew: bool
+    reference: str
+    reacquire: bool
+    first_pose: Callable[[Scan], tuple[Pose | None, str]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,13 +87,13 @@ class Memory:
 
 def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
     """One scan through the whole chain. A scan that goes wrong still leaves a row."""
-    memory, track = _track(stages, memory, scan)
+    memory, track, begun = _track(stages, memory, scan)
     prediction = stages.estimator.predict(track, scan.t_ns)
-    guess, origin = _guess(stages, memory, prediction)
-
-    alignment = stages.registrar.register(scan.points, guess)
-    seen = _innovate(stages.estimator, prediction, alignment)
-    verdict = stages.detector.judge(scan.status, alignment, seen, prediction.belief)
+    sighted = begun or _register(stages, memory, scan, prediction)
+    seen, verdict = _judge(stages, scan, prediction, sighted.alignment)
+    if not verdict.gamma and _lost(stages, scan, prediction):
+        sighted = Sighted(stages.registrar.acquire(scan.points), "acquired")
+        seen, verdict = _judge(stages, scan, prediction, sighted.alignment)
     track = stages.estimator.update(track, prediction, seen, verdict.gamma)
 
     watch, columns = look(stages.monitors, memory.watch, stages.estimator, prediction, seen, verdict.gamma, track)
@@ -90,17 +108,18 @@ def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
         Findings(
             scan=scan,
             since_ns=memory.since_ns,
-            guess=origin,
-            alignment=alignment,
+            guess=sighted.origin,
+            alignment=sighted.alignment,
             verdict=verdict,
             innovation=seen,
             belief=track.belief,
             estimator=track.mode,
+            reference=stages.reference,
             converged=converged,
             columns=columns,
         )
     )
-    last = alignment.T_ac if verdict.gamma else memory.last
+    last = sighted.alignment.T_ac if verdict.gamma else memory.last
     return replace(memory, watch=watch, pilot=pilot, aim=aim, track=track, last=last), row
 
 
@@ -111,21 +130,49 @@ def fold(stages: Stages, memory: Memory, scans: Iterable[Scan]) -> Iterator[tupl
         yield memory, row
 
 
-def _track(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Track]:
-    """The track so far; at the first scan a new one, with its origin noted."""
-    if memory.track is not None:
-        return memory, memory.track
+def _track(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Track, Sighted | None]:
+    """The track so far; at the first scan a new one. What was acquired is tried anew until a scan is healthy."""
+    if memory.track is not None and not (memory.origin == "acquired" and memory.last is None):
+        return memory, memory.track, None
     pose, origin = stages.first_pose(scan)
-    return replace(memory, origin=origin, since_ns=scan.t_ns), stages.estimator.initial(scan.t_ns, pose)
+    begun = None
+    if pose is None:
+        begun = Sighted(stages.registrar.acquire(scan.points), origin)
+        pose = begun.alignment.T_ac
+    since_ns = scan.t_ns if memory.track is None else memory.since_ns
+    return replace(memory, origin=origin, since_ns=since_ns), stages.estimator.initial(scan.t_ns, pose), begun
 
 
-def _guess(stages: Stages, memory: Memory, prediction: Prediction) -> tuple[Pose, str]:
+def _register(stages: Stages, memory: Memory, scan: Scan, prediction: Prediction) -> Sighted:
+    """The scan against the model, from the guess that the configuration asks for."""
+    points = _still(stages, memory, scan, prediction)
     if memory.last is None:
-        return prediction.belief.x.T_ac, memory.origin
+        return Sighted(stages.registrar.register(points, prediction.belief.x.T_ac), memory.origin)
     if stages.guess is Guess.LAST:
-        return memory.last, "last"
-    return prediction.belief.x.T_ac, "predicted"
+        return Sighted(stages.registrar.register(points, memory.last), "last")
+    return Sighted(stages.registrar.register(points, prediction.belief.x.T_ac), "predicted")
 
 
-def _innovate(estimator: Estimator, prediction: Prediction, alignment: Alignment) -> Innovation | None:
-    return None if alignment.status in _UNMEASURED else estimator.innovate(prediction, alignment)
+def _judge(
+    stages: Stages, scan: Scan, prediction: Prediction, alignment: Alignment
+) -> tuple[Innovation | None, Verdict]:
+    measured = alignment.status not in _UNMEASURED
+    seen = stages.estimator.innovate(prediction, alignment) if measured else None
+    return seen, stages.detector.judge(scan.status, alignment, seen, prediction.belief)
+
+
+def _lost(stages: Stages, scan: Scan, prediction: Prediction) -> bool:
+    """Is the predicted pose too unsure to be a guess: 3 sigma beyond a quarter of the reach, or beyond 15 deg?"""
+    if not stages.reacquire or not len(scan.points):
+        return False
+    variance = np.diag(prediction.H @ prediction.belief.P @ prediction.H.T)
+    position, half_angle = 3.0 * np.sqrt(variance[:3].sum()), 3.0 * np.sqrt(variance[3:].sum())
+    return bool(position > _SURE_OF_REACH * stages.registrar.limits.reach_m or 2.0 * half_angle > _SURE_RAD)
+
+
+def _still(stages: Stages, memory: Memory, scan: Scan, prediction: Prediction) -> NDArray[Any]:
+    """The scan's points at one instant: carried by the prior's motion where they have times and there is a motion."""
+    known = memory.last is not None or stages.estimator.start is not None
+    if scan.times_s is None or not (stages.deskew and known):
+        return scan.points
+    return deskew(scan.points, scan.times_s, prediction)

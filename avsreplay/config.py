@@ -23,7 +23,7 @@ from avsreplay.monitor.faults import FaultParams
 from avsreplay.plan import PlanParams, SupervisorParams
 from avsreplay.register import RegisterParams
 
-__all__ = ["Guess", "RunConfig", "load_config", "parse_pose"]
+__all__ = ["Against", "Guess", "RunConfig", "load_config", "parse_pose"]
 
 
 class Guess(Enum):
@@ -31,6 +31,13 @@ class Guess(Enum):
 
     PREDICTED = "predicted"  # closed loop: the filter's prior
     LAST = "last"  # open loop: the last healthy pose
+
+
+class Against(Enum):
+    """What errors are taken against."""
+
+    TRUTH = "truth"
+    FIT = "fit"
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +48,12 @@ class RunConfig:
     guess: Guess = Guess.PREDICTED
     # first pose: "log" (what the log says), "truth", "auto" (acquisition), or "x,y,z,qx,qy,qz,qw" of {C} in {A}
     init: str = "log"
+    # carry points with times of their own to the scan's instant by the predicted motion
+    deskew: bool = True
+    # search without a guess once a faulty scan finds the prediction too unsure to be one
+    reacquire: bool = True
+    # what errors are against: "truth" (the log's), or "fit" (one motion fitted to all healthy poses of a first pass)
+    reference: Against = Against.TRUTH
     register: RegisterParams = field(default_factory=RegisterParams)
     estimator: EstimatorParams = field(default_factory=EstimatorParams)
     faults: FaultParams = field(default_factory=FaultParams)

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.estimate.layout import boxminus
 from avsreplay.estimate.measure import sensitivity
-from avsreplay.estimate.relabel import nees
+from avsreplay.estimate.relabel import nearest
 from avsreplay.geometry import Array, Pose
+from avsreplay.monitor.consistency import block_nees
 from avsreplay.records import BLOCKS, Alignment, Belief, Innovation, Scan, ScanStatus, Verdict
 from avsreplay.rows import Row
 
@@ -26,6 +28,7 @@ class Findings:
     Attributes:
         since_ns: instant of the log's first scan.  guess: where the registration's guess came from.
         belief: after the update, None before the first pose.  estimator: who speaks.
+        reference: what the scan's truth is: "truth", or "fit".
         columns: row fields that monitors and pilot fill, by column name.
     """
 
@@ -37,6 +40,7 @@ class Findings:
     innovation: Innovation | None
     belief: Belief | None
     estimator: str
+    reference: str
     converged: bool
     columns: dict[str, Any]
 
@@ -53,6 +57,7 @@ def row_of(found: Findings) -> Row:
         reason=found.verdict.reason.value,
         guess=found.guess,
         fault=scan.fault,
+        reference=None if scan.truth is None else found.reference,
         estimator=found.estimator,
         converged=found.converged,
         **_registration(found.alignment, scan),
@@ -116,8 +121,12 @@ def _pose_sigma(belief: Belief) -> tuple[float, float]:
 def _errors(belief: Belief | None, scan: Scan) -> dict[str, Any]:
     if belief is None or scan.truth is None:
         return {}
-    fields = dict(zip(("pos_err_m", "rot_err_deg"), _distance(belief.x.T_ac, scan.truth), strict=True))
-    return fields if scan.body is None else {**fields, "nees": _finite(nees(belief, scan.body))}
+    fields: dict[str, Any] = dict(zip(("pos_err_m", "rot_err_deg"), _distance(belief.x.T_ac, scan.truth), strict=True))
+    if scan.body is None:
+        return fields
+    named, size = nearest(belief, scan.body)
+    blocks = block_nees(boxminus(named, belief.x), belief.P)
+    return fields | {"nees": _finite(size)} | {f"nees_{name}": _finite(blocks[name]) for name in BLOCKS}
 
 
 def _distance(pose: Pose, truth: Pose) -> tuple[float, float]:

@@ -14,12 +14,14 @@ from typing import Any
 
 from avsreplay import chain, settings
 from avsreplay.chain import Memory
-from avsreplay.config import RunConfig, load_config
+from avsreplay.config import Against, RunConfig, load_config
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.estimate.reference import Reference, reference_fit
 from avsreplay.estimate.relabel import nearest
+from avsreplay.geometry import Pose
 from avsreplay.log import Source, SourceOptions, open_source
 from avsreplay.records import Scan, State, Surface
-from avsreplay.report import Summary
+from avsreplay.report import Summary, row_poses
 from avsreplay.report.summary import SummaryFold
 from avsreplay.rows import Row
 from avsreplay.wire import first_memory, stages
@@ -66,7 +68,8 @@ class Run:
             header = self.source.header
             self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
             self.surface: Surface = self._model()
-            self._stages = stages(self.config, header, self.surface, self.source.truth_poses())
+            self._reference: Reference | None = None
+            self._stages = stages(self.config, header, self.surface, self._true_poses())
         except BaseException:
             self.source.close()
             raise
@@ -130,8 +133,31 @@ class Run:
         surface = self.surface
         return {"name": Path(surface.name).name, "sha256": surface.sha256, "extent_m": surface.extent}
 
+    def _true_poses(self) -> list[tuple[int, Pose]]:
+        """What hindsight judges by: the log's truth, or the poses of a motion fitted in a first pass."""
+        if self.config.reference is Against.TRUTH:
+            return self.source.truth_poses()
+        ready = stages(self.config, self.source.header, self.surface)
+        rows = [row for _, row in chain.fold(ready, first_memory(ready), self.source.scans(self.job.prefetch))]
+        healthy = [row for row in rows if row.gamma]
+        poses = [pose for _, pose in row_poses(healthy, "registration")]
+        stamps = [row.t_ns for row in healthy]
+        self._reference = reference_fit(stamps, poses, None, self.surface.extent, self.config.estimator)
+        inside = [row.t_ns for row in rows if stamps[0] <= row.t_ns <= stamps[-1] and row.status != "clock"]
+        return [(t_ns, self._reference.at(t_ns).T_ac) for t_ns in sorted(set(inside))]
+
+    def _judged(self, scan: Scan) -> Scan:
+        """The scan with the reference in place of its truth, where a reference is asked for."""
+        if self._reference is None:
+            return scan
+        try:
+            state = self._reference.at(scan.t_ns)
+        except ValueError:  # before the first or after the last healthy pose
+            return replace(scan, truth=None, body=None)
+        return replace(scan, truth=state.T_ac, body=None)
+
     def _overheard(self, heard: list[Scan]) -> Iterator[Scan]:
-        for scan in self.source.scans(self.job.prefetch):
+        for scan in map(self._judged, self.source.scans(self.job.prefetch)):
             heard[:] = [scan]
             yield scan
 

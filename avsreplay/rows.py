@@ -52,6 +52,10 @@ def _number(doc: str, unit: str = "", fmt: str = ".4g", table: bool = False, ato
     return column(unit, fmt, 1e-4, atol, doc, table)
 
 
+def _nees(block: str) -> Any:
+    return column("", ".2f", 1e-2, 1e-3, f"the same of the block '{block}' alone")
+
+
 def _flag(doc: str, table: bool = False) -> Any:
     return column("", "", 0.0, 0.0, doc, table)
 
@@ -124,9 +128,17 @@ class Row:
     rot_err_deg: float | None = column("deg", ".3f", 1e-3, 1e-3, "angle between estimated and true attitude", True)
     reg_pos_err_m: float | None = column("m", ".4f", 1e-3, 1e-5, "distance of measured and true position")
     reg_rot_err_deg: float | None = column("deg", ".3f", 1e-3, 1e-3, "angle between measured and true attitude")
+    reference: str | None = _flag("what the errors are against: truth, or fit (a motion fitted to all healthy poses)")
     nees: float | None = column(
         "", ".2f", 1e-2, 1e-3, "normalised estimation error squared of 20 states, modulo relabelling"
     )
+    nees_attitude: float | None = _nees("attitude")
+    nees_rate: float | None = _nees("rate")
+    nees_position: float | None = _nees("position")
+    nees_velocity: float | None = _nees("velocity")
+    nees_sigma: float | None = _nees("sigma")
+    nees_varrho: float | None = _nees("varrho")
+    nees_mu: float | None = _nees("mu")
 
     r_pos_m: float | None = _number("adapted measurement noise, position, root mean diagonal", "m")
     r_rot_deg: float | None = _number("adapted measurement noise, attitude, root mean diagonal", "deg")
@@ -138,8 +150,13 @@ class Row:
     )
     ogm_log10_cond_scaled: float | None = column("", ".1f", 1e-3, 1e-2, "the same, scaled by the prior sigmas")
     ogm_rank: int | None = _flag("numerical rank of the scaled Gramian out of 20", table=True)
+    nis_mean: float | None = _number("mean NIS over the consistency window (6 is right)", fmt=".2f", atol=1e-4)
+    autocorrelation: float | None = _number("largest lag-1 autocorrelation of the whitened innovation", atol=1e-4)
     consistent: bool | None = _flag("innovations inside their chi-square band")
     converged: bool = _flag("may the planner rely on the estimate", table=True)
+    covariance_holds: bool | None = _flag("every block of the covariance is below its limit (the paper's test)")
+    predictive_holds: bool | None = _flag("the grasp point's predicted 1 sigma is below its limits")
+    unknown: str | None = _flag("blocks above their covariance limit")
     grasp_pos_1s_m: float | None = _number("horizon's largest 1 sigma of the grasp point's position", "m")
     grasp_vel_1s_mps: float | None = _number("horizon's largest 1 sigma of its velocity", "m/s")
     grasp_rot_1s_deg: float | None = _number("horizon's largest 1 sigma of its attitude", "deg")

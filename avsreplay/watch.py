@@ -45,10 +45,11 @@ def look(
     """One scan on; the second value is the row's monitor columns."""
     gramian = observe(watch.gramian, prediction.Phi, prediction.H, gamma)
     honest = monitors.consistency.observe(watch.consistency, seen, gamma)
-    consistent = monitors.consistency.judge(honest).consistent
+    said = monitors.consistency.judge(honest)
     forecast = estimator.forecast(track.belief, monitors.convergence.params.times_s)
-    convergence = monitors.convergence.judge(watch.convergence, track.belief, forecast, consistent is not False)
-    columns = _observability(gramian) | _forecast(forecast) | {"consistent": consistent}
+    convergence = monitors.convergence.judge(watch.convergence, track.belief, forecast, said.consistent is not False)
+    columns = _observability(gramian) | _forecast(forecast) | _convergence(convergence)
+    columns |= {"consistent": said.consistent, "nis_mean": said.nis_mean, "autocorrelation": said.autocorrelation}
     columns |= {"sigma_hits": track.sigma_hits, "r_floors": track.r_floors}
     return Watch(gramian, honest, convergence), columns
 
@@ -59,6 +60,14 @@ def _observability(gramian: Gramian) -> dict[str, Any]:
         "ogm_rank": found.rank,
         "ogm_log10_cond": found.log10_cond,
         "ogm_log10_cond_scaled": found.log10_cond_scaled,
+    }
+
+
+def _convergence(track: ConvergenceTrack) -> dict[str, Any]:
+    return {
+        "covariance_holds": track.covariance_holds,
+        "predictive_holds": track.predictive_holds,
+        "unknown": ", ".join(track.unknown) or None,
     }
 
 

@@ -43,6 +43,9 @@ def stages(config: RunConfig, header: LogHeader, surface: Surface, truth: Sequen
         hindsight=Hindsight(truth),
         standoff_c=(supervision.standoff_m or 0.0) * np.array(config.fixture_axis_c),
         guess=config.guess,
+        deskew=config.deskew,
+        reference=config.reference.value,
+        reacquire=config.reacquire,
         first_pose=_first_pose(config, header),
     )
 
@@ -56,19 +59,27 @@ def first_memory(ready: Stages) -> Memory:
     return Memory(watch)
 
 
-def _first_pose(config: RunConfig, header: LogHeader) -> Callable[[Scan], tuple[Pose, str]]:
-    """Where the first pose comes from; "log" is the log's first belief, else its truth."""
+def _first_pose(config: RunConfig, header: LogHeader) -> Callable[[Scan], tuple[Pose | None, str]]:
+    """Where the first pose comes from; "log" is the log's first belief, else its truth, else acquisition."""
     if config.init == "truth":
         return _truth
+    if config.init == "auto":
+        return _acquire
     if config.init == "log":
         start = header.start
-        return _truth if start is None else lambda _scan: (start.x.T_ac, "start")
+        if start is not None:
+            return lambda _scan: (start.x.T_ac, "start")
+        return lambda scan: _acquire(scan) if scan.truth is None else (scan.truth, "truth")
     pose = parse_pose(config.init)
     return lambda _scan: (pose, "given")
 
 
-def _truth(scan: Scan) -> tuple[Pose, str]:
+def _acquire(_scan: Scan) -> tuple[Pose | None, str]:
+    return None, "acquired"
+
+
+def _truth(scan: Scan) -> tuple[Pose | None, str]:
     if scan.truth is None:
-        hint = "name its truth with --truth-topic, or give --init x,y,z,qx,qy,qz,qw"
-        raise UsageError("the log says no first pose of the target", where="--init", hint=hint)
+        hint = "name its truth with --truth-topic, or give --init auto"
+        raise UsageError("the log has no true pose at its first scan", where="--init truth", hint=hint)
     return scan.truth, "truth"

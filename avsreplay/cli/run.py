@@ -34,7 +34,13 @@ Examples:
 Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
             3 unreadable input, 4 finished but data was lost."""
 
-ASSIGNED = {"backend": "register.backend", "policy": "faults.policy", "guess": "guess", "init": "init"}
+ASSIGNED = {
+    "backend": "register.backend",
+    "policy": "faults.policy",
+    "guess": "guess",
+    "init": "init",
+    "reference": "reference",
+}
 
 
 class _Start(click.ParamType[str | float]):
@@ -62,6 +68,8 @@ class _Start(click.ParamType[str | float]):
 @click.option("--init", metavar="log|truth|auto|POSE", help="First pose; POSE is x,y,z,qx,qy,qz,qw of {C} in {A}.")
 @click.option("--guess", type=click.Choice(["predicted", "last"]), help="Registration's guess: closed or open loop.")
 @click.option("--policy", type=click.Choice(["any", "all"]), help="How the fault tests are joined.")
+@click.option("--reference", type=click.Choice(["truth", "fit"]), help="What errors are against; fit needs no truth.")
+@click.option("--no-deskew", is_flag=True, help="Take a scan's points as measured at one instant.")
 @click.option("--config", "config_file", type=click.Path(path_type=Path), help="TOML with settings, a table a stage.")
 @click.option("--set", "assignments", multiple=True, metavar="A.B=C", help="One setting; may be repeated.")
 @click.option("--clock", type=click.Choice(["header", "log", "publish"]), help="Clock the scans are placed by.")
@@ -133,6 +141,7 @@ def _job(log: Path, flags: dict[str, Any]) -> Job:
     named = {key: flags.pop(name) for name, key in ASSIGNED.items()}
     config_file, more, starts = flags.pop("config_file"), flags.pop("assignments"), flags.pop("starts")
     assignments = [f"{key}={value}" for key, value in named.items() if value is not None]
+    assignments += ["deskew=false"] if flags.pop("no_deskew") else []
     assignments += [f"estimator.start={mode}" for mode in starts if isinstance(mode, str)]
     return Job(source=log, options=_options(flags, starts), config_file=config_file, assignments=(*more, *assignments))
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-from avsreplay.records import Label, State
+from avsreplay.records import BLOCKS, Label, State
 from avsreplay.report.capture import Capture, CaptureFold
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
 from avsreplay.report.parameters import Parameter, parameters
@@ -23,6 +23,7 @@ from avsreplay.rows import Row
 __all__ = ["Convergence", "Errors", "Observability", "Share", "Summary", "SummaryFold"]
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
+BLOCK_BANDS = {2: (0.05064, 7.3778), 3: (0.2158, 9.3484)}  # the same with 2 and 3
 NEES_BAND = (9.5908, 34.1696)  # the same with 20
 
 
@@ -95,6 +96,8 @@ class Summary:
     r_floors: int | None
     nis: Share | None
     nees: Share | None
+    nees_blocks: Mapping[str, Share]
+    reference: str | None
     observability: Observability
     convergence: Convergence
     capture: Capture
@@ -143,6 +146,7 @@ class SummaryFold:
         self._status: Counter[str] = Counter()
         self._reasons: Counter[str] = Counter()
         self._last: Row | None = None
+        self._reference: str | None = None
         self._full_rank_s: float | None = None
         self._t1_s: float | None = None
         self._withdrawn = 0
@@ -163,6 +167,10 @@ class SummaryFold:
         for name in ("pos_err_m", "rot_err_deg", "reg_pos_err_m", "reg_rot_err_deg", "nis", "rms_m", "iterations"):
             self._keep(f"{name}/{state}", getattr(row, name))
         self._keep("nees", row.nees)
+        for name, block in BLOCKS.items():
+            value = getattr(row, f"nees_{name}")
+            self._keep(f"nees_{name}", None if value is None else value / (block.stop - block.start))
+        self._reference = row.reference or self._reference
 
     def _keep(self, name: str, value: float | None) -> None:
         if value is not None and math.isfinite(value):
@@ -205,11 +213,24 @@ class SummaryFold:
             r_floors=last.r_floors if last else None,
             nis=_share(self._values.get("nis/healthy", []), NIS_BAND),
             nees=_share(self._values.get("nees", []), NEES_BAND),
+            nees_blocks=self._blocks(),
+            reference=self._reference,
             observability=self._observability(),
             convergence=Convergence(self._t1_s, bool(last and last.converged), self._withdrawn),
             capture=self._capture.result(),
             counts=self._counts,
         )
+
+    def _blocks(self) -> dict[str, Share]:
+        """NEES of each block of the state per degree of freedom, and its band likewise."""
+        out: dict[str, Share] = {}
+        for name, block in BLOCKS.items():
+            size = block.stop - block.start
+            low, high = (bound / size for bound in BLOCK_BANDS[size])
+            share = _share(self._values.get(f"nees_{name}", []), (low, high))
+            if share is not None:
+                out[name] = share
+        return out
 
     def _errors(self, prefix: str, state: str) -> Errors:
         position = self._values.get(f"{prefix}pos_err_m/{state}", [])

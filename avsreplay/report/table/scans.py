@@ -71,6 +71,8 @@ def scan_table(console: Console, rows: Sequence[Row], *, every: int | None = Non
     for name in fitting:
         justify = "left" if name in ("reason", "fault", "action", "status") else "right"
         label = "state" if name == "reason" else head(declared[name])
+        if name in ("pos_err_m", "rot_err_deg") and chosen[0].reference == "fit":
+            label = label.replace("err", "vs fit")
         table.add_column(label, justify=justify, no_wrap=True, vertical="bottom")  # type: ignore[arg-type]
     for k in range(len(chosen)):
         table.add_row(*(cells[name][k] for name in fitting))

@@ -54,7 +54,13 @@ def print_tables(
 def print_summary(console: Console, summary: Summary, *, scans_per_s: float | None = None) -> None:
     """Errors, faults, parameters and the rest, each a small table; those with nothing to say are left out."""
     palette = Palette.of(console)
-    for table in (_errors(console, summary), _faults(console, summary, palette), _parameters(console, summary)):
+    tables = (
+        _errors(console, summary),
+        _faults(console, summary, palette),
+        _parameters(console, summary),
+        _consistency(console, summary),
+    )
+    for table in tables:
         if table.row_count:
             console.print(table)
             console.print()
@@ -67,7 +73,7 @@ def print_summary(console: Console, summary: Summary, *, scans_per_s: float | No
 
 
 def _errors(console: Console, summary: Summary) -> Table:
-    table = new_table(console, "Errors")
+    table = new_table(console, "Errors vs fit" if summary.reference == "fit" else "Errors")
     table.add_column("of", no_wrap=True)
     table.add_column("unit", no_wrap=True)
     for name in ("n", *(name for name, _ in _STATISTICS)):
@@ -86,6 +92,21 @@ def _errors(console: Console, summary: Summary) -> Table:
             unit, factor = ("mm", 1000.0) if unit == "m" and spread.rmse < 1.0 else (unit, 1.0)
             fmt = f".{decimals([factor * spread.rmse], 2)}f"
             table.add_row(name, unit, str(spread.count), *(format(factor * get(spread), fmt) for _, get in _STATISTICS))
+    return table
+
+
+def _consistency(console: Console, summary: Summary) -> Table:
+    """Normalised errors squared, whole and block by block, against their two-sided 95 % chi-square bands."""
+    table = new_table(console, "Consistency (per degree of freedom: 1 is right)")
+    table.add_column("statistic", no_wrap=True)
+    for name in ("n", "median", "inside 95 % band [%]", "band"):
+        table.add_column(name, justify="right", no_wrap=True)
+    whole = [("NIS", summary.nis, 6), ("NEES", summary.nees, 20)]
+    blocks = [(f"NEES {name}", share, 1) for name, share in summary.nees_blocks.items()]
+    for name, share, size in (*whole, *blocks):
+        if share is not None:
+            band = f"{share.low / size:.2f} to {share.high / size:.2f}"
+            table.add_row(name, str(share.count), f"{share.median / size:.2f}", f"{100.0 * share.inside:.1f}", band)
     return table
 
 
