@@ -313,3 +313,29 @@ def test_a_bag_made_to_cost_time_costs_little(tmp_path: Path, what: str) -> None
     with open_source(tmp_path / "x.bag", look=True) as source:
         assert source.losses
     assert time.process_time() - start < 10.0
+
+
+def test_an_attachment_over_the_limit_is_passed_over_whole(tmp_path: Path) -> None:
+    """Even one that is a log itself, whose chunks are not ours."""
+    from mcap.writer import Writer
+
+    from avsreplay.log.encode import point_cloud2
+    from avsreplay.log.schemas import schema_text
+
+    rng = np.random.Generator(np.random.PCG64(2))
+    inner = [Scan(i, t, rng.normal(size=(9000, 3)).astype(np.float32), log_ns=t) for i, t in enumerate(range(1, 40))]
+    write(tmp_path / "inner.mcap", LogHeader(), inner, compression="none", chunk_bytes=300_000)
+    kind = "sensor_msgs/msg/PointCloud2"
+    with (tmp_path / "x.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2")
+        writer.add_attachment(0, 0, "inner.mcap", "application/octet-stream", (tmp_path / "inner.mcap").read_bytes())
+        channel = writer.register_channel("/p", "cdr", writer.register_schema(kind, "ros2msg", schema_text(kind)))
+        for c in CLOUDS:
+            writer.add_message(channel, c.log_ns, point_cloud2(c.t_ns, "s", c.points, None), c.log_ns)
+        writer.finish()
+    found, losses = read(tmp_path / "x.mcap", max_message_mib=2)
+    assert len(found) == len(CLOUDS)
+    assert all(same(scan) for scan in found)
+    assert "over the limit" in losses[0].what
+    assert not read(tmp_path / "x.mcap")[1]

@@ -20,7 +20,7 @@ from avsreplay.log.chunks import ChunkStore
 from avsreplay.log.cursor import BadMessage
 from avsreplay.log.mcap_channels import ChannelTable
 from avsreplay.log.mcap_records import Channel, Fields, Tap
-from avsreplay.log.mcap_resync import first_chunk, hides_chunk, next_record
+from avsreplay.log.mcap_resync import begins_record, first_chunk, hides_chunk, next_record
 from avsreplay.log.mcap_summary import Summary, read_summary
 from avsreplay.log.options import Loss, TopicInfo
 from avsreplay.log.recording import MAX_NS, CloudIndex, MessageTable, Sink
@@ -151,6 +151,9 @@ class McapFile:
         try:
             if end > self._size or (summary.start and end > summary.start):
                 raise BadMessage("a record ends past the file")
+            if length > self._limit and opcode != mcap.CHUNK and begins_record(self._file, end):
+                self._lose(Loss(f"a record of {length} bytes is over the limit of {self._limit}", at, end - at))
+                return end
             self._take(opcode, at, end)
         except BadMessage as error:
             return self._resync(at, summary, str(error))

@@ -9,7 +9,7 @@ from avsreplay.log import mcap_records as mcap
 from avsreplay.log.byte_file import ByteFile
 from avsreplay.log.cursor import BadMessage
 
-__all__ = ["first_chunk", "hides_chunk", "is_chunk", "next_record"]
+__all__ = ["begins_record", "first_chunk", "hides_chunk", "is_chunk", "next_record"]
 
 _WINDOW = 1 << 20
 _MARGIN = 64  # a candidate is told by so many bytes behind its first
@@ -24,6 +24,12 @@ def is_chunk(file: ByteFile, at: int, stop: int) -> bool:
     except BadMessage:
         return False
     return True
+
+
+def begins_record(file: ByteFile, at: int) -> bool:
+    """Could a record of a known kind begin at ``at`` and end inside the file?"""
+    head = file.upto(at, 9)
+    return len(head) == 9 and 0 < head[0] < 16 and at + 9 + int.from_bytes(head[1:], "little") <= file.size
 
 
 def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
@@ -57,8 +63,7 @@ def _is_message(file: ByteFile, at: int, stop: int, channels: frozenset[int]) ->
     end = at + 9 + int.from_bytes(head[1:9], "little")
     if end > stop or end < at + 31 or int.from_bytes(head[9:11], "little") not in channels:
         return False
-    following = file.upto(end, 9)
-    return end == stop or (len(following) == 9 and 0 < following[0] < 16 and not any(following[6:]))
+    return end == stop or begins_record(file, end)
 
 
 def _search(
