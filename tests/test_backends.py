@@ -108,6 +108,18 @@ def test_a_missing_library_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -
     assert [state.installed for state in port.available() if state.name == "kiss"] == [False]
 
 
+def test_a_library_that_does_not_load_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken(_Guesser):
+        get = "pip install broken"
+
+        def __init__(self, target: port.Target) -> None:
+            raise ImportError("libX is not there")
+
+    _install(monkeypatch, Broken)
+    with pytest.raises(MissingBackend, match=r"libX is not there.*pip install broken"):
+        Bench("broken")
+
+
 def test_command_lists_and_checks() -> None:
     listed = CliRunner().invoke(command, ["--json"])
     assert {entry["name"] for entry in json.loads(listed.stdout)} >= set(BUILT_IN)

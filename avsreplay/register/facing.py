@@ -21,7 +21,7 @@ __all__ = ["Camera", "View", "is_outward"]
 CLEARANCE_OF_EXTENT = 0.25
 LEAST_FACING = 0.4
 PAIRED_EDGES = 0.95
-FAR_OF_EXTENT = 0.5  # a scan's middle this far from the origin was taken from there
+FAR_OF_EXTENT = 0.6  # a scan's middle this far from the origin was taken from there
 ASKED_POINTS = 500
 
 

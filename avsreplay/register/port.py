@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from avsreplay.register.model import Model
     from avsreplay.register.params import Limits
 
-__all__ = ["GROUP", "Availability", "Backend", "Target", "available", "load", "names"]
+__all__ = ["GROUP", "Availability", "Backend", "Target", "available", "build", "load", "names"]
 
 GROUP = "avsreplay.backends"
 
@@ -91,6 +91,15 @@ def load(name: str) -> Factory:
     if not state.installed:
         raise _missing(name, "is not installed", state.get)
     return cast(Factory, factory)
+
+
+def build(name: str, factory: Factory, target: Target) -> Backend:
+    """The back end itself. Raises MissingBackend where its library is there but does not load."""
+    try:
+        return factory(target)
+    except ImportError as error:
+        get = str(getattr(factory, "get", "install the package that provides it"))
+        raise _missing(name, f"does not load ({error})", get) from None
 
 
 def available() -> tuple[Availability, ...]:

@@ -17,7 +17,7 @@ from avsreplay.register.facing import View
 from avsreplay.register.freedom import turn_words
 from avsreplay.register.model import Model
 from avsreplay.register.params import RegisterParams
-from avsreplay.register.port import Target, load
+from avsreplay.register.port import Target, build, load
 from avsreplay.register.sampling import thin
 from avsreplay.register.second_look import look_again
 
@@ -35,11 +35,11 @@ class Registrar:
         """
         self.params = params or RegisterParams()
         self.limits = self.params.limits(surface.extent)
-        factory = load(self.params.backend)
+        factory = load(self.params.backend)  # before the index: a wrong name is said at once
         self._model = _indexed(surface, self.limits.reach_m)
         self._view = View(surface, self.params.camera)
         self._target = Target(surface, self._model, self.limits, self._view)
-        self._backend = factory(self._target)
+        self._backend = build(self.params.backend, factory, self._target)
         self._acquirer: Acquirer | None = None
 
     def register(self, points: NDArray[Any], guess: Pose) -> Alignment:
