@@ -85,6 +85,10 @@ def command(
         click.echo(json.dumps(summary.document(), indent=1, allow_nan=False))
     else:
         _print(summary)
+    _complain(summary, journal, output)
+
+
+def _complain(summary: SweepSummary, journal: Journal, output: Path) -> None:
     if failed := summary.done - summary.status.get("ok", 0):
         first = next(o for o in journal.outcomes() if o.status != "ok")
         what = f"{failed} of {summary.done} runs failed, for example: {first.error}"
