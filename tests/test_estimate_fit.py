@@ -283,11 +283,10 @@ def test_too_few_poses() -> None:
         fit(poses, to_chart(rough_state(fixes)), prior_of(poses, WHITE), FitParams())
 
 
-def test_poses_can_be_cut_and_thinned() -> None:
+def test_poses_can_be_cut() -> None:
     poses = poses_of(seen(tumbling.draw(0, seconds=10.0), 0))
     assert isinstance(poses, Poses)
     assert len(poses.upto(5)) == 5
-    assert len(poses.every(2)) == 11
 
 
 def test_a_body_at_rest_is_no_trouble() -> None:

@@ -121,9 +121,7 @@ def _print(found: dict[str, Any]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    title = (
-        f"Observability Gramian, {found['healthy_scans']} scans: rank, log10 of its condition raw and scaled"
-    )
+    title = f"Observability Gramian, {found['healthy_scans']} scans: rank, log10 of its condition raw and scaled"
     table = Table(title=title, title_justify="left", box=SIMPLE)
     table.add_column("\nt [s]", justify="right", no_wrap=True)
     for head in HEADS.values():

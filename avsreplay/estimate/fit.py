@@ -72,10 +72,6 @@ class Poses:
         """The first ``count`` of them."""
         return Poses(self.times_s[:count], self.q[:count], self.t[:count], self.C[:count])
 
-    def every(self, stride: int) -> Poses:
-        """Every ``stride``-th of them."""
-        return Poses(self.times_s[::stride], self.q[::stride], self.t[::stride], self.C[::stride])
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
