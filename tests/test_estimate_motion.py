@@ -8,6 +8,7 @@ import tumbling
 from scipy.integrate import solve_ivp
 
 from avsreplay import geometry
+from avsreplay.errors import UsageError
 from avsreplay.estimate import horizon, motion
 from avsreplay.estimate.layout import boxminus, boxplus
 from avsreplay.records import Belief, State
@@ -164,3 +165,9 @@ def test_forecast_adds_the_disturbance_of_every_step() -> None:
         J = motion.grasp_rows(then.x)
         want = np.sqrt(np.diag(J @ then.P @ J.T).reshape(3, 3).sum(axis=1)) * [1, 1, 2]
         assert (seen.pos_1s_m[i], seen.vel_1s_mps[i], seen.rot_1s_rad[i]) == pytest.approx(tuple(want), rel=1e-5)
+
+
+def test_a_gap_of_years_is_refused_in_one_line() -> None:
+    x, _ = some_state(1)
+    with pytest.raises(UsageError, match="too far to predict"):
+        motion.propagate(Belief(0, x, np.eye(20)), 10**18, 0.0, 0.0)

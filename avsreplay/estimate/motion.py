@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from avsreplay.errors import UsageError
 from avsreplay.estimate.layout import DIM, DQ, RHO, SIGMA, VEL, W, hamilton
 from avsreplay.geometry import Array, matrix
 from avsreplay.records import Belief, State
@@ -37,6 +38,7 @@ __all__ = [
 
 SUBSTEP_RAD = 0.2
 TAIL = 1e-12
+MOST_RAD = 2e4  # turn a single step may have: some seconds of work
 _POLE = 1.5  # the solutions are elliptic functions: no pole nearer than |w| h = pi / 2
 _I6 = np.eye(6)
 _I9 = np.eye(9)
@@ -227,9 +229,16 @@ def advance(x: State, step: Flow, h: float) -> State:
 
 
 def propagate(belief: Belief, t_ns: int, torque: float, force: float) -> tuple[Belief, Array]:
-    """Belief at t_ns and the step's Phi (eq:state-prop, eq:cov-prop). A step back in time adds no noise."""
+    """Belief at t_ns and the step's Phi (eq:state-prop, eq:cov-prop). A step back in time adds no noise.
+
+    Raises:
+        UsageError: the step turns the target more than ``MOST_RAD``.
+    """
     h = (t_ns - belief.t_ns) * 1e-9
     x = belief.x
+    if abs(h) * float(np.abs(x.w_b).max()) > MOST_RAD:
+        what = f"a scan comes {h:.4g} s after the one before, too far to predict its pose"
+        raise UsageError(what, where=f"stamp {t_ns}", hint="leave out what is beyond the gap with --start or --end")
     step = flow(x.w_b, x.sigma, h, torque)
     Phi = transition(step, x.sigma, h)
     P = Phi @ belief.P @ Phi.T
