@@ -46,7 +46,7 @@ def pose_stamped(t_ns: int, frame: str, pose: Pose) -> bytes:
 
 def odometry(t_ns: int, frame: str, child: str, body: State) -> bytes:
     """A nav_msgs Odometry: the pose of {B} in {A}, the twist in {B} as ROS has it."""
-    v_b = geometry.matrix(body.q_ab).T @ body.v_a
+    v_b = geometry.rotate(geometry.matrix(body.q_ab).T, body.v_a)
     zeros = (0.0,) * 36
     packer = Packer().header(t_ns, frame).string(child).f64s(*body.r_a, *body.q_ab, *zeros)
     return packer.f64s(*v_b, *body.w_b, *zeros).bytes()
