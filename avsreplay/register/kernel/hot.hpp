@@ -12,7 +12,6 @@ struct View {
 };
 
 constexpr int CHUNK = 512;  // points; partial sums are added in the order of chunks
-constexpr int SUMS = 32;
 
 enum class Pass { point, plane };
 
@@ -24,15 +23,16 @@ struct Look {
   bool facing;  // only primitives that face the camera count
 };
 
-// Sums of one chunk, coordinates relative to the model's centre.
-//   always: [0] inliers, [1] sum d2, [2] points not finite, [3] searches, [4..6] sum p
-//   point:  [7..9] sum foot, [10..18] sum p foot'
-//   plane:  [7..27] lower triangle of sum J'J, row by row, [28..] is in `extra`
+// Sums over a chunk or a scan; p, foot relative to the model's centre, e = n . (foot - p), J = [p x n, n].
+//   always: [0] inliers, [1] sum d2, [2] points not finite, [3] searches made, [4..6] sum p
+//   point:  [7..9] sum foot, [10..18] sum p foot', row by row
+//   plane:  [7..27] lower triangle of sum J'J, row by row, [28..33] sum J'e, [34] sum e^2
+constexpr int SUMS = 35;
 struct Sums {
-  double v[SUMS + 4];
+  double v[SUMS];
 };
 
-// Place, foot and identity of each point at its last search.
+// Where a point was at its last search, and what was found.
 struct Kept {
   double x, y, z;
   float radius2;   // the neighbour is the same nearer than this to (x, y, z)
@@ -46,7 +46,7 @@ struct Feet {
   double* normal;   // (n, 3)
 };
 
-// The top of a cell to be filled by `filter`: blocks that can hold the nearest primitive of some place in a box.
+// A question to `filter`: which of the blocks `in` can hold the nearest primitive of some place in a box?
 struct Filter {
   double centre[3];
   double half;
