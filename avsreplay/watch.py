@@ -47,7 +47,7 @@ def look(
     honest = monitors.consistency.observe(watch.consistency, seen, gamma)
     said = monitors.consistency.judge(honest)
     forecast = estimator.forecast(track.belief, monitors.convergence.params.times_s)
-    convergence = monitors.convergence.judge(watch.convergence, track.belief, forecast, said.consistent is not False)
+    convergence = monitors.convergence.judge(watch.convergence, track.belief, forecast, said.consistent is True)
     columns = _observability(gramian) | _forecast(forecast) | _convergence(convergence)
     columns |= {"consistent": said.consistent, "nis_mean": said.nis_mean, "autocorrelation": said.autocorrelation}
     columns |= {"sigma_hits": track.sigma_hits, "r_floors": track.r_floors}
