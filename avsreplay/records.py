@@ -228,7 +228,6 @@ class Alignment:
             T_ac_true = T_ac @ Exp(d): noise-scaled, singular directions left singular.
         covariance: (6, 6) calibrated covariance of the same d, or None where the view is degenerate.
         weakest: words for the free directions ("slides along x"), empty if none.
-        alike: share of the covariance that successive scans have in common, fading over a turn of ``alike_rad``.
     """
 
     T_ac: Pose
@@ -241,8 +240,6 @@ class Alignment:
     status: AlignStatus
     covariance: Array | None = None
     weakest: str = ""
-    alike: float = 0.0
-    alike_rad: float = 1.0
 
     @property
     def inlier_ratio(self) -> float:

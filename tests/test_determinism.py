@@ -4,7 +4,8 @@ import filecmp
 
 import pytest
 
-RESULTS = ("rows.jsonl", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz", "result.mcap", "view.npz", "run.json")
+POSES = ("estimate.tum", "registration.tum", "truth.tum")
+RESULTS = ("rows.jsonl", *POSES, "beliefs.npz", "result.mcap", "view.npz", "run.json")
 ELSEWHERE = {"PYTHONHASHSEED": "77", "OMP_NUM_THREADS": "4", "OPENBLAS_NUM_THREADS": "3", "MKL_NUM_THREADS": "2"}
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.reading import READING_FLAGS, reading_flags
 from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
@@ -26,7 +27,10 @@ Examples:
   avsreplay record scenario.toml -o x.mcap --seed 7     a scenario file
   avsreplay record scans/ -o y.mcap --model m.ply       a folder of scans with a poses file
   avsreplay record drive.bag -o z.mcap --topic /points  a ROS 1 or 2 bag, or an MCAP"""
-READING = ("topic", "truth_topic", "truth_file", "rate_hz", "every", "start_s", "end_s", "n_scans", "clock", "strict")
+READING = (
+    *("topic", "truth_topic", "truth_file", "rate_hz", "every", "start_s", "end_s", "duration_s", "n_scans"),
+    *("start_offset_s", "max_message_mib", "clock", "strict", *READING_FLAGS),
+)
 
 
 @click.command("record", epilog=EPILOG)
@@ -39,11 +43,17 @@ READING = ("topic", "truth_topic", "truth_file", "rate_hz", "every", "start_s", 
 @click.option("--truth-topic", help="Topic of the true poses.")
 @click.option("--truth", "truth_file", type=click.Path(path_type=Path), help="File of the true poses.")
 @click.option("--rate", "rate_hz", type=float, help="Scans a second of a folder (1 by default).")
-@click.option("--every-scan", "every", type=click.IntRange(1), help="Take every N-th scan, each at its own time.")
+@click.option(
+    "--every-scan", "--every", "every", type=click.IntRange(1), help="Take every N-th scan, each at its own time."
+)
 @click.option("--start", "start_s", type=float, help="Leave out what is before, seconds after the first scan.")
 @click.option("--end", "end_s", type=float, help="Leave out what is after, seconds after the first scan.")
+@click.option("--duration", "duration_s", type=float, help="Length of what is taken over [s].")
+@click.option("--start-offset", "start_offset_s", type=float, help="The same as --start.")
+@click.option("--max-message-mib", type=click.IntRange(1), help="Largest message read.")
 @click.option("--n-scans", type=click.IntRange(1), help="At most so many scans.")
 @click.option("--clock", type=click.Choice(["header", "log", "publish"]), help="Clock of a recorded source.")
+@reading_flags
 @click.option("--strict", is_flag=True, default=None, help="Any damage of the source is an error (exit 3).")
 @click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")

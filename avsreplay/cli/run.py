@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.reading import reading_flags
 from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ class _Start(click.ParamType[str | float]):
 @click.option("--n-scans", type=click.IntRange(1), help="At most so many scans.")
 @click.option("--every-scan", "every", type=click.IntRange(1), help="Take every N-th scan, each at its own time.")
 @click.option("--rate", "rate_hz", type=float, help="Scans a second of a folder of scans.")
+@reading_flags
 @click.option("--strict", is_flag=True, default=None, help="Any damage of the log is an error (exit 3).")
 @click.option("--max-message-mib", type=click.IntRange(1), help="Largest message read.")
 @click.option("--golden", type=click.Path(path_type=Path), help="Rows that must come out; exit 1 if they do not.")

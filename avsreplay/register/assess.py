@@ -23,10 +23,8 @@ __all__ = ["Evidence", "assess", "covariance", "evidence", "nothing"]
 
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer than this may agree with one another
 LEAST_PATCHES = 24
-# Measured by tests/benchmarks/registration_noise.py: what the sandwich leaves out (closest points near edges lean one
-# way), and how much of the error successive scans share while the target turns.
+# What the sandwich leaves out (closest points near edges lean one way), by tests/benchmarks/registration_noise.py.
 UNEXPLAINED = 1.24
-ALIKE, ALIKE_RAD = 0.11, 0.6
 SIGMA_PER_MEDIAN = 1.4826  # of |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 
@@ -122,8 +120,6 @@ def assess(
         status=_status(overlap, fit.converged, bool(weakest)),
         covariance=frozen(UNEXPLAINED * covariance(found)) if certain else None,
         weakest=", ".join(weakest),
-        alike=ALIKE,
-        alike_rad=ALIKE_RAD,
     )
 
 
