@@ -45,7 +45,7 @@ class AcquireParams:
     middle_passes: int = 15  # plane passes in the second selection
     fine_starts: int = 6  # different poses registered on the model itself
     fine_points: int = 1500  # points they are registered and ranked with
-    enough_ratio: float = 0.85  # share of the scan on the model that ends the search at the first effort
+    enough_ratio: float = 0.95  # share of the scan on the model that ends the search at the first effort
     least_ratio: float = 0.7  # smaller than that nothing was found
     margin: float = 0.01  # a second pose that leaves so little more of the scan unexplained is as good
 
