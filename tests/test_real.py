@@ -33,13 +33,22 @@ def test_every_scan_of_the_turn_is_healthy_and_close(dragon, cli):
 
 
 def test_closed_loop_keeps_the_track_at_48_degrees_where_open_loop_loses_scans(dragon, cli):
-    closed = rows_of(cli("run", dragon, "--json", "--every-scan", 2))
-    opened = rows_of(cli("run", dragon, "--json", "--every-scan", 2, "--guess", "last"))
+    flags = ("--json", "--every-scan", 2, "--set", "reacquire=false")
+    closed = rows_of(cli("run", dragon, *flags))
+    opened = rows_of(cli("run", dragon, *flags, "--guess", "last"))
     assert [r["gamma"] for r in closed] == [1] * 8
     assert rms([r["rot_err_deg"] for r in closed[1:]]) < 0.5
     assert sum(r["gamma"] for r in opened) < 8
     passes = [sum(r["iterations"] for r in rows[2:]) for rows in (closed, opened)]
     assert passes[0] < passes[1] / 3  # a good guess also saves most of the work
+
+
+def test_72_degree_steps_are_kept_once_the_second_scan_is_acquired(dragon, cli):
+    kept = rows_of(cli("run", dragon, "--json", "--every-scan", 3))
+    lost = rows_of(cli("run", dragon, "--json", "--every-scan", 3, "--set", "reacquire=false"))
+    assert [r["gamma"] for r in kept] == [1] * 5
+    assert [r["guess"] for r in kept] == ["truth", "acquired", "predicted", "predicted", "predicted"]
+    assert sum(r["gamma"] for r in lost) < 5
 
 
 def test_the_folder_itself_runs_without_recording_first(cli, shared_data):
