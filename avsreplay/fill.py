@@ -10,7 +10,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.estimate.layout import boxminus
 from avsreplay.estimate.measure import sensitivity
-from avsreplay.estimate.relabel import nearest
+from avsreplay.estimate.relabel import nearest, nees
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.consistency import block_nees
 from avsreplay.records import BLOCKS, Alignment, Belief, Innovation, Scan, ScanStatus, Verdict
@@ -124,9 +124,11 @@ def _errors(belief: Belief | None, scan: Scan) -> dict[str, Any]:
     fields: dict[str, Any] = dict(zip(("pos_err_m", "rot_err_deg"), _distance(belief.x.T_ac, scan.truth), strict=True))
     if scan.body is None:
         return fields
-    named, size = nearest(belief, scan.body)
+    named, _ = nearest(belief, scan.body)
     blocks = block_nees(boxminus(named, belief.x), belief.P)
-    return fields | {"nees": _finite(size)} | {f"nees_{name}": _finite(blocks[name]) for name in BLOCKS}
+    return (
+        fields | {"nees": _finite(nees(belief, scan.body))} | {f"nees_{name}": _finite(blocks[name]) for name in BLOCKS}
+    )
 
 
 def _distance(pose: Pose, truth: Pose) -> tuple[float, float]:

@@ -66,10 +66,14 @@ def normalise(q: ArrayLike) -> Array:
 def multiply(q_ab: ArrayLike, q_bc: ArrayLike) -> Array:
     """Hamilton product, ``q_ac``. (..., 4) x (..., 4) -> (..., 4)."""
     a, b = np.asarray(q_ab, dtype=np.float64), np.asarray(q_bc, dtype=np.float64)
-    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    vector = aw * bv + bw * av + np.cross(av, bv)
-    scalar = aw * bw - np.sum(av * bv, axis=-1, keepdims=True)
-    return np.concatenate([vector, scalar], axis=-1)
+    ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
+    bx, by, bz, bw = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
+    out = np.empty(np.broadcast_shapes(a.shape, b.shape))
+    out[..., 0] = aw * bx + bw * ax + (ay * bz - az * by)
+    out[..., 1] = aw * by + bw * ay + (az * bx - ax * bz)
+    out[..., 2] = aw * bz + bw * az + (ax * by - ay * bx)
+    out[..., 3] = aw * bw - (ax * bx + ay * by + az * bz)
+    return out
 
 
 def conjugate(q_ab: ArrayLike) -> Array:

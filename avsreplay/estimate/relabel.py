@@ -10,7 +10,7 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate.chart import to_chart, to_errors
-from avsreplay.estimate.layout import DIM, DMU, DQ, SIGMA, VARRHO, W, boxminus
+from avsreplay.estimate.layout import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W
 from avsreplay.estimate.motion import sigma3, sigma_join
 from avsreplay.estimate.naming import NAMINGS, Naming
 from avsreplay.geometry import Array
@@ -41,11 +41,32 @@ def relabel_covariance(P: Array, x: State, naming: Naming) -> Array:
 
 def nearest(estimate: Belief, truth: State) -> tuple[State, float]:
     """The naming of ``truth`` nearest to the estimate in its own covariance, and e' P^-1 e there (the NEES)."""
-    named = [relabel(truth, naming) for naming in NAMINGS]
-    errors = np.array([boxminus(x, estimate.x) for x in named])
+    errors = _errors(truth, estimate.x)
     sizes = np.einsum("ni,in->n", errors, np.linalg.solve(estimate.P, errors.T))
     best = int(np.argmin(sizes))
-    return named[best], float(sizes[best])
+    return relabel(truth, NAMINGS[best]), float(sizes[best])
+
+
+def _errors(truth: State, x: State) -> Array:
+    """(24, 20) ``boxminus(relabel(truth, naming), x)`` of every naming, at once."""
+    R_nb = np.array([naming.R_bn.T for naming in NAMINGS])
+    q_bn = np.array([naming.q_bn for naming in NAMINGS])
+    parity = np.array([naming.parity for naming in NAMINGS])
+    perms = np.array([naming.perm[:2] for naming in NAMINGS])
+    triple = np.array([truth.sigma[0], truth.sigma[1], sigma3(truth.sigma)])
+    d = np.empty((len(NAMINGS), DIM))
+    d[:, DQ] = _small(geometry.multiply(geometry.conjugate(x.q_ab), geometry.multiply(truth.q_ab, q_bn)))
+    q_nc = geometry.multiply(geometry.conjugate(q_bn), truth.q_bc)
+    d[:, DMU] = _small(geometry.multiply(q_nc, geometry.conjugate(x.q_bc)))
+    d[:, W], d[:, VARRHO] = R_nb @ truth.w_b - x.w_b, R_nb @ truth.c_b - x.c_b
+    d[:, RHO], d[:, VEL] = truth.r_a - x.r_a, truth.v_a - x.v_a
+    d[:, SIGMA] = parity[:, None] * triple[perms] - x.sigma
+    return d
+
+
+def _small(q: Array) -> Array:
+    """Vector part (n, 3), of the sign with w >= 0."""
+    return np.where(q[:, 3:] >= 0.0, q[:, :3], -q[:, :3])
 
 
 def nees(belief: Belief, truth: State) -> float:

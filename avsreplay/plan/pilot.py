@@ -116,7 +116,9 @@ class Pilot:
 
     def step(self, memory: PilotMemory, sight: Sight) -> PilotMemory:
         """One scan on."""
-        if memory.captured_ns is None and self._closed(memory, sight.t_ns):
+        if memory.captured_ns is not None:  # the gripper has closed: nothing is left to decide
+            return memory
+        if self._closed(memory, sight.t_ns):
             memory = replace(memory, captured_ns=memory.leg.end_ns)
         plan, leg = self._replan(memory, sight)
         facts = self._facts(memory, sight, plan, leg)
