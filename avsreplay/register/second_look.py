@@ -49,8 +49,10 @@ def look_again(
 def _doubtful(first: Alignment, guess: Pose, points: NDArray[Any], gate_m: float) -> bool:
     if first.status in (AlignStatus.FAILED, AlignStatus.NO_POINTS) or not first.inliers:
         return False
+    if first.rms_m <= POOR_OF_GATE * gate_m:
+        return False
     moved = first.T_ac.inverse().apply(points) - guess.inverse().apply(points)
-    return first.rms_m > POOR_OF_GATE * gate_m and float(np.linalg.norm(moved, axis=1).mean()) > gate_m
+    return float(np.linalg.norm(moved, axis=1).mean()) > gate_m
 
 
 def _cost(found: Alignment, gate_m: float) -> float:
