@@ -106,14 +106,6 @@ def _ply(data: bytes) -> tuple[Array, NDArray[np.int64]]:
     return ply.points().astype(np.float64), ply.faces
 
 
-def _shape_only(data: bytes, suffix: str) -> bytes:
-    """An OBJ without its materials: naming one makes the library look for an image reader."""
-    if suffix != "obj":
-        return data
-    dropped = (b"mtllib", b"usemtl")
-    return b"\n".join(line for line in data.splitlines() if not line.lstrip().startswith(dropped))
-
-
 def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
     import trimesh
 
@@ -125,9 +117,7 @@ def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
     # process=False keeps vertices as they stand; force="mesh" puts the parts of a scene together.
     logging.getLogger("trimesh").addHandler(_SILENT)  # it logs tracebacks of what it goes on to try otherwise
     with np.errstate(all="ignore"):
-        mesh: Any = trimesh.load(
-            io.BytesIO(_shape_only(data, suffix)), file_type=suffix, process=False, force="mesh", **options
-        )
+        mesh: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or (len(faces) and faces.shape[1] != 3):
         raise BadFile("no triangles in space")
