@@ -8,7 +8,7 @@ GOOD_PLY = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty
 FACES = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 %s\n3 0 1 2\n"
 
 
-def one_line(done, code, *words):
+def check_one_line(done, code, *words):
     assert done.code == code, done.out + done.err
     assert done.out == ""
     lines = done.err.strip().splitlines()
@@ -26,7 +26,7 @@ def log(fixtures_folder):
 
 @pytest.mark.parametrize("verb", ["run", "info"])
 def test_a_file_that_is_not_there(verb, cli, tmp_path):
-    one_line(cli(verb, tmp_path / "none.mcap"), 3, "none.mcap")
+    check_one_line(cli(verb, tmp_path / "none.mcap"), 3, "none.mcap")
 
 
 @pytest.mark.parametrize("verb", ["run", "info"])
@@ -34,29 +34,29 @@ def test_a_file_that_is_not_there(verb, cli, tmp_path):
 def test_a_file_that_is_no_log(verb, content, cli, tmp_path):
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
-    one_line(cli(verb, path), 3, "x.mcap")
+    check_one_line(cli(verb, path), 3, "x.mcap")
 
 
 def test_a_log_cut_off_after_its_first_bytes(cli, tmp_path):
     path = tmp_path / "x.mcap"
     path.write_bytes(b"\x89MCAP0\r\n")
-    one_line(cli("run", path), 3, "x.mcap")
+    check_one_line(cli("run", path), 3, "x.mcap")
     assert cli("info", path).code == 4  # it says what there is, and that the rest is lost
 
 
 def test_a_folder_without_scans(cli, tmp_path):
-    one_line(cli("run", tmp_path), 3)
+    check_one_line(cli("run", tmp_path), 3)
 
 
 def test_a_log_without_a_cloud_topic(cli, shared_data):
     bag = shared_data / "mcap-rosbag2" / "cdr_test"
-    one_line(cli("run", bag), 3, "PointCloud2")
+    check_one_line(cli("run", bag), 3, "PointCloud2")
 
 
 def test_no_model(cli, shared_data, tmp_path):
     out = tmp_path / "d.mcap"
     assert cli("record", shared_data / "stanford-dragon", "-o", out, "--n-scans", 1).code == 0
-    one_line(cli("run", out), 2, "no model", "--model")
+    check_one_line(cli("run", out), 2, "no model", "--model")
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,7 @@ def test_no_model(cli, shared_data, tmp_path):
 def test_a_model_that_cannot_be_right(text, word, cli, log, tmp_path):
     model = tmp_path / "m.ply"
     model.write_bytes(text)
-    one_line(cli("run", log, "--model", model), 3, word)
+    check_one_line(cli("run", log, "--model", model), 3, word)
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,7 @@ def test_a_scenario_with_a_wrong_key(text, line, word, cli, tmp_path):
     path = tmp_path / "s.toml"
     path.write_text(text)
     done = cli("record", path, "-o", tmp_path / "x.mcap")
-    one_line(done, 2, word, f"s.toml:{line}" if line else "s.toml")
+    check_one_line(done, 2, word, f"s.toml:{line}" if line else "s.toml")
     assert not (tmp_path / "x.mcap").exists()
 
 
@@ -104,19 +104,19 @@ def test_a_scenario_with_a_wrong_key(text, line, word, cli, tmp_path):
     ],
 )
 def test_a_flag_that_cannot_be_right(flags, word, cli, log):
-    one_line(cli("run", log, *flags), 2, word)
+    check_one_line(cli("run", log, *flags), 2, word)
 
 
 def test_a_config_file_with_a_wrong_key(cli, log, tmp_path):
     config = tmp_path / "c.toml"
     config.write_text("[plan]\n\nhorizon = 3\n")
-    one_line(cli("run", log, "--config", config), 2, "c.toml:3")
+    check_one_line(cli("run", log, "--config", config), 2, "c.toml:3")
 
 
 def test_an_existing_log_is_not_overwritten(cli, tmp_path):
     out = tmp_path / "x.mcap"
     out.write_bytes(b"precious")
-    one_line(cli("record", "-o", out), 2, "--overwrite")
+    check_one_line(cli("record", "-o", out), 2, "--overwrite")
     assert out.read_bytes() == b"precious"
 
 
@@ -138,7 +138,7 @@ def test_a_cloud_in_an_encoding_that_is_not_known(cli, tmp_path):
         channel = writer.register_channel("/points", "json", schema)
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()
-    one_line(cli("run", path), 3, "json.mcap")
+    check_one_line(cli("run", path), 3, "json.mcap")
 
 
 def test_terminal_escapes_in_names_are_shown_not_sent(cli, tmp_path):
