@@ -3,7 +3,8 @@
 python tests/benchmarks/whole_run.py LOG [--repeats N] [--quick]
 
 A log of 600 scans with 10,000 points each is the built-in scenario with more rays:
-sed 's/^rays.*/rays = [235, 235]/' avsreplay/simulate/builtin.toml > dense.toml && avsreplay record dense.toml -o dense.mcap
+sed 's/^rays.*/rays = [235, 235]/' avsreplay/simulate/builtin.toml > dense.toml
+avsreplay record dense.toml -o dense.mcap
 """
 
 from __future__ import annotations
