@@ -48,7 +48,8 @@ Exit codes: 0 ok (also where no capture lies within the horizon: the status says
 @click.option("--keepout-release", "keepout_release_m", type=float, help="Nearer the grasp point it does not hold [m].")
 @click.option("--samples", type=click.IntRange(1), default=64, show_default=True, help="Draws from the belief.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the draws.")
-@click.option("--every", "every_s", type=float, default=2.0, show_default=True, help="Hindsight: a plan so often [s].")
+@click.option("--every", "every_s", type=float, help="Hindsight: a plan so often [s]; 2, or 20 under limits.")
+@click.option("--fly", is_flag=True, help="Fly the log under limits too: a constrained plan a second, minutes in all.")
 @click.option("--extent", "extent_m", type=float, help="Target's size [m], where the result does not tell.")
 @click.option("--export", type=click.Path(path_type=Path), help="Write t, r, v, u of the plan as CSV.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing CSV.")
@@ -58,7 +59,8 @@ def command(
     at_s: float | None,
     samples: int,
     seed: int,
-    every_s: float,
+    every_s: float | None,
+    fly: bool,
     extent_m: float | None,
     export: Path | None,
     overwrite: bool,
@@ -83,10 +85,14 @@ def command(
     index = saved.index_at(at_s)
     made = _usable(lambda: planning.plan_at(index))
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
-    hindsight = _usable(lambda: planning.hindsight(every_s))
-    execution = _usable(planning.execute)
+    limited = planning.limits.any
+    period_s = every_s or (20.0 if limited else 2.0)
+    hindsight = _usable(lambda: planning.hindsight(period_s))
+    execution = _usable(planning.execute) if fly or not limited else None
     if export:
         _export(planning, made, export)
+    if limited and not fly:
+        click.echo("not flown: under limits every replan is costly; --fly does it all the same", err=True)
     if as_json:
         click.echo(_document(planning, index, made, spread, hindsight, execution), nl=False)
     else:
