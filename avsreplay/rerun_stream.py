@@ -63,5 +63,9 @@ class RerunStream:
         if row.gamma == 0:
             rr.log("rows/reason", rr.TextLog(row.reason))
 
+    def close(self) -> None:
+        """Hand on what is still on its way."""
+        self._rr.disconnect()
+
     def _place(self, path: str, pose: Pose) -> None:
         self._rr.log(path, self._rr.Transform3D(translation=pose.t, quaternion=pose.q))

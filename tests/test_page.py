@@ -204,10 +204,6 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     assert isinstance(again.exception, AvsError)
     assert "already there" in str(again.exception)
     assert CliRunner().invoke(command, [str(tmp_path), "--overwrite", "--title", "x"]).exit_code == 0
-    exports = [f"--{name}={tmp_path / name}" for name in ("csv", "parquet", "tum", "kitti")]
-    assert CliRunner().invoke(command, [str(tmp_path), *exports]).exit_code == 0
-    assert [len((tmp_path / n).read_text().splitlines()) for n in ("csv", "tum", "kitti")] == [31, 30, 30]
-    assert isinstance(CliRunner().invoke(command, [str(tmp_path), exports[0]]).exception, AvsError)
     (tmp_path / "none.jsonl").write_text("")
     empty = CliRunner().invoke(command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")])
     assert "holds no row" in str(empty.exception)

@@ -141,5 +141,7 @@ def test_a_run_streams_to_rerun(fixtures_folder, tmp_path):
     from avsreplay.rerun_stream import RerunStream
 
     with Run(Job(source=fixtures_folder / "tumble.mcap")) as run:
-        rows = list(run.rows([RerunStream(run.surface, tmp_path / "x.rrd")]))
+        stream = RerunStream(run.surface, tmp_path / "x.rrd")
+        rows = list(run.rows([stream]))
+        stream.close()
     assert (tmp_path / "x.rrd").stat().st_size > 100 * len(rows)

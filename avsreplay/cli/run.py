@@ -172,12 +172,15 @@ def _replayed(
     from avsreplay.rerun_stream import RerunStream
 
     keeper = ResultKeeper(target, run.surface) if target else None
-    listeners: list[Listener] = [RerunStream(run.surface)] if to_rerun else []
+    viewer = RerunStream(run.surface) if to_rerun else None
+    listeners: list[Listener] = [viewer] if viewer else []
     with keeper or nullcontext():
         begun = time.perf_counter()
         listeners += keeper.listeners if keeper else ()
         rows = list(tracked(run.rows(listeners), len(run), "replaying"))
         seconds = max(time.perf_counter() - begun, 1e-9)
+        if viewer:
+            viewer.close()
         summary = run.summary()
         record = _record(run, summary)
         if keeper:
