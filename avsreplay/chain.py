@@ -20,7 +20,7 @@ from avsreplay.fill import Findings, row_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.faults import FaultDetector
 from avsreplay.plan import Pilot, PilotMemory
-from avsreplay.records import Alignment, AlignStatus, Innovation, Scan, Verdict
+from avsreplay.records import Alignment, Innovation, Scan, Verdict
 from avsreplay.register import Registrar
 from avsreplay.rows import Row
 from avsreplay.sight import Aim, Hindsight, aim_columns, plan_columns, see
@@ -28,7 +28,6 @@ from avsreplay.watch import Monitors, Watch, look
 
 __all__ = ["Memory", "Stages", "fold", "step"]
 
-_UNMEASURED = (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED)
 _SURE_OF_REACH, _SURE_RAD = 0.25, np.radians(15.0)
 
 
@@ -123,11 +122,11 @@ def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
     return replace(memory, watch=watch, pilot=pilot, aim=aim, track=track, last=last), row
 
 
-def fold(stages: Stages, memory: Memory, scans: Iterable[Scan]) -> Iterator[tuple[Memory, Row]]:
+def fold(stages: Stages, memory: Memory, scans: Iterable[Scan]) -> Iterator[tuple[Scan, Memory, Row]]:
     """Fold ``step`` over the scans, one at a time: what is held is one scan, not one log."""
     for scan in scans:
         memory, row = step(stages, memory, scan)
-        yield memory, row
+        yield scan, memory, row
 
 
 def _track(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Track, Sighted | None]:
@@ -156,8 +155,7 @@ def _register(stages: Stages, memory: Memory, scan: Scan, prediction: Prediction
 def _judge(
     stages: Stages, scan: Scan, prediction: Prediction, alignment: Alignment
 ) -> tuple[Innovation | None, Verdict]:
-    measured = alignment.status not in _UNMEASURED
-    seen = stages.estimator.innovate(prediction, alignment) if measured else None
+    seen = stages.estimator.innovate(prediction, alignment) if alignment.measured else None
     return seen, stages.detector.judge(scan.status, alignment, seen, prediction.belief)
 
 

@@ -18,8 +18,6 @@ from avsreplay.rows import Row
 
 __all__ = ["Findings", "row_of"]
 
-_MEASURED = {"aligned", "degenerate", "not_converged", "ambiguous"}
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
@@ -69,12 +67,11 @@ def row_of(found: Findings) -> Row:
 
 
 def _registration(alignment: Alignment, scan: Scan) -> dict[str, Any]:
-    measured = alignment.status.value in _MEASURED
     fields: dict[str, Any] = {"points": len(scan.points), "weakest": alignment.weakest or None}
     if len(scan.points):
         fields |= {"iterations": alignment.iterations, "inliers": alignment.inliers}
         fields |= {"inlier_ratio": alignment.inlier_ratio, "rms_m": _finite(alignment.rms_m)}
-    if measured:
+    if alignment.measured:
         fields |= _pose(alignment.T_ac, "reg_")
         if scan.truth is not None:
             fields |= dict(

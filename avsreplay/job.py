@@ -95,13 +95,13 @@ class Run:
             hint = "widen the selection, or see 'avsreplay info'"
             raise UnreadableInput("no scan to replay", where=str(self.job.source), hint=hint)
         listeners = tuple(listeners)
-        heard: list[Scan] = []
-        for memory, row in chain.fold(self._stages, first_memory(self._stages), self._overheard(heard)):
+        scans = map(self._judged, self.source.scans(self.job.prefetch))
+        for scan, memory, row in chain.fold(self._stages, first_memory(self._stages), scans):
             self._fold.add(row)
-            if heard[-1].body is not None:
-                self._end = memory, heard[-1].body
+            if scan.body is not None:
+                self._end = memory, scan.body
             for listener in listeners:
-                listener(heard[-1], memory, row)
+                listener(scan, memory, row)
             yield row
 
     @property
@@ -138,7 +138,7 @@ class Run:
         if self.config.reference is Against.TRUTH:
             return self.source.truth_poses()
         ready = stages(self.config, self.source.header, self.surface)
-        rows = [row for _, row in chain.fold(ready, first_memory(ready), self.source.scans(self.job.prefetch))]
+        rows = [row for _, _, row in chain.fold(ready, first_memory(ready), self.source.scans(self.job.prefetch))]
         healthy = [row for row in rows if row.gamma]
         poses = [pose for _, pose in row_poses(healthy, "registration")]
         stamps = [row.t_ns for row in healthy]
@@ -155,11 +155,6 @@ class Run:
         except ValueError:  # before the first or after the last healthy pose
             return replace(scan, truth=None, body=None)
         return replace(scan, truth=state.T_ac, body=None)
-
-    def _overheard(self, heard: list[Scan]) -> Iterator[Scan]:
-        for scan in map(self._judged, self.source.scans(self.job.prefetch)):
-            heard[:] = [scan]
-            yield scan
 
     def _model(self) -> Surface:
         surface = self.source.header.surface

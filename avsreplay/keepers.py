@@ -19,7 +19,7 @@ from avsreplay.log.result_log import ResultFrame, ResultLog
 from avsreplay.plan.pilot import Leg
 from avsreplay.records import Belief, Scan, Surface
 from avsreplay.register.model import Model
-from avsreplay.report import CloudView, PathView, View, thin_cloud, thin_surface, write_layout, write_view
+from avsreplay.report import CloudView, PathView, View, row_poses, thin_cloud, thin_surface, write_layout, write_view
 from avsreplay.results import Beliefs, ResultDirectory, belief_of
 from avsreplay.rows import Row
 
@@ -75,7 +75,7 @@ class LogKeeper:
                 points=scan.points,
                 estimate=belief.x.T_ac,
                 covariance=pose_covariance(belief),
-                registration=_registered(row),
+                registration=next((pose for _, pose in row_poses([row], "registration")), None),
                 truth=scan.truth,
                 path=self._paths.new(memory),
                 healthy=row.gamma == 1,
@@ -144,10 +144,3 @@ class ResultKeeper:
         self._directory.write(rows, self._beliefs, record)
         write_view(self._directory.file("view.npz"), self._view.view())
         write_layout(self._directory.file("result.layout.json"))
-
-
-def _registered(row: Row) -> Pose | None:
-    if row.reg_x_m is None:
-        return None
-    q = [getattr(row, f"reg_q{axis}") for axis in "xyzw"]
-    return Pose(np.array(q), np.array([row.reg_x_m, row.reg_y_m, row.reg_z_m]))

@@ -242,6 +242,11 @@ class Alignment:
     weakest: str = ""
 
     @property
+    def measured(self) -> bool:
+        """Is ``T_ac`` a measurement, however good, and not just the guess handed back?"""
+        return self.status not in (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED)
+
+    @property
     def inlier_ratio(self) -> float:
         """Inliers over points, 0 for an empty scan."""
         return self.inliers / self.points if self.points else 0.0

@@ -26,7 +26,7 @@ class Monitors:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Watch:
-    """What they remember. ``gramian`` is None until the first estimate."""
+    """What they remember."""
 
     gramian: Gramian
     consistency: ConsistencyTrack
