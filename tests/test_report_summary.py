@@ -157,6 +157,52 @@ def test_a_track_never_taken_up_again_has_no_recovery_time(clean):
     assert faults.episodes[0].recover_s is None
 
 
+def test_delay_is_counted_from_the_labels_first_scan(clean):
+    rows = [dataclasses.replace(r, fault="clutter") if 10 <= r.seq <= 14 else r for r in clean]
+    labels = [_label(rows, "clutter", 10, 14), _label(rows, "dropped", 30, 30)]
+    late = report.Summary.fold(_flag(rows, {13, 14}, fault="clutter"), labels=labels).faults.episodes
+    assert (late[0].delay_scans, late[0].delay_s) == (3, pytest.approx(0.6))
+    at_once = report.Summary.fold(_flag(rows, {10}, fault="clutter"), labels=labels).faults.episodes
+    assert (at_once[0].delay_scans, at_once[0].delay_s) == (0, 0.0)
+    never = report.Summary.fold(rows, labels=labels).faults.episodes
+    assert [(e.delay_scans, e.delay_s) for e in never] == [(None, None)] * 2
+
+
+def test_a_fault_seen_only_in_what_follows_it_needs_recovery(clean):
+    rows = _flag([dataclasses.replace(r, fault="frozen") if r.seq == 10 else r for r in clean], {11, 12})
+    (episode,) = report.Summary.fold(rows, labels=[_label(rows, "frozen", 10, 10)]).faults.episodes
+    assert (episode.detected, episode.recover_scans, episode.lost) == (False, 2, False)
+    assert episode.recover_s == pytest.approx(0.4)
+    rows = _flag(rows, range(11, 40))
+    (episode,) = report.Summary.fold(rows, labels=[_label(rows, "frozen", 10, 10)]).faults.episodes
+    assert (episode.detected, episode.recover_s, episode.lost) == (False, None, True)
+
+
+def test_a_fault_that_lasts_to_the_end_is_not_called_lost(clean):
+    rows = _flag(clean, range(35, 40), fault="clutter")
+    (episode,) = report.Summary.fold(rows, labels=[_label(rows, "clutter", 35, 39)]).faults.episodes
+    assert (episode.detected, episode.recover_s, episode.lost) == (True, None, False)
+
+
+def test_the_errors_of_a_fault_are_apart_by_what_was_done_with_the_scan(clean):
+    rows = [dataclasses.replace(r, pos_err_m=0.001 * r.seq, rot_err_deg=40.0 - r.seq) for r in clean]
+    rows = [dataclasses.replace(r, fault="clutter") if 10 <= r.seq <= 14 else r for r in rows]
+    rows = [dataclasses.replace(r, gamma=0, reason="fit_error") if r.seq in (11, 12, 16, 17) else r for r in rows]
+    gone = _label(rows, "dropped", 20, 21)
+    rows = [r for r in rows if r.seq not in (20, 21)]
+    faults = report.Summary.fold(rows, labels=[_label(clean, "clutter", 10, 14), gone]).faults
+    episode, dropped = faults.episodes
+    assert dataclasses.astuple(episode.peak_flagged) == (0.012, 29.0)
+    assert dataclasses.astuple(episode.peak_used) == (0.014, 30.0)
+    assert dataclasses.astuple(episode.peak_after) == (0.019, 25.0)  # up to the gap, not beyond it
+    assert dataclasses.astuple(dropped.peak_flagged) == (None, None)
+    assert dataclasses.astuple(dropped.peak_after) == (0.039, 18.0)
+    assert dataclasses.astuple(faults.peak_flagged) == (0.017, 24.0)
+    assert dataclasses.astuple(faults.peak_used) == (0.039, 40.0)
+    blind = [dataclasses.replace(r, pos_err_m=None, rot_err_deg=None) for r in rows]
+    assert report.Summary.fold(blind, labels=[gone]).faults.peak_used.pos_err_m is None
+
+
 def test_the_longest_coast_ends_with_its_error(make_rows):
     rows = _flag(make_rows(40), {3})
     summary = report.Summary.fold(rows)

@@ -3,19 +3,22 @@
 A label is *harmful* (the scan must be flagged) or not (either word is right). A harmful label is *detected* where at
 least one of its scans has gamma 0 or, where no scan came at all, where a gap covers it. A flagged scan without a
 label is a *false alarm*. A *gap* is an interval between scans longer than 1.5 times the median interval.
+
+Recovery is the detector's word: a track that followed wrong poses agrees with the next ones and counts as healthy.
+What a label really did shows in the errors of the estimate: over its flagged scans, its used ones, and those after.
 """
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise, takewhile
 
 from avsreplay.records import Label
 from avsreplay.report.spread import median
 
-__all__ = ["GAP", "Coast", "Episode", "FaultAccount", "Mark", "account", "coasts", "gaps"]
+__all__ = ["GAP", "Coast", "Episode", "FaultAccount", "Mark", "Peak", "account", "coasts", "gaps"]
 
 GAP = 1.5
 
@@ -32,6 +35,23 @@ class Mark:
 
 
 @dataclass(frozen=True, slots=True)
+class Peak:
+    """Largest errors of the estimate over some scans, each by itself; None without truth or without such a scan."""
+
+    pos_err_m: float | None = None
+    rot_err_deg: float | None = None
+
+    @classmethod
+    def of(cls, marks: Iterable[Mark]) -> Peak:
+        """Over ``marks``; errors that are None are passed over."""
+        listed = list(marks)
+        return cls(
+            max((m.pos_err_m for m in listed if m.pos_err_m is not None), default=None),
+            max((m.rot_err_deg for m in listed if m.rot_err_deg is not None), default=None),
+        )
+
+
+@dataclass(frozen=True, slots=True)
 class Episode:
     """One label and its fate.
 
@@ -39,7 +59,12 @@ class Episode:
         start_s, end_s: its window, since the first scan.  scans: rows that carry it.  flagged: those with gamma 0.
         detected: see the module.  recover_scans: scans without a label after it that were still flagged.
         recover_s: from the first scan without a label after it to the first healthy scan (0: at once);
-            None where there was nothing to recover from or no recovery.
+            None where there was nothing to recover from (neither it nor the scan after it was flagged) or no recovery.
+        strength: what its label says of it.
+        delay_scans, delay_s: from its first scan to the first flagged one; None where none was.
+        lost: scans without a label came after it, and not one of them was healthy.
+        peak_flagged, peak_used: of its scans with gamma 0 and with gamma 1.
+        peak_after: of the healthy scans without a label after it, up to the next label.
     """
 
     kind: str
@@ -51,6 +76,13 @@ class Episode:
     detected: bool
     recover_scans: int | None
     recover_s: float | None
+    strength: float | None = None
+    delay_scans: int | None = None
+    delay_s: float | None = None
+    lost: bool = False
+    peak_flagged: Peak = field(default_factory=Peak)
+    peak_used: Peak = field(default_factory=Peak)
+    peak_after: Peak = field(default_factory=Peak)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +93,7 @@ class FaultAccount:
         known: does the log say what was injected? Without that a flagged scan is no proven false alarm.
         injected, detected, missed: harmful labels.  missed_scans: harmful scans with gamma 1.
         false_alarms: flagged scans without a label, of ``unlabelled`` scans.
+        peak_flagged, peak_used: of the scans without a label with gamma 0 and with gamma 1.
     """
 
     known: bool
@@ -72,6 +105,8 @@ class FaultAccount:
     unlabelled: int
     false_alarms: int
     episodes: tuple[Episode, ...]
+    peak_flagged: Peak = field(default_factory=Peak)
+    peak_used: Peak = field(default_factory=Peak)
 
     @property
     def false_alarm_rate(self) -> float:
@@ -111,7 +146,8 @@ def account(marks: Sequence[Mark], labels: Sequence[Label] | None) -> FaultAccou
     members = _members(marks, labels)
     holes = gaps([m.t_ns for m in marks])
     t0 = marks[0].t_ns if marks else 0
-    episodes = tuple(_episode(label, members[i], marks, holes, t0) for i, label in enumerate(labels))
+    nexts = _nexts(labels)
+    episodes = tuple(_episode(label, members[i], marks, holes, t0, nexts[i]) for i, label in enumerate(labels))
     harmful = [i for i, label in enumerate(labels) if label.harmful]
     scans = [k for i in harmful for k in members[i]]
     free = [m for m in marks if m.fault is None]
@@ -126,6 +162,8 @@ def account(marks: Sequence[Mark], labels: Sequence[Label] | None) -> FaultAccou
         unlabelled=len(free),
         false_alarms=sum(m.gamma == 0 for m in free),
         episodes=episodes,
+        peak_flagged=Peak.of(m for m in free if m.gamma == 0),
+        peak_used=Peak.of(m for m in free if m.gamma == 1),
     )
 
 
@@ -157,12 +195,21 @@ def _distance(label: Label, t_ns: int) -> int:
 
 
 def _episode(
-    label: Label, rows: Sequence[int], marks: Sequence[Mark], holes: Sequence[tuple[int, int]], t0: int
+    label: Label,
+    rows: Sequence[int],
+    marks: Sequence[Mark],
+    holes: Sequence[tuple[int, int]],
+    t0: int,
+    next_ns: int | None,
 ) -> Episode:
-    flagged = sum(marks[k].gamma == 0 for k in rows)
+    own = [marks[k] for k in rows]
+    flagged = sum(m.gamma == 0 for m in own)
     missing = not rows and any(a <= label.end_ns and label.start_ns <= b for a, b in holes)
     last = rows[-1] + 1 if rows else bisect_right([m.t_ns for m in marks], label.end_ns)
-    recovery = _recovery(marks, last) if flagged or missing else None
+    after = [m for m in marks[last:] if m.fault is None]
+    found = _first(after, gamma=1)
+    recovery = found if flagged or missing or found != (0, 0.0) else None
+    delay = _first(own, gamma=0)
     return Episode(
         kind=label.kind,
         harmful=label.harmful,
@@ -173,15 +220,34 @@ def _episode(
         detected=bool(flagged or missing),
         recover_scans=recovery[0] if recovery else None,
         recover_s=recovery[1] if recovery else None,
+        strength=label.strength,
+        delay_scans=delay[0] if delay else None,
+        delay_s=delay[1] if delay else None,
+        lost=bool(after) and found is None,
+        peak_flagged=Peak.of(m for m in own if m.gamma == 0),
+        peak_used=Peak.of(m for m in own if m.gamma == 1),
+        peak_after=Peak.of(m for m in _until_next(marks[last:], next_ns) if m.gamma == 1),
     )
 
 
-def _recovery(marks: Sequence[Mark], start: int) -> tuple[int, float] | None:
-    free = [m for m in marks[start:] if m.fault is None]
-    for late, mark in enumerate(free):
-        if mark.gamma == 1:
-            return late, (mark.t_ns - free[0].t_ns) * 1e-9
+def _first(marks: Sequence[Mark], gamma: int) -> tuple[int, float] | None:
+    """Scans and seconds from the first of ``marks`` to the first of them with ``gamma``; None where none has it."""
+    for late, mark in enumerate(marks):
+        if mark.gamma == gamma:
+            return late, (mark.t_ns - marks[0].t_ns) * 1e-9
     return None
+
+
+def _until_next(marks: Sequence[Mark], next_ns: int | None) -> Iterable[Mark]:
+    """The first of ``marks`` up to a label; one that begins at ``next_ns`` may have left no scan."""
+    return takewhile(lambda m: m.fault is None and (next_ns is None or m.t_ns < next_ns), marks)
+
+
+def _nexts(labels: Sequence[Label]) -> list[int | None]:
+    """Of each label, when the next one after its end begins."""
+    starts = sorted(label.start_ns for label in labels)
+    places = [bisect_left(starts, max(label.end_ns, label.start_ns + 1)) for label in labels]
+    return [starts[k] if k < len(starts) else None for k in places]
 
 
 def coasts(marks: Sequence[Mark]) -> list[Coast]:

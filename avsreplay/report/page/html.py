@@ -69,12 +69,14 @@ def _statistics(s: Spread) -> list[str]:
 
 def fault_table(summary: Summary, rows: Sequence[Row]) -> str:
     """Injected faults, each with a button that jumps to its first scan."""
-    heads = ("kind", "verdict", "from [s]", "to [s]", "scans", "flagged", "recovered after [s]")
+    heads = ("kind", "verdict", "from [s]", "to [s]", "scans", "flagged", "delay [s]", "recovered after [s]")
     lines = []
     for e in summary.faults.episodes:
-        after = "" if e.recover_s is None else f"{e.recover_s:.2f}"
+        delay = "" if e.delay_s is None else f"{e.delay_s:.2f}"
+        after = "never" if e.lost else "" if e.recover_s is None else f"{e.recover_s:.2f}"
         kind = f'<button class="jump" data-scan="{_place(e, rows)}">{escape(e.kind)}</button>'
-        lines.append([kind, _verdict(e), f"{e.start_s:.1f}", f"{e.end_s:.1f}", str(e.scans), str(e.flagged), after])
+        counts = [str(e.scans), str(e.flagged)]
+        lines.append([kind, _verdict(e), f"{e.start_s:.1f}", f"{e.end_s:.1f}", *counts, delay, after])
     return table("Injected faults", heads, lines, numeric=2)
 
 
