@@ -112,14 +112,13 @@ def _consistency(console: Console, summary: Summary) -> Table:
 
 def _faults(console: Console, summary: Summary, palette: Palette) -> Table:
     table = new_table(console, "Injected faults")
-    heads = ("kind", "from\n[s]", "to\n[s]", "scans", "flagged", "verdict", "delay\n[s]", "recovered\nafter [s]")
-    for name in heads:
+    for name in ("kind", "from\n[s]", "to\n[s]", "scans\nflagged", "verdict", "delay\n[s]", "recovery\n[s]"):
         table.add_column(name, justify="left" if name in ("kind", "verdict") else "right", no_wrap=True)
     for e in summary.faults.episodes:
         delay = palette.dash if e.delay_s is None else f"{e.delay_s:.2f}"
         after = "never" if e.lost else palette.dash if e.recover_s is None else f"{e.recover_s:.2f}"
-        scans = [str(e.scans), str(e.flagged)]
-        table.add_row(e.kind, f"{e.start_s:.1f}", f"{e.end_s:.1f}", *scans, _verdict(e, palette), delay, after)
+        window, scans = [f"{e.start_s:.1f}", f"{e.end_s:.1f}"], f"{e.flagged}/{e.scans}"
+        table.add_row(e.kind, *window, scans, _verdict(e, palette), delay, after)
     return table
 
 
