@@ -36,10 +36,14 @@ Array = NDArray[np.float64]
 def frozen(values: ArrayLike, *shape: int) -> Array:
     """A read-only float64 copy in C order; with ``shape`` given, checked against it (-1: any)."""
     array = np.array(values, dtype=np.float64, order="C")
-    if shape and (array.ndim != len(shape) or any(s not in (-1, n) for s, n in zip(shape, array.shape, strict=True))):
+    if shape and array.shape != shape and not _fits(array.shape, shape):
         raise ValueError(f"expected shape {shape}, got {array.shape}")
-    array.flags.writeable = False
+    array.setflags(write=False)
     return array
+
+
+def _fits(found: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
+    return len(found) == len(wanted) and all(s in (-1, n) for s, n in zip(wanted, found, strict=True))
 
 
 IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.estimate.arc import Path
 from avsreplay.estimate.estimator import Prediction
-from avsreplay.estimate.motion import advance, flow
 from avsreplay.geometry import Array
 from avsreplay.records import State
 
@@ -49,11 +48,9 @@ def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) 
 
 def _back(x: State, knots: Array) -> tuple[Array, Array]:
     """R (k, 3, 3) and offset (k, 3) of T_ac(0) T_ac(t)^-1 at ``knots`` about now."""
-    first = float(knots[0])
-    begin = advance(x, flow(x.w_b, x.sigma, first), first)
-    here = Path(begin, float(knots[-1] - first)).at(knots - first)
-    A_t, now = geometry.matrix(here.q), x.T_ac
-    q_ac = geometry.multiply(here.q, x.q_bc)
+    q_ab, _ = Path(x).at(knots)
+    A_t, now = geometry.matrix(q_ab), x.T_ac
+    q_ac = geometry.multiply(q_ab, x.q_bc)
     t_ac = x.r_a + knots[:, None] * x.v_a + A_t @ x.c_b
     R = now.R @ np.swapaxes(geometry.matrix(q_ac), -1, -2)
     return R, now.t - np.einsum("kij,kj->ki", R, t_ac)

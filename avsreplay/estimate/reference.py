@@ -96,14 +96,14 @@ def _windows(poses: Poses, start: Chart) -> list[int]:
 
 
 def _motion(x: State, first_ns: int, last_ns: int) -> Callable[[int], State]:
-    path = Path(x, (last_ns - first_ns) * 1e-9)
+    path = Path(x)
 
     def at(t_ns: int) -> State:
         """The state at an instant within the poses' span."""
         h = (t_ns - first_ns) * 1e-9
         if not 0 <= t_ns - first_ns <= last_ns - first_ns:
             raise ValueError(f"t_ns is {t_ns}, outside the reference's span {first_ns} to {last_ns}")
-        here = path.at(np.array([h]))
-        return State(here.q[0], here.w[0], x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+        q, w = path.at(np.array([h]))
+        return State(q[0], w[0], x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
 
     return at

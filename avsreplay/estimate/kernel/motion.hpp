@@ -1,0 +1,47 @@
+// Torque-free rotation in the inertia ratios (eq:dot_omega, Eq:F): attitude, rate, their derivatives and their noise.
+#pragma once
+#include <vector>
+
+namespace avs {
+
+// A body: sigma1..3, and the variance its rate gets from the disturbance torque [rad2/s3], by axis of {B}.
+struct Body {
+  double sigma[3];
+  double push[3];
+};
+
+// Attitude [x y z w] of {B} and rate in {B} [rad/s].
+struct Turn {
+  double q[4];
+  double w[3];
+};
+
+// A turn, the derivative S of (dq_v, w) by (dq_v, w, sigma1..3) at the start, and the covariance Q the torque has added.
+struct Flow {
+  Turn at;
+  double S[6][9];
+  double Q[6][6];
+};
+
+// The flow over no time.
+Flow begin(const Turn& at);
+
+// On by h seconds, of either sign, cut where more than SUBSTEP rad are turned; noise grows with |h|.
+void advance(Turn& at, const Body& body, double h);
+void advance(Flow& flow, const Body& body, double h);
+
+constexpr double SUBSTEP = 0.2;  // rad
+
+// Any instant of one motion. Knots are laid down SUBSTEP apart as far as they have been asked for.
+class Path {
+ public:
+  Path(const Turn& start, const Body& body);
+  Turn at(double t);
+
+ private:
+  Body body_;
+  double spacing_;  // s
+  std::vector<Turn> knots_;
+};
+
+}  // namespace avs
