@@ -1,12 +1,15 @@
 """The campaign's page: self-contained, well-formed, its figures where the numbers are."""
 
+import dataclasses
 import re
 from html.parser import HTMLParser
 
 import pytest
 
+from avsreplay.report.episodes import Peak
+from avsreplay.sweep.kinds import KindOfFault
 from avsreplay.sweep.page import build_page, words
-from avsreplay.sweep.statistics import ScoreHistogram, consistency, quantiles, rate
+from avsreplay.sweep.statistics import ScoreHistogram, consistency, quantiles, rate, typical
 from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary
 
 VOID = {"meta"}
@@ -83,6 +86,47 @@ def test_the_curve_rises_and_stays_in_its_frame(summary):
     assert all(60 <= x <= 480 and 20 <= y <= 440 for x, y in places)
     assert [x for x, _ in places] == sorted(x for x, _ in places)
     assert [y for _, y in places] == sorted((y for _, y in places), reverse=True)
+
+
+def _cells(text):
+    rows = re.findall(r"<tr>(<td>.*?)</tr>", text[text.index("By kind of fault") :])
+    return [re.findall(r"<td>(.*?)</td>", row) for row in rows]
+
+
+def test_faults_by_kind_stand_together_false_alarms_first(summary):
+    frozen = KindOfFault(
+        harmful=True,
+        strengths=(),
+        lengths_s=(2.0,),
+        scans=8,
+        flagged=rate(6, 8),
+        episodes=2,
+        detected=rate(2, 2),
+        delay_s=typical([0.5, 1.5]),
+        delay_scans=typical([1, 3]),
+        lost=1,
+        peak_flagged=Peak(0.0123, 0.004),
+        peak_used=Peak(1.25, 178.6),
+    )
+    clutter = KindOfFault(False, (0.5,), (2.0,), 4, rate(0, 4), 1, rate(0, 1))
+    none = KindOfFault(False, (), (), 200, rate(1, 200))
+    kinds = {"clutter": clutter, "frozen": frozen, "none": none}
+    cells = tuple(dataclasses.replace(cell, kinds=kinds) for cell in summary.cells)
+    page = build_page(dataclasses.replace(summary, cells=cells, detector=None))
+    checker = Checker()
+    checker.feed(page)
+    assert checker.open == []
+    found = _cells(page)
+    assert [row[:2] for row in found] == [[k, n] for k in ("none", "clutter ~", "frozen") for n in ("0", "1")]
+    assert found[0][2:] == ["", "0.5%", *[""] * 7]
+    assert found[2][2:] == ["0.5, 2 s", "0.0%", "0/1", "", "", "0", "", "", ""]
+    assert found[4][2:] == ["2 s", "75.0%", "2/2", "1, 1.5", "", "1", "12, 0.004", "1250, 179", ""]
+
+
+def test_without_faults_there_is_no_table_of_them(summary):
+    none = {"none": KindOfFault(False, (), (), 200, rate(1, 200))}
+    cells = tuple(dataclasses.replace(cell, kinds=none) for cell in summary.cells)
+    assert "By kind of fault" not in build_page(dataclasses.replace(summary, cells=cells))
 
 
 def test_an_empty_campaign_has_a_page_too():

@@ -90,6 +90,12 @@ def test_the_results_say_what_was_run(reference, tmp_path):
             "empty": (6, 1.0),
             "none": (12, 0.0),
         }
+        empty = cell["kinds"]["empty"]
+        assert (empty["episodes"], empty["detected"]["share"], empty["lost"]) == (3, 1.0, 0)
+        assert empty["delay_scans"] == {"count": 3, "median": 0.0, "worst": 0.0}
+        assert (empty["recovery_s"]["worst"], empty["lengths_s"], empty["strengths"]) == (0.0, [0.6], [])
+        assert 0 < empty["peak_flagged"]["pos_err_m"] < 0.05
+        assert empty["peak_used"] == {"pos_err_m": None, "rot_err_deg": None}
 
 
 def test_noise_matters_in_every_repeat(reference, tmp_path):
@@ -107,6 +113,19 @@ def test_any_number_of_workers_gives_the_same_bytes(campaign, reference, tmp_pat
     assert done.exit_code == 0, done.output
     assert "small: 6 of 6 runs done (6 ok)" in done.output
     assert results(tmp_path / "out") == reference
+
+
+def test_faults_by_kind_need_no_lines_a_scan(campaign, reference, tmp_path):
+    campaign.write_text(SMALL.replace("repeats = 3", "repeats = 3\nscans = false"))
+    done = sweep(campaign, tmp_path / "out", "--workers", "0")
+    assert done.exit_code == 0, done.output
+    assert "by kind of fault" in done.output
+    assert "empty" in done.output
+    kinds = [
+        [cell["kinds"] for cell in json.loads(text)["cells"]]
+        for text in ((tmp_path / "out" / "summary.json").read_bytes(), reference["summary.json"])
+    ]
+    assert kinds[0] == kinds[1]
 
 
 def test_a_limit_is_taken_up_where_it_ended(campaign, reference, tmp_path):

@@ -131,6 +131,7 @@ def _print(summary: SweepSummary) -> None:
             console.print(_cell_table(number, cell))
     if summary.detector is not None and summary.detector.harmful:
         console.print(_detector_table(summary.detector))
+    if any(cell.kinds.keys() - {"none"} for cell in summary.cells):
         console.print(_kinds_table(summary))
 
 
@@ -166,7 +167,7 @@ def _cell_table(number: int, cell: Cell) -> Table:
 def _detector_table(detector: Detector) -> Table:
     from rich.table import Table
 
-    heads = ("test", "detected", "false alarms", "area under ROC", "threshold at 1 % false", "detected there")
+    heads = ("test", "detected", "others flagged", "area under ROC", "threshold at 1 % false", "detected there")
     table = Table(
         *heads,
         title=f"fault tests over {detector.harmful} harmful and {detector.other} other scans",
@@ -182,15 +183,20 @@ def _detector_table(detector: Detector) -> Table:
 
 
 def _kinds_table(summary: SweepSummary) -> Table:
-    """Share flagged, a row a kind of fault, a column a combination."""
+    """A line a kind of fault and combination; a rule between kinds."""
+    from rich.box import SIMPLE
     from rich.table import Table
 
-    cells = [(number, cell) for number, cell in enumerate(summary.cells) if cell.kinds]
-    table = Table(title="scans flagged by kind of fault, for each combination", title_justify="left")
-    table.add_column("fault")
-    for number, _ in cells:
-        table.add_column(str(number), justify="right")
-    for name in sorted({name for _, cell in cells for name in cell.kinds}):
-        found = (cell.kinds.get(name) for _, cell in cells)
-        table.add_row(name, *("" if k is None or k.flagged is None else f"{k.flagged.share:.1%}" for k in found))
+    from avsreplay.sweep.kinds_table import KIND_HEADS, kind_rows
+
+    title = "by kind of fault: times in s, errors in mm and deg; ~: harmless by its label; none: outside every window"
+    table = Table(title=title, title_justify="left", box=SIMPLE, padding=0, pad_edge=False)
+    for place, head in enumerate(KIND_HEADS):
+        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    last = ""
+    for row in kind_rows([(number, cell) for number, cell in enumerate(summary.cells) if cell.runs]):
+        if row[0] != last and last:
+            table.add_section()
+        table.add_row(row[0] if row[0] != last else "", *row[1:])
+        last = row[0]
     return table

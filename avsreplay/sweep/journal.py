@@ -132,7 +132,8 @@ class Journal:
 
 
 def _line(outcome: Outcome) -> bytes:
-    values = {"error": outcome.error, "metrics": outcome.metrics, "scans": outcome.scans}
+    values = {"error": outcome.error, "metrics": outcome.metrics, "episodes": outcome.episodes}
+    values["scans"] = outcome.scans
     rest = f"{outcome.id} {outcome.status} {json.dumps(values, separators=(',', ':'))}".encode()
     return b"%08x %s\n" % (zlib.crc32(rest), rest)
 
@@ -141,5 +142,5 @@ def _outcome(line: bytes) -> Outcome:
     run_id, status, body = line[9:-1].split(b" ", 2)
     values: dict[str, Any] = json.loads(body)
     metrics = values["metrics"] and {sys.intern(name): value for name, value in values["metrics"].items()}
-    scans = tuple(tuple(scan) for scan in values["scans"])
-    return Outcome(run_id.decode(), status.decode(), values["error"], metrics, scans)
+    scans, episodes = (tuple(map(tuple, values.get(name, ()))) for name in ("scans", "episodes"))
+    return Outcome(run_id.decode(), status.decode(), values["error"], metrics, scans, episodes)

@@ -7,6 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+from avsreplay.sweep.kinds import NONE
+from avsreplay.sweep.kinds_table import KIND_HEADS, kind_rows
 from avsreplay.sweep.statistics import Quantiles, Rate, Roc
 from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary
 
@@ -16,6 +18,12 @@ __all__ = ["build_page", "words"]
 _STYLES = (("#0072B2", ""), ("#D55E00", "7 3"), ("#009E73", "2 3"), ("#CC79A7", "8 3 2 3"))
 _LEFT, _WIDTH, _ROW = 260, 760, 26
 _FALSE_MIN = 1e-4  # left end of the ROC's logarithmic axis
+_KINDS_SAID = """No.: the combination. None: the scans outside every window; what is flagged there is a false
+alarm. ~: harmless by its label. Found: windows with a flagged scan or, without any scan, a gap. Delay: from a
+window's first scan to its first flagged one [s], median and worst. Recovery: from the first scan after it to the
+first healthy one [s], where there was something to recover from. Lost: windows after which no scan was healthy.
+Worst: errors of the estimate [mm, deg] over the window's flagged scans, over its used ones, and over the used ones
+after it up to the next window."""
 _CSS = """
 :root{color-scheme:light dark;--ink:#1b1b1b;--paper:#fff;--line:#c9c9c9;--soft:#f2f2f2;--mark:#0072B2}
 @media(prefers-color-scheme:dark){:root{--ink:#eaeaea;--paper:#16181b;--line:#4a4f55;--soft:#22262a;--mark:#56B4E9}}
@@ -24,7 +32,7 @@ body{max-width:1080px;margin:auto;padding:1rem}
 h1{font-size:1.4rem}h2{font-size:1.1rem;margin-top:2rem}
 .scroll{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
 th,td{border-bottom:1px solid var(--line);padding:.25rem .7rem;text-align:right;white-space:nowrap}
-th:first-child,td:first-child{text-align:left}thead th{background:var(--soft)}
+th:first-child,td:first-child{text-align:left}thead th{background:var(--soft);white-space:pre-line}
 svg{max-width:100%;height:auto}svg text{fill:var(--ink);font-size:13px}
 .axis{stroke:var(--line)}.span{stroke:var(--mark);stroke-width:2}.band{stroke:var(--mark);stroke-width:7;opacity:.45}
 .dot{fill:var(--mark)}
@@ -45,7 +53,8 @@ def build_page(summary: SweepSummary) -> str:
         *(_spans(title, [(n, c.metrics.get(name)) for n, c in cells]) for name, title in HEADLINES.items()),
     ]
     if summary.detector is not None and summary.detector.harmful:
-        parts += ["<h2>Fault tests</h2>", _detector(summary.detector), "<h2>By kind of fault</h2>", _kinds(cells)]
+        parts += ["<h2>Fault tests</h2>", _detector(summary.detector)]
+    parts.append(_kinds(cells))
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width">'
     head += f"<title>{escape(summary.name)}</title>"
     body = "\n".join(parts)
@@ -135,13 +144,11 @@ def _detector(detector: Detector) -> str:
 
 
 def _kinds(cells: Sequence[tuple[int, Cell]]) -> str:
-    heads = ["combination", "fault", "scans", "flagged", "worst position error [m]", "worst rotation error [deg]"]
-    rows = []
-    for number, cell in cells:
-        for name, kind in cell.kinds.items():
-            worst = ("" if v is None else f"{v:.4g}" for v in (kind.worst_pos_err_m, kind.worst_rot_err_deg))
-            rows.append([str(number), name, str(kind.scans), _share(kind.flagged), *worst])
-    return _table(heads, rows)
+    """Faults by kind, with what the columns mean; empty where nothing was injected and nothing flagged."""
+    rows = list(kind_rows(cells))
+    if not any(cell.kinds.keys() - {NONE} for _, cell in cells):
+        return ""
+    return f"<h2>By kind of fault</h2><p>{escape(_KINDS_SAID)}</p>{_table(KIND_HEADS, rows)}"
 
 
 def _roc(detector: Detector) -> str:

@@ -29,7 +29,7 @@ from avsreplay.sweep.toml_text import toml_text, toml_value
 
 __all__ = ["Plan", "Point", "Task", "expand"]
 
-FORMAT = 1
+FORMAT = 2  # of what a run leaves behind: an older one is run again
 _NAMED = ("scenario", "log", "case")  # axes that choose a file or a case, not a key
 
 

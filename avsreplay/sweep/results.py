@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +53,7 @@ def arrow() -> tuple[Any, Any]:
 
 
 def _without_scans(outcome: Outcome) -> Outcome:
-    return Outcome(outcome.id, outcome.status, outcome.error, outcome.metrics)
+    return replace(outcome, scans=())
 
 
 def _run_table(done: Sequence[tuple[Point, Outcome]]) -> Any:

@@ -9,7 +9,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Consistency", "Quantiles", "Rate", "Roc", "ScoreHistogram", "consistency", "quantiles", "rate"]
+__all__ = [
+    "Consistency",
+    "Quantiles",
+    "Rate",
+    "Roc",
+    "ScoreHistogram",
+    "Typical",
+    "consistency",
+    "quantiles",
+    "rate",
+    "typical",
+]
 
 Z95 = 1.959963984540054  # two-sided 95 % point of the normal distribution
 
@@ -39,6 +50,22 @@ def quantiles(values: Sequence[float]) -> Quantiles | None:
     low, high = math.floor(0.5 * n - reach), math.ceil(0.5 * n + reach)
     q05, median, q95 = (float(np.quantile(ordered, q)) for q in (0.05, 0.5, 0.95))
     return Quantiles(n, q05, median, q95, float(ordered[max(low, 0)]), float(ordered[min(high, n - 1)]))
+
+
+@dataclass(frozen=True, slots=True)
+class Typical:
+    """Of the windows that have the figure: how many, the median and the largest."""
+
+    count: int
+    median: float
+    worst: float
+
+
+def typical(values: Sequence[float]) -> Typical | None:
+    """Median (the mean of the middle two of an even count) and worst. None where there is no value."""
+    if not len(values):
+        return None
+    return Typical(len(values), float(np.median(values)), float(max(values)))
 
 
 @dataclass(frozen=True, slots=True)

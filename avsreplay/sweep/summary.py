@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 from avsreplay import settings
 from avsreplay.sweep.campaign import Criterion
+from avsreplay.sweep.kinds import KindOfFault, kinds_of_fault
 from avsreplay.sweep.plan import Plan, Point
 from avsreplay.sweep.statistics import (
     Consistency,
@@ -23,7 +24,7 @@ from avsreplay.sweep.statistics import (
 )
 from avsreplay.sweep.worker import SCAN_COLUMNS, Outcome
 
-__all__ = ["HEADLINES", "Cell", "Detector", "KindOfFault", "SweepSummary", "summarise"]
+__all__ = ["HEADLINES", "Cell", "Detector", "SweepSummary", "summarise"]
 
 HEADLINES = {
     "pose_healthy.position_m.rmse": "position error, healthy scans [m]",
@@ -45,28 +46,13 @@ STATES = 20
 
 
 @dataclass(frozen=True, slots=True)
-class KindOfFault:
-    """The scans of one kind of fault ("none": outside every window).
-
-    Attributes:
-        scans: how many.  flagged: share with gamma 0.
-        worst_pos_err_m, worst_rot_err_deg: of the estimate, over all of them; None without truth.
-    """
-
-    scans: int
-    flagged: Rate | None
-    worst_pos_err_m: float | None
-    worst_rot_err_deg: float | None
-
-
-@dataclass(frozen=True, slots=True)
 class Cell:
     """One combination.
 
     Attributes:
         values: what was set.  runs: done.  status: how many ended how.  metrics: HEADLINES' quantiles.
         rates: of the runs done, by criterion.  nees: at the last scan of each run.
-        kinds: the fault rule by kind of fault, where scans are kept.
+        kinds: the fault rule by kind of fault, "none" for the scans outside every window.
     """
 
     values: Mapping[str, Any]
@@ -115,27 +101,20 @@ def summarise(plan: Plan, done: Sequence[tuple[Point, Outcome]], outcomes: Itera
     campaign = plan.loaded.campaign
     criteria = (*CRITERIA, *campaign.success)
     by_cell: dict[int, list[Outcome]] = {k: [] for k in range(len(plan.cells))}
-    cells_of: dict[str, list[int]] = {}
     for point, outcome in done:
         by_cell[point.cell].append(outcome)
-        cells_of.setdefault(outcome.id, []).append(point.cell)
-    detector, kinds = _detectors(outcomes if campaign.scans else (), cells_of)
+    used = {outcome.id for _, outcome in done}
     return SweepSummary(
         name=campaign.name,
         planned=len(plan),
         done=len(done),
         status=_status([outcome for _, outcome in done]),
-        cells=tuple(_cell(plan.cells[k], found, criteria, kinds.get(k, {})) for k, found in by_cell.items()),
-        detector=detector if campaign.scans else None,
+        cells=tuple(_cell(plan.cells[k], found, criteria) for k, found in by_cell.items()),
+        detector=_detector(o for o in outcomes if o.id in used) if campaign.scans else None,
     )
 
 
-def _cell(
-    values: Mapping[str, Any],
-    found: Sequence[Outcome],
-    criteria: Sequence[Criterion],
-    kinds: Mapping[str, KindOfFault],
-) -> Cell:
+def _cell(values: Mapping[str, Any], found: Sequence[Outcome], criteria: Sequence[Criterion]) -> Cell:
     return Cell(
         values=values,
         runs=len(found),
@@ -143,7 +122,7 @@ def _cell(
         metrics={name: quantiles(_numbers(found, name)) for name in HEADLINES},
         rates={c.name: rate(sum(_meets(c, o) for o in found), len(found)) for c in criteria},
         nees=consistency(_numbers(found, "end.nees"), STATES),
-        kinds=kinds,
+        kinds=kinds_of_fault((line for o in found for line in o.episodes), [o.metrics for o in found if o.metrics]),
     )
 
 
@@ -169,20 +148,12 @@ class _DetectorFold:
     def __init__(self) -> None:
         self._curves = {name: ScoreHistogram() for name in SCORES}
         self._flagged: Counter[tuple[bool, bool]] = Counter()
-        self._kinds: Counter[tuple[str, bool]] = Counter()
-        self._worst: dict[tuple[str, str], float] = {}
 
     def add(self, line: Sequence[Any]) -> None:
         harmful, flagged = bool(line[self.PLACE["harmful"]]), line[self.PLACE["gamma"]] == 0
-        kind = line[self.PLACE["fault"]] or "none"
         self._flagged[harmful, flagged] += 1
-        self._kinds[kind, flagged] += 1
         for name, column in SCORES.items():
             self._curves[name].add(_score(name, line[self.PLACE[column]]), harmful)
-        for name in ("pos_err_m", "rot_err_deg"):
-            value = line[self.PLACE[name]]
-            if value is not None:
-                self._worst[kind, name] = max(value, self._worst.get((kind, name), 0.0))
 
     def result(self) -> Detector:
         counts = {kind: self._flagged[kind, True] + self._flagged[kind, False] for kind in (True, False)}
@@ -194,26 +165,14 @@ class _DetectorFold:
             curves={name: histogram.roc() for name, histogram in self._curves.items()},
         )
 
-    def kinds(self) -> dict[str, KindOfFault]:
-        return {kind: self._kind(kind) for kind in sorted({kind for kind, _ in self._kinds})}
 
-    def _kind(self, kind: str) -> KindOfFault:
-        scans = self._kinds[kind, True] + self._kinds[kind, False]
-        worst = (self._worst.get((kind, name)) for name in ("pos_err_m", "rot_err_deg"))
-        return KindOfFault(scans, rate(self._kinds[kind, True], scans), *worst)
-
-
-def _detectors(
-    outcomes: Iterable[Outcome], cells_of: Mapping[str, Sequence[int]]
-) -> tuple[Detector, dict[int, dict[str, KindOfFault]]]:
-    """The fault rule over all scans, and by kind for each combination; a run that stands twice counts once in all."""
-    total, by_cell = _DetectorFold(), {cell: _DetectorFold() for cells in cells_of.values() for cell in cells}
+def _detector(outcomes: Iterable[Outcome]) -> Detector:
+    """The fault rule over all scans; a run that stands twice in the plan counts once."""
+    fold = _DetectorFold()
     for outcome in outcomes:
-        folds = [total, *(by_cell[cell] for cell in cells_of[outcome.id])] if outcome.id in cells_of else []
         for line in outcome.scans:
-            for fold in folds:
-                fold.add(line)
-    return total.result(), {cell: fold.kinds() for cell, fold in by_cell.items()}
+            fold.add(line)
+    return fold.result()
 
 
 def _score(name: str, value: float | None) -> float | None:

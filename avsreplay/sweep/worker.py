@@ -21,6 +21,7 @@ from avsreplay.recording import RecordOptions, record_scenario
 from avsreplay.records import Label, Scan
 from avsreplay.rows import Row
 from avsreplay.simulate import scenario_of
+from avsreplay.sweep.kinds import episode_lines
 from avsreplay.sweep.metrics import metrics
 from avsreplay.sweep.plan import Task
 
@@ -48,6 +49,7 @@ class Outcome:
     Attributes:
         id: of its task.  status: ``ok``, ``failed`` (an error of the input) or ``crashed``.  error: its one line.
         metrics: numbers, truth values and words by name.  scans: a list a scan in the order of SCAN_COLUMNS.
+        episodes: a list a window of a fault in the order of EPISODE_COLUMNS.
     """
 
     id: str
@@ -55,6 +57,7 @@ class Outcome:
     error: str | None = None
     metrics: Mapping[str, Any] | None = None
     scans: tuple[tuple[Any, ...], ...] = ()
+    episodes: tuple[tuple[Any, ...], ...] = ()
 
 
 def run_task(task: Task) -> Outcome:
@@ -90,7 +93,9 @@ def _replayed(task: Task, log: Path) -> Outcome:
             last = row
             if task.scans:
                 lines.append(_line(row, heard[0], run.source.header.labels, length_m))
-        return Outcome(task.id, "ok", None, metrics(run.summary(), last), tuple(lines))
+        summary = run.summary()
+        episodes = episode_lines(summary.faults.episodes)
+        return Outcome(task.id, "ok", None, metrics(summary, last), tuple(lines), episodes)
 
 
 def _line(row: Row, scan: Scan, labels: tuple[Label, ...], length_m: float) -> tuple[Any, ...]:
