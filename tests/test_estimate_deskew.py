@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 import tumbling
 
+from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.deskew import deskew
+from avsreplay.estimate.deskew import deskew, late
+from avsreplay.estimate.layout import boxplus
+from avsreplay.estimate.measure import innovation
+from avsreplay.geometry import Pose
 from avsreplay.records import Belief
 
 
@@ -51,3 +55,68 @@ def test_what_does_not_fit_is_refused() -> None:
         deskew(seen, times[1:], predict(now))
     with pytest.raises(ValueError, match="not finite"):
         deskew(seen, np.full(500, np.nan), predict(now))
+
+
+# --- what the carried scan's pose is a measurement of
+
+
+def surface_points(seed: int, late_half: bool):
+    """(500, 3) points with normals; with ``late_half`` the second half of them lies on one side of the body."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    p, n = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    if late_half:
+        p[250:, 0], n[250:] = np.abs(p[250:, 0]) + 1.0, n[250:] * [1.0, 0.2, 0.2]
+        n /= np.linalg.norm(n, axis=1, keepdims=True)
+    return p, n
+
+
+def mean_instants(p, n, times):
+    J = np.hstack([np.cross(p, n), n])
+    return np.linalg.solve(J.T @ J, (J.T * times) @ J), J
+
+
+@pytest.mark.parametrize(("late_half", "begin"), [(False, 0.0), (False, -0.5), (True, 0.0), (True, -0.25)])
+def test_the_innovation_of_a_carried_scan_is_late_h_times_the_priors_error(begin: float, late_half: bool) -> None:
+    """A prior off by dx carries the points; least squares over surface distances then gives the pose: no H in it."""
+    world = tumbling.draw(3, rate=0.2, seconds=1.0)
+    times = begin + np.sort(np.random.Generator(np.random.PCG64(5)).uniform(0.0, 0.5, 500))
+    at = 2.0
+    order = np.argsort(np.append(at + times, at))
+    states = tumbling.follow(np.append(at + times, at)[order], world.moments, world.states[0])
+    now = states.pop(int(np.searchsorted(times, 0.0)))
+    p, n = surface_points(7, late_half)
+    seen = np.array([x.T_ac.apply(c) for x, c in zip(states, p, strict=True)])
+    M, J = mean_instants(p, n, times)
+    rng = np.random.Generator(np.random.PCG64(9))
+    for _ in range(5):
+        dx = 1e-3 * rng.normal(size=20)
+        prior = predict(boxplus(now, -dx))
+        guess = prior.belief.x.T_ac
+        found = guess.inverse().apply(deskew(seen, times, prior))  # in the prior's {C}: p + J' d
+        d = np.linalg.lstsq(J, np.einsum("ij,ij->i", n, found - p), rcond=None)[0]
+        alpha = innovation(prior.belief.x, guess @ Pose(geometry.exp(d[:3]), d[3:]))
+        told = late(prior, M, times)
+        error = np.linalg.norm(alpha - told.H @ dx)
+        assert error < 0.015 * np.linalg.norm(alpha)
+        assert error < 0.25 * np.linalg.norm(alpha - prior.H @ dx)
+
+
+def test_a_flash_scan_tests_the_motion_at_its_instant() -> None:
+    now = skewed(0.1, 0.2, 1.0)[2]
+    prior = predict(now)
+    assert late(prior, np.zeros((6, 6)), np.zeros(500)) is prior
+    assert late(prior, np.zeros((6, 6)), np.zeros(0)) is prior
+
+
+def test_points_all_late_by_the_same_time_test_the_pose_then() -> None:
+    """Turned into {C}, H is that of the prior carried on to the instant they were measured at."""
+    now = skewed(0.1, 0.2, 1.0)[2]
+    prior = predict(now)
+    told = late(prior, 0.5 * np.eye(6), np.full(500, 0.5))
+    estimator = Estimator(EstimatorParams(), Belief(0, now, np.eye(20) * 1e-6), 2.0)
+    then = estimator.predict(estimator.initial(0, now.T_ac), 500_000_000)
+    turn = now.T_ac.R @ then.belief.x.T_ac.R.T
+    want = then.H @ then.Phi
+    np.testing.assert_allclose(told.H[:3], turn @ want[:3], atol=1e-12)
+    np.testing.assert_allclose(told.H[3:], want[3:], atol=1e-12)

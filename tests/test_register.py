@@ -187,6 +187,31 @@ def test_not_converged_is_said_and_graded(surface: Surface, scan: np.ndarray) ->
     assert found.inliers > 0
 
 
+@pytest.mark.parametrize("late_far", [False, True])
+def test_instants_say_which_pose_a_moving_scan_is_registered_at(
+    registrar: Registrar, surface: Surface, scan: np.ndarray, late_far: bool
+) -> None:
+    """The target drifts by t d1 while it is scanned, along one side or at random: the pose found is off by M d1."""
+    T_ac, rng = proving_pose(), _rng()
+    body = T_ac.inverse().apply(scan)
+    times = rng.uniform(0.0, 1.0, len(scan))
+    if late_far:
+        times[np.argsort(body[:, 1])] = np.sort(times)
+    d1 = np.array([2e-3, -1e-3, 1.5e-3, 1e-3, 2e-3, -1e-3])
+    moved = T_ac.apply(body + times[:, None] * (np.cross(d1[:3], body) + d1[3:]))
+    found = Registrar(surface, RegisterParams(eps_rad=1e-7, eps_m=1e-7, n_max=1000)).register(moved, T_ac)
+    step = T_ac.inverse() @ found.T_ac
+    d = np.concatenate([geometry.log(step.q), step.t])
+    M = registrar.instants(moved, times, found.T_ac)
+    np.testing.assert_allclose(d, M @ d1, atol=0.04 * np.abs(d).max())
+    assert (np.abs(M - 0.5 * np.eye(6)).max() > 0.1) == late_far
+
+
+def test_points_of_one_instant_have_it_in_every_direction(registrar: Registrar, scan: np.ndarray) -> None:
+    M = registrar.instants(scan, np.full(len(scan), 0.3), proving_pose())
+    np.testing.assert_allclose(M, 0.3 * np.eye(6), atol=1e-12)
+
+
 # --- what a view leaves free
 
 

@@ -1,7 +1,12 @@
-"""Motion inside a scan: points measured at their own instants carried to the scan's instant by the predicted motion."""
+"""Motion inside a scan: points measured at their own instants carried to the scan's instant by the predicted motion.
+
+What is carried takes the prediction's error along, so the scan's pose is no measurement at the scan's instant: ``late``
+says what it is one of. Without it the prior is taken for news, and the estimate for surer than it is.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,10 +15,12 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.estimate.arc import Path
 from avsreplay.estimate.estimator import Prediction
+from avsreplay.estimate.measure import sensitivity
+from avsreplay.estimate.motion import advance, flow, transition
 from avsreplay.geometry import Array
 from avsreplay.records import State
 
-__all__ = ["deskew"]
+__all__ = ["deskew", "late"]
 
 _KNOTS = 65  # instants the motion is worked out at; between them rotation and position go straight
 
@@ -44,6 +51,41 @@ def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) 
     part = (place - low)[:, None]
     carried = [np.einsum("nij,nj->ni", rotations[k], points) + offsets[k] for k in (low, low + 1)]
     return np.asarray((1.0 - part) * carried[0] + part * carried[1])
+
+
+def late(prediction: Prediction, instants: Array, times_s: NDArray[Any]) -> Prediction:
+    """The prediction with the H (6, 20) of a scan that it carried to its instant itself.
+
+    A point measured at tau and carried by the prior shows the prior's error at tau: delta(tau) in {C}, whatever
+    instant it is carried to. Over a scan delta is taken as straight, so the registered pose shows
+    delta(first) + (M - first) delta', by the mean instants M.
+
+    Args:
+        prediction: the scan's prior, that of ``deskew``.
+        instants: (6, 6) M, mean instant of the registered points by direction in {C} [s].
+        times_s: (n,) instants of the points relative to the scan's [s].
+    """
+    if not len(times_s):
+        return prediction
+    x, first, last = prediction.belief.x, float(np.min(times_s)), float(np.max(times_s))
+    if first == 0.0 == last:
+        return prediction
+    G = _fixture_rows(x, first)
+    if last > first:
+        slope = (_fixture_rows(x, last) - G) / (last - first)
+        G = G + (instants - first * np.eye(6)) @ slope
+    J = np.zeros((6, 6))
+    J[:3, 3:], J[3:, :3] = geometry.matrix(x.T_ac.q), 0.5 * geometry.matrix(x.q_bc)
+    return replace(prediction, H=J @ G)
+
+
+def _fixture_rows(x: State, h: float) -> Array:
+    """(6, 20) error of the pose h seconds on, d = [theta; v] in {C} [rad, m], by the error states now."""
+    step = flow(x.w_b, x.sigma, h)
+    then = advance(x, step, h)
+    H = sensitivity(then) @ transition(step, x.sigma, h)
+    rows: Array = np.vstack([2.0 * geometry.matrix(x.q_bc).T @ H[3:], geometry.matrix(then.T_ac.q).T @ H[:3]])
+    return rows
 
 
 def _back(x: State, knots: Array) -> tuple[Array, Array]:

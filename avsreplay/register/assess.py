@@ -19,7 +19,7 @@ from avsreplay.register.freedom import free_directions
 from avsreplay.register.model import Model
 from avsreplay.register.params import Limits, RegisterParams
 
-__all__ = ["Evidence", "assess", "covariance", "evidence", "nothing"]
+__all__ = ["Evidence", "assess", "covariance", "evidence", "instants", "nothing"]
 
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer than this may agree with one another
 LEAST_PATCHES = 24
@@ -65,6 +65,23 @@ def evidence(
     J = np.hstack([np.cross(p, n), n])
     noise = noise_m or _noise(e, gate_m)
     return Evidence(len(points), count, rms, J, e, centre, noise, _patches(p, PATCH_OF_EXTENT * model.extent_m))
+
+
+def instants(model: Model, view: View, points: NDArray[Any], times_s: NDArray[Any], T_ca: Pose, gate_m: float) -> Array:
+    """(6, 6) M [s]: a pose error d(t) = d0 + t d1 inside the scan is registered as d0 + M d1.
+
+    Point k, at ``times_s`` (n,), says J_k d(t_k), so the least squares give N^-1 (sum of t J'J) = M, N = J'J. What no
+    inlier sees takes the mean of all times.
+    """
+    moved = T_ca.apply(points)
+    found = model.closest(moved, camera_c=view.camera_c(model, points, T_ca))
+    near = found.d2 < gate_m**2
+    times = np.asarray(times_s, dtype=np.float64)
+    mean = float(times.mean()) if len(times) else 0.0
+    p, n = moved[near], found.normal[near]
+    J = np.hstack([np.cross(p, n), n])
+    M: Array = mean * np.eye(6) + np.linalg.pinv(J.T @ J, hermitian=True) @ ((J.T * (times[near] - mean)) @ J)
+    return M
 
 
 def _patches(p: Array, size_m: float) -> NDArray[np.intp]:

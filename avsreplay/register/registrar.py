@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import MissingBackend
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register.acquire import Acquirer, Acquisition
-from avsreplay.register.assess import assess, nothing
+from avsreplay.register.assess import assess, instants, nothing
 from avsreplay.register.facing import View
 from avsreplay.register.freedom import turn_words
 from avsreplay.register.model import Model
@@ -76,6 +76,16 @@ class Registrar:
             words = turn_words(search.best.T_ca @ search.second.T_ca.inverse())
             return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, weakest=words)
         return found
+
+    def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
+        """When points that have each their own time saw the target, by direction: (6, 6) [s], see ``assess.instants``.
+
+        Args:
+            points: (n, 3) finite, in {A} [m], carried to one instant.
+            times_s: (n,) their own instants, from that one [s].
+            T_ac: the pose they were registered at.
+        """
+        return instants(self._model, self._view, points, times_s, T_ac.inverse(), self.limits.gate_m)
 
     def search(self, points: NDArray[Any]) -> Acquisition:
         """Best and second best pose of a scan (n, 3) in {A} [m], finite, n >= 1, and what can be said of them."""
