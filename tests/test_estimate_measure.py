@@ -81,7 +81,7 @@ def test_a_free_direction_is_not_measured(x: State) -> None:
 
 
 def test_grasp_rows_are_the_derivative(x: State) -> None:
-    J, eps = grasp_rows(x.q_ab[None], x.w_b[None], x.c_b)[0], 1e-6
+    J, eps = grasp_rows(geometry.matrix(x.q_ab)[None], x.w_b[None], x.c_b)[0], 1e-6
 
     def seen(y: State) -> np.ndarray:
         turn = geometry.multiply(geometry.multiply(geometry.conjugate(x.q_ab), y.T_ac.q), geometry.conjugate(x.q_bc))

@@ -162,7 +162,7 @@ def test_forecast_adds_the_disturbance_of_every_step() -> None:
     seen = horizon.forecast(Belief(0, x, P0), times, torque, force)
     for i, t in enumerate(times):
         then, _ = motion.propagate(Belief(0, x, P0), round(t * 1e9), torque, force)
-        J = motion.grasp_rows(then.x.q_ab[None], then.x.w_b[None], x.c_b)[0]
+        J = motion.grasp_rows(geometry.matrix(then.x.q_ab)[None], then.x.w_b[None], x.c_b)[0]
         want = np.sqrt(np.diag(J @ then.P @ J.T).reshape(3, 3).sum(axis=1)) * [1, 1, 2]
         assert (seen.pos_1s_m[i], seen.vel_1s_mps[i], seen.rot_1s_rad[i]) == pytest.approx(tuple(want), rel=1e-5)
 

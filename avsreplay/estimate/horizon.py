@@ -7,7 +7,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.estimate import _motion
 from avsreplay.estimate.arc import Path
-from avsreplay.estimate.layout import RHO, SIGMA, VEL
+from avsreplay.estimate.layout import RHO, SIGMA, VEL, rotation
 from avsreplay.estimate.motion import MOST_RAD, grasp_rows, push, ratios, sigma_join
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Forecast, State, Trajectory
@@ -17,7 +17,7 @@ __all__ = ["forecast", "trajectory"]
 
 def trajectory(x: State) -> Trajectory:
     """Times (n,) >= 0 [s after now] -> positions and velocities (n, 3) of the grasp point in {A}, undisturbed."""
-    path = Path(x)
+    path, arm = Path(x), geometry.skew(x.c_b)  # w x c = w' [c x]
 
     def at(times: Array) -> tuple[Array, Array]:
         times = np.asarray(times, dtype=np.float64)
@@ -26,7 +26,7 @@ def trajectory(x: State) -> Trajectory:
         q, w = path.at(times)
         A = geometry.matrix(q)
         position = x.r_a + times[:, None] * x.v_a + A @ x.c_b
-        velocity = x.v_a + (A @ np.cross(w, x.c_b)[:, :, None])[:, :, 0]
+        velocity = x.v_a + (A @ (w @ arm)[:, :, None])[:, :, 0]
         return position, velocity
 
     return at
@@ -38,13 +38,14 @@ def forecast(belief: Belief, times_s: Array, torque: float, force: float) -> For
     Infinite where the target would turn more than ``MOST_RAD`` on the way.
     """
     times = np.asarray(times_s, dtype=np.float64)
-    if times.ndim != 1 or np.any(np.diff(times, prepend=0.0) < 0.0):
+    if times.ndim != 1 or np.any(times[:1] < 0.0) or np.any(times[1:] < times[:-1]):
         raise ValueError("times must ascend from 0")
     x = belief.x
     if float(np.abs(x.w_b).max()) * float(times.max(initial=0.0)) > MOST_RAD:
         return Forecast(times, *np.full((3, len(times)), np.inf))
-    q, w, S, Q = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), push(x.sigma, torque), times)
-    J = grasp_rows(q, w, x.c_b)
+    _, w, S, Q = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), push(x.sigma, torque), times)
+    A_ab = rotation(x.q_ab) @ np.swapaxes(S[:, :3, :3], 1, 2)  # S's attitude block is A(q_rel)'
+    J = grasp_rows(A_ab, w, x.c_b)
     turning = J[:, :, :6]
     moved = J.copy()  # J Phi
     moved[:, :, :6] = turning @ S[:, :, :6]

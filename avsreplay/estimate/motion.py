@@ -13,8 +13,8 @@ import numpy as np
 
 from avsreplay.errors import UsageError
 from avsreplay.estimate import _motion
-from avsreplay.estimate.layout import DIM, DQ, RHO, SIGMA, VEL, W, hamilton
-from avsreplay.geometry import IDENTITY_QUAT, Array, matrix, skew
+from avsreplay.estimate.layout import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W, hamilton
+from avsreplay.geometry import IDENTITY_QUAT, Array, skew
 from avsreplay.records import Belief, State
 
 __all__ = [
@@ -36,9 +36,7 @@ __all__ = [
 Triple = tuple[float, float, float]
 
 MOST_RAD = 2e4  # turn a single step may have: some seconds of work
-_I20 = np.eye(DIM)
-
-
+_I3, _I20 = np.eye(3), np.eye(DIM)
 
 
 def _diagonal(rows: slice, columns: slice) -> slice:
@@ -49,6 +47,7 @@ def _diagonal(rows: slice, columns: slice) -> slice:
 
 _PLACE, _MIXED, _SPEED = _diagonal(RHO, RHO), _diagonal(RHO, VEL), _diagonal(VEL, VEL)
 _MIXED_MIRROR = _diagonal(VEL, RHO)
+
 
 def sigma3(sigma: Array) -> float:
     """The dependent ratio, -(s1 + s2) / (1 + s1 s2) (eq:sigma_constraint)."""
@@ -158,18 +157,20 @@ def propagate(belief: Belief, t_ns: int, torque: float, force: float) -> tuple[B
     return Belief(t_ns, advance(x, step, h), 0.5 * (P + P.T)), Phi
 
 
-def grasp_rows(q_ab: Array, w_b: Array, c_b: Array) -> Array:
+def grasp_rows(A_ab: Array, w_b: Array, c_b: Array) -> Array:
     """Derivative (n, 9, 20) of the grasp point's position [m], velocity [m/s] and half-angle attitude (section 8).
 
     Args:
-        q_ab: (n, 4).
+        A_ab: (n, 3, 3) attitudes.
         w_b: (n, 3) rates [rad/s].
         c_b: (3,) the fixture in {B} [m].
     """
-    A = matrix(q_ab)
-    J = np.zeros((len(A), 9, DIM))
-    J[:, :3, 14:17] = A
-    J[:, :3, DQ], J[:, 3:6, W] = -2.0 * A @ (arm := skew(c_b)), -A @ arm
-    J[:, 3:6, DQ], J[:, 3:6, 14:17] = -2.0 * A @ skew(np.cross(w_b, c_b)), A @ skew(w_b)
-    J[:, :3, RHO] = J[:, 3:6, VEL] = J[:, 6:, DQ] = J[:, 6:, 17:] = np.eye(3)
+    turning, arm = skew(w_b), skew(c_b)
+    J = np.zeros((len(A_ab), 9, DIM))
+    J[:, :3, VARRHO] = A_ab
+    J[:, 3:6, VARRHO] = A_ab @ turning
+    J[:, 3:6, W] = -A_ab @ arm
+    J[:, :3, DQ] = 2.0 * J[:, 3:6, W]
+    J[:, 3:6, DQ] = -2.0 * A_ab @ skew(turning @ c_b)
+    J[:, :3, RHO] = J[:, 3:6, VEL] = J[:, 6:, DQ] = J[:, 6:, DMU] = _I3
     return J

@@ -18,6 +18,12 @@ from avsreplay.records import Belief, State
 
 __all__ = ["nearest", "nees", "relabel", "relabel_covariance"]
 
+_R_NB = np.array([naming.R_bn.T for naming in NAMINGS])
+_Q_BN = np.array([naming.q_bn for naming in NAMINGS])
+_Q_NB = geometry.conjugate(_Q_BN)
+_PARITY = np.array([[naming.parity] for naming in NAMINGS])
+_PERMS = np.array([naming.perm[:2] for naming in NAMINGS])
+
 
 def relabel(x: State, naming: Naming) -> State:
     """The same motion with its principal axes named anew."""
@@ -49,18 +55,13 @@ def nearest(estimate: Belief, truth: State) -> tuple[State, float]:
 
 def _errors(truth: State, x: State) -> Array:
     """(24, 20) ``boxminus(relabel(truth, naming), x)`` of every naming, at once."""
-    R_nb = np.array([naming.R_bn.T for naming in NAMINGS])
-    q_bn = np.array([naming.q_bn for naming in NAMINGS])
-    parity = np.array([naming.parity for naming in NAMINGS])
-    perms = np.array([naming.perm[:2] for naming in NAMINGS])
     triple = np.array([truth.sigma[0], truth.sigma[1], sigma3(truth.sigma)])
     d = np.empty((len(NAMINGS), DIM))
-    d[:, DQ] = _small(geometry.multiply(geometry.conjugate(x.q_ab), geometry.multiply(truth.q_ab, q_bn)))
-    q_nc = geometry.multiply(geometry.conjugate(q_bn), truth.q_bc)
-    d[:, DMU] = _small(geometry.multiply(q_nc, geometry.conjugate(x.q_bc)))
-    d[:, W], d[:, VARRHO] = R_nb @ truth.w_b - x.w_b, R_nb @ truth.c_b - x.c_b
+    d[:, DQ] = _small(geometry.multiply(geometry.multiply(geometry.conjugate(x.q_ab), truth.q_ab), _Q_BN))
+    d[:, DMU] = _small(geometry.multiply(_Q_NB, geometry.multiply(truth.q_bc, geometry.conjugate(x.q_bc))))
+    d[:, W], d[:, VARRHO] = _R_NB @ truth.w_b - x.w_b, _R_NB @ truth.c_b - x.c_b
     d[:, RHO], d[:, VEL] = truth.r_a - x.r_a, truth.v_a - x.v_a
-    d[:, SIGMA] = parity[:, None] * triple[perms] - x.sigma
+    d[:, SIGMA] = _PARITY * triple[_PERMS] - x.sigma
     return d
 
 
