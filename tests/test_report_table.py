@@ -115,12 +115,24 @@ def test_the_fault_table_says_detected_missed_and_harmless(make_rows):
     ]
     text = _printed(rows, labels=labels)
     for pattern in (
-        r"full_occlusion .* 6 .* 6 .*detected .* 0.00",
-        r"range_bias .* 1 .* 0 .*missed",
-        r"clutter .* 1 .* 0 .*harmless, used",
+        r"full_occlusion .* 6/6 .*detected +0\.00 +0\.00",
+        r"range_bias .* 0/1 .*missed +\S +\S$",
+        r"clutter .* 0/1 .*harmless, used",
         r"2 injected, 1 detected, 1 missed; 6 of 7 harmful scans",
     ):
-        assert re.search(pattern, text), pattern
+        assert re.search(pattern, text, re.MULTILINE), pattern
+
+
+def test_the_fault_table_says_when_it_was_seen_and_that_the_track_was_never_taken_up(make_rows):
+    rows = [dataclasses.replace(r, gamma=1, reason="ok", fault=None) for r in make_rows(40)]
+    rows = [dataclasses.replace(r, fault="partial_occlusion") if 10 <= r.seq < 30 else r for r in rows]
+    rows = [dataclasses.replace(r, gamma=0, reason="fit_error") if r.seq >= 12 else r for r in rows]
+    window = (rows[10].t_ns, rows[29].t_ns)
+    labels = [Label("partial_occlusion", *window), Label("dropped", rows[35].t_ns, rows[36].t_ns)]
+    text = _printed([r for r in rows if r.seq not in (35, 36)], labels=labels)
+    assert re.search(r"partial_occlusion .* 18/20 .*detected +0\.40 +never", text)
+    assert re.search(r"dropped .* 0/0 .*detected as a gap +\S+ +never", text)
+    assert "…" not in text
 
 
 def test_speed_stands_in_the_table_only(make_rows):
