@@ -6,7 +6,7 @@ n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over the inliers give everyt
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,13 +19,15 @@ from avsreplay.register.freedom import free_directions
 from avsreplay.register.model import Model
 from avsreplay.register.params import Limits, RegisterParams
 
-__all__ = ["Evidence", "assess", "covariance", "evidence", "instants", "nothing"]
+__all__ = ["Evidence", "assess", "counted", "covariance", "evidence", "instants", "nothing"]
 
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer than this may agree with one another
 LEAST_PATCHES = 24
-# What the sandwich leaves out (closest points near edges lean one way), by tests/benchmarks/registration_noise.py.
-UNEXPLAINED = 1.24
+# What the jackknife leaves out (closest points near edges lean one way), by tests/benchmarks/estimate_noise.py.
+UNEXPLAINED = 1.1
+LONE = 0.5  # of what is known of a motion: more than that from one patch, and the patch does not count
 SIGMA_PER_MEDIAN = 1.4826  # of |e| for a normal e
+ALONE = 1e-9  # keeps the motion that one patch alone holds finite
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 
 
@@ -99,20 +101,47 @@ def _noise(e: Array, gate_m: float) -> float:
 
 
 def covariance(found: Evidence) -> Array:
-    """(6, 6) covariance of d = [theta; v], the sandwich N^-1 (sum over patches g'g) N^-1, N = J'J, g = sum of e J.
+    """(6, 6) covariance of d = [theta; v]: what leaving out one patch after the other does to it, squared and summed.
 
     Errors within a patch may agree (the model is off there, a range error seen at a slant, outliers that stick to it);
-    patches are taken as independent. Corrected for the six values fitted.
+    patches are taken as independent. Without patch p, of sums N_p = J'J and g_p = sum of e J, d moves by
+    (N - N_p)^-1 g_p = N^-1 (I - N_p N^-1)^-1 g_p: a patch that holds much shows more than its residuals.
     """
-    normal = found.J.T @ found.J
-    count = int(found.patch.max(initial=-1)) + 1
-    g = np.stack(
-        [np.bincount(found.patch, weights=column, minlength=count) for column in (found.J * found.e[:, None]).T]
-    )
-    meat = g @ g.T * (count / max(count - 6, 1))
-    bread = np.linalg.pinv(normal, hermitian=True)
-    P: Array = bread @ meat @ bread
+    normals, g = _patch_sums(found)
+    bread = np.linalg.pinv(normals.sum(axis=0), hermitian=True)
+    left = (1.0 + ALONE) * np.eye(6) - normals @ bread
+    moved = np.linalg.solve(left, g[:, :, None])[:, :, 0] @ bread
+    P: Array = moved.T @ moved
     return 0.5 * (P + P.T)
+
+
+def counted(found: Evidence) -> Evidence:
+    """The evidence without the patches that tell more than ``LONE`` of a motion by themselves.
+
+    On a bare box the side that is hardly seen is held by a few points next to its edge, which may be its neighbour's.
+    """
+    normals, _ = _patch_sums(found)
+    share = normals @ np.linalg.pinv(normals.sum(axis=0), hermitian=True)
+    lone = np.trace(share, axis1=1, axis2=2) > LONE  # the largest eigenvalue is at most the trace
+    lone[lone] = np.linalg.eigvals(share[lone]).real.max(axis=1, initial=0.0) > LONE
+    keep = ~lone[found.patch]
+    if not lone.any() or np.count_nonzero(keep) < 6:
+        return found
+    patch = np.unique(found.patch[keep], return_inverse=True)[1].reshape(-1)
+    return replace(found, J=found.J[keep], e=found.e[keep], patch=patch)
+
+
+def _patch_sums(found: Evidence) -> tuple[Array, Array]:
+    """Sums of J'J (m, 6, 6) and of e J (m, 6) over each patch."""
+    J, count = found.J, int(found.patch.max(initial=-1)) + 1
+    normals = np.empty((count, 6, 6))
+    for a in range(6):
+        for b in range(a + 1):
+            normals[:, a, b] = normals[:, b, a] = np.bincount(found.patch, J[:, a] * J[:, b], count)
+    g = np.empty((count, 6))
+    for a in range(6):
+        g[:, a] = np.bincount(found.patch, J[:, a] * found.e, count)
+    return normals, g
 
 
 def assess(
@@ -122,8 +151,9 @@ def assess(
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return nothing(len(points), AlignStatus.FAILED)
     found = evidence(model, view, points, fit.T_ca, limits.gate_m, params.noise_m)
-    info = frozen(found.J.T @ found.J / found.noise_m**2)
     overlap = found.inliers >= max(params.min_inliers, params.min_inlier_ratio * found.points)
+    found = counted(found) if overlap else found
+    info = frozen(found.J.T @ found.J / found.noise_m**2)
     weakest = free_directions(found.J, found.centre) if overlap else ()
     certain = overlap and not weakest
     return Alignment(
