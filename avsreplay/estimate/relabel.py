@@ -77,7 +77,5 @@ def nees(belief: Belief, truth: State) -> float:
     smooth matrix, and what cannot be known is only a wide direction.
     """
     here = to_chart(belief.x)
-    T = to_errors(here)
-    P = np.linalg.solve(T, np.linalg.solve(T, belief.P).T)
-    y = to_chart(truth).minus(here)
-    return float(y @ np.linalg.solve(0.5 * (P + P.T), y))
+    d = to_errors(here) @ to_chart(truth).minus(here)  # back in error states, where P is
+    return float(d @ np.linalg.solve(belief.P, d))

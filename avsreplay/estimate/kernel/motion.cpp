@@ -1,7 +1,7 @@
 // One Taylor series gives all of it. With time scaled to the step, u = w h, the rate obeys u' = phi(u, sigma), a quadratic
 // equation whose coefficients follow from Cauchy products; attitude, derivatives and noise obey linear equations with u
 // as coefficient. The solutions are elliptic functions without a pole nearer than |w| h = pi / 2, so the order at which
-// the tail is below 1e-12 is known beforehand.
+// the tail is small enough is known beforehand.
 #include "motion.hpp"
 
 #include <algorithm>
@@ -12,17 +12,24 @@
 namespace avs {
 namespace {
 
-constexpr double TAIL = 1e-12, POLE = 1.5;
+constexpr double POLE = 1.5;
 constexpr double MOST = 1e6;  // rad in one advance: some seconds of work
-constexpr int LEAST_ORDER = 4;  // which the noise of a body at rest needs
-constexpr int MOST_ORDER = 15;  // enough for a piece of SUBSTEP
+constexpr int MOST_ORDER = 16;  // enough for a piece of SUBSTEP
 
 double size(const double* w) { return std::sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]); }
 
+// Terms until the tail is below `tail`; one at least.
+int terms(double turn, double tail) {
+  int n = 1;
+  for (double left = turn / POLE; left > tail && n < MOST_ORDER; ++n) left *= turn / POLE;
+  return n;
+}
+
+// State to 1e-12 of a radian; noise to 1e-10 of itself, and that of the attitude begins with the third power of time.
+template <int N>
 int order_for(double turn) {
-  int order = 0;
-  for (double tail = 1; (tail > TAIL || order < LEAST_ORDER) && order < MOST_ORDER; ++order) tail *= turn / POLE;
-  return order;
+  const int state = std::max(3, terms(turn, 1e-12));
+  return N == 12 ? std::min(MOST_ORDER, std::max(state, 3 + terms(turn, 1e-10))) : state;
 }
 
 // Taylor coefficients over a step of length 1. Rows of X: dq_v, then u. Its first six columns are the derivatives by u
@@ -101,7 +108,7 @@ void linear(Series<N>& y, int k, const Body& body, const double* p, const double
 // The whole series of a step of h seconds; returns its order.
 template <int N>
 int expand(Series<N>& y, const double* w, const Body& body, double h) {
-  const int order = order_for(size(w) * std::fabs(h));
+  const int order = order_for<N>(size(w) * std::fabs(h));
   double push[3];
   for (int r = 0; r < 3; ++r) {
     y.u[0][r] = w[r] * h;
