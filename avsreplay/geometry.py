@@ -55,6 +55,9 @@ IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])
 def skew(v: ArrayLike) -> Array:
     """The matrix [v x] with ``skew(v) @ u == cross(v, u)``. (..., 3) -> (..., 3, 3)."""
     a: Array = np.asarray(v, dtype=np.float64)
+    if a.ndim == 1:
+        x, y, z = a.tolist()
+        return np.array(((0.0, -z, y), (z, 0.0, -x), (-y, x, 0.0)))
     out = np.zeros((*a.shape, 3))
     out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -a[..., 2], a[..., 1], -a[..., 0]
     out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = a[..., 2], -a[..., 1], a[..., 0]

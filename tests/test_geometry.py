@@ -123,3 +123,8 @@ def test_a_single_one_is_a_row_of_the_batch_to_the_bit(function):
 def test_a_single_product_is_a_row_of_the_batch_to_the_bit():
     a, b = batch(300, seed=6), batch(300, seed=7)
     assert np.array_equal([geometry.multiply(p, q) for p, q in zip(a, b, strict=True)], geometry.multiply(a, b))
+
+
+def test_a_single_skew_is_a_row_of_the_batch_to_the_bit():
+    v = batch(50)[:, :3]
+    assert np.array_equal([geometry.skew(one) for one in v], geometry.skew(v))
