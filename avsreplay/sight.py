@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from avsreplay.estimate import Estimator, Track
 from avsreplay.geometry import Array, Pose
 from avsreplay.plan import Miss, Motion, PilotMemory, Sight, interpolated, miss
 from avsreplay.plan.pilot import Leg
+from avsreplay.records import Trajectory
 
 __all__ = ["Aim", "Hindsight", "aim_columns", "plan_columns", "see"]
 
@@ -20,15 +22,20 @@ __all__ = ["Aim", "Hindsight", "aim_columns", "plan_columns", "see"]
 def see(estimator: Estimator, track: Track, t_ns: int, gamma: int, converged: bool, standoff_c: Array) -> Sight:
     """What the pilot may know: never the truth. ``standoff_c`` (3,) is the approach point in {C} [m]."""
     belief = track.belief
-    x = belief.x
-    away = replace(x, c_b=x.c_b + geometry.matrix(x.q_bc) @ standoff_c)
+
+    @cache
+    def standoff() -> Trajectory:
+        x = belief.x
+        away = replace(x, c_b=x.c_b + geometry.matrix(x.q_bc) @ standoff_c)
+        return estimator.motion(replace(belief, x=away))
+
     return Sight(
         t_ns=t_ns,
         gamma=gamma,
         converged=converged,
         goal=estimator.motion(belief),
         forecast=lambda times_s: estimator.forecast(belief, times_s),
-        standoff=estimator.motion(replace(belief, x=away)),
+        standoff=lambda times_s: standoff()(times_s),
     )
 
 
