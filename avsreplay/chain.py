@@ -93,7 +93,7 @@ def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
     if not verdict.gamma and _lost(stages, scan, prediction):
         sighted = Sighted(stages.registrar.acquire(scan.points), "acquired")
         seen, verdict = _judge(stages, scan, prediction, sighted.alignment)
-    track = stages.estimator.update(track, prediction, seen, verdict.gamma)
+    track = stages.estimator.update(track, prediction, seen, verdict.gamma, memory.watch.convergence.converged)
 
     watch, columns = look(stages.monitors, memory.watch, stages.estimator, prediction, seen, verdict.gamma, track)
     converged = watch.convergence.converged

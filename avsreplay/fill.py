@@ -86,6 +86,7 @@ def _innovation(innovation: Innovation | None) -> dict[str, Any]:
     noise = np.diag(innovation.R)
     return {
         "nis": _finite(innovation.nis),
+        "weight": innovation.weight,
         "innov_m": _finite(innovation.distance_m),
         "innov_deg": _finite(np.degrees(innovation.angle_rad)),
         "r_pos_m": float(np.sqrt(noise[:3].mean())),

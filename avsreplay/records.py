@@ -276,6 +276,7 @@ class Innovation:
     Attributes:
         alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.
         nis: alpha' S^-1 alpha.  distance_m: |d rho|.  angle_rad: rotation angle of the innovation.
+        weight: share of its say that a healthy pose is left, 1 where its NIS is not beyond belief.
     """
 
     alpha: Array
@@ -284,6 +285,7 @@ class Innovation:
     nis: float
     distance_m: float
     angle_rad: float
+    weight: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -88,6 +88,7 @@ class Row:
     reg_qw: float | None = _number("see reg_qx")
 
     nis: float | None = column("", ".2f", 1e-3, 1e-4, "normalised innovation squared, chi-square of 6", True)
+    weight: float | None = _number("share of its say a pose is left, 1 up to the 99.99 % point of NIS", atol=1e-4)
     innov_m: float | None = _metres("length of the position innovation")
     innov_deg: float | None = _degrees("rotation angle of the innovation")
 
@@ -144,6 +145,7 @@ class Row:
     r_rot_deg: float | None = _number("adapted measurement noise, attitude, root mean diagonal", "deg")
     sigma_hits: int | None = _flag("times a sigma bound cut the gain so far")
     r_floors: int | None = _flag("times an eigenvalue floor of R acted so far")
+    recalls: int | None = _flag("times a fit to the poses contradicted the filter and took its place so far")
 
     ogm_log10_cond: float | None = column(
         "", ".1f", 1e-3, 1e-2, "log10 condition of the Gramian (null below full rank)", True

@@ -164,8 +164,8 @@ def test_before_a_full_window_r0_stands() -> None:
     R0 = np.diag(np.arange(1.0, 7.0))
     window = fill(adapt.NoiseWindow.empty(), np.ones((5, 6)), 6)
     assert adapt.matrix_noise(window, R0, 6) is R0
-    assert np.array_equal(adapt.factors(window, 6), np.ones(6))
-    assert not np.array_equal(adapt.factors(fill(window, np.full((1, 6), 3.0), 6), 6), np.ones(6))
+    assert np.array_equal(window.factors, np.ones(6))
+    assert not np.array_equal(fill(window, np.full((1, 6), 3.0), 6).factors, np.ones(6))
 
 
 def test_floor_acts_on_eigenvalues_in_units_of_r0_and_is_counted() -> None:
@@ -212,7 +212,7 @@ def burst(level: float, seconds: float = 20.0):
         alignment = tumbling.alignment(x.T_ac, rng, 0.01 * k, np.radians(k), reported=1.0 / k**2)
         prediction = estimator.predict(track, round(t * 1e9))
         track = estimator.update(track, prediction, estimator.innovate(prediction, alignment), 1)
-        yield t, adapt.factors(track.window, estimator.params.window)[[0, 3]]
+        yield t, track.window.factors[[0, 3]]
 
 
 def test_a_burst_is_followed_within_a_window_and_left_again() -> None:

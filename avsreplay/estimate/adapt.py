@@ -3,7 +3,8 @@
 Two rules. ``matrix`` is the paper's: R = mean of r r' + H P+ H', six by six, from R0's place. ``scale`` keeps the
 shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
 attitude, s^2 = mean of tr(R_b^-1 (r r' + H P+ H')) / 3 over the block: two numbers from a window instead of 21, so the
-window's own scatter does not spoil the consistency.
+window's own scatter does not spoil the consistency. The mean is weighted as the updates were: a wild
+pose is no noise.
 """
 
 from __future__ import annotations
@@ -14,65 +15,74 @@ import numpy as np
 
 from avsreplay.geometry import Array, frozen
 
-__all__ = ["NoiseWindow", "at_floor", "factors", "filled", "floored", "matrix_noise", "push"]
+__all__ = ["Epoch", "NoiseWindow", "at_floor", "filled", "floored", "matrix_noise", "push"]
+
+_DOUBT = 0.1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Epoch:
+    """What one healthy epoch says: outer (6, 6) = r r' + H P+ H', its trace against the base R by block, its weight."""
+
+    outer: Array
+    ratios: Array
+    weight: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseWindow:
-    """Residuals of the last healthy epochs, oldest first, at most the window's length.
+    """The last healthy epochs, oldest first, at most the window's length.
 
     Attributes:
-        outer: (n, 6, 6) r r' + H P+ H' of each epoch.  ratios: (n, 2) its trace against the base R, by block.
+        factors: (6,) standard deviations over the base R, position three times and attitude three times; 1 until full.
+        doubtful: do the poses contradict the estimate: have more than a tenth of them lost their say?
     """
 
-    outer: Array
-    ratios: Array
+    epochs: tuple[Epoch, ...]
+    factors: Array
+    doubtful: bool
 
     @classmethod
     def empty(cls) -> NoiseWindow:
         """A window nothing has been put into."""
-        return cls(frozen(np.zeros((0, 6, 6))), frozen(np.zeros((0, 2))))
+        return cls((), frozen(np.ones(6)), False)
 
 
-def push(window: NoiseWindow, residual: Array, HPH: Array, base: Array, length: int) -> NoiseWindow:
+def push(
+    window: NoiseWindow, residual: Array, HPH: Array, base: Array, length: int, weight: float = 1.0
+) -> NoiseWindow:
     """The window with one more epoch: residual (6,) after the update, H P+ H' (6, 6), the base R it was given."""
-    outer = np.outer(residual, residual) + HPH
-    ratios = np.trace(np.linalg.solve(_blocks(base), _blocks(outer)), axis1=1, axis2=2) / 3.0
-    keep = length - 1
-    return NoiseWindow(_append(window.outer, outer, keep), _append(window.ratios, ratios, keep))
+    outer = residual[:, None] * residual + HPH
+    ratios = np.linalg.solve(_blocks(base), _blocks(outer)).trace(axis1=1, axis2=2) / 3.0
+    return _summed((*window.epochs[-length + 1 :], Epoch(outer, ratios, weight)), length)
 
 
 def _blocks(A: Array) -> Array:
     """(2, 3, 3) position and attitude blocks of (6, 6)."""
-    return np.stack([A[:3, :3], A[3:, 3:]])
+    return A.reshape(2, 3, 2, 3)[(0, 1), :, (0, 1)]
 
 
-def _append(stack: Array, item: Array, keep: int) -> Array:
-    out = np.concatenate([stack[max(0, len(stack) - keep) :], item[None]])
-    out.flags.writeable = False
-    return out
+def _summed(epochs: tuple[Epoch, ...], length: int) -> NoiseWindow:
+    weight = sum(epoch.weight for epoch in epochs)
+    doubtful = weight < (1.0 - _DOUBT) * len(epochs)
+    if len(epochs) < length:
+        return NoiseWindow(epochs, np.ones(6), doubtful)
+    ratios = sum(epoch.weight * epoch.ratios for epoch in epochs) / weight
+    return NoiseWindow(epochs, np.sqrt(ratios).repeat(3), doubtful)
 
 
 def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
     """The paper's R: R0 until the window is full, then the mean over it."""
-    if len(window.outer) < length:
+    if len(window.epochs) < length:
         return R0
-    R: Array = window.outer.mean(axis=0)
-    return R
-
-
-def factors(window: NoiseWindow, length: int) -> Array:
-    """(6,) standard deviation factors of the base R, position three times and attitude three times; 1 until full."""
-    if len(window.ratios) < length:
-        return np.ones(6)
-    return np.repeat(np.sqrt(window.ratios.mean(axis=0)), 3)
+    weight = sum(epoch.weight for epoch in window.epochs)
+    return np.asarray(sum(epoch.weight * epoch.outer for epoch in window.epochs) / weight)
 
 
 def filled(base: Array, factors: Array, length: int) -> NoiseWindow:
     """A full window that says what a fit found: ``factors`` (2,) of attitude and position on ``base`` (6, 6)."""
-    s = np.repeat(factors[::-1], 3)
-    outer, ratios = base * np.outer(s, s), factors[::-1] ** 2
-    return NoiseWindow(frozen(np.broadcast_to(outer, (length, 6, 6))), frozen(np.broadcast_to(ratios, (length, 2))))
+    s = factors[::-1].repeat(3)
+    return _summed((Epoch(base * np.outer(s, s), factors[::-1] ** 2, 1.0),) * length, length)
 
 
 def floored(R: Array, R0: Array, fraction: float) -> Array:

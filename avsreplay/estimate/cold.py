@@ -14,7 +14,8 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate.chart import Chart, to_chart
-from avsreplay.estimate.fit import FitParams, Fitted, Poses, Prior, fit
+from avsreplay.estimate.drift import disturbed
+from avsreplay.estimate.fit import FitParams, Poses, Prior, fit
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.spread import Spread, belief_at, spread
 from avsreplay.estimate.start import PoseFix, rates
@@ -32,11 +33,12 @@ class ColdFit:
     """The last fit: its values at the epoch (the first pose), how many poses it had, and what came of it.
 
     Attributes:
-        chart: where the next one starts.  count: poses.
+        epoch_ns: instant of the first pose.  chart: values there, where the next fit starts.  count: poses.
         factors, colour: (2,) noise factors and time correlation, of attitude and position.
         belief: at the last pose.  settled: may the filter take over.
     """
 
+    epoch_ns: int
     chart: Chart
     count: int
     factors: Array
@@ -85,17 +87,25 @@ def _median_rates(fixes: tuple[PoseFix, ...], apart: int) -> tuple[Array, Array]
     return np.median([w for w, _ in found], axis=0), np.median([v for _, v in found], axis=0)
 
 
-def refit(fixes: tuple[PoseFix, ...], last: ColdFit | None, params: EstimatorParams, rules: FitParams) -> ColdFit:
-    """Fit all poses, from the last fit's values where there is one."""
+def refit(
+    fixes: tuple[PoseFix, ...],
+    params: EstimatorParams,
+    rules: FitParams,
+    last: ColdFit | None = None,
+    start: Chart | None = None,
+) -> ColdFit:
+    """Fit all poses, from ``start`` or the last fit's values where there are any."""
     poses = poses_of(fixes)
     prior = prior_of(poses, params)
-    start = to_chart(rough_state(fixes)) if last is None else last.chart
+    if start is None:
+        start = to_chart(rough_state(fixes)) if last is None else last.chart
     rules = replace(rules, least_colour=params.colour(_mean_turn(poses)))
     fitted = fit(poses, start, prior, rules, None if last is None else last.factors * np.sqrt(last.colour))
     found = spread(poses, fitted, prior, rules)
+    found = disturbed(found, poses, prior, rules, params.torque_noise_radps15, params.force)
     belief = belief_at(found, fixes[-1].t_ns, float(poses.times_s[-1]))
-    settled = _settled(found, fitted, prior)
-    return ColdFit(fitted.chart, len(poses), fitted.factors, fitted.colour, belief, settled)
+    settled = _settled(found, prior)
+    return ColdFit(fixes[0].t_ns, fitted.chart, len(poses), fitted.factors, fitted.colour, belief, settled)
 
 
 def _mean_turn(poses: Poses) -> float:
@@ -104,6 +114,7 @@ def _mean_turn(poses: Poses) -> float:
     return float(np.mean(geometry.angle(steps)))
 
 
-def _settled(found: Spread, fitted: Fitted, prior: Prior) -> bool:
+def _settled(found: Spread, prior: Prior) -> bool:
+    fitted = found.fitted
     told = np.linalg.eigvalsh(fitted.P_chart / np.outer(prior.one_sigma, prior.one_sigma))[-1] < _TOLD**2
     return found.settled and bool(told) and fitted.converged

@@ -6,6 +6,7 @@ import numpy as np
 
 from avsreplay.estimate.chart import retract
 from avsreplay.estimate.constrain import shrink
+from avsreplay.estimate.fit import GATE
 from avsreplay.estimate.layout import SIGMA, boxplus
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation
@@ -13,13 +14,18 @@ from avsreplay.records import Belief, Innovation
 __all__ = ["gain", "innovate", "joseph", "update", "update_in_chart", "widened"]
 
 
-def innovate(P: Array, H: Array, alpha: Array, R: Array) -> Innovation:
-    """The innovation's covariance S = H P H' + R and its sizes."""
+def innovate(P: Array, H: Array, alpha: Array, R: Array, robust: bool = False) -> Innovation:
+    """The innovation's covariance S = H P H' + R and its sizes.
+
+    ``robust`` weighs a pose down whose NIS is beyond the 99.99 % point, by Cauchy's weight, as the fit does.
+    """
     seen = H @ P @ H.T + R
     S = np.asarray(0.5 * (seen + seen.T), dtype=np.float64)
     half = min(1.0, float(np.sqrt(alpha[3:] @ alpha[3:])))
     distance = float(np.sqrt(alpha[:3] @ alpha[:3]))
-    return Innovation(alpha, S, R, float(alpha @ np.linalg.solve(S, alpha)), distance, 2.0 * float(np.arcsin(half)))
+    nis = float(alpha @ np.linalg.solve(S, alpha))
+    weight = min(1.0, GATE / nis) if robust and nis > GATE else 1.0
+    return Innovation(alpha, S, R, nis, distance, 2.0 * float(np.arcsin(half)), weight)
 
 
 def gain(P: Array, H: Array, S: Array) -> Array:
@@ -29,7 +35,7 @@ def gain(P: Array, H: Array, S: Array) -> Array:
 
 def update(prior: Belief, H: Array, seen: Innovation, margin: float, colour: Array) -> tuple[Belief, int]:
     """Posterior of a healthy epoch (gamma 1), and how many sigma bounds acted. ``colour`` (2,) as in ``widened``."""
-    R = widened(seen.R, colour)
+    R = widened(seen.R, colour / seen.weight)
     K = gain(prior.P, H, seen.S + (R - seen.R))
     betas, hits = shrink(prior.x.sigma, K[SIGMA] @ seen.alpha, margin)
     if hits:
@@ -41,7 +47,7 @@ def update(prior: Belief, H: Array, seen: Innovation, margin: float, colour: Arr
 
 def update_in_chart(prior: Belief, H: Array, seen: Innovation, colour: Array) -> Belief:
     """The same update displaced through the chart, where inertia cannot leave its bounds and beta has nothing to do."""
-    R = widened(seen.R, colour)
+    R = widened(seen.R, colour / seen.weight)
     K = gain(prior.P, H, seen.S + (R - seen.R))
     x, P = retract(prior.x, joseph(prior.P, H, K, R), K @ seen.alpha)
     return Belief(prior.t_ns, x, P)

@@ -24,9 +24,9 @@ from avsreplay.estimate.layout import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W
 from avsreplay.geometry import Array
 from avsreplay.records import State
 
-__all__ = ["FitParams", "Fitted", "Pin", "Poses", "Prior", "cost", "fit", "pinned"]
+__all__ = ["GATE", "FitParams", "Fitted", "Pin", "Poses", "Prior", "cost", "fit", "linearised", "pinned"]
 
-_GATE = 27.86  # chi-square with 6 degrees of freedom, 99.99 %
+GATE = 27.86  # chi-square with 6 degrees of freedom, 99.99 %
 _FEWEST_FOR_FACTORS = 12
 _LAGS = (5, 10, 20, 40)
 _WILD_RADPS = 0.5  # a step that adds more to the rate than this and the rate itself is not tried
@@ -173,7 +173,7 @@ class _Problem:
 
     def at(self, chart: Chart) -> _Here:
         d, J = self._residuals(chart)
-        e = self._whitened(d)
+        e = self.whitened(d)
         chi2 = np.einsum("ni,ni->n", e, e)
         weights, robust = _robust(chi2, self.redescend)
         cost = 0.5 * float(robust.sum()) + 0.5 * float(self.prior_info @ chart.minus(self.prior.mean) ** 2)
@@ -183,7 +183,7 @@ class _Problem:
 
     def normal(self, here: _Here) -> tuple[Array, Array]:
         """A (20, 20) and b (20,) of the step: A step = b."""
-        e, J = self._whitened(here.d), self._whitened(here.J)
+        e, J = self.whitened(here.d), self.whitened(here.J)
         JW = J * here.weights[:, None, None]
         A = np.tensordot(JW, J, ([0, 1], [0, 1])) + np.diag(self.prior_info)
         b = -np.tensordot(JW, e, ([0, 1], [0, 1])) - self.prior_info * here.chart.minus(self.prior.mean)
@@ -205,10 +205,10 @@ class _Problem:
 
     def colour(self, here: _Here) -> Array:
         """(2,) 1 + 2 sum of the residuals' autocorrelations, of attitude and position."""
-        e = self._whitened(here.d) * np.sqrt(here.weights)[:, None]
+        e = self.whitened(here.d) * np.sqrt(here.weights)[:, None]
         return np.array([_colour(e[:, :3]), _colour(e[:, 3:])])
 
-    def _whitened(self, rows: Array) -> Array:
+    def whitened(self, rows: Array) -> Array:
         scaled = rows / np.repeat(self.factors, 3).reshape((6,) + (1,) * (rows.ndim - 2))
         out: Array = np.einsum("nij,nj...->ni...", self.white.root, scaled)
         return out
@@ -238,10 +238,10 @@ class _Problem:
 
 def _robust(chi2: Array, redescend: bool) -> tuple[Array, Array]:
     """Weights and costs (n,): plain up to the gate; beyond it Cauchy's logarithm, or Huber's root on the way in."""
-    over = np.maximum(chi2 / _GATE, 1.0)
+    over = np.maximum(chi2 / GATE, 1.0)
     if redescend:
-        return 1.0 / over, np.where(over > 1.0, _GATE * (1.0 + np.log(over)), chi2)
-    return 1.0 / np.sqrt(over), np.where(over > 1.0, _GATE * (2.0 * np.sqrt(over) - 1.0), chi2)
+        return 1.0 / over, np.where(over > 1.0, GATE * (1.0 + np.log(over)), chi2)
+    return 1.0 / np.sqrt(over), np.where(over > 1.0, GATE * (2.0 * np.sqrt(over) - 1.0), chi2)
 
 
 def _colour(e: Array) -> float:
@@ -296,11 +296,22 @@ def cost(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: A
     return _Problem(poses, prior, params, factors).at(chart).cost
 
 
-def pinned(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Array, pin: Pin) -> Chart:
-    """The fit with one direction held."""
+def linearised(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: Array) -> tuple[Array, Array]:
+    """Residuals (n, 6) and their derivative (n, 6, 20) in the chart, whitened and weighted: each of unit variance."""
+    problem = _Problem(poses, prior, params, factors)
+    here = problem.at(chart)
+    root = np.sqrt(here.weights)[:, None]
+    return problem.whitened(here.d) * root, problem.whitened(here.J) * root[:, None]
+
+
+def pinned(
+    poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Array, pin: Pin
+) -> tuple[Chart, Array]:
+    """The fit with one direction held, and its covariance (20, 20) in the chart."""
     rough = replace(params, gain_tol=max(params.gain_tol, _PIN_TOL))
     problem = _Problem(poses, prior, rough, factors, pin)
-    return _descend(problem, problem.at(start), rough.max_steps)[0].chart
+    here = _descend(problem, problem.at(start), rough.max_steps)[0]
+    return here.chart, _inverse(problem.normal(here)[0])
 
 
 def _descend(problem: _Problem, here: _Here, max_steps: int) -> tuple[_Here, int, bool]:

@@ -83,8 +83,12 @@ class EstimatorParams:
     correlated_rad: float = 0.4
     # how it begins: a given belief (near), the fit (cold), the paper's filter from zero (paper); auto: near where given
     start: Start = Start.AUTO
-    # cold: the fit is repeated when the healthy poses have grown by this share
-    refit_growth: float = 0.1
+    # the fit is repeated when the healthy poses have grown by this share
+    refit_growth: float = 0.05
+    # how many healthy poses the filter is set against a fit to them; 0: never
+    audit_poses: int = 1000
+    # give a healthy pose less say the further its NIS is beyond the 99.99 % point; the paper's start never does
+    robust: bool = True
     # 1 sigma of the pose that is handed in before any scan [m]; auto: 0.05 of the extent
     start_pos_1s_m: float | None = None
     # the same, attitude about each axis [deg]
@@ -111,6 +115,8 @@ class EstimatorParams:
             raise ValueError(f"sigma_margin is {self.sigma_margin}, must be in (0, 0.5)")
         if not (0.0 <= self.correlated_share <= 1.0 and 0.0 <= self.correlated_rad < math.inf):
             raise ValueError(f"correlated_share is {self.correlated_share}, correlated_rad is {self.correlated_rad}")
+        if self.audit_poses < 0:
+            raise ValueError(f"audit_poses is {self.audit_poses}, must not be negative")
         if self.window < 6 or not 0.0 <= self.refit_growth <= 1.0:
             raise ValueError(f"window is {self.window} (6 at least), refit_growth is {self.refit_growth} (0 to 1)")
 

@@ -2,8 +2,9 @@
 
 Before a few turns are seen, some directions of the inertia are known so poorly that the valley of the cost bends within
 its own 1 sigma; the curvature at its bottom then denies most of it. Two sigma along each of the weakest directions
-the cost is compared with the normal one. Where it is bent, the fit is repeated with that direction held at plus and
-minus root three sigma: with weights 1/6, 4/6, 1/6 (Gauss-Hermite) the three fits carry the direction's second moments.
+the cost is compared with the normal one. Where it is bent, the fit is repeated with that direction held to either side
+where the cost, minimised over all else, has risen by 3/2, as it does at root three sigma of a normal one: with weights
+1/6, 4/6, 1/6 (Gauss-Hermite) the three fits, each with the covariance that is left there, carry the second moments.
 They are taken at the instant asked for, after each has moved there, in the chart's coordinates.
 """
 
@@ -20,19 +21,28 @@ from avsreplay.estimate.layout import DIM, SIGMA
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 
-__all__ = ["Bend", "Spread", "belief_at", "spread"]
+__all__ = ["Bend", "Node", "Spread", "belief_at", "spread"]
 
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
 _TRIAL = 2.0  # sigma
+_RISE, _TRIES = 0.5 * _NODE**2, 4
 _PIN_1S = 0.02  # of the direction's sigma
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Node:
+    """A fit held to one side of a bent direction, and what is left of its covariance P (20, 20) there."""
+
+    chart: Chart
+    P: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Bend:
-    """A bent direction: its part of P_chart, ``ray ray'``, and the fits held at either side."""
+    """A bent direction: its part of P_chart, ``ray ray'``, and the fits held to either side."""
 
     ray: Array
-    sides: tuple[Chart, Chart]
+    sides: tuple[Node, Node]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,33 +81,40 @@ def _bent(poses: Poses, fitted: Fitted, prior: Prior, params: FitParams, ray: Ar
     return False
 
 
-def _held(poses: Poses, fitted: Fitted, prior: Prior, params: FitParams, ray: Array, row: Array, side: float) -> Chart:
-    pin = Pin(fitted.chart, row, side, _PIN_1S)
-    return pinned(poses, fitted.chart.moved(side * ray), prior, params, fitted.effective, pin)
+def _held(poses: Poses, fitted: Fitted, prior: Prior, params: FitParams, ray: Array, row: Array, side: float) -> Node:
+    """The fit held to one side, at most ``_TRIES`` times, until the cost has risen as it should."""
+    there, P = fitted.chart.moved(side * ray), fitted.P_chart
+    for _ in range(_TRIES):
+        there, P = pinned(poses, there, prior, params, fitted.effective, Pin(fitted.chart, row, side, _PIN_1S))
+        rise = cost(poses, there, prior, params, fitted.effective) - fitted.half_chi2
+        if abs(rise - _RISE) < 0.2 * _RISE:
+            break
+        side *= float(np.clip(np.sqrt(_RISE / max(rise, 1e-9)), 0.4, 2.5))
+    return Node(there, P)
 
 
 def belief_at(found: Spread, t_ns: int, after_s: float) -> Belief:
     """Mean of the fit and its mended covariance, ``after_s`` after the epoch; ``t_ns`` is that instant."""
     fitted = found.fitted
-    x, Phi = _carried(fitted.chart, after_s)
+    x, step = _carried(fitted.chart, after_s)
     here = to_chart(x)
-    T = to_errors(here)
     P0 = fitted.P_chart - sum((np.outer(b.ray, b.ray) for b in found.bends), np.zeros((DIM, DIM)))
-    step = np.linalg.solve(T, Phi @ to_errors(fitted.chart))
-    P = step @ P0 @ step.T
-    for bend in found.bends:
-        for side in bend.sides:
-            y = to_chart(_carried(side, after_s)[0]).minus(here)
-            P += _WEIGHT * np.outer(y, y)
+    P = (1.0 - 2.0 * _WEIGHT * len(found.bends)) * step @ P0 @ step.T
+    for node in (side for bend in found.bends for side in bend.sides):
+        there, step = _carried(node.chart, after_s)
+        y = to_chart(there).minus(here)
+        P += _WEIGHT * (np.outer(y, y) + step @ node.P @ step.T)
+    T = to_errors(here)
     P = T @ P @ T.T
     return Belief(t_ns, x, 0.5 * (P + P.T))
 
 
 def _carried(chart: Chart, h: float) -> tuple[State, Array]:
-    """The state h seconds on, and Phi (20, 20)."""
+    """The state h seconds on, and the derivative (20, 20) of its chart by the one at the epoch."""
     x = to_state(chart)
     path = arc(x, np.array([h]))
     Phi = np.eye(DIM)
     Phi[:6, :6], Phi[:6, SIGMA] = path.S[0, :, :6], path.S[0, :, 6:]
     Phi[(6, 7, 8), (9, 10, 11)] = h
-    return State(path.q[0], path.w[0], x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc), Phi
+    there = State(path.q[0], path.w[0], x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+    return there, np.asarray(np.linalg.solve(to_errors(to_chart(there)), Phi @ to_errors(chart)))

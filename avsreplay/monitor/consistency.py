@@ -51,7 +51,10 @@ def block_nees(error: Array, P: Array) -> dict[str, float]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConsistencyTrack:
-    """The fold's state: whitened innovations L^-1 alpha of the last healthy epochs, (n, 6), oldest first."""
+    """The fold's state: whitened innovations L^-1 alpha of the last healthy epochs, (n, 6), oldest first.
+
+    Each at the weight the estimate gave it: a wild pose that was hardly listened to says little about the filter.
+    """
 
     white: Array
 
@@ -88,7 +91,7 @@ class Consistency:
         """One scan on; faulty ones say nothing."""
         if seen is None or gamma == 0:
             return track
-        white = np.linalg.solve(np.linalg.cholesky(seen.S), seen.alpha)
+        white = np.sqrt(seen.weight) * np.linalg.solve(np.linalg.cholesky(seen.S), seen.alpha)
         kept = track.white[max(0, len(track.white) + 1 - self.params.window) :]
         return ConsistencyTrack(frozen(np.vstack([kept, white])))
 

@@ -1,0 +1,195 @@
+"""What a scan that should not have passed does to the estimate: little, and not for long. And what pushes do to a fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tumbling
+from scipy.stats import chi2
+
+from avsreplay.estimate import Estimator, EstimatorParams, Track
+from avsreplay.estimate.audit import contradicted, start_at
+from avsreplay.estimate.chart import to_chart
+from avsreplay.estimate.cold import poses_of, prior_of, refit, rough_state
+from avsreplay.estimate.drift import disturbed, memory_s
+from avsreplay.estimate.ekf import innovate
+from avsreplay.estimate.fit import FitParams, fit
+from avsreplay.estimate.layout import boxplus
+from avsreplay.estimate.motion import disturbance
+from avsreplay.estimate.params import Start
+from avsreplay.estimate.relabel import nees
+from avsreplay.estimate.spread import spread
+from avsreplay.estimate.start import PoseFix
+from avsreplay.monitor.consistency import Consistency, ConsistencyParams
+from avsreplay.records import Belief, State
+
+NEAR_1S = np.repeat([0.0025, 0.0025, 0.01, 0.001, 0.025, 0.025, 0.005], [3, 3, 3, 3, 2, 3, 3])
+POS_M, ROT_RAD = 0.005, np.radians(0.3)
+WHITE = EstimatorParams(correlated_share=0.0, start=Start.NEAR)
+DEAF = replace(WHITE, audit_poses=0, robust=False)  # the filter as printed
+BAND_20 = chi2.ppf([0.0005, 0.9995], 20)
+
+
+def pushed(seed: int, torque: float, seconds: float, hz: float) -> tuple[np.ndarray, list[State]]:
+    """A body under a random torque, integrated from its full tensor between the pushes."""
+    world = tumbling.draw(seed, seconds=1.0, hz=hz, sigma_max=0.85)
+    rng = np.random.Generator(np.random.PCG64([seed, 99]))
+    states = [world.states[0]]
+    for _ in range(round(seconds * hz)):
+        x = tumbling.follow(np.array([0.0, 1.0 / hz]), world.moments, states[-1])[-1]
+        push = np.array(disturbance(x.sigma)) * torque * rng.normal(size=3) / np.sqrt(hz)
+        states.append(replace(x, w_b=x.w_b + push))
+    return np.arange(len(states)) / hz, states
+
+
+def near(x: State, seed: int) -> Belief:
+    rng = np.random.Generator(np.random.PCG64([seed, 8]))
+    return Belief(0, boxplus(x, NEAR_1S * rng.normal(size=20)), np.diag(NEAR_1S**2))
+
+
+def fold(
+    times: np.ndarray, states: list[State], params: EstimatorParams, seed: int, wrong=None, noise=1.0
+) -> Iterator[Track]:
+    """The track after each scan; ``wrong`` (index, pose) -> the pose that registration gives, all of them healthy."""
+    rng = np.random.Generator(np.random.PCG64([seed, 7]))
+    estimator = Estimator(params, near(states[0], seed) if params.start is Start.NEAR else None, 2.0)
+    track = estimator.initial(0, states[0].T_ac)
+    for k, (t, x) in enumerate(zip(times, states, strict=True)):
+        prediction = estimator.predict(track, round(t * 1e9))
+        seen = tumbling.alignment(x.T_ac, rng, noise * POS_M, noise * ROT_RAD)
+        if wrong is not None:
+            seen = replace(seen, T_ac=wrong(k, seen.T_ac))
+        track = estimator.update(track, prediction, estimator.innovate(prediction, seen), 1)
+        yield track
+
+
+def last(*args) -> Track:
+    for track in fold(*args):  # noqa: B007
+        pass
+    return track
+
+
+def frozen_scanner(first: int, count: int, states: list[State]):
+    """The scan before ``first`` again, ``count`` times."""
+    return lambda k, pose: states[first - 1].T_ac if first <= k < first + count else pose
+
+
+def test_a_pose_loses_its_say_beyond_the_gate_and_none_before() -> None:
+    P, H, R = np.zeros((20, 20)), np.zeros((6, 20)), np.eye(6)
+    for size in (0.0, 1.0, 5.0, 5.27, 5.29, 20.0, 1e6):
+        seen = innovate(P, H, np.array([size, 0, 0, 0, 0, 0]), R, robust=True)
+        assert seen.nis == pytest.approx(size**2)
+        assert seen.weight == pytest.approx(min(1.0, chi2.ppf(0.9999, 6) / max(size**2, 1e-9)), rel=1e-3)
+        assert innovate(P, H, seen.alpha, R).weight == 1.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_frozen_scan_that_passes_leaves_the_estimate_honest(seed: int) -> None:
+    """One and the same fault, and the printed filter denies its error."""
+    world = tumbling.draw(seed, seconds=100.0, sigma_max=0.85)
+    wrong = frozen_scanner(120, 4, world.states)
+    honest, deaf = (last(world.times, world.states, p, seed, wrong, 0.1) for p in (WHITE, DEAF))
+    assert nees(honest.belief, world.states[-1]) < BAND_20[1]
+    assert nees(deaf.belief, world.states[-1]) > 3.0 * BAND_20[1]
+
+
+def test_a_right_filter_is_left_alone() -> None:
+    """Twenty bodies, three audits each: the fit takes the word from none, and nothing differs in a bit."""
+    recalls = 0
+    for seed in range(20):
+        world = tumbling.draw(seed, seconds=100.0, sigma_max=0.85)
+        recalls += last(world.times, world.states, WHITE, seed).recalls
+    assert recalls <= 1
+
+
+def test_poses_that_contradict_the_filter_withdraw_its_word() -> None:
+    world = tumbling.draw(1, seconds=100.0, sigma_max=0.85)
+    tracks = list(fold(world.times, world.states, WHITE, 1, frozen_scanner(120, 8, world.states)))
+    assert not tracks[119].window.doubtful
+    assert any(track.window.doubtful for track in tracks[120:130])
+    assert not tracks[-1].window.doubtful
+
+
+def test_one_wild_pose_does_not_make_the_innovations_inconsistent() -> None:
+    monitor, rng = Consistency(ConsistencyParams()), np.random.Generator(np.random.PCG64(0))
+    wild, plain = monitor.initial(), monitor.initial()
+    for k in range(50):
+        alpha = rng.normal(size=6) * (100.0 if k == 25 else 1.0)
+        for robust in (True, False):
+            seen = innovate(np.zeros((20, 20)), np.zeros((6, 20)), alpha, np.eye(6), robust)
+            if robust:
+                wild = monitor.observe(wild, seen, 1)
+            else:
+                plain = monitor.observe(plain, seen, 1)
+    assert monitor.judge(wild).consistent
+    assert monitor.judge(plain).consistent is False
+
+
+def test_the_papers_start_stays_the_papers() -> None:
+    world = tumbling.draw(2, seconds=40.0)
+    track = last(world.times, world.states, replace(WHITE, start=Start.PAPER), 2, frozen_scanner(30, 3, world.states))
+    assert track.recalls == 0
+    assert track.fixes == ()
+    assert {epoch.weight for epoch in track.window.epochs} == {1.0}
+
+
+def fixes(seed: int, seconds: float) -> tuple[PoseFix, ...]:
+    world, rng = tumbling.draw(seed, seconds=seconds), np.random.Generator(np.random.PCG64([seed, 7]))
+    seen = [tumbling.alignment(x.T_ac, rng, POS_M, ROT_RAD) for x in world.states]
+    return tuple(PoseFix(round(t * 1e9), a.T_ac, a.covariance) for t, a in zip(world.times, seen, strict=True))
+
+
+def test_without_pushes_the_pass_is_the_fit_and_with_them_it_knows_less() -> None:
+    found = fixes(4, 100.0)
+    poses, params = poses_of(found), WHITE.resolved(2.0)
+    prior = prior_of(poses, params)
+    fitted = fit(poses, to_chart(rough_state(found)), prior, FitParams())
+    plain = spread(poses, fitted, prior, FitParams())
+    calm = disturbed(plain, poses, prior, FitParams(), 0.0, 0.0).fitted
+    scale = np.sqrt(np.outer(np.diag(fitted.P_chart), np.diag(fitted.P_chart)))
+    assert np.abs((calm.P_chart - fitted.P_chart) / scale).max() < 1e-4
+    y = calm.chart.minus(fitted.chart)
+    assert y @ np.linalg.solve(fitted.P_chart, y) < 0.01
+    for torque, force in ((1e-6, 0.0), (1e-5, 0.0), (0.0, 1e-4)):
+        wide = disturbed(plain, poses, prior, FitParams(), torque, force).fitted.P_chart
+        least = np.linalg.eigvalsh((wide - fitted.P_chart) / scale)
+        assert least[0] > -1e-4
+        assert least[-1] > 1e-3
+
+
+def test_the_memory_is_where_pushes_have_turned_the_body_by_the_stray() -> None:
+    for torque in (1e-6, 1e-4):
+        assert 3.0 * torque * np.sqrt(memory_s(torque) ** 3 / 3.0) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("start", [Start.NEAR, Start.COLD])
+def test_a_pushed_body_is_told_honestly(start: Start) -> None:
+    """Ten times the default torque noise over 100 s; mean NEES of eight bodies, the fit's word or the filter's."""
+    sizes = []
+    for seed in range(8):
+        times, states = pushed(seed, 1e-5, 100.0, 2.0)
+        track = last(times, states, replace(WHITE, start=start, torque_noise_radps15=1e-5), seed)
+        sizes.append(nees(track.belief, states[-1]) / 20)
+    assert np.median(sizes) < 1.4
+    assert np.median(sizes) > 0.5
+
+
+def test_contradiction_counts_in_the_fits_own_spread() -> None:
+    found = fixes(4, 100.0)
+    cold = refit(found, WHITE.resolved(2.0), FitParams())
+    assert not contradicted(cold.belief, cold.belief)
+    sizes = np.sqrt(np.linalg.eigvalsh(cold.belief.P))
+    axis = np.linalg.eigh(cold.belief.P)[1][:, -1]
+    for off, expected in ((6.0, False), (9.0, True)):
+        there = replace(cold.belief, x=boxplus(cold.belief.x, 0.01 * off * sizes[-1] * axis))
+        small = replace(cold.belief, P=1e-4 * cold.belief.P)
+        assert contradicted(there, small) is expected
+
+
+def test_the_fit_begins_where_the_belief_came_from() -> None:
+    world = tumbling.draw(3, seconds=60.0)
+    chart = start_at(Belief(round(world.times[-1] * 1e9), world.states[-1], np.eye(20)), 0)
+    assert np.abs(chart.minus(to_chart(world.states[0]))).max() < 1e-7
