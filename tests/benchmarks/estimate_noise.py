@@ -10,7 +10,7 @@ from its true pose. Noise is in thousandths of the extent. Prints, of the whiten
     k       share / (1 - share) over inliers (rms / extent)^2
     reach   sum of the autocorrelations over the turn, over the share [rad]
     colour  1 + 2 sum of the autocorrelations: how many times less such poses say than white ones
-    const   the colour of ``EstimatorParams``
+    const   the colour of CONST over REACH_RAD, whatever the scan
     law     the colour of share / (1 - share) = K inliers (rms / extent)^2 over REACH_RAD
 """
 
@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 
 from avsreplay import geometry, settings
-from avsreplay.estimate import EstimatorParams
 from avsreplay.geometry import Array
 from avsreplay.log import parse_surface, read_surface
 from avsreplay.records import AlignStatus, Surface
@@ -38,7 +37,7 @@ TURN_RAD, FARTHEST_RAD, NEAR_RAD = 0.02, 0.6, 0.06
 RATE_RADPS, RATE_HZ = 0.1, 5.0
 NOISE = (0.0005, 0.002, 0.004)  # of the extent
 RAYS = (48, 100)  # a side
-K, REACH_RAD = 20.0, 0.4
+K, CONST, REACH_RAD = 20.0, 0.1, 0.4
 
 
 @dataclass(frozen=True)
@@ -130,8 +129,12 @@ def line(name: str, surface: Surface, registrar: Registrar, noise: float, rays: 
     return (
         f"{head} {size:6.2f} {share:7.3f} {share / (1.0 - share) / edge_mean if shown else np.nan:6.1f}"
         f" {area / share if shown else np.nan:6.2f} {1.0 + 2.0 * rho.sum():8.2f}"
-        f" {EstimatorParams().colour(TURN_RAD):6.1f} {1.0 + 2.0 * law * REACH_RAD / TURN_RAD:6.1f}"
+        f" {_colour(CONST):6.1f} {_colour(law):6.1f}"
     )
+
+
+def _colour(share: float) -> float:
+    return 1.0 + 2.0 * share * REACH_RAD / TURN_RAD
 
 
 def main() -> None:
