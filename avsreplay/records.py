@@ -149,7 +149,8 @@ class State:
     @property
     def fixture_velocity(self) -> Array:
         """(3,) velocity of {C}'s origin in {A} [m/s] (section 8)."""
-        return self.v_a + geometry.rotate(geometry.matrix(self.q_ab), np.cross(self.w_b, self.c_b))
+        speed_b = geometry.rotate(geometry.skew(self.w_b), self.c_b)
+        return self.v_a + geometry.rotate(geometry.matrix(self.q_ab), speed_b)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

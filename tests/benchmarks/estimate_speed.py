@@ -41,12 +41,15 @@ def filter_us(count: int) -> dict[str, float]:
     seen = tumbling.alignment(world.states[1].T_ac, np.random.Generator(np.random.PCG64(0)), 0.005, 0.005)
     prediction = estimator.predict(track, 200_000_000)
     innovation = estimator.innovate(prediction, seen)
-    times = np.linspace(5.0, 30.0, 6)
+    times, many = np.linspace(5.0, 30.0, 6), np.linspace(0.0, 60.0, 100)
+    path = estimator.motion(track.belief)
     return {
         "predict": 1e6 * least(lambda: estimator.predict(track, 200_000_000), count),
         "innovate": 1e6 * least(lambda: estimator.innovate(prediction, seen), count),
         "update": 1e6 * least(lambda: estimator.update(track, prediction, innovation, 1), count),
         "forecast 30 s": 1e6 * least(lambda: estimator.forecast(track.belief, times), count // 10),
+        "new path": 1e6 * least(lambda: estimator.motion(track.belief)(times[3:4]), count // 10),
+        "path, 100 times": 1e6 * least(lambda: path(many), count // 10),
     }
 
 
