@@ -39,7 +39,7 @@ def sensitivity(x: State) -> Array:
 
 def innovation(x: State, T_ac: Pose) -> Array:
     """The innovation alpha (6,) = z - h at zero error: [m in {A}, half-angle vector in {B}]."""
-    q = hamilton(hamilton(_inverse(x.q_ab), T_ac.q), _inverse(x.q_bc))
+    q = hamilton(hamilton(_inverse(x.q_ab), T_ac.q.tolist()), _inverse(x.q_bc))
     s = 1.0 if q[3] >= 0.0 else -1.0
     dx, dy, dz = (T_ac.t - x.r_a - rotation(x.q_ab) @ x.c_b).tolist()
     return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
@@ -49,8 +49,8 @@ def residual(posterior: State, prior: State, alpha: Array) -> Array:
     """Z - h(x+) (6,) of the pose that gave ``alpha`` at the prior."""
     vx, vy, vz = alpha[3:].tolist()
     deta = (vx, vy, vz, math.sqrt(max(0.0, 1.0 - vx * vx - vy * vy - vz * vz)))
-    left = hamilton(_inverse(posterior.q_ab), prior.q_ab)
-    right = hamilton(prior.q_bc, _inverse(posterior.q_bc))
+    left = hamilton(_inverse(posterior.q_ab), prior.q_ab.tolist())
+    right = hamilton(prior.q_bc.tolist(), _inverse(posterior.q_bc))
     q = hamilton(hamilton(left, deta), right)
     s = 1.0 if q[3] >= 0.0 else -1.0
     seen = prior.r_a + rotation(prior.q_ab) @ prior.c_b + alpha[:3]
@@ -62,7 +62,7 @@ def measured_pose(x: State, alpha: Array) -> Pose:
     """The pose T_ac that ``innovation`` made alpha of: its inverse in the second argument."""
     vx, vy, vz = alpha[3:].tolist()
     deta = (vx, vy, vz, math.sqrt(max(0.0, 1.0 - vx * vx - vy * vy - vz * vz)))
-    q = hamilton(hamilton(x.q_ab, deta), x.q_bc)
+    q = hamilton(hamilton(x.q_ab.tolist(), deta), x.q_bc.tolist())
     return Pose(np.array(q), x.r_a + matrix(x.q_ab) @ x.c_b + alpha[:3])
 
 
