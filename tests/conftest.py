@@ -113,6 +113,7 @@ def _row(k: int, rng: np.random.Generator, blind: bool, changes: dict[str, objec
         "mu_1s_deg": 0.2,
         "sigma_hits": 2,
         "r_floors": 0,
+        "recalls": 0,
         "ogm_rank": min(k, 20),
         "ogm_log10_cond": None if k < 20 else 9.0,
         "ogm_log10_cond_scaled": None if k < 20 else 4.0,

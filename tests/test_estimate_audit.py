@@ -1,4 +1,4 @@
-"""What a scan that should not have passed does to the estimate: little, and not for long. And what pushes do to a fit."""
+"""What a scan that should not have passed does to the estimate: little. And what pushes do to a fit."""
 
 from __future__ import annotations
 

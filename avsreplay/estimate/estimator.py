@@ -30,7 +30,7 @@ from avsreplay.records import Alignment, Belief, Forecast, Innovation, State, Tr
 __all__ = ["Estimator", "Prediction", "Track"]
 
 _FEWEST_TO_FIT = 3
-_FEWEST_TO_AUDIT, _FEWEST_IN_DOUBT = 50, 10
+_FEWEST_TO_AUDIT, _AUDIT_GROWTH, _FEWEST_IN_DOUBT = 50, 0.25, 10
 _LONGEST_S = 1e9  # what nanoseconds hold
 _instant = attrgetter("t_ns")
 _WHITE = frozen(np.ones(2))
@@ -161,7 +161,7 @@ class Estimator:
 
         A fit whose likelihood is not normal yet has that right only where the poses themselves contradict the filter.
         """
-        enough = max(_FEWEST_TO_AUDIT, self.params.refit_growth * len(track.fixes))
+        enough = max(_FEWEST_TO_AUDIT, _AUDIT_GROWTH * len(track.fixes))
         if not self.audits or track.since < (_FEWEST_IN_DOUBT if track.window.doubtful else enough):
             return track
         begin = start_at(track.belief, track.fixes[0].t_ns)

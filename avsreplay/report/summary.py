@@ -72,6 +72,7 @@ class Summary:
     Attributes:
         pose_healthy, pose_coasting: of the estimate.  registration_healthy, registration_flagged: of the measurement.
         reasons: why scans were flagged.  status: what door and ruler found.  counts: handed in (losses, clock).
+        weighed_down: healthy scans that kept less than their whole say.  recalls: times a fit took the filter's place.
         coasts: runs without a measurement.  interval_s: median between scans.  gaps: longer than 1.5 times it.
     """
 
@@ -94,6 +95,8 @@ class Summary:
     parameters: tuple[Parameter, ...]
     sigma_hits: int | None
     r_floors: int | None
+    weighed_down: int
+    recalls: int | None
     nis: Share | None
     nees: Share | None
     nees_blocks: Mapping[str, Share]
@@ -149,7 +152,7 @@ class SummaryFold:
         self._reference: str | None = None
         self._full_rank_s: float | None = None
         self._t1_s: float | None = None
-        self._withdrawn = 0
+        self._withdrawn = self._weighed_down = 0
         self._capture = CaptureFold()
 
     def add(self, row: Row) -> None:
@@ -158,6 +161,8 @@ class SummaryFold:
         self._status[row.status] += 1
         if row.gamma == 0:
             self._reasons[row.reason] += 1
+        elif row.weight is not None and row.weight < 1.0:
+            self._weighed_down += 1
         self._add_errors(row)
         self._add_milestones(row)
         self._last = row
@@ -211,6 +216,8 @@ class SummaryFold:
             parameters=parameters(last, truth or self._truth) if last else (),
             sigma_hits=last.sigma_hits if last else None,
             r_floors=last.r_floors if last else None,
+            weighed_down=self._weighed_down,
+            recalls=last.recalls if last else None,
             nis=_share(self._values.get("nis/healthy", []), NIS_BAND),
             nees=_share(self._values.get("nees", []), NEES_BAND),
             nees_blocks=self._blocks(),
