@@ -12,6 +12,7 @@ import argparse
 import numpy as np
 import tumbling
 from scipy.stats import chi2
+from watched import fold
 
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.measure import innovation, sensitivity
@@ -25,17 +26,13 @@ SEEN_S = 80.0
 def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]]:
     """Is it converged when the light goes out; per length: errors [m, deg], 1 sigma of both, chi-square of the pose."""
     world = tumbling.draw(seed, seconds=SEEN_S + LENGTHS[-1], hz=5.0)
+    seen = int(np.searchsorted(world.times, SEEN_S, side="right"))
+    lit = tumbling.World(world.times[:seen], world.states[:seen], world.moments)
     rng = np.random.Generator(np.random.PCG64([seed, 11]))
     estimator = Estimator(EstimatorParams(start=Start.COLD, correlated_share=0.0), None, 2.0)
-    test = Convergence(ConvergenceParams(), 2.0)
-    track, held = estimator.initial(0, world.states[0].T_ac), test.initial()
-    for t, x in zip(world.times, world.states, strict=True):
-        if t > SEEN_S:
-            break
-        prediction = estimator.predict(track, round(t * 1e9))
-        seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, 0.005, np.radians(0.3)))
-        track = estimator.update(track, prediction, seen, 1)
-        held = test.judge(held, track.belief, estimator.forecast(track.belief, test.params.times_s))
+    tests = [Convergence(ConvergenceParams(), 2.0)]
+    for _, _, track, words in fold(lit, estimator, tests, rng, (0.005, np.radians(0.3))):  # noqa: B007
+        pass
     found = []
     for length in LENGTHS:
         ahead = estimator.predict(track, track.belief.t_ns + round(length * 1e9)).belief
@@ -53,13 +50,13 @@ def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]
                 float(error @ np.linalg.solve(S, error)),
             )
         )
-    return held.converged, found
+    return words[0].converged, found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="4 bodies instead of 40")
-    parser.add_argument("--seeds", type=int, default=40)
+    parser.add_argument("--quick", action="store_true", help="4 bodies instead of 100")
+    parser.add_argument("--seeds", type=int, default=100)
     given = parser.parse_args()
     runs = [one(seed) for seed in range(4 if given.quick else given.seeds)]
     sure = [found for converged, found in runs if converged]
@@ -71,7 +68,7 @@ def main() -> None:
         inside = np.mean(values[:, 4] < chi2.ppf(0.9973, 6))
         print(
             f"{length:4.0f} s {1e3 * rms[0]:10.1f} mm {1e3 * rms[2]:8.1f} mm"
-            f" {rms[1]:9.2f} deg {rms[3]:8.2f} deg {inside:10.0%}"
+            f" {rms[1]:9.2f} deg {rms[3]:8.2f} deg {inside:10.1%} of {len(sure)}"
         )
 
 

@@ -14,13 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 import tumbling
 from scipy.stats import chi2
+from watched import fold
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams
+from avsreplay.estimate.measure import sensitivity
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.relabel import nees
-from avsreplay.monitor.consistency import Consistency, ConsistencyParams
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams, Criterion
+from avsreplay.records import Belief
 
 EXTENT = 2.0
 MARKS = (20.0, 40.0, 70.0, 100.0)
@@ -35,6 +37,7 @@ class Outcome:
     known: tuple[bool, ...]
     position_m: float
     rotation_deg: float
+    predicted: tuple[float, float]
     mode: str
     t1_s: float
     seconds: float
@@ -45,30 +48,28 @@ def one(seed: int, start: Start) -> Outcome:
     rng = np.random.Generator(np.random.PCG64([seed, 7]))
     estimator = Estimator(EstimatorParams(start=start, correlated_share=0.0), None, EXTENT)
     tests = [Convergence(ConvergenceParams(criterion=c), EXTENT) for c in (Criterion.PREDICTIVE, Criterion.COVARIANCE)]
-    watch, seen_so_far = Consistency(ConsistencyParams()), None
-    seen_so_far, claims = watch.initial(), [t.initial() for t in tests]
-    track = estimator.initial(0, world.states[0].T_ac)
     marks, begun = [], time.perf_counter()
-    for t, x in zip(world.times, world.states, strict=True):
-        prediction = estimator.predict(track, round(t * 1e9))
-        seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, 0.01, np.radians(1.0)))
-        track = estimator.update(track, prediction, seen, 1)
-        seen_so_far = watch.observe(seen_so_far, seen, 1)
-        honest = watch.judge(seen_so_far).consistent is not False
-        forecast = estimator.forecast(track.belief, tests[0].params.times_s)
-        claims = [test.judge(c, track.belief, forecast, honest) for test, c in zip(tests, claims, strict=True)]
+    for t, x, track, words in fold(world, estimator, tests, rng, (0.01, np.radians(1.0))):
         if t in MARKS:
-            marks.append((nees(track.belief, x) / 20, claims[0].converged, claims[1].converged))
+            marks.append((nees(track.belief, x) / 20, words[0].converged, words[1].converged))
     pose, truth = track.belief.x.T_ac, world.states[-1].T_ac
     turn = geometry.multiply(geometry.conjugate(truth.q), pose.q)
     return Outcome(
         *(tuple(column) for column in zip(*marks, strict=True)),
         float(np.linalg.norm(pose.t - truth.t)),
         float(np.degrees(geometry.angle(turn))),
+        _predicted(track.belief),
         track.mode,
-        (claims[0].t1_ns or -1) * 1e-9,
+        (words[0].t1_ns or -1) * 1e-9,
         time.perf_counter() - begun,
     )
+
+
+def _predicted(belief: Belief) -> tuple[float, float]:
+    """1 sigma of the pose: position [m], attitude [deg]."""
+    H = sensitivity(belief.x)
+    S = H @ belief.P @ H.T
+    return float(np.sqrt(np.trace(S[:3, :3]))), float(np.degrees(2.0 * np.sqrt(np.trace(S[3:, 3:]))))
 
 
 def table(name: str, outcomes: list[Outcome]) -> None:
@@ -88,8 +89,10 @@ def table(name: str, outcomes: list[Outcome]) -> None:
             f" {len(claimed):24d} {_mean(claimed)} {outside:15d} | {len(known):22d} {_mean(known)}"
         )
     print(
-        f"  at the end: pose error median {1e3 * np.median([o.position_m for o in outcomes]):.1f} mm,"
-        f" {np.median([o.rotation_deg for o in outcomes]):.2f} deg;"
+        f"  at the end: pose error median {1e3 * np.median([o.position_m for o in outcomes]):.2f} mm,"
+        f" {np.median([o.rotation_deg for o in outcomes]):.3f} deg;"
+        f" predicted 1 sigma median {1e3 * np.median([o.predicted[0] for o in outcomes]):.2f} mm,"
+        f" {np.median([o.predicted[1] for o in outcomes]):.3f} deg;"
         f" mode { ({m: sum(o.mode == m for o in outcomes) for m in ('fit', 'filter')}) }"
     )
     worst = sorted(range(len(outcomes)), key=lambda s: -outcomes[s].nees[-1])[:5]

@@ -1,0 +1,91 @@
+"""The fit's part in a run: it speaks first where nothing is known, and again where the filter is contradicted."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import replace
+from operator import attrgetter
+
+from avsreplay.estimate import adapt, ekf
+from avsreplay.estimate.audit import contradicted, start_at
+from avsreplay.estimate.cold import ColdFit, refit
+from avsreplay.estimate.drift import memory_s
+from avsreplay.estimate.fit import FitParams
+from avsreplay.estimate.measure import in_fixture, measured_pose
+from avsreplay.estimate.noise import Noise
+from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
+from avsreplay.estimate.start import PoseFix, first_belief
+from avsreplay.estimate.track import Prediction, Track
+from avsreplay.records import Innovation
+
+__all__ = ["Fitting"]
+
+_FEWEST_TO_FIT = 3
+_FEWEST_TO_AUDIT, _AUDIT_GROWTH, _FEWEST_IN_DOUBT = 50, 0.25, 10
+_LONGEST_S = 1e9  # what nanoseconds hold
+_instant = attrgetter("t_ns")
+
+
+class Fitting:
+    """Fits to the healthy poses so far.
+
+    Args:
+        params: settings, auto values filled in.
+        noise: the measurement noise in force.
+    """
+
+    def __init__(self, params: EstimatorParams, noise: Noise) -> None:
+        self.params, self.noise = params, noise
+        self.audits = 0 if params.start is Start.PAPER else params.audit_poses
+        self._rules = FitParams(rescale=params.adapt is not Adaptation.OFF)
+        self._memory_ns = round(min(memory_s(params.torque_noise_radps15), _LONGEST_S) * 1e9)
+
+    def begun(self, track: Track, prediction: Prediction, seen: Innovation, converged: bool) -> Track:
+        """Another healthy pose where the fit speaks: fit them all when enough have come, else go on with the last fit.
+
+        Between fits the filter's update joins in only where the likelihood is normal: a bent one is carried along as it
+        is.
+        """
+        track = replace(track, fixes=self._with(track, prediction, seen), R=seen.R, since=track.since + 1)
+        if len(track.fixes) < _FEWEST_TO_FIT:
+            return replace(track, belief=first_belief(track.fixes, self.params))
+        last = track.cold
+        if last is None or track.since >= max(1.0, self.params.refit_growth * last.count):
+            moved = last is not None and last.epoch_ns != track.fixes[0].t_ns
+            start = start_at(prediction.belief, track.fixes[0].t_ns) if moved else None
+            cold = refit(track.fixes, self.params, self._rules, last, start)
+            return self._adopted(track, cold, cold.settled and converged)
+        if last.settled:
+            return replace(track, belief=ekf.update_in_chart(prediction.belief, prediction.H, seen, track.colour))
+        return replace(track, belief=prediction.belief)
+
+    def remembered(self, track: Track, prediction: Prediction, seen: Innovation) -> tuple[PoseFix, ...]:
+        """The newest poses, for an audit of the filter."""
+        return self._with(track, prediction, seen)[-self.audits :] if self.audits else ()
+
+    def audited(self, track: Track) -> Track:
+        """The filter's track, or the fit's where a fit to the same poses contradicts it.
+
+        A fit whose likelihood is not normal yet has that right only where the poses themselves contradict the filter.
+        """
+        enough = max(_FEWEST_TO_AUDIT, _AUDIT_GROWTH * len(track.fixes))
+        if not self.audits or track.since < (_FEWEST_IN_DOUBT if track.window.doubtful else enough):
+            return track
+        cold = refit(track.fixes, self.params, self._rules, start=start_at(track.belief, track.fixes[0].t_ns))
+        if not ((cold.settled or track.window.doubtful) and contradicted(track.belief, cold.belief)):
+            return replace(track, since=0)
+        return replace(self._adopted(track, cold, cold.settled), recalls=track.recalls + 1)
+
+    def _adopted(self, track: Track, cold: ColdFit, settled: bool) -> Track:
+        """The track with a fit's word for its own; the filter goes on from it once ``settled``."""
+        window = adapt.filled(self.noise.base(track.R, track.window), cold.factors, self.params.window)
+        mode = "filter" if settled else "fit"
+        spoken = replace(track, belief=cold.belief, mode=mode, window=window, cold=cold, since=0)
+        return replace(spoken, charted=True, colour=cold.colour)
+
+    def _with(self, track: Track, prediction: Prediction, seen: Innovation) -> tuple[PoseFix, ...]:
+        """The poses that a fit may look back on, with this one."""
+        t_ns, x = prediction.belief.t_ns, prediction.belief.x
+        pose = measured_pose(x, seen.alpha)
+        fix = PoseFix(t_ns, pose, in_fixture(self.noise.base(seen.R, prediction.window), pose.q, x.q_bc))
+        return (*track.fixes[bisect_left(track.fixes, t_ns - self._memory_ns, key=_instant) :], fix)

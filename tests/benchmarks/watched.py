@@ -1,0 +1,35 @@
+"""A tumbling body through estimator and monitors, scan by scan, as the chain takes it: for the campaigns."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import tumbling
+
+from avsreplay.estimate import Estimator, Track
+from avsreplay.monitor.consistency import Consistency, ConsistencyParams
+from avsreplay.monitor.convergence import Convergence, ConvergenceTrack
+from avsreplay.records import State
+
+
+def fold(
+    world: tumbling.World,
+    estimator: Estimator,
+    tests: Sequence[Convergence],
+    rng: np.random.Generator,
+    noise: tuple[float, float],
+) -> Iterator[tuple[float, State, Track, list[ConvergenceTrack]]]:
+    """Every scan healthy, with white noise [m, rad]: instant, truth, track, each test's word; the first one decides."""
+    watch, words = Consistency(ConsistencyParams()), [test.initial() for test in tests]
+    seen_so_far = watch.initial()
+    track = estimator.initial(0, world.states[0].T_ac)
+    for t, x in zip(world.times, world.states, strict=True):
+        prediction = estimator.predict(track, round(t * 1e9))
+        seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, *noise))
+        track = estimator.update(track, prediction, seen, 1, words[0].converged)
+        seen_so_far = watch.observe(seen_so_far, seen, 1)
+        honest = watch.judge(seen_so_far).consistent is True and not track.window.doubtful
+        forecast = estimator.forecast(track.belief, tests[0].params.times_s)
+        words = [test.judge(word, track.belief, forecast, honest) for test, word in zip(tests, words, strict=True)]
+        yield t, x, track, words
