@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
-from avsreplay.estimate.deskew import deskew
+from avsreplay.estimate.deskew import deskew, late
 from avsreplay.fill import Findings, row_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.faults import FaultDetector
@@ -33,10 +33,15 @@ _SURE_OF_REACH, _SURE_RAD = 0.25, np.radians(15.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sighted:
-    """An alignment and where its guess came from: start, truth, given, predicted, last, acquired."""
+    """An alignment and where its guess came from: start, truth, given, predicted, last, acquired.
+
+    Attributes:
+        instants: (6, 6) when it was seen, by direction [s], see ``Registrar.instants``; None at the scan's own instant.
+    """
 
     alignment: Alignment
     origin: str
+    instants: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,13 +94,13 @@ def step(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Row]:
     memory, track, begun = _track(stages, memory, scan)
     prediction = stages.estimator.predict(track, scan.t_ns)
     sighted = begun or _register(stages, memory, scan, prediction)
-    seen, verdict = _judge(stages, scan, prediction, sighted.alignment)
+    prior, seen, verdict = _judge(stages, scan, prediction, sighted)
     if not verdict.gamma and _lost(stages, scan, prediction):
-        sighted = Sighted(stages.registrar.acquire(scan.points), "acquired")
-        seen, verdict = _judge(stages, scan, prediction, sighted.alignment)
-    track = stages.estimator.update(track, prediction, seen, verdict.gamma, memory.watch.convergence.converged)
+        sighted = _acquired(stages, scan, _still(stages, memory, scan, prediction), "acquired")
+        prior, seen, verdict = _judge(stages, scan, prediction, sighted)
+    track = stages.estimator.update(track, prior, seen, verdict.gamma, memory.watch.convergence.converged)
 
-    watch, columns = look(stages.monitors, memory.watch, stages.estimator, prediction, seen, verdict.gamma, track)
+    watch, columns = look(stages.monitors, memory.watch, stages.estimator, prior, seen, verdict.gamma, track)
     converged = watch.convergence.converged
     sight = see(stages.estimator, track, scan.t_ns, verdict.gamma, converged, stages.standoff_c)
     before = memory.pilot or stages.pilot.initial(scan.t_ns)
@@ -136,7 +141,7 @@ def _track(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Track, S
     pose, origin = stages.first_pose(scan)
     begun = None
     if pose is None:
-        begun = Sighted(stages.registrar.acquire(scan.points), origin)
+        begun = _acquired(stages, scan, scan.points, origin)
         pose = begun.alignment.T_ac
     since_ns = scan.t_ns if memory.track is None else memory.since_ns
     return replace(memory, origin=origin, since_ns=since_ns), stages.estimator.initial(scan.t_ns, pose), begun
@@ -145,18 +150,33 @@ def _track(stages: Stages, memory: Memory, scan: Scan) -> tuple[Memory, Track, S
 def _register(stages: Stages, memory: Memory, scan: Scan, prediction: Prediction) -> Sighted:
     """The scan against the model, from the guess that the configuration asks for."""
     points = _still(stages, memory, scan, prediction)
+    guess, origin = prediction.belief.x.T_ac, "predicted"
     if memory.last is None:
-        return Sighted(stages.registrar.register(points, prediction.belief.x.T_ac), memory.origin)
-    if stages.guess is Guess.LAST:
-        return Sighted(stages.registrar.register(points, memory.last), "last")
-    return Sighted(stages.registrar.register(points, prediction.belief.x.T_ac), "predicted")
+        origin = memory.origin
+    elif stages.guess is Guess.LAST:
+        guess, origin = memory.last, "last"
+    return _sighted(stages, scan, points, stages.registrar.register(points, guess), origin)
+
+
+def _acquired(stages: Stages, scan: Scan, points: NDArray[Any], origin: str) -> Sighted:
+    """The scan's points against the model without a guess."""
+    return _sighted(stages, scan, points, stages.registrar.acquire(points), origin)
+
+
+def _sighted(stages: Stages, scan: Scan, points: NDArray[Any], alignment: Alignment, origin: str) -> Sighted:
+    if scan.times_s is None or not (stages.deskew and alignment.measured):
+        return Sighted(alignment, origin)
+    return Sighted(alignment, origin, stages.registrar.instants(points, scan.times_s, alignment.T_ac))
 
 
 def _judge(
-    stages: Stages, scan: Scan, prediction: Prediction, alignment: Alignment
-) -> tuple[Innovation | None, Verdict]:
-    seen = stages.estimator.innovate(prediction, alignment) if alignment.measured else None
-    return seen, stages.detector.judge(scan.status, alignment, seen, prediction.belief)
+    stages: Stages, scan: Scan, prediction: Prediction, sighted: Sighted
+) -> tuple[Prediction, Innovation | None, Verdict]:
+    """The prediction as this scan tests it, the innovation and the verdict."""
+    if scan.times_s is not None and sighted.instants is not None:
+        prediction = late(prediction, sighted.instants, scan.times_s)
+    seen = stages.estimator.innovate(prediction, sighted.alignment) if sighted.alignment.measured else None
+    return prediction, seen, stages.detector.judge(scan.status, sighted.alignment, seen, prediction.belief)
 
 
 def _lost(stages: Stages, scan: Scan, prediction: Prediction) -> bool:

@@ -278,6 +278,7 @@ class Innovation:
         alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.
         nis: alpha' S^-1 alpha.  distance_m: |d rho|.  angle_rad: rotation angle of the innovation.
         weight: share of its say that a healthy pose is left, 1 where its NIS is not beyond belief.
+        share: of R's variance, what the poses of neighbouring scans have in common.
     """
 
     alpha: Array
@@ -287,6 +288,7 @@ class Innovation:
     distance_m: float
     angle_rad: float
     weight: float = 1.0
+    share: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -99,11 +99,12 @@ def refit(
     prior = prior_of(poses, params)
     if start is None:
         start = to_chart(rough_state(fixes)) if last is None else last.chart
-    rules = replace(rules, least_colour=params.colour(_mean_turn(poses)))
+    rules = replace(rules, least_colour=params.colour(_mean_turn(poses), float(np.mean([f.share for f in fixes]))))
     fitted = fit(poses, start, prior, rules, None if last is None else last.factors * np.sqrt(last.colour))
     found = spread(poses, fitted, prior, rules)
     found = disturbed(found, poses, prior, rules, params.torque_noise_radps15, params.force)
-    belief = belief_at(found, fixes[-1].t_ns, float(poses.times_s[-1]))
+    now_ns = fixes[-1].scan_ns
+    belief = belief_at(found, now_ns, (now_ns - fixes[0].t_ns) * 1e-9)
     settled = _settled(found, prior)
     return ColdFit(fixes[0].t_ns, fitted.chart, len(poses), fitted.factors, fitted.colour, belief, settled)
 

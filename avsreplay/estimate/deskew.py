@@ -54,11 +54,12 @@ def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) 
 
 
 def late(prediction: Prediction, instants: Array, times_s: NDArray[Any]) -> Prediction:
-    """The prediction with the H (6, 20) of a scan that it carried to its instant itself.
+    """The prediction with the H (6, 20) of a scan that it carried to its instant itself, its lag and its blur.
 
     A point measured at tau and carried by the prior shows the prior's error at tau: delta(tau) in {C}, whatever
     instant it is carried to. Over a scan delta is taken as straight, so the registered pose shows
-    delta(first) + (M - first) delta', by the mean instants M.
+    delta(first) + (M - first) delta', by the mean instants M. Taken for the pose of one instant, the lag tr M / 6, it
+    is off by (M - lag) delta': the blur.
 
     Args:
         prediction: the scan's prior, that of ``deskew``.
@@ -70,13 +71,15 @@ def late(prediction: Prediction, instants: Array, times_s: NDArray[Any]) -> Pred
     x, first, last = prediction.belief.x, float(np.min(times_s)), float(np.max(times_s))
     if first == 0.0 == last:
         return prediction
-    G = _fixture_rows(x, first)
+    G, lag_s, blur = _fixture_rows(x, first), float(np.trace(instants)) / 6.0, None
     if last > first:
         slope = (_fixture_rows(x, last) - G) / (last - first)
+        rest = (instants - lag_s * np.eye(6)) @ slope
         G = G + (instants - first * np.eye(6)) @ slope
+        blur = rest @ prediction.belief.P @ rest.T
     J = np.zeros((6, 6))
     J[:3, 3:], J[3:, :3] = geometry.matrix(x.T_ac.q), 0.5 * geometry.matrix(x.q_bc)
-    return replace(prediction, H=J @ G)
+    return replace(prediction, H=J @ G, lag_s=lag_s, blur=blur)
 
 
 def _fixture_rows(x: State, h: float) -> Array:

@@ -14,10 +14,11 @@ from avsreplay.records import Belief, Innovation
 __all__ = ["gain", "innovate", "joseph", "update", "update_in_chart", "widened"]
 
 
-def innovate(P: Array, H: Array, alpha: Array, R: Array, robust: bool = False) -> Innovation:
+def innovate(P: Array, H: Array, alpha: Array, R: Array, robust: bool = False, share: float = 0.0) -> Innovation:
     """The innovation's covariance S = H P H' + R and its sizes.
 
     ``robust`` weighs a pose down whose NIS is beyond the 99.99 % point, by Cauchy's weight, as the fit does.
+    ``share``: of R, what neighbouring scans have in common.
     """
     seen = H @ P @ H.T + R
     S = np.asarray(0.5 * (seen + seen.T), dtype=np.float64)
@@ -25,7 +26,7 @@ def innovate(P: Array, H: Array, alpha: Array, R: Array, robust: bool = False) -
     distance = float(np.sqrt(alpha[:3] @ alpha[:3]))
     nis = float(alpha @ np.linalg.solve(S, alpha))
     weight = min(1.0, GATE / nis) if robust and nis > GATE else 1.0
-    return Innovation(alpha, S, R, nis, distance, 2.0 * float(np.arcsin(half)), weight)
+    return Innovation(alpha, S, R, nis, distance, 2.0 * float(np.arcsin(half)), weight, share)
 
 
 def gain(P: Array, H: Array, S: Array) -> Array:

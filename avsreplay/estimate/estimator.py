@@ -61,7 +61,8 @@ class Estimator:
         """alpha, S and R of a measured pose, and the weight it is given."""
         x = prediction.belief.x
         R = self.noise.of(alignment, x, prediction.window)
-        return ekf.innovate(prediction.belief.P, prediction.H, innovation(x, alignment.T_ac), R, self._robust)
+        alpha, share = innovation(x, alignment.T_ac), self.noise.share(alignment)
+        return ekf.innovate(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
 
     def update(
         self, track: Track, prediction: Prediction, seen: Innovation | None, gamma: int, converged: bool = True
@@ -86,7 +87,7 @@ class Estimator:
 
     def _filtered(self, track: Track, prediction: Prediction, seen: Innovation) -> Track:
         """The filter's posterior, its noise window and its memory of poses."""
-        colour = self.noise.colour(track, prediction.belief)
+        colour = self.noise.colour(track, prediction.belief, seen)
         if track.charted:
             belief, hits = ekf.update_in_chart(prediction.belief, prediction.H, seen, colour), 0
         else:

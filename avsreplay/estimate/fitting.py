@@ -12,6 +12,7 @@ from avsreplay.estimate.cold import ColdFit, refit
 from avsreplay.estimate.drift import memory_s
 from avsreplay.estimate.fit import FitParams
 from avsreplay.estimate.measure import in_fixture, measured_pose
+from avsreplay.estimate.motion import advance, flow
 from avsreplay.estimate.noise import Noise
 from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
 from avsreplay.estimate.start import PoseFix, first_belief
@@ -72,9 +73,9 @@ class Fitting:
         if not self.audits or track.since < (_FEWEST_IN_DOUBT if track.window.doubtful else enough):
             return track
         cold = refit(track.fixes, self.params, self._rules, start=start_at(track.belief, track.fixes[0].t_ns))
-        if not ((cold.settled or track.window.doubtful) and contradicted(track.belief, cold.belief)):
-            return replace(track, since=0)
-        return replace(self._adopted(track, cold, cold.settled), recalls=track.recalls + 1)
+        if (cold.settled or track.window.doubtful) and contradicted(track.belief, cold.belief):
+            return replace(self._adopted(track, cold, cold.settled), recalls=track.recalls + 1)
+        return replace(track, since=0)
 
     def _adopted(self, track: Track, cold: ColdFit, settled: bool) -> Track:
         """The track with a fit's word for its own; the filter goes on from it once ``settled``."""
@@ -85,7 +86,17 @@ class Fitting:
 
     def _with(self, track: Track, prediction: Prediction, seen: Innovation) -> tuple[PoseFix, ...]:
         """The poses that a fit may look back on, with this one."""
-        t_ns, x = prediction.belief.t_ns, prediction.belief.x
+        oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns, key=_instant)
+        return (*track.fixes[oldest:], self._fix(prediction, seen))
+
+    def _fix(self, prediction: Prediction, seen: Innovation) -> PoseFix:
+        """The healthy pose, at the instant it was seen: a scan carried by the prior is carried back by it."""
+        x, lag_ns = prediction.belief.x, round(prediction.lag_s * 1e9)
         pose = measured_pose(x, seen.alpha)
-        fix = PoseFix(t_ns, pose, in_fixture(self.noise.base(seen.R, prediction.window), pose.q, x.q_bc))
-        return (*track.fixes[bisect_left(track.fixes, t_ns - self._memory_ns, key=_instant) :], fix)
+        C = in_fixture(self.noise.base(seen.R, prediction.window), pose.q, x.q_bc)
+        if prediction.blur is not None:
+            C = C + prediction.blur
+        if lag_ns:
+            h = lag_ns * 1e-9
+            pose = advance(x, flow(x.w_b, x.sigma, h), h).T_ac @ x.T_ac.inverse() @ pose
+        return PoseFix(prediction.belief.t_ns + lag_ns, pose, C, lag_ns, seen.share)

@@ -29,6 +29,7 @@ class Noise:
     def __init__(self, params: EstimatorParams, extent_m: float) -> None:
         self.params = params
         self._R0 = params.R0
+        self._extent_m = extent_m
         self._free = (_FREE_RAD, 0.5 * extent_m)
 
     def of(self, alignment: Alignment, x: State, window: NoiseWindow) -> Array:
@@ -49,14 +50,18 @@ class Noise:
         """How many eigenvalues of R stand on the floor."""
         return adapt.at_floor(R, self._R0, self.params.r_floor)
 
-    def colour(self, track: Track, prior: Belief) -> Array:
+    def share(self, alignment: Alignment) -> float:
+        """Of R, what the poses of neighbouring scans have in common."""
+        return self.params.share(alignment.inliers, alignment.rms_m / self._extent_m)
+
+    def colour(self, track: Track, prior: Belief, seen: Innovation) -> Array:
         """(2,) how many times less than white ones the poses say; the paper's own filter takes them as white."""
         if track.charted:
             return track.colour
         if self.params.start is Start.PAPER:
             return WHITE
         turn = float(np.linalg.norm(prior.x.w_b)) * (prior.t_ns - track.belief.t_ns) * 1e-9
-        return np.full(2, self.params.colour(turn))
+        return np.full(2, self.params.colour(turn, seen.share))
 
     def remembered(self, prediction: Prediction, seen: Innovation, posterior: Belief, colour: Array) -> NoiseWindow:
         """The window with this epoch's a posteriori residual z - h(x+), its ratios against the base R.

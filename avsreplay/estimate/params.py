@@ -14,6 +14,7 @@ from avsreplay.geometry import Array
 __all__ = ["Adaptation", "EstimatorParams", "NoiseSource", "Start"]
 
 _MOST_ALIKE = 50.0  # scans: a view that does not turn would never say anything new
+_EDGE_LEAN = 20.0  # by tests/benchmarks/estimate_noise.py: 9 to 33 on five meshes
 _POSITIVE = (
     "torque_noise_radps15",
     "force_noise_mps15",
@@ -77,8 +78,9 @@ class EstimatorParams:
     r_floor: float = 1e-6
     # |sigma| stays below 1 minus this
     sigma_margin: float = 0.01
-    # share of a registration's error that stays while the view turns little, its variance over the whole
-    correlated_share: float = 0.1
+    # share of a registration's error that stays while the view turns little, its variance over the whole; auto: by its
+    # inliers and their rms, as points near edges lean one way (docs/estimation.md, Noise)
+    correlated_share: float | None = None
     # how far the view turns until that share has changed [rad]
     correlated_rad: float = 0.4
     # how it begins: a given belief (near), the fit (cold), the paper's filter from zero (paper); auto: near where given
@@ -113,7 +115,7 @@ class EstimatorParams:
                 raise ValueError(f"{name} is {value}, must be positive and finite")
         if not 0.0 < self.sigma_margin < 0.5:
             raise ValueError(f"sigma_margin is {self.sigma_margin}, must be in (0, 0.5)")
-        if not (0.0 <= self.correlated_share <= 1.0 and 0.0 <= self.correlated_rad < math.inf):
+        if not (0.0 <= (self.correlated_share or 0.0) <= 1.0 and 0.0 <= self.correlated_rad < math.inf):
             raise ValueError(f"correlated_share is {self.correlated_share}, correlated_rad is {self.correlated_rad}")
         if self.audit_poses < 0:
             raise ValueError(f"audit_poses is {self.audit_poses}, must not be negative")
@@ -133,13 +135,24 @@ class EstimatorParams:
         }
         return replace(self, **{k: f * extent_m for k, f in auto.items() if getattr(self, k) is None})
 
-    def colour(self, turn_rad: float) -> float:
+    def share(self, inliers: int, rms_of_extent: float) -> float:
+        """Share of a registered pose's variance that its neighbours have in common.
+
+        White error falls with the inliers, the lean of those within the noise of an edge does not: its variance over
+        the white one's is K inliers (rms / extent)^2, whatever the target's size.
+        """
+        if self.correlated_share is not None:
+            return self.correlated_share
+        lean = _EDGE_LEAN * inliers * rms_of_extent**2
+        return lean / (1.0 + lean)
+
+    def colour(self, turn_rad: float, share: float) -> float:
         """How many times less than white ones poses say whose view turns by ``turn_rad`` from one to the next.
 
-        Neighbours share ``correlated_share`` of their variance over ``correlated_rad``: 1 + 2 sum of correlations.
+        Neighbours have ``share`` of their variance in common over ``correlated_rad``: 1 + 2 sum of correlations.
         """
         scans = self.correlated_rad / max(turn_rad, self.correlated_rad / _MOST_ALIKE)
-        return 1.0 + 2.0 * self.correlated_share * scans
+        return 1.0 + 2.0 * share * scans
 
     @property
     def R0(self) -> Array:

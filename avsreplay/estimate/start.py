@@ -29,11 +29,20 @@ class PoseFix:
 
     Attributes:
         C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
+        lag_ns: the instant after that of its scan: a scan that takes its time shows the pose of its middle.
+        share: of C that neighbouring poses have in common.
     """
 
     t_ns: int
     T_ac: Pose
     C: Array
+    lag_ns: int = 0
+    share: float = 0.0
+
+    @property
+    def scan_ns(self) -> int:
+        """Instant of its scan."""
+        return self.t_ns - self.lag_ns
 
 
 def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
@@ -42,17 +51,18 @@ def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
 
 
 def first_belief(fixes: tuple[PoseFix, ...], params: EstimatorParams) -> Belief:
-    """The belief at the last of the poses: rate and velocity from the last two, at rest from a single one."""
+    """The belief at the last pose's scan: rate and velocity from the last two, at rest from a single one."""
     last = fixes[-1]
-    x = _state(last.T_ac, *rates(fixes))
+    x, back = _state(last.T_ac, *rates(fixes)), -last.lag_ns * 1e-9
+    x = advance(x, flow(x.w_b, x.sigma, back), back)
     info = np.diag(params.start_1s**-2.0)
     for fix in fixes:
-        h = (fix.t_ns - last.t_ns) * 1e-9
+        h = (fix.t_ns - last.scan_ns) * 1e-9
         step = flow(x.w_b, x.sigma, h)
         H = sensitivity(advance(x, step, h)) @ transition(step, x.sigma, h)
         info += H.T @ np.linalg.solve(in_camera(fix.C, fix.T_ac.q, x.q_bc), H)
     P = np.linalg.inv(info)
-    return Belief(last.t_ns, x, 0.5 * (P + P.T))
+    return Belief(last.scan_ns, x, 0.5 * (P + P.T))
 
 
 def rates(fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:

@@ -53,9 +53,13 @@ class Prediction:
     Attributes:
         belief: prior mean and covariance.  Phi: (20, 20) of the step.  H: (6, 20) at the prior.
         window: the track's noise window.
+        lag_s: after that instant, when the scan's points were measured on the mean.  blur: (6, 6) covariance in {C} of
+            what their having been measured at many instants does to a pose taken for one of one, None for nothing.
     """
 
     belief: Belief
     Phi: Array
     H: Array
     window: NoiseWindow
+    lag_s: float = 0.0
+    blur: Array | None = None
