@@ -61,7 +61,7 @@ def row_of(found: Findings) -> Row:
         **_registration(found.alignment, scan),
         **_innovation(found.innovation),
         **_estimate(found.belief),
-        **_errors(found.belief, scan),
+        **_errors(found.belief, scan, found.estimator),
         **found.columns,
     )
 
@@ -116,11 +116,12 @@ def _pose_sigma(belief: Belief) -> tuple[float, float]:
     return float(np.sqrt(max(variance[:3].sum(), 0.0))), _half_angle_deg(variance[3:].sum())
 
 
-def _errors(belief: Belief | None, scan: Scan) -> dict[str, Any]:
+def _errors(belief: Belief | None, scan: Scan, estimator: str) -> dict[str, Any]:
+    """Against the truth; no NEES of a cold start's first poses, which are no normal belief about the 20 numbers yet."""
     if belief is None or scan.truth is None:
         return {}
     fields: dict[str, Any] = dict(zip(("pos_err_m", "rot_err_deg"), _distance(belief.x.T_ac, scan.truth), strict=True))
-    if scan.body is None:
+    if scan.body is None or estimator == "start":
         return fields
     named, _ = nearest(belief, scan.body)
     blocks = block_nees(boxminus(named, belief.x), belief.P)

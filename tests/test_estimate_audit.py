@@ -19,7 +19,7 @@ from avsreplay.estimate.ekf import innovate
 from avsreplay.estimate.fit import FitParams, fit
 from avsreplay.estimate.layout import boxplus
 from avsreplay.estimate.motion import disturbance
-from avsreplay.estimate.params import Start
+from avsreplay.estimate.params import Constraint, Start
 from avsreplay.estimate.relabel import nees
 from avsreplay.estimate.spread import spread
 from avsreplay.estimate.start import PoseFix
@@ -29,7 +29,7 @@ from avsreplay.records import Belief, State
 NEAR_1S = np.repeat([0.0025, 0.0025, 0.01, 0.001, 0.025, 0.025, 0.005], [3, 3, 3, 3, 2, 3, 3])
 POS_M, ROT_RAD = 0.005, np.radians(0.3)
 WHITE = EstimatorParams(correlated_share=0.0, start=Start.NEAR)
-DEAF = replace(WHITE, audit_poses=0, robust=False)  # the filter as printed
+DEAF = replace(WHITE, audit_poses=0, robust=False, constraint=Constraint.GAIN)  # the filter as printed
 BAND_20 = chi2.ppf([0.0005, 0.9995], 20)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tumbling
@@ -12,7 +14,7 @@ from avsreplay.estimate import Estimator, EstimatorParams, adapt, ekf
 from avsreplay.estimate.constrain import shrink
 from avsreplay.estimate.layout import boxminus, boxplus
 from avsreplay.estimate.measure import sensitivity
-from avsreplay.estimate.params import Adaptation, NoiseSource
+from avsreplay.estimate.params import Adaptation, Constraint, NoiseSource
 from avsreplay.estimate.relabel import nees
 from avsreplay.geometry import Pose
 from avsreplay.records import Belief, Innovation, State
@@ -110,15 +112,16 @@ def near(world: tumbling.World, seed: int) -> Belief:
     return Belief(0, boxplus(world.states[0], NEAR_1S * rng.normal(size=20)), np.diag(NEAR_1S**2))
 
 
-def test_consistent_from_a_near_start_over_fifty_runs() -> None:
+@pytest.mark.parametrize("constraint", Constraint)
+def test_consistent_from_a_near_start_over_many_runs(constraint: Constraint) -> None:
     """Mean NEES and NIS in their 99.9 % chi-square bands, truth from the full inertia tensor.
 
     No |sigma| above 0.85: closer to 1 a normal belief about sigma reaches over the bound and cannot be right.
     """
     last, nis = [], []
-    for seed in range(50):
+    for seed in range(50 if constraint is Constraint.GAIN else 25):
         world = tumbling.draw(seed, seconds=40.0, hz=2.0, sigma_max=0.85)
-        for track, seen in run(world, near(world, seed), QUIET, seed):  # noqa: B007
+        for track, seen in run(world, near(world, seed), replace(QUIET, constraint=constraint), seed):  # noqa: B007
             nis.append(seen.nis)
         last.append(nees(track.belief, world.states[-1]))
     low, high = chi2.ppf([0.0005, 0.9995], 20 * len(last)) / (20 * len(last))
@@ -138,7 +141,9 @@ def test_gamma_zero_leaves_the_prior_exactly() -> None:
         assert faulty.belief is prediction.belief
         assert faulty.window is track.window
         assert faulty.mode == "near"
-    assert estimator.update(track, prediction, seen, 1).mode == "filter"
+    assert estimator.update(track, prediction, seen, 1).mode == "near"
+    plain = Estimator(replace(QUIET, constraint=Constraint.GAIN), near(world, 0), 1.0)
+    assert plain.update(track, prediction, seen, 1).mode == "filter"
 
 
 def fill(window: adapt.NoiseWindow, residuals: np.ndarray, length: int) -> adapt.NoiseWindow:

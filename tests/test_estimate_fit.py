@@ -139,7 +139,7 @@ def test_exact_poses_give_the_exact_motion() -> None:
         PoseFix(round(t * 1e9), x.T_ac, np.eye(6) * 1e-8) for t, x in zip(world.times, world.states, strict=True)
     )
     poses = poses_of(fixes)
-    flat = Prior(to_chart(rough_state(fixes)), np.full(20, 1e4))
+    flat = Prior(to_chart(rough_state(fixes)), np.diag(np.full(20, 1e8)))
     start = to_chart(world.states[0]).moved(np.full(20, 2e-3))
     fitted = fit(poses, start, flat, FitParams(rescale=False, gain_tol=1e-9))
     assert np.abs(to_chart(world.states[0]).minus(fitted.chart)).max() < 1e-6

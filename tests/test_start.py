@@ -30,7 +30,7 @@ def test_a_log_begins_without_any_guess(cli, fixtures_folder):
 @pytest.mark.parametrize("mode", ["near", "cold", "paper"])
 def test_each_start_tracks_the_pose(mode, cli, fixtures_folder):
     found = rows(cli, fixtures_folder / "tumble.mcap", "--start", mode, "--n-scans", 15)
-    assert found[0]["estimator"] == {"near": "filter", "cold": "start", "paper": "filter"}[mode]
+    assert found[0]["estimator"] == {"near": "near", "cold": "start", "paper": "filter"}[mode]
     assert rms(found[5:], "pos_err_m") < 0.01
 
 

@@ -16,15 +16,17 @@ from avsreplay import geometry
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.drift import disturbed
 from avsreplay.estimate.fit import FitParams, Poses, Prior, fit
+from avsreplay.estimate.layout import DIM, boxplus
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.spread import Spread, belief_at, spread
 from avsreplay.estimate.start import PoseFix, rates
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 
-__all__ = ["ColdFit", "poses_of", "prior_of", "refit", "rough_state"]
+__all__ = ["ColdFit", "given_prior", "poses_of", "prior_of", "refit", "rough_state"]
 
 _PAIR_RAD = 0.7
+_DRAWS, _EDGE = 500, 0.99
 _TOLD = 0.5  # of the prior's sigma: what is known no better is told by the prior
 
 
@@ -64,7 +66,23 @@ def prior_of(poses: Poses, params: EstimatorParams) -> Prior:
     arm = params.length("start_varrho_1s_m")
     speed = params.length("start_vel_1s_mps") + params.start_rate_1s_radps * arm
     widths = [2.0, params.start_rate_1s_radps, 4.0 * arm, speed, params.start_log_inertia_1s, arm]
-    return Prior(mean, np.repeat(widths, [3, 3, 3, 3, 5, 3]))
+    return Prior(mean, np.diag(np.repeat(widths, [3, 3, 3, 3, 5, 3]) ** 2))
+
+
+def given_prior(belief: Belief) -> Prior:
+    """A given belief in the chart's coordinates, by draws from it.
+
+    Its derivative would not do: where two moments are nearly equal, what the belief says of the axes mu matters as far
+    as the moments differ, and that the belief does not know.
+    """
+    mean, root = to_chart(belief.x), np.linalg.cholesky(belief.P)
+    draws = np.random.Generator(np.random.PCG64(0)).standard_normal((_DRAWS, DIM)) @ root.T
+    y = np.array([to_chart(_bounded(boxplus(belief.x, d))).minus(mean) for d in np.concatenate([draws, -draws])])
+    return Prior(mean, y.T @ y / len(y))
+
+
+def _bounded(x: State) -> State:
+    return replace(x, sigma=np.clip(x.sigma, -_EDGE, _EDGE))
 
 
 def rough_state(fixes: tuple[PoseFix, ...]) -> State:
@@ -93,10 +111,12 @@ def refit(
     rules: FitParams,
     last: ColdFit | None = None,
     start: Chart | None = None,
+    given: Prior | None = None,
 ) -> ColdFit:
-    """Fit all poses, from ``start`` or the last fit's values where there are any."""
+    """Fit all poses, from ``start`` or the last fit's values if there are any; ``given``: known at the first pose."""
     poses = poses_of(fixes)
-    prior = prior_of(poses, params)
+    weak = prior_of(poses, params)
+    prior = weak if given is None else given
     if start is None:
         start = to_chart(rough_state(fixes)) if last is None else last.chart
     rules = replace(rules, least_colour=params.colour(_mean_turn(poses), float(np.mean([f.share for f in fixes]))))
@@ -105,7 +125,7 @@ def refit(
     found = disturbed(found, poses, prior, rules, params.torque_noise_radps15, params.force)
     now_ns = fixes[-1].scan_ns
     belief = belief_at(found, now_ns, (now_ns - fixes[0].t_ns) * 1e-9)
-    settled = _settled(found, prior)
+    settled = _settled(found, weak)
     return ColdFit(fixes[0].t_ns, fitted.chart, len(poses), fitted.factors, fitted.colour, belief, settled)
 
 
@@ -115,7 +135,7 @@ def _mean_turn(poses: Poses) -> float:
     return float(np.mean(geometry.angle(steps)))
 
 
-def _settled(found: Spread, prior: Prior) -> bool:
+def _settled(found: Spread, weak: Prior) -> bool:
     fitted = found.fitted
-    told = np.linalg.eigvalsh(fitted.P_chart / np.outer(prior.one_sigma, prior.one_sigma))[-1] < _TOLD**2
+    told = np.linalg.eigvalsh(fitted.P_chart / np.outer(weak.one_sigma, weak.one_sigma))[-1] < _TOLD**2
     return found.settled and bool(told) and fitted.converged

@@ -37,7 +37,7 @@ def disturbed(found: Spread, poses: Poses, prior: Prior, rules: FitParams, torqu
     rows, J = linearised(poses, fitted.chart, prior, rules, fitted.effective)
     T = to_errors(fitted.chart)
     Q = np.linalg.solve(T, np.swapaxes(np.linalg.solve(T, _added(fitted.x, poses.times_s, torque, force)), 1, 2))
-    y, P = -fitted.chart.minus(prior.mean), np.diag(prior.one_sigma**2)
+    y, P = -fitted.chart.minus(prior.mean), prior.P
     for e, H, added in zip(rows, J, Q, strict=True):
         P = P + added
         K = np.linalg.solve(H @ P @ H.T + np.eye(6), H @ P).T

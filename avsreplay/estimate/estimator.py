@@ -42,7 +42,7 @@ class Estimator:
             raise UsageError("a near start is asked for and the log gives none", where="estimator.start", hint=hint)
         self.start = start if params.start in (Start.AUTO, Start.NEAR) else None
         self.noise = Noise(self.params, extent_m)
-        self.fitting = Fitting(self.params, self.noise)
+        self.fitting = Fitting(self.params, self.noise, self.start)
         self._robust = params.robust and params.start is not Start.PAPER
 
     def initial(self, t_ns: int, T_ac: Pose) -> Track:
@@ -73,7 +73,7 @@ class Estimator:
         """
         if seen is None or gamma == 0:
             return replace(track, belief=prediction.belief)
-        if track.mode in ("start", "fit"):
+        if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
             return self.fitting.begun(track, prediction, seen, converged)
         return self.fitting.audited(self._filtered(track, prediction, seen))
 
@@ -88,10 +88,10 @@ class Estimator:
     def _filtered(self, track: Track, prediction: Prediction, seen: Innovation) -> Track:
         """The filter's posterior, its noise window and its memory of poses."""
         colour = self.noise.colour(track, prediction.belief, seen)
-        if track.charted:
-            belief, hits = ekf.update_in_chart(prediction.belief, prediction.H, seen, colour), 0
-        else:
+        if self.params.by_gain and track.cold is None:
             belief, hits = ekf.update(prediction.belief, prediction.H, seen, self.params.sigma_margin, colour)
+        else:
+            belief, hits = ekf.update_in_chart(prediction.belief, prediction.H, seen, colour), 0
         return replace(
             track,
             belief=belief,

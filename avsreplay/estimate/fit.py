@@ -1,10 +1,10 @@
 """Maximum likelihood of the 20 initial values over all healthy poses: Levenberg-Marquardt on the manifold.
 
 The motion is taken as deterministic; each pose's residual d = [theta; v] stands in {C}, where its covariance is given.
-Jacobians are H Phi chained, in the coordinates of ``chart``, which keep the inertia physical without a bound. A weak
-prior keeps directions finite that the poses do not tell yet. A pose beyond the 99.99 % point of chi-square with 6
-degrees of freedom is weighted down (Huber's weight on the way in, Cauchy's at the end), others are not touched, so
-honest noise costs nothing. The poses' noise may be rescaled by two factors, attitude and position, taken from the
+Jacobians are H Phi chained, in the coordinates of ``chart``, which keep the inertia physical without a bound. A prior,
+given or weak, keeps directions finite that the poses do not tell yet. A pose beyond the 99.99 % point of chi-square
+with 6 degrees of freedom is weighted down (Huber's weight on the way in, Cauchy's at the end), others are not touched,
+so honest noise costs nothing. The poses' noise may be rescaled by two factors, attitude and position, taken from the
 residuals themselves; where these are correlated in time, as registration's are, the covariance is widened by their
 integrated autocorrelation.
 """
@@ -75,10 +75,15 @@ class Poses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """A weak normal belief about the initial values: mean and 1 sigma (20,) of the chart's coordinates."""
+    """A normal belief about the initial values: mean and covariance P (20, 20) of the chart's coordinates."""
 
     mean: Chart
-    one_sigma: Array
+    P: Array
+
+    @property
+    def one_sigma(self) -> Array:
+        """(20,) 1 sigma of each coordinate."""
+        return np.sqrt(np.diagonal(self.P))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,14 +174,15 @@ class _Problem:
         self.redescend = True
         self.factors = factors
         self.R_ca = np.swapaxes(geometry.matrix(poses.q), -1, -2)
-        self.prior_info = prior.one_sigma**-2.0
+        self.prior_info = _inverse(prior.P)
 
     def at(self, chart: Chart) -> _Here:
         d, J = self._residuals(chart)
         e = self.whitened(d)
         chi2 = np.einsum("ni,ni->n", e, e)
         weights, robust = _robust(chi2, self.redescend)
-        cost = 0.5 * float(robust.sum()) + 0.5 * float(self.prior_info @ chart.minus(self.prior.mean) ** 2)
+        off = chart.minus(self.prior.mean)
+        cost = 0.5 * float(robust.sum()) + 0.5 * float(off @ self.prior_info @ off)
         if self.pin is not None:
             cost += 0.5 * self.pin.error(chart) ** 2
         return _Here(chart, d, J, weights, cost)
@@ -185,8 +191,8 @@ class _Problem:
         """A (20, 20) and b (20,) of the step: A step = b."""
         e, J = self.whitened(here.d), self.whitened(here.J)
         JW = J * here.weights[:, None, None]
-        A = np.tensordot(JW, J, ([0, 1], [0, 1])) + np.diag(self.prior_info)
-        b = -np.tensordot(JW, e, ([0, 1], [0, 1])) - self.prior_info * here.chart.minus(self.prior.mean)
+        A = np.tensordot(JW, J, ([0, 1], [0, 1])) + self.prior_info
+        b = -np.tensordot(JW, e, ([0, 1], [0, 1])) - self.prior_info @ here.chart.minus(self.prior.mean)
         if self.pin is not None:
             row = self.pin.row / self.pin.one_sigma
             A += np.outer(row, row)

@@ -56,7 +56,7 @@ class Noise:
 
     def colour(self, track: Track, prior: Belief, seen: Innovation) -> Array:
         """(2,) how many times less than white ones the poses say; the paper's own filter takes them as white."""
-        if track.charted:
+        if track.colour is not None:
             return track.colour
         if self.params.start is Start.PAPER:
             return WHITE

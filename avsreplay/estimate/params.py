@@ -11,7 +11,7 @@ import numpy as np
 
 from avsreplay.geometry import Array
 
-__all__ = ["Adaptation", "EstimatorParams", "NoiseSource", "Start"]
+__all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
 _MOST_ALIKE = 50.0  # scans: a view that does not turn would never say anything new
 _EDGE_LEAN = 20.0  # by tests/benchmarks/estimate_noise.py: 9 to 33 on five meshes
@@ -48,6 +48,13 @@ class Start(Enum):
     PAPER = "paper"  # the plain filter from zero, everything wide
 
 
+class Constraint(Enum):
+    """What keeps sigma inside its bounds, and where the filter begins from a given belief."""
+
+    CHART = "chart"  # coordinates that have no bounds; a fit with the given belief as its prior comes first
+    GAIN = "gain"  # the paper's beta on the gain; the filter begins at once
+
+
 class Adaptation(Enum):
     """What residuals do to R."""
 
@@ -76,7 +83,9 @@ class EstimatorParams:
     r0_rot_deg: float = 0.5
     # least eigenvalue of R in units of R0
     r_floor: float = 1e-6
-    # |sigma| stays below 1 minus this
+    # what keeps sigma inside its bounds: coordinates without bounds (chart), or the paper's beta, until a fit speaks
+    constraint: Constraint = Constraint.CHART
+    # gain: |sigma| stays below 1 minus this
     sigma_margin: float = 0.01
     # share of a registration's error that stays while the view turns little, its variance over the whole; auto: by its
     # inliers and their rms, as points near edges lean one way (docs/estimation.md, Noise)
@@ -158,6 +167,11 @@ class EstimatorParams:
     def R0(self) -> Array:
         """(6, 6) noise for (metres, half angle); auto values must be filled in."""
         return np.diag(np.repeat([_given(self.r0_pos_m), 0.5 * math.radians(self.r0_rot_deg)], 3) ** 2)
+
+    @property
+    def by_gain(self) -> bool:
+        """Is the filter the paper's, its gain constrained; always so from the paper's start."""
+        return self.constraint is Constraint.GAIN or self.start is Start.PAPER
 
     def length(self, name: str) -> float:
         """An auto length, filled in."""

@@ -21,7 +21,7 @@ from avsreplay.estimate.layout import DIM, SIGMA
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 
-__all__ = ["Bend", "Node", "Spread", "belief_at", "spread"]
+__all__ = ["Bend", "Node", "Spread", "belief_at", "carried", "spread"]
 
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
 _TRIAL = 2.0  # sigma
@@ -96,12 +96,12 @@ def _held(poses: Poses, fitted: Fitted, prior: Prior, params: FitParams, ray: Ar
 def belief_at(found: Spread, t_ns: int, after_s: float) -> Belief:
     """Mean of the fit and its mended covariance, ``after_s`` after the epoch; ``t_ns`` is that instant."""
     fitted = found.fitted
-    x, step = _carried(fitted.chart, after_s)
+    x, step = carried(fitted.chart, after_s)
     here = to_chart(x)
     P0 = fitted.P_chart - sum((np.outer(b.ray, b.ray) for b in found.bends), np.zeros((DIM, DIM)))
     P = (1.0 - 2.0 * _WEIGHT * len(found.bends)) * step @ P0 @ step.T
     for node in (side for bend in found.bends for side in bend.sides):
-        there, step = _carried(node.chart, after_s)
+        there, step = carried(node.chart, after_s)
         y = to_chart(there).minus(here)
         P += _WEIGHT * (np.outer(y, y) + step @ node.P @ step.T)
     T = to_errors(here)
@@ -109,7 +109,7 @@ def belief_at(found: Spread, t_ns: int, after_s: float) -> Belief:
     return Belief(t_ns, x, 0.5 * (P + P.T))
 
 
-def _carried(chart: Chart, h: float) -> tuple[State, Array]:
+def carried(chart: Chart, h: float) -> tuple[State, Array]:
     """The state h seconds on, and the derivative (20, 20) of its chart by the one at the epoch."""
     x = to_state(chart)
     path = arc(x, np.array([h]))

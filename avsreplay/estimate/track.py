@@ -28,8 +28,7 @@ class Track:
         R: (6, 6) noise of the last healthy scan [m, half-angle], zero before it.
         fixes: healthy poses: all of them until the filter speaks, then the newest.  cold: the last fit that spoke.
         since: healthy poses since the last fit was made.  recalls: how often a fit took the word from the filter.
-        charted: does the filter move through the chart (after a fit), or as the paper's.
-        colour: (2,) the fit's word on the poses' correlation in time, attitude and position.
+        colour: (2,) the last fit's word on the poses' correlation in time, attitude and position; None before one.
     """
 
     belief: Belief
@@ -42,8 +41,7 @@ class Track:
     cold: ColdFit | None = None
     since: int = 0
     recalls: int = 0
-    charted: bool = False
-    colour: Array = field(default_factory=lambda: WHITE)
+    colour: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
