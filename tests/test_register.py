@@ -14,7 +14,7 @@ from avsreplay.records import AlignStatus, Fit, Surface
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.assess import Evidence, assess, counted, covariance, evidence
 from avsreplay.register.facing import Camera, View, is_outward
-from avsreplay.register.freedom import free_directions
+from avsreplay.register.freedom import free_directions, loose_directions
 from avsreplay.register.model import Model
 from avsreplay.register.proving import plate_scan, proving_pose, proving_surface, view
 from avsreplay.register.quaternion_fit import best_motion, horn_matrix
@@ -399,3 +399,21 @@ def test_what_one_patch_holds_alone_is_not_held() -> None:
     assert np.all(left.J[:, 5] == 0.0)
     assert left.patch.max() == 28
     assert counted(found) is found
+
+
+def test_patches_are_left_out_until_none_holds_a_motion_alone() -> None:
+    """Patch 7 holds the last motion, 8 what is left of it without 7, 9 the rest: all three go, one after the other."""
+    found = _in_patches(4)
+    J = found.J.copy()
+    for patch in range(30):
+        J[found.patch == patch, 5] *= {7: 1.0, 8: 1e-2, 9: 1e-4}.get(patch, 0.0)
+    left = counted(replace(found, J=J))
+    assert np.all(left.J[:, 5] == 0.0)
+    assert len(left.J) == 540
+
+
+def test_a_motion_known_no_better_than_the_targets_size_is_loose() -> None:
+    P = np.diag([1e-8, 1e-8, 4.0, 1e-8, 1e12, 1e-8])
+    assert loose_directions(P, 3.0) == ("turns about z", "slides along y")
+    assert loose_directions(P, 3e6) == ("turns about z",)
+    assert loose_directions(np.eye(6) * 1e-6, 3.0) == ()

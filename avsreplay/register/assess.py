@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.facing import View
-from avsreplay.register.freedom import free_directions
+from avsreplay.register.freedom import free_directions, loose_directions
 from avsreplay.register.model import Model
 from avsreplay.register.params import Limits, RegisterParams
 
@@ -120,15 +120,16 @@ def counted(found: Evidence) -> Evidence:
 
     On a bare box the side that is hardly seen is held by a few points next to its edge, which may be its neighbour's.
     """
-    normals, _ = _patch_sums(found)
-    share = normals @ np.linalg.pinv(normals.sum(axis=0), hermitian=True)
-    lone = np.trace(share, axis1=1, axis2=2) > LONE  # the largest eigenvalue is at most the trace
-    lone[lone] = np.linalg.eigvals(share[lone]).real.max(axis=1, initial=0.0) > LONE
-    keep = ~lone[found.patch]
-    if not lone.any() or np.count_nonzero(keep) < 6:
-        return found
-    patch = np.unique(found.patch[keep], return_inverse=True)[1].reshape(-1)
-    return replace(found, J=found.J[keep], e=found.e[keep], patch=patch)
+    while True:
+        normals, _ = _patch_sums(found)
+        share = normals @ np.linalg.pinv(normals.sum(axis=0), hermitian=True)
+        lone = np.trace(share, axis1=1, axis2=2) > LONE  # the largest eigenvalue is at most the trace
+        lone[lone] = np.linalg.eigvals(share[lone]).real.max(axis=1, initial=0.0) > LONE
+        keep = ~lone[found.patch]
+        if not lone.any() or np.count_nonzero(keep) < 6:
+            return found
+        patch = np.unique(found.patch[keep], return_inverse=True)[1].reshape(-1)
+        found = replace(found, J=found.J[keep], e=found.e[keep], patch=patch)
 
 
 def _patch_sums(found: Evidence) -> tuple[Array, Array]:
@@ -155,7 +156,10 @@ def assess(
     found = counted(found) if overlap else found
     info = frozen(found.J.T @ found.J / found.noise_m**2)
     weakest = free_directions(found.J, found.centre) if overlap else ()
-    certain = overlap and not weakest
+    P: Array | None = UNEXPLAINED * covariance(found) if overlap and not weakest else None
+    loose = () if P is None else loose_directions(P, model.extent_m)
+    if P is not None and loose:
+        info, P, weakest = frozen(np.linalg.pinv(P, hermitian=True)), None, loose
     return Alignment(
         T_ac=fit.T_ca.inverse(),
         iterations=fit.iterations,
@@ -165,7 +169,7 @@ def assess(
         rms_m=found.rms_m,
         info=info,
         status=_status(overlap, fit.converged, bool(weakest)),
-        covariance=frozen(UNEXPLAINED * covariance(found)) if certain else None,
+        covariance=None if P is None else frozen(P),
         weakest=", ".join(weakest),
     )
 

@@ -7,7 +7,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 
-__all__ = ["FREE_BELOW", "free_directions", "scaled_information", "turn_words"]
+__all__ = ["FREE_BELOW", "free_directions", "loose_directions", "scaled_information", "turn_words"]
 
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is free
 AXIS_WITHIN = 0.966  # cosine of 15 deg: nearer than that to an axis is called by the axis' name
@@ -32,6 +32,16 @@ def free_directions(J: Array, centre: Array) -> tuple[str, ...]:
     values, vectors = np.linalg.eigh(info)
     free = vectors[:, values < FREE_BELOW].T
     return tuple(_words(row) for row in _plain_basis(free))
+
+
+def loose_directions(P: Array, extent_m: float) -> tuple[str, ...]:
+    """Words for every motion whose 1 sigma by P (6, 6), turns in units of the extent, is the extent or more.
+
+    Such a motion is held by next to nothing, whatever the points' number says.
+    """
+    scale = np.repeat([1.0, 1.0 / extent_m], 3)
+    values, vectors = np.linalg.eigh(P * np.outer(scale, scale))
+    return tuple(_words(row) for row in _plain_basis(vectors[:, values >= 1.0].T))
 
 
 def turn_words(step: Pose) -> str:
