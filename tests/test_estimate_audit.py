@@ -12,8 +12,8 @@ from scipy.stats import chi2
 
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.audit import contradicted, start_at
-from avsreplay.estimate.chart import to_chart
-from avsreplay.estimate.cold import poses_of, prior_of, refit, rough_state
+from avsreplay.estimate.chart import to_chart, to_errors
+from avsreplay.estimate.cold import given_prior, poses_of, prior_of, refit, rough_state
 from avsreplay.estimate.drift import disturbed, memory_s
 from avsreplay.estimate.ekf import innovate
 from avsreplay.estimate.fit import FitParams, fit
@@ -45,17 +45,17 @@ def pushed(seed: int, torque: float, seconds: float, hz: float) -> tuple[np.ndar
     return np.arange(len(states)) / hz, states
 
 
-def near(x: State, seed: int) -> Belief:
+def near(x: State, seed: int, wide: float = 1.0) -> Belief:
     rng = np.random.Generator(np.random.PCG64([seed, 8]))
-    return Belief(0, boxplus(x, NEAR_1S * rng.normal(size=20)), np.diag(NEAR_1S**2))
+    return Belief(0, boxplus(x, wide * NEAR_1S * rng.normal(size=20)), np.diag((wide * NEAR_1S) ** 2))
 
 
 def fold(
-    times: np.ndarray, states: list[State], params: EstimatorParams, seed: int, wrong=None, noise=1.0
+    times: np.ndarray, states: list[State], params: EstimatorParams, seed: int, wrong=None, noise=1.0, wide=1.0
 ) -> Iterator[Track]:
     """The track after each scan; ``wrong`` (index, pose) -> the pose that registration gives, all of them healthy."""
     rng = np.random.Generator(np.random.PCG64([seed, 7]))
-    estimator = Estimator(params, near(states[0], seed) if params.start is Start.NEAR else None, 2.0)
+    estimator = Estimator(params, near(states[0], seed, wide) if params.start is Start.NEAR else None, 2.0)
     track = estimator.initial(0, states[0].T_ac)
     for k, (t, x) in enumerate(zip(times, states, strict=True)):
         prediction = estimator.predict(track, round(t * 1e9))
@@ -193,3 +193,32 @@ def test_the_fit_begins_where_the_belief_came_from() -> None:
     world = tumbling.draw(3, seconds=60.0)
     chart = start_at(Belief(round(world.times[-1] * 1e9), world.states[-1], np.eye(20)), 0)
     assert np.abs(chart.minus(to_chart(world.states[0]))).max() < 1e-7
+
+
+def test_a_given_start_is_honest_under_precise_poses() -> None:
+    """Poses far finer than the start: what the printed filter linearises on the way it takes for knowledge."""
+    sizes: dict[Constraint, list[float]] = {constraint: [] for constraint in Constraint}
+    for seed in range(10):
+        world = tumbling.draw(seed, seconds=30.0, sigma_max=0.6)
+        for constraint, found in sizes.items():
+            params = replace(WHITE, constraint=constraint, audit_poses=0)
+            track = last(world.times, world.states, params, seed, None, 0.1, 3.0)
+            found.append(nees(track.belief, world.states[-1]) / 20)
+    low, high = chi2.ppf([0.0005, 0.9995], 20 * 10) / (20 * 10)
+    assert low < np.mean(sizes[Constraint.CHART]) < high
+    assert np.mean(sizes[Constraint.GAIN]) > 3.0 * high
+
+
+def test_a_belief_becomes_a_prior_by_its_draws() -> None:
+    """Where it is narrow the derivative says the same; where two moments are nearly equal the axes count for more."""
+    world = tumbling.draw(4, seconds=1.0)
+    x = replace(world.states[0], sigma=np.array([-0.5, 0.4]))
+    P = np.diag(NEAR_1S**2) * 1e-4
+    back = np.linalg.inv(to_errors(to_chart(x)))
+    scale = np.sqrt(np.diagonal(back @ P @ back.T))
+    assert np.abs((given_prior(Belief(0, x, P)).P - back @ P @ back.T) / np.outer(scale, scale)).max() < 0.2
+    near_equal = replace(x, sigma=np.array([-0.5, 0.001]))
+    P = np.diag(NEAR_1S**2)
+    back = np.linalg.inv(to_errors(to_chart(near_equal)))
+    drawn, straight = given_prior(Belief(0, near_equal, P)).P, back @ P @ back.T
+    assert np.linalg.eigvalsh(drawn[12:17, 12:17])[0] > 3.0 * np.linalg.eigvalsh(straight[12:17, 12:17])[0]
