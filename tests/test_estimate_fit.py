@@ -13,7 +13,7 @@ from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.arc import arc
-from avsreplay.estimate.chart import Chart, retract, to_chart, to_errors, to_state
+from avsreplay.estimate.chart import Chart, to_chart, to_errors, to_state
 from avsreplay.estimate.cold import poses_of, prior_of, rough_state
 from avsreplay.estimate.fit import FitParams, Pin, Poses, Prior, cost, fit, pinned
 from avsreplay.estimate.layout import boxminus
@@ -90,15 +90,6 @@ def test_equal_moments_are_no_singular_point() -> None:
         x = to_state(sphere.moved(side * y))
         assert np.abs(to_chart(x).minus(sphere) - side * y).max() < 1e-3
         assert np.all(np.isfinite(to_errors(sphere.moved(side * y))))
-
-
-def test_retraction_carries_mean_and_covariance() -> None:
-    x = tumbling.draw(2, seconds=1.0).states[0]
-    d = np.random.Generator(np.random.PCG64(1)).normal(size=20) * 1e-5
-    P = np.diag(np.linspace(1, 2, 20)) * 1e-6
-    moved, carried = retract(x, P, d)
-    assert np.abs(boxminus(moved, x) - d).max() < 1e-8
-    assert np.abs(carried - P).max() < 1e-3 * np.abs(P).max()
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -9,6 +9,7 @@ pose is no noise.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,7 +26,7 @@ class Epoch:
     """What one healthy epoch says: outer (6, 6) = r r' + H P+ H', its trace against the base R by block, its weight."""
 
     outer: Array
-    ratios: Array
+    ratios: tuple[float, float]
     weight: float
 
 
@@ -53,22 +54,26 @@ def push(
 ) -> NoiseWindow:
     """The window with one more epoch: residual (6,) after the update, H P+ H' (6, 6), the base R it was given."""
     outer = residual[:, None] * residual + HPH
-    ratios = np.linalg.solve(_blocks(base), _blocks(outer)).trace(axis1=1, axis2=2) / 3.0
-    return _summed((*window.epochs[-length + 1 :], Epoch(outer, ratios, weight)), length)
+    place, turn = np.linalg.solve(_blocks(base), _blocks(outer)).trace(axis1=1, axis2=2).tolist()
+    return _summed((*window.epochs[-length + 1 :], Epoch(outer, (place / 3.0, turn / 3.0), weight)), length)
 
 
 def _blocks(A: Array) -> Array:
     """(2, 3, 3) position and attitude blocks of (6, 6)."""
-    return A.reshape(2, 3, 2, 3)[(0, 1), :, (0, 1)]
+    return A.reshape(2, 3, 2, 3).diagonal(axis1=0, axis2=2).transpose(2, 0, 1)
 
 
 def _summed(epochs: tuple[Epoch, ...], length: int) -> NoiseWindow:
-    weight = sum(epoch.weight for epoch in epochs)
+    weight = place = turn = 0.0
+    for epoch in epochs:
+        weight += epoch.weight
+        place += epoch.weight * epoch.ratios[0]
+        turn += epoch.weight * epoch.ratios[1]
     doubtful = weight < (1.0 - _DOUBT) * len(epochs)
     if len(epochs) < length:
         return NoiseWindow(epochs, np.ones(6), doubtful)
-    ratios = sum(epoch.weight * epoch.ratios for epoch in epochs) / weight
-    return NoiseWindow(epochs, np.sqrt(ratios).repeat(3), doubtful)
+    s, t = math.sqrt(place / weight), math.sqrt(turn / weight)
+    return NoiseWindow(epochs, np.array((s, s, s, t, t, t)), doubtful)
 
 
 def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
@@ -81,8 +86,9 @@ def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
 
 def filled(base: Array, factors: Array, length: int) -> NoiseWindow:
     """A full window that says what a fit found: ``factors`` (2,) of attitude and position on ``base`` (6, 6)."""
+    turn, place = factors.tolist()
     s = factors[::-1].repeat(3)
-    return _summed((Epoch(base * np.outer(s, s), factors[::-1] ** 2, 1.0),) * length, length)
+    return _summed((Epoch(base * np.outer(s, s), (place**2, turn**2), 1.0),) * length, length)
 
 
 def floored(R: Array, R0: Array, fraction: float) -> Array:

@@ -22,7 +22,7 @@ from avsreplay.estimate.naming import NAMINGS
 from avsreplay.geometry import Array
 from avsreplay.records import State
 
-__all__ = ["RATE", "Chart", "retract", "to_chart", "to_errors", "to_state"]
+__all__ = ["RATE", "Chart", "to_chart", "to_errors", "to_state"]
 
 ETA, RATE, POSITION, VELOCITY = (slice(k, k + 3) for k in (0, 3, 6, 9))
 INERTIA, ARM = slice(12, 17), slice(17, 20)
@@ -146,13 +146,3 @@ def to_errors(c: Chart) -> Array:
     T[14:17, ARM], T[14:17, INERTIA] = A, -2.0 * geometry.skew(A @ c.arm_c) @ dmu
     T[17:20, INERTIA] = dmu
     return T
-
-
-def retract(x: State, P: Array, d: Array) -> tuple[State, Array]:
-    """The state displaced by the error d (20,), and P about it, through the chart: no bound or naming is in the way."""
-    here = to_chart(x)
-    T = to_errors(here)
-    there = here.moved(np.asarray(np.linalg.solve(T, d), dtype=np.float64))
-    carry = np.asarray(np.linalg.solve(T.T, to_errors(there).T).T)
-    out = carry @ P @ carry.T
-    return to_state(there), 0.5 * (out + out.T)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from avsreplay.estimate.chart import retract
+from avsreplay.estimate import _motion
 from avsreplay.estimate.constrain import shrink
 from avsreplay.estimate.fit import GATE
 from avsreplay.estimate.layout import SIGMA, boxplus
 from avsreplay.geometry import Array
-from avsreplay.records import Belief, Innovation
+from avsreplay.records import Belief, Innovation, State
 
 __all__ = ["gain", "innovate", "joseph", "update", "update_in_chart", "widened"]
 
@@ -47,11 +47,15 @@ def update(prior: Belief, H: Array, seen: Innovation, margin: float, colour: Arr
 
 
 def update_in_chart(prior: Belief, H: Array, seen: Innovation, colour: Array) -> Belief:
-    """The same update displaced through the chart, where inertia cannot leave its bounds and beta has nothing to do."""
-    R = widened(seen.R, colour / seen.weight)
-    K = gain(prior.P, H, seen.S + (R - seen.R))
-    x, P = retract(prior.x, joseph(prior.P, H, K, R), K @ seen.alpha)
-    return Belief(prior.t_ns, x, P)
+    """The same update displaced through the chart, where inertia cannot leave its bounds and beta has nothing to do.
+
+    Gain, Joseph's form and the displacement, mean and P by the chart's derivatives, are one call of the extension.
+    """
+    x, say = prior.x, colour / seen.weight
+    *mean, P = _motion.correct(
+        x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, prior.P, H, seen.alpha, seen.S, seen.R, say.tolist()
+    )
+    return Belief(prior.t_ns, State(*mean), P)
 
 
 def joseph(P: Array, H: Array, K: Array, R: Array) -> Array:

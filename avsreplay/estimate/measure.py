@@ -11,10 +11,13 @@ import math
 import numpy as np
 
 from avsreplay.estimate.layout import DIM, DMU, DQ, RHO, hamilton, rotation
-from avsreplay.geometry import Array, Pose, matrix
+from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, State
 
 __all__ = ["in_camera", "in_fixture", "innovation", "measured_pose", "noise_of", "residual", "sensitivity"]
+
+Triple = tuple[float, float, float]
+Quad = tuple[float, float, float, float]
 
 
 def _constant() -> Array:
@@ -40,30 +43,21 @@ def sensitivity(x: State) -> Array:
 def innovation(x: State, T_ac: Pose) -> Array:
     """The innovation alpha (6,) = z - h at zero error: [m in {A}, half-angle vector in {B}]."""
     q = hamilton(hamilton(_inverse(x.q_ab), T_ac.q.tolist()), _inverse(x.q_bc))
-    s = 1.0 if q[3] >= 0.0 else -1.0
-    dx, dy, dz = (T_ac.t - x.r_a - rotation(x.q_ab) @ x.c_b).tolist()
-    return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
+    return _difference(T_ac.t.tolist(), _fixture(x), q)
 
 
 def residual(posterior: State, prior: State, alpha: Array) -> Array:
     """Z - h(x+) (6,) of the pose that gave ``alpha`` at the prior."""
-    vx, vy, vz = alpha[3:].tolist()
-    deta = (vx, vy, vz, math.sqrt(max(0.0, 1.0 - vx * vx - vy * vy - vz * vz)))
+    place, deta = _seen(prior, alpha)
     left = hamilton(_inverse(posterior.q_ab), prior.q_ab.tolist())
     right = hamilton(prior.q_bc.tolist(), _inverse(posterior.q_bc))
-    q = hamilton(hamilton(left, deta), right)
-    s = 1.0 if q[3] >= 0.0 else -1.0
-    seen = prior.r_a + rotation(prior.q_ab) @ prior.c_b + alpha[:3]
-    dx, dy, dz = (seen - posterior.r_a - rotation(posterior.q_ab) @ posterior.c_b).tolist()
-    return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
+    return _difference(place, _fixture(posterior), hamilton(hamilton(left, deta), right))
 
 
 def measured_pose(x: State, alpha: Array) -> Pose:
     """The pose T_ac that ``innovation`` made alpha of: its inverse in the second argument."""
-    vx, vy, vz = alpha[3:].tolist()
-    deta = (vx, vy, vz, math.sqrt(max(0.0, 1.0 - vx * vx - vy * vy - vz * vz)))
-    q = hamilton(hamilton(x.q_ab.tolist(), deta), x.q_bc.tolist())
-    return Pose(np.array(q), x.r_a + matrix(x.q_ab) @ x.c_b + alpha[:3])
+    place, deta = _seen(x, alpha)
+    return Pose(np.array(hamilton(hamilton(x.q_ab.tolist(), deta), x.q_bc.tolist())), np.array(place))
 
 
 def noise_of(alignment: Alignment, x: State, free: tuple[float, float]) -> Array | None:
@@ -85,7 +79,7 @@ def noise_of(alignment: Alignment, x: State, free: tuple[float, float]) -> Array
 def in_camera(C: Array, q_ac: Array, q_bc: Array) -> Array:
     """R (6, 6) in metres in {A} and half angles in {B} from C (6, 6) of d = [theta; v] in {C}."""
     J = np.zeros((6, 6))
-    J[:3, 3:], J[3:, :3] = matrix(q_ac), 0.5 * matrix(q_bc)
+    J[:3, 3:], J[3:, :3] = rotation(q_ac), 0.5 * rotation(q_bc)
     R: Array = J @ C @ J.T
     return 0.5 * (R + R.T)
 
@@ -93,11 +87,36 @@ def in_camera(C: Array, q_ac: Array, q_bc: Array) -> Array:
 def in_fixture(R: Array, q_ac: Array, q_bc: Array) -> Array:
     """``in_camera``'s inverse."""
     J = np.zeros((6, 6))
-    J[:3, 3:], J[3:, :3] = 2.0 * matrix(q_bc).T, matrix(q_ac).T
+    J[:3, 3:], J[3:, :3] = 2.0 * rotation(q_bc).T, rotation(q_ac).T
     C: Array = J @ R @ J.T
     return 0.5 * (C + C.T)
 
 
-def _inverse(q: Array) -> tuple[float, float, float, float]:
+def _seen(x: State, alpha: Array) -> tuple[Triple, Quad]:
+    """Position and deta of the pose that gave ``alpha`` at x."""
+    (x0, y0, z0), (dx, dy, dz, vx, vy, vz) = _fixture(x), alpha.tolist()
+    w = math.sqrt(max(0.0, 1.0 - vx * vx - vy * vy - vz * vz))
+    return (x0 + dx, y0 + dy, z0 + dz), (vx, vy, vz, w)
+
+
+def _fixture(x: State) -> Triple:
+    """Position of the fixture in {A}, r + A(q) c, in scalars: c + w t + v x t with t = 2 v x c."""
+    (qx, qy, qz, qw), (cx, cy, cz), (rx, ry, rz) = x.q_ab.tolist(), x.c_b.tolist(), x.r_a.tolist()
+    tx, ty, tz = 2.0 * (qy * cz - qz * cy), 2.0 * (qz * cx - qx * cz), 2.0 * (qx * cy - qy * cx)
+    return (
+        rx + (cx + qw * tx + qy * tz - qz * ty),
+        ry + (cy + qw * ty + qz * tx - qx * tz),
+        rz + (cz + qw * tz + qx * ty - qy * tx),
+    )
+
+
+def _difference(place: Triple, other: Triple, q: Quad) -> Array:
+    """(6,) difference of two positions, and the vector part of q, of the sign with w >= 0."""
+    s = 1.0 if q[3] >= 0.0 else -1.0
+    dx, dy, dz = place[0] - other[0], place[1] - other[1], place[2] - other[2]
+    return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
+
+
+def _inverse(q: Array) -> Quad:
     x, y, z, w = q.tolist()
     return -x, -y, -z, w

@@ -8,18 +8,20 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import tumbling
 
 from avsreplay import geometry
-from avsreplay.estimate import Estimator, EstimatorParams
+from avsreplay.estimate import Estimator, EstimatorParams, Prediction, Track
 from avsreplay.estimate.arc import arc
 from avsreplay.estimate.chart import to_chart
 from avsreplay.estimate.cold import prior_of
 from avsreplay.estimate.fit import FitParams, Poses, fit
-from avsreplay.estimate.params import Start
-from avsreplay.records import Belief
+from avsreplay.estimate.fitting import _AUDIT_GROWTH, _FEWEST_TO_AUDIT
+from avsreplay.estimate.params import Constraint, Start
+from avsreplay.records import Alignment, Belief
 
 
 def least(run: Callable[[], object], count: int) -> float:
@@ -33,24 +35,52 @@ def least(run: Callable[[], object], count: int) -> float:
     return best
 
 
-def filter_us(count: int) -> dict[str, float]:
-    world = tumbling.draw(4, seconds=1.0, hz=5.0)
-    x = world.states[0]
-    estimator = Estimator(EstimatorParams(start=Start.NEAR), Belief(0, x, np.eye(20) * 1e-6), 2.0)
-    track = estimator.initial(0, x.T_ac)
-    seen = tumbling.alignment(world.states[1].T_ac, np.random.Generator(np.random.PCG64(0)), 0.005, 0.005)
-    prediction = estimator.predict(track, 200_000_000)
-    innovation = estimator.innovate(prediction, seen)
+def tracked(params: EstimatorParams, scans: int) -> tuple[Estimator, Track, Prediction, Alignment]:
+    """An estimator so many scans on at 5 Hz, its window full, all poses remembered, and the scan that is next."""
+    world = tumbling.draw(4, seconds=0.2 * scans, hz=5.0)
+    rng = np.random.Generator(np.random.PCG64(0))
+    seen = [tumbling.alignment(x.T_ac, rng, 0.005, 0.005) for x in world.states]
+    times = [round(t * 1e9) for t in world.times]
+    estimator = Estimator(params, Belief(0, world.states[0], np.eye(20) * 1e-6), 2.0)
+    track = estimator.initial(0, seen[0].T_ac)
+    for t_ns, alignment in zip(times[:-1], seen[:-1], strict=True):
+        prediction = estimator.predict(track, t_ns)
+        track = estimator.update(track, prediction, estimator.innovate(prediction, alignment), 1)
+    return estimator, replace(track, since=0), estimator.predict(track, times[-1]), seen[-1]
+
+
+def scan_us(name: str, params: EstimatorParams, count: int) -> dict[str, float]:
+    """Parts of a scan, with 200 poses remembered; no fit is due."""
+    estimator, track, prediction, seen = tracked(params, 200)
+    if track.mode != "filter":
+        raise SystemExit("the filter does not speak")
+    innovation, t_ns = estimator.innovate(prediction, seen), prediction.belief.t_ns
+    parts = {
+        "predict": 1e6 * least(lambda: estimator.predict(track, t_ns), count),
+        "innovate": 1e6 * least(lambda: estimator.innovate(prediction, seen), count),
+        f"update ({name})": 1e6 * least(lambda: estimator.update(track, prediction, innovation, 1), count),
+    }
+    return parts | {f"predict + update ({name})": parts["predict"] + parts[f"update ({name})"]}
+
+
+def ahead_us(count: int) -> dict[str, float]:
+    """What the planner asks."""
+    estimator, track, _, _ = tracked(EstimatorParams(start=Start.NEAR), 20)
     times, many = np.linspace(5.0, 30.0, 6), np.linspace(0.0, 60.0, 100)
     path = estimator.motion(track.belief)
     return {
-        "predict": 1e6 * least(lambda: estimator.predict(track, 200_000_000), count),
-        "innovate": 1e6 * least(lambda: estimator.innovate(prediction, seen), count),
-        "update": 1e6 * least(lambda: estimator.update(track, prediction, innovation, 1), count),
-        "forecast 30 s": 1e6 * least(lambda: estimator.forecast(track.belief, times), count // 10),
-        "new path": 1e6 * least(lambda: estimator.motion(track.belief)(times[3:4]), count // 10),
-        "path, 100 times": 1e6 * least(lambda: path(many), count // 10),
+        "forecast 30 s": 1e6 * least(lambda: estimator.forecast(track.belief, times), count),
+        "new path": 1e6 * least(lambda: estimator.motion(track.belief)(times[3:4]), count),
+        "path, 100 times": 1e6 * least(lambda: path(many), count),
     }
+
+
+def audit_ms(scans: int) -> tuple[float, float]:
+    """An audit of the filter with so many poses remembered, and its share of each scan until the next [ms]."""
+    estimator, track, _, _ = tracked(EstimatorParams(start=Start.NEAR), scans)
+    due = replace(track, since=len(track.fixes))
+    whole = 1e3 * least(lambda: estimator.fitting.audited(due), 1)
+    return whole, whole / max(_FEWEST_TO_AUDIT, _AUDIT_GROWTH * len(track.fixes))
 
 
 def fit_s(n: int, seconds: float) -> tuple[float, float, int]:
@@ -79,8 +109,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer repeats, no fit over 5,000 poses")
     quick = parser.parse_args().quick
-    for name, value in filter_us(50 if quick else 400).items():
-        print(f"{name:16s} {value:8.0f} us")
+    count, near = 50 if quick else 400, EstimatorParams(start=Start.NEAR)
+    parts = scan_us("gain", replace(near, constraint=Constraint.GAIN), count) | scan_us("chart", near, count)
+    for name, value in (parts | ahead_us(count // 10)).items():
+        print(f"{name:24s} {value:8.1f} us")
+    for scans in (200,) if quick else (200, 500, 1000):
+        whole, share = audit_ms(scans)
+        print(f"audit over {scans:4d} poses: {whole:6.1f} ms, amortised {share:.2f} ms a scan")
     for n, seconds in ((200, 100.0),) if quick else ((200, 100.0), (600, 120.0), (5000, 1000.0)):
         once, whole, steps = fit_s(n, seconds)
         print(f"fit of {n:5d} poses over {seconds:6.0f} s: {whole:6.3f} s, {steps} steps; arc {1e3 * once:.1f} ms")

@@ -1,0 +1,28 @@
+// The filter's update in fixed size: gain, Joseph's form, and the displacement of a state through the chart.
+#pragma once
+
+namespace avs {
+
+constexpr int DIM = 20, SEEN = 6;  // error states, and what a pose measures
+
+// The mean that the error states surround (eq:x): attitude and rate of {B}, centre of mass, its velocity, ratios,
+// fixture in {B}, {C} to {B}.
+struct State {
+  double q_ab[4], w_b[3], r_a[3], v_a[3], sigma[2], c_b[3], q_bc[4];
+};
+
+// What a pose says at a prior: derivative H, innovation alpha, its covariance S, and the noise R in it.
+struct Pose {
+  double H[SEEN][DIM], alpha[SEEN], S[SEEN][SEEN], R[SEEN][SEEN];
+};
+
+// x and P once a pose has been seen, its noise widened by `colour` (attitude, position), through the chart: ekf.py.
+void correct(State& x, double P[DIM][DIM], const Pose& seen, const double colour[2]);
+
+// y and P once rows e + H y of unit variance have been seen, P having grown by Q before.
+void pass(double y[DIM], double P[DIM][DIM], const double e[SEEN], const double H[SEEN][DIM], const double Q[DIM][DIM]);
+
+// x displaced by the error d through the chart, and P carried from about the one to about the other.
+void retract(State& x, double P[DIM][DIM], const double d[DIM]);
+
+}  // namespace avs
