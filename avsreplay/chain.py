@@ -1,7 +1,7 @@
 """The path: one scan in, one row out. Read ``step`` and know the program.
 
 scan -> register -> innovation -> verdict (gamma) -> estimate -> monitors -> plan -> row; the predicted pose goes back
-to registration as its guess, the only loop.
+to registration as its guess, the only loop; the last scan's word on convergence lets a fit give way to the filter.
 """
 
 from __future__ import annotations

@@ -27,6 +27,7 @@ __all__ = ["Fitting"]
 
 _FEWEST_TO_FIT = 3
 _FEWEST_TO_AUDIT, _AUDIT_GROWTH, _FEWEST_IN_DOUBT = 50, 0.25, 10
+_RECENT = 0.1  # of the fit's memory: pushes have done little to what was given so long ago
 _SURE_HALF_RAD = 0.2  # 1 sigma of the given attitude beyond which it is not normal any more
 _LONGEST_S = 1e9  # what nanoseconds hold
 _instant = attrgetter("t_ns")
@@ -94,7 +95,7 @@ class Fitting:
 
     def _given(self, t_ns: int) -> Prior | None:
         """What was given, at the first pose's instant; nothing where the way there has made little of it."""
-        if self.start is None or self._prior is None:
+        if self.start is None or self._prior is None or t_ns - self.start.t_ns > _RECENT * self._memory_ns:
             return None
         x, step = carried(self._prior.mean, (t_ns - self.start.t_ns) * 1e-9)
         P = step @ self._prior.P @ step.T
