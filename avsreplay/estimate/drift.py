@@ -35,16 +35,9 @@ def disturbed(found: Spread, poses: Poses, prior: Prior, rules: FitParams, torqu
     """The same fit as it bears on the last pose's instant; ``torque``, ``force``: root densities as in the filter."""
     fitted = found.fitted
     rows, J = linearised(poses, fitted.chart, prior, rules, fitted.effective)
-    T = to_errors(fitted.chart)
-    Q = np.linalg.solve(T, np.swapaxes(np.linalg.solve(T, _added(fitted.x, poses.times_s, torque, force)), 1, 2))
-    y, P = -fitted.chart.minus(prior.mean), prior.P
-    for e, H, added in zip(rows, J, Q, strict=True):
-        P = P + added
-        K = np.linalg.solve(H @ P @ H.T + np.eye(6), H @ P).T
-        y = y - K @ (e + H @ y)
-        L = np.eye(DIM) - K @ H
-        P = L @ P @ L.T + K @ K.T
-    P = 0.5 * (P + P.T)
+    into = np.linalg.inv(to_errors(fitted.chart))
+    Q = into @ _added(fitted.x, poses.times_s, torque, force) @ into.T
+    y, P = _motion.filter(-fitted.chart.minus(prior.mean), prior.P, rows, J, Q)
     more = P - fitted.P_chart
     moved = [[Node(node.chart.moved(y), node.P + more) for node in bend.sides] for bend in found.bends]
     bends = tuple(Bend(bend.ray, (low, high)) for bend, (low, high) in zip(found.bends, moved, strict=True))
