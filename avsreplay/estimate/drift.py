@@ -14,7 +14,7 @@ import numpy as np
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import to_errors
 from avsreplay.estimate.fit import FitParams, Poses, Prior, linearised
-from avsreplay.estimate.layout import DIM, RHO, VEL
+from avsreplay.estimate.layout import RHO, VEL
 from avsreplay.estimate.motion import push, ratios
 from avsreplay.estimate.spread import Bend, Node, Spread
 from avsreplay.geometry import Array
@@ -23,6 +23,7 @@ from avsreplay.records import State
 __all__ = ["disturbed", "memory_s"]
 
 _STRAY_RAD = 0.05  # how far pushes may turn the body from the fitted path: beyond, the problem about it is not linear
+_MOVING = 12  # error states a push reaches: attitude, rate, position, velocity
 _SPHERE = 3.0  # tr I / I
 
 
@@ -35,7 +36,7 @@ def disturbed(found: Spread, poses: Poses, prior: Prior, rules: FitParams, torqu
     """The same fit as it bears on the last pose's instant; ``torque``, ``force``: root densities as in the filter."""
     fitted = found.fitted
     rows, J = linearised(poses, fitted.chart, prior, rules, fitted.effective)
-    into = np.linalg.inv(to_errors(fitted.chart))
+    into = np.linalg.inv(to_errors(fitted.chart))[:, :_MOVING]
     Q = into @ _added(fitted.x, poses.times_s, torque, force) @ into.T
     y, P = _motion.filter(-fitted.chart.minus(prior.mean), prior.P, rows, J, Q)
     more = P - fitted.P_chart
@@ -45,12 +46,13 @@ def disturbed(found: Spread, poses: Poses, prior: Prior, rules: FitParams, torqu
 
 
 def _added(x: State, times_s: Array, torque: float, force: float) -> Array:
-    """(n, 20, 20) covariance that comes in before each pose, carried back to the epoch."""
+    """(n, 12, 12) covariance of attitude to velocity that comes in before each pose, carried back to the epoch."""
     _, _, S, pushed = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), push(x.sigma, torque), times_s)
     back = np.linalg.inv(S[:, :, :6])
-    total = np.zeros((len(times_s), DIM, DIM))
+    total = np.zeros((len(times_s), _MOVING, _MOVING))
     total[:, :6, :6] = back @ pushed @ np.swapaxes(back, 1, 2)
     t, one = times_s[:, None, None], force**2 * np.eye(3)
     total[:, RHO, RHO], total[:, VEL, VEL] = one * t**3 / 3.0, one * t
     total[:, RHO, VEL] = total[:, VEL, RHO] = -one * t**2 / 2.0
-    return np.diff(total, axis=0, prepend=0.0 * total[:1])
+    total[1:] -= total[:-1].copy()
+    return total

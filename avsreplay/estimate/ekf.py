@@ -6,8 +6,8 @@ import numpy as np
 
 from avsreplay.estimate import _motion
 from avsreplay.estimate.constrain import shrink
-from avsreplay.estimate.fit import GATE
 from avsreplay.estimate.layout import SIGMA, boxplus
+from avsreplay.estimate.robust import GATE
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation, State
 

@@ -11,24 +11,23 @@ integrated autocorrelation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.estimate.arc import arc
+from avsreplay.estimate.arc import Arc, arc
 from avsreplay.estimate.chart import RATE, Chart, to_errors, to_state
-from avsreplay.estimate.layout import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W
-from avsreplay.geometry import Array
+from avsreplay.estimate.layout import DIM, DMU, RHO, SIGMA, VARRHO, VEL
+from avsreplay.estimate.robust import colour_of, weigh
+from avsreplay.geometry import Array, skew
 from avsreplay.records import State
 
-__all__ = ["GATE", "FitParams", "Fitted", "Pin", "Poses", "Prior", "cost", "fit", "linearised", "pinned"]
+__all__ = ["FitParams", "Fitted", "Pin", "Poses", "Prior", "cost", "fit", "linearised", "pinned"]
 
-GATE = 27.86  # chi-square with 6 degrees of freedom, 99.99 %
 _FEWEST_FOR_FACTORS = 12
-_LAGS = (5, 10, 20, 40)
 _WILD_RADPS = 0.5  # a step that adds more to the rate than this and the rate itself is not tried
 _PIN_TOL = 0.02  # half chi-square: how well a held fit needs to be known
 
@@ -58,12 +57,19 @@ class Poses:
     Attributes:
         times_s: (n,) since the fit's epoch [s].  q: (n, 4) q_ac.  t: (n, 3) [m].
         C: (n, 6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
+        root: (n, 6, 6) with root C root' = 1.  R_ca: (n, 3, 3).
     """
 
     times_s: Array
     q: Array
     t: Array
     C: Array
+    root: Array = field(init=False)
+    R_ca: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "root", _inverse(np.linalg.cholesky(self.C)))
+        object.__setattr__(self, "R_ca", np.swapaxes(geometry.matrix(self.q), -1, -2).copy())
 
     def __len__(self) -> int:
         return len(self.times_s)
@@ -132,12 +138,16 @@ class Fitted:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Whitener:
-    """(n, 6, 6) roots with root C root' = 1, and the inverse covariances of each block (n, 3, 3)."""
+class _Seen:
+    """The poses as a state has them: residuals d (n, 6), weights, cost; the motion x and path they come from."""
 
-    root: Array
-    attitude: Array
-    position: Array
+    chart: Chart
+    x: State
+    path: Arc
+    A_ab: Array
+    d: Array
+    weights: Array
+    cost: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,29 +180,49 @@ class _Problem:
 
     def __init__(self, poses: Poses, prior: Prior, params: FitParams, factors: Array, pin: Pin | None = None) -> None:
         self.poses, self.prior, self.params, self.pin = poses, prior, params, pin
-        self.white = _whitener(poses.C)
         self.redescend = True
         self.factors = factors
-        self.R_ca = np.swapaxes(geometry.matrix(poses.q), -1, -2)
         self.prior_info = _inverse(prior.P)
 
     def at(self, chart: Chart) -> _Here:
-        d, J = self._residuals(chart)
-        e = self.whitened(d)
-        chi2 = np.einsum("ni,ni->n", e, e)
-        weights, robust = _robust(chi2, self.redescend)
+        return self.linear(self.seen(chart))
+
+    def seen(self, chart: Chart) -> _Seen:
+        x, p = to_state(chart), self.poses
+        path = arc(x, p.times_s)
+        A_ab, d = geometry.matrix(path.q), np.empty((len(p), 6))
+        d[:, :3] = geometry.log(geometry.multiply(geometry.conjugate(p.q), geometry.multiply(path.q, x.q_bc)))
+        off_a = x.r_a + p.times_s[:, None] * x.v_a + A_ab @ x.c_b - p.t
+        d[:, 3:] = (p.R_ca @ off_a[:, :, None])[:, :, 0]
+        e = self.whitened(d[:, :, None])
+        chi2 = np.einsum("nij,nij->n", e, e)
+        weights, robust = weigh(chi2, self.redescend)
         off = chart.minus(self.prior.mean)
         cost = 0.5 * float(robust.sum()) + 0.5 * float(off @ self.prior_info @ off)
         if self.pin is not None:
             cost += 0.5 * self.pin.error(chart) ** 2
-        return _Here(chart, d, J, weights, cost)
+        return _Seen(chart, x, path, A_ab, d, weights, cost)
+
+    def linear(self, seen: _Seen) -> _Here:
+        """With the derivative, H Phi chained and taken into the chart."""
+        x, p, turn = seen.x, self.poses, seen.path.S[:, :3]
+        A_cb, R_cb = geometry.matrix(x.q_bc).T.copy(), p.R_ca @ seen.A_ab
+        J = np.zeros((len(p), 6, DIM))
+        for rows, by_turn in ((slice(0, 3), 2.0 * A_cb @ turn), (slice(3, 6), -2.0 * (R_cb @ skew(x.c_b)) @ turn)):
+            J[:, rows, :6], J[:, rows, SIGMA] = by_turn[:, :, :6], by_turn[:, :, 6:]
+        J[:, :3, DMU] = 2.0 * A_cb
+        J[:, 3:, RHO] = p.R_ca
+        J[:, 3:, VEL] = p.R_ca * p.times_s[:, None, None]
+        J[:, 3:, VARRHO] = R_cb
+        J = (J.reshape(-1, DIM) @ to_errors(seen.chart)).reshape(J.shape)
+        return _Here(seen.chart, seen.d, J, seen.weights, seen.cost)
 
     def normal(self, here: _Here) -> tuple[Array, Array]:
         """A (20, 20) and b (20,) of the step: A step = b."""
-        e, J = self.whitened(here.d), self.whitened(here.J)
-        JW = J * here.weights[:, None, None]
-        A = np.tensordot(JW, J, ([0, 1], [0, 1])) + self.prior_info
-        b = -np.tensordot(JW, e, ([0, 1], [0, 1])) - self.prior_info @ here.chart.minus(self.prior.mean)
+        e, J = self.rows(here)
+        J = J.reshape(-1, DIM)
+        A = J.T @ J + self.prior_info
+        b = -J.T @ e.reshape(-1) - self.prior_info @ here.chart.minus(self.prior.mean)
         if self.pin is not None:
             row = self.pin.row / self.pin.one_sigma
             A += np.outer(row, row)
@@ -201,67 +231,29 @@ class _Problem:
 
     def rescaled(self, here: _Here, P: Array) -> Array:
         """Factors (2,) from the residuals: mean of d' C^-1 d and of what the fit took up of it, J P J'."""
-        w = here.weights
-        found = []
-        for rows, info in ((slice(0, 3), self.white.attitude), (slice(3, 6), self.white.position)):
-            d, J = here.d[:, rows], here.J[:, rows]
-            size = np.einsum("ni,nij,nj->n", d, info, d) + np.einsum("nij,njk,kl,nil->n", info, J, P, J, optimize=True)
+        w, found = here.weights, []
+        for rows in (slice(0, 3), slice(3, 6)):
+            info, d, J = _inverse(self.poses.C[:, rows, rows]), here.d[:, rows], here.J[:, rows]
+            size = np.einsum("ni,nij,nj->n", d, info, d) + ((info @ J) * (J @ P)).sum(axis=(1, 2))
             found.append(np.sqrt(float(w @ size) / (3.0 * float(w.sum()))))
         return np.array(found)
 
     def colour(self, here: _Here) -> Array:
         """(2,) 1 + 2 sum of the residuals' autocorrelations, of attitude and position."""
-        e = self.whitened(here.d) * np.sqrt(here.weights)[:, None]
-        return np.array([_colour(e[:, :3]), _colour(e[:, 3:])])
+        e = self.whitened(here.d[:, :, None])[:, :, 0] * np.sqrt(here.weights)[:, None]
+        return np.array([colour_of(e[:, :3]), colour_of(e[:, 3:])])
 
-    def whitened(self, rows: Array) -> Array:
-        scaled = rows / np.repeat(self.factors, 3).reshape((6,) + (1,) * (rows.ndim - 2))
-        out: Array = np.einsum("nij,nj...->ni...", self.white.root, scaled)
+    def rows(self, here: _Here) -> tuple[Array, Array]:
+        """Residuals (n, 6) and derivative (n, 6, 20), whitened and weighted: each of unit variance."""
+        both = (
+            self.whitened(np.concatenate([here.J, here.d[:, :, None]], axis=2)) * np.sqrt(here.weights)[:, None, None]
+        )
+        return both[:, :, DIM], both[:, :, :DIM]
+
+    def whitened(self, columns: Array) -> Array:
+        """Columns (n, 6, k) in units of the noise."""
+        out: Array = (self.poses.root / np.repeat(self.factors, 3)) @ columns
         return out
-
-    def _residuals(self, chart: Chart) -> tuple[Array, Array]:
-        """From measured to fitted pose in {C}, d (n, 6), and its derivative (n, 6, 20) in the chart."""
-        p, x = self.poses, to_state(chart)
-        path = arc(x, p.times_s)
-        A_ab, A_cb = geometry.matrix(path.q), geometry.matrix(x.q_bc).T
-        q_ac = geometry.multiply(path.q, x.q_bc)
-        d = np.empty((len(p), 6))
-        d[:, :3] = geometry.log(geometry.multiply(geometry.conjugate(p.q), q_ac))
-        centre = x.r_a + p.times_s[:, None] * x.v_a
-        d[:, 3:] = np.einsum("nij,nj->ni", self.R_ca, centre + A_ab @ x.c_b - p.t)
-        J = np.zeros((len(p), 6, DIM))
-        turn = path.S[:, :3]
-        columns = np.r_[DQ, W, SIGMA]
-        J[:, :3, columns] = 2.0 * A_cb @ turn
-        J[:, :3, DMU] = 2.0 * A_cb
-        R_cb = self.R_ca @ A_ab
-        J[:, 3:, columns] = -2.0 * (R_cb @ geometry.skew(x.c_b)) @ turn
-        J[:, 3:, RHO] = self.R_ca
-        J[:, 3:, VEL] = self.R_ca * p.times_s[:, None, None]
-        J[:, 3:, VARRHO] = R_cb
-        return d, J @ to_errors(chart)
-
-
-def _robust(chi2: Array, redescend: bool) -> tuple[Array, Array]:
-    """Weights and costs (n,): plain up to the gate; beyond it Cauchy's logarithm, or Huber's root on the way in."""
-    over = np.maximum(chi2 / GATE, 1.0)
-    if redescend:
-        return 1.0 / over, np.where(over > 1.0, GATE * (1.0 + np.log(over)), chi2)
-    return 1.0 / np.sqrt(over), np.where(over > 1.0, GATE * (2.0 * np.sqrt(over) - 1.0), chi2)
-
-
-def _colour(e: Array) -> float:
-    """1 + 2 sum of autocorrelations of rows e (n, 3), over the lags that show most, where three sigma do."""
-    n, total = len(e), float(np.sum(e * e))
-    lags = [k for k in _LAGS if k <= n // 8]
-    rho = [float(np.sum(e[k:] * e[:-k])) / total * n / (n - k) for k in range(1, max(lags, default=0) + 1)]
-    sums = [(sum(rho[:k]), 3.0 * np.sqrt(k / (3.0 * n))) for k in lags]
-    return 1.0 + 2.0 * max((found for found, doubt in sums if found > doubt), default=0.0)
-
-
-def _whitener(C: Array) -> _Whitener:
-    root = _inverse(np.linalg.cholesky(C))
-    return _Whitener(root, _inverse(C[:, :3, :3]), _inverse(C[:, 3:, 3:]))
 
 
 def _inverse(A: NDArray[Any]) -> Array:
@@ -299,15 +291,13 @@ def fit(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Ar
 
 def cost(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: Array) -> float:
     """Half chi-square of initial values, the prior's share included."""
-    return _Problem(poses, prior, params, factors).at(chart).cost
+    return _Problem(poses, prior, params, factors).seen(chart).cost
 
 
 def linearised(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: Array) -> tuple[Array, Array]:
     """Residuals (n, 6) and their derivative (n, 6, 20) in the chart, whitened and weighted: each of unit variance."""
     problem = _Problem(poses, prior, params, factors)
-    here = problem.at(chart)
-    root = np.sqrt(here.weights)[:, None]
-    return problem.whitened(here.d) * root, problem.whitened(here.J) * root[:, None]
+    return problem.rows(problem.at(chart))
 
 
 def pinned(
@@ -327,11 +317,11 @@ def _descend(problem: _Problem, here: _Here, max_steps: int) -> tuple[_Here, int
         step = np.asarray(np.linalg.solve(A + damping * np.diag(np.diagonal(A)), b), dtype=np.float64)
         expected = float(step @ b) - 0.5 * float(step @ A @ step)
         wild = float(np.linalg.norm(step[RATE])) > _WILD_RADPS + float(np.linalg.norm(here.chart.w_c))
-        trial = here if wild else problem.at(here.chart.moved(step))
-        gain = here.cost - trial.cost
-        if gain > 0.0:
+        trial = None if wild else problem.seen(here.chart.moved(step))
+        gain = 0.0 if trial is None else here.cost - trial.cost
+        if trial is not None and gain > 0.0:
             damping = max(damping * (0.1 if gain > 0.5 * expected else 0.5), 1e-9)
-            here = trial
+            here = problem.linear(trial)
             A, b = problem.normal(here)
         else:
             damping *= 8.0
