@@ -108,7 +108,7 @@ def to_chart(x: State) -> Chart:
 
 
 def _eigenvalues(c: Chart) -> Array:
-    m: Array = np.einsum("ji,jk,ki->i", c.R_cb, c.M, c.R_cb)
+    m: Array = (c.R_cb.T @ c.M @ c.R_cb).diagonal().copy()
     low, middle, high = np.argsort(m, kind="stable")
     m[middle] = max(m[middle], m[low] + LEAST_GAP)
     m[high] = max(m[high], m[middle] + LEAST_GAP)
@@ -122,14 +122,14 @@ def to_state(c: Chart) -> State:
     q_bc = geometry.quaternion(c.R_cb.T)
     q_ab = geometry.multiply(c.q_ac, geometry.conjugate(q_bc))
     R_ac = geometry.matrix(c.q_ac)
-    r_a, v_a = c.t_a - R_ac @ c.arm_c, c.u_a - R_ac @ np.cross(c.w_c, c.arm_c)
+    r_a, v_a = c.t_a - R_ac @ c.arm_c, c.u_a - R_ac @ (geometry.skew(c.w_c) @ c.arm_c)
     return State(q_ab, c.R_cb.T @ c.w_c, r_a, v_a, sigma, c.R_cb.T @ c.arm_c, q_bc)
 
 
 def to_errors(c: Chart) -> Array:
     """T (20, 20): error states d = T y of ``to_state`` for a small chart step y."""
     A, m = c.R_cb.T, _eigenvalues(c)
-    D = np.einsum("ai,kij,bj->kab", A, _BASIS, A)  # basis seen in {B}
+    D = A @ _BASIS @ A.T  # basis seen in {B}
     dmu = np.zeros((3, 5))
     for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         dmu[axis] = 0.5 * D[:, i, j] / (m[j] - m[i])
@@ -137,10 +137,11 @@ def to_errors(c: Chart) -> Array:
     T = np.zeros((DIM, DIM))
     T[0:3, ETA], T[0:3, INERTIA] = A, -dmu
     T[3:6, RATE], T[3:6, INERTIA] = A, -2.0 * geometry.skew(A @ c.w_c) @ dmu
-    R_ac, arm, twist = geometry.matrix(c.q_ac), geometry.skew(c.arm_c), geometry.skew(np.cross(c.w_c, c.arm_c))
+    R_ac, arm, turning = geometry.matrix(c.q_ac), geometry.skew(c.arm_c), geometry.skew(c.w_c)
+    twist = geometry.skew(turning @ c.arm_c)
     T[6:9, POSITION] = T[9:12, VELOCITY] = np.eye(3)
     T[6:9, ETA], T[6:9, ARM] = 2.0 * R_ac @ arm, -R_ac
-    T[9:12, ETA], T[9:12, RATE], T[9:12, ARM] = 2.0 * R_ac @ twist, R_ac @ arm, -R_ac @ geometry.skew(c.w_c)
+    T[9:12, ETA], T[9:12, RATE], T[9:12, ARM] = 2.0 * R_ac @ twist, R_ac @ arm, -R_ac @ turning
     T[12, INERTIA] = 0.5 * (1.0 - sigma[0] ** 2) * (D[:, 2, 2] - D[:, 1, 1])
     T[13, INERTIA] = 0.5 * (1.0 - sigma[1] ** 2) * (D[:, 0, 0] - D[:, 2, 2])
     T[14:17, ARM], T[14:17, INERTIA] = A, -2.0 * geometry.skew(A @ c.arm_c) @ dmu

@@ -194,14 +194,12 @@ class _Problem:
         d[:, :3] = geometry.log(geometry.multiply(geometry.conjugate(p.q), geometry.multiply(path.q, x.q_bc)))
         off_a = x.r_a + p.times_s[:, None] * x.v_a + A_ab @ x.c_b - p.t
         d[:, 3:] = (p.R_ca @ off_a[:, :, None])[:, :, 0]
-        e = self.whitened(d[:, :, None])
-        chi2 = np.einsum("nij,nij->n", e, e)
-        weights, robust = weigh(chi2, self.redescend)
-        off = chart.minus(self.prior.mean)
-        cost = 0.5 * float(robust.sum()) + 0.5 * float(off @ self.prior_info @ off)
-        if self.pin is not None:
-            cost += 0.5 * self.pin.error(chart) ** 2
-        return _Seen(chart, x, path, A_ab, d, weights, cost)
+        return _Seen(chart, x, path, A_ab, d, *self._say(chart, d))
+
+    def again(self, here: _Here) -> _Here:
+        """The same place, under the factors and the kind of weights now in force."""
+        weights, cost = self._say(here.chart, here.d)
+        return replace(here, weights=weights, cost=cost)
 
     def linear(self, seen: _Seen) -> _Here:
         """With the derivative, H Phi chained and taken into the chart."""
@@ -222,7 +220,7 @@ class _Problem:
         e, J = self.rows(here)
         J = J.reshape(-1, DIM)
         A = J.T @ J + self.prior_info
-        b = -J.T @ e.reshape(-1) - self.prior_info @ here.chart.minus(self.prior.mean)
+        b = -(J.T @ e.reshape(-1)) - self.prior_info @ here.chart.minus(self.prior.mean)
         if self.pin is not None:
             row = self.pin.row / self.pin.one_sigma
             A += np.outer(row, row)
@@ -245,15 +243,25 @@ class _Problem:
 
     def rows(self, here: _Here) -> tuple[Array, Array]:
         """Residuals (n, 6) and derivative (n, 6, 20), whitened and weighted: each of unit variance."""
-        both = (
-            self.whitened(np.concatenate([here.J, here.d[:, :, None]], axis=2)) * np.sqrt(here.weights)[:, None, None]
-        )
+        columns = np.concatenate([here.J, here.d[:, :, None]], axis=2)
+        both = self.whitened(columns) * np.sqrt(here.weights)[:, None, None]
         return both[:, :, DIM], both[:, :, :DIM]
 
     def whitened(self, columns: Array) -> Array:
         """Columns (n, 6, k) in units of the noise."""
         out: Array = (self.poses.root / np.repeat(self.factors, 3)) @ columns
         return out
+
+    def _say(self, chart: Chart, d: Array) -> tuple[Array, float]:
+        """Weights (n,) of residuals, and the cost."""
+        e = self.whitened(d[:, :, None])
+        chi2 = np.einsum("nij,nij->n", e, e)
+        weights, robust = weigh(chi2, self.redescend)
+        off = chart.minus(self.prior.mean)
+        cost = 0.5 * float(robust.sum()) + 0.5 * float(off @ self.prior_info @ off)
+        if self.pin is not None:
+            cost += 0.5 * self.pin.error(chart) ** 2
+        return weights, cost
 
 
 def _inverse(A: NDArray[Any]) -> Array:
@@ -275,7 +283,7 @@ def fit(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Ar
     problem.redescend = False
     here, steps, done = _descend(problem, problem.at(start), params.max_steps)
     problem.redescend = True
-    here, more, done = _descend(problem, problem.at(here.chart), params.max_steps)
+    here, more, done = _descend(problem, problem.again(here), params.max_steps)
     steps += more
     plain, colour = problem.factors / least, least**2
     if params.rescale and len(poses) >= _FEWEST_FOR_FACTORS:
@@ -283,7 +291,7 @@ def fit(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Ar
             plain = problem.rescaled(here, _inverse(problem.normal(here)[0]))
             colour = np.maximum(problem.colour(here), params.least_colour)
             problem.factors = plain * np.sqrt(colour)
-            here, more, done = _descend(problem, problem.at(here.chart), params.max_steps)
+            here, more, done = _descend(problem, problem.again(here), params.max_steps)
             steps += more
     P = _inverse(problem.normal(here)[0])
     return Fitted(here.chart, P, here.cost, here.d, here.weights, plain, colour, steps, done)

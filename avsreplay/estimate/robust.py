@@ -22,8 +22,9 @@ def weigh(chi2: Array, redescend: bool) -> tuple[Array, Array]:
 
 def colour_of(e: Array) -> float:
     """1 + 2 sum of autocorrelations of rows e (n, 3), over the lags that show most, where three sigma do."""
-    n, total = len(e), float(np.sum(e * e))
+    n, e = len(e), np.ascontiguousarray(e).reshape(-1)
+    total = float(e @ e)
     lags = [k for k in _LAGS if k <= n // 8]
-    rho = [float(np.sum(e[k:] * e[:-k])) / total * n / (n - k) for k in range(1, max(lags, default=0) + 1)]
+    rho = [float(e[3 * k :] @ e[: -3 * k]) / total * n / (n - k) for k in range(1, max(lags, default=0) + 1)]
     sums = [(sum(rho[:k]), 3.0 * np.sqrt(k / (3.0 * n))) for k in lags]
     return 1.0 + 2.0 * max((found for found, doubt in sums if found > doubt), default=0.0)
