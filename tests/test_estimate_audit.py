@@ -18,7 +18,6 @@ from avsreplay.estimate.drift import disturbed, memory_s
 from avsreplay.estimate.ekf import innovate
 from avsreplay.estimate.fit import FitParams, fit
 from avsreplay.estimate.layout import boxplus
-from avsreplay.estimate.motion import disturbance
 from avsreplay.estimate.params import Constraint, Start
 from avsreplay.estimate.relabel import nees
 from avsreplay.estimate.spread import spread
@@ -26,28 +25,10 @@ from avsreplay.estimate.start import PoseFix
 from avsreplay.monitor.consistency import Consistency, ConsistencyParams
 from avsreplay.records import Belief, State
 
-NEAR_1S = np.repeat([0.0025, 0.0025, 0.01, 0.001, 0.025, 0.025, 0.005], [3, 3, 3, 3, 2, 3, 3])
 POS_M, ROT_RAD = 0.005, np.radians(0.3)
 WHITE = EstimatorParams(correlated_share=0.0, start=Start.NEAR)
 DEAF = replace(WHITE, audit_poses=0, robust=False, constraint=Constraint.GAIN)  # the filter as printed
 BAND_20 = chi2.ppf([0.0005, 0.9995], 20)
-
-
-def pushed(seed: int, torque: float, seconds: float, hz: float) -> tuple[np.ndarray, list[State]]:
-    """A body under a random torque, integrated from its full tensor between the pushes."""
-    world = tumbling.draw(seed, seconds=1.0, hz=hz, sigma_max=0.85)
-    rng = np.random.Generator(np.random.PCG64([seed, 99]))
-    states = [world.states[0]]
-    for _ in range(round(seconds * hz)):
-        x = tumbling.follow(np.array([0.0, 1.0 / hz]), world.moments, states[-1])[-1]
-        push = np.array(disturbance(x.sigma)) * torque * rng.normal(size=3) / np.sqrt(hz)
-        states.append(replace(x, w_b=x.w_b + push))
-    return np.arange(len(states)) / hz, states
-
-
-def near(x: State, seed: int, wide: float = 1.0) -> Belief:
-    rng = np.random.Generator(np.random.PCG64([seed, 8]))
-    return Belief(0, boxplus(x, wide * NEAR_1S * rng.normal(size=20)), np.diag((wide * NEAR_1S) ** 2))
 
 
 def fold(
@@ -55,7 +36,7 @@ def fold(
 ) -> Iterator[Track]:
     """The track after each scan; ``wrong`` (index, pose) -> the pose that registration gives, all of them healthy."""
     rng = np.random.Generator(np.random.PCG64([seed, 7]))
-    estimator = Estimator(params, near(states[0], seed, wide) if params.start is Start.NEAR else None, 2.0)
+    estimator = Estimator(params, tumbling.near(states[0], seed, wide) if params.start is Start.NEAR else None, 2.0)
     track = estimator.initial(0, states[0].T_ac)
     for k, (t, x) in enumerate(zip(times, states, strict=True)):
         prediction = estimator.predict(track, round(t * 1e9))
@@ -170,9 +151,9 @@ def test_a_pushed_body_is_told_honestly(start: Start) -> None:
     """Ten times the default torque noise over 100 s; mean NEES of eight bodies, the fit's word or the filter's."""
     sizes = []
     for seed in range(8):
-        times, states = pushed(seed, 1e-5, 100.0, 2.0)
-        track = last(times, states, replace(WHITE, start=start, torque_noise_radps15=1e-5), seed)
-        sizes.append(nees(track.belief, states[-1]) / 20)
+        world = tumbling.pushed(seed, 1e-5, seconds=100.0, hz=2.0)
+        track = last(world.times, world.states, replace(WHITE, start=start, torque_noise_radps15=1e-5), seed)
+        sizes.append(nees(track.belief, world.states[-1]) / 20)
     assert np.median(sizes) < 1.4
     assert np.median(sizes) > 0.5
 
@@ -213,12 +194,12 @@ def test_a_belief_becomes_a_prior_by_its_draws() -> None:
     """Where it is narrow the derivative says the same; where two moments are nearly equal the axes count for more."""
     world = tumbling.draw(4, seconds=1.0)
     x = replace(world.states[0], sigma=np.array([-0.5, 0.4]))
-    P = np.diag(NEAR_1S**2) * 1e-4
+    P = np.diag(tumbling.NEAR_1S**2) * 1e-4
     back = np.linalg.inv(to_errors(to_chart(x)))
     scale = np.sqrt(np.diagonal(back @ P @ back.T))
     assert np.abs((given_prior(Belief(0, x, P)).P - back @ P @ back.T) / np.outer(scale, scale)).max() < 0.2
     near_equal = replace(x, sigma=np.array([-0.5, 0.001]))
-    P = np.diag(NEAR_1S**2)
+    P = np.diag(tumbling.NEAR_1S**2)
     back = np.linalg.inv(to_errors(to_chart(near_equal)))
     drawn, straight = given_prior(Belief(0, near_equal, P)).P, back @ P @ back.T
     assert np.linalg.eigvalsh(drawn[12:17, 12:17])[0] > 3.0 * np.linalg.eigvalsh(straight[12:17, 12:17])[0]

@@ -12,14 +12,13 @@ from scipy.stats import chi2
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, adapt, ekf
 from avsreplay.estimate.constrain import shrink
-from avsreplay.estimate.layout import boxminus, boxplus
+from avsreplay.estimate.layout import boxminus
 from avsreplay.estimate.measure import sensitivity
 from avsreplay.estimate.params import Adaptation, Constraint, NoiseSource
 from avsreplay.estimate.relabel import nees
 from avsreplay.geometry import Pose
 from avsreplay.records import Belief, Innovation, State
 
-NEAR_1S = np.repeat([0.0025, 0.0025, 0.01, 0.001, 0.025, 0.025, 0.005], [3, 3, 3, 3, 2, 3, 3])
 WHITE = np.ones(2)
 QUIET = EstimatorParams(torque_noise_radps15=1e-9, force_noise_mps15=1e-9, adapt=Adaptation.OFF, correlated_share=0.0)
 
@@ -107,11 +106,6 @@ def run(
         yield track, seen
 
 
-def near(world: tumbling.World, seed: int) -> Belief:
-    rng = np.random.Generator(np.random.PCG64([seed, 8]))
-    return Belief(0, boxplus(world.states[0], NEAR_1S * rng.normal(size=20)), np.diag(NEAR_1S**2))
-
-
 @pytest.mark.parametrize("constraint", Constraint)
 def test_consistent_from_a_near_start_over_many_runs(constraint: Constraint) -> None:
     """Mean NEES and NIS in their 99.9 % chi-square bands, truth from the full inertia tensor.
@@ -121,7 +115,8 @@ def test_consistent_from_a_near_start_over_many_runs(constraint: Constraint) -> 
     last, nis = [], []
     for seed in range(50 if constraint is Constraint.GAIN else 25):
         world = tumbling.draw(seed, seconds=40.0, hz=2.0, sigma_max=0.85)
-        for track, seen in run(world, near(world, seed), replace(QUIET, constraint=constraint), seed):  # noqa: B007
+        start, params = tumbling.near(world.states[0], seed), replace(QUIET, constraint=constraint)
+        for track, seen in run(world, start, params, seed):  # noqa: B007
             nis.append(seen.nis)
         last.append(nees(track.belief, world.states[-1]))
     low, high = chi2.ppf([0.0005, 0.9995], 20 * len(last)) / (20 * len(last))
@@ -132,7 +127,7 @@ def test_consistent_from_a_near_start_over_many_runs(constraint: Constraint) -> 
 
 def test_gamma_zero_leaves_the_prior_exactly() -> None:
     world = tumbling.draw(0, seconds=1.0)
-    estimator = Estimator(QUIET, near(world, 0), 1.0)
+    estimator = Estimator(QUIET, tumbling.near(world.states[0], 0), 1.0)
     track = estimator.initial(0, world.states[0].T_ac)
     prediction = estimator.predict(track, 500_000_000)
     alignment = tumbling.alignment(world.states[1].T_ac, np.random.Generator(np.random.PCG64(0)), 0.01, 0.01)
@@ -142,7 +137,7 @@ def test_gamma_zero_leaves_the_prior_exactly() -> None:
         assert faulty.window is track.window
         assert faulty.mode == "near"
     assert estimator.update(track, prediction, seen, 1).mode == "near"
-    plain = Estimator(replace(QUIET, constraint=Constraint.GAIN), near(world, 0), 1.0)
+    plain = Estimator(replace(QUIET, constraint=Constraint.GAIN), tumbling.near(world.states[0], 0), 1.0)
     assert plain.update(track, prediction, seen, 1).mode == "filter"
 
 
@@ -192,7 +187,7 @@ def test_a_wrong_noise_is_found(rule: Adaptation) -> None:
     """A registration that claims a quarter of its variance, or an R0 far off, ends near the true noise."""
     world = tumbling.draw(11, seconds=60.0, hz=5.0)
     params = EstimatorParams(adapt=rule, window=60, correlated_share=0.0, r0_pos_m=0.05, r0_rot_deg=3.0)
-    tracks = [track for track, _ in run(world, near(world, 11), params, 11, reported=0.25)]
+    tracks = [track for track, _ in run(world, tumbling.near(world.states[0], 11), params, 11, reported=0.25)]
     R = np.mean([np.diag(t.R) for t in tracks[100:]], axis=0)
     assert np.sqrt(R[:3].mean()) == pytest.approx(0.01, rel=0.12)
     assert np.sqrt(R[3:].mean()) == pytest.approx(np.radians(0.5), rel=0.12)
@@ -203,14 +198,16 @@ def test_scale_keeps_nis_honest_where_the_registration_lies() -> None:
     for seed in range(4):
         world = tumbling.draw(seed, seconds=60.0, hz=5.0)
         params = EstimatorParams(torque_noise_radps15=1e-9, force_noise_mps15=1e-9, correlated_share=0.0)
-        nis += [seen.nis for _, seen in run(world, near(world, seed), params, seed, reported=0.04)][60:]
+        nis += [seen.nis for _, seen in run(world, tumbling.near(world.states[0], seed), params, seed, reported=0.04)][
+            60:
+        ]
     assert np.mean(nis) / 6 == pytest.approx(1.0, abs=0.1)
 
 
 def burst(level: float, seconds: float = 20.0):
     """Noise up by ``level`` from 30 s on for ``seconds``; the factor the window finds after each scan."""
     world = tumbling.draw(12, seconds=80.0, hz=5.0)
-    estimator = Estimator(EstimatorParams(correlated_share=0.0), near(world, 12), 1.0)
+    estimator = Estimator(EstimatorParams(correlated_share=0.0), tumbling.near(world.states[0], 12), 1.0)
     track, rng = estimator.initial(0, world.states[0].T_ac), np.random.Generator(np.random.PCG64(12))
     for t, x in zip(world.times[1:], world.states[1:], strict=True):
         k = level if 30.0 <= t < 30.0 + seconds else 1.0
@@ -235,7 +232,7 @@ def test_a_burst_is_followed_within_a_window_and_left_again() -> None:
 
 def test_r0_is_used_where_asked_for() -> None:
     world = tumbling.draw(0, seconds=1.0)
-    estimator = Estimator(EstimatorParams(noise=NoiseSource.R0, r0_pos_m=0.3), near(world, 0), 1.0)
+    estimator = Estimator(EstimatorParams(noise=NoiseSource.R0, r0_pos_m=0.3), tumbling.near(world.states[0], 0), 1.0)
     prediction = estimator.predict(estimator.initial(0, world.states[0].T_ac), 500_000_000)
     alignment = tumbling.alignment(world.states[1].T_ac, np.random.Generator(np.random.PCG64(0)), 0.01, 0.01)
     assert np.sqrt(np.diag(estimator.innovate(prediction, alignment).R)[:3]) == pytest.approx(0.3)

@@ -12,8 +12,9 @@ from pathlib import Path
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.log.cursor import BadMessage
-from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.recording import CloudIndex, MessageTable, Sink, canonical_type
+from avsreplay.log.options import Loss
+from avsreplay.log.recording import MessageTable, Sink, canonical_type
+from avsreplay.log.tabled import Tabled
 from avsreplay.log.text import shown
 
 __all__ = ["SQLITE_MAGIC", "Db3File"]
@@ -26,7 +27,7 @@ _STEPS = 4096  # rows tried one by one behind a damaged page, before strides dou
 _MAX_ID = 1 << 62  # where the last one cannot be told: strides double, so it takes few steps
 
 
-class Db3File:
+class Db3File(Tabled):
     """One sqlite3 file of a ROS 2 bag, surveyed; a Recording.
 
     Args:
@@ -51,18 +52,6 @@ class Db3File:
         except _SQLITE as error:
             self._db.close()
             raise _unreadable(path, error) from None
-
-    def topics(self) -> list[TopicInfo]:
-        """Every topic, by name."""
-        return self._table.topics()
-
-    def clouds(self, topic: str) -> CloudIndex:
-        """The index of a cloud topic."""
-        return self._table.clouds(topic)
-
-    def encoding(self, topic: str) -> str:
-        """The serialisation a topic is stored in."""
-        return self._table.encoding(topic)
 
     def read(self, topic: str, place: int) -> bytes | memoryview:
         """The payload of a cloud. Raises BadMessage where it cannot be had."""

@@ -22,9 +22,10 @@ from avsreplay.log.mcap_channels import ChannelTable
 from avsreplay.log.mcap_records import Channel, Fields, Tap
 from avsreplay.log.mcap_resync import begins_record, first_chunk, hides_chunk, next_record
 from avsreplay.log.mcap_summary import Summary, read_summary
-from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.recording import MAX_NS, CloudIndex, MessageTable, Sink
+from avsreplay.log.options import Loss
+from avsreplay.log.recording import MAX_NS, MessageTable, Sink
 from avsreplay.log.surface import MODEL_ENDINGS
+from avsreplay.log.tabled import Chunked
 from avsreplay.log.text import shown
 
 __all__ = ["McapFile"]
@@ -35,7 +36,7 @@ _LEAST_CHUNK = 49
 _MAX_LOSSES = 10_000
 
 
-class McapFile:
+class McapFile(Chunked):
     """One MCAP file, surveyed; a Recording.
 
     Args:
@@ -76,29 +77,9 @@ class McapFile:
             self._file.close()
             raise
 
-    def topics(self) -> list[TopicInfo]:
-        """Every topic that has a message or a channel, by name."""
-        return self._table.topics()
-
     def channels(self) -> dict[int, Channel]:
         """Channels by id."""
         return dict(self._channels.by_id)
-
-    def clouds(self, topic: str) -> CloudIndex:
-        """The index of a cloud topic."""
-        return self._table.clouds(topic)
-
-    def encoding(self, topic: str) -> str:
-        """The message encoding of a topic."""
-        return self._table.encoding(topic)
-
-    def read(self, topic: str, place: int) -> bytes | memoryview:
-        """The payload of a cloud. Raises BadMessage where it cannot be had."""
-        index = self._table.clouds(topic)
-        chunk, offset, size = index.container[place], index.offset[place], index.size[place]
-        if chunk < 0:
-            return self._file.read(offset, size)
-        return memoryview(self._chunks[chunk])[offset : offset + size]
 
     def data_checksum_holds(self) -> bool:
         """Does the checksum over all records, which covers what no other one does, hold? True where there is none."""
@@ -115,10 +96,6 @@ class McapFile:
             return None
         name, offset, size = self._model
         return name, self._file.read(offset, size)
-
-    def close(self) -> None:
-        """Let go of the file."""
-        self._file.close()
 
     def _survey(self) -> None:
         if self._size == 0:

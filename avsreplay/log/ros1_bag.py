@@ -15,8 +15,9 @@ from avsreplay.log.byte_file import ByteFile
 from avsreplay.log.chunks import ChunkStore
 from avsreplay.log.cursor import BadMessage
 from avsreplay.log.mcap_records import ChunkHead, Fields
-from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.recording import CloudIndex, MessageTable, Sink, canonical_type
+from avsreplay.log.options import Loss
+from avsreplay.log.recording import MessageTable, Sink, canonical_type
+from avsreplay.log.tabled import Chunked
 
 __all__ = ["ROS1_MAGIC", "Ros1Bag"]
 
@@ -49,7 +50,7 @@ class _Record:
         return int.from_bytes(self.fields[name], "little")
 
 
-class Ros1Bag:
+class Ros1Bag(Chunked):
     """One ROS 1 bag, surveyed; a Recording.
 
     Args:
@@ -78,33 +79,9 @@ class Ros1Bag:
             self._file.close()
             raise
 
-    def topics(self) -> list[TopicInfo]:
-        """Every topic, by name."""
-        return self._table.topics()
-
-    def clouds(self, topic: str) -> CloudIndex:
-        """The index of a cloud topic."""
-        return self._table.clouds(topic)
-
-    def encoding(self, topic: str) -> str:
-        """Always ``ros1``."""
-        return self._table.encoding(topic)
-
-    def read(self, topic: str, place: int) -> bytes | memoryview:
-        """The payload of a cloud. Raises BadMessage where it cannot be had."""
-        index = self._table.clouds(topic)
-        offset, size = index.offset[place], index.size[place]
-        if index.container[place] < 0:
-            return self._file.read(offset, size)
-        return memoryview(self._chunks[index.container[place]])[offset : offset + size]
-
     def attachment(self) -> tuple[str, bytes] | None:
         """A bag carries no model."""
         return None
-
-    def close(self) -> None:
-        """Let go of the file."""
-        self._file.close()
 
     def _survey(self) -> None:
         stop = self._index_at()

@@ -7,39 +7,21 @@ is told the torque's root density. NEES per degree of freedom at 50, 100 and 150
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
 import numpy as np
 import tumbling
 
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.layout import boxplus
-from avsreplay.estimate.motion import disturbance
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.relabel import nees
-from avsreplay.records import Belief
 
 HZ, SECONDS, MARKS = 2.0, 150.0, (50.0, 100.0, 150.0)
-START_1S = np.repeat([0.0025, 0.0025, 0.01, 0.001, 0.025, 0.025, 0.005], [3, 3, 3, 3, 2, 3, 3])
-
-
-def pushed(seed: int, torque: float) -> tumbling.World:
-    """Integrated from the full tensor between the pushes."""
-    world = tumbling.draw(seed, seconds=1.0, hz=HZ, sigma_max=0.85)
-    rng = np.random.Generator(np.random.PCG64([seed, 99]))
-    states = [world.states[0]]
-    for _ in range(round(SECONDS * HZ)):
-        x = tumbling.follow(np.array([0.0, 1.0 / HZ]), world.moments, states[-1])[-1]
-        push = np.array(disturbance(x.sigma)) * torque * rng.normal(size=3) / np.sqrt(HZ)
-        states.append(replace(x, w_b=x.w_b + push))
-    return tumbling.World(np.arange(len(states)) / HZ, states, world.moments)
 
 
 def one(seed: int, torque: float, start: Start) -> list[float]:
     """NEES per degree of freedom at the marks."""
-    world, rng = pushed(seed, torque), np.random.Generator(np.random.PCG64([seed, 7]))
-    drawn = START_1S * np.random.Generator(np.random.PCG64([seed, 8])).normal(size=20)
-    given = Belief(0, boxplus(world.states[0], drawn), np.diag(START_1S**2))
+    world = tumbling.pushed(seed, torque, seconds=SECONDS, hz=HZ)
+    rng, given = np.random.Generator(np.random.PCG64([seed, 7])), tumbling.near(world.states[0], seed)
     params = EstimatorParams(torque_noise_radps15=torque, start=start, correlated_share=0.0)
     estimator = Estimator(params, given if start is Start.NEAR else None, 2.0)
     track, found = estimator.initial(0, world.states[0].T_ac), []

@@ -15,19 +15,14 @@ import numpy as np
 import tumbling
 
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.layout import boxplus
 from avsreplay.estimate.params import Constraint, Start
 from avsreplay.estimate.relabel import nees
-from avsreplay.records import Belief
-
-START_1S = np.repeat([0.0025, 0.0025, 0.01, 0.001, 0.025, 0.025, 0.005], [3, 3, 3, 3, 2, 3, 3])
 
 
 def one(seed: int, constraint: Constraint, fine: float, wide: float) -> float:
     """NEES per degree of freedom after 30 s."""
     world = tumbling.draw(seed, seconds=30.0, sigma_max=0.6)
-    drawn = np.random.Generator(np.random.PCG64([seed, 8])).normal(size=20)
-    start = Belief(0, boxplus(world.states[0], wide * START_1S * drawn), np.diag((wide * START_1S) ** 2))
+    start = tumbling.near(world.states[0], seed, wide)
     params = EstimatorParams(start=Start.NEAR, constraint=constraint, correlated_share=0.0, audit_poses=0)
     estimator, rng = Estimator(params, start, 2.0), np.random.Generator(np.random.PCG64([seed, 7]))
     track = estimator.initial(0, start.x.T_ac)

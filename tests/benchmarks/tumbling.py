@@ -7,14 +7,17 @@ calls the estimator's motion.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 from avsreplay import geometry
+from avsreplay.estimate.layout import boxplus
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, AlignStatus, State
+from avsreplay.records import Alignment, AlignStatus, Belief, State
+
+NEAR_1S = np.repeat([0.0025, 0.0025, 0.01, 0.001, 0.025, 0.025, 0.005], [3, 3, 3, 3, 2, 3, 3])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +95,24 @@ def follow(times: Array, moments: Array, start: State) -> list[State]:
         )
         for t, y in zip(times, path, strict=True)
     ]
+
+
+def pushed(seed: int, torque: float, *, seconds: float, hz: float) -> World:
+    """A body under a random torque of that root density, integrated from its full tensor between the pushes."""
+    world = draw(seed, seconds=1.0, hz=hz, sigma_max=0.85)
+    rng = np.random.Generator(np.random.PCG64([seed, 99]))
+    states = [world.states[0]]
+    for _ in range(round(seconds * hz)):
+        x = follow(np.array([0.0, 1.0 / hz]), world.moments, states[-1])[-1]
+        push = world.moments.sum() / world.moments * torque * rng.normal(size=3) / np.sqrt(hz)
+        states.append(replace(x, w_b=x.w_b + push))
+    return World(np.arange(len(states)) / hz, states, world.moments)
+
+
+def near(x: State, seed: int, wide: float = 1.0) -> Belief:
+    """A belief drawn about a state, ``wide`` times ``NEAR_1S`` wide: attitude 0.29 deg, sigma 0.025, mu 0.57 deg."""
+    drawn = wide * NEAR_1S * np.random.Generator(np.random.PCG64([seed, 8])).normal(size=20)
+    return Belief(0, boxplus(x, drawn), np.diag((wide * NEAR_1S) ** 2))
 
 
 def alignment(truth: Pose, rng: np.random.Generator, pos_m: float, rot_rad: float, reported: float = 1.0) -> Alignment:
