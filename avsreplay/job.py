@@ -16,17 +16,20 @@ from avsreplay import chain, settings
 from avsreplay.chain import Memory
 from avsreplay.config import Against, RunConfig, load_config
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.estimate.reference import Reference, reference_fit
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
 from avsreplay.estimate.relabel import nearest
+from avsreplay.estimate.start import PoseFix
 from avsreplay.geometry import Pose
 from avsreplay.log import Source, SourceOptions, open_source
 from avsreplay.records import Scan, State, Surface
-from avsreplay.report import Summary, row_poses
+from avsreplay.register import Registrar
+from avsreplay.report import Summary
 from avsreplay.report.summary import SummaryFold
 from avsreplay.rows import Row
 from avsreplay.wire import first_memory, stages
 
-__all__ = ["Job", "Listener", "Run", "replay"]
+__all__ = ["HealthyPoses", "Job", "Listener", "Run", "replay"]
 
 Listener = Callable[[Scan, Memory, Row], None]
 """Called after each scan: what keeps beliefs, truth, clouds and plans beside the rows."""
@@ -49,11 +52,29 @@ class Job:
     prefetch: int = 2
 
 
+class HealthyPoses:
+    """A listener that collects the healthy poses of a run, for a fit to all of them."""
+
+    def __init__(self, params: EstimatorParams) -> None:
+        """``params``: the estimator's, auto values filled in."""
+        self._params, self._fixes = params, list[PoseFix]()
+
+    def __call__(self, _scan: Scan, memory: Memory, row: Row) -> None:
+        """Take one scan."""
+        if row.gamma and memory.track is not None and memory.last is not None:
+            self._fixes.append(healthy_pose(memory.track, row.t_ns, memory.last, self._params))
+
+    def reference(self) -> Reference:
+        """The motion that fits them best. Raises UsageError where they are too few."""
+        return reference_of(self._fixes, self._params)
+
+
 class Run:
     """An open run; a context manager. ``rows`` may be taken once.
 
     Attributes:
         source: the open log.  config: the effective configuration.  surface: the model in force.
+        registrar: of that model.
     """
 
     def __init__(self, job: Job) -> None:
@@ -69,7 +90,9 @@ class Run:
             self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
             self.surface: Surface = self._model()
             self._reference: Reference | None = None
-            self._stages = stages(self.config, header, self.surface, self._true_poses())
+            self.registrar = Registrar(self.surface, self.config.register)
+            truth = self._true_poses()
+            self._stages = stages(self.config, header, self.surface, truth, self.registrar)
         except BaseException:
             self.source.close()
             raise
@@ -137,14 +160,15 @@ class Run:
         """What hindsight judges by: the log's truth, or the poses of a motion fitted in a first pass."""
         if self.config.reference is Against.TRUTH:
             return self.source.truth_poses()
-        ready = stages(self.config, self.source.header, self.surface)
-        rows = [row for _, _, row in chain.fold(ready, first_memory(ready), self.source.scans(self.job.prefetch))]
-        healthy = [row for row in rows if row.gamma]
-        poses = [pose for _, pose in row_poses(healthy, "registration")]
-        stamps = [row.t_ns for row in healthy]
-        self._reference = reference_fit(stamps, poses, None, self.surface.extent, self.config.estimator)
-        inside = [row.t_ns for row in rows if stamps[0] <= row.t_ns <= stamps[-1] and row.status != "clock"]
-        return [(t_ns, self._reference.at(t_ns).T_ac) for t_ns in sorted(set(inside))]
+        ready = stages(self.config, self.source.header, self.surface, registrar=self.registrar)
+        poses, stamps = HealthyPoses(ready.estimator.params), set[int]()
+        for scan, memory, row in chain.fold(ready, first_memory(ready), self.source.scans(self.job.prefetch)):
+            poses(scan, memory, row)
+            if row.status != "clock":
+                stamps.add(row.t_ns)
+        reference = self._reference = poses.reference()
+        inside = sorted(t_ns for t_ns in stamps if reference.epoch_ns <= t_ns <= reference.end_ns)
+        return [(t_ns, reference.at(t_ns).T_ac) for t_ns in inside]
 
     def _judged(self, scan: Scan) -> Scan:
         """The scan with the reference in place of its truth, where a reference is asked for."""

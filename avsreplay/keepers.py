@@ -18,7 +18,7 @@ from avsreplay.job import Listener
 from avsreplay.log.result_log import ResultFrame, ResultLog
 from avsreplay.plan.pilot import Leg
 from avsreplay.records import Belief, Scan, Surface
-from avsreplay.register.model import Model
+from avsreplay.register import Registrar
 from avsreplay.report import CloudView, PathView, View, row_poses, thin_cloud, thin_surface, write_layout, write_view
 from avsreplay.results import Beliefs, ResultDirectory, belief_of
 from avsreplay.rows import Row
@@ -88,9 +88,8 @@ class LogKeeper:
 class ViewKeeper:
     """Keeps a thinned model, thinned clouds and planned paths for the page."""
 
-    def __init__(self, surface: Surface) -> None:
-        self._surface, self._paths = surface, _Paths()
-        self._model = Model.build(surface, VIEW_REACH * surface.extent)
+    def __init__(self, surface: Surface, registrar: Registrar) -> None:
+        self._surface, self._registrar, self._paths = surface, registrar, _Paths()
         self._clouds: list[CloudView] = []
         self._plans: list[PathView] = []
 
@@ -103,9 +102,8 @@ class ViewKeeper:
             self._plans.append(PathView(row.t_ns, np.asarray(path[1], np.float32), row.hindsight_m))
 
     def _residual(self, points: NDArray[np.float32], T_ac: Pose) -> NDArray[np.float32]:
-        """Distance (n,) [m] of points (n, 3) in {A} to the model at the estimated pose, the reach at most."""
-        found = self._model.closest(T_ac.inverse().apply(points))
-        return np.sqrt(np.minimum(found.d2, self._model.reach_m**2)).astype(np.float32)
+        """Distance (n,) [m] of points (n, 3) in {A} to the model at the estimated pose."""
+        return self._registrar.distance(points, T_ac, VIEW_REACH * self._surface.extent).astype(np.float32)
 
     def view(self) -> View:
         """Everything kept so far."""
@@ -119,9 +117,9 @@ class ResultKeeper:
     The directory appears when the block ends well, after ``finish``, and not otherwise.
     """
 
-    def __init__(self, directory: ResultDirectory, surface: Surface) -> None:
+    def __init__(self, directory: ResultDirectory, surface: Surface, registrar: Registrar) -> None:
         self._directory, self._surface = directory, surface
-        self._beliefs, self._view = Beliefs(), ViewKeeper(surface)
+        self._beliefs, self._view = Beliefs(), ViewKeeper(surface, registrar)
 
     def __enter__(self) -> ResultKeeper:
         self._directory.__enter__()

@@ -25,17 +25,22 @@ from avsreplay.watch import Monitors, Watch
 __all__ = ["first_memory", "stages"]
 
 
-def stages(config: RunConfig, header: LogHeader, surface: Surface, truth: Sequence[tuple[int, Pose]] = ()) -> Stages:
-    """The chain for one log; ``truth`` (T_ac by instant) is for hindsight alone.
+def stages(
+    config: RunConfig,
+    header: LogHeader,
+    surface: Surface,
+    truth: Sequence[tuple[int, Pose]] = (),
+    registrar: Registrar | None = None,
+) -> Stages:
+    """The chain for one log; ``truth`` (T_ac by instant) is for hindsight alone. A ``registrar`` may serve again.
 
     Raises:
         UsageError: no first pose is to be had.  MissingBackend: the back end is not installed.
     """
-    registrar = Registrar(surface, config.register)
     start = header.start if config.init == "log" or config.estimator.start is Start.NEAR else None
     supervision = config.supervisor.resolved(surface.extent)
     return Stages(
-        registrar=registrar,
+        registrar=registrar or Registrar(surface, config.register),
         estimator=Estimator(config.estimator, start, surface.extent),
         detector=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),

@@ -62,10 +62,13 @@ def _job(log: Path, flags: dict[str, Any]) -> Any:
 
 
 def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
-    rows = list(run.rows())
-    reference = _reference(run, rows)
-    last = rows[-1].t_ns if len(rows) == 1 else max(row.t_ns for row in rows if row.gamma)
-    lines, ends = _summed([row for row in rows if reference.epoch_ns <= row.t_ns <= last], reference, run)
+    from avsreplay.job import HealthyPoses
+
+    poses = HealthyPoses(run.config.estimator.resolved(run.surface.extent))
+    rows = list(run.rows([poses]))
+    reference = poses.reference()
+    inside = [row for row in rows if reference.epoch_ns <= row.t_ns <= reference.end_ns]
+    lines, ends = _summed(inside, reference, run)
     keep = sorted({round(k * (len(lines) - 1) / (marks - 1)) for k in range(marks)})
     from avsreplay.estimate.variants import BLOCKS_OF
     from avsreplay.monitor.observability import weakest as in_words
@@ -76,18 +79,6 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
         "lines": [lines[k] for k in keep],
         "weakest": {name: list(in_words(end, weakest, BLOCKS_OF[name])) for name, end in ends.items()},
     }
-
-
-def _reference(run: Run, rows: list[Row]) -> Reference:
-    from avsreplay.estimate.reference import reference_fit
-    from avsreplay.geometry import Pose
-
-    healthy = [row for row in rows if row.gamma]
-    poses = [
-        Pose([row.reg_qx, row.reg_qy, row.reg_qz, row.reg_qw], [row.reg_x_m, row.reg_y_m, row.reg_z_m])  # type: ignore[arg-type]
-        for row in healthy
-    ]
-    return reference_fit([row.t_ns for row in healthy], poses, None, run.surface.extent, run.config.estimator)
 
 
 def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[str, Any]], dict[str, Gramian]]:

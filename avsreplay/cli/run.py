@@ -171,7 +171,7 @@ def _replayed(
     from avsreplay.keepers import ResultKeeper
     from avsreplay.rerun_stream import RerunStream
 
-    keeper = ResultKeeper(target, run.surface) if target else None
+    keeper = ResultKeeper(target, run.surface, run.registrar) if target else None
     viewer = RerunStream(run.surface) if to_rerun else None
     listeners: list[Listener] = [viewer] if viewer else []
     with keeper or nullcontext():

@@ -14,10 +14,11 @@ from avsreplay.estimate.cold import poses_of, prior_of, rough_state
 from avsreplay.estimate.fit import FitParams, Fitted, Poses, fit
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.start import PoseFix
+from avsreplay.estimate.track import Track
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
 
-__all__ = ["Reference", "reference_fit"]
+__all__ = ["Reference", "healthy_pose", "reference_fit", "reference_of"]
 
 _FEWEST = 4
 _FIRST_TURN = np.pi  # the window begins at half a turn and doubles
@@ -28,11 +29,13 @@ class Reference:
     """The motion that fits all poses best.
 
     Attributes:
-        fitted: the fit, residuals and all.  epoch_ns: its epoch, the first pose.  at: instant [ns] -> state.
+        fitted: the fit, residuals and all.  epoch_ns, end_ns: instants of the first and the last pose; in between
+            ``at``: instant [ns] -> state.
     """
 
     fitted: Fitted
     epoch_ns: int
+    end_ns: int
     at: Callable[[int], State]
 
 
@@ -55,16 +58,29 @@ def reference_fit(
     Raises:
         UsageError: fewer than four poses.
     """
+    settings = (params or EstimatorParams()).resolved(extent_m)
+    given = covariances or [_plain(settings)] * len(poses)
+    return reference_of([PoseFix(t, pose, C) for t, pose, C in zip(t_ns, poses, given, strict=True)], settings)
+
+
+def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference:
+    """Fit the whole of a log's poses, in time order; ``params`` with auto values filled in.
+
+    Raises:
+        UsageError: fewer than four poses.
+    """
     if len(poses) < _FEWEST:
         hint = "a reference needs four healthy poses at least"
         raise UsageError(f"only {len(poses)} poses to fit a reference to", where="--reference fit", hint=hint)
-    settings = (params or EstimatorParams()).resolved(extent_m)
-    fixes = tuple(
-        PoseFix(t, pose, C)
-        for t, pose, C in zip(t_ns, poses, covariances or [_plain(settings)] * len(poses), strict=True)
-    )
-    fitted = _grown(poses_of(fixes), to_chart(rough_state(fixes)), settings)
-    return Reference(fitted, fixes[0].t_ns, _motion(fitted.x, fixes[0].t_ns, fixes[-1].t_ns))
+    fixes = tuple(poses)
+    fitted = _grown(poses_of(fixes), to_chart(rough_state(fixes)), params)
+    first_ns, last_ns = fixes[0].t_ns, fixes[-1].t_ns
+    return Reference(fitted, first_ns, last_ns, _motion(fitted.x, first_ns, last_ns))
+
+
+def healthy_pose(track: Track, t_ns: int, T_ac: Pose, params: EstimatorParams) -> PoseFix:
+    """The pose a healthy scan gave, at its own instant and with its covariance where the track remembers it."""
+    return track.fixes[-1] if track.fixes else PoseFix(t_ns, T_ac, _plain(params))
 
 
 def _plain(params: EstimatorParams) -> Array:

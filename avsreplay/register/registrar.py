@@ -87,6 +87,11 @@ class Registrar:
         """
         return instants(self._model, self._view, points, times_s, T_ac.inverse(), self.limits.gate_m)
 
+    def distance(self, points: NDArray[Any], T_ac: Pose, most_m: float) -> Array:
+        """Distance (n,) [m] of points (n, 3) in {A} to the model at a pose, ``most_m`` or the reach at most."""
+        d2 = self._model.closest(T_ac.inverse().apply(points)).d2
+        return np.asarray(np.sqrt(np.minimum(d2, min(most_m, self._model.reach_m) ** 2)))
+
     def search(self, points: NDArray[Any]) -> Acquisition:
         """Best and second best pose of a scan (n, 3) in {A} [m], finite, n >= 1, and what can be said of them."""
         if self._acquirer is None:
