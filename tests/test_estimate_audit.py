@@ -203,3 +203,28 @@ def test_a_belief_becomes_a_prior_by_its_draws() -> None:
     back = np.linalg.inv(to_errors(to_chart(near_equal)))
     drawn, straight = given_prior(Belief(0, near_equal, P)).P, back @ P @ back.T
     assert np.linalg.eigvalsh(drawn[12:17, 12:17])[0] > 3.0 * np.linalg.eigvalsh(straight[12:17, 12:17])[0]
+
+
+@pytest.mark.parametrize("constraint", Constraint)
+def test_a_given_start_that_is_wrong_is_left_out(constraint: Constraint) -> None:
+    """Ten of its own sigma off: no confident wrong number is made of it, and the row says that it was contradicted."""
+    for seed in range(2):
+        world = tumbling.draw(seed, seconds=100.0, sigma_max=0.6)
+        false = replace(tumbling.near(world.states[0], seed), x=tumbling.near(world.states[0], seed, 10.0).x)
+        estimator = Estimator(replace(WHITE, constraint=constraint), false, 2.0)
+        track, rng = estimator.initial(0, false.x.T_ac), np.random.Generator(np.random.PCG64([seed, 7]))
+        for t, x in zip(world.times, world.states, strict=True):
+            prediction = estimator.predict(track, round(t * 1e9))
+            seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, POS_M, ROT_RAD))
+            track = estimator.update(track, prediction, seen, 1)
+        assert track.recalls == 1
+        assert nees(track.belief, x) < BAND_20[1]
+
+
+def test_a_right_start_is_kept() -> None:
+    for seed in range(6):
+        world = tumbling.draw(seed, seconds=30.0, sigma_max=0.85)
+        track = last(world.times, world.states, WHITE, seed)
+        assert track.recalls == 0
+        assert track.cold is not None
+        assert not track.cold.forsaken

@@ -12,11 +12,10 @@ import numpy as np
 
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
 from avsreplay.estimate.motion import advance, flow
+from avsreplay.estimate.robust import BOUND
 from avsreplay.records import Belief
 
 __all__ = ["contradicted", "start_at"]
-
-_BOUND = 52.4  # chi-square with 20 degrees of freedom, 99.99 %
 
 
 def start_at(belief: Belief, t_ns: int) -> Chart:
@@ -35,4 +34,4 @@ def contradicted(belief: Belief, fitted: Belief) -> bool:
     there = to_chart(fitted.x)
     T = to_errors(there)
     y = T @ to_chart(belief.x).minus(there)
-    return float(y @ np.linalg.solve(fitted.P, y)) > _BOUND
+    return float(y @ np.linalg.solve(fitted.P, y)) > BOUND

@@ -15,9 +15,10 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.drift import disturbed
-from avsreplay.estimate.fit import FitParams, Poses, Prior, fit
+from avsreplay.estimate.fit import FitParams, Fitted, Poses, Prior, cost, fit
 from avsreplay.estimate.layout import DIM, boxplus
 from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.robust import BOUND
 from avsreplay.estimate.spread import Spread, belief_at, spread
 from avsreplay.estimate.start import PoseFix, rates
 from avsreplay.geometry import Array
@@ -38,6 +39,7 @@ class ColdFit:
         epoch_ns: instant of the first pose.  chart: values there, where the next fit starts.  count: poses.
         factors, colour: (2,) noise factors and time correlation, of attitude and position.
         belief: at the last pose.  settled: may the filter take over.
+        forsaken: the poses contradict what was given, and it was left out.
     """
 
     epoch_ns: int
@@ -47,6 +49,7 @@ class ColdFit:
     colour: Array
     belief: Belief
     settled: bool
+    forsaken: bool = False
 
 
 def poses_of(fixes: tuple[PoseFix, ...]) -> Poses:
@@ -113,20 +116,37 @@ def refit(
     start: Chart | None = None,
     given: Prior | None = None,
 ) -> ColdFit:
-    """Fit all poses, from ``start`` or the last fit's values if there are any; ``given``: known at the first pose."""
+    """Fit all poses, from ``start`` or the last fit's values if there are any; ``given``: known at the first pose.
+
+    What is given is left out once the poses contradict it.
+    """
     poses = poses_of(fixes)
-    weak = prior_of(poses, params)
-    prior = weak if given is None else given
+    prior = weak = prior_of(poses, params)
     if start is None:
         start = to_chart(rough_state(fixes)) if last is None else last.chart
     rules = replace(rules, least_colour=params.colour(_mean_turn(poses), float(np.mean([f.share for f in fixes]))))
-    fitted = fit(poses, start, prior, rules, None if last is None else last.factors * np.sqrt(last.colour))
+    factors = None if last is None else last.factors * np.sqrt(last.colour)
+    fitted = fit(poses, start, weak, rules, factors)
+    forsaken = last is not None and last.forsaken
+    if given is not None and not forsaken:
+        joint = fit(poses, start, given, rules, factors)
+        forsaken = _contradicts(poses, fitted, weak, joint, given, rules)
+        fitted, prior = (fitted, weak) if forsaken else (joint, given)
     found = spread(poses, fitted, prior, rules)
     found = disturbed(found, poses, prior, rules, params.torque_noise_radps15, params.force)
     now_ns = fixes[-1].scan_ns
     belief = belief_at(found, now_ns, (now_ns - fixes[0].t_ns) * 1e-9)
     settled = _settled(found, weak)
-    return ColdFit(fixes[0].t_ns, fitted.chart, len(poses), fitted.factors, fitted.colour, belief, settled)
+    return ColdFit(fixes[0].t_ns, fitted.chart, len(poses), fitted.factors, fitted.colour, belief, settled, forsaken)
+
+
+def _contradicts(poses: Poses, fitted: Fitted, weak: Prior, joint: Fitted, given: Prior, rules: FitParams) -> bool:
+    """Do the poses, at the noise that they show by themselves, cost too much more with what is given than without it?
+
+    Where it is right, twice the difference is chi-square with 20 degrees of freedom at most.
+    """
+    alone = cost(poses, fitted.chart, weak, rules, fitted.effective)
+    return 2.0 * (cost(poses, joint.chart, given, rules, fitted.effective) - alone) > BOUND
 
 
 def _mean_turn(poses: Poses) -> float:

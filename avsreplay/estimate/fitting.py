@@ -39,7 +39,7 @@ class Fitting:
     Args:
         params: settings, auto values filled in.
         noise: the measurement noise in force.
-        start: the belief that is given, None where there is none.
+        start: the belief that is given, None where there is none. It is left out once the poses contradict it.
     """
 
     def __init__(self, params: EstimatorParams, noise: Noise, start: Belief | None) -> None:
@@ -63,6 +63,8 @@ class Fitting:
             moved = last is not None and last.epoch_ns != track.fixes[0].t_ns
             start = start_at(prediction.belief, track.fixes[0].t_ns) if moved else None
             cold = refit(track.fixes, self.params, self._rules, last, start, self._given(track.fixes[0].t_ns))
+            dropped = cold.forsaken and not (last is not None and last.forsaken)
+            track = replace(track, recalls=track.recalls + dropped)
             return self._adopted(track, cold, cold.settled and converged)
         if last.settled:
             return replace(track, belief=ekf.update_in_chart(prediction.belief, prediction.H, seen, last.colour))
@@ -81,7 +83,8 @@ class Fitting:
         if not self.audits or track.since < (_FEWEST_IN_DOUBT if track.window.doubtful else enough):
             return track
         epoch_ns = track.fixes[0].t_ns
-        begin, given = start_at(track.belief, epoch_ns), self._given(epoch_ns)
+        forsaken = track.cold is not None and track.cold.forsaken
+        begin, given = start_at(track.belief, epoch_ns), None if forsaken else self._given(epoch_ns)
         cold = refit(track.fixes, self.params, self._rules, start=begin, given=given)
         if (cold.settled or track.window.doubtful) and contradicted(track.belief, cold.belief):
             return replace(self._adopted(track, cold, cold.settled), recalls=track.recalls + 1)

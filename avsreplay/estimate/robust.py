@@ -1,4 +1,4 @@
-"""How much residuals say: weights beyond the gate, and what their correlation in time takes from the rest."""
+"""What is beyond belief, how much residuals say, and what their correlation in time takes from them."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import numpy as np
 
 from avsreplay.geometry import Array
 
-__all__ = ["GATE", "colour_of", "weigh"]
+__all__ = ["BOUND", "GATE", "colour_of", "weigh"]
 
-GATE = 27.86  # chi-square with 6 degrees of freedom, 99.99 %
+GATE = 27.86  # chi-square with 6 degrees of freedom, 99.99 %: a pose
+BOUND = 52.4  # the same with 20: a state
 _LAGS = (5, 10, 20, 40)
 
 

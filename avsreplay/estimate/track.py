@@ -27,7 +27,8 @@ class Track:
         sigma_hits: sigma bounds that cut the gain so far.  r_floors: eigenvalues of R raised so far.
         R: (6, 6) noise of the last healthy scan [m, half-angle], zero before it.
         fixes: healthy poses: all of them until the filter speaks, then the newest.  cold: the last fit that spoke.
-        since: healthy poses since the last fit was made.  recalls: how often a fit took the word from the filter.
+        since: healthy poses since the last fit was made.  recalls: how often a fit took the word from
+            the filter, or left out the given start.
         colour: (2,) the last fit's word on the poses' correlation in time, attitude and position; None before one.
     """
 

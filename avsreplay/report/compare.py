@@ -96,7 +96,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("mu_err_deg", "deg", "error of mu at the last scan", _parameter("mu")),
     Metric("sigma_hits", "", "times a sigma bound cut the gain", lambda s: s.sigma_hits),
     Metric("weighed_down", "", "healthy scans that kept less than their say", lambda s: s.weighed_down),
-    Metric("recalls", "", "times a fit took the filter's place", lambda s: s.recalls),
+    Metric("recalls", "", "times the poses contradicted the filter or the start", lambda s: s.recalls),
     Metric("nis_median", "", "median NIS (5.35 expected)", lambda s: s.nis.median if s.nis else None),
     Metric("nis_inside", "", "share of NIS inside its 95 % band", lambda s: s.nis.inside if s.nis else None),
     Metric("nees_median", "", "median NEES (19.34 expected)", lambda s: s.nees.median if s.nees else None),

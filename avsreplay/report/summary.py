@@ -72,7 +72,8 @@ class Summary:
     Attributes:
         pose_healthy, pose_coasting: of the estimate.  registration_healthy, registration_flagged: of the measurement.
         reasons: why scans were flagged.  status: what door and ruler found.  counts: handed in (losses, clock).
-        weighed_down: healthy scans that kept less than their whole say.  recalls: times a fit took the filter's place.
+        weighed_down: healthy scans that kept less than their whole say.  recalls: times the poses contradicted
+            the filter or the given start.
         coasts: runs without a measurement.  interval_s: median between scans.  gaps: longer than 1.5 times it.
     """
 

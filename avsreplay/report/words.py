@@ -99,7 +99,7 @@ def _filter_facts(summary: Summary) -> list[tuple[str, str]]:
         facts.append(("constraints", f"sigma bound hit {summary.sigma_hits} times{floors}"))
     if summary.recalls is not None:
         taken = f"{summary.weighed_down} healthy scans beyond belief, weighed down"
-        facts.append(("outliers", f"{taken}; a fit took the filter's place {summary.recalls} times"))
+        facts.append(("outliers", f"{taken}; the poses contradicted filter or start {summary.recalls} times"))
     seen = summary.observability
     if seen.rank is not None:
         full = "never full" if seen.full_rank_s is None else f"full from {seen.full_rank_s:.2f} s"
