@@ -59,7 +59,7 @@ class Fitting:
         if len(track.fixes) < _FEWEST_TO_FIT:
             return replace(track, belief=self._first(track, prediction, seen))
         last = track.cold
-        if last is None or track.since >= max(1.0, self.params.refit_growth * last.count):
+        if last is None or track.since >= max(1.0, self._growth(last) * last.count):
             moved = last is not None and last.epoch_ns != track.fixes[0].t_ns
             start = start_at(prediction.belief, track.fixes[0].t_ns) if moved else None
             cold = refit(track.fixes, self.params, self._rules, last, start, self._given(track.fixes[0].t_ns))
@@ -69,6 +69,10 @@ class Fitting:
         if last.settled:
             return replace(track, belief=ekf.update_in_chart(prediction.belief, prediction.H, seen, last.colour))
         return replace(track, belief=prediction.belief)
+
+    def _growth(self, last: ColdFit) -> float:
+        """Share by which the poses grow until the next fit; a normal likelihood is carried along well in between."""
+        return _AUDIT_GROWTH if last.settled else self.params.refit_growth
 
     def remembered(self, track: Track, prediction: Prediction, seen: Innovation) -> tuple[PoseFix, ...]:
         """The newest poses, for an audit of the filter."""

@@ -94,7 +94,7 @@ class EstimatorParams:
     correlated_rad: float = 0.4
     # how it begins: a given belief (near), the fit (cold), the paper's filter from zero (paper); auto: near where given
     start: Start = Start.AUTO
-    # cold: the fit is repeated when the healthy poses have grown by this share
+    # until a fit's likelihood is normal it is repeated when the healthy poses have grown by this share
     refit_growth: float = 0.05
     # how many healthy poses the filter is set against a fit to them; 0: never
     audit_poses: int = 1000
