@@ -145,9 +145,7 @@ class Row:
     r_rot_deg: float | None = _number("adapted measurement noise, attitude, root mean diagonal", "deg")
     sigma_hits: int | None = _flag("times a sigma bound cut the gain so far")
     r_floors: int | None = _flag("times an eigenvalue floor of R acted so far")
-    recalls: int | None = _flag(
-        "times the poses contradicted the filter or the given start so far"
-    )
+    recalls: int | None = _flag("times the poses contradicted the filter or the given start so far")
 
     ogm_log10_cond: float | None = column(
         "", ".1f", 1e-3, 1e-2, "log10 condition of the Gramian (null below full rank)", True

@@ -3,8 +3,8 @@
 Two rules. ``matrix`` is the paper's: R = mean of r r' + H P+ H', six by six, from R0's place. ``scale`` keeps the
 shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
 attitude, s^2 = mean of tr(R_b^-1 (r r' + H P+ H')) / 3 over the block: two numbers from a window instead of 21, so the
-window's own scatter does not spoil the consistency. The mean is weighted as the updates were: a wild
-pose is no noise.
+window's own scatter does not spoil the consistency. The mean is weighted as the updates were: a
+wild pose is no noise.
 """
 
 from __future__ import annotations

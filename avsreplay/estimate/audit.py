@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
-from avsreplay.estimate.motion import advance, flow
+from avsreplay.estimate.motion import moved
 from avsreplay.estimate.robust import BOUND
 from avsreplay.records import Belief
 
@@ -20,9 +20,8 @@ __all__ = ["contradicted", "start_at"]
 
 def start_at(belief: Belief, t_ns: int) -> Chart:
     """The belief's motion at another instant, where the fit begins."""
-    h = (t_ns - belief.t_ns) * 1e-9
-    x = belief.x
-    return to_chart(advance(x, flow(x.w_b, x.sigma, h), h))
+    there, _ = moved(belief.x, (t_ns - belief.t_ns) * 1e-9)
+    return to_chart(there)
 
 
 def contradicted(belief: Belief, fitted: Belief) -> bool:

@@ -1,9 +1,8 @@
 """Start without a belief: the rate from the first poses, then the fit over all of them, until the filter may go on.
 
-The fit is repeated each time the poses have grown by a stated share; in between the filter's update carries its belief
-along, in the chart's coordinates. The filter takes over, with the fit's own mean and covariance, once the likelihood is
-normal (``spread`` finds no bent direction) and the poses, not the prior, tell every direction. A body of which
-something can never be told stays with the fit.
+The fit is repeated each time the poses have grown by a stated share (``fitting`` says when). It has settled once its
+likelihood is normal (``spread`` finds no bent direction) and the poses, not the prior, tell every direction: then the
+filter may take over with the fit's mean and covariance. A body of which something can never be told stays with the fit.
 """
 
 from __future__ import annotations

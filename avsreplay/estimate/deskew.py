@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.estimate.arc import Path
 from avsreplay.estimate.estimator import Prediction
-from avsreplay.estimate.measure import sensitivity
-from avsreplay.estimate.motion import advance, flow, transition
+from avsreplay.estimate.measure import sensitivity, to_camera, to_fixture
+from avsreplay.estimate.motion import moved
 from avsreplay.geometry import Array
 from avsreplay.records import State
 
@@ -77,18 +77,13 @@ def late(prediction: Prediction, instants: Array, times_s: NDArray[Any]) -> Pred
         rest = (instants - lag_s * np.eye(6)) @ slope
         G = G + (instants - first * np.eye(6)) @ slope
         blur = rest @ prediction.belief.P @ rest.T
-    J = np.zeros((6, 6))
-    J[:3, 3:], J[3:, :3] = geometry.matrix(x.T_ac.q), 0.5 * geometry.matrix(x.q_bc)
-    return replace(prediction, H=J @ G, lag_s=lag_s, blur=blur)
+    return replace(prediction, H=to_camera(x.T_ac.q, x.q_bc) @ G, lag_s=lag_s, blur=blur)
 
 
 def _fixture_rows(x: State, h: float) -> Array:
     """(6, 20) error of the pose h seconds on, d = [theta; v] in {C} [rad, m], by the error states now."""
-    step = flow(x.w_b, x.sigma, h)
-    then = advance(x, step, h)
-    H = sensitivity(then) @ transition(step, x.sigma, h)
-    rows: Array = np.vstack([2.0 * geometry.matrix(x.q_bc).T @ H[3:], geometry.matrix(then.T_ac.q).T @ H[:3]])
-    return rows
+    then, Phi = moved(x, h)
+    return to_fixture(then.T_ac.q, x.q_bc) @ sensitivity(then) @ Phi
 
 
 def _back(x: State, knots: Array) -> tuple[Array, Array]:

@@ -25,7 +25,7 @@ def innovate(P: Array, H: Array, alpha: Array, R: Array, robust: bool = False, s
     half = min(1.0, float(np.sqrt(alpha[3:] @ alpha[3:])))
     distance = float(np.sqrt(alpha[:3] @ alpha[:3]))
     nis = float(alpha @ np.linalg.solve(S, alpha))
-    weight = min(1.0, GATE / nis) if robust and nis > GATE else 1.0
+    weight = GATE / nis if robust and nis > GATE else 1.0
     return Innovation(alpha, S, R, nis, distance, 2.0 * float(np.arcsin(half)), weight, share)
 
 

@@ -15,7 +15,7 @@ from avsreplay.estimate.cold import ColdFit, given_prior, refit
 from avsreplay.estimate.drift import memory_s
 from avsreplay.estimate.fit import FitParams, Prior
 from avsreplay.estimate.measure import in_fixture, measured_pose
-from avsreplay.estimate.motion import advance, flow
+from avsreplay.estimate.motion import moved
 from avsreplay.estimate.noise import Noise
 from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
 from avsreplay.estimate.spread import carried
@@ -60,8 +60,8 @@ class Fitting:
             return replace(track, belief=self._first(track, prediction, seen))
         last = track.cold
         if last is None or track.since >= max(1.0, self._growth(last) * last.count):
-            moved = last is not None and last.epoch_ns != track.fixes[0].t_ns
-            start = start_at(prediction.belief, track.fixes[0].t_ns) if moved else None
+            forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
+            start = start_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
             cold = refit(track.fixes, self.params, self._rules, last, start, self._given(track.fixes[0].t_ns))
             dropped = cold.forsaken and not (last is not None and last.forsaken)
             track = replace(track, recalls=track.recalls + dropped)
@@ -127,6 +127,6 @@ class Fitting:
         if prediction.blur is not None:
             C = C + prediction.blur
         if lag_ns:
-            h = lag_ns * 1e-9
-            pose = advance(x, flow(x.w_b, x.sigma, h), h).T_ac @ x.T_ac.inverse() @ pose
+            then, _ = moved(x, lag_ns * 1e-9)
+            pose = then.T_ac @ x.T_ac.inverse() @ pose
         return PoseFix(prediction.belief.t_ns + lag_ns, pose, C, lag_ns, seen.share)

@@ -14,7 +14,17 @@ from avsreplay.estimate.layout import DIM, DMU, DQ, RHO, hamilton, rotation
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, State
 
-__all__ = ["in_camera", "in_fixture", "innovation", "measured_pose", "noise_of", "residual", "sensitivity"]
+__all__ = [
+    "in_camera",
+    "in_fixture",
+    "innovation",
+    "measured_pose",
+    "noise_of",
+    "residual",
+    "sensitivity",
+    "to_camera",
+    "to_fixture",
+]
 
 Triple = tuple[float, float, float]
 Quad = tuple[float, float, float, float]
@@ -78,18 +88,30 @@ def noise_of(alignment: Alignment, x: State, free: tuple[float, float]) -> Array
 
 def in_camera(C: Array, q_ac: Array, q_bc: Array) -> Array:
     """R (6, 6) in metres in {A} and half angles in {B} from C (6, 6) of d = [theta; v] in {C}."""
-    J = np.zeros((6, 6))
-    J[:3, 3:], J[3:, :3] = rotation(q_ac), 0.5 * rotation(q_bc)
+    J = to_camera(q_ac, q_bc)
     R: Array = J @ C @ J.T
     return 0.5 * (R + R.T)
 
 
 def in_fixture(R: Array, q_ac: Array, q_bc: Array) -> Array:
     """``in_camera``'s inverse."""
-    J = np.zeros((6, 6))
-    J[:3, 3:], J[3:, :3] = 2.0 * rotation(q_bc).T, rotation(q_ac).T
+    J = to_fixture(q_ac, q_bc)
     C: Array = J @ R @ J.T
     return 0.5 * (C + C.T)
+
+
+def to_camera(q_ac: Array, q_bc: Array) -> Array:
+    """J (6, 6) from d = [theta; v] in {C} to metres in {A} and half angles in {B}."""
+    J = np.zeros((6, 6))
+    J[:3, 3:], J[3:, :3] = rotation(q_ac), 0.5 * rotation(q_bc)
+    return J
+
+
+def to_fixture(q_ac: Array, q_bc: Array) -> Array:
+    """``to_camera``'s inverse."""
+    J = np.zeros((6, 6))
+    J[:3, 3:], J[3:, :3] = 2.0 * rotation(q_bc).T, rotation(q_ac).T
+    return J
 
 
 def _seen(x: State, alpha: Array) -> tuple[Triple, Quad]:

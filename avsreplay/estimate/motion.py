@@ -24,6 +24,7 @@ __all__ = [
     "disturbance",
     "flow",
     "grasp_rows",
+    "moved",
     "process_noise",
     "propagate",
     "push",
@@ -136,6 +137,12 @@ def advance(x: State, step: Flow, h: float) -> State:
     """The state after a step."""
     q_ab = np.array(hamilton(x.q_ab.tolist(), step.q.tolist()))
     return State(q_ab, step.w, x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+
+
+def moved(x: State, h: float) -> tuple[State, Array]:
+    """The state h seconds on (either sign) without disturbance, and Phi (20, 20) of the way."""
+    step = flow(x.w_b, x.sigma, h)
+    return advance(x, step, h), transition(step, x.sigma, h)
 
 
 def propagate(belief: Belief, t_ns: int, torque: float, force: float) -> tuple[Belief, Array]:

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avsreplay.estimate.arc import arc
 from avsreplay.estimate.chart import Chart, to_chart, to_errors, to_state
 from avsreplay.estimate.fit import FitParams, Fitted, Pin, Poses, Prior, cost, pinned
-from avsreplay.estimate.layout import DIM, SIGMA
+from avsreplay.estimate.layout import DIM
+from avsreplay.estimate.motion import moved
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 
@@ -111,10 +111,5 @@ def belief_at(found: Spread, t_ns: int, after_s: float) -> Belief:
 
 def carried(chart: Chart, h: float) -> tuple[State, Array]:
     """The state h seconds on, and the derivative (20, 20) of its chart by the one at the epoch."""
-    x = to_state(chart)
-    path = arc(x, np.array([h]))
-    Phi = np.eye(DIM)
-    Phi[:6, :6], Phi[:6, SIGMA] = path.S[0, :, :6], path.S[0, :, 6:]
-    Phi[(6, 7, 8), (9, 10, 11)] = h
-    there = State(path.q[0], path.w[0], x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+    there, Phi = moved(to_state(chart), h)
     return there, np.asarray(np.linalg.solve(to_errors(to_chart(there)), Phi @ to_errors(chart)))

@@ -15,7 +15,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.estimate.layout import hamilton
 from avsreplay.estimate.measure import in_camera, sensitivity
-from avsreplay.estimate.motion import advance, flow, transition
+from avsreplay.estimate.motion import moved
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
@@ -53,13 +53,12 @@ def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
 def first_belief(fixes: tuple[PoseFix, ...], params: EstimatorParams) -> Belief:
     """The belief at the last pose's scan: rate and velocity from the last two, at rest from a single one."""
     last = fixes[-1]
-    x, back = _state(last.T_ac, *rates(fixes)), -last.lag_ns * 1e-9
-    x = advance(x, flow(x.w_b, x.sigma, back), back)
+    x, _ = moved(_state(last.T_ac, *rates(fixes)), -last.lag_ns * 1e-9)
     info = np.diag(params.start_1s**-2.0)
     for fix in fixes:
         h = (fix.t_ns - last.scan_ns) * 1e-9
-        step = flow(x.w_b, x.sigma, h)
-        H = sensitivity(advance(x, step, h)) @ transition(step, x.sigma, h)
+        then, Phi = moved(x, h)
+        H = sensitivity(then) @ Phi
         info += H.T @ np.linalg.solve(in_camera(fix.C, fix.T_ac.q, x.q_bc), H)
     P = np.linalg.inv(info)
     return Belief(last.scan_ns, x, 0.5 * (P + P.T))

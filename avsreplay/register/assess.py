@@ -6,7 +6,7 @@ n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over the inliers give everyt
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.facing import View
 from avsreplay.register.freedom import free_directions, loose_directions
-from avsreplay.register.model import Model
+from avsreplay.register.model import Closest, Model
 from avsreplay.register.params import Limits, RegisterParams
 
 __all__ = ["Evidence", "assess", "counted", "covariance", "evidence", "instants", "nothing"]
@@ -40,6 +40,7 @@ class Evidence:
             that face the camera where its place is known.  rms_m: of their distances.
         J: (k, 6) rows [p x n, n].  e: (k,) n . (p - foot) [m].  centre: (3,) centroid of the inliers.
         noise_m: 1 sigma of e, robust.  patch: (k,) number of the patch of the model that each inlier lies on.
+        normals, pulls: (m, 6, 6) and (m, 6) sums of J'J and of e J over each of the m patches.
     """
 
     points: int
@@ -50,21 +51,26 @@ class Evidence:
     centre: Array
     noise_m: float
     patch: NDArray[np.intp]
+    normals: Array = field(init=False)
+    pulls: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        normals, pulls = _patch_sums(self.J, self.e, self.patch)
+        object.__setattr__(self, "normals", normals)
+        object.__setattr__(self, "pulls", pulls)
 
 
 def evidence(
     model: Model, view: View, points: NDArray[Any], T_ca: Pose, gate_m: float, noise_m: float | None = None
 ) -> Evidence:
     """Gather it: ``points`` (n, 3) in {A} [m]; ``noise_m`` None estimates it from the residuals."""
-    moved = T_ca.apply(points)
-    found = model.closest(moved, camera_c=view.camera_c(model, points, T_ca))
-    near = found.d2 < gate_m**2
+    moved, found, near = _met(model, view, points, T_ca, gate_m)
     p, n = moved[near], found.normal[near]
     e = np.einsum("ij,ij->i", n, p - found.foot[near])
     count = len(p)
     rms = float(np.sqrt(found.d2[near].mean())) if count else float("nan")
     centre = p.mean(axis=0) if count else np.zeros(3)
-    J = np.hstack([np.cross(p, n), n])
+    J = _rows(p, n)
     noise = noise_m or _noise(e, gate_m)
     return Evidence(len(points), count, rms, J, e, centre, noise, _patches(p, PATCH_OF_EXTENT * model.extent_m))
 
@@ -75,15 +81,26 @@ def instants(model: Model, view: View, points: NDArray[Any], times_s: NDArray[An
     Point k, at ``times_s`` (n,), says J_k d(t_k), so the least squares give N^-1 (sum of t J'J) = M, N = J'J. What no
     inlier sees takes the mean of all times.
     """
-    moved = T_ca.apply(points)
-    found = model.closest(moved, camera_c=view.camera_c(model, points, T_ca))
-    near = found.d2 < gate_m**2
+    moved, found, near = _met(model, view, points, T_ca, gate_m)
     times = np.asarray(times_s, dtype=np.float64)
     mean = float(times.mean()) if len(times) else 0.0
-    p, n = moved[near], found.normal[near]
-    J = np.hstack([np.cross(p, n), n])
+    J = _rows(moved[near], found.normal[near])
     M: Array = mean * np.eye(6) + np.linalg.pinv(J.T @ J, hermitian=True) @ ((J.T * (times[near] - mean)) @ J)
     return M
+
+
+def _met(
+    model: Model, view: View, points: NDArray[Any], T_ca: Pose, gate_m: float
+) -> tuple[Array, Closest, NDArray[np.bool_]]:
+    """Points in {C} (n, 3), what of the model is closest to each, and which are inliers (n,)."""
+    moved = T_ca.apply(points)
+    found = model.closest(moved, camera_c=view.camera_c(model, points, T_ca))
+    return moved, found, found.d2 < gate_m**2
+
+
+def _rows(p: Array, n: Array) -> Array:
+    """J (k, 6) of points p and normals n (k, 3)."""
+    return np.hstack([np.cross(p, n), n])
 
 
 def _patches(p: Array, size_m: float) -> NDArray[np.intp]:
@@ -107,10 +124,9 @@ def covariance(found: Evidence) -> Array:
     patches are taken as independent. Without patch p, of sums N_p = J'J and g_p = sum of e J, d moves by
     (N - N_p)^-1 g_p = N^-1 (I - N_p N^-1)^-1 g_p: a patch that holds much shows more than its residuals.
     """
-    normals, g = _patch_sums(found)
-    bread = np.linalg.pinv(normals.sum(axis=0), hermitian=True)
-    left = (1.0 + ALONE) * np.eye(6) - normals @ bread
-    moved = np.linalg.solve(left, g[:, :, None])[:, :, 0] @ bread
+    bread = np.linalg.pinv(found.normals.sum(axis=0), hermitian=True)
+    left = (1.0 + ALONE) * np.eye(6) - found.normals @ bread
+    moved = np.linalg.solve(left, found.pulls[:, :, None])[:, :, 0] @ bread
     P: Array = moved.T @ moved
     return 0.5 * (P + P.T)
 
@@ -121,8 +137,7 @@ def counted(found: Evidence) -> Evidence:
     On a bare box the side that is hardly seen is held by a few points next to its edge, which may be its neighbour's.
     """
     while True:
-        normals, _ = _patch_sums(found)
-        share = normals @ np.linalg.pinv(normals.sum(axis=0), hermitian=True)
+        share = found.normals @ np.linalg.pinv(found.normals.sum(axis=0), hermitian=True)
         lone = np.trace(share, axis1=1, axis2=2) > LONE  # the largest eigenvalue is at most the trace
         lone[lone] = np.linalg.eigvals(share[lone]).real.max(axis=1, initial=0.0) > LONE
         keep = ~lone[found.patch]
@@ -132,16 +147,16 @@ def counted(found: Evidence) -> Evidence:
         found = replace(found, J=found.J[keep], e=found.e[keep], patch=patch)
 
 
-def _patch_sums(found: Evidence) -> tuple[Array, Array]:
+def _patch_sums(J: Array, e: Array, patch: NDArray[np.intp]) -> tuple[Array, Array]:
     """Sums of J'J (m, 6, 6) and of e J (m, 6) over each patch."""
-    J, count = found.J, int(found.patch.max(initial=-1)) + 1
+    count = int(patch.max(initial=-1)) + 1
     normals = np.empty((count, 6, 6))
     for a in range(6):
         for b in range(a + 1):
-            normals[:, a, b] = normals[:, b, a] = np.bincount(found.patch, J[:, a] * J[:, b], count)
+            normals[:, a, b] = normals[:, b, a] = np.bincount(patch, J[:, a] * J[:, b], count)
     g = np.empty((count, 6))
     for a in range(6):
-        g[:, a] = np.bincount(found.patch, J[:, a] * found.e, count)
+        g[:, a] = np.bincount(patch, J[:, a] * e, count)
     return normals, g
 
 
