@@ -1,0 +1,284 @@
+"""Measure the structure of the source code: size, share of imports, path of one scan, duplicate names, documentation.
+
+    python tests/benchmarks/structure.py                  # this checkout
+    python tests/benchmarks/structure.py --json           # the same for machines
+    python tests/benchmarks/structure.py --root CHECKOUT  # another checkout, for example an earlier version
+
+Definitions: a module is a Python file of the package. Code lines are lines without blanks, comments and docstrings. The
+import share counts the lines of import statements and of ``__all__`` over all lines. The path of one scan is what runs
+in the package between two rows of a replay of ``fixtures/tumble.mcap`` (reading, step, score and row; without threads
+of their own), as seen by ``sys.setprofile``; the figures are the median and the largest value over the scans. A
+duplicate is a public class or module-level function name that two modules define. Docstring coverage counts public
+functions, methods and classes with arguments beyond ``self`` that have an ``Args`` or ``Attributes`` section.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import collections
+import io
+import json
+import subprocess
+import sys
+import tokenize
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--root", type=Path, default=ROOT, help="the checkout to measure")
+    parser.add_argument("--json", action="store_true", help="one JSON document")
+    parser.add_argument("--scan-path", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.scan_path:
+        print(json.dumps(scan_path(options.root)))
+        return
+    found = sizes(options.root) | names(options.root) | docstrings(options.root) | settings(options.root)
+    found |= traced(options.root)
+    if options.json:
+        print(json.dumps(found, indent=1))
+        return
+    for key, value in found.items():
+        print(f"{key:<44} {value}")
+
+
+def modules(root: Path) -> list[Path]:
+    """The package's Python files in order."""
+    return sorted((root / "avsreplay").rglob("*.py"))
+
+
+def sizes(root: Path) -> dict:
+    """Modules, lines, code lines and the share of imports, in all and by package."""
+    total = code = imports = 0
+    longest = ("", 0)
+    packages: dict[str, list[int]] = collections.defaultdict(lambda: [0, 0])
+    importers: dict[str, set[str]] = collections.defaultdict(set)
+    known = {module_name(root, path): path for path in modules(root)}
+    for path in modules(root):
+        text = path.read_text(encoding="utf-8")
+        tree = ast.parse(text)
+        lines = text.count("\n")
+        total, code, imports = total + lines, code + code_lines(text, tree), imports + import_lines(tree)
+        longest = max(longest, (str(path.relative_to(root)), lines), key=lambda pair: pair[1])
+        parts = path.relative_to(root / "avsreplay").parts
+        package = packages[parts[0] if len(parts) > 1 else "root"]
+        package[0], package[1] = package[0] + 1, package[1] + lines
+        for name in imported(tree):
+            target = name if name in known else name.rpartition(".")[0]
+            if target in known:
+                importers[target].add(module_name(root, path))
+    single = sum(1 for name in known if len(importers[name]) == 1)
+    short = sum(1 for path in modules(root) if path.read_text(encoding="utf-8").count("\n") < 100)
+    return {
+        "modules": len(known),
+        "lines": total,
+        "code lines": code,
+        "lines of imports and __all__ [%]": round(100.0 * imports / total, 1),
+        "modules under 100 lines": short,
+        "modules with one importer": single,
+        "longest module": f"{longest[0]} ({longest[1]} lines)",
+        **{f"  {name} (modules, lines)": f"{n}, {k}" for name, (n, k) in sorted(packages.items())},
+    }
+
+
+def module_name(root: Path, path: Path) -> str:
+    """The dotted name of a file."""
+    parts = list(path.relative_to(root).with_suffix("").parts)
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imported(tree: ast.Module):
+    """Names of the package's modules and members that a module imports."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("avsreplay"):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.startswith("avsreplay"))
+
+
+def code_lines(text: str, tree: ast.Module) -> int:
+    """Lines with a token that is neither comment nor part of a docstring."""
+    skipped: set[int] = set()
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)):
+            first = node.body[0] if node.body else None
+            if (
+                isinstance(first, ast.Expr)
+                and isinstance(first.value, ast.Constant)
+                and isinstance(first.value.value, str)
+            ):
+                skipped.update(range(first.lineno, (first.end_lineno or first.lineno) + 1))
+    layout = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER)
+    used: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in layout:
+            used.update(range(token.start[0], token.end[0] + 1))
+    return len(used - skipped)
+
+
+def import_lines(tree: ast.Module) -> int:
+    """Lines of import statements and of ``__all__``."""
+    count = 0
+    for node in ast.walk(tree):
+        exported = isinstance(node, ast.Assign) and any(
+            isinstance(t, ast.Name) and t.id == "__all__" for t in node.targets
+        )
+        if exported or isinstance(node, (ast.Import, ast.ImportFrom)):
+            count += (node.end_lineno or node.lineno) - node.lineno + 1
+    return count
+
+
+def names(root: Path) -> dict:
+    """Public class and function names that two modules define."""
+    defined: dict[str, dict[str, set[str]]] = {"class": {}, "function": {}}
+    for path in modules(root):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            kind = (
+                "class" if isinstance(node, ast.ClassDef) else "function" if isinstance(node, ast.FunctionDef) else ""
+            )
+            if kind and not node.name.startswith("_"):
+                defined[kind].setdefault(node.name, set()).add(module_name(root, path))
+    found = {}
+    for kind, table in defined.items():
+        twice = sorted(name for name, places in table.items() if len(places) > 1)
+        found[f"duplicate {kind} names"] = f"{len(twice)} {', '.join(twice)}".strip()
+    return found
+
+
+def docstrings(root: Path) -> dict:
+    """Docstrings of public functions and methods: present, with Args, with Raises where they raise."""
+    public = documented = with_args = needs_args = raising = says_raises = 0
+    exported = exported_args = 0
+    api = exports(root)
+    for path in modules(root):
+        module = module_name(root, path)
+        for name, node in public_functions(ast.parse(path.read_text(encoding="utf-8"))):
+            text = ast.get_docstring(node) or ""
+            public += 1
+            documented += bool(text)
+            takes = any(a.arg not in ("self", "cls") for a in (*node.args.args, *node.args.kwonlyargs))
+            needs_args += takes
+            with_args += takes and "Args:" in text
+            if takes and (name in api or module == "avsreplay"):
+                exported += 1
+                exported_args += "Args:" in text
+            if any(isinstance(n, ast.Raise) for n in ast.walk(node)):
+                raising += 1
+                says_raises += "Raise" in text
+    return {
+        "public functions and methods": public,
+        "  with a docstring": documented,
+        "  with arguments": needs_args,
+        "  with arguments and an Args section": with_args,
+        "exported functions with arguments": exported,
+        "  with an Args section": exported_args,
+        "functions that raise": raising,
+        "  whose docstring says so": says_raises,
+    }
+
+
+def exports(root: Path) -> set[str]:
+    """Names in the ``__all__`` of the package and of its subpackages."""
+    found: set[str] = set()
+    for path in (root / "avsreplay").rglob("__init__.py"):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.Assign) and any(
+                isinstance(t, ast.Name) and t.id == "__all__" for t in node.targets
+            ):
+                found.update(c.value for c in ast.walk(node.value) if isinstance(c, ast.Constant))
+    return found
+
+
+def public_functions(tree: ast.Module):
+    """Public module-level functions and methods of public classes: (exported name, node)."""
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            yield node.name, node
+        elif isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            for method in node.body:
+                if isinstance(method, ast.FunctionDef) and (
+                    method.name == "__init__" or not method.name.startswith("_")
+                ):
+                    yield node.name, method
+
+
+def settings(root: Path) -> dict:
+    """Settings of a run, and those without a sentence of meaning."""
+    code = (
+        "import dataclasses, json\n"
+        "from avsreplay.config import RunConfig\n"
+        "from typing import get_type_hints\n"
+        "def walk(cls, prefix=''):\n"
+        "    hints = get_type_hints(cls)\n"
+        "    for f in dataclasses.fields(cls):\n"
+        "        inner = hints[f.name]\n"
+        "        if dataclasses.is_dataclass(inner): yield from walk(inner, prefix + f.name + '.')\n"
+        "        else: yield prefix + f.name, bool(f.metadata.get('doc') or f.metadata.get('meaning'))\n"
+        "print(json.dumps(list(walk(RunConfig))))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
+    if done.returncode:
+        return {"settings": "cannot be read: " + done.stderr.strip().splitlines()[-1]}
+    table = json.loads(done.stdout)
+    return {"settings of a run": len(table), "  without a declared meaning": sum(1 for _, said in table if not said)}
+
+
+def traced(root: Path) -> dict:
+    """The path of one scan, measured in a process of its own so that the right checkout is imported."""
+    command = [sys.executable, str(Path(__file__).resolve()), "--root", str(root.resolve()), "--scan-path"]
+    done = subprocess.run(command, cwd=root, capture_output=True, text=True, check=False, env=None)
+    if done.returncode:
+        return {"path of one scan": "cannot be traced: " + done.stderr.strip().splitlines()[-1]}
+    found: dict = json.loads(done.stdout)
+    return found
+
+
+def scan_path(root: Path) -> dict:
+    """Files, functions and calls of the package between two rows."""
+    sys.path.insert(0, str(root))
+    import avsreplay
+
+    package = str(root / "avsreplay")
+    rows = avsreplay.replay(root / "fixtures" / "tumble.mcap")
+    next(rows)
+    counts = []
+    while (count := calls_of_next(rows, package)) is not None:
+        counts.append(count)
+    median = [sorted(column)[len(counts) // 2] for column in zip(*counts, strict=True)]
+    most = [max(column) for column in zip(*counts, strict=True)]
+    labels = ("files", "functions", "calls", "depth")
+    return {f"one scan: {label} (median, most)": f"{a}, {b}" for label, a, b in zip(labels, median, most, strict=True)}
+
+
+def calls_of_next(rows, package: str):
+    """Files, functions, calls and depth of the package while the next row is made; None at the end."""
+    files: set[str] = set()
+    functions: set[tuple[str, int]] = set()
+    calls = depth = deepest = 0
+
+    def watch(frame, event, _arg):
+        nonlocal calls, depth, deepest
+        code = frame.f_code
+        if not code.co_filename.startswith(package):
+            return
+        if event == "call":
+            calls, depth = calls + 1, depth + 1
+            deepest = max(deepest, depth)
+            files.add(code.co_filename)
+            functions.add((code.co_filename, code.co_firstlineno))
+        elif event == "return":
+            depth -= 1
+
+    sys.setprofile(watch)
+    try:
+        row = next(rows, None)
+    finally:
+        sys.setprofile(None)
+    return None if row is None else (len(files), len(functions), calls, deepest)
+
+
+if __name__ == "__main__":
+    main()
