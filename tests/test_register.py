@@ -15,10 +15,10 @@ from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.assess import assess, evidence
 from avsreplay.register.facing import Camera, View, is_outward
 from avsreplay.register.freedom import free_directions
-from avsreplay.register.model import Model
 from avsreplay.register.proving import plate_scan, proving_pose, proving_surface, view
 from avsreplay.register.quaternion_fit import best_motion, horn_matrix
 from avsreplay.register.sampling import sample, thin
+from avsreplay.register.surface_index import SurfaceIndex
 
 RNG_SEED = 11
 
@@ -144,7 +144,7 @@ def test_a_back_ends_trouble_is_a_status(monkeypatch, surface: Surface, scan: np
 def test_information_is_the_curvature_of_the_cost(surface: Surface, registrar: Registrar, scan: np.ndarray) -> None:
     """J of the ruler against finite differences of the residuals, in d of T_ac_true = T_ac @ Exp(d)."""
     T_ac = proving_pose()
-    model = Model.build(surface, 0.5)
+    model = SurfaceIndex.build(surface, 0.5)
     base = evidence(model, View(surface), scan, T_ac.inverse(), 0.05)
     h = 1e-6
     for k in range(6):
@@ -174,7 +174,7 @@ def test_covariance_shrinks_with_points_and_grows_with_noise(surface: Surface, r
 def test_no_overlap_whatever_the_flag_says(surface: Surface, scan: np.ndarray) -> None:
     params = RegisterParams()
     far = Fit(Pose(proving_pose().inverse().q, np.full(3, 1e3)), 1, True)
-    found = assess(Model.build(surface, 0.5), View(surface), scan, far, params.limits(surface.extent), params)
+    found = assess(SurfaceIndex.build(surface, 0.5), View(surface), scan, far, params.limits(surface.extent), params)
     assert found.status is AlignStatus.NO_OVERLAP
     assert (found.inliers, found.covariance) == (0, None)
 
@@ -283,7 +283,7 @@ def test_outward_is_told_from_inward_open_and_cloud(surface: Surface) -> None:
 
 
 def test_the_camera_is_the_origin_where_it_can_be(surface: Surface, scan: np.ndarray) -> None:
-    model, T_ca = Model.build(surface, 0.5), proving_pose().inverse()
+    model, T_ca = SurfaceIndex.build(surface, 0.5), proving_pose().inverse()
     np.testing.assert_array_equal(View(surface).camera_c(model, scan, T_ca), T_ca.t)
     np.testing.assert_array_equal(View(surface, Camera.ORIGIN).camera_c(model, scan, T_ca), T_ca.t)
     assert View(surface, Camera.NONE).camera_c(model, scan, T_ca) is None
@@ -292,7 +292,7 @@ def test_the_camera_is_the_origin_where_it_can_be(surface: Surface, scan: np.nda
 
 
 def test_a_camera_inside_the_model_or_behind_the_measured_sides_is_not_believed(surface: Surface) -> None:
-    model, T_ca = Model.build(surface, 0.5), proving_pose().inverse()
+    model, T_ca = SurfaceIndex.build(surface, 0.5), proving_pose().inverse()
     near = view(surface, 3000, T_ca.t)
     assert View(surface).camera_c(model, near, Pose.identity()) is None
     behind = view(surface, 3000, -T_ca.t)  # the sides that a camera on the other side would see
@@ -322,7 +322,7 @@ def test_a_thin_panel_is_not_laid_on_its_back(offset: float) -> None:
 
 def test_samples_lie_on_the_surface_evenly_and_repeat(surface: Surface) -> None:
     points, normals = sample(surface, 5000)
-    found = Model.build(surface, 0.5).closest(points)
+    found = SurfaceIndex.build(surface, 0.5).closest(points)
     assert found.d2.max() < 1e-20
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))

@@ -19,11 +19,11 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register.horn import HornBackend
-from avsreplay.register.model import IcpParams, Model
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.port import Target
 from avsreplay.register.sampling import even, sample, without_strays
 from avsreplay.register.starts import VisibleCentres, attitudes
+from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 __all__ = ["Acquirer", "Acquisition", "Candidate"]
 
@@ -84,7 +84,7 @@ class Acquirer:
         self._extent = target.surface.extent
         self._points, self._normals = _drawn(target.surface)
         cloud = Surface(self._points, np.empty((0, 3), dtype=np.int32), target.surface.name, "")
-        self._cloud = Model.build(cloud, REACH_OF_EXTENT * self._extent, engine=target.model.engine)
+        self._cloud = SurfaceIndex.build(cloud, REACH_OF_EXTENT * self._extent)
         self._sided = target.view.sided
         self._centres = VisibleCentres(self._points, self._normals, self._extent)
         self._middle = self._points.mean(axis=0)

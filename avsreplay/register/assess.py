@@ -16,8 +16,8 @@ from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.facing import View
 from avsreplay.register.freedom import free_directions, loose_directions
-from avsreplay.register.model import Closest, Model
 from avsreplay.register.params import Limits, RegisterParams
+from avsreplay.register.surface_index import Closest, SurfaceIndex
 
 __all__ = ["Evidence", "assess", "counted", "covariance", "evidence", "instants", "nothing"]
 
@@ -61,7 +61,7 @@ class Evidence:
 
 
 def evidence(
-    model: Model, view: View, points: NDArray[Any], T_ca: Pose, gate_m: float, noise_m: float | None = None
+    model: SurfaceIndex, view: View, points: NDArray[Any], T_ca: Pose, gate_m: float, noise_m: float | None = None
 ) -> Evidence:
     """Gather it: ``points`` (n, 3) in {A} [m]; ``noise_m`` None estimates it from the residuals."""
     moved, found, near = _met(model, view, points, T_ca, gate_m)
@@ -75,7 +75,9 @@ def evidence(
     return Evidence(len(points), count, rms, J, e, centre, noise, _patches(p, PATCH_OF_EXTENT * model.extent_m))
 
 
-def instants(model: Model, view: View, points: NDArray[Any], times_s: NDArray[Any], T_ca: Pose, gate_m: float) -> Array:
+def instants(
+    model: SurfaceIndex, view: View, points: NDArray[Any], times_s: NDArray[Any], T_ca: Pose, gate_m: float
+) -> Array:
     """(6, 6) M [s]: a pose error d(t) = d0 + t d1 inside the scan is registered as d0 + M d1.
 
     Point k, at ``times_s`` (n,), says J_k d(t_k), so the least squares give N^-1 (sum of t J'J) = M, N = J'J. What no
@@ -90,7 +92,7 @@ def instants(model: Model, view: View, points: NDArray[Any], times_s: NDArray[An
 
 
 def _met(
-    model: Model, view: View, points: NDArray[Any], T_ca: Pose, gate_m: float
+    model: SurfaceIndex, view: View, points: NDArray[Any], T_ca: Pose, gate_m: float
 ) -> tuple[Array, Closest, NDArray[np.bool_]]:
     """Points in {C} (n, 3), what of the model is closest to each, and which are inliers (n,)."""
     moved = T_ca.apply(points)
@@ -161,7 +163,7 @@ def _patch_sums(J: Array, e: Array, patch: NDArray[np.intp]) -> tuple[Array, Arr
 
 
 def assess(
-    model: Model, view: View, points: NDArray[Any], fit: Fit, limits: Limits, params: RegisterParams
+    model: SurfaceIndex, view: View, points: NDArray[Any], fit: Fit, limits: Limits, params: RegisterParams
 ) -> Alignment:
     """Grade a back end's pose. No or too few inliers is NO_OVERLAP whatever the back end's flag says."""
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):

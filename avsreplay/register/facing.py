@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
-from avsreplay.register.model import Model
+from avsreplay.register.surface_index import SurfaceIndex
 
 __all__ = ["Camera", "View", "is_outward"]
 
@@ -48,7 +48,7 @@ class View:
         self._extent = surface.extent
         self.sided = camera is Camera.ORIGIN or (camera is Camera.AUTO and is_outward(surface))
 
-    def camera_c(self, model: Model, points: NDArray[Any], T_ca: Pose) -> Array | None:
+    def camera_c(self, model: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> Array | None:
         """(3,) the camera in {C} [m] where the test applies to this scan (n, 3) in {A} at this pose, else None."""
         if not (self.sided and self._clear(T_ca.t)):
             return None

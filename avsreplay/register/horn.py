@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Pose
 from avsreplay.records import Fit
-from avsreplay.register.model import IcpParams
 from avsreplay.register.port import Target
+from avsreplay.register.surface_index import IcpParams
 
 __all__ = ["HornBackend"]
 
@@ -18,11 +18,11 @@ PLANE_PASSES = 6
 
 
 class HornBackend:
-    """Ours: exact closest points on the model, one fused pass, the same bits for any number of threads.
+    """Exact closest points on the model, one fused pass, identical results for any number of threads.
 
-    Rejection and stopping are those of :class:`avsreplay.register.model.IcpParams`: the gate starts at ``reach_m``,
-    follows three times the last pass' rms and never goes under ``gate_m``. Where the camera's place is known
-    (``facing``), only faces that look at it are matched.
+    Rejection and stopping are those of :class:`~avsreplay.register.surface_index.IcpParams`: the gate starts at
+    ``reach_m``, follows three times the rms of the last pass and never goes below ``gate_m``. Where the position of the
+    camera is known, only faces that face it are matched.
     """
 
     name: ClassVar[str] = "horn"

@@ -20,8 +20,8 @@ from avsreplay.records import Fit, Surface
 
 if TYPE_CHECKING:
     from avsreplay.register.facing import View
-    from avsreplay.register.model import Model
     from avsreplay.register.params import Limits
+    from avsreplay.register.surface_index import SurfaceIndex
 
 __all__ = ["GROUP", "Availability", "Backend", "Target", "available", "build", "load", "names"]
 
@@ -33,7 +33,7 @@ class Target:
     """What a back end is built from: the surface in {C}, its exact index, the limits, and where the camera was."""
 
     surface: Surface
-    model: Model
+    model: SurfaceIndex
     limits: Limits
     view: View
 

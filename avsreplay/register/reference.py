@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Fit
-from avsreplay.register.model import Model
 from avsreplay.register.port import Target
 from avsreplay.register.quaternion_fit import best_motion
 
@@ -39,7 +38,7 @@ class ReferenceBackend:
 
     def __init__(self, target: Target) -> None:
         self._limits, self._view = target.limits, target.view
-        self._model = Model.build(target.surface, target.limits.reach_m, engine="reference")
+        self._model = target.model
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """See :class:`avsreplay.register.port.Backend`."""

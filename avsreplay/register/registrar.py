@@ -8,18 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.errors import MissingBackend
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register.acquire import Acquirer, Acquisition
 from avsreplay.register.assess import assess, instants, nothing
 from avsreplay.register.facing import View
 from avsreplay.register.freedom import turn_words
-from avsreplay.register.model import Model
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.port import Target, build, load
 from avsreplay.register.sampling import thin
 from avsreplay.register.second_look import look_again
+from avsreplay.register.surface_index import SurfaceIndex
 
 __all__ = ["Registrar"]
 
@@ -36,7 +35,7 @@ class Registrar:
         self.params = params or RegisterParams()
         self.limits = self.params.limits(surface.extent)
         factory = load(self.params.backend)  # before the index: a wrong name is said at once
-        self._model = _indexed(surface, self.limits.reach_m)
+        self._model = SurfaceIndex.build(surface, self.limits.reach_m)
         self._view = View(surface, self.params.camera)
         self._target = Target(surface, self._model, self.limits, self._view)
         self._backend = build(self.params.backend, factory, self._target)
@@ -117,11 +116,3 @@ class Registrar:
         except Exception:  # the one place that may: a library's trouble is a status, not the end of a replay
             return None
         return fit if finite else None
-
-
-def _indexed(surface: Surface, reach_m: float) -> Model:
-    """The exact index, in numpy where the C++ kernel is not built: the same feet, slower."""
-    try:
-        return Model.build(surface, reach_m)
-    except MissingBackend:
-        return Model.build(surface, reach_m, engine="reference")

@@ -3,8 +3,8 @@
     python tests/benchmarks/registration.py [--quick] [--model 100000] [--scan 10000] [--reps 7] [--only index,passes]
 
 The target is the built-in satellite; the scan is ray-cast from one side with 1 cm noise and a share of outliers.
-Model-side structures are built beforehand; GICP's scan covariances are part of its work. Peers that are not installed
-are left out and said so.
+Structures of the model are built beforehand; the scan covariances of GICP are part of its work. Peers that are not
+installed are left out and named.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ import numpy as np
 
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
-from avsreplay.register.model import IcpParams, Model
 from avsreplay.register.quaternion_fit import best_motion
+from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 from avsreplay.simulate import builtin_surface
 
 REACH_M = 0.3
@@ -128,7 +128,7 @@ def table(title: str, cases: dict[str, Case], truth: Pose, ours: str) -> None:
         print(f"{name:40} {times} {case.passes:7d} {deg:8.4f} {mm:8.3f}", flush=True)
 
 
-def ours(model: Model, scan: Array, guess: Pose, rule: IcpParams) -> Callable[[], tuple[Array, int]]:
+def ours(model: SurfaceIndex, scan: Array, guess: Pose, rule: IcpParams) -> Callable[[], tuple[Array, int]]:
     def run() -> tuple[Array, int]:
         r = model.icp(scan, guess, rule)
         return r.T_ca, r.iterations
@@ -240,7 +240,7 @@ def index(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
         clock, processor = [], []
         for _ in range(1 if args.quick else 3):
             start, busy = time.perf_counter(), time.process_time()
-            model = Model.build(target, reach)
+            model = SurfaceIndex.build(target, reach)
             clock.append(time.perf_counter() - start)
             processor.append(time.process_time() - busy)
         times = f"{statistics.median(clock):7.3f} s, processor {statistics.median(processor):7.3f} s"
@@ -249,7 +249,7 @@ def index(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
 
 def passes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
     """The same 20 point-to-point passes, with and without outliers."""
-    model, mesh = Model.build(cloud, REACH_M), Model.build(surface, REACH_M)
+    model, mesh = SurfaceIndex.build(cloud, REACH_M), SurfaceIndex.build(surface, REACH_M)
     points = cloud.vertices
     for outliers, deg, metres in ((0.05, 3.0, 0.05), (0.0, 3.0, 0.05), (0.0, 0.5, 0.01)):
         scan, truth = look(surface, args.scan, outliers, 3)
@@ -272,7 +272,7 @@ def passes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
 
 def converged(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
     """To converged: ours with the default rule, the peers with theirs."""
-    model, mesh = Model.build(cloud, REACH_M), Model.build(surface, REACH_M)
+    model, mesh = SurfaceIndex.build(cloud, REACH_M), SurfaceIndex.build(surface, REACH_M)
     points = cloud.vertices
     normals = model.closest(points).normal
     for outliers, deg, metres in ((0.0, 0.5, 0.01), (0.05, 3.0, 0.05)):
@@ -302,7 +302,7 @@ def speed(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
     scan, truth = look(surface, args.scan, 0.0, 3)
     guess = off(truth, 0.5, 0.01, 4)
     for name, target in (("cloud", cloud), ("mesh", surface)):
-        model = Model.build(target, REACH_M)
+        model = SurfaceIndex.build(target, REACH_M)
         still = Pose.from_matrix(model.icp(scan, guess, fixed(60)).T_ca)
         cases = {}
         for kind, n_plane in (("point", 0), ("plane", 20)):
@@ -315,7 +315,7 @@ def speed(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
     many, truth = look(surface, 50_000, 0.05, 3)
     guess = off(truth, 3.0, 0.05, 4)
     for name, target in (("cloud", cloud), ("mesh", surface)):
-        model = Model.build(target, REACH_M)
+        model = SurfaceIndex.build(target, REACH_M)
         cases = {f"{t} threads": Case(ours(model, many, guess, fixed(20, threads=t))) for t in (1, 2)}
         in_turn(cases, args.reps)
         gain = ratio(*(c.seconds for c in cases.values()))
@@ -325,7 +325,7 @@ def speed(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
 
 def views(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
     """Final errors over 12 sides of the target, ours and GICP's."""
-    mesh, points = Model.build(surface, REACH_M), cloud.vertices
+    mesh, points = SurfaceIndex.build(surface, REACH_M), cloud.vertices
     for outliers, deg, metres in ((0.0, 0.5, 0.01), (0.05, 3.0, 0.05)):
         errors: dict[str, list[tuple[float, float]]] = {}
         for side in range(3 if args.quick else 12):

@@ -1,8 +1,8 @@
-"""An index kept on disk, so that a large model is indexed once: named by what it was built from, trusted for nothing.
+"""Surface indices kept on disk, so that a large model is indexed once.
 
 A file is ``<key>.avsindex``: 8 bytes of magic, the SHA-256 of the payload, the payload. The key is the SHA-256 of the
-layout's number, the machine's byte order, the reach and the surface's vertices and faces, so a changed model, reach or
-version asks for another file. A file that is short, altered or of another make counts as not there.
+layout version, the byte order, the reach and the vertices and faces of the surface, so a changed model, reach or
+version uses another file. A file that is truncated, altered or of another kind is ignored.
 """
 
 from __future__ import annotations
@@ -19,13 +19,11 @@ from numpy.typing import NDArray
 from avsreplay.errors import UsageError
 from avsreplay.geometry import Array
 
-__all__ = ["path_of", "read", "write"]
-
 MAGIC = b"AVSINDEX"
 
 
 def path_of(folder: Path, layout: int, vertices: Array, faces: NDArray[np.int32], reach_m: float) -> Path:
-    """Where the index of this surface and reach belongs in ``folder``."""
+    """Return the file name of the index of this surface and reach in ``folder``."""
     key = hashlib.sha256(f"{layout} {sys.byteorder} {float(reach_m).hex()} {vertices.shape} {faces.shape}".encode())
     key.update(vertices.tobytes())
     key.update(faces.tobytes())
@@ -33,7 +31,7 @@ def path_of(folder: Path, layout: int, vertices: Array, faces: NDArray[np.int32]
 
 
 def read(path: Path) -> bytes | None:
-    """The payload, or None where there is no whole file."""
+    """Return the payload, or None if there is no complete, unchanged file."""
     try:
         data = path.read_bytes()
     except OSError:
@@ -44,7 +42,7 @@ def read(path: Path) -> bytes | None:
 
 
 def write(path: Path, payload: bytes) -> None:
-    """Write whole or not at all. Raises UsageError where the folder cannot be written to."""
+    """Write the file atomically. Raises UsageError if the folder cannot be written to."""
     try:
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem[:8], suffix=".part")
     except OSError as error:

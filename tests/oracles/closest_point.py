@@ -1,22 +1,21 @@
-"""The reference engine: numpy and scipy, plain and slow. What the C++ kernel must agree with.
+"""Closest points, the ICP loop and the normal equations in numpy and scipy: the oracle for the C++ extension.
 
-Closest point on a mesh: a triangle's distance is at least |q - centroid| - radius, so every triangle whose bound is
-under the exact distance of the best-bounded one is measured, and no other.
+Closest point on a mesh: the distance to a triangle is at least |q - centroid| - radius, so every triangle whose bound
+is below the exact distance of the triangle with the smallest bound is measured, and no other.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from avsreplay import geometry
-from avsreplay.geometry import Array
-
-__all__ = ["NORMAL_NEIGHBOURS", "ReferenceIndex", "cloud_normals", "foot_on_triangles"]
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Surface
+from avsreplay.register.surface_index import Closest, IcpParams, IcpResult, NormalEquations
 
 NORMAL_NEIGHBOURS = 10
 _CHUNK_PAIRS = 2_000_000
@@ -25,71 +24,51 @@ _MIN_INLIERS = 6
 _Search = Callable[[Array], tuple[Array, Array, NDArray[np.int32]]]
 
 
-class ReferenceIndex:
-    """Closest points, the ICP loop and the normal equations in numpy."""
+class OracleIndex:
+    """The methods of ``SurfaceIndex``, one plain line of numpy after the other."""
 
-    def __init__(
-        self,
-        vertices: Array,
-        faces: NDArray[np.int32],
-        kept: NDArray[np.int32],
-        reach_m: float,
-        threads: int,
-        portable: bool,
-        saved_in: Path | None,
-    ) -> None:
-        del threads, portable, saved_in
-        self._reach = reach_m
+    def __init__(self, surface: Surface, reach_m: float) -> None:
+        self.reach_m, self.extent_m = reach_m, surface.extent
+        vertices, faces = surface.vertices, surface.faces
         if len(faces):
-            corners = vertices[faces[kept]]
+            corners = vertices[faces]
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-            self._normals = normals / np.linalg.norm(normals, axis=1, keepdims=True)
-            self._corners: Array | None = corners
+            area2 = np.linalg.norm(normals, axis=1)
+            kept = np.flatnonzero(area2 > 0.0)
+            self._normals = normals[kept] / area2[kept, None]
+            self._corners: Array | None = corners[kept]
             self._tie = 1e-10 * (float(np.linalg.norm(np.ptp(vertices, axis=0))) + reach_m)
-            self._search: _Search = _MeshSearch(corners, self._normals, self._tie)
+            self._search: _Search = _MeshSearch(corners[kept], self._normals, self._tie)
             self._ids = kept
         else:
             self._corners = None
             self._normals = cloud_normals(vertices)
             self._search = _CloudSearch(vertices)
-            self._ids = np.arange(len(vertices), dtype=np.int32)
+            self._ids = np.arange(len(vertices))
 
-    nbytes = 0
-    restored = False
-
-    def closest(
-        self, points: NDArray[Any], threads: int, camera_c: Array | None
-    ) -> tuple[Array, Array, NDArray[np.int32], Array]:
-        """Feet (n, 3), squared distances (n,), ids (n,), normals (n, 3)."""
-        del threads
+    def closest(self, points: NDArray[Any], *, camera_c: ArrayLike | None = None) -> Closest:
+        """Closest points, as ``SurfaceIndex.closest``."""
         n = len(points)
         foot, normal = np.full((n, 3), np.nan), np.full((n, 3), np.nan)
         d2, ids = np.full(n, np.inf), np.full(n, -1, dtype=np.int32)
         good = np.flatnonzero(np.isfinite(points).all(axis=1))
-        f, d, i = self._near(points[good].astype(np.float64), camera_c)
+        f, d, i = self._near(points[good].astype(np.float64), None if camera_c is None else np.asarray(camera_c))
         near = np.flatnonzero(i >= 0)
         rows = good[near]
         foot[rows], d2[rows], ids[rows], normal[rows] = f[near], d[near], self._ids[i[near]], self._normals[i[near]]
-        return foot, d2, ids, normal
+        return Closest(foot, d2, ids, normal)
 
-    def icp(
-        self,
-        points: NDArray[Any],
-        T_ca: Array,
-        rule: tuple[int, int, float, float, float, float, float],
-        threads: int,
-        keep: bool,
-        facing: bool,
-    ) -> tuple[Any, ...]:
-        """The loop of ``Model.icp``; ``rule`` is (n_max, n_plane, gate, tighten, floor, eps_rad, eps_m)."""
-        del threads, keep
-        n_max, n_plane, gate, tighten, floor, eps_rad, eps_m = rule
-        finite = np.isfinite(points).all(axis=1)
-        scan = points[finite].astype(np.float64)
-        T, plane, done, passes = T_ca.copy(), n_plane > 0, False, 0
+    def icp(self, points: NDArray[Any], T_ca: Pose, params: IcpParams | None = None) -> IcpResult:
+        """The loop of ``SurfaceIndex.icp``."""
+        rule = params or IcpParams()
+        gate = min(self.reach_m, self.reach_m if rule.gate_m is None else rule.gate_m)
+        floor = self.extent_m / 500.0 if rule.floor_m is None else rule.floor_m
+        eps_m = 1e-6 * self.extent_m if rule.eps_m is None else rule.eps_m
+        scan = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        T, plane, done, passes = T_ca.matrix.copy(), rule.n_plane > 0, False, 0
         inliers, rms, turn, move = 0, float("nan"), float("inf"), float("inf")
-        while passes < n_max and not done:
-            p, foot, normal, d2 = self._matched(scan, T, gate, facing)
+        while passes < rule.n_max and not done:
+            p, foot, normal, d2 = self._matched(scan, T, gate, rule.facing)
             passes += 1
             inliers = len(p)
             rms = float(np.sqrt(np.mean(d2))) if inliers else float("nan")
@@ -97,25 +76,27 @@ class ReferenceIndex:
                 break
             D, turn, move = _plane_step(p, foot, normal) if plane else _horn_step(p, foot)
             T = D @ T
-            tighter = min(gate, max(floor, tighten * rms)) if tighten > 0.0 else gate
-            small = turn < eps_rad and move < eps_m and tighter >= 0.99 * gate
+            tighter = min(gate, max(floor, rule.tighten * rms)) if rule.tighten > 0.0 else gate
+            small = turn < rule.eps_rad and move < eps_m and tighter >= 0.99 * gate
             gate, done = tighter, small and not plane
-            plane = plane and passes < n_plane and not small
-        searched = passes * len(scan)
-        return T, passes, done, inliers, rms, gate, turn, move, len(points) - len(scan), searched
+            plane = plane and passes < rule.n_plane and not small
+        ignored, searched = len(points) - len(scan), passes * len(scan)
+        return IcpResult(T, passes, done, inliers, rms, gate, turn, move, ignored, searched)
 
     def normal_equations(
-        self, points: NDArray[Any], T_ca: Array, gate_m: float, threads: int, facing: bool
-    ) -> tuple[Array, Array, int, float, float, int, int]:
-        """Sums of ``Model.normal_equations``."""
-        del threads
+        self, points: NDArray[Any], T_ca: ArrayLike | Pose, gate_m: float | None = None, *, facing: bool = False
+    ) -> NormalEquations:
+        """Sums of ``SurfaceIndex.normal_equations``."""
+        T = T_ca.matrix if isinstance(T_ca, Pose) else np.asarray(T_ca)
+        gate = self.reach_m if gate_m is None else min(gate_m, self.reach_m)
         scan = points[np.isfinite(points).all(axis=1)].astype(np.float64)
-        p, foot, normal, d2 = self._matched(scan, T_ca, gate_m, facing)
+        p, foot, normal, d2 = self._matched(scan, T, gate, facing)
         J, e = np.hstack([np.cross(p, normal), normal]), np.sum((foot - p) * normal, axis=1)
-        return J.T @ J, J.T @ e, len(p), float(e @ e), float(np.sum(d2)), len(scan), len(points) - len(scan)
+        ignored = len(points) - len(scan)
+        return NormalEquations(J.T @ J, J.T @ e, len(p), float(e @ e), float(np.sum(d2)), len(scan), ignored)
 
     def _near(self, p: Array, camera_c: Array | None) -> tuple[Array, Array, NDArray[np.int32]]:
-        """Foot, d2 and index into the primitives; -1 at the reach or farther."""
+        """Closest point, squared distance and index into the primitives; -1 at the reach or farther."""
         if camera_c is None or self._corners is None:
             foot, d2, i = self._search(p)
         else:
@@ -124,7 +105,7 @@ class ReferenceIndex:
                 return np.zeros_like(p), np.full(len(p), np.inf), np.full(len(p), -1, dtype=np.int32)
             foot, d2, i = _MeshSearch(self._corners[seen], self._normals[seen], self._tie)(p)
             i = seen[i].astype(np.int32)
-        return foot, d2, np.where(d2 < self._reach**2, i, -1).astype(np.int32)
+        return foot, d2, np.where(d2 < self.reach_m**2, i, -1).astype(np.int32)
 
     def _matched(self, scan: Array, T_ca: Array, gate: float, facing: bool) -> tuple[Array, Array, Array, Array]:
         p = scan @ T_ca[:3, :3].T + T_ca[:3, 3]
@@ -179,7 +160,7 @@ class _MeshSearch:
 def foot_on_triangles(p: Array, corners: Array) -> Array:
     """Nearest point of triangle k to p[k]. (n, 3) x (n, 3, 3) -> (n, 3).
 
-    The foot in the plane where it falls inside, else the nearest of the feet on the three edges.
+    The projection onto the plane where it falls inside, else the nearest of the closest points on the three edges.
     """
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     n = np.cross(b - a, c - a)
@@ -200,7 +181,7 @@ def _foot_on_edge(p: Array, u: Array, v: Array) -> Array:
 
 
 def cloud_normals(points: Array, neighbours: int = NORMAL_NEIGHBOURS) -> Array:
-    """Least direction of each point's nearest ``neighbours`` (itself among them). (n, 3) -> (n, 3) unit, sign free."""
+    """Direction of least scatter of the ``neighbours`` nearest points, itself included. (n, 3) -> (n, 3), any sign."""
     from scipy.spatial import cKDTree
 
     k = min(neighbours, len(points))

@@ -11,7 +11,7 @@ import pytest
 from avsreplay.errors import UsageError
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
-from avsreplay.register.model import Model
+from avsreplay.register.surface_index import SurfaceIndex
 
 kernel = pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
 
@@ -29,7 +29,7 @@ def surface(request: pytest.FixtureRequest) -> Surface:
     return Surface(vertices, faces, "test", "")
 
 
-def answers(model: Model) -> bytes:
+def answers(model: SurfaceIndex) -> bytes:
     found = model.closest(rng(2).uniform(-3, 3, (2000, 3)))
     arrays: list[Array] = [found.foot, found.d2, found.normal]
     return found.id.tobytes() + b"".join(a.tobytes() for a in arrays)
@@ -41,39 +41,39 @@ def saved(folder: Path) -> Path:
 
 
 def test_a_restored_index_answers_to_the_bit(surface: Surface, tmp_path: Path) -> None:
-    built = Model.build(surface, 0.5, saved_in=tmp_path)
-    restored = Model.build(surface, 0.5, saved_in=tmp_path)
+    built = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
+    restored = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     assert (built.restored, restored.restored) == (False, True)
-    assert answers(built) == answers(restored) == answers(Model.build(surface, 0.5))
+    assert answers(built) == answers(restored) == answers(SurfaceIndex.build(surface, 0.5))
     assert saved(tmp_path).suffix == ".avsindex"
 
 
 def test_another_reach_or_surface_is_another_file(surface: Surface, tmp_path: Path) -> None:
-    Model.build(surface, 0.5, saved_in=tmp_path)
+    SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     moved = Surface(surface.vertices + 1e-9, surface.faces, "test", "")
-    assert not Model.build(surface, np.nextafter(0.5, 1), saved_in=tmp_path).restored
-    assert not Model.build(moved, 0.5, saved_in=tmp_path).restored
+    assert not SurfaceIndex.build(surface, np.nextafter(0.5, 1), cache_dir=tmp_path).restored
+    assert not SurfaceIndex.build(moved, 0.5, cache_dir=tmp_path).restored
     assert len(list(tmp_path.iterdir())) == 3
 
 
 @pytest.mark.parametrize("harm", ["short", "empty", "flipped", "longer", "magic"])
 def test_a_harmed_file_is_built_anew(surface: Surface, tmp_path: Path, harm: str) -> None:
-    want = answers(Model.build(surface, 0.5, saved_in=tmp_path))
+    want = answers(SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path))
     path = saved(tmp_path)
     data = bytearray(path.read_bytes())
     if harm == "flipped":
         data[len(data) // 2] ^= 1
     changed = {"short": data[:-1], "empty": b"", "longer": data + b"\0", "magic": b"X" + data[1:]}.get(harm, data)
     path.write_bytes(bytes(changed))
-    again = Model.build(surface, 0.5, saved_in=tmp_path)
+    again = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     assert not again.restored
     assert answers(again) == want
-    assert Model.build(surface, 0.5, saved_in=tmp_path).restored
+    assert SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path).restored
 
 
 def test_no_payload_leads_a_search_astray(surface: Surface, tmp_path: Path) -> None:
     """Payloads with a right checksum but random words in them: refused, or searched without leaving the arrays."""
-    Model.build(surface, 0.5, saved_in=tmp_path)
+    SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     path = saved(tmp_path)
     good = path.read_bytes()[40:]
     r = rng(3)
@@ -83,7 +83,7 @@ def test_no_payload_leads_a_search_astray(surface: Surface, tmp_path: Path) -> N
         for at in r.integers(0, len(good) // 4, size=r.integers(1, 40)):
             bad[4 * at : 4 * at + 4] = r.integers(0, 2**32, dtype=np.uint32).tobytes()
         path.write_bytes(b"AVSINDEX" + hashlib.sha256(bad).digest() + bad)
-        model = Model.build(surface, 0.5, saved_in=tmp_path)
+        model = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
         restored += model.restored
         assert len(answers(model)) == len(answers(model))
     assert restored < 40
@@ -91,4 +91,4 @@ def test_no_payload_leads_a_search_astray(surface: Surface, tmp_path: Path) -> N
 
 def test_a_folder_that_is_not_there_is_said(surface: Surface, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="not saved"):
-        Model.build(surface, 0.5, saved_in=tmp_path / "none")
+        SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path / "none")

@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles.closest_point import OracleIndex
 
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
-from avsreplay.register.model import IcpParams, Model
+from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 kernel = pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
 scipy_spatial = pytest.importorskip("scipy.spatial")
@@ -96,7 +97,7 @@ def test_nearest_point_is_that_of_a_kd_tree(name: str) -> None:
     points = clouds()[name]
     extent = max(float(np.linalg.norm(np.ptp(points, axis=0))), 0.1)
     reach = 0.4 * extent
-    model = Model.build(surface(points), reach)
+    model = SurfaceIndex.build(surface(points), reach)
     low, high = points.min(0) - 1.2 * reach, points.max(0) + 1.2 * reach
     q = np.concatenate([rng(2).uniform(low, high, (8000, 3)), adversarial(points, 3, 300)])
     found = model.closest(q)
@@ -110,7 +111,7 @@ def test_nearest_point_is_that_of_a_kd_tree(name: str) -> None:
 
 def test_the_lower_index_wins_a_tie() -> None:
     points = np.repeat(rng(4).standard_normal((500, 3)), 3, axis=0)[rng(5).permutation(1500)]
-    found = Model.build(surface(points), 1.0).closest(points)
+    found = SurfaceIndex.build(surface(points), 1.0).closest(points)
     first = np.array([np.flatnonzero((points == p).all(1))[0] for p in points])
     assert np.array_equal(found.id, first)
 
@@ -119,7 +120,7 @@ def test_the_lower_index_wins_a_tie() -> None:
 def test_nearest_triangle_is_that_of_a_full_search(n: int, size: float) -> None:
     mesh = soup(n, seed=n, size=size)
     reach = 0.35
-    model = Model.build(mesh, reach)
+    model = SurfaceIndex.build(mesh, reach)
     corners = mesh.vertices[mesh.faces]
     q = np.concatenate([rng(6).uniform(-1.6, 1.6, (300, 3)), adversarial(mesh.vertices, 7, 60)])
     found = model.closest(q)
@@ -138,7 +139,7 @@ def test_nearest_triangle_is_that_of_a_full_search(n: int, size: float) -> None:
 def test_the_foot_is_on_its_triangle_and_nowhere_nearer_point_is_found() -> None:
     """Optimality: no random convex combination of any triangle's corners is nearer."""
     mesh = soup(200, seed=8)
-    model = Model.build(mesh, 1.0)
+    model = SurfaceIndex.build(mesh, 1.0)
     q = rng(9).uniform(-1.5, 1.5, (300, 3))
     found = model.closest(q)
     inside = rng(10).dirichlet(np.ones(3), size=(200, 50))
@@ -149,10 +150,10 @@ def test_the_foot_is_on_its_triangle_and_nowhere_nearer_point_is_found() -> None
     assert (np.sqrt(found.d2[near]) <= least + 1e-12).all()
 
 
-def test_both_engines_find_the_same_feet_on_the_built_in_like_mesh() -> None:
+def test_kernel_and_oracle_find_the_same_closest_points_on_the_built_in_like_mesh() -> None:
     mesh = soup(400, seed=11)
     q = np.concatenate([rng(12).uniform(-1.5, 1.5, (3000, 3)), adversarial(mesh.vertices, 13, 100)])
-    ours, plain = (Model.build(mesh, 0.5, engine=e).closest(q) for e in ("kernel", "reference"))
+    ours, plain = (index(mesh, 0.5).closest(q) for index in (SurfaceIndex.build, OracleIndex))
     near = (ours.id >= 0) & (plain.id >= 0)
     unsure = np.abs(np.sqrt(np.minimum(ours.d2, plain.d2)) - 0.5) < 1e-9
     assert np.array_equal((ours.id >= 0) | unsure, (plain.id >= 0) | unsure)
@@ -171,7 +172,7 @@ FACING = IcpParams(n_max=40, facing=True)
 GUESS = Pose(exp([0.03, -0.02, 0.04]), [0.02, -0.03, 0.01])
 
 
-def everything(model: Model, scan: Array, rule: IcpParams = RULE) -> bytes:
+def everything(model: SurfaceIndex, scan: Array, rule: IcpParams = RULE) -> bytes:
     """All bits of an alignment and of the sums at its end."""
     r = model.icp(scan, GUESS, rule)
     n = model.normal_equations(scan, r.T_ca, 0.2, threads=rule.threads, facing=rule.facing)
@@ -190,7 +191,7 @@ def target(request: pytest.FixtureRequest) -> Surface:
 @pytest.mark.parametrize("threads", [2, 3, 7])
 def test_any_number_of_threads_gives_the_same_bits(target: Surface, threads: int) -> None:
     scan = scan_of(soup(600, seed=14), 5003, 16)
-    model = Model.build(target, 0.4)
+    model = SurfaceIndex.build(target, 0.4)
     rule = IcpParams(n_max=40, threads=threads)
     assert everything(model, scan, rule) == everything(model, scan)
     assert everything(model, scan, replace(rule, facing=True)) == everything(model, scan, FACING)
@@ -198,7 +199,7 @@ def test_any_number_of_threads_gives_the_same_bits(target: Surface, threads: int
 
 def test_keeping_neighbours_gives_the_same_bits(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 5003, 17)
-    model = Model.build(target, 0.4)
+    model = SurfaceIndex.build(target, 0.4)
     kept, searched = model.icp(scan, GUESS, RULE), model.icp(scan, GUESS, IcpParams(n_max=40, keep=False))
     assert everything(model, scan) == everything(model, scan, IcpParams(n_max=40, keep=False))
     assert kept.searched < searched.searched == searched.iterations * len(scan)
@@ -207,19 +208,21 @@ def test_keeping_neighbours_gives_the_same_bits(target: Surface) -> None:
 
 def test_any_instruction_set_gives_the_same_bits(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 5003, 18)
-    fast, plain = Model.build(target, 0.4), Model.build(target, 0.4, portable=True)
+    fast, plain = SurfaceIndex.build(target, 0.4), SurfaceIndex.build(target, 0.4, portable=True)
     assert everything(fast, scan) == everything(plain, scan)
     assert everything(fast, scan, FACING) == everything(plain, scan, FACING)
 
 
 def test_building_twice_gives_the_same_bits(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 2000, 19)
-    assert everything(Model.build(target, 0.4), scan) == everything(Model.build(target, 0.4, threads=3), scan)
+    assert everything(SurfaceIndex.build(target, 0.4), scan) == everything(
+        SurfaceIndex.build(target, 0.4, threads=3), scan
+    )
 
 
 def test_strided_and_single_precision_views_are_read_where_they_lie(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 3000, 20).astype(np.float32)
-    model = Model.build(target, 0.4)
+    model = SurfaceIndex.build(target, 0.4)
     want = everything(model, scan)
     record = np.zeros(3000, dtype=[("pad", "u1", 3), ("x", "f4"), ("y", "f4"), ("z", "f4"), ("i", "u2")])
     for k, name in enumerate("xyz"):
@@ -236,7 +239,7 @@ def test_strided_and_single_precision_views_are_read_where_they_lie(target: Surf
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, -1e300, 1e30])
 def test_points_that_are_no_measurement_change_nothing(target: Surface, bad: float) -> None:
     scan = scan_of(soup(600, seed=14), 1536, 21)
-    model = Model.build(target, 0.4)
+    model = SurfaceIndex.build(target, 0.4)
     dirty = np.insert(scan, [1536, 1536, 1536], bad, axis=0)
     dirty[-1, 0] = 0.0
     a, b = model.icp(scan, GUESS, RULE), model.icp(dirty, GUESS, RULE)
@@ -248,7 +251,7 @@ def test_points_that_are_no_measurement_change_nothing(target: Surface, bad: flo
 
 
 def test_no_points_at_all(target: Surface) -> None:
-    model = Model.build(target, 0.4)
+    model = SurfaceIndex.build(target, 0.4)
     empty = np.zeros((0, 3), dtype=np.float32)
     r = model.icp(empty, GUESS)
     assert (r.converged, r.inliers, r.iterations) == (False, 0, 1)
@@ -259,7 +262,7 @@ def test_no_points_at_all(target: Surface) -> None:
 
 
 def test_a_scan_far_away_stays_where_it_is(target: Surface) -> None:
-    model = Model.build(target, 0.4)
+    model = SurfaceIndex.build(target, 0.4)
     r = model.icp(scan_of(soup(600, seed=14), 500, 22) + 100.0, GUESS)
     assert (r.converged, r.inliers) == (False, 0)
     assert np.array_equal(r.T_ca, GUESS.matrix)
@@ -267,7 +270,7 @@ def test_a_scan_far_away_stays_where_it_is(target: Surface) -> None:
 
 def test_many_threads_may_share_a_model(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 2000, 23)
-    model = Model.build(target, 0.4)
+    model = SurfaceIndex.build(target, 0.4)
     want, got = everything(model, scan), []
     workers = [threading.Thread(target=lambda: got.append(everything(model, scan))) for _ in range(4)]
     for w in workers:
@@ -277,13 +280,13 @@ def test_many_threads_may_share_a_model(target: Surface) -> None:
     assert got == [want] * 4
 
 
-def test_the_door_refuses_what_it_cannot_read() -> None:
-    model = Model.build(soup(5, seed=24), 0.5)
+def test_input_of_the_wrong_shape_or_type_is_refused() -> None:
+    model = SurfaceIndex.build(soup(5, seed=24), 0.5)
     with pytest.raises(ValueError, match=r"\(n, 3\)"):
         model.closest(np.zeros((4, 2)))
     with pytest.raises(ValueError, match=r"\(n, 3\)"):
         model.closest(np.zeros(3))
-    index = model._index._index  # type: ignore[attr-defined]
+    index = model._index
     with pytest.raises((ValueError, TypeError)):
         index.closest(np.zeros((4, 3), dtype=np.int64))
     with pytest.raises((ValueError, TypeError)):

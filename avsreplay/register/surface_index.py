@@ -1,0 +1,279 @@
+"""Exact closest points on the target model, and the ICP loop and normal equations that use them.
+
+The work is done by the C++ extension ``_kernel``; this module checks the input and names the results. An index is built
+once for one maximum distance and is read-only afterwards.
+
+Closest point
+    The nearest point of the surface to a query point: on a face, an edge or a vertex. A query at ``reach_m`` or farther
+    from the surface has none: id -1, d2 inf, foot and normal NaN.
+Ties
+    Among faces at the same distance (to 1e-10; this happens on edges and vertices) the face with the largest distance
+    between the query point and the plane of the face is chosen, then the lower index. Among points of a cloud the lower
+    index is chosen.
+Normal
+    The face normal by the right-hand rule of the chosen triangle, also where the closest point lies on an edge or a
+    vertex. For a point cloud: the eigenvector of the smallest eigenvalue of the scatter of the 10 nearest points; its
+    sign is arbitrary.
+Degenerate triangles
+    Triangles without area are left out of the index and counted in ``dropped``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from avsreplay.errors import MissingBackend, UsageError
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Surface
+from avsreplay.register import index_cache
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IcpParams:
+    """Parameters of the ICP loop.
+
+    Rejection rule: a point is used while its distance to the surface is below the gate; after each pass
+    gate = min(gate, max(floor_m, tighten * rms of that pass)), so the gate never grows. ``tighten`` 0: constant gate.
+    Stopping rule: the last step rotated by less than ``eps_rad`` and moved the centroid of the inliers by less than
+    ``eps_m``, and the gate changed by less than 1 %. Only Horn passes (point to point) can end the loop.
+    """
+
+    n_max: int = 100  # largest number of passes, of both kinds
+    n_plane: int = 6  # point-to-plane passes before Horn's; fewer are made once their step is below the stopping rule
+    gate_m: float | None = None  # first rejection distance [m]; auto: the reach of the index
+    tighten: float = 3.0  # the gate in units of the rms of the last pass; 0: constant gate
+    floor_m: float | None = None  # smallest gate [m]; auto: 1/500 of the extent of the model
+    eps_rad: float = 1e-5  # stop below this rotation [rad]
+    eps_m: float | None = None  # and below this displacement of the centroid [m]; auto: 1e-6 of the extent
+    threads: int = 1  # the result is identical, to the bit, for any number
+    facing: bool = False  # match only faces that face the camera (origin of {A}); for meshes with outward faces
+    keep: bool = True  # keep a correspondence while it provably cannot change; the result is identical, to the bit
+
+    def __post_init__(self) -> None:
+        if self.n_max < 1 or not 0 <= self.n_plane <= self.n_max:
+            raise ValueError(f"need n_max >= 1 and 0 <= n_plane <= n_max, got {self.n_max} and {self.n_plane}")
+        for name in ("gate_m", "tighten", "floor_m", "eps_rad", "eps_m"):
+            value = getattr(self, name)
+            if value is not None and not (np.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} must be finite and not negative, got {value}")
+        if self.threads < 1:
+            raise ValueError(f"threads must be at least 1, got {self.threads}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Closest:
+    """Closest points of n queries: foot (n, 3) [m], d2 (n,) squared distance [m^2], id (n,) face or point, normal."""
+
+    foot: Array
+    d2: Array
+    id: NDArray[np.int32]
+    normal: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class IcpResult:
+    """Result of the ICP loop.
+
+    Attributes:
+        T_ca: (4, 4) scan {A} into model {C}.
+        iterations: passes made, of both kinds.
+        converged: the stopping rule held before n_max.
+        inliers, rms_m: of the last pass, before its step (distance between point and closest point).
+        gate_m: rejection distance after the last pass.
+        step_rad, step_m: the last step.
+        ignored: points with a coordinate that is not finite.
+        searched: neighbour searches made over all passes.
+    """
+
+    T_ca: Array
+    iterations: int
+    converged: bool
+    inliers: int
+    rms_m: float
+    gate_m: float
+    step_rad: float
+    step_m: float
+    ignored: int
+    searched: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """Point-to-plane sums at a pose, for d = [theta; v] in {C} with T_ac_true = T_ac @ Exp(d).
+
+    With p_c = T_ca p_a, e = n . (foot - p_c) and J = de/dd = [p_c x n, n].
+
+    Attributes:
+        info: (6, 6) sum J'J, not divided by the variance of the noise.
+        gradient: (6,) sum J'e.
+        inliers: points nearer than the gate.
+        sum_e2: sum of e^2 [m^2].
+        sum_d2: sum of the squared distances to the closest points [m^2].
+        points: finite points.
+        ignored: points with a coordinate that is not finite.
+    """
+
+    info: Array
+    gradient: Array
+    inliers: int
+    sum_e2: float
+    sum_d2: float
+    points: int
+    ignored: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfaceIndex:
+    """An indexed surface. Build it with :meth:`build`; it is read-only and may be shared by threads.
+
+    Attributes:
+        reach_m: no closest point is searched at this distance or farther.
+        extent_m: diagonal of the bounding box of the surface.
+        primitives: triangles or points in the index.
+        dropped: triangles without area, left out.
+        restored: the index was read from the cache instead of built.
+    """
+
+    reach_m: float
+    extent_m: float
+    primitives: int
+    dropped: int
+    restored: bool
+    _index: Any
+
+    @classmethod
+    def build(
+        cls,
+        surface: Surface,
+        reach_m: float,
+        *,
+        threads: int = 1,
+        portable: bool = False,
+        cache_dir: Path | None = None,
+    ) -> SurfaceIndex:
+        """Index ``surface`` for queries up to ``reach_m`` [m] from it.
+
+        Args:
+            surface: mesh or point cloud, vertices in {C} [m].
+            reach_m: largest distance at which a closest point is searched [m].
+            threads: threads that build the index; the result does not depend on it.
+            portable: use only the instructions that every processor of this kind has; the results are identical.
+            cache_dir: folder in which the index is looked up and saved under the hash of the surface.
+
+        Raises:
+            UsageError: a surface with no primitive, a coordinate that is not finite, a face that refers to a missing
+                vertex, or a reach that is not positive.
+            MissingBackend: the C++ extension is not built.
+        """
+        vertices, faces = _checked(surface, reach_m)
+        kept = _with_area(vertices, faces)
+        if len(faces) and not len(kept):
+            raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
+        kernel = _kernel()
+        size = len(kept) if len(faces) else len(vertices)
+        path = None if cache_dir is None else index_cache.path_of(cache_dir, kernel.LAYOUT, vertices, faces, reach_m)
+        saved = None if path is None else index_cache.read(path)
+        index = None if saved is None else _restored(kernel, saved, size, len(faces) or size, len(faces) > 0, portable)
+        restored = index is not None
+        index = index or kernel.Index(vertices, faces, kept, float(reach_m), threads, portable)
+        if path is not None and not restored:
+            index_cache.write(path, index.save())
+        return cls(float(reach_m), surface.extent, size, len(faces) - len(kept), restored, index)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the index [B]."""
+        return int(self._index.nbytes)
+
+    def closest(self, points: NDArray[Any], *, threads: int = 1, camera_c: ArrayLike | None = None) -> Closest:
+        """Closest points of ``points`` (n, 3) [m] in {C}; a point that is not finite has none.
+
+        With ``camera_c`` (3,) [m] only faces that face this position are searched; a point cloud is searched whole.
+        """
+        camera = None if camera_c is None else tuple(np.asarray(camera_c, dtype=np.float64).reshape(3).tolist())
+        return Closest(*self._index.closest(_points(points), threads, camera))
+
+    def icp(self, points: NDArray[Any], T_ca: ArrayLike | Pose, params: IcpParams | None = None) -> IcpResult:
+        """Align the scan ``points`` (n, 3) [m] in {A} to the model from the guess ``T_ca`` (4, 4).
+
+        Point-to-plane passes come first, then Horn's point-to-point passes until their fixed point (eq:ICP).
+        The rotation of the guess is re-orthonormalised. With fewer than 6 inliers the loop ends, not converged.
+        """
+        params = params or IcpParams()
+        gate = min(self.reach_m, self.reach_m if params.gate_m is None else params.gate_m)
+        floor = self.extent_m / 500.0 if params.floor_m is None else params.floor_m
+        eps_m = 1e-6 * self.extent_m if params.eps_m is None else params.eps_m
+        rule = (params.n_max, params.n_plane, gate, params.tighten, floor, params.eps_rad, eps_m)
+        flags = (params.threads, params.keep, params.facing)
+        return IcpResult(*self._index.icp(_points(points), _rigid(T_ca), *rule, *flags))
+
+    def normal_equations(
+        self,
+        points: NDArray[Any],
+        T_ca: ArrayLike | Pose,
+        gate_m: float | None = None,
+        *,
+        threads: int = 1,
+        facing: bool = False,
+    ) -> NormalEquations:
+        """Point-to-plane information, gradient and residual sums of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4).
+
+        ``facing``: as in :class:`IcpParams`.
+        """
+        gate = self.reach_m if gate_m is None else min(gate_m, self.reach_m)
+        return NormalEquations(*self._index.normal_equations(_points(points), _rigid(T_ca), gate, threads, facing))
+
+
+def _kernel() -> Any:
+    try:
+        from avsreplay.register import _kernel
+    except ImportError:
+        hint = "run 'pip install .' in the source folder (needs a C++17 compiler)"
+        raise MissingBackend("the C++ extension is not built", where="avsreplay.register._kernel", hint=hint) from None
+    return _kernel
+
+
+def _restored(kernel: Any, saved: bytes, primitives: int, ids: int, mesh: bool, portable: bool) -> Any:
+    try:
+        return kernel.Index(saved, primitives, ids, mesh, portable)
+    except ValueError:  # damaged: it is built again
+        return None
+
+
+def _points(points: NDArray[Any]) -> NDArray[Any]:
+    array = np.asarray(points)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f"points must be (n, 3), got {array.shape}")
+    return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
+
+
+def _rigid(T_ca: ArrayLike | Pose) -> Array:
+    pose = T_ca if isinstance(T_ca, Pose) else Pose.from_matrix(T_ca)
+    return pose.matrix
+
+
+def _checked(surface: Surface, reach_m: float) -> tuple[Array, NDArray[np.int32]]:
+    vertices = np.ascontiguousarray(surface.vertices, dtype=np.float64)
+    faces = np.ascontiguousarray(surface.faces, dtype=np.int32).reshape(-1, 3)
+    if not (np.isfinite(reach_m) and reach_m > 0.0):
+        raise UsageError(f"reach must be positive, got {reach_m}", where=surface.name, hint="give a distance in metres")
+    if not len(vertices):
+        raise UsageError("the model has no point", where=surface.name, hint="give a mesh or a cloud")
+    if not np.isfinite(vertices).all():
+        raise UsageError("the model has a coordinate that is not finite", where=surface.name, hint="repair the model")
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise UsageError("a face refers to a missing vertex", where=surface.name, hint="repair the model")
+    return vertices, faces
+
+
+def _with_area(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Indices of the faces whose area is above rounding: |ab x ac| > 1e-12 of the longest edge squared."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    longest2 = np.max([np.sum((b - a) ** 2, 1), np.sum((c - b) ** 2, 1), np.sum((a - c) ** 2, 1)], axis=0, initial=0.0)
+    area2 = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.flatnonzero(area2 > 1e-12 * longest2).astype(np.int32)
