@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.log import Loss, SourceOptions, open_source
-from avsreplay.log import mcap_records as mcap
+from avsreplay.log import mcap_format as mcap
 from avsreplay.records import LogHeader, Scan
 
 CLOUDS = scans(24, 200)
@@ -202,8 +202,7 @@ def test_a_decompression_bomb_is_refused(tmp_path: Path, compression: str) -> No
 def test_a_file_without_chunks_is_read_and_found_again_past_damage(tmp_path: Path) -> None:
     from mcap.writer import CompressionType, Writer
 
-    from avsreplay.log.encode import point_cloud2
-    from avsreplay.log.schemas import schema_text
+    from avsreplay.log.cdr import point_cloud2, schema_text
 
     with (tmp_path / "flat.mcap").open("wb") as file:
         writer = Writer(file, use_chunking=False, compression=CompressionType.NONE)
@@ -319,8 +318,7 @@ def test_an_attachment_over_the_limit_is_passed_over_whole(tmp_path: Path) -> No
     """Even one that is a log itself, whose chunks are not ours."""
     from mcap.writer import Writer
 
-    from avsreplay.log.encode import point_cloud2
-    from avsreplay.log.schemas import schema_text
+    from avsreplay.log.cdr import point_cloud2, schema_text
 
     rng = np.random.Generator(np.random.PCG64(2))
     inner = [Scan(i, t, rng.normal(size=(9000, 3)).astype(np.float32), log_ns=t) for i, t in enumerate(range(1, 40))]

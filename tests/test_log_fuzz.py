@@ -16,12 +16,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_cases import scans
 
-from avsreplay.log.cursor import BadMessage
-from avsreplay.log.encode import point_cloud2
+from avsreplay.log.bytes_io import BadFile, BadMessage
+from avsreplay.log.cdr import point_cloud2
 from avsreplay.log.pcd import read_pcd, unpack_lzf
-from avsreplay.log.ply import BadFile, read_ply
+from avsreplay.log.ply import read_ply
 from avsreplay.log.point_cloud2 import decode_cloud
-from avsreplay.log.poses import POSE_TYPES, read_pose, read_transforms
+from avsreplay.log.pose_messages import POSE_TYPES, read_pose, read_transforms
 
 CORPUS = seeds()
 

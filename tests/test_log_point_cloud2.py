@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from avsreplay.log.cursor import BadMessage
-from avsreplay.log.encode import point_cloud2
+from avsreplay.log.bytes_io import BadMessage
+from avsreplay.log.cdr import point_cloud2
 from avsreplay.log.point_cloud2 import decode_cloud, read_layout
 
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}

@@ -15,8 +15,9 @@ from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source, parse_surface, read_surface
+from avsreplay.log.bytes_io import BadFile
 from avsreplay.log.pcd import read_pcd, unpack_lzf
-from avsreplay.log.ply import BadFile, read_ply
+from avsreplay.log.ply import read_ply
 from avsreplay.log.surface import surface_bytes
 from avsreplay.records import Scan, ScanStatus
 

@@ -83,7 +83,7 @@ def _print(source: Path, findings: list[Finding], output: Path | None, done: Rep
     from rich.text import Text
 
     from avsreplay.cli.info import WIDTH
-    from avsreplay.log.text import shown
+    from avsreplay.log.bytes_io import shown
 
     console = Console(highlight=False)
     if not console.is_terminal:

@@ -66,7 +66,7 @@ def document(info: LogInfo) -> dict[str, Any]:
 
 def loss_line(loss: Loss) -> str:
     """One loss in one line."""
-    from avsreplay.log.text import shown
+    from avsreplay.log.bytes_io import shown
 
     parts = [f"{loss.file}: " if loss.file else "", loss.what, f" (byte {loss.offset}, {loss.bytes} bytes"]
     if loss.chunks:
@@ -83,7 +83,7 @@ def _print(info: LogInfo) -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from avsreplay.log.text import shown
+    from avsreplay.log.bytes_io import shown
 
     console = Console(highlight=False, soft_wrap=True)
     if not console.is_terminal:
@@ -142,7 +142,7 @@ def _topics(info: LogInfo) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    from avsreplay.log.text import shown
+    from avsreplay.log.bytes_io import shown
 
     table = Table(title="topics", title_justify="left")
     for head in ("topic", "type", "encoding"):
@@ -163,7 +163,7 @@ def _faults(info: LogInfo) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    from avsreplay.log.text import shown
+    from avsreplay.log.bytes_io import shown
 
     table = Table("fault", title="faults injected", title_justify="left")
     for head in ("start [s]", "end [s]", "harmful"):

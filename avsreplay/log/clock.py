@@ -21,8 +21,6 @@ import numpy as np
 
 from avsreplay.log.options import ClockChoice, ClockSummary
 
-__all__ = ["Placed", "place"]
-
 _FLOOR_NS = 500_000_000
 _PERIODS = 5
 _FIRST = 9

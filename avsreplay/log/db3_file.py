@@ -7,17 +7,13 @@ counts what it skips.
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.log.cursor import BadMessage
+from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.index import Recording, Sink, canonical_type
 from avsreplay.log.options import Loss
-from avsreplay.log.recording import MessageTable, Sink, canonical_type
-from avsreplay.log.tabled import Tabled
-from avsreplay.log.text import shown
-
-__all__ = ["SQLITE_MAGIC", "Db3File"]
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
 # A message of sqlite's own may name a damaged table in bytes that are no text.
@@ -27,8 +23,8 @@ _STEPS = 4096  # rows tried one by one behind a damaged page, before strides dou
 _MAX_ID = 1 << 62  # where the last one cannot be told: strides double, so it takes few steps
 
 
-class Db3File(Tabled):
-    """One sqlite3 file of a ROS 2 bag, surveyed; a Recording.
+class Db3File(Recording):
+    """One sqlite3 file of a ROS 2 bag, surveyed.
 
     Args:
         path: the file.  limit: most bytes a message may take.
@@ -39,12 +35,11 @@ class Db3File(Tabled):
     """
 
     kind = "ros2 bag"
-    profile, library = "ros2", ""
+    profile = "ros2"
 
-    def __init__(self, path: Path, limit: int, sinks: Mapping[str, Sink] | None = None) -> None:
-        self.path, self.losses = path, list[Loss]()
-        self.metadata: dict[str, dict[str, str]] = {}
-        self._limit, self._table, self._sinks = limit, MessageTable(sinks), frozenset(sinks or ())
+    def __init__(self, path: Path, limit: int, sinks: dict[str, Sink] | None = None) -> None:
+        super().__init__(path, limit, sinks)
+        self._sinks = frozenset(sinks or ())
         self._topics: dict[int, str] = {}
         self._db = _connected(path, limit)
         try:
@@ -64,12 +59,8 @@ class Db3File(Tabled):
             raise BadMessage("the message is not in the database any more")
         return row[0]
 
-    def attachment(self) -> tuple[str, bytes] | None:
-        """A bag carries no model."""
-        return None
-
     def close(self) -> None:
-        """Let go of the file."""
+        """Close the database."""
         self._db.close()
 
     def _survey(self) -> None:

@@ -12,17 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from avsreplay.geometry import Array
-from avsreplay.log.cursor import BadMessage
+from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.mcap_file import McapFile
-from avsreplay.log.mcap_records import is_mcap
+from avsreplay.log.mcap_format import is_mcap
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import read_layout
 from avsreplay.log.source import Source
-from avsreplay.log.text import shown
 from avsreplay.records import Scan, ScanStatus
-
-__all__ = ["Finding", "Severity", "examine"]
 
 _GAP_PERIODS, _GAP_FLOOR_S = 3.0, 0.5
 _NAMED = 5

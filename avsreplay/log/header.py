@@ -15,8 +15,6 @@ import numpy as np
 
 from avsreplay.records import Belief, Label, LogHeader, State
 
-__all__ = ["FORMAT", "HEADER_RECORD", "decode_header", "encode_header"]
-
 HEADER_RECORD = "avsreplay"
 FORMAT = "1"
 _STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")

@@ -9,26 +9,18 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.log import mcap_records as mcap
-from avsreplay.log.byte_file import ByteFile
-from avsreplay.log.chunks import ChunkStore
-from avsreplay.log.cursor import BadMessage
-from avsreplay.log.mcap_channels import ChannelTable
-from avsreplay.log.mcap_records import Channel, Fields, Tap
-from avsreplay.log.mcap_resync import begins_record, first_chunk, hides_chunk, next_record
-from avsreplay.log.mcap_summary import Summary, read_summary
+from avsreplay.log import mcap_format as mcap
+from avsreplay.log.bytes_io import BadMessage, ByteFile, shown
+from avsreplay.log.index import MAX_NS, Recording, Sink
+from avsreplay.log.mcap_format import Channel, ChunkStore, Fields, Summary, Tap, read_summary
+from avsreplay.log.mcap_salvage import ChannelTable, begins_record, first_chunk, hides_chunk, next_record
 from avsreplay.log.options import Loss
-from avsreplay.log.recording import MAX_NS, MessageTable, Sink
 from avsreplay.log.surface import MODEL_ENDINGS
-from avsreplay.log.tabled import Chunked
-from avsreplay.log.text import shown
-
-__all__ = ["McapFile"]
 
 _TIMES = struct.Struct("<QQ")
 _BLOCK = 1 << 20
@@ -36,8 +28,8 @@ _LEAST_CHUNK = 49
 _MAX_LOSSES = 10_000
 
 
-class McapFile(Chunked):
-    """One MCAP file, surveyed; a Recording.
+class McapFile(Recording):
+    """One MCAP file, surveyed.
 
     Args:
         path: the file.  limit: most bytes a message, chunk or attachment may take.
@@ -54,14 +46,11 @@ class McapFile(Chunked):
 
     kind = "mcap"
 
-    def __init__(self, path: Path, limit: int, sinks: Mapping[str, Sink] | None = None, tap: Tap | None = None) -> None:
+    def __init__(self, path: Path, limit: int, sinks: dict[str, Sink] | None = None, tap: Tap | None = None) -> None:
         self._tap = tap
-        self.path, self.losses = path, list[Loss]()
-        self.metadata: dict[str, dict[str, str]] = {}
-        self.profile = self.library = ""
+        super().__init__(path, limit, sinks)
         self.closed_properly = False
         self.summary, self.data_end, self.unchecked = Summary(), (0, 0), 0
-        self._limit, self._table = limit, MessageTable(sinks)
         self._channels = ChannelTable(self._table)
         self._model: tuple[str, int, int] | None = None
         self._bad_chunk: Loss | None = None
@@ -173,7 +162,7 @@ class McapFile(Chunked):
         self._message(payload, 0, len(payload), -1, at + 9)
 
     def _take_message_index(self, at: int, end: int) -> None:
-        fields = Fields(memoryview(self._file.upto(at + 9, min(6, end - at - 9))))
+        fields = Fields(memoryview(self._file.read_at_most(at + 9, min(6, end - at - 9))))
         fields.take(2)
         size = fields.number(4)
         if size % 16 or size != end - at - 15:
@@ -209,7 +198,7 @@ class McapFile(Chunked):
         self.data_end = (at, int.from_bytes(self._file.read(at + 9, 4), "little"))
 
     def _take_chunk(self, at: int, end: int) -> None:
-        head = mcap.chunk_head(self._file.upto(at, min(mcap.CHUNK_PREFIX, end - at)), end - at)
+        head = mcap.chunk_head(self._file.read_at_most(at, min(mcap.CHUNK_PREFIX, end - at)), end - at)
         try:
             data = self._chunks.check(at, head)
             walked = [(op, b, e) for op, b, e in mcap.records(memoryview(data))]
@@ -234,7 +223,7 @@ class McapFile(Chunked):
         inner = first_chunk(self._file, at + 1, end)
         if inner is None:
             return None
-        head = mcap.chunk_head(self._file.upto(inner, mcap.CHUNK_PREFIX))
+        head = mcap.chunk_head(self._file.read_at_most(inner, mcap.CHUNK_PREFIX))
         try:
             self._chunks.check(inner, head)
         except BadMessage:

@@ -1,26 +1,29 @@
-"""Opening of a source: which kind of bytes it is, which topic, which truth, which model."""
+"""Opening of a source: detects the format, selects the cloud topic, attaches ground truth and model."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.log.bags import is_bag_folder, open_recording
-from avsreplay.log.cursor import BadMessage
-from avsreplay.log.feed import MessageFeed
-from avsreplay.log.guides import MessageGuides
+from avsreplay.geometry import Pose
+from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.cloud_stream import FolderClouds, MessageClouds
+from avsreplay.log.db3_file import SQLITE_MAGIC, Db3File
+from avsreplay.log.ground_truth import Guides, MessageGuides, file_truth
 from avsreplay.log.header import HEADER_RECORD, decode_header
-from avsreplay.log.open_folder import open_folder
+from avsreplay.log.index import CLOUD_TYPES, Merged, Recording, Sink
+from avsreplay.log.mcap_file import McapFile
+from avsreplay.log.mcap_format import MAGIC
 from avsreplay.log.options import Loss, SourceOptions, TopicInfo
-from avsreplay.log.recording import CLOUD_TYPES, Recording
+from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_times, seconds_to_ns
+from avsreplay.log.ros1_bag import ROS1_MAGIC, Ros1Bag
+from avsreplay.log.scan_files import by_number, scan_files
 from avsreplay.log.source import Source, refuse_losses
 from avsreplay.log.surface import parse_surface, read_surface
-from avsreplay.log.text import shown
 from avsreplay.records import LogHeader, Surface
-
-__all__ = ["open_source"]
 
 
 def open_source(path: str | Path, options: SourceOptions | None = None, *, look: bool = False) -> Source:
@@ -68,7 +71,7 @@ def _messages(path: Path, options: SourceOptions, look: bool) -> Source:
         topic = _looked(recording, options, path) if look else _cloud_topic(recording, options, path)
         header, lost = _header(recording, options)
         guides = collected.guides()
-        feed = MessageFeed(recording, topic)
+        feed = MessageClouds(recording, topic)
     except BaseException:
         recording.close()
         raise
@@ -137,3 +140,136 @@ def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
         return (None if found is None else parse_surface(found[1], found[0])), []
     except (UnreadableInput, BadMessage) as error:
         return None, [Loss(f"the model inside cannot be used: {shown(error)}", 0, 0)]
+
+
+_STORAGE = (".mcap", ".db3")
+_LISTED = re.compile(r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE)
+_MAX_METADATA = 4 << 20
+
+
+def is_bag_folder(path: Path) -> bool:
+    """Does a folder hold a ROS 2 bag rather than scans?"""
+    return path.is_dir() and any(p.suffix in (*_STORAGE, ".zstd") for p in path.iterdir())
+
+
+def open_recording(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
+    """Survey a log file by its first bytes, or all files of a bag's folder.
+
+    Raises UnreadableInput where it is not there, empty or no log.
+    """
+    return _folder(path, limit, sinks) if path.is_dir() else _file(path, limit, sinks)
+
+
+def _file(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError as error:
+        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+    if head.startswith(ROS1_MAGIC):
+        return Ros1Bag(path, limit, sinks)
+    if head == SQLITE_MAGIC:
+        return Db3File(path, limit, sinks)
+    if head.startswith(b"#ROSBAG"):
+        raise UnreadableInput("a ROS bag older than format 2.0", where=shown(path), hint="migrate it with rosbag fix")
+    if head.startswith(b"\x28\xb5\x2f\xfd"):
+        raise UnreadableInput("a zstd-compressed file", where=shown(path), hint="unpack it first: zstd -d")
+    if not head.startswith(MAGIC) and path.suffix.lower() in (".ply", ".pcd", ".bin", ".npy", ".npz"):
+        raise UnreadableInput("one scan, not a log", where=shown(path), hint="give the folder it is in")
+    return McapFile(path, limit, sinks)
+
+
+def _folder(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
+    files, losses = _files(path)
+    parts: list[Recording] = []
+    try:
+        parts.extend(_file(file, limit, sinks) for file in files)
+    except BaseException:
+        for part in parts:
+            part.close()
+        raise
+    if not parts:
+        raise UnreadableInput("none of the bag's files is there", where=shown(path), hint="check its metadata.yaml")
+    return Merged(parts, "ros2 bag", losses)
+
+
+def _files(path: Path) -> tuple[list[Path], list[Loss]]:
+    """The bag's files in order, and a loss for each that its metadata names and that is not there."""
+    there = sorted((p for p in path.iterdir() if p.suffix in _STORAGE), key=lambda p: by_number(p.name))
+    metadata = path / "metadata.yaml"
+    if not metadata.is_file():
+        return there, []
+    text = metadata.read_bytes()[:_MAX_METADATA].decode("utf-8", "backslashreplace")
+    listed = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
+    losses = [
+        Loss("a file that the bag's metadata names is not there", 0, 0, file=name)
+        for name in listed
+        if not (path / name).is_file()
+    ]
+    packed = [name for name in listed if name.endswith(".zstd") and (path / name).is_file()]
+    if packed:
+        raise UnreadableInput("a zstd-compressed bag file", where=shown(path / packed[0]), hint="unpack it: zstd -d")
+    named = [path / name for name in listed if (path / name).is_file()]
+    return (named or there), losses
+
+
+_POSE_FILES = ("*.conf", "*.tum", "poses.txt")
+_TIME_FILE = "times.txt"
+_STAMPED = re.compile(r"^\d{9,10}\.\d+$|^\d{16,19}$")
+
+
+def open_folder(path: Path, options: SourceOptions) -> Source:
+    """A folder of scans as a source.
+
+    Scans are in the order of the numbers in their names; with a ``.conf`` only those it names. Their times are, the
+    first that is there: ``times.txt`` (a time [s] a line), names that are times, the times of a pose file with one
+    line a scan, else ``rate_hz``.
+
+    Raises:
+        UnreadableInput: no scans, or a pose or time file that cannot be read.
+        UsageError: a topic was asked for, or several pose files are there and none was named.
+    """
+    for flag, value in (("--topic", options.topic), ("--truth-topic", options.truth_topic)):
+        if value is not None:
+            raise UsageError("a folder of scans has no topics", where=f"{shown(path)}, {flag}", hint="leave it out")
+    pose_file = options.truth_file or _pose_file(path)
+    by_name = read_conf(pose_file) if pose_file is not None and pose_file.suffix == ".conf" else {}
+    found = read_poses(pose_file) if pose_file is not None and not by_name else None
+    files = scan_files(path, tuple(by_name))
+    times = _times(path, files, found)
+    feed = FolderClouds(files, options.rate_hz, options.max_message_mib << 20, times)
+    surface = None if options.model is None else read_surface(options.model, options.cloud_model)
+    notes = {"source": "folder", "times": "given" if times else f"steady at {options.rate_hz!r} Hz"}
+    guides = _guides(files, feed.header_ns, by_name, found, options)
+    besides = [p for p in (pose_file, path / _TIME_FILE) if p is not None and p.is_file() and p.is_relative_to(path)]
+    return Source(path, feed, LogHeader(surface=surface, notes=notes), options, guides, files=[*files, *besides])
+
+
+def _pose_file(path: Path) -> Path | None:
+    found = sorted({p for pattern in _POSE_FILES for p in path.glob(pattern) if p.is_file()})
+    if len(found) > 1:
+        names = ", ".join(shown(p.name) for p in found)
+        raise UsageError(f"several pose files: {names}", where=shown(path), hint="choose one with --truth-file")
+    return found[0] if found else None
+
+
+def _times(path: Path, files: list[Path], found: TimedPoses | None) -> list[int] | None:
+    listed = path / _TIME_FILE
+    if listed.is_file():
+        times = read_times(listed)
+        if len(times) != len(files):
+            what = f"{len(times)} times for {len(files)} scans"
+            raise UnreadableInput(what, where=shown(listed), hint="one line a scan")
+        return times
+    if all(_STAMPED.match(p.stem) for p in files):
+        return [int(p.stem) if "." not in p.stem else seconds_to_ns(p.stem) or 0 for p in files]
+    return list(found.t_ns) if found is not None and found.t_ns is not None and len(found.t_ns) == len(files) else None
+
+
+def _guides(
+    files: list[Path], times: list[int], by_name: dict[str, Pose], found: TimedPoses | None, options: SourceOptions
+) -> Guides:
+    if found is None and by_name:
+        named = [(t, by_name[f.name]) for t, f in zip(times, files, strict=True)]
+        found = TimedPoses(tuple(pose for _, pose in named), tuple(t for t, _ in named))
+    return Guides() if found is None else Guides(*file_truth(found, options.truth_gap_s))

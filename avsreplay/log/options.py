@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
-__all__ = ["ClockChoice", "ClockSummary", "LogInfo", "Loss", "SourceOptions", "TopicInfo"]
-
 
 class ClockChoice(Enum):
     """Which clock ``Scan.t_ns`` is on."""

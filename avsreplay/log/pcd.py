@@ -12,9 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.log.ply import BadFile
-
-__all__ = ["read_pcd", "unpack_lzf"]
+from avsreplay.log.bytes_io import BadFile
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _MAX_HEADER = 1 << 16

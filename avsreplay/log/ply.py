@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BadFile", "Ply", "read_ply"]
+from avsreplay.log.bytes_io import BadFile
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -20,10 +20,6 @@ _TYPES = {
     "double": "f8", "float64": "f8",
 }  # fmt: skip
 _MAX_HEADER = 1 << 16
-
-
-class BadFile(ValueError):
-    """A file whose bytes do not hold what its header says."""
 
 
 @dataclass(frozen=True, slots=True)

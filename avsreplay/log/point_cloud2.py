@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.log.cursor import BadMessage, Cursor
-
-__all__ = ["Cloud", "Field", "Layout", "decode_cloud", "read_layout"]
+from avsreplay.log.bytes_io import BadMessage
+from avsreplay.log.cdr import Cursor
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MAX_FIELDS = 256

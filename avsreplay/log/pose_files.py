@@ -1,7 +1,8 @@
-"""Pose files beside a log: TUM, KITTI and EuRoC; each line is T_ac, the pose of the model in the camera.
+"""Pose files: TUM, KITTI, EuRoC and the ``.conf`` of the Stanford scans; each pose is T_ac, the model in the camera.
 
-TUM: ``t tx ty tz qx qy qz qw`` [s].  KITTI: the twelve numbers of [R | t] by row, one line a scan, without times.
-EuRoC: ``t[ns],px,py,pz,qw,qx,qy,qz,...``: scalar first.
+TUM: ``t tx ty tz qx qy qz qw`` with t in seconds.  KITTI: the twelve numbers of [R | t] by row, without times.
+EuRoC: ``t[ns],px,py,pz,qw,qx,qy,qz,...``, scalar first.  ``.conf``: ``bmesh name tx ty tz qx qy qz qw`` where the
+quaternion is conjugate to the usual convention, p_model = R(q)' p_scan + t, so that T_ac = (R(q), -R(q) t).
 """
 
 from __future__ import annotations
@@ -15,10 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.geometry import Pose
-from avsreplay.log.text import shown
-
-__all__ = ["TimedPoses", "read_poses", "read_times", "seconds_to_ns"]
+from avsreplay.geometry import Pose, matrix, normalise
+from avsreplay.log.bytes_io import shown
 
 _MAX_BYTES = 256 << 20
 
@@ -108,3 +107,34 @@ def _from_rows(values: list[float]) -> Pose:
     if not np.isfinite(T).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         raise ValueError
     return Pose.from_matrix(T)
+
+
+_MAX_CONF_BYTES = 16 << 20
+
+
+def read_conf(path: Path) -> dict[str, Pose]:
+    """T_ac of each scan by file name. Raises UnreadableInput for a line that cannot be read."""
+    try:
+        raw = path.read_bytes()[: _MAX_CONF_BYTES + 1]
+    except OSError as error:
+        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+    if len(raw) > _MAX_CONF_BYTES:
+        raise UnreadableInput("larger than 16 MiB, not a pose file", where=shown(path), hint="check the file")
+    poses: dict[str, Pose] = {}
+    for number, line in enumerate(raw.decode("utf-8", "backslashreplace").splitlines(), 1):
+        words = line.split()
+        if words[:1] == ["bmesh"]:
+            poses[words[1] if len(words) > 1 else ""] = _bmesh_pose(words, f"{shown(path)}:{number}")
+    return poses
+
+
+def _bmesh_pose(words: list[str], where: str) -> Pose:
+    try:
+        values = [float(w) for w in words[2:9]]
+    except ValueError:
+        values = []
+    if len(values) != 7 or not all(map(math.isfinite, values)) or math.hypot(*values[3:]) < 0.5:
+        hint = "write: bmesh name tx ty tz qx qy qz qw"
+        raise UnreadableInput("not a bmesh line", where=where, hint=hint)
+    q_ac = normalise(values[3:])
+    return Pose(q_ac, -matrix(q_ac) @ values[:3])

@@ -7,17 +7,14 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.log.cursor import BadMessage
+from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.header import HEADER_RECORD, decode_header
+from avsreplay.log.index import CLOUD_TYPES, MAX_NS
 from avsreplay.log.mcap_file import McapFile
-from avsreplay.log.mcap_records import Channel, is_mcap
+from avsreplay.log.mcap_format import Channel, is_mcap
 from avsreplay.log.point_cloud2 import decode_cloud
-from avsreplay.log.recording import CLOUD_TYPES, MAX_NS
 from avsreplay.log.surface import MODEL_ENDINGS, parse_surface
-from avsreplay.log.text import shown
 from avsreplay.log.writer import LIBRARY
-
-__all__ = ["Repaired", "repair"]
 
 _CHUNK_BYTES = 1 << 20
 

@@ -16,10 +16,8 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, Pose
-from avsreplay.log.encode import point_cloud2
+from avsreplay.log.cdr import point_cloud2
 from avsreplay.records import Surface
-
-__all__ = ["ResultFrame", "ResultLog"]
 
 CAMERA, TARGET, ROOT = "camera", "target", "map"
 LIBRARY = "avsreplay"

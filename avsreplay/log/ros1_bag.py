@@ -7,19 +7,14 @@ tells of damage is a frame that does not fit and a compressed chunk that does no
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from avsreplay.log.byte_file import ByteFile
-from avsreplay.log.chunks import ChunkStore
-from avsreplay.log.cursor import BadMessage
-from avsreplay.log.mcap_records import ChunkHead, Fields
+from avsreplay.log.bytes_io import BadMessage, ByteFile
+from avsreplay.log.index import Recording, Sink, canonical_type
+from avsreplay.log.mcap_format import ChunkHead, ChunkStore, Fields
 from avsreplay.log.options import Loss
-from avsreplay.log.recording import MessageTable, Sink, canonical_type
-from avsreplay.log.tabled import Chunked
-
-__all__ = ["ROS1_MAGIC", "Ros1Bag"]
 
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
@@ -50,8 +45,8 @@ class _Record:
         return int.from_bytes(self.fields[name], "little")
 
 
-class Ros1Bag(Chunked):
-    """One ROS 1 bag, surveyed; a Recording.
+class Ros1Bag(Recording):
+    """One ROS 1 bag, surveyed.
 
     Args:
         path: the file.  limit: most bytes a message or chunk may take.
@@ -62,12 +57,10 @@ class Ros1Bag(Chunked):
     """
 
     kind = "ros1 bag"
-    profile, library = "ros1", ""
+    profile = "ros1"
 
-    def __init__(self, path: Path, limit: int, sinks: Mapping[str, Sink] | None = None) -> None:
-        self.path, self.losses = path, list[Loss]()
-        self.metadata: dict[str, dict[str, str]] = {}
-        self._limit, self._table = limit, MessageTable(sinks)
+    def __init__(self, path: Path, limit: int, sinks: dict[str, Sink] | None = None) -> None:
+        super().__init__(path, limit, sinks)
         self._topics: dict[int, str] = {}
         self._bad_chunk: Loss | None = None
         self._orphans = self._tried = 0
@@ -78,10 +71,6 @@ class Ros1Bag(Chunked):
         except BaseException:
             self._file.close()
             raise
-
-    def attachment(self) -> tuple[str, bytes] | None:
-        """A bag carries no model."""
-        return None
 
     def _survey(self) -> None:
         stop = self._index_at()
@@ -198,7 +187,7 @@ class Ros1Bag(Chunked):
     def _next_chunk(self, at: int, end: int) -> int | None:
         start = at
         while at < end:
-            window = self._file.upto(at, _WINDOW + _MARGIN)
+            window = self._file.read_at_most(at, _WINDOW + _MARGIN)
             for match in _CHUNK_OP.finditer(window):
                 self._tried += 1
                 if self._tried > _MAX_CANDIDATES:  # bytes made to look like chunks everywhere
@@ -210,7 +199,7 @@ class Ros1Bag(Chunked):
         return None
 
     def _is_chunk(self, at: int, end: int) -> bool:
-        if not 8 <= int.from_bytes(self._file.upto(at, 4), "little") <= _MARGIN:
+        if not 8 <= int.from_bytes(self._file.read_at_most(at, 4), "little") <= _MARGIN:
             return False
         try:
             record = self._record(at)

@@ -12,17 +12,13 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Pose
+from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.clock import Placed, place
-from avsreplay.log.cursor import BadMessage
-from avsreplay.log.feed import Feed
-from avsreplay.log.guides import Guides
+from avsreplay.log.cloud_stream import CloudStream, ahead
+from avsreplay.log.ground_truth import Guides
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import Cloud
-from avsreplay.log.prefetch import ahead
-from avsreplay.log.text import shown
 from avsreplay.records import LogHeader, Scan, ScanStatus, State
-
-__all__ = ["Source"]
 
 _BLOCK = 1 << 20
 
@@ -38,7 +34,7 @@ class Source:
     def __init__(
         self,
         path: Path,
-        feed: Feed,
+        feed: CloudStream,
         header: LogHeader,
         options: SourceOptions,
         guides: Guides,

@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, frozen
-from avsreplay.log.ply import BadFile, read_ply
-from avsreplay.log.text import shown
+from avsreplay.log.bytes_io import BadFile, shown
+from avsreplay.log.ply import read_ply
 from avsreplay.records import Surface
-
-__all__ = ["MODEL_ENDINGS", "parse_surface", "read_surface", "surface_bytes"]
 
 MAX_BYTES = 512 << 20
 _SILENT = logging.NullHandler()

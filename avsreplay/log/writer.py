@@ -15,13 +15,10 @@ from typing import Any, BinaryIO
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
-from avsreplay.log.encode import diagnostic, odometry, point_cloud2, pose_stamped, static_transform
+from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, static_transform
 from avsreplay.log.header import HEADER_RECORD, encode_header
-from avsreplay.log.schemas import schema_text
 from avsreplay.log.surface import surface_bytes
 from avsreplay.records import Label, LogHeader, Scan, State
-
-__all__ = ["BODY_TOPIC", "CLOUD_TOPIC", "FAULT_TOPIC", "TRUTH_TOPIC", "LogWriter"]
 
 CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = "/points", "/truth/pose", "/truth/body", "/faults"
 CAMERA_FRAME, TARGET_FRAME, BODY_FRAME, ROOT_FRAME = "camera", "target", "target_body", "map"

@@ -25,11 +25,10 @@ from fuzz_inputs import case, seeds
 from avsreplay import settings
 from avsreplay.errors import AvsError
 from avsreplay.log import SourceOptions, open_source, parse_surface
-from avsreplay.log.conf import read_conf
-from avsreplay.log.cursor import BadMessage
+from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.doctor import examine
 from avsreplay.log.point_cloud2 import decode_cloud
-from avsreplay.log.pose_files import read_poses
+from avsreplay.log.pose_files import read_conf, read_poses
 from avsreplay.log.repair import repair
 
 LIMIT_S, LIMIT_MIB, MESSAGE_MIB = 10, 700, 16

@@ -16,11 +16,11 @@ import atheris
 with atheris.instrument_imports(include=["avsreplay.log"]):
     from fuzz_inputs import seeds
 
-    from avsreplay.log.cursor import BadMessage
-    from avsreplay.log.formats import read_points
+    from avsreplay.log.bytes_io import BadFile, BadMessage
     from avsreplay.log.pcd import read_pcd, unpack_lzf
-    from avsreplay.log.ply import BadFile, read_ply
+    from avsreplay.log.ply import read_ply
     from avsreplay.log.point_cloud2 import decode_cloud
+    from avsreplay.log.scan_files import read_points
 
 _SCRATCH = Path(tempfile.mkdtemp()) / "one.npy"
 

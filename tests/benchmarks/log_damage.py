@@ -18,7 +18,7 @@ import numpy as np
 from log_cases import header, scans, write
 
 from avsreplay.errors import AvsError
-from avsreplay.log import mcap_records as mcap
+from avsreplay.log import mcap_format as mcap
 from avsreplay.log import open_source
 
 CLOUDS = scans(40, 300)

@@ -1,4 +1,4 @@
-"""What goes with a scan beside its points: the truth, the full state, the pose of a moving sensor."""
+"""Lookups by time for one log: true pose, true state and pose of a moving sensor."""
 
 from __future__ import annotations
 
@@ -7,16 +7,12 @@ from dataclasses import dataclass, field
 
 from avsreplay.errors import UsageError
 from avsreplay.geometry import Pose
+from avsreplay.log.bytes_io import shown
+from avsreplay.log.index import Sink
 from avsreplay.log.options import ClockChoice, SourceOptions, TopicInfo
 from avsreplay.log.pose_files import TimedPoses, read_poses
-from avsreplay.log.poses import POSE_TYPES
-from avsreplay.log.recording import Sink
-from avsreplay.log.text import shown
-from avsreplay.log.tf import TF_TYPE, TfBuffer
-from avsreplay.log.truth import PoseTrack
+from avsreplay.log.pose_messages import POSE_TYPES, TF_TYPE, PoseTrack, TfBuffer
 from avsreplay.log.writer import BODY_TOPIC, TRUTH_TOPIC
-
-__all__ = ["Guides", "MessageGuides", "file_truth"]
 
 TruthLookup = Callable[[int, int, str], Pose | None]
 """(instant [ns], place in the feed, frame of the cloud) -> T_ac, None where there is none."""

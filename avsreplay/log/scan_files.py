@@ -1,4 +1,4 @@
-"""One scan from one file: PLY, PCD, KITTI ``.bin``, ``.npy``, ``.npz``, ``.las``, ``.laz``."""
+"""Scans stored as files: PLY, PCD, KITTI ``.bin``, ``.npy``, ``.npz``, ``.las`` and ``.laz``."""
 
 from __future__ import annotations
 
@@ -7,19 +7,17 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.errors import MissingBackend
+from avsreplay.errors import MissingBackend, UnreadableInput
+from avsreplay.log.bytes_io import BadFile, shown
 from avsreplay.log.pcd import read_pcd
-from avsreplay.log.ply import BadFile, read_ply
-
-__all__ = ["SCAN_FORMATS", "read_points"]
-
+from avsreplay.log.ply import read_ply
 
 _MAX_NPY_HEADER = 4096
 _NPY_HEADER = re.compile(
@@ -124,3 +122,31 @@ _READERS: dict[str, Callable[[bytes, int], NDArray[Any]]] = {
     ".laz": _las,
 }
 SCAN_FORMATS = tuple(_READERS)
+
+
+_NUMBER = re.compile(r"\d+")
+
+
+def scan_files(folder: Path, names: Sequence[str] = ()) -> list[Path]:
+    """The scans of a folder: those named, else every file of the commonest known format; sorted by number, then name.
+
+    Raises UnreadableInput where there are none, or a named one is not there.
+    """
+    if names:
+        missing = [n for n in names if not (folder / n).is_file() or Path(n).name != n]
+        if missing:
+            hint = "remove its line or add the file"
+            raise UnreadableInput(f"scan '{shown(missing[0])}' of the pose file", where=shown(folder), hint=hint)
+        return sorted((folder / n for n in names), key=lambda p: by_number(p.name))
+    found = [p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in SCAN_FORMATS]
+    if not found:
+        hint = f"scans are {', '.join(SCAN_FORMATS)} files; a log is an MCAP or a ROS bag"
+        raise UnreadableInput("no scans in this folder", where=shown(folder), hint=hint)
+    counts = {s: sum(p.suffix.lower() == s for p in found) for s in SCAN_FORMATS}
+    common = max(SCAN_FORMATS, key=lambda s: counts[s])
+    return sorted((p for p in found if p.suffix.lower() == common), key=lambda p: by_number(p.name))
+
+
+def by_number(name: str) -> tuple[tuple[int, ...], str]:
+    """Sorts ``s_9`` before ``s_10``."""
+    return tuple(int(n) for n in _NUMBER.findall(name)), name

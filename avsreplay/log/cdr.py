@@ -1,0 +1,272 @@
+"""Reading and writing of serialised ROS messages: CDR (ROS 2, both byte orders) and the ROS 1 wire format.
+
+One reader serves both: they differ in alignment, in the closing NUL of a string and in the ``seq`` of a header. Every
+read is checked against the end of the buffer, so that a wrong length raises ``BadMessage``.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.geometry import Pose
+from avsreplay.log.bytes_io import BadMessage
+from avsreplay.records import Label, State
+
+_CDR_LITTLE = {0x0001: "<", 0x0000: ">"}  # plain CDR; parameter lists (0x0002, 0x0003) are no ROS message
+
+
+class Cursor:
+    """A checked walk over one message.
+
+    Attributes:
+        data: the bytes walked over (of CDR: after the four-byte encapsulation).  pos: next byte.
+        order: ``<`` or ``>``.  ros1: the wire form of ROS 1.
+    """
+
+    __slots__ = ("data", "order", "pos", "ros1")
+
+    def __init__(self, payload: bytes | memoryview, encoding: str = "cdr") -> None:
+        view = memoryview(payload).cast("B")
+        self.pos = 0
+        self.ros1 = encoding == "ros1"
+        self.order = "<"
+        if not self.ros1:
+            if len(view) < 4:
+                raise BadMessage("shorter than the CDR encapsulation")
+            kind = (view[0] << 8) | view[1]
+            if kind not in _CDR_LITTLE:
+                raise BadMessage(f"unknown CDR encapsulation 0x{kind:04x}")
+            self.order = _CDR_LITTLE[kind]
+            view = view[4:]
+        self.data = view
+
+    def _take(self, fmt: str, size: int) -> int | float:
+        start = self.pos if self.ros1 else (self.pos + size - 1) & -size
+        try:
+            value: int | float = struct.unpack_from(self.order + fmt, self.data, start)[0]
+        except struct.error:
+            raise BadMessage(f"ends at byte {len(self.data)}, {start + size} needed") from None
+        self.pos = start + size
+        return value
+
+    def u8(self) -> int:
+        """An octet."""
+        return int(self._take("B", 1))
+
+    def u32(self) -> int:
+        """An unsigned 32-bit number."""
+        return int(self._take("I", 4))
+
+    def i32(self) -> int:
+        """A signed 32-bit number."""
+        return int(self._take("i", 4))
+
+    def f64s(self, count: int) -> tuple[float, ...]:
+        """``count`` doubles, without a length before them."""
+        start = self.pos if self.ros1 else (self.pos + 7) & -8
+        try:
+            values = struct.unpack_from(f"{self.order}{count}d", self.data, start)
+        except struct.error:
+            raise BadMessage(f"ends at byte {len(self.data)}, {start + 8 * count} needed") from None
+        self.pos = start + 8 * count
+        return values
+
+    def octets(self) -> memoryview:
+        """A sequence of octets, as a view."""
+        size = self.u32()
+        start = self.pos
+        if start + size > len(self.data):
+            raise BadMessage(f"a sequence of {size} bytes where {len(self.data) - start} are left")
+        self.pos = start + size
+        return self.data[start : self.pos]
+
+    def string(self) -> str:
+        r"""Text; bytes that are not UTF-8 are kept readable as ``\xNN``."""
+        raw = bytes(self.octets())
+        return (raw if self.ros1 else raw.rstrip(b"\x00")).decode("utf-8", "backslashreplace")
+
+    def stamp(self) -> int:
+        """A time [ns]."""
+        seconds = self.u32() if self.ros1 else self.i32()
+        return seconds * 1_000_000_000 + self.u32()
+
+    def header(self) -> tuple[int, str]:
+        """A std_msgs Header: stamp [ns] and frame."""
+        if self.ros1:
+            self.u32()
+        return self.stamp(), self.string()
+
+
+class Packer:
+    """Little-endian CDR, written front to back."""
+
+    __slots__ = ("out",)
+
+    def __init__(self) -> None:
+        self.out = bytearray(b"\x00\x01\x00\x00")
+
+    def _align(self, size: int) -> None:
+        self.out += b"\x00" * (-(len(self.out) - 4) % size)
+
+    def u8(self, value: int) -> Packer:
+        """An octet."""
+        self.out.append(value)
+        return self
+
+    def u32(self, value: int) -> Packer:
+        """An unsigned 32-bit number."""
+        self._align(4)
+        self.out += struct.pack("<I", value)
+        return self
+
+    def i32(self, value: int) -> Packer:
+        """A signed 32-bit number."""
+        self._align(4)
+        self.out += struct.pack("<i", value)
+        return self
+
+    def f64s(self, *values: float) -> Packer:
+        """Doubles, without a length before them."""
+        self._align(8)
+        self.out += struct.pack(f"<{len(values)}d", *values)
+        return self
+
+    def string(self, text: str) -> Packer:
+        """Text with its closing NUL."""
+        raw = text.encode("utf-8") + b"\x00"
+        self.u32(len(raw))
+        self.out += raw
+        return self
+
+    def octets(self, raw: bytes) -> Packer:
+        """A sequence of octets."""
+        self.u32(len(raw))
+        self.out += raw
+        return self
+
+    def header(self, t_ns: int, frame: str) -> Packer:
+        """A std_msgs Header. Raises ValueError where ``t_ns`` does not fit a ROS 2 time."""
+        seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
+        if not -(2**31) <= seconds < 2**31:
+            raise ValueError(f"stamp {t_ns} ns does not fit a ROS 2 time")
+        return self.i32(seconds).u32(nanoseconds).string(frame)
+
+    def bytes(self) -> bytes:
+        """What was packed."""
+        return bytes(self.out)
+
+
+_DATATYPE = {"float32": 7, "float64": 8}
+
+
+def point_cloud2(
+    t_ns: int, frame: str, points: NDArray[Any], times_s: NDArray[Any] | None, point_type: str = "float32"
+) -> bytes:
+    """A cloud of (n, 3) points [m] with, where given, the field ``t``: (n,) float32 [s] after the stamp."""
+    names = ["x", "y", "z"]
+    formats = [f"<f{4 if point_type == 'float32' else 8}"] * 3
+    if times_s is not None:
+        names, formats = [*names, "t"], [*formats, "<f4"]
+    table = np.empty(len(points), dtype={"names": names, "formats": formats})
+    for axis, name in enumerate("xyz"):
+        table[name] = points[:, axis]
+    if times_s is not None:
+        table["t"] = times_s
+    packer = Packer().header(t_ns, frame).u32(1).u32(len(points)).u32(len(names))
+    for name in names:
+        offset = int(table.dtype.fields[name][1]) if table.dtype.fields else 0
+        kind = 7 if name == "t" else _DATATYPE[point_type]
+        packer.string(name).u32(offset).u8(kind).u32(1)
+    step = table.dtype.itemsize
+    return packer.u8(0).u32(step).u32(step * len(points)).octets(table.tobytes()).u8(1).bytes()
+
+
+def pose_stamped(t_ns: int, frame: str, pose: Pose) -> bytes:
+    """A geometry_msgs PoseStamped."""
+    return Packer().header(t_ns, frame).f64s(*pose.t, *pose.q).bytes()
+
+
+def odometry(t_ns: int, frame: str, child: str, body: State) -> bytes:
+    """A nav_msgs Odometry: the pose of {B} in {A}, the twist in {B} as ROS has it."""
+    v_b = geometry.rotate(geometry.matrix(body.q_ab).T, body.v_a)
+    zeros = (0.0,) * 36
+    packer = Packer().header(t_ns, frame).string(child).f64s(*body.r_a, *body.q_ab, *zeros)
+    return packer.f64s(*v_b, *body.w_b, *zeros).bytes()
+
+
+def static_transform(t_ns: int, parent: str, child: str) -> bytes:
+    """A tf2_msgs TFMessage with one identity transform, so that a viewer finds the cloud's frame."""
+    packer = Packer().u32(1).header(t_ns, parent).string(child)
+    return packer.f64s(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0).bytes()
+
+
+def diagnostic(t_ns: int, label: Label, begins: bool) -> bytes:
+    """A diagnostic_msgs DiagnosticArray saying that an injected fault begins (WARN) or ends (OK)."""
+    message = "injected fault begins" if begins else "injected fault ends"
+    values = {"start_ns": label.start_ns, "end_ns": label.end_ns, "harmful": label.harmful, "strength": label.strength}
+    packer = Packer().header(t_ns, "").u32(1).u8(1 if begins else 0)
+    packer.string(label.kind).string(message).string("").u32(len(values))
+    for key, value in values.items():
+        packer.string(key).string(str(value))
+    return packer.bytes()
+
+
+_TIME = ("builtin_interfaces/Time", "int32 sec\nuint32 nanosec\n")
+_HEADER = ("std_msgs/Header", "builtin_interfaces/Time stamp\nstring frame_id\n")
+_POINT = ("geometry_msgs/Point", "float64 x\nfloat64 y\nfloat64 z\n")
+_VECTOR3 = ("geometry_msgs/Vector3", "float64 x\nfloat64 y\nfloat64 z\n")
+_QUATERNION = ("geometry_msgs/Quaternion", "float64 x 0\nfloat64 y 0\nfloat64 z 0\nfloat64 w 1\n")
+_POSE = ("geometry_msgs/Pose", "Point position\nQuaternion orientation\n")
+_TWIST = ("geometry_msgs/Twist", "Vector3 linear\nVector3 angular\n")
+_FIELD = (
+    "sensor_msgs/PointField",
+    "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\nuint8 UINT32=6\nuint8 FLOAT32=7\n"
+    "uint8 FLOAT64=8\nstring name\nuint32 offset\nuint8 datatype\nuint32 count\n",
+)
+_TRANSFORM = ("geometry_msgs/Transform", "Vector3 translation\nQuaternion rotation\n")
+_STAMPED = ("geometry_msgs/TransformStamped", "std_msgs/Header header\nstring child_frame_id\nTransform transform\n")
+_POSE_COV = ("geometry_msgs/PoseWithCovariance", "Pose pose\nfloat64[36] covariance\n")
+_TWIST_COV = ("geometry_msgs/TwistWithCovariance", "Twist twist\nfloat64[36] covariance\n")
+_KEY_VALUE = ("diagnostic_msgs/KeyValue", "string key\nstring value\n")
+_DIAGNOSTIC = (
+    "diagnostic_msgs/DiagnosticStatus",
+    "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\n"
+    "string hardware_id\nKeyValue[] values\n",
+)
+
+SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
+    "sensor_msgs/msg/PointCloud2": (
+        "std_msgs/Header header\nuint32 height\nuint32 width\nPointField[] fields\nbool is_bigendian\n"
+        "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n",
+        (_HEADER, _TIME, _FIELD),
+    ),
+    "geometry_msgs/msg/PoseStamped": (
+        "std_msgs/Header header\nPose pose\n",
+        (_HEADER, _TIME, _POSE, _POINT, _QUATERNION),
+    ),
+    "nav_msgs/msg/Odometry": (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
+        "geometry_msgs/TwistWithCovariance twist\n",
+        (_HEADER, _TIME, _POSE_COV, _POSE, _POINT, _QUATERNION, _TWIST_COV, _TWIST, _VECTOR3),
+    ),
+    "tf2_msgs/msg/TFMessage": (
+        "geometry_msgs/TransformStamped[] transforms\n",
+        (_STAMPED, _HEADER, _TIME, _TRANSFORM, _VECTOR3, _QUATERNION),
+    ),
+    "diagnostic_msgs/msg/DiagnosticArray": (
+        "std_msgs/Header header\nDiagnosticStatus[] status\n",
+        (_HEADER, _TIME, _DIAGNOSTIC, _KEY_VALUE),
+    ),
+}
+
+
+def schema_text(name: str) -> bytes:
+    """The full definition of a message type of ``SCHEMAS``."""
+    body, dependencies = SCHEMAS[name]
+    parts = [body, *(f"MSG: {dep}\n{text}" for dep, text in dependencies)]
+    return ("\n" + "=" * 80 + "\n").join(p.rstrip("\n") for p in parts).encode() + b"\n"

@@ -1,0 +1,229 @@
+"""The index of a log: its topics, the places of its cloud messages, and the base class of the log readers."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from avsreplay.log.bytes_io import BadMessage, ByteFile
+from avsreplay.log.cdr import Cursor
+from avsreplay.log.mcap_format import ChunkStore
+from avsreplay.log.options import Loss, TopicInfo
+
+MAX_NS = 2**63 - 1
+CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2",)
+Sink = Callable[[str, str, int, bytes | memoryview], None]
+"""Receives (type, encoding, log time [ns], payload) of each message of a topic, in file order."""
+
+
+def _column() -> array[int]:
+    return array("q")
+
+
+@dataclass(slots=True)
+class CloudIndex:
+    """The messages of one cloud topic in file order; one entry for each message in every array.
+
+    Attributes:
+        log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header [ns].
+        container, offset, size: where the reader finds the message again.
+    """
+
+    log_ns: array[int] = field(default_factory=_column)
+    publish_ns: array[int] = field(default_factory=_column)
+    header_ns: array[int] = field(default_factory=_column)
+    container: array[int] = field(default_factory=_column)
+    offset: array[int] = field(default_factory=_column)
+    size: array[int] = field(default_factory=_column)
+
+    def add(self, clocks: tuple[int, int, int], container: int, offset: int, size: int) -> None:
+        """Append a message with its (log, publish, header) times [ns]."""
+        for column, value in zip((self.log_ns, self.publish_ns, self.header_ns), clocks, strict=True):
+            column.append(max(-(2**63), min(value, MAX_NS)))
+        self.container.append(container)
+        self.offset.append(offset)
+        self.size.append(size)
+
+    def order(self) -> list[int]:
+        """Return the entries ordered by log time, then by file order."""
+        return sorted(range(len(self.log_ns)), key=self.log_ns.__getitem__)
+
+
+@dataclass(slots=True)
+class _TopicCount:
+    name: str
+    type: str
+    encoding: str
+    count: int = 0
+    first_ns: int | None = None
+    last_ns: int | None = None
+
+    def add(self, log_ns: int) -> None:
+        self.count += 1
+        if self.first_ns is None or self.last_ns is None:
+            self.first_ns = self.last_ns = log_ns
+        elif log_ns < self.first_ns:
+            self.first_ns = log_ns
+        elif log_ns > self.last_ns:
+            self.last_ns = log_ns
+
+
+class MessageTable:
+    """Topics with their message counts and the index of every cloud topic, filled by one pass over the log.
+
+    Args:
+        sinks: called with every message of a topic during the pass.
+    """
+
+    def __init__(self, sinks: dict[str, Sink] | None = None) -> None:
+        self._sinks = dict(sinks or {})
+        self._topics: dict[str, _TopicCount] = {}
+        self._clouds: dict[str, CloudIndex] = {}
+
+    def declare(self, topic: str, kind: str, encoding: str) -> None:
+        """Declare a topic; the first declared type is kept."""
+        self._topics.setdefault(topic, _TopicCount(topic, kind, encoding))
+
+    def add(self, topic: str, times: tuple[int, int], payload: memoryview, place: tuple[int, int]) -> None:
+        """Add a message of a declared topic: (log, publish) times [ns], payload and (container, offset)."""
+        known = self._topics[topic]
+        log_ns = min(times[0], MAX_NS)
+        known.add(log_ns)
+        if known.type in CLOUD_TYPES:
+            clocks = (log_ns, times[1], _stamp(payload, known.encoding))
+            self._clouds.setdefault(topic, CloudIndex()).add(clocks, *place, len(payload))
+        if topic in self._sinks:
+            self._sinks[topic](known.type, known.encoding, log_ns, payload)
+
+    def topics(self) -> list[TopicInfo]:
+        """Return all topics, sorted by name."""
+        infos = (TopicInfo(t.name, t.type, t.encoding, t.count, t.first_ns, t.last_ns) for t in self._topics.values())
+        return sorted(infos, key=lambda t: t.name)
+
+    def clouds(self, topic: str) -> CloudIndex:
+        """Return the index of a cloud topic."""
+        return self._clouds.get(topic, CloudIndex())
+
+
+def _stamp(payload: memoryview, encoding: str) -> int:
+    """Return the header stamp of a message [ns], 0 if the message is too short."""
+    try:
+        cursor = Cursor(payload, encoding)
+        if cursor.ros1:
+            cursor.u32()
+        return cursor.stamp()
+    except BadMessage:
+        return 0
+
+
+class Recording:
+    """Base class of the log readers: a log of messages that was read once from begin to end.
+
+    Attributes:
+        path: the file.
+        losses: parts that could not be read.
+        metadata: MCAP metadata records by name.
+        kind: the format in words.
+        profile, library: what the file states about its use and its writer.
+    """
+
+    kind = ""
+    profile = library = ""
+    _file: ByteFile
+    _chunks: ChunkStore
+
+    def __init__(self, path: Path, limit: int, sinks: dict[str, Sink] | None = None) -> None:
+        self.path, self.losses = path, list[Loss]()
+        self.metadata: dict[str, dict[str, str]] = {}
+        self._limit, self._table = limit, MessageTable(sinks)
+
+    def topics(self) -> list[TopicInfo]:
+        """Return every topic that was declared, sorted by name."""
+        return self._table.topics()
+
+    def clouds(self, topic: str) -> CloudIndex:
+        """Return the index of a cloud topic."""
+        return self._table.clouds(topic)
+
+    def read(self, topic: str, place: int) -> bytes | memoryview:
+        """Return the payload of the cloud message with this index entry. Raises BadMessage if it cannot be read."""
+        index = self._table.clouds(topic)
+        chunk, offset, size = index.container[place], index.offset[place], index.size[place]
+        if chunk < 0:  # the message is not inside a chunk
+            return self._file.read(offset, size)
+        return memoryview(self._chunks[chunk])[offset : offset + size]
+
+    def attachment(self) -> tuple[str, bytes] | None:
+        """Return name and bytes of the model file attached to the log, None if there is none."""
+        return None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+class Merged(Recording):
+    """Several recordings in order, read as one log.
+
+    Args:
+        parts: the recordings, at least one.
+        kind: the format in words.
+        losses: losses of the whole, for instance missing files.
+    """
+
+    def __init__(self, parts: Sequence[Recording], kind: str, losses: Sequence[Loss] = ()) -> None:
+        self.kind, self._parts = kind, list(parts)
+        self.losses = [*losses, *(loss for part in parts for loss in part.losses)]
+        self.profile, self.library = parts[0].profile, parts[0].library
+        self.metadata = {}
+        for part in reversed(self._parts):  # the first part with a record of that name counts
+            self.metadata.update(part.metadata)
+
+    def topics(self) -> list[TopicInfo]:
+        """Return every topic of any part with the sum of its counts, sorted by name."""
+        out: dict[str, TopicInfo] = {}
+        for topic in (t for part in self._parts for t in part.topics()):
+            out[topic.name] = _joined(out[topic.name], topic) if topic.name in out else topic
+        return sorted(out.values(), key=lambda t: t.name)
+
+    def clouds(self, topic: str) -> CloudIndex:
+        """Return the index of a cloud topic over all parts."""
+        out = CloudIndex()
+        for number, part in enumerate(self._parts):
+            index = part.clouds(topic)
+            for place, clocks in enumerate(zip(index.log_ns, index.publish_ns, index.header_ns, strict=True)):
+                out.add(clocks, number, place, index.size[place])
+        return out
+
+    def read(self, topic: str, place: int) -> bytes | memoryview:
+        """Return the payload of the cloud message with this index entry. Raises BadMessage if it cannot be read."""
+        for part in self._parts:
+            count = len(part.clouds(topic).log_ns)
+            if place < count:
+                return part.read(topic, place)
+            place -= count
+        raise IndexError(place)
+
+    def attachment(self) -> tuple[str, bytes] | None:
+        """Return the first model that a part carries."""
+        return next(filter(None, (part.attachment() for part in self._parts)), None)
+
+    def close(self) -> None:
+        """Close all files."""
+        for part in self._parts:
+            part.close()
+
+
+def _joined(one: TopicInfo, two: TopicInfo) -> TopicInfo:
+    firsts = [t for t in (one.first_ns, two.first_ns) if t is not None]
+    lasts = [t for t in (one.last_ns, two.last_ns) if t is not None]
+    first, last = min(firsts, default=None), max(lasts, default=None)
+    return TopicInfo(one.name, one.type, one.encoding, one.count + two.count, first, last)
+
+
+def canonical_type(name: str) -> str:
+    """Return ``pkg/msg/Type`` for ``pkg/Type``, the form of ROS 1 and of old bags."""
+    package, _, rest = name.partition("/")
+    return name if rest.startswith("msg/") or not rest else f"{package}/msg/{rest}"

@@ -1,0 +1,258 @@
+"""The MCAP format: records, chunks and the summary section, with every length checked."""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Protocol
+
+from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 2, 3, 4, 5, 6, 7
+ATTACHMENT, STATISTICS, METADATA, DATA_END = 9, 11, 12, 15
+CHUNK_PREFIX = 9 + 8 + 8 + 8 + 4 + 4 + 4 + 8  # opcode and length, then the longest head of a chunk
+_HEAD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQII")
+_SIGNATURE = re.compile(rb"(?=\x06[\s\S]{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd))")
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """A channel with its schema's name and text."""
+
+    id: int
+    topic: str
+    type: str
+    encoding: str
+    schema_encoding: str = ""
+    schema: bytes = b""
+    metadata: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkHead:
+    """What a chunk says of itself; ``data_at`` counts from the record's opcode."""
+
+    start_ns: int
+    end_ns: int
+    size: int
+    crc: int
+    compression: str
+    data_at: int
+    data_size: int
+
+
+class Fields:
+    """A walk over one record's content. Raises BadMessage past its end."""
+
+    __slots__ = ("at", "view")
+
+    def __init__(self, view: memoryview) -> None:
+        self.view, self.at = view, 0
+
+    def number(self, size: int) -> int:
+        """An unsigned little-endian number."""
+        raw = self.view[self.at : self.at + size]
+        if len(raw) < size:
+            raise BadMessage("a record ends inside a number")
+        self.at += size
+        return int.from_bytes(raw, "little")
+
+    def take(self, size: int) -> memoryview:
+        """So many bytes."""
+        if self.at + size > len(self.view):
+            raise BadMessage(f"a record holds {len(self.view) - self.at} of {size} bytes")
+        self.at += size
+        return self.view[self.at - size : self.at]
+
+    def text(self) -> str:
+        r"""A string; bytes that are not UTF-8 stay readable as ``\xNN``."""
+        return bytes(self.take(self.number(4))).decode("utf-8", "backslashreplace")
+
+    def mapping(self) -> dict[str, str]:
+        """A map of strings."""
+        inner = Fields(self.take(self.number(4)))
+        out: dict[str, str] = {}
+        while inner.at < len(inner.view):
+            key = inner.text()
+            out[key] = inner.text()
+        return out
+
+
+def records(view: memoryview) -> Iterator[tuple[int, int, int]]:
+    """(opcode, begin, end) of the content of each record. Raises BadMessage where the last one is cut."""
+    at, size = 0, len(view)
+    while at + 9 <= size:
+        opcode, length = _HEAD.unpack_from(view, at)
+        if length > size - at - 9:
+            raise BadMessage("a record ends past its container")
+        yield opcode, at + 9, at + 9 + length
+        at += 9 + length
+    if at != size:
+        raise BadMessage("bytes after the last record of a container")
+
+
+def chunk_head(view: memoryview | bytes, record_size: int | None = None) -> ChunkHead:
+    """Parse a chunk record from its opcode on. Raises BadMessage where its lengths contradict each other."""
+    if len(view) < 49 or view[0] != CHUNK:
+        raise BadMessage("no chunk")
+    _, length = _HEAD.unpack_from(view, 0)
+    start, end, size, crc, name_size = _CHUNK.unpack_from(view, 9)
+    if name_size > 16 or len(view) < 49 + name_size:
+        raise BadMessage("a chunk names no known compression")
+    name = bytes(view[41 : 41 + name_size]).decode("ascii", "replace")
+    if name not in ("", "zstd", "lz4"):
+        raise BadMessage("a chunk names no known compression")
+    data_size = int.from_bytes(view[41 + name_size : 49 + name_size], "little")
+    if length != 40 + name_size + data_size or (record_size is not None and length + 9 > record_size):
+        raise BadMessage("a chunk's lengths contradict each other")
+    if start > end:
+        raise BadMessage("a chunk ends before it starts")
+    return ChunkHead(start, end, size, crc, name, 49 + name_size, data_size)
+
+
+def chunk_candidates(window: bytes) -> Iterator[int]:
+    """Places in ``window`` where a chunk record may begin."""
+    return (match.start() for match in _SIGNATURE.finditer(window))
+
+
+def is_mcap(path: Path) -> bool:
+    """Does a file begin as MCAP does?"""
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(8) == MAGIC
+
+
+class Tap(Protocol):
+    """Takes every intact record of a file, in file order; times are (log, publish or creation) [ns]."""
+
+    def message(self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview) -> None:
+        """A message."""
+
+    def attachment(self, name: str, media: str, times: tuple[int, int], data: memoryview) -> None:
+        """An attachment whose checksum holds."""
+
+    def metadata(self, name: str, values: dict[str, str]) -> None:
+        """A metadata record."""
+
+
+_COMPRESSIONS = ("", "zstd", "lz4", "bz2")
+_KEPT = 2
+
+
+class ChunkStore:
+    """Chunks by number, in file order.
+
+    Args:
+        file: the file they are in.  limit: most bytes a chunk may have, packed or inflated.
+    """
+
+    def __init__(self, file: ByteFile, limit: int) -> None:
+        self._file, self._limit = file, limit
+        self._offset, self._packed, self._compression, self._size = (array("q") for _ in range(4))
+        self._cache: dict[int, bytes] = {}
+
+    def __len__(self) -> int:
+        return len(self._offset)
+
+    def check(self, at: int, head: ChunkHead) -> bytes:
+        """The inflated chunk at ``at``. Raises BadMessage where its checksum does not hold or it is over the limit."""
+        if max(head.size, head.data_size) > self._limit:
+            raise BadMessage(f"a chunk of {head.size} bytes is over the limit of {self._limit}")
+        data = inflate(self._file.read(at + head.data_at, head.data_size), head.compression, head.size)
+        if head.crc and zlib.crc32(data) != head.crc:
+            raise BadMessage("the checksum of a chunk does not hold")
+        return data
+
+    def add(self, at: int, head: ChunkHead) -> int:
+        """Take in a checked chunk and return its number."""
+        values = (at + head.data_at, head.data_size, _COMPRESSIONS.index(head.compression), head.size)
+        for column, value in zip((self._offset, self._packed, self._compression, self._size), values, strict=True):
+            column.append(value)
+        return len(self._offset) - 1
+
+    def __getitem__(self, number: int) -> bytes:
+        """The inflated chunk. Raises BadMessage where the file has changed meanwhile."""
+        if number not in self._cache:
+            if len(self._cache) >= _KEPT:
+                self._cache.pop(next(iter(self._cache)))
+            packed = self._file.read(self._offset[number], self._packed[number])
+            self._cache[number] = inflate(packed, _COMPRESSIONS[self._compression[number]], self._size[number])
+        return self._cache[number]
+
+
+TAIL = 37  # footer record (29 bytes) and closing magic
+_DATA_END = re.compile(rb"\x0f\x04\x00{7}")
+_SEARCHED = 4 << 20
+_FOOTER_HEAD = b"\x02\x14\x00\x00\x00\x00\x00\x00\x00"
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """The summary section.
+
+    Attributes:
+        start: where it begins, 0 where there is none to trust.  messages: how many the file holds, None: not said.
+        definitions: its schema and channel records.  trouble: what is wrong with it, "" where nothing is.
+    """
+
+    start: int = 0
+    messages: int | None = None
+    definitions: tuple[tuple[int, Fields], ...] = ()
+    trouble: str = ""
+
+
+def read_summary(file: ByteFile, limit: int) -> Summary:
+    """The summary of a file, an empty one that says why where it cannot be trusted."""
+    try:
+        return _read(file, limit)
+    except BadMessage as error:
+        return Summary(trouble=str(error))
+
+
+def _read(file: ByteFile, limit: int) -> Summary:
+    if file.size < 8 + TAIL:
+        raise BadMessage("no footer")
+    tail = file.read(file.size - TAIL, TAIL)
+    if tail[29:] != MAGIC or tail[:9] != _FOOTER_HEAD:
+        raise BadMessage("no footer")
+    start, crc = int.from_bytes(tail[9:17], "little"), int.from_bytes(tail[25:29], "little")
+    if start == 0:
+        return Summary()
+    inside = 8 < start <= file.size - TAIL and file.size - start <= limit
+    data = file.read(start, file.size - TAIL - start + 25) if inside else b""
+    if inside and (not crc or zlib.crc32(data) == crc):
+        return _walk(start, memoryview(data)[: len(data) - 25])
+    moved = _moved(file, crc)
+    if moved is not None:
+        return replace(_walk(*moved), trouble="the footer points elsewhere: bytes were put in or taken out before it")
+    raise BadMessage("the checksum of the summary does not hold" if inside else "the footer points outside the file")
+
+
+def _moved(file: ByteFile, crc: int) -> tuple[int, memoryview] | None:
+    """Where the summary is after all, when bytes before it came or went: behind an end of data, and its sum holds."""
+    begin = max(file.size - _SEARCHED, 8)
+    window = file.read(begin, file.size - begin)
+    end = len(window) - TAIL + 25
+    for match in _DATA_END.finditer(window):
+        start = match.start() + 13
+        if crc and start <= end - 25 and zlib.crc32(window[start:end]) == crc:
+            return begin + start, memoryview(window)[start : end - 25]
+    return None
+
+
+def _walk(start: int, view: memoryview) -> Summary:
+    messages, definitions = None, list[tuple[int, Fields]]()
+    for opcode, begin, end in records(view):
+        if opcode in (SCHEMA, CHANNEL):
+            definitions.append((opcode, Fields(view[begin:end])))
+        elif opcode == STATISTICS:
+            messages = Fields(view[begin:end]).number(8)
+    return Summary(start, messages, tuple(definitions))

@@ -1,0 +1,163 @@
+"""Recovery of a damaged MCAP file: the next readable record, and channels whose definition is lost."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable
+
+from avsreplay.log import mcap_format as mcap
+from avsreplay.log.bytes_io import BadMessage, ByteFile
+from avsreplay.log.cdr import Cursor
+from avsreplay.log.index import MessageTable, canonical_type
+from avsreplay.log.mcap_format import Channel, Fields
+from avsreplay.log.point_cloud2 import read_layout
+from avsreplay.log.pose_messages import read_pose
+from avsreplay.log.writer import BODY_TOPIC, LIBRARY, TRUTH_TOPIC
+
+
+class ChannelTable:
+    """Channels by id; the first definition of an id holds.
+
+    Args:
+        table: where their topics are declared.
+    """
+
+    def __init__(self, table: MessageTable) -> None:
+        self._table = table
+        self._schemas: dict[int, tuple[str, str, bytes]] = {}
+        self.by_id: dict[int, Channel] = {}
+
+    def schema(self, fields: Fields) -> None:
+        """Take in a schema record. Raises BadMessage."""
+        number, name, encoding = fields.number(2), fields.text(), fields.text()
+        self._schemas.setdefault(number, (name, encoding, bytes(fields.take(fields.number(4)))))
+
+    def channel(self, fields: Fields) -> None:
+        """Take in a channel record. Raises BadMessage."""
+        number, schema = fields.number(2), fields.number(2)
+        topic, encoding = fields.text(), fields.text()
+        name, form, text = self._schemas.get(schema, ("", "", b""))
+        self._take(Channel(number, topic, canonical_type(name), encoding, form, text, fields.mapping()))
+
+    def guess(self, number: int, payload: memoryview, library: str) -> Channel | None:
+        """Take a channel without a definition for what its message is; None where nothing tells."""
+        channel = guess_channel(number, payload, library)
+        if channel is not None:
+            self._take(channel)
+        return channel
+
+    def _take(self, channel: Channel) -> None:
+        if channel.id not in self.by_id:
+            self.by_id[channel.id] = channel
+            self._table.declare(channel.topic, channel.type, channel.encoding)
+
+
+_POSE, _ODOMETRY = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
+
+
+def guess_channel(number: int, payload: memoryview, library: str) -> Channel | None:
+    """The channel a message seems to be of, None where nothing tells."""
+    if _is_cloud(payload):
+        return Channel(number, f"/lost/channel_{number}", "sensor_msgs/msg/PointCloud2", "cdr")
+    if library == LIBRARY and _is_whole(_POSE, payload, 7):
+        return Channel(number, TRUTH_TOPIC, _POSE, "cdr")
+    if library == LIBRARY and _is_whole(_ODOMETRY, payload, 7 + 36 + 6 + 36):
+        return Channel(number, BODY_TOPIC, _ODOMETRY, "cdr")
+    return None
+
+
+def _is_cloud(payload: memoryview) -> bool:
+    try:
+        layout = read_layout(payload)
+    except BadMessage:
+        return False
+    return {"x", "y", "z"} <= {field.name for field in layout.fields}
+
+
+def _is_whole(kind: str, payload: memoryview, doubles: int) -> bool:
+    """Does the message read as ``kind`` and end where that type ends?"""
+    try:
+        read_pose(kind, payload)
+        cursor = Cursor(payload)
+        cursor.header()
+        if kind == _ODOMETRY:
+            cursor.string()
+        cursor.f64s(doubles)
+    except BadMessage:
+        return False
+    return cursor.pos == len(cursor.data)
+
+
+_WINDOW = 1 << 20
+_MARGIN = 64  # a candidate is told by so many bytes behind its first
+_MAX_CANDIDATES = 1_000_000
+_MESSAGE = re.compile(rb"(?=\x05[\s\S]{4}\x00{4}[\s\S]{2})")
+
+
+def is_chunk(file: ByteFile, at: int, stop: int) -> bool:
+    """Could a chunk record stand at ``at`` and end by ``stop``?"""
+    try:
+        mcap.chunk_head(file.read_at_most(at, mcap.CHUNK_PREFIX), stop - at)
+    except BadMessage:
+        return False
+    return True
+
+
+def begins_record(file: ByteFile, at: int) -> bool:
+    """Could a record of a known kind begin at ``at`` and end inside the file?"""
+    head = file.read_at_most(at, 9)
+    return len(head) == 9 and 0 < head[0] < 16 and at + 9 + int.from_bytes(head[1:], "little") <= file.size
+
+
+def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
+    """Is a record of a private kind a chunk but for its first byte?"""
+    try:
+        mcap.chunk_head(b"\x06" + file.read_at_most(at + 1, mcap.CHUNK_PREFIX - 1), end - at)
+    except BadMessage:
+        return False
+    return True
+
+
+def first_chunk(file: ByteFile, at: int, last: int) -> int | None:
+    """The first place in [at, last) where a chunk may begin, wherever it ends."""
+    return _search(file, at, last, mcap.chunk_candidates, lambda place: is_chunk(file, place, file.size))
+
+
+def next_record(file: ByteFile, at: int, stop: int, channels: frozenset[int], chunked: bool) -> int | None:
+    """The next chunk in [at, stop); in a file without chunks the next message of a known channel."""
+    if chunked:
+        return _search(file, at, stop, mcap.chunk_candidates, lambda place: is_chunk(file, place, stop))
+    return _search(file, at, stop, _messages, lambda place: _is_message(file, place, stop, channels))
+
+
+def _messages(window: bytes) -> list[int]:
+    return [match.start() for match in _MESSAGE.finditer(window)]
+
+
+def _is_message(file: ByteFile, at: int, stop: int, channels: frozenset[int]) -> bool:
+    """A message of a known channel behind which another record begins."""
+    head = file.read_at_most(at, 11)
+    end = at + 9 + int.from_bytes(head[1:9], "little")
+    if end > stop or end < at + 31 or int.from_bytes(head[9:11], "little") not in channels:
+        return False
+    return end == stop or begins_record(file, end)
+
+
+def _search(
+    file: ByteFile,
+    at: int,
+    stop: int,
+    candidates: Callable[[bytes], Iterable[int]],
+    accept: Callable[[int], bool],
+) -> int | None:
+    tried = 0
+    while at < stop:
+        window = file.read_at_most(at, min(_WINDOW, stop - at) + _MARGIN)
+        for place in candidates(window):
+            tried += 1
+            if tried > _MAX_CANDIDATES:  # bytes made to look like records everywhere
+                return None
+            if at + place < stop and accept(at + place):
+                return at + place
+        at += _WINDOW
+    return None

@@ -1,0 +1,225 @@
+"""Pose messages, pose tracks over time and transform trees (/tf, /tf_static)."""
+
+from __future__ import annotations
+
+import math
+from array import array
+from bisect import bisect_left
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.log.bytes_io import BadMessage
+from avsreplay.log.cdr import Cursor
+from avsreplay.log.index import Sink
+from avsreplay.records import State
+
+_MAX_TRANSFORMS = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Transform:
+    """A stamped pose of ``child`` in ``parent``: seven numbers x y z qx qy qz qw, and a twist where there is one."""
+
+    t_ns: int
+    parent: str
+    child: str
+    pose: tuple[float, ...]
+    twist: tuple[float, ...] | None = None
+
+
+def read_pose(kind: str, payload: bytes | memoryview, encoding: str = "cdr") -> Transform:
+    """A pose of one of ``POSE_TYPES``. Raises BadMessage where it is cut, not finite, or no unit quaternion."""
+    return checked(POSE_TYPES[kind](Cursor(payload, encoding)))
+
+
+def checked(out: Transform) -> Transform:
+    """The transform itself. Raises BadMessage where it is not finite or its quaternion not of unit length."""
+    if not all(map(math.isfinite, out.pose)) or not 0.5 < math.hypot(*out.pose[3:]) < 2.0:
+        raise BadMessage("a pose that is no pose")
+    return out
+
+
+def read_transforms(payload: bytes | memoryview, encoding: str = "cdr") -> list[Transform]:
+    """The transforms of a TFMessage. Raises BadMessage."""
+    cursor = Cursor(payload, encoding)
+    count = cursor.u32()
+    if count > _MAX_TRANSFORMS:
+        raise BadMessage(f"{count} transforms in one message")
+    return [_transform(cursor) for _ in range(count)]
+
+
+def _pose(cursor: Cursor) -> Transform:
+    t_ns, frame = cursor.header()
+    return Transform(t_ns, frame, "", cursor.f64s(7))
+
+
+def _odometry(cursor: Cursor) -> Transform:
+    t_ns, frame = cursor.header()
+    child = cursor.string()
+    pose = cursor.f64s(7)
+    cursor.f64s(36)
+    return Transform(t_ns, frame, child, pose, cursor.f64s(6))
+
+
+def _transform(cursor: Cursor) -> Transform:
+    t_ns, frame = cursor.header()
+    child = cursor.string()
+    return Transform(t_ns, frame, child, cursor.f64s(7))
+
+
+POSE_TYPES: dict[str, Callable[[Cursor], Transform]] = {
+    "geometry_msgs/msg/PoseStamped": _pose,
+    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose,
+    "nav_msgs/msg/Odometry": _odometry,
+    "geometry_msgs/msg/TransformStamped": _transform,
+}
+
+
+class PoseTrack:
+    """Poses x y z qx qy qz qw, with a twist where there is one, by time.
+
+    Args:
+        gap_s: widest gap between two poses that is interpolated across.
+        by_log: the instants are the log clock's, not the stamps'.
+    """
+
+    def __init__(self, gap_s: float, by_log: bool = False) -> None:
+        self._gap_ns, self._by_log = round(gap_s * 1e9), by_log
+        self._times, self._values = array("q"), array("d")
+        self._order: list[int] | None = None
+        self._sorted: list[int] = []
+        self.damaged = 0
+        self.frames: tuple[str, str] | None = None
+
+    def __len__(self) -> int:
+        return len(self._times)
+
+    def take(self, kind: str, encoding: str, log_ns: int, payload: bytes | memoryview) -> None:
+        """Add a pose message (a Sink); one that cannot be read is counted in ``damaged``."""
+        try:
+            found = read_pose(kind, payload, encoding)
+        except BadMessage:
+            self.damaged += 1
+            return
+        self.frames = self.frames or (found.parent, found.child)
+        unset = found.t_ns == 0 and log_ns > self._gap_ns
+        self.add(log_ns if self._by_log or unset else found.t_ns, found.pose, found.twist)
+
+    def add(self, t_ns: int, pose: tuple[float, ...], twist: tuple[float, ...] | None = None) -> None:
+        """Add a pose of seven numbers and, where there is one, a twist of six."""
+        self._times.append(t_ns)
+        self._values.extend((*pose, *(twist or (float("nan"),) * 6)))
+        self._order = None
+
+    def pose(self, t_ns: int) -> Pose | None:
+        """The pose at an instant, None outside the track or inside too wide a gap."""
+        row = self._at(t_ns)
+        return None if row is None else Pose(row[3:7], row[:3])
+
+    def body(self, t_ns: int, constants: State) -> State | None:
+        """The full state from a track of {B} with twists in {B}; sigma, varrho and mu are ``constants``'."""
+        row = self._at(t_ns)
+        if row is None or not np.isfinite(row[7:]).all():
+            return None
+        q_ab = row[3:7]
+        v_a = geometry.matrix(q_ab) @ row[7:10]
+        return State(q_ab, row[10:13], row[:3], v_a, constants.sigma, constants.c_b, constants.q_bc)
+
+    def _row(self, place: int) -> Array:
+        at = 13 * self._index()[place]
+        row = np.array(self._values[at : at + 13])
+        row[3:7] = geometry.normalise(row[3:7])
+        return row
+
+    def _index(self) -> list[int]:
+        if self._order is None:
+            self._order = sorted(range(len(self._times)), key=self._times.__getitem__)
+            self._sorted = [self._times[i] for i in self._order]
+        return self._order
+
+    def _at(self, t_ns: int) -> Array | None:
+        self._index()
+        right = bisect_left(self._sorted, t_ns)
+        if right < len(self._sorted) and self._sorted[right] == t_ns:
+            return self._row(right)
+        if right in (0, len(self._sorted)):
+            return None
+        before, after = self._sorted[right - 1], self._sorted[right]
+        if after - before > self._gap_ns:
+            return None
+        a, b, fraction = self._row(right - 1), self._row(right), (t_ns - before) / (after - before)
+        out = a + fraction * (b - a)
+        out[3:7] = geometry.slerp(a[3:7], b[3:7], fraction)
+        return out
+
+
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+_TF_TYPES = (TF_TYPE, "tf/msg/tfMessage")
+
+
+class TfBuffer:
+    """The transforms of a log.
+
+    Args:
+        gap_s: widest gap between two transforms that is interpolated across.  by_log: times are the log clock's.
+    """
+
+    def __init__(self, gap_s: float, by_log: bool = False) -> None:
+        self._gap_s, self._by_log = gap_s, by_log
+        self._parents: dict[str, str] = {}
+        self._static: dict[str, Pose] = {}
+        self._moving: dict[str, PoseTrack] = {}
+        self.damaged = 0
+
+    def sink(self, static: bool) -> Sink:
+        """Who takes the messages of /tf (or, ``static``, of /tf_static)."""
+
+        def take(kind: str, encoding: str, log_ns: int, payload: bytes | memoryview) -> None:
+            if kind not in _TF_TYPES:
+                return
+            try:
+                found = [checked(t) for t in read_transforms(payload, encoding)]
+            except BadMessage:
+                self.damaged += 1
+                return
+            for transform in found:
+                self._add(transform, log_ns, static)
+
+        return take
+
+    def _add(self, transform: Transform, log_ns: int, static: bool) -> None:
+        child = transform.child.lstrip("/")
+        self._parents[child] = transform.parent.lstrip("/")
+        if static:
+            self._static[child] = Pose(transform.pose[3:], transform.pose[:3])  # type: ignore[arg-type]
+            return
+        track = self._moving.setdefault(child, PoseTrack(self._gap_s))
+        track.add(log_ns if self._by_log else transform.t_ns, transform.pose)
+
+    def frames(self) -> list[str]:
+        """Every frame that a transform names."""
+        return sorted({*self._parents, *self._parents.values()})
+
+    def pose(self, parent: str, child: str, t_ns: int) -> Pose | None:
+        """T_parent_child at an instant, None where the frames are not joined or the gap is too wide."""
+        up, down = self._to_root(parent.lstrip("/"), t_ns), self._to_root(child.lstrip("/"), t_ns)
+        for frame, to_frame in up:
+            for other, from_frame in down:
+                if frame == other:
+                    return to_frame.inverse() @ from_frame
+        return None
+
+    def _to_root(self, frame: str, t_ns: int) -> list[tuple[str, Pose]]:
+        """(ancestor, T_ancestor_frame) from the frame itself up to its root, or to where the chain breaks."""
+        out, pose = [(frame, Pose.identity())], Pose.identity()
+        while frame in self._parents and len(out) <= len(self._parents):
+            step = self._static[frame] if frame in self._static else self._moving[frame].pose(t_ns)
+            if step is None:
+                break
+            pose, frame = step @ pose, self._parents[frame]
+            out.append((frame, pose))
+        return out
