@@ -19,7 +19,7 @@ from avsreplay.estimate.deskew import deskew, late
 from avsreplay.fill import Findings, row_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.faults import FaultDetector
-from avsreplay.plan import Pilot, PilotMemory
+from avsreplay.plan import Guidance, GuidanceState
 from avsreplay.records import Alignment, Innovation, Scan, Verdict
 from avsreplay.register import Registrar
 from avsreplay.rows import Row
@@ -59,7 +59,7 @@ class Stages:
     estimator: Estimator
     detector: FaultDetector
     monitors: Monitors
-    pilot: Pilot
+    pilot: Guidance
     hindsight: Hindsight
     standoff_c: Array
     guess: Guess
@@ -81,7 +81,7 @@ class Memory:
     """
 
     watch: Watch
-    pilot: PilotMemory | None = None
+    pilot: GuidanceState | None = None
     aim: Aim = field(default_factory=Aim)
     track: Track | None = None
     last: Pose | None = None

@@ -16,7 +16,7 @@ from avsreplay.estimate.measure import sensitivity
 from avsreplay.geometry import Array, Pose
 from avsreplay.job import Listener
 from avsreplay.log.result_log import ResultFrame, ResultLog
-from avsreplay.plan.pilot import Leg
+from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief, Scan, Surface
 from avsreplay.register import Registrar
 from avsreplay.report import CloudView, PathView, View, row_poses, thin_cloud, thin_surface, write_layout, write_view
@@ -43,16 +43,16 @@ class _Paths:
     """Tells a new plan from the one before and samples it."""
 
     def __init__(self) -> None:
-        self._known: Leg | None = None
+        self._known: Segment | None = None
 
     def new(self, memory: Memory) -> tuple[Array, Array] | None:
         """(times (n,), positions (n, 3)) of a plan not seen before."""
         leg = memory.aim.leg
-        if leg is None or leg is self._known or leg.flight is None:
+        if leg is None or leg is self._known or leg.path is None:
             return None
         self._known = leg
-        times = np.linspace(0.0, leg.flight.t_go_s, PATH_POINTS)
-        return times, leg.flight.at(times)[0]
+        times = np.linspace(0.0, leg.path.t_go_s, PATH_POINTS)
+        return times, leg.path.at(times)[0]
 
 
 class LogKeeper:

@@ -6,6 +6,7 @@ also the frame of the model. ``T_ac`` is the pose of {C} in {A}. SI units and ra
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -319,13 +320,21 @@ Trajectory = Callable[[Array], tuple[Array, Array]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Plan:
-    """A rendezvous: least time to meet r(t_f) = rho(t_f) and the velocities alike, with |u| <= a_max.
+    """A rendezvous in least time: meet the grasp point in position and velocity with |u| <= a_max (eq:terminal).
 
     Attributes:
-        t_ns: instant of planning.  t_go_s: t_f - t (NaN where there is none).
-        costate: (6,) [c1, c2] of p = c2 - c1 tau, tau from t, unit norm.
-        lower_bound_s: certified least t_go.  u_max: largest |u| found along the propagated plan [m/s2].
-        position_error_m, velocity_error_mps: terminal errors of the propagated plan.
+        t_ns: Instant of planning.
+        t_go_s: Time from t_ns to the capture [s], NaN where there is none.
+        costate: (6,) [c1, c2] of the primer vector p = c2 - c1 tau, tau from t_ns, of unit norm; NaN for a plan with
+            ``thrust``.
+        a_max: Bound on the thrust [m/s2].
+        lower_bound_s: Certified lower bound of t_go_s [s].
+        position_error_m, velocity_error_mps: Terminal errors of the propagated plan.
+        u_max: Largest |u| found along the propagated plan [m/s2].
+        latency_s: Coasting time before the thrust [s].
+        thrust: (n, 3) acceleration in {A} over n equal intervals [m/s2]; None where the costate defines the thrust.
+        violation_m: Largest excess over the constraints between the nodes [m]; NaN without constraints.
+        steps: Number of steps of the search.
     """
 
     t_ns: int
@@ -337,7 +346,15 @@ class Plan:
     position_error_m: float
     velocity_error_mps: float
     u_max: float
-    extras: Mapping[str, Any] = field(default_factory=dict)
+    latency_s: float = 0.0
+    thrust: Array | None = None
+    violation_m: float = math.nan
+    steps: int = 0
+
+    @property
+    def gap_s(self) -> float:
+        """Difference between the time to go and its certified lower bound [s]."""
+        return self.t_go_s - self.lower_bound_s
 
     @property
     def found(self) -> bool:

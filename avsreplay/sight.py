@@ -12,14 +12,14 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, Track
 from avsreplay.geometry import Array, Pose
-from avsreplay.plan import Miss, Motion, PilotMemory, Sight, interpolated, miss
-from avsreplay.plan.pilot import Leg
+from avsreplay.plan import GuidanceState, Miss, Motion, PlannerInput, interpolated, miss
+from avsreplay.plan.guidance import Segment
 from avsreplay.records import Trajectory
 
 __all__ = ["Aim", "Hindsight", "aim_columns", "plan_columns", "see"]
 
 
-def see(estimator: Estimator, track: Track, t_ns: int, gamma: int, converged: bool, standoff_c: Array) -> Sight:
+def see(estimator: Estimator, track: Track, t_ns: int, gamma: int, converged: bool, standoff_c: Array) -> PlannerInput:
     """What the pilot may know: never the truth. ``standoff_c`` (3,) is the approach point in {C} [m]."""
     belief = track.belief
 
@@ -29,7 +29,7 @@ def see(estimator: Estimator, track: Track, t_ns: int, gamma: int, converged: bo
         away = replace(x, c_b=x.c_b + geometry.matrix(x.q_bc) @ standoff_c)
         return estimator.motion(replace(belief, x=away))
 
-    return Sight(
+    return PlannerInput(
         t_ns=t_ns,
         gamma=gamma,
         converged=converged,
@@ -50,11 +50,11 @@ class Hindsight:
             times = np.array([(t_ns - self._since_ns) * 1e-9 for t_ns, _ in poses])
             self._truth = interpolated(times, [pose for _, pose in poses])
 
-    def judge(self, leg: Leg, attitude: Array) -> Miss | None:
+    def judge(self, leg: Segment, attitude: Array) -> Miss | None:
         """A leg against the truth at its end; ``attitude`` (4,) is the q_ac predicted for it. None beyond the truth."""
-        if self._truth is None or leg.flight is None:
+        if self._truth is None or leg.path is None:
             return None
-        found = miss(leg.flight, (leg.t_ns - self._since_ns) * 1e-9, self._truth, attitude)
+        found = miss(leg.path, (leg.t_ns - self._since_ns) * 1e-9, self._truth, attitude)
         return found if np.isfinite(found.distance_m) else None
 
 
@@ -62,19 +62,19 @@ class Hindsight:
 class Aim:
     """The leg that closes in on the target, and what hindsight says of it."""
 
-    leg: Leg | None = None
+    leg: Segment | None = None
     miss: Miss | None = None
 
-    def follow(self, pilot: PilotMemory, estimator: Estimator, track: Track, hindsight: Hindsight) -> Aim:
+    def follow(self, pilot: GuidanceState, estimator: Estimator, track: Track, hindsight: Hindsight) -> Aim:
         """The aim after a scan: judged anew when the pilot has set out on another leg to the grasp point."""
-        leg, plan = pilot.leg, pilot.plan
-        if leg is self.leg or leg.flight is None or plan is None or plan.t_ns != track.belief.t_ns:
+        leg, plan = pilot.segment, pilot.plan
+        if leg is self.leg or leg.path is None or plan is None or plan.t_ns != track.belief.t_ns:
             return self
         predicted = estimator.predict(track, leg.end_ns).belief.x.T_ac.q
         return Aim(leg, hindsight.judge(leg, predicted))
 
 
-def plan_columns(pilot: PilotMemory, since_ns: int, t_ns: int) -> dict[str, Any]:
+def plan_columns(pilot: GuidanceState, since_ns: int, t_ns: int) -> dict[str, Any]:
     """The row's columns on plan and supervisor."""
     fields: dict[str, Any] = {"action": pilot.decision.action.value, "rule": pilot.decision.rule}
     plan = pilot.plan

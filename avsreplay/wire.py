@@ -16,7 +16,7 @@ from avsreplay.monitor.consistency import Consistency
 from avsreplay.monitor.convergence import Convergence
 from avsreplay.monitor.faults import FaultDetector
 from avsreplay.monitor.observability import gramian
-from avsreplay.plan import Pilot, Supervisor
+from avsreplay.plan import Guidance, Supervisor
 from avsreplay.records import LogHeader, Scan, Surface
 from avsreplay.register import Registrar
 from avsreplay.sight import Hindsight
@@ -44,7 +44,7 @@ def stages(
         estimator=Estimator(config.estimator, start, surface.extent),
         detector=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
-        pilot=Pilot(config.plan, Supervisor(supervision)),
+        pilot=Guidance(config.plan, Supervisor(supervision)),
         hindsight=Hindsight(truth),
         standoff_c=(supervision.standoff_m or 0.0) * np.array(config.fixture_axis_c),
         guess=config.guess,

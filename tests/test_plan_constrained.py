@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from avsreplay.plan import Limits, PlanParams, Scene, StepFlight, constrained, path_of, rendezvous
+from avsreplay.plan import Limits, PlanParams, Scene, StepPath, constrained, path_of, rendezvous
 from avsreplay.plan.limits import margin
 from avsreplay.records import PlanStatus
 
@@ -118,7 +118,7 @@ def test_sphere_is_kept_out_of_and_only_claimed_feasible():
 def test_steps_are_flown_as_an_integrator_would():
     rng = np.random.default_rng(4)
     u, r0, v0 = 0.05 * rng.normal(size=(12, 3)), rng.normal(size=3), 0.1 * rng.normal(size=3)
-    flight = StepFlight(r0, v0, u, 0.7, 6.7)
+    flight = StepPath(r0, v0, u, 0.7, 6.7)
     y, at = np.r_[r0, v0], 0.0
     for stop in (0.7, *(0.7 + 0.5 * (k + 1) for k in range(12)), 8.0):
         push = flight.thrust(np.array([0.5 * (at + stop)]))[0]

@@ -1,4 +1,4 @@
-"""The supervisor's table: every rule is reached, the order holds; and the pilot that flies by it."""
+"""The supervisor: every rule can apply, their order holds. Guidance: flights on a made-up estimate."""
 
 import dataclasses
 import math
@@ -11,11 +11,11 @@ from avsreplay.geometry import IDENTITY_QUAT, Pose, exp
 from avsreplay.plan import (
     RULES,
     Action,
+    CostatePath,
     Facts,
-    Flight,
-    Pilot,
+    Guidance,
+    PlannerInput,
     PlanParams,
-    Sight,
     Supervisor,
     SupervisorMemory,
     SupervisorParams,
@@ -124,7 +124,7 @@ def turning(rate=0.1, arm=1.0, distance=5.0):
     return at
 
 
-def sights(truth, error=0.0, blind=(), sigma=(0.001, 0.0003, 0.001), growth=0.0, end=90.0, from_s=5.0):
+def inputs(truth, error=0.0, blind=(), sigma=(0.001, 0.0003, 0.001), growth=0.0, end=90.0, from_s=5.0):
     """What a made-up estimator knows: the truth, moved by ``error`` [m]; sigmas grow with prediction time."""
     seen = 0.0
     for t in np.arange(0.0, end, 0.2):
@@ -143,13 +143,13 @@ def sights(truth, error=0.0, blind=(), sigma=(0.001, 0.0003, 0.001), growth=0.0,
             position, velocity, _ = truth(t + dt)
             return position - np.array([0, 0, 1.0]), velocity
 
-        yield Sight(round(t * 1e9), gamma, t >= from_s, goal, forecast, standoff)
+        yield PlannerInput(round(t * 1e9), gamma, t >= from_s, goal, forecast, standoff)
 
 
 def fly(truth, **kwargs):
-    pilot = Pilot(PlanParams(), Supervisor(PARAMS))
+    guidance = Guidance(PlanParams(), Supervisor(PARAMS))
     return execute(
-        pilot, sights(truth, **kwargs), truth, lambda sight, dt: truth(np.array([sight.t_ns * 1e-9 + dt]))[2][0]
+        guidance, inputs(truth, **kwargs), truth, lambda known, dt: truth(np.array([known.t_ns * 1e-9 + dt]))[2][0]
     )
 
 
@@ -207,30 +207,30 @@ def test_never_converged_never_moves():
     assert execution.ended is Action.STAND_STILL
 
 
-def test_latency_is_flown_on_the_old_leg():
+def test_latency_is_flown_on_the_current_segment():
     truth = turning()
-    pilot = Pilot(PlanParams(latency_s=0.7), Supervisor(PARAMS))
+    guidance = Guidance(PlanParams(latency_s=0.7), Supervisor(PARAMS))
     positions = []
-    for sight, memory in pilot.fly(sights(truth)):
-        positions.append(memory.leg.at(sight.t_ns)[0])
+    for known, memory in guidance.fly(inputs(truth)):
+        positions.append(memory.segment.at(known.t_ns)[0])
         if memory.captured_ns is not None:
             break
     at_converged = round(5.0 / 0.2)
     assert np.all(np.array(positions[: at_converged + 4]) == 0.0)  # the first plan's thrust begins 0.7 s later
     jumps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     assert jumps.max() < 0.05 * 0.2 * 25  # no faster than thrust allows: the path is continuous
-    assert execute(pilot, sights(truth), truth).miss.distance_m < 1e-6
+    assert execute(guidance, inputs(truth), truth).miss.distance_m < 1e-6
 
 
 def test_a_broken_limit_makes_the_pilot_retreat():
     truth = turning()
-    pilot = Pilot(PlanParams(), Supervisor(PARAMS))
-    limited = (dataclasses.replace(s, margin=lambda r, v: 0.35 - float(np.linalg.norm(v))) for s in sights(truth))
-    for sight, memory in pilot.fly(limited):  # noqa: B007
+    guidance = Guidance(PlanParams(), Supervisor(PARAMS))
+    limited = (dataclasses.replace(s, margin=lambda r, v: 0.35 - float(np.linalg.norm(v))) for s in inputs(truth))
+    for known, memory in guidance.fly(limited):  # noqa: B007
         if memory.decision.rule == "constraint_broken":
             break
     assert memory.decision.action is Action.RETREAT
-    speed = [np.linalg.norm(memory.leg.at(sight.t_ns + round(s * 1e9))[1]) for s in (0.0, 2.0, 4.0)]
+    speed = [np.linalg.norm(memory.segment.at(known.t_ns + round(s * 1e9))[1]) for s in (0.0, 2.0, 4.0)]
     assert speed[0] > speed[1] > speed[2]
 
 
@@ -241,8 +241,8 @@ def test_a_hold_plans_at_the_period_and_sets_out_at_once():
         made.append(t_ns * 1e-9)
         return rendezvous(goal, r0, v0, params, t_ns)
 
-    pilot = Pilot(PlanParams(replan_period_s=2.0), Supervisor(PARAMS), planner)
-    rules = [(s.t_ns * 1e-9, m.decision.rule) for s, m in pilot.fly(sights(truth, blind=[(15.0, 40.3)], growth=2.0))]
+    guidance = Guidance(PlanParams(replan_period_s=2.0), Supervisor(PARAMS), planner)
+    rules = [(s.t_ns * 1e-9, m.decision.rule) for s, m in guidance.fly(inputs(truth, blind=[(15.0, 40.3)], growth=2.0))]
     held = [t for t in made if 20.0 < t < 40.0]
     assert np.diff(held).min() > 1.9
     out = next(t for t, rule in rules if rule == "healthy" and t > 40.0)
@@ -251,13 +251,13 @@ def test_a_hold_plans_at_the_period_and_sets_out_at_once():
 
 def test_latency_leaves_a_costate_that_flies_the_plan():
     truth = turning()
-    pilot = Pilot(PlanParams(latency_s=0.7), Supervisor(PARAMS))
-    for sight, memory in pilot.fly(sights(truth)):  # noqa: B007
+    guidance = Guidance(PlanParams(latency_s=0.7), Supervisor(PARAMS))
+    for known, memory in guidance.fly(inputs(truth)):  # noqa: B007
         if memory.plan is not None:
             break
-    flight = Flight.of(memory.plan, np.zeros(3), np.zeros(3))  # at rest the old leg is a coast
-    assert flight.terminal_errors(sight.goal)[0] < 1e-8
-    assert memory.leg.end_ns == pytest.approx(sight.t_ns + flight.t_go_s * 1e9, abs=2)
+    flight = CostatePath.of(memory.plan, np.zeros(3), np.zeros(3))  # at rest the current segment is a coast
+    assert flight.terminal_errors(known.goal)[0] < 1e-8
+    assert memory.segment.end_ns == pytest.approx(known.t_ns + flight.t_go_s * 1e9, abs=2)
 
 
 def test_hindsight_of_a_plan_that_was_right_is_zero():
@@ -265,7 +265,7 @@ def test_hindsight_of_a_plan_that_was_right_is_zero():
     goal = lambda t: truth(t + 3.0)[:2]  # noqa: E731
     plan = rendezvous(goal, np.zeros(3), np.zeros(3))
     q = truth(np.array([3.0 + plan.t_go_s]))[2][0]
-    found = miss(Flight.of(plan, np.zeros(3), np.zeros(3)), 3.0, truth, q)
+    found = miss(CostatePath.of(plan, np.zeros(3), np.zeros(3)), 3.0, truth, q)
     assert found.distance_m < 1e-8
     assert found.speed_mps < 1e-8
     assert found.angle_deg < 1e-5

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
     from avsreplay.plan import Execution, Limits, Miss, PlanParams, Spread
     from avsreplay.records import Plan
-    from avsreplay.replanning import Replanning, Saved
+    from avsreplay.replan import Replanning, Saved
 
 __all__ = ["command"]
 
@@ -73,7 +73,7 @@ def command(
     log has the truth, what each plan would have missed by and how a flight under the supervisor would have ended.
     """
     from avsreplay.errors import UsageError
-    from avsreplay.replanning import load_saved
+    from avsreplay.replan import load_saved
 
     for name, value in (("--every", every_s), ("--extent", extent_m)):
         if value is not None and not 0.0 < value < float("inf"):
@@ -113,7 +113,7 @@ def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
     from dataclasses import fields, replace
 
     from avsreplay.plan import Limits, PlanParams
-    from avsreplay.replanning import Replanning
+    from avsreplay.replan import Replanning
 
     given = {name: value for name, value in flags.items() if value is not None}
     if "robot_position_m" in given:
@@ -183,7 +183,7 @@ def _plan_record(made: Plan, since_s: float) -> dict[str, Any]:
         "position_error_m": made.position_error_m,
         "velocity_error_mps": made.velocity_error_mps,
         "costate": made.costate.tolist(),
-        "violation_m": made.extras.get("violation_m"),
+        "violation_m": made.violation_m,
     }
 
 
@@ -226,8 +226,8 @@ def _print_plan(console: Console, planning: Replanning, index: int, made: Plan, 
         table.add_row("largest |u|", f"{made.u_max:.6g} of {made.a_max:.6g} m/s2")
     basis = "certified; the limits aside" if planning.limits.any else "certified"
     table.add_row("no capture before", f"{made.lower_bound_s:.4f} s after planning ({basis})")
-    if "violation_m" in made.extras:
-        table.add_row("limits", f"checked between nodes, worst {made.extras['violation_m']:.1e} m")
+    if made.thrust is not None:
+        table.add_row("limits", f"checked between nodes, worst {made.violation_m:.1e} m")
     for name, value in _spread_rows(spread):
         table.add_row(name, value)
     console.print(table)
@@ -278,7 +278,7 @@ def _print_hindsight(console: Console, hindsight: list[tuple[float, Plan, Miss |
 def _print_execution(console: Console, execution: Execution, planning: Replanning) -> None:
     from avsreplay.report.table.console import new_table
 
-    table = new_table(console, "Flight under the supervisor")
+    table = new_table(console, "CostatePath under the supervisor")
     for name in ("from\n[s]", "action", "rule"):
         table.add_column(name, justify="right" if name.startswith("from") else "left")
     for t_s, action, rule in execution.actions:

@@ -1,12 +1,11 @@
-"""Rendezvous with a moving grasp point in least time, under a supervisor, and what it would have done."""
+"""Time-optimal rendezvous with the grasp point under constraints, the supervisor, and their evaluation."""
 
 from avsreplay.plan.constrained import constrained
-from avsreplay.plan.flight import Flight, Path, StepFlight, path_of
-from avsreplay.plan.hindsight import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
+from avsreplay.plan.evaluation import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
+from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Limits, Scene
-from avsreplay.plan.pilot import Pilot, PilotMemory, Sight
+from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
-from avsreplay.plan.spread import Future, Spread, draws, sigma_points, spread
 from avsreplay.plan.supervisor import (
     RULES,
     Action,
@@ -16,26 +15,28 @@ from avsreplay.plan.supervisor import (
     SupervisorMemory,
     SupervisorParams,
 )
+from avsreplay.plan.uncertainty import Future, Spread, draws, spread
 
 __all__ = [
     "RULES",
     "Action",
+    "CostatePath",
     "Decision",
     "Execution",
     "Facts",
-    "Flight",
     "Future",
+    "Guidance",
+    "GuidanceState",
     "Limits",
     "Miss",
     "Motion",
-    "Path",
-    "Pilot",
-    "PilotMemory",
     "PlanParams",
+    "PlannerInput",
+    "RobotPath",
     "Scene",
-    "Sight",
+    "Segment",
     "Spread",
-    "StepFlight",
+    "StepPath",
     "Supervisor",
     "SupervisorMemory",
     "SupervisorParams",
@@ -47,6 +48,5 @@ __all__ = [
     "miss",
     "path_of",
     "rendezvous",
-    "sigma_points",
     "spread",
 ]

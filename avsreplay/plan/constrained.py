@@ -17,16 +17,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from avsreplay.geometry import Array
-from avsreplay.plan.cones import Funnel, Programme, Wall, solve
-from avsreplay.plan.flight import StepFlight
+from avsreplay.plan.cone_programme import ConeConstraint, ConeProgramme, HalfSpaces, solve
 from avsreplay.plan.limits import Limits, SampledScene, Scene
+from avsreplay.plan.path import StepPath
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.records import Plan, PlanStatus
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-__all__ = ["constrained", "violations"]
 
 BETWEEN = 8  # instants a thrust interval is checked at
 VIOLATION_M = 5e-7  # what may stick out of a limit [m]
@@ -76,7 +74,7 @@ class _Trial:
 
     t: float
     thrust: float
-    flight: StepFlight | None
+    flight: StepPath | None
     known: _Known
 
 
@@ -95,7 +93,7 @@ def constrained(
         extent_m: bounding diagonal of the target [m].
 
     Returns:
-        Plan whose ``extras`` hold ``thrust`` (n, 3), ``latency_s``, ``violation_m`` and ``scan_s``; its costate is NaN.
+        Plan with ``thrust`` (n, 3) and ``violation_m``; its costate is NaN.
 
     Raises:
         ValueError: naming a value that cannot be right, or what the scene does not know.
@@ -114,22 +112,23 @@ def _plan(case: _Case, free: Plan, found: _Trial | None, t_ns: int) -> Plan:
     nan, none = math.nan, np.full(6, math.nan)
     if found is None or found.flight is None:
         status = PlanStatus.INFEASIBLE
-        return Plan(
-            t_ns, status, nan, none, free.a_max, free.lower_bound_s, nan, nan, nan, {"scan_s": case.limits.scan_s}
-        )
-    flight = found.flight
-    same = flight.t_go_s - free.lower_bound_s <= SAME_TIME_S
-    position, velocity = flight.terminal_errors(case.scene.goal)
-    extras = {
-        "thrust": flight.u,
-        "latency_s": flight.latency_s,
-        "violation_m": float(max(v.max() for v in violations(case.sampled, case.limits, flight))),
-        "scan_s": case.limits.scan_s,
-        "gap_s": flight.t_go_s - free.lower_bound_s,
-    }
-    status = PlanStatus.OPTIMAL if same and case.limits.keepout_m is None else PlanStatus.FEASIBLE
+        return Plan(t_ns, status, nan, none, free.a_max, free.lower_bound_s, nan, nan, nan)
+    path = found.flight
+    same = path.t_go_s - free.lower_bound_s <= SAME_TIME_S
+    position, velocity = path.terminal_errors(case.scene.goal)
     return Plan(
-        t_ns, status, flight.t_go_s, none, free.a_max, free.lower_bound_s, position, velocity, flight.u_max(), extras
+        t_ns=t_ns,
+        status=PlanStatus.OPTIMAL if same and case.limits.keepout_m is None else PlanStatus.FEASIBLE,
+        t_go_s=path.t_go_s,
+        costate=none,
+        a_max=free.a_max,
+        lower_bound_s=free.lower_bound_s,
+        position_error_m=position,
+        velocity_error_mps=velocity,
+        u_max=path.u_max(),
+        latency_s=path.latency_s,
+        thrust=path.u,
+        violation_m=float(max(v.max() for v in violations(case.sampled, case.limits, path))),
     )
 
 
@@ -211,7 +210,7 @@ def _try(case: _Case, t: float, known: _Known) -> _Trial:
     wait, n = case.params.latency_s, known.active.shape[1] - 1
     rho, rate = case.scene.goal(np.array([wait + t, wait + t - 1e-4]))
     start = case.r0 + wait * case.v0
-    base = Programme(t, n, start, case.v0, rho[0], rate[0], case.limits.speed_max_mps)
+    base = ConeProgramme(t, n, start, case.v0, rho[0], rate[0], case.limits.speed_max_mps)
     if case.limits.contact_accel_mps2 is not None:
         base = replace(base, contact=((rate[0] - rate[1]) / 1e-4, case.limits.contact_accel_mps2))
     nodes = case.sampled.at(wait + np.linspace(0.0, t, n + 1))
@@ -222,7 +221,7 @@ def _try(case: _Case, t: float, known: _Known) -> _Trial:
             return _Trial(t, math.inf, None, known)
         if found[0] > CLEARLY_SHORT * case.params.a_max_mps2:  # a limit added can only ask for more
             return _Trial(t, found[0], None, known)
-        flight = StepFlight(case.r0, case.v0, found[1], wait, wait + t)
+        flight = StepPath(case.r0, case.v0, found[1], wait, wait + t)
         out = violations(case.sampled, case.limits, flight)
         known = _learn(known, out, flight.nodes()[0])
         if max(v.max() for v in out) <= known.slack:
@@ -232,7 +231,7 @@ def _try(case: _Case, t: float, known: _Known) -> _Trial:
 
 def _limits_at(
     limits: Limits, nodes: tuple[Array, Array, Array], known: _Known
-) -> tuple[tuple[Funnel, ...], tuple[Wall, ...]]:
+) -> tuple[tuple[ConeConstraint, ...], tuple[HalfSpaces, ...]]:
     apex, axis, centre = nodes
     mouth = limits.mouth_m or 0.0
     funnels = []
@@ -240,17 +239,17 @@ def _limits_at(
         k = np.flatnonzero(known.active[row])
         if degrees is not None and len(k):
             slope = math.tan(math.radians(degrees))
-            funnels.append(Funnel(k, apex[k], axis[k], slope, mouth - known.off[row, k]))
+            funnels.append(ConeConstraint(k, apex[k], axis[k], slope, mouth - known.off[row, k]))
     k = np.flatnonzero(known.active[2])
     if limits.keepout_m is None or known.path is None or not len(k):
         return tuple(funnels), ()
     out = known.path[k] - centre[k]
     normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
     offset = limits.keepout_m + known.off[2, k] + np.sum(normal * centre[k], axis=1)
-    return tuple(funnels), (Wall(k, normal, offset),)
+    return tuple(funnels), (HalfSpaces(k, normal, offset),)
 
 
-def violations(scene: SampledScene, limits: Limits, flight: StepFlight) -> Sequence[Array]:
+def violations(scene: SampledScene, limits: Limits, flight: StepPath) -> Sequence[Array]:
     """What sticks out of cone, last metres and sphere [m], each (n * 8 + 1,) over the flight, 0 inside."""
     n = len(flight.u)
     times = np.linspace(flight.latency_s, flight.t_go_s, BETWEEN * n + 1)

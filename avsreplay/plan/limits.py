@@ -15,8 +15,6 @@ import numpy as np
 from avsreplay.geometry import Array
 from avsreplay.records import Trajectory
 
-__all__ = ["Limits", "SampledScene", "Scene", "margin"]
-
 
 @dataclass(frozen=True, slots=True)
 class Limits:

@@ -1,9 +1,10 @@
-"""The least time to meet a moving goal with |u| <= a_max: the first root of a*(t_f) = a_max, certified.
+"""Time-optimal rendezvous with a moving goal under |u| <= a_max: the first root of a*(t_f) = a_max, with a certificate.
 
-For a fixed t_f the least thrust a* is the gauge of one convex body (``reach``). A normal P of that body that keeps
-the goal out at t, G(t) = P.b(t) - a_max t^2 h(P) > 0, keeps it out for as long as G stays positive: so the search
-steps from one instant to the next root of G and never passes a feasible time. P is optimal where it was found, so G
-touches a* to first order and the steps end quadratically at the first root, from below.
+For a fixed t_f the least thrust a* is the gauge of one convex set (``reachable_set``). If a normal P of this set
+separates the goal from it at time t, that is if G(t) = P.b(t) - a_max t^2 h(P) > 0, then the goal remains unreachable
+for as long as G stays positive. The search therefore advances from t to the next root of G and cannot skip a feasible
+time. P is optimal at the instant for which it was computed, so G is tangent to the true margin there and the steps
+converge quadratically to the first root from below.
 """
 
 from __future__ import annotations
@@ -14,23 +15,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avsreplay.geometry import Array
-from avsreplay.plan.flight import Flight
-from avsreplay.plan.goal import SampledGoal, sample
-from avsreplay.plan.reach import Touch, touch
+from avsreplay.plan.path import CostatePath, SampledGoal, sample_goal
+from avsreplay.plan.reachable_set import Gauge, gauge
 from avsreplay.records import Plan, PlanStatus, Trajectory
 
-__all__ = ["PlanParams", "rendezvous"]
-
 MAX_STEPS = 400
-STRETCH_S = 30.0  # the goal is sampled this far at a time: most captures need no more
-NEAR_ROOT = 1e-2  # a_max short by less than this part: Newton ends the search, and G closes the gap behind it
-GAP_LIMIT_S = 1e-6  # t_f less its bound above this: step instead
-RESIDUAL_LIMIT = 1e-8  # terminal errors above this, in metres or metres a second, are not a solution
+STRETCH_S = 30.0  # the goal is sampled over this time span at once; most captures need no more
+NEAR_ROOT = 1e-2  # where a* exceeds a_max by less than this fraction, Newton's method finishes the search
+GAP_LIMIT_S = 1e-6  # where t_f exceeds its lower bound by more, the certified steps continue to the root
+RESIDUAL_LIMIT = 1e-8  # largest terminal error of a solution, in metres and in metres per second
 
 
 @dataclass(frozen=True, slots=True)
 class PlanParams:
-    """What the robot can do and how it is asked to plan."""
+    """Parameters of the robot and of the planner."""
 
     a_max_mps2: float = 0.05  # largest acceleration of the robot's end-effector
     horizon_s: float = 120.0  # latest capture looked for, after the instant of planning
@@ -59,50 +57,50 @@ def _positive(name: str, value: float) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
-    """Where certified stepping ended: no capture before ``t``, and, if ``reached``, one at ``t`` to rounding."""
+    """End of the certified steps: no capture before ``t``; if ``reached``, a capture at ``t`` to rounding."""
 
     t: float
     reached: bool
-    normal: Touch | None
+    normal: Gauge | None
     steps: int
 
 
 def rendezvous(goal: Trajectory, r0: Array, v0: Array, params: PlanParams | None = None, t_ns: int = 0) -> Plan:
-    """Least-time plan from the robot's position and velocity to the goal's.
+    """Plan the time-optimal rendezvous without constraints other than |u| <= a_max (eq:terminal, eq:a_max).
 
     Args:
-        goal: times (n,) [s after t_ns] -> positions (n, 3) [m], velocities (n, 3) [m/s] in {A}.
-        r0: (3,) robot in {A} at t_ns [m].
+        goal: Function of times (n,) [s after t_ns]: positions (n, 3) [m] and velocities (n, 3) [m/s] in {A}.
+        r0: (3,) position of the robot in {A} at t_ns [m].
         v0: (3,) its velocity [m/s].
-        params: see PlanParams.
-        t_ns: instant of planning.
+        params: Thrust, horizon, latency and grid; the defaults where None.
+        t_ns: Instant of planning.
 
     Returns:
-        Plan with status ``optimal`` (first feasible time, certified down to ``lower_bound_s``),
+        A plan with status ``optimal`` (the first feasible time, certified by ``lower_bound_s``),
         ``infeasible_within_horizon`` (``lower_bound_s`` is the horizon) or ``no_convergence``.
 
     Raises:
-        ValueError: naming a start or a goal that is not finite.
+        ValueError: The start or the goal is not finite.
     """
     params = params or PlanParams()
     r0, v0 = _finite("r0", r0), _finite("v0", v0)
     search, sampled = _first_feasible(goal, r0, v0, params, near=True)
     if search.reached and search.normal is None:
-        here = np.array([1.0, 0.0, 0.0])  # nothing to make good: no thrust time, so its direction does not matter
+        here = np.array([1.0, 0.0, 0.0])  # already at the goal: the thrust time is 0 and its direction has no effect
         wait = params.latency_s
         return _grade(
-            Flight(r0, v0, params.a_max_mps2, wait, wait, np.concatenate([0.0 * here, here])), goal, t_ns, search
+            CostatePath(r0, v0, params.a_max_mps2, wait, wait, np.concatenate([0.0 * here, here])), goal, t_ns, search
         )
     if not search.reached or search.normal is None:
         return _no_plan(t_ns, params, search)
     t, found, bound = _polish(goal, r0, v0, params, sampled, search, search.normal)
-    if t - bound > GAP_LIMIT_S:  # the thrust needed all but touches the limit: step on to the very root
+    if t - bound > GAP_LIMIT_S:  # a* is nearly tangent to a_max: take certified steps to the root
         search, sampled = _first_feasible(goal, r0, v0, params, near=False)
         if not search.reached or search.normal is None:
             return _no_plan(t_ns, params, search)
         t, found, bound = _polish(goal, r0, v0, params, sampled, search, search.normal)
-    flight = Flight.from_normal(r0, v0, params.a_max_mps2, params.latency_s, t, found.P0, found.P1)
-    return _grade(flight, goal, t_ns, replace(search, t=bound))
+    path = CostatePath.from_normal(r0, v0, params.a_max_mps2, params.latency_s, t, found.P0, found.P1)
+    return _grade(path, goal, t_ns, replace(search, t=bound))
 
 
 def _finite(name: str, value: Array) -> Array:
@@ -116,38 +114,37 @@ def _no_plan(t_ns: int, params: PlanParams, search: _Search) -> Plan:
     ended = search.t >= params.horizon_s - params.latency_s
     status = PlanStatus.INFEASIBLE if ended else PlanStatus.NO_CONVERGENCE
     nan, bound = math.nan, params.latency_s + search.t
-    return Plan(t_ns, status, nan, np.full(6, nan), params.a_max_mps2, bound, nan, nan, nan, {"steps": search.steps})
+    return Plan(t_ns, status, nan, np.full(6, nan), params.a_max_mps2, bound, nan, nan, nan, steps=search.steps)
 
 
-def _grade(flight: Flight, goal: Trajectory, t_ns: int, search: _Search) -> Plan:
-    """The plan with what its own propagation says of it."""
-    position, velocity = flight.terminal_errors(goal)
+def _grade(path: CostatePath, goal: Trajectory, t_ns: int, search: _Search) -> Plan:
+    """Return the plan with the terminal errors and the thrust of its own propagation."""
+    position, velocity = path.terminal_errors(goal)
     solved = position <= RESIDUAL_LIMIT and velocity <= RESIDUAL_LIMIT
-    bound = min(flight.latency_s + search.t, flight.t_go_s)
-    extras = {"latency_s": flight.latency_s, "gap_s": flight.t_go_s - bound, "steps": search.steps}
     return Plan(
-        t_ns,
-        PlanStatus.OPTIMAL if solved else PlanStatus.NO_CONVERGENCE,
-        flight.t_go_s,
-        flight.costate,
-        flight.a_max,
-        bound,
-        position,
-        velocity,
-        flight.u_max(),
-        extras,
+        t_ns=t_ns,
+        status=PlanStatus.OPTIMAL if solved else PlanStatus.NO_CONVERGENCE,
+        t_go_s=path.t_go_s,
+        costate=path.costate,
+        a_max=path.a_max,
+        lower_bound_s=min(path.latency_s + search.t, path.t_go_s),
+        position_error_m=position,
+        velocity_error_mps=velocity,
+        u_max=path.u_max(),
+        latency_s=path.latency_s,
+        steps=search.steps,
     )
 
 
 def _first_feasible(
     goal: Trajectory, r0: Array, v0: Array, params: PlanParams, near: bool
 ) -> tuple[_Search, SampledGoal]:
-    """Step from one certified bound to the next, stretch by stretch, until thrust suffices (``near``: all but)."""
+    """Advance the certified bound, time span by time span, until a_max suffices (``near``: nearly suffices)."""
     end, t, found = params.horizon_s - params.latency_s, 0.0, None
     begin, steps = 0.0, 0
     while True:
         stretch = min(begin + STRETCH_S, end)
-        sampled = sample(goal, r0, v0, params.latency_s, begin, stretch, params.grid_s)
+        sampled = sample_goal(goal, r0, v0, params.latency_s, begin, stretch, params.grid_s)
         if begin == 0.0:
             if _met(sampled):
                 return _Search(0.0, True, None, 0), sampled
@@ -158,40 +155,40 @@ def _first_feasible(
         t, found, steps, begin = search.t, search.normal, search.steps, stretch
 
 
-def _search_stretch(goal: SampledGoal, a_max: float, t: float, found: Touch | None, steps: int, near: bool) -> _Search:
-    """Certified steps within one stretch of samples, from thrust time t on."""
+def _search_stretch(goal: SampledGoal, a_max: float, t: float, found: Gauge | None, steps: int, near: bool) -> _Search:
+    """Take certified steps within one sampled time span, from thrust time t on."""
     excess = 1.0
     for count in range(steps, MAX_STEPS):
         if t >= goal.end:
             return _Search(goal.end, False, found, count)
         dr, dv, ddv = goal.at(t)
-        # a rough normal is as good a certificate while far from the root; G's error is the square of the residual
+        # far from the root an approximate normal is still a valid certificate; G's error is the residual squared
         tolerance = max(1e-15, 1e-2 * min(excess * excess, 1.0))
-        found = touch(dr, t * dv - dr, (found.P0, found.P1) if found else None, tolerance)
-        margin = found.gauge - a_max * t * t  # G(t), with h(P) = 1
-        ahead = _Ahead.of(found, t, dv, ddv, a_max)
-        if margin <= 1e-12 * found.gauge:
+        found = gauge(dr, t * dv - dr, (found.P0, found.P1) if found else None, tolerance)
+        margin = found.value - a_max * t * t  # G(t), with h(P) = 1
+        local = _Margin.of(found, t, dv, ddv, a_max)
+        if margin <= 1e-12 * found.value:
             if tolerance <= 1e-15:
-                return _Search(ahead.before(goal, t), True, found, count)
+                return _Search(local.before(goal, t), True, found, count)
             excess = 0.0
             continue
-        excess = margin / found.gauge
-        if near and excess < NEAR_ROOT and margin < 0.25 * ahead.slope * ahead.slope / ahead.bend(goal, t, a_max):
+        excess = margin / found.value
+        if near and excess < NEAR_ROOT and margin < 0.25 * local.slope * local.slope / local.bend(goal, t, a_max):
             return _Search(t, True, found, count)
-        t_new = ahead.step(goal, found, t, margin, a_max)
+        t_new = local.step(goal, found, t, margin, a_max)
         if t_new - t <= 1e-10 * t:
-            return _Search(ahead.before(goal, t), True, found, count)
+            return _Search(local.before(goal, t), True, found, count)
         t = t_new
     return _Search(t, False, found, MAX_STEPS)
 
 
 def _met(goal: SampledGoal) -> bool:
-    """Is there nothing to make good at the start?"""
+    """Return whether the coasting robot already meets the goal at the start."""
     return float(np.linalg.norm(goal.dr[0])) <= RESIDUAL_LIMIT and float(np.linalg.norm(goal.dv[0])) <= RESIDUAL_LIMIT
 
 
 def _first_bound(goal: SampledGoal, a_max: float) -> float:
-    """A time before which the distance or the speed cannot be made good."""
+    """Return a time before which neither the distance nor the relative speed can be removed."""
     distance, speed = float(np.linalg.norm(goal.dr[0])), float(np.linalg.norm(goal.dv[0]))
     pull = a_max + goal.acceleration
     by_distance = 2.0 * distance / (speed + math.sqrt(speed * speed + 2.0 * pull * distance))
@@ -199,35 +196,38 @@ def _first_bound(goal: SampledGoal, a_max: float) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class _Ahead:
-    """G of one normal seen from t: |P0 - P1|, |P1|, and dG/dt."""
+class _Margin:
+    """Local behaviour of G for one normal: n0 = |P0 - P1|, n1 = |P1|, and the slope dG/dt."""
 
     n0: float
     n1: float
     slope: float
 
     @classmethod
-    def of(cls, found: Touch, t: float, dv: Array, ddv: Array, a_max: float) -> _Ahead:
+    def of(cls, found: Gauge, t: float, dv: Array, ddv: Array, a_max: float) -> _Margin:
         across = found.P0 - found.P1
         slope = float(across @ dv + found.P1 @ (dv + t * ddv)) - 2.0 * a_max * t
         return cls(math.sqrt(float(across @ across)), math.sqrt(float(found.P1 @ found.P1)), slope)
 
     def before(self, goal: SampledGoal, t: float) -> float:
-        """The bound t, taken back by what interpolating the goal may have moved the root."""
-        return max(t - goal.blur(self.n0, self.n1, t) / max(-self.slope, 1e-9), 0.0)
+        """Return t reduced by the largest shift of the root that the interpolation of the goal can cause."""
+        return max(t - goal.interpolation_error(self.n0, self.n1, t) / max(-self.slope, 1e-9), 0.0)
 
     def bend(self, goal: SampledGoal, t: float, a_max: float) -> float:
-        """Bound on |d2G/dt2| up to t."""
+        """Return a bound on |d2G/dt2| up to t."""
         return float(goal.curvature(self.n0, self.n1, t)) + 2.0 * a_max
 
     def joined(self, goal: SampledGoal, t: float, margin: float, bound: float, a_max: float) -> float:
-        """The bound moved up to the root t where G, falling through it, is positive all the way back to ``bound``."""
+        """Return the bound moved to the root t if G decreases through t and is positive from ``bound`` up to t."""
         if self.slope < 0.0 and t - bound < -self.slope / self.bend(goal, t, a_max):
             return max(bound, t - 2.0 * margin / -self.slope)
         return bound
 
-    def step(self, goal: SampledGoal, found: Touch, t: float, margin: float, a_max: float) -> float:
-        """The latest instant up to which G is certainly positive: by nodes and sag, or by Taylor within a cell."""
+    def step(self, goal: SampledGoal, found: Gauge, t: float, margin: float, a_max: float) -> float:
+        """Return the latest instant up to which G is certainly positive.
+
+        Over several grid intervals the nodes and the chord error bound G; within one interval a Taylor bound does.
+        """
         sag = 0.125 * goal.step**2
         near = self.bend(goal, t + goal.step, a_max)
         taylor = 2.0 * margin / (math.sqrt(self.slope * self.slope + 2.0 * near * margin) - self.slope)
@@ -236,7 +236,7 @@ class _Ahead:
         if first >= len(goal.times) or margin <= near * sag:
             return reach
         times = goal.times[first:]
-        bend = goal.curvature(self.n0, self.n1, times + goal.step) + 2.0 * a_max  # of the cell after each node
+        bend = goal.curvature(self.n0, self.n1, times + goal.step) + 2.0 * a_max  # of the interval after each node
         along = goal.dr[first:] @ (found.P0 - found.P1) + times * (goal.dv[first:] @ found.P1)
         positive = along - a_max * times * times > sag * bend
         stop = int(positive.argmin())
@@ -246,21 +246,21 @@ class _Ahead:
 
 
 def _polish(
-    goal: Trajectory, r0: Array, v0: Array, params: PlanParams, sampled: SampledGoal, search: _Search, found: Touch
-) -> tuple[float, Touch, float]:
-    """Newton on G(t) = 0 with the goal itself in place of its interpolation. Returns t, the normal and the bound."""
+    goal: Trajectory, r0: Array, v0: Array, params: PlanParams, sampled: SampledGoal, search: _Search, found: Gauge
+) -> tuple[float, Gauge, float]:
+    """Solve G(t) = 0 by Newton's method on the exact goal. Returns t, the normal and the lower bound."""
     t, a_max = search.t, params.a_max_mps2
     best = (math.inf, t, found, search.t)
     for _ in range(6):
         rho, rate = goal(np.array([params.latency_s + t]))
         dv = rate[0] - v0
         dr = rho[0] - r0 - v0 * (params.latency_s + t)
-        found = touch(dr, t * dv - dr, (found.P0, found.P1))
-        margin = found.gauge - a_max * t * t
-        ahead = _Ahead.of(found, t, dv, sampled.at(t)[2], a_max)
+        found = gauge(dr, t * dv - dr, (found.P0, found.P1))
+        margin = found.value - a_max * t * t
+        local = _Margin.of(found, t, dv, sampled.at(t)[2], a_max)
         if abs(margin) < best[0]:
-            best = (abs(margin), t, found, ahead.joined(sampled, t, abs(margin), search.t, a_max))
-        if ahead.slope >= 0.0 or abs(margin) <= 1e-13 * found.gauge:
+            best = (abs(margin), t, found, local.joined(sampled, t, abs(margin), search.t, a_max))
+        if local.slope >= 0.0 or abs(margin) <= 1e-13 * found.value:
             break
-        t -= margin / ahead.slope
+        t -= margin / local.slope
     return best[1:]

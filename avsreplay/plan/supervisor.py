@@ -1,8 +1,8 @@
-"""What to do now, chosen by a table of rules: data, not code.
+"""The supervisor: a table of rules that selects the action of the robot after each scan.
 
-The paper promises "the most appropriate control action if partial or complete failure of the vision system in the
-short term occurs" and leaves the choice open. Here it is a list, read from the top: the first rule whose every test
-holds gives the action, and its name goes into the row.
+The paper requires "the most appropriate control action if partial or complete failure of the vision system in the
+short term occurs" and leaves the choice open. Here the rules are data: the table is read from the top, the first rule
+whose conditions all hold determines the action, and its name is written to the row.
 """
 
 from __future__ import annotations
@@ -14,24 +14,22 @@ from dataclasses import dataclass, fields, replace
 from enum import Enum
 from types import MappingProxyType
 
-__all__ = ["RULES", "Action", "Decision", "Facts", "Rule", "Supervisor", "SupervisorMemory", "SupervisorParams", "Test"]
-
 
 class Action(Enum):
-    """What the robot is told."""
+    """Actions of the robot."""
 
-    STAND_STILL = "stand_still"  # the estimate is not to be relied on yet
-    APPROACH = "approach"  # fly the plan, vision healthy
-    APPROACH_ON_PREDICTION = "approach_on_prediction"  # vision lost, prediction good enough to the end
-    HOLD = "hold"  # stop closing, keep the approach point
-    RETREAT = "retreat"  # move away: too near for what is known
+    STAND_STILL = "stand_still"  # remain at rest: the estimate has not converged
+    APPROACH = "approach"  # fly the plan with healthy measurements
+    APPROACH_ON_PREDICTION = "approach_on_prediction"  # fly the plan without measurements, the prediction suffices
+    HOLD = "hold"  # stop the approach and keep the approach point
+    RETREAT = "retreat"  # increase the distance to the target
     CAPTURE = "capture"  # fly the last plan to its end and close the gripper
-    ABORT = "abort"  # move away and stay there
+    ABORT = "abort"  # retreat and end the approach
 
 
 @dataclass(frozen=True, slots=True)
 class SupervisorParams:
-    """Tolerances of a capture and patience of the supervisor. None: taken from the target's extent."""
+    """Capture tolerances and time limits of the supervisor. None: a fraction of the target's extent."""
 
     # capture tolerance on position [m]; auto: 0.0025 of the extent
     capture_pos_m: float | None = None
@@ -61,7 +59,7 @@ class SupervisorParams:
                 raise ValueError(f"{f.name} is {value}, must be a finite number above 0")
 
     def resolved(self, extent_m: float) -> SupervisorParams:
-        """With every length taken from the target's extent [m] where it was left out."""
+        """Return the parameters with every missing length set to its fraction of the target's extent [m]."""
         shares = {"capture_pos_m": 0.0025, "capture_speed_mps": 0.00125, "standoff_m": 0.125, "retreat_m": 0.5}
         left_out = {name: share * extent_m for name, share in shares.items() if getattr(self, name) is None}
         return replace(self, **left_out)  # type: ignore[arg-type]
@@ -69,14 +67,18 @@ class SupervisorParams:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
-    """What is known at one scan.
+    """What the supervisor knows after one scan.
 
     Attributes:
-        t_s: time [s].  gamma: of this scan.  converged: may the planner rely on the estimate.
-        planned: is there a capture to fly.  t_go_s: to its end (NaN without).
-        pos_1s_m, vel_1s_mps, rot_1s_deg: 1 sigma of the grasp point predicted at that end, without more vision.
-        distance_m: robot to grasp point.  now_1s_m: 1 sigma of the grasp point's position now.
-        margin: least margin of the planner's constraints now, below 0 where one is broken (1 without constraints).
+        t_s: Time of the scan [s].
+        gamma: 1 if the scan is healthy, else 0.
+        converged: Whether the estimate may be used for planning.
+        planned: Whether a capture plan exists.
+        t_go_s: Time to the end of the plan [s], NaN without a plan.
+        pos_1s_m, vel_1s_mps, rot_1s_deg: 1 sigma of the grasp point predicted for that end without measurements.
+        distance_m: Distance of the robot to the grasp point [m].
+        now_1s_m: 1 sigma of the grasp point's position now [m].
+        margin: Smallest margin of the constraints now, negative if one is violated (1 without constraints).
     """
 
     t_s: float
@@ -94,7 +96,15 @@ class Facts:
 
 @dataclass(frozen=True, slots=True)
 class SupervisorMemory:
-    """What is carried from scan to scan. ``held_since_s`` is the begin of a hold or retreat that has not ended."""
+    """State of the supervisor carried from scan to scan.
+
+    Attributes:
+        action, rule: Latest decision.
+        seen_s: Time of the latest healthy scan [s], None before the first.
+        healthy_run: Number of consecutive healthy scans.
+        held_since_s: Begin of the current hold or retreat [s], None outside one.
+        moving: Whether the robot has left its initial position.
+    """
 
     action: Action = Action.STAND_STILL
     rule: str = ""
@@ -106,15 +116,15 @@ class SupervisorMemory:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """The action and the name of the rule that fired."""
+    """The selected action and the name of the rule that selected it."""
 
     action: Action
     rule: str
 
 
 @dataclass(frozen=True, slots=True)
-class Test:
-    """``measure compare bound``; a bound that is a text names a parameter."""
+class Condition:
+    """``measure compare bound``; a bound given as text is the name of a parameter."""
 
     measure: str
     compare: str
@@ -123,11 +133,11 @@ class Test:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """An action and every test that must hold for it. ``why`` is for people."""
+    """An action, the conditions that must all hold for it, and the reason in words."""
 
     name: str
     action: Action
-    tests: tuple[Test, ...]
+    conditions: tuple[Condition, ...]
     why: str
 
 
@@ -135,66 +145,100 @@ _COMPARE: Mapping[str, Callable[[float, float], bool]] = MappingProxyType(
     {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq}
 )
 
-_MOVING, _AT_REST = Test("moving", "==", 1), Test("moving", "==", 0)
-_SEEN, _BLIND = Test("gamma", "==", 1), Test("gamma", "==", 0)
-_AT_END, _SURE, _UNSURE = Test("t_go_s", "<=", "commit_s"), Test("doubt", "<=", 1.0), Test("doubt", ">", 1.0)
-_HOLDING = Test("holding", "==", 1)
+_MOVING, _AT_REST = Condition("moving", "==", 1), Condition("moving", "==", 0)
+_HEALTHY, _FAULTY = Condition("gamma", "==", 1), Condition("gamma", "==", 0)
+_AT_END, _HOLDING = Condition("t_go_s", "<=", "commit_s"), Condition("holding", "==", 1)
+_ACCURATE, _INACCURATE = Condition("error_ratio", "<=", 1.0), Condition("error_ratio", ">", 1.0)
 
 RULES: tuple[Rule, ...] = (
-    Rule("aborted", Action.ABORT, (Test("aborted", "==", 1),), "an abort stands"),
-    Rule("captured", Action.CAPTURE, (Test("captured", "==", 1),), "a capture once begun is flown to its end"),
-    Rule("held_too_long", Action.ABORT, (Test("held_s", ">", "hold_limit_s"),), "nothing has become better"),
-    Rule("constraint_broken", Action.RETREAT, (_MOVING, Test("margin", "<", 0.0)), "outside what the plan allows"),
-    Rule("too_close_unsure", Action.RETREAT, (_MOVING, _UNSURE, Test("clearance_m", "<", 0.0)), "could touch unawares"),
-    Rule("not_converged", Action.STAND_STILL, (_AT_REST, Test("converged", "==", 0)), "the paper's stand-still"),
-    Rule("convergence_lost", Action.HOLD, (Test("converged", "==", 0),), "the estimate was withdrawn on the way"),
-    Rule("no_plan_yet", Action.STAND_STILL, (_AT_REST, Test("planned", "==", 0)), "no capture within the horizon"),
-    Rule("plan_lost", Action.HOLD, (Test("planned", "==", 0),), "no capture within the horizon any more"),
-    Rule("blind_at_rest", Action.STAND_STILL, (_AT_REST, _BLIND), "no reason to set out without sight"),
+    Rule("aborted", Action.ABORT, (Condition("aborted", "==", 1),), "an abort is final"),
+    Rule("captured", Action.CAPTURE, (Condition("captured", "==", 1),), "a capture is flown to its end"),
+    Rule("held_too_long", Action.ABORT, (Condition("held_s", ">", "hold_limit_s"),), "the time limit is exceeded"),
+    Rule("constraint_broken", Action.RETREAT, (_MOVING, Condition("margin", "<", 0.0)), "a constraint is violated"),
+    Rule(
+        "too_close_unsure",
+        Action.RETREAT,
+        (_MOVING, _INACCURATE, Condition("distance_margin_m", "<", 0.0)),
+        "contact is possible",
+    ),
+    Rule(
+        "not_converged",
+        Action.STAND_STILL,
+        (_AT_REST, Condition("converged", "==", 0)),
+        "at rest until convergence (paper)",
+    ),
+    Rule("convergence_lost", Action.HOLD, (Condition("converged", "==", 0),), "convergence was lost"),
+    Rule("no_plan_yet", Action.STAND_STILL, (_AT_REST, Condition("planned", "==", 0)), "no capture within the horizon"),
+    Rule("plan_lost", Action.HOLD, (Condition("planned", "==", 0),), "no capture within the horizon any more"),
+    Rule("blind_at_rest", Action.STAND_STILL, (_AT_REST, _FAULTY), "the approach does not begin without measurements"),
     Rule(
         "recovering",
         Action.HOLD,
-        (_SEEN, _HOLDING, Test("healthy_run", "<", "recover_scans")),
-        "sight is back, not yet trusted",
+        (_HEALTHY, _HOLDING, Condition("healthy_run", "<", "recover_scans")),
+        "too few healthy scans so far",
     ),
-    Rule("arrived_sure", Action.CAPTURE, (_AT_END, _SURE), "the end is near and inside the tolerances"),
-    Rule("arrived_unsure", Action.HOLD, (_AT_END, _UNSURE), "the end is near and not inside the tolerances"),
-    Rule("healthy", Action.APPROACH, (_SEEN,), "sight is good: what is not known yet will be"),
-    Rule("prediction_good", Action.APPROACH_ON_PREDICTION, (_SURE,), "inside the tolerances to the end, unseen"),
-    Rule("blind_holding", Action.HOLD, (_HOLDING,), "still no sight"),
-    Rule("short_gap", Action.APPROACH_ON_PREDICTION, (Test("blind_s", "<=", "patience_s"),), "a scan or two may fail"),
-    Rule("prediction_poor", Action.HOLD, (), "unseen, and not inside the tolerances at the end"),
+    Rule("arrived_sure", Action.CAPTURE, (_AT_END, _ACCURATE), "accurate enough at the end"),
+    Rule("arrived_unsure", Action.HOLD, (_AT_END, _INACCURATE), "not accurate enough at the end"),
+    Rule("healthy", Action.APPROACH, (_HEALTHY,), "measurements improve the estimate"),
+    Rule("prediction_good", Action.APPROACH_ON_PREDICTION, (_ACCURATE,), "accurate enough without measurements"),
+    Rule("blind_holding", Action.HOLD, (_HOLDING,), "still no healthy measurement"),
+    Rule(
+        "short_gap",
+        Action.APPROACH_ON_PREDICTION,
+        (Condition("blind_s", "<=", "patience_s"),),
+        "short gaps are bridged",
+    ),
+    Rule("prediction_poor", Action.HOLD, (), "not accurate enough without measurements"),
 )
-"""Read from the top; the last rule has no test, so one always fires."""
+"""The rules in order of precedence; the last rule has no condition, so one rule always applies."""
 
 
 class Supervisor:
-    """Chooses one action a scan. ``params`` must be resolved (no None left)."""
+    """Selects one action per scan."""
 
     def __init__(self, params: SupervisorParams, rules: tuple[Rule, ...] = RULES) -> None:
+        """Create a supervisor.
+
+        Args:
+            params: Resolved parameters (``SupervisorParams.resolved``).
+            rules: Rules in order of precedence; the last one must have no condition.
+
+        Raises:
+            ValueError: A parameter is None, or the last rule has a condition.
+        """
         for f in fields(params):
             if getattr(params, f.name) is None:
                 raise ValueError(f"{f.name} is None, resolve the parameters with the target's extent first")
-        if not rules or rules[-1].tests:
-            raise ValueError("the last rule must have no test, so that one rule always fires")
+        if not rules or rules[-1].conditions:
+            raise ValueError("the last rule must have no condition, so that one rule always applies")
         self.params = params
         self.rules = rules
 
     def decide(self, memory: SupervisorMemory, facts: Facts) -> tuple[SupervisorMemory, Decision]:
-        """The action for this scan and what to remember of it."""
+        """Select the action for one scan.
+
+        Args:
+            memory: State after the previous scan.
+            facts: What is known after this scan.
+
+        Returns:
+            The new state and the decision.
+        """
         seen_s = facts.t_s if facts.gamma else memory.seen_s
         run = memory.healthy_run + 1 if facts.gamma else 0
         now = replace(memory, seen_s=seen_s, healthy_run=run)
         measures = self._measures(now, facts)
-        rule = next(rule for rule in self.rules if all(self._holds(test, measures) for test in rule.tests))
+        rule = next(
+            rule for rule in self.rules if all(self._holds(condition, measures) for condition in rule.conditions)
+        )
         holding = rule.action in (Action.HOLD, Action.RETREAT)
         since = (memory.held_since_s if memory.held_since_s is not None else facts.t_s) if holding else None
         moving = memory.moving or rule.action is not Action.STAND_STILL
         after = replace(now, action=rule.action, rule=rule.name, held_since_s=since, moving=moving)
         return after, Decision(rule.action, rule.name)
 
-    def doubt(self, facts: Facts) -> float:
-        """Predicted error at the end in units of the tolerances, at most 1 is good enough; infinite where unknown."""
+    def error_ratio(self, facts: Facts) -> float:
+        """Return the predicted error at the end of the plan over the tolerance; infinite where it is unknown."""
         p = self.params
         parts = (
             facts.pos_1s_m / (p.capture_pos_m or math.nan),
@@ -214,14 +258,14 @@ class Supervisor:
             "aborted": float(memory.action is Action.ABORT),
             "captured": float(memory.action is Action.CAPTURE),
             "t_go_s": facts.t_go_s if facts.planned else math.inf,
-            "doubt": self.doubt(facts),
+            "error_ratio": self.error_ratio(facts),
             "held_s": held,
             "blind_s": math.inf if memory.seen_s is None else facts.t_s - memory.seen_s,
             "healthy_run": float(memory.healthy_run),
-            "clearance_m": facts.distance_m - self.params.sigmas * facts.now_1s_m,
+            "distance_margin_m": facts.distance_m - self.params.sigmas * facts.now_1s_m,
             "margin": facts.margin,
         }
 
-    def _holds(self, test: Test, measures: Mapping[str, float]) -> bool:
-        bound = float(getattr(self.params, test.bound)) if isinstance(test.bound, str) else test.bound
-        return _COMPARE[test.compare](measures[test.measure], bound)
+    def _holds(self, condition: Condition, measures: Mapping[str, float]) -> bool:
+        bound = float(getattr(self.params, condition.bound)) if isinstance(condition.bound, str) else condition.bound
+        return _COMPARE[condition.compare](measures[condition.measure], bound)

@@ -1,7 +1,7 @@
 """Seeded campaigns with blackouts: what the supervisor lets through, and what it holds back.
 
 Truth from the full inertia tensor by DOP853; poses with white noise at 5 Hz; the filter from a near start; one to three
-blackouts of 5-30 s at random moments; the pilot flies under the supervisor. Registration is left out.
+blackouts of 5-30 s at random moments; the guidance flies under the supervisor. Registration is left out.
 
 python tests/benchmarks/plan_campaign.py [--quick] [--count 200] [--seed 1] [--one-at S --length S]
 """
@@ -22,8 +22,8 @@ from avsreplay.estimate.layout import boxplus
 from avsreplay.estimate.motion import propagate
 from avsreplay.geometry import Pose
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams, ConvergenceTrack
-from avsreplay.plan import Pilot, PlanParams, Sight, Supervisor, SupervisorParams, Tolerance, miss
-from avsreplay.plan.hindsight import closed_miss
+from avsreplay.plan import Guidance, PlannerInput, PlanParams, Supervisor, SupervisorParams, Tolerance, miss
+from avsreplay.plan.evaluation import closed_miss
 from avsreplay.records import Alignment, AlignStatus, Belief, State
 
 EXTENT_M, RATE_HZ, SPAN_S = 8.0, 5.0, 120.0
@@ -89,8 +89,8 @@ def campaign(seed, one=None):
     params = EstimatorParams(noise=EstimatorParams().noise.__class__("r0"), r0_pos_m=NOISE_M, r0_rot_deg=NOISE_DEG)
     estimator = Estimator(params, near_start(state(0.0), rng), EXTENT_M)
     convergence, watch = Convergence(ConvergenceParams(), EXTENT_M), ConvergenceTrack()
-    pilot = Pilot(PlanParams(), Supervisor(SupervisorParams().resolved(EXTENT_M)))
-    track, memory = estimator.initial(0, state(0.0).T_ac), pilot.initial(0)
+    guidance = Guidance(PlanParams(), Supervisor(SupervisorParams().resolved(EXTENT_M)))
+    track, memory = estimator.initial(0, state(0.0).T_ac), guidance.initial(0)
     rules, committed, held_good = [], None, None
     for t in np.arange(1, int(SPAN_S * RATE_HZ)) / RATE_HZ:
         t_ns, x = round(t * 1e9), state(t)
@@ -105,20 +105,22 @@ def campaign(seed, one=None):
             belief.x.q_ab, belief.x.w_b, belief.x.r_a, belief.x.v_a, belief.x.sigma,
             belief.x.c_b + geometry.matrix(belief.x.q_bc) @ np.array([1.0, 0.0, 0.0]), belief.x.q_bc,
         )  # fmt: skip
-        sight = Sight(
+        known = PlannerInput(
             t_ns, gamma, watch.converged, estimator.motion(belief), lambda s, b=belief: estimator.forecast(b, s),
             estimator.motion(Belief(t_ns, away, belief.P)),
         )  # fmt: skip
-        before, memory = memory, pilot.step(memory, sight)
+        before, memory = memory, guidance.step(memory, known)
         rule = memory.decision.rule
         if not rules or rules[-1] != rule:
             rules.append(rule)
-        if rule == "prediction_poor" and held_good is None and before.leg.flight is not None:
-            lead_s = (before.leg.end_ns - t_ns) * 1e-9
-            aimed = propagate(belief, before.leg.end_ns, 0.0, 0.0)[0].x.T_ac.q
-            held_good = lead_s > 0 and miss(before.leg.flight, before.leg.t_ns * 1e-9, motion, aimed).inside(TOLERANCE)
+        if rule == "prediction_poor" and held_good is None and before.segment.path is not None:
+            lead_s = (before.segment.end_ns - t_ns) * 1e-9
+            aimed = propagate(belief, before.segment.end_ns, 0.0, 0.0)[0].x.T_ac.q
+            held_good = lead_s > 0 and miss(before.segment.path, before.segment.t_ns * 1e-9, motion, aimed).inside(
+                TOLERANCE
+            )
         if rule == "arrived_sure":
-            committed = propagate(belief, memory.leg.end_ns, 0.0, 0.0)[0].x.T_ac.q
+            committed = propagate(belief, memory.segment.end_ns, 0.0, 0.0)[0].x.T_ac.q
         if memory.captured_ns is not None:
             found = closed_miss(memory, 0, motion, committed)
             return ("captured" if found.inside(TOLERANCE) else "outside"), found, rules, held_good

@@ -13,8 +13,8 @@ import numpy as np
 from plan_problems import problems
 from scipy.integrate import solve_ivp
 
-from avsreplay.plan import Flight, Limits, PlanParams, Scene, constrained, path_of, rendezvous
-from avsreplay.plan.reach import touch
+from avsreplay.plan import CostatePath, Limits, PlanParams, Scene, constrained, path_of, rendezvous
+from avsreplay.plan.reachable_set import gauge
 from avsreplay.records import PlanStatus
 
 ORIGIN = np.zeros(3)
@@ -40,16 +40,16 @@ def scan(goal, a_max, step, end):
     rho, rate = goal(times)
     out = np.empty(len(times), dtype=bool)
     for i, t in enumerate(times):
-        found = touch(rho[i], t * rate[i] - rho[i])
+        found = gauge(rho[i], t * rate[i] - rho[i])
         if found.residual > 1e-10:
             raise SystemExit(f"gauge not solved at {t}: {found.residual}")
-        out[i] = found.gauge <= a_max * t * t
+        out[i] = found.value <= a_max * t * t
     return times, out
 
 
 def flown(plan, goal):
     """Terminal errors by DOP853 through the plan's thrust alone."""
-    flight = Flight.of(plan, ORIGIN, ORIGIN)
+    flight = CostatePath.of(plan, ORIGIN, ORIGIN)
 
     def fly(t, y):
         return np.r_[y[3:], flight.thrust(np.array([min(t, plan.t_go_s)]))[0]]

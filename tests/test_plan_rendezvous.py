@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from avsreplay.plan import Flight, PlanParams, rendezvous
-from avsreplay.plan.reach import integrals, support, touch
+from avsreplay.plan import CostatePath, PlanParams, rendezvous
+from avsreplay.plan.reachable_set import gauge, integrals, support
 from avsreplay.records import PlanStatus
 
 ORIGIN = np.zeros(3)
@@ -48,7 +48,7 @@ def ratio(goal, r0, v0, a, times):
     out = []
     for t, p, v in zip(times, rho, rate, strict=True):
         dr, dv = p - r0 - v0 * t, v - v0
-        out.append(touch(dr, t * dv - dr).gauge / (a * t * t))
+        out.append(gauge(dr, t * dv - dr).value / (a * t * t))
     return np.array(out)
 
 
@@ -92,9 +92,9 @@ def test_touching_point_lies_on_the_ray_through_the_goal():
         b0, b1 = rng.normal(size=(2, 3))
         if k % 2:
             b1 = rng.normal() * b0 + 10.0 ** rng.uniform(-14, -1) * rng.normal(size=3)
-        found = touch(b0, b1)
+        found = gauge(b0, b1)
         first, second = integrals(found.P0[None], found.P1[None])
-        reached = found.gauge * np.r_[second[0], first[0] - second[0]]
+        reached = found.value * np.r_[second[0], first[0] - second[0]]
         assert np.allclose(reached, np.r_[b0, b1], atol=1e-11)
 
 
@@ -146,7 +146,7 @@ def test_first_feasible_time_of_a_tumbling_goal(seed):
     def fly(t, y):
         return np.r_[y[3:], flight.thrust(np.array([t]))[0]]
 
-    flight = Flight.of(plan, r0, v0)
+    flight = CostatePath.of(plan, r0, v0)
     end = solve_ivp(fly, [0, plan.t_go_s], np.r_[r0, v0], method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     rho, rate = goal(np.array([plan.t_go_s]))
     assert np.linalg.norm(end[:3] - rho[0]) < 1e-8
@@ -159,7 +159,7 @@ def test_the_seventh_equation_is_an_identity_and_as_printed_is_false():
     printed = []
     for _ in range(50):
         c, v0, a, end = rng.normal(size=6), rng.normal(size=3), 0.07, rng.uniform(1, 40)
-        flight = Flight(ORIGIN, v0, a, 0.0, end, c)
+        flight = CostatePath(ORIGIN, v0, a, 0.0, end, c)
         ends = np.array([0.0, end])
         p, (_, v) = np.linalg.norm(flight.p(ends), axis=1), flight.at(ends)
         assert a * (p[0] - p[1]) + c[:3] @ (v[1] - v[0]) == pytest.approx(0.0, abs=1e-10 * a * p.max() * end)
@@ -173,7 +173,7 @@ def test_latency_is_a_coast_and_then_the_same_problem():
     late = rendezvous(goal, ORIGIN, v0, PlanParams(latency_s=2.5))
     same = rendezvous(lambda t: goal(t + 2.5), 2.5 * v0, v0, PlanParams())
     assert late.t_go_s == pytest.approx(same.t_go_s + 2.5, abs=1e-7)
-    assert np.all(Flight.of(late, ORIGIN, v0).thrust(np.array([0.0, 2.4])) == 0.0)
+    assert np.all(CostatePath.of(late, ORIGIN, v0).thrust(np.array([0.0, 2.4])) == 0.0)
     assert late.position_error_m < 1e-8
 
 

@@ -21,9 +21,9 @@ from avsreplay.plan import (
     Limits,
     Miss,
     Motion,
+    PlannerInput,
     PlanParams,
     Scene,
-    Sight,
     Spread,
     SupervisorParams,
     Tolerance,
@@ -178,7 +178,7 @@ class Replanning:
             return plan.rendezvous(scene.goal, *self.start, self.params, belief.t_ns)
         return plan.constrained(scene, *self.start, self.params, self.limits, belief.t_ns, self.saved.extent_m)
 
-    def path(self, made: Plan) -> plan.Path:
+    def path(self, made: Plan) -> plan.RobotPath:
         """What a plan flies from the start."""
         return plan.path_of(made, *self.start)
 
@@ -218,11 +218,11 @@ class Replanning:
         """Fly the log under the supervisor; None without truth."""
         if self.saved.truth is None:
             return None
-        pilot = plan.Pilot(self.params, plan.Supervisor(self.supervisor), self._planner)
+        guidance = plan.Guidance(self.params, plan.Supervisor(self.supervisor), self._planner)
         beliefs = {belief.t_ns: belief for belief in self.saved.beliefs}
         sights = (self.sight(k) for k in range(len(self.saved.rows)))
         turned = lambda sight, after_s: self.attitude(beliefs[sight.t_ns], after_s)  # noqa: E731
-        return plan.execute(pilot, sights, self.saved.truth, turned, self.saved.since_ns)
+        return plan.execute(guidance, sights, self.saved.truth, turned, self.saved.since_ns)
 
     def _planner(self, goal: Any, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
         if not self.limits.any:
@@ -234,11 +234,11 @@ class Replanning:
         shifted = Scene(goal, axis and (lambda t: axis(t + wait)), centre and (lambda t: centre(t + wait)))
         return plan.constrained(shifted, r0, v0, params, self.limits, t_ns, self.saved.extent_m)
 
-    def sight(self, index: int) -> Sight:
+    def sight(self, index: int) -> PlannerInput:
         """What the pilot may know after a scan."""
         belief, row = self.saved.beliefs[index], self.saved.rows[index]
         away = _moved(belief.x, (self.supervisor.standoff_m or 0.0) * self.saved.axis_c)
-        return Sight(
+        return PlannerInput(
             t_ns=belief.t_ns,
             gamma=row.gamma,
             converged=row.converged,

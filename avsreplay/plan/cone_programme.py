@@ -18,11 +18,9 @@ from avsreplay.geometry import Array
 
 Index = NDArray[np.signedinteger[Any]]
 
-__all__ = ["Funnel", "Programme", "Wall", "solve"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Funnel:
+class ConeConstraint:
     """|across| <= slope * along + mouth at some nodes, along and across taken from ``apex`` about ``axis``.
 
     Attributes:
@@ -38,7 +36,7 @@ class Funnel:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Wall:
+class HalfSpaces:
     """``normal . r >= offset`` at some nodes. nodes (m,), normal (m, 3) unit, offset (m,) [m]."""
 
     nodes: Index
@@ -47,7 +45,7 @@ class Wall:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Programme:
+class ConeProgramme:
     """From (r0, v0) to (r1, v1) in t seconds over n intervals, under the limits given.
 
     Attributes:
@@ -62,8 +60,8 @@ class Programme:
     v1: Array
     speed: float | None = None
     contact: tuple[Array, float] | None = None
-    funnels: tuple[Funnel, ...] = ()
-    walls: tuple[Wall, ...] = ()
+    funnels: tuple[ConeConstraint, ...] = ()
+    walls: tuple[HalfSpaces, ...] = ()
 
 
 @dataclass(slots=True)
@@ -88,7 +86,7 @@ class _Rows:
         self.count += len(right)
 
 
-def solve(p: Programme) -> tuple[float, Array] | None:
+def solve(p: ConeProgramme) -> tuple[float, Array] | None:
     """Least bound on thrust [m/s2] and the thrust (n, 3) that keeps it; None where the limits cannot be met."""
     clarabel: Any = importlib.import_module("clarabel")
     from scipy import sparse
@@ -125,7 +123,7 @@ def _settings(clarabel: Any) -> Any:
     return settings
 
 
-def _dynamics(rows: _Rows, p: Programme, way: float) -> None:
+def _dynamics(rows: _Rows, p: ConeProgramme, way: float) -> None:
     """Let r' = r + h v + h^2/2 u and v' = v + h u over each interval, and both ends. Variables: r, v, u, bound."""
     n, h = p.n, 1.0 / p.n
     k, at_v, at_u = np.arange(3 * n), 3 * (n + 1), 6 * (n + 1)
@@ -142,7 +140,7 @@ def _dynamics(rows: _Rows, p: Programme, way: float) -> None:
         rows.close(value)
 
 
-def _norms(rows: _Rows, p: Programme, way: float) -> int:
+def _norms(rows: _Rows, p: ConeProgramme, way: float) -> int:
     """|u| <= bound, |v| <= speed, |u_last - a| <= contact. Returns how many cones of 4 these are."""
     n, at_v, at_u = p.n, 3 * (p.n + 1), 6 * (p.n + 1)
     k, count = np.arange(n), n
@@ -164,7 +162,7 @@ def _norms(rows: _Rows, p: Programme, way: float) -> int:
     return count
 
 
-def _funnels(rows: _Rows, p: Programme, way: float) -> int:
+def _funnels(rows: _Rows, p: ConeProgramme, way: float) -> int:
     """Rows s = (slope axis.(r - apex) + mouth, (I - axis axis^T)(r - apex)) in the cone of 4, each node."""
     count = 0
     for f in p.funnels:
@@ -183,7 +181,7 @@ def _funnels(rows: _Rows, p: Programme, way: float) -> int:
     return count
 
 
-def _walls(rows: _Rows, p: Programme, way: float) -> int:
+def _walls(rows: _Rows, p: ConeProgramme, way: float) -> int:
     count = 0
     for w in p.walls:
         m = np.arange(len(w.nodes))

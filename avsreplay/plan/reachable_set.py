@@ -1,12 +1,13 @@
-"""The body of reachable moments, one convex set for every problem, and its support function in closed form.
+"""The reachable set of a robot with bounded thrust, a convex set common to all problems, and its support function.
 
-With s = tau / t in [0, 1] and |w(s)| <= 1, the moments b0 = int (1 - s) w ds and b1 = int s w ds fill one fixed
-convex body K of R^6. Its support function is h(P0, P1) = int |P(s)| ds with P(s) = (1 - s) P0 + s P1, reached by
-w = P / |P| (eq:u). Thrust of size a over t takes a coasting robot from the terminal residual (dr, dv) to the goal
-iff (dr, t dv - dr) / (a t^2) lies in K, so the least thrust is a gauge: a*(t) = max over P of P.b / (t^2 h(P)).
+With s = tau / t in [0, 1] and |w(s)| <= 1, the moments b0 = int (1 - s) w ds and b1 = int s w ds form a fixed convex
+set K in R^6. Its support function is h(P0, P1) = int |P(s)| ds with P(s) = (1 - s) P0 + s P1, and the maximiser is
+w = P / |P|, the primer-vector law of eq:u. Thrust of magnitude a over time t takes a coasting robot from the terminal
+residual (dr, dv) to the goal if and only if (dr, t dv - dr) / (a t^2) lies in K. The least thrust is therefore a gauge
+(Minkowski functional): a*(t) = max over P of P.b / (t^2 h(P)).
 
-K is unchanged by a rotation of both moments, so the best P lies in the plane of b0 and b1: the search is over two
-plane vectors, four numbers and one scale. Everything here is plane geometry in floats; no unit, no frame.
+K does not change when both moments are rotated alike, so the optimal P lies in the plane of b0 and b1, and the search
+has four unknowns in the plane, one of which is scale. All quantities here are dimensionless and belong to no frame.
 """
 
 from __future__ import annotations
@@ -18,11 +19,10 @@ import numpy as np
 
 from avsreplay.geometry import Array
 
-__all__ = ["Touch", "integrals", "support", "touch"]
-
 Vector = list[float]
 
-SMALL_TURN = 0.25  # |P1 - P0| / (|P0| + |P1|) below which the closed form cancels and eight Gauss nodes are exact
+# |P1 - P0| / (|P0| + |P1|) below which the closed form loses digits; eight Gauss nodes are exact to rounding there
+SMALL_TURN = 0.25
 MAX_NEWTON = 60
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _GAUSS_S = 0.5 * (_NODES + 1.0)
@@ -32,34 +32,34 @@ _FLOOR = 1e-150
 
 
 @dataclass(frozen=True, slots=True)
-class Touch:
-    """Where the ray through b leaves K.
+class Gauge:
+    """The boundary point of K in a given direction.
 
     Attributes:
-        P0, P1: (3,) normal of K there, scaled to h(P0, P1) = 1.
-        gauge: P.b, the factor by which K must grow to reach b (b lies in K iff it is <= 1).
-        residual: |grad h - b / gauge|, 0 at the exact touching point.
+        P0, P1: (3,) normal of K at that point, scaled to h(P0, P1) = 1.
+        value: The gauge P.b, the factor by which K must be scaled to contain b (b lies in K if it is <= 1).
+        residual: |grad h - b / value|, which is 0 at the exact boundary point.
     """
 
     P0: Array
     P1: Array
-    gauge: float
+    value: float
     residual: float
 
 
 def _rod(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, float, float]:
-    """Integrals over s in [0, 1] of 1/|P|, and the end lengths: the potential of a rod, (2/l) atanh(l/(r0+r1))."""
+    """Return the integral of 1/|P| over s in [0, 1], (2/l) atanh(l/(r0+r1)), and the lengths at both ends."""
     r0, r1 = math.hypot(p0x, p0y), math.hypot(p1x, p1y)
     length = math.hypot(p1x - p0x, p1y - p0y)
     dot, cross = p0x * p1x + p0y * p1y, p0x * p1y - p0y * p1x
-    # (r0 + r1)^2 - l^2 = 2 (r0 r1 + dot), written without the cancellation of opposed ends
+    # (r0 + r1)^2 - l^2 = 2 (r0 r1 + dot), written without cancellation for opposed ends
     gap = 2.0 * (r0 * r1 + dot) if dot > 0.0 else 2.0 * cross * cross / max(r0 * r1 - dot, _FLOOR)
     total = r0 + r1 + length
     return math.log(max(total * total, _FLOOR) / max(gap, _FLOOR)) / max(length, _FLOOR), r0, r1
 
 
 def _gauss_support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, list[float], list[float]]:
-    """The support function where P hardly turns: eight Gauss nodes, exact to rounding there."""
+    """Evaluate the support function with eight Gauss nodes, for P of nearly constant direction."""
     h = g0x = g0y = g1x = g1y = 0.0
     hess = [0.0] * 9
     for s, weight in _GAUSS:
@@ -82,7 +82,7 @@ def _gauss_support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[floa
 
 
 def _closed_support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, list[float], list[float]]:
-    """The support function by its closed form, along e = (P1 - P0)/l and n across: P = u e + d n, u = u0 + l s."""
+    """Evaluate the support function in closed form: P = u e + d n, u = u0 + l s, e = (P1 - P0)/l, n normal to e."""
     j0, r0, r1 = _rod(p0x, p0y, p1x, p1y)
     dx, dy = p1x - p0x, p1y - p0y
     l = math.hypot(dx, dy)
@@ -118,7 +118,7 @@ def _closed_support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[flo
 
 
 def support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, list[float], list[float]]:
-    """h(P0, P1) in the plane, its gradient (4) and the blocks 00, 01, 11 of its Hessian as (xx, xy, yy) each."""
+    """Return h(P0, P1) in the plane, its gradient (4) and the Hessian blocks 00, 01, 11 as (xx, xy, yy) each."""
     turn = math.hypot(p1x - p0x, p1y - p0y)
     ends = math.hypot(p0x, p0y) + math.hypot(p1x, p1y)
     if turn < SMALL_TURN * ends:
@@ -129,10 +129,10 @@ def support(p0x: float, p0y: float, p1x: float, p1y: float) -> tuple[float, list
 def _newton_step(
     residual: list[float], hess: list[float], P: list[float], b: list[float], damping: float
 ) -> list[float]:
-    """The step that lowers h on the plane P.b = 1.
+    """Return the Newton step that decreases h on the plane P.b = 1.
 
-    h is homogeneous, so H P = 0 and P.(grad - h b) = 0: the solution of (H + k b b^T) step = -(grad - h b) has
-    b.step = 0 of itself, and the KKT system shrinks to four symmetric positive definite equations (LDL^T).
+    h is homogeneous, so H P = 0 and P.(grad - h b) = 0. The solution of (H + k b b^T) step = -(grad - h b) therefore
+    satisfies b.step = 0, and the KKT system reduces to four symmetric positive definite equations (LDL^T).
     """
     k = hess[0] + hess[2] + hess[6] + hess[8]
     b0, b1, b2, b3 = b
@@ -164,7 +164,7 @@ def _dot(a: list[float], b: list[float]) -> float:
 
 @dataclass(slots=True)
 class _Point:
-    """One trial of the descent: P, h(P), its Hessian, grad h - h b and the size of that."""
+    """One iterate: P, h(P), the Hessian, the residual grad h - h b and its norm."""
 
     P: list[float]
     h: float
@@ -180,7 +180,7 @@ def _evaluate(P: list[float], b: list[float]) -> _Point:
 
 
 def _descend(P: list[float], b: list[float], tolerance: float) -> _Point:
-    """Least h on P.b = 1 by damped Newton with a line search, down to |grad h - h b| <= tolerance."""
+    """Minimise h on P.b = 1 by damped Newton steps with a line search until |grad h - h b| <= tolerance."""
     now = _evaluate(P, b)
     for _ in range(MAX_NEWTON):
         if now.size <= tolerance + 4e-16 * now.h:
@@ -195,7 +195,7 @@ def _descend(P: list[float], b: list[float], tolerance: float) -> _Point:
 
 
 def _search(now: _Point, step: list[float], b: list[float]) -> _Point | None:
-    """The first point along the step that lowers h enough (Armijo), or the residual where h is at its floor."""
+    """Return the first point along the step with sufficient decrease of h (Armijo), or of the residual at rounding."""
     size = min(1.0, 2.0 * _norm(now.P) / max(_norm(step), _FLOOR))
     slope = _dot(now.residual, step)  # that of h: b.step is 0
     P = now.P
@@ -209,30 +209,35 @@ def _search(now: _Point, step: list[float], b: list[float]) -> _Point | None:
     return None
 
 
-def touch(b0: Array, b1: Array, warm: tuple[Array, Array] | None = None, tolerance: float = 1e-15) -> Touch:
-    """Where the ray through (b0, b1) leaves K. (3,), (3,) -> Touch.
+def gauge(b0: Array, b1: Array, warm: tuple[Array, Array] | None = None, tolerance: float = 1e-15) -> Gauge:
+    """Return the gauge of K at (b0, b1) and the normal at the boundary point.
 
     Args:
         b0: (3,) first moment.
-        b1: (3,) second moment; not both are zero.
-        warm: a normal found nearby.
-        tolerance: on the residual; a gauge found too early is too small, by the square of the residual.
+        b1: (3,) second moment; b0 and b1 must not both be zero.
+        warm: A normal found for similar moments, used as the initial guess.
+        tolerance: On the residual. The gauge is too small by about the square of the residual.
     """
     x, y, size = _scaled(b0, b1)
     plane = _plane(x, y)
     b = _in_plane(x, y, plane)
-    start = [4 * b[0] - 2 * b[2], 4 * b[1] - 2 * b[3], 4 * b[2] - 2 * b[0], 4 * b[3] - 2 * b[1]]  # least int |w|^2
+    start = [
+        4 * b[0] - 2 * b[2],
+        4 * b[1] - 2 * b[3],
+        4 * b[2] - 2 * b[0],
+        4 * b[3] - 2 * b[1],
+    ]
     if warm is not None:
         tried = _in_plane(warm[0].tolist(), warm[1].tolist(), plane)
         start = tried if _dot(tried, b) > 0.0 else start
     along = _dot(start, b)
     end = _descend([p / along for p in start], b, tolerance)
     p0x, p0y, p1x, p1y = (p / end.h for p in end.P)
-    return Touch(_lifted(p0x, p0y, plane), _lifted(p1x, p1y, plane), size / end.h, end.size)
+    return Gauge(_lifted(p0x, p0y, plane), _lifted(p1x, p1y, plane), size / end.h, end.size)
 
 
 def _scaled(b0: Array, b1: Array) -> tuple[Vector, Vector, float]:
-    """Both as floats, in units of their common length, and that length; scalars are quicker than arrays of three."""
+    """Return both vectors in units of their common norm, and that norm; lists are faster than arrays of three."""
     x, y = b0.tolist(), b1.tolist()
     size = math.sqrt(_dot3(x, x) + _dot3(y, y))
     return [v / size for v in x], [v / size for v in y], size
@@ -253,11 +258,11 @@ def _lifted(along: float, across: float, plane: tuple[Vector, Vector]) -> Array:
 
 
 def _plane(b0: Vector, b1: Vector) -> tuple[Vector, Vector]:
-    """Two orthonormal vectors that span b0 and b1, also where these are parallel or one is zero."""
+    """Return two orthonormal vectors whose plane contains b0 and b1, also if these are parallel or one is zero."""
     first, second = (b0, b1) if _dot3(b0, b0) >= _dot3(b1, b1) else (b1, b0)
     norm = math.sqrt(_dot3(first, first))
     e0 = [v / norm for v in first]
-    across = _without(_without(second, e0), e0)  # twice: what rounding left of e0 goes as well
+    across = _without(_without(second, e0), e0)  # twice, to remove the rounding error of the first pass
     norm = math.sqrt(_dot3(across, across))
     if norm < 1e-14:
         least = min(range(3), key=lambda i: abs(e0[i]))
@@ -267,16 +272,22 @@ def _plane(b0: Vector, b1: Vector) -> tuple[Vector, Vector]:
 
 
 def _without(v: Vector, e: Vector) -> Vector:
-    """The part of v across the unit vector e."""
+    """Return the component of v normal to the unit vector e."""
     k = _dot3(v, e)
     return [v[0] - k * e[0], v[1] - k * e[1], v[2] - k * e[2]]
 
 
 def integrals(P0: Array, P1: Array) -> tuple[Array, Array]:
-    """First and second integral of P/|P| over s in [0, 1]. (n, 3), (n, 3) -> (n, 3) int w, (n, 3) int (1 - s) w.
+    """Integrate P/|P| over s in [0, 1] once and twice, with closed forms in J_k = int s^k / |P| ds.
 
-    Closed form through J_k = int s^k / |P| ds, the collinear case with its reversal included; eight Gauss nodes
-    where P hardly turns and the closed form would cancel.
+    Where the direction of P hardly changes, eight Gauss nodes replace the closed form.
+
+    Args:
+        P0: (n, 3) vectors at s = 0.
+        P1: (n, 3) vectors at s = 1.
+
+    Returns:
+        int w ds (n, 3) and int (1 - s) w ds (n, 3) with w = P/|P|.
     """
     r0, r1 = np.linalg.norm(P0, axis=1), np.linalg.norm(P1, axis=1)
     D = P1 - P0

@@ -1,0 +1,246 @@
+"""The robot under guidance: supervisor, planner and path in one state, advanced scan by scan.
+
+``Guidance.step`` takes what is known after a scan, never the ground truth, and returns the decision, the plan in force
+and the motion of the robot. The robot follows its path exactly; only the target is uncertain.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from avsreplay.geometry import Array
+from avsreplay.plan.path import RobotPath, path_of
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
+from avsreplay.records import Forecast, Plan, Trajectory
+
+Planner = Callable[[Trajectory, Array, Array, PlanParams, int], Plan]
+"""Makes a capture plan from (goal, r0, v0, params, t_ns)."""
+
+_CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannerInput:
+    """What guidance knows after a scan.
+
+    Attributes:
+        t_ns: Instant of the scan.
+        gamma: 1 if the scan is healthy, else 0.
+        converged: Whether the estimate may be used for planning.
+        goal: Trajectory of the grasp point in {A} after t_ns.
+        forecast: Times (n,) [s after t_ns] -> 1 sigma of the grasp point if no further measurement arrives.
+        standoff: Trajectory of the approach point, fixed in the target; None: a hold brakes to rest.
+        margin: Position and velocity (3,) of the robot -> smallest margin of the constraints, negative if violated.
+    """
+
+    t_ns: int
+    gamma: int
+    converged: bool
+    goal: Trajectory
+    forecast: Callable[[Array], Forecast]
+    standoff: Trajectory | None = None
+    margin: Callable[[Array, Array], float] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segment:
+    """A path that begins at ``t_ns`` from r0, v0; before that instant the robot flies the segment ``previous``.
+
+    Attributes:
+        t_ns: Begin of the segment.
+        r0, v0: (3,) position [m] and velocity [m/s] of the robot in {A} at t_ns.
+        path: Path from t_ns on; None: the robot coasts.
+        previous: Segment flown before t_ns, None where t_ns has passed.
+    """
+
+    t_ns: int
+    r0: Array
+    v0: Array
+    path: RobotPath | None = None
+    previous: Segment | None = None
+
+    def at(self, t_ns: int) -> tuple[Array, Array]:
+        """Return position [m] and velocity [m/s] (3,) of the robot in {A} at an instant."""
+        if self.previous is not None and t_ns < self.t_ns:
+            return self.previous.at(t_ns)
+        span = (t_ns - self.t_ns) * 1e-9
+        if self.path is None:
+            return self.r0 + span * self.v0, self.v0
+        position, velocity = self.path.at(np.array([span]))
+        return position[0], velocity[0]
+
+    @property
+    def end_ns(self) -> int:
+        """Instant at which the thrust ends."""
+        return self.t_ns + (round(self.path.t_go_s * 1e9) if self.path else 0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GuidanceState:
+    """State of guidance carried from scan to scan.
+
+    Attributes:
+        segment: What the robot flies now.
+        supervisor: State of the supervisor.
+        plan: The latest capture plan; its ``t_ns`` is the instant of planning.
+        decision: The latest decision.
+        made_ns: When the latest segment of a hold or retreat was planned.
+        captured_ns: When the gripper closed.
+    """
+
+    segment: Segment
+    supervisor: SupervisorMemory = field(default_factory=SupervisorMemory)
+    plan: Plan | None = None
+    decision: Decision = field(default_factory=lambda: Decision(Action.STAND_STILL, ""))
+    made_ns: int | None = None
+    captured_ns: int | None = None
+
+
+class Guidance:
+    """Flies the rendezvous under the decisions of a supervisor."""
+
+    def __init__(self, params: PlanParams, supervisor: Supervisor, planner: Planner = rendezvous) -> None:
+        """Create the guidance of one run.
+
+        Args:
+            params: Parameters of robot and planner.
+            supervisor: Supervisor with resolved parameters.
+            planner: Makes a capture plan from (goal, r0, v0, params, t_ns).
+        """
+        self.params, self.supervisor, self.planner = params, supervisor, planner
+
+    def initial(self, t_ns: int) -> GuidanceState:
+        """Return the state at the first scan: the robot at its configured position and velocity."""
+        r0, v0 = np.array(self.params.robot_position_m), np.array(self.params.robot_velocity_mps)
+        return GuidanceState(Segment(t_ns, r0, v0))
+
+    def fly(self, inputs: Iterable[PlannerInput]) -> Iterator[tuple[PlannerInput, GuidanceState]]:
+        """Apply ``step`` to one input after the other."""
+        state: GuidanceState | None = None
+        for known in inputs:
+            state = self.step(state or self.initial(known.t_ns), known)
+            yield known, state
+
+    def step(self, state: GuidanceState, known: PlannerInput) -> GuidanceState:
+        """Advance by one scan.
+
+        Args:
+            state: State after the previous scan.
+            known: What is known after this scan.
+
+        Returns:
+            The new state with decision, plan and segment. After the capture the state no longer changes.
+        """
+        if state.captured_ns is not None:
+            return state
+        if state.decision.action is Action.CAPTURE and known.t_ns >= state.segment.end_ns:
+            state = replace(state, captured_ns=state.segment.end_ns)
+        plan, segment = self._replan(state, known)
+        facts = self._facts(state, known, plan, segment)
+        supervisor, decision = self.supervisor.decide(state.supervisor, facts)
+        state = replace(state, supervisor=supervisor, decision=decision, plan=plan)
+        if decision.action not in _CLOSING:
+            return self._withdraw(state, known)
+        if segment is None:  # the approach resumes between two replanning instants
+            plan, segment = self._plan(state.segment, known.goal, known.t_ns, self.planner)
+        return replace(state, plan=plan, segment=segment or state.segment, made_ns=None)
+
+    def _replan(self, state: GuidanceState, known: PlannerInput) -> tuple[Plan | None, Segment | None]:
+        """Return the capture plan in force, renewed where it is due, and the segment that flies it, if any."""
+        closing = state.decision.action in _CLOSING
+        flown = state.segment if closing else None
+        if not known.converged or state.decision.action in (Action.CAPTURE, Action.ABORT):
+            return state.plan, flown
+        age_s = math.inf if state.plan is None else (known.t_ns - state.plan.t_ns) * 1e-9
+        left_s = (state.segment.end_ns - known.t_ns) * 1e-9 if closing else math.inf
+        if not self._due(age_s, left_s):
+            return state.plan, flown
+        plan, segment = self._plan(state.segment, known.goal, known.t_ns, self.planner)
+        return plan, segment or flown
+
+    def _due(self, age_s: float, left_s: float) -> bool:
+        """Return whether to replan: at the period, at every scan near the end, not where a plan would come too late."""
+        near = left_s <= 2.0 * self.supervisor.params.commit_s
+        return (age_s >= self.params.replan_period_s - 1e-6 or near) and left_s > self.params.latency_s
+
+    def _plan(self, segment: Segment, goal: Trajectory, t_ns: int, planner: Planner) -> tuple[Plan, Segment | None]:
+        """Plan from the state that the current segment reaches when the latency is over."""
+        wait_s = self.params.latency_s
+        begin_ns = t_ns + round(wait_s * 1e9)
+        r0, v0 = segment.at(begin_ns)
+        # the robot flies the current segment during the latency, so the planner starts at its end without latency
+        late = replace(self.params, latency_s=0.0)
+        plan = planner(lambda t: goal(t + wait_s), r0, v0, late, t_ns)
+        if not plan.found:
+            return plan, None
+        previous = segment if t_ns < segment.t_ns else replace(segment, previous=None)
+        return _counted_from_planning(plan, wait_s), Segment(begin_ns, r0, v0, path_of(plan, r0, v0), previous)
+
+    def _facts(self, state: GuidanceState, known: PlannerInput, plan: Plan | None, segment: Segment | None) -> Facts:
+        planned = plan is not None and plan.found
+        t_go = _left_s(plan, segment, known.t_ns)
+        sigma = known.forecast(np.array([0.0, t_go]) if planned else np.array([0.0]))
+        position, velocity = state.segment.at(known.t_ns)
+        return Facts(
+            t_s=known.t_ns * 1e-9,
+            gamma=known.gamma,
+            converged=known.converged,
+            planned=planned,
+            t_go_s=t_go,
+            pos_1s_m=float(sigma.pos_1s_m[-1]),
+            vel_1s_mps=float(sigma.vel_1s_mps[-1]),
+            rot_1s_deg=math.degrees(float(sigma.rot_1s_rad[-1])),
+            distance_m=float(np.linalg.norm(known.goal(np.zeros(1))[0][0] - position)),
+            now_1s_m=float(sigma.pos_1s_m[0]),
+            margin=known.margin(position, velocity) if known.margin else 1.0,
+        )
+
+    def _withdraw(self, state: GuidanceState, known: PlannerInput) -> GuidanceState:
+        """Fly a hold, a retreat or an abort. Hold and retreat are replanned at the replanning period."""
+        action = state.decision.action
+        due = state.made_ns is None or (known.t_ns - state.made_ns) * 1e-9 >= self.params.replan_period_s - 1e-6
+        if action is Action.STAND_STILL or not due or (action is Action.ABORT and state.made_ns is not None):
+            return state
+        _, segment = self._plan(state.segment, self._retreat_goal(state, known), known.t_ns, rendezvous)
+        return replace(state, segment=segment or state.segment, made_ns=known.t_ns)
+
+    def _retreat_goal(self, state: GuidanceState, known: PlannerInput) -> Trajectory:
+        """Return the goal of a hold (approach point, or rest) or of a retreat (rest at a distance)."""
+        position, velocity = state.segment.at(known.t_ns)
+        if state.decision.action is Action.HOLD:
+            braking = velocity * np.linalg.norm(velocity) / (2.0 * self.params.a_max_mps2)
+            return known.standoff or _rest(position + braking)
+        target = known.goal(np.zeros(1))[0][0]
+        away = position - target
+        distance = float(np.linalg.norm(away))
+        if distance <= 0.0:
+            away, distance = np.array([1.0, 0.0, 0.0]), 1.0
+        return _rest(target + away / distance * max(distance, self.supervisor.params.retreat_m or 0.0))
+
+
+def _left_s(plan: Plan | None, segment: Segment | None, t_ns: int) -> float:
+    """Return the time to the end of the segment, else of the plan [s], at least 0; NaN without a plan."""
+    if plan is None or not plan.found:
+        return math.nan
+    return max((segment.end_ns - t_ns) * 1e-9 if segment else plan.t_go_s - (t_ns - plan.t_ns) * 1e-9, 0.0)
+
+
+def _counted_from_planning(plan: Plan, wait_s: float) -> Plan:
+    """Return the plan with its times and its costate counted from ``wait_s`` earlier."""
+    c = np.concatenate([plan.costate[:3], plan.costate[3:] + wait_s * plan.costate[:3]])
+    return replace(
+        plan,
+        t_go_s=plan.t_go_s + wait_s,
+        lower_bound_s=plan.lower_bound_s + wait_s,
+        costate=c / np.linalg.norm(c),
+        latency_s=wait_s,
+    )
+
+
+def _rest(point: Array) -> Trajectory:
+    return lambda t: (np.tile(point, (len(t), 1)), np.zeros((len(t), 3)))
