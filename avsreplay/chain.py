@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
-from avsreplay.estimate.deskew import deskew, late
+from avsreplay.estimate.deskew import deskew, with_scan_duration
 from avsreplay.fill import Findings, row_of
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.faults import FaultDetector
@@ -174,7 +174,7 @@ def _judge(
 ) -> tuple[Prediction, Innovation | None, Verdict]:
     """The prediction as this scan tests it, the innovation and the verdict."""
     if scan.times_s is not None and sighted.instants is not None:
-        prediction = late(prediction, sighted.instants, scan.times_s)
+        prediction = with_scan_duration(prediction, sighted.instants, scan.times_s)
     seen = stages.estimator.innovate(prediction, sighted.alignment) if sighted.alignment.measured else None
     return prediction, seen, stages.detector.judge(scan.status, sighted.alignment, seen, prediction.belief)
 

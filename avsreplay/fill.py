@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.estimate.layout import boxminus
-from avsreplay.estimate.measure import sensitivity
-from avsreplay.estimate.relabel import nearest, nees
+from avsreplay.estimate.chart import nearest_permutation, nees
+from avsreplay.estimate.error_state import boxminus
+from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.consistency import block_nees
 from avsreplay.records import BLOCKS, Alignment, Belief, Innovation, Scan, ScanStatus, Verdict
@@ -111,7 +111,7 @@ def _estimate(belief: Belief | None) -> dict[str, Any]:
 
 def _pose_sigma(belief: Belief) -> tuple[float, float]:
     """1 sigma of the fixture's position [m] and attitude [deg]."""
-    H = sensitivity(belief.x)
+    H = measurement_jacobian(belief.x)
     variance = np.diag(H @ belief.P @ H.T)
     return float(np.sqrt(max(variance[:3].sum(), 0.0))), _half_angle_deg(variance[3:].sum())
 
@@ -123,7 +123,7 @@ def _errors(belief: Belief | None, scan: Scan, estimator: str) -> dict[str, Any]
     fields: dict[str, Any] = dict(zip(("pos_err_m", "rot_err_deg"), _distance(belief.x.T_ac, scan.truth), strict=True))
     if scan.body is None or estimator == "start":
         return fields
-    named, _ = nearest(belief, scan.body)
+    named, _ = nearest_permutation(belief, scan.body)
     blocks = block_nees(boxminus(named, belief.x), belief.P)
     return (
         fields | {"nees": _finite(nees(belief, scan.body))} | {f"nees_{name}": _finite(blocks[name]) for name in BLOCKS}

@@ -16,10 +16,10 @@ from avsreplay import chain, settings
 from avsreplay.chain import Memory
 from avsreplay.config import Against, RunConfig, load_config
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.estimate.chart import nearest_permutation
+from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
-from avsreplay.estimate.relabel import nearest
-from avsreplay.estimate.start import PoseFix
 from avsreplay.geometry import Pose
 from avsreplay.log import Source, SourceOptions, open_source
 from avsreplay.records import Scan, State, Surface
@@ -132,7 +132,7 @@ class Run:
         """The true state at the last scan that has one, its principal axes named as the estimate names them."""
         if self._end is None or self._end[0].track is None:
             return self.source.header.truth
-        return nearest(self._end[0].track.belief, self._end[1])[0]
+        return nearest_permutation(self._end[0].track.belief, self._end[1])[0]
 
     def summary(self) -> Summary:
         """The summary of the rows taken so far."""

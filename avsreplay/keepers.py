@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.chain import Memory
-from avsreplay.estimate.measure import sensitivity
+from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.geometry import Array, Pose
 from avsreplay.job import Listener
 from avsreplay.log.result_log import ResultFrame, ResultLog
@@ -32,7 +32,7 @@ _VALUES = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank",
 
 def pose_covariance(belief: Belief) -> Array:
     """(6, 6) of the fixture's (position in {A} [m], rotation vector in {A} [rad])."""
-    H = sensitivity(belief.x)
+    H = measurement_jacobian(belief.x)
     to_a = np.zeros((6, 6))
     to_a[:3, :3] = np.eye(3)
     to_a[3:, 3:] = 2.0 * geometry.matrix(belief.x.q_ab)  # half angle in {B} -> full angle in {A}

@@ -12,9 +12,8 @@ import numpy as np
 from avsreplay import geometry, plan, settings
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.horizon import trajectory
-from avsreplay.estimate.layout import boxplus
-from avsreplay.estimate.motion import propagate
+from avsreplay.estimate.dynamics import grasp_trajectory, propagate
+from avsreplay.estimate.error_state import boxplus
 from avsreplay.geometry import Array
 from avsreplay.plan import (
     Execution,
@@ -162,8 +161,8 @@ class Replanning:
 
     def scene(self, x: State) -> Scene:
         """The target after a belief's instant: grasp point, fixture axis and mass centre."""
-        goal = trajectory(x)
-        tip = trajectory(_moved(x, self.saved.axis_c))
+        goal = grasp_trajectory(x)
+        tip = grasp_trajectory(_moved(x, self.saved.axis_c))
         return Scene(
             goal,
             lambda t: tip(t)[0] - goal(t)[0],
@@ -242,9 +241,9 @@ class Replanning:
             t_ns=belief.t_ns,
             gamma=row.gamma,
             converged=row.converged,
-            goal=trajectory(belief.x),
+            goal=grasp_trajectory(belief.x),
             forecast=lambda times: self.saved.estimator.forecast(belief, times),
-            standoff=trajectory(away),
+            standoff=grasp_trajectory(away),
             margin=self._margin(belief.x) if self.limits.any else None,
         )
 
@@ -265,7 +264,7 @@ def _attitude(belief: Belief, after_s: float) -> Array:
 
 def _future(x: State, belief: Belief) -> plan.Future:
     drawn = Belief(belief.t_ns, x, belief.P)
-    return plan.Future(trajectory(x), lambda after_s: _attitude(drawn, after_s))
+    return plan.Future(grasp_trajectory(x), lambda after_s: _attitude(drawn, after_s))
 
 
 def _bounded(x: State) -> State:

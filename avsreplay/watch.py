@@ -46,12 +46,12 @@ def look(
     gramian = observe(watch.gramian, prediction.Phi, prediction.H, gamma)
     honest = monitors.consistency.observe(watch.consistency, seen, gamma)
     said = monitors.consistency.judge(honest)
-    consistent = said.consistent and not track.window.doubtful
+    consistent = said.consistent and not track.window.many_outliers
     forecast = estimator.forecast(track.belief, monitors.convergence.params.times_s)
     convergence = monitors.convergence.judge(watch.convergence, track.belief, forecast, consistent is True)
     columns = _observability(gramian) | _forecast(forecast) | _convergence(convergence)
     columns |= {"consistent": consistent, "nis_mean": said.nis_mean, "autocorrelation": said.autocorrelation}
-    columns |= {"sigma_hits": track.sigma_hits, "r_floors": track.r_floors, "recalls": track.recalls}
+    columns |= {"sigma_hits": track.sigma_hits, "r_floors": track.r_floors, "recalls": track.reinitialised}
     return Watch(gramian, honest, convergence), columns
 
 

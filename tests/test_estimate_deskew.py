@@ -8,9 +8,9 @@ import tumbling
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.deskew import deskew, late
-from avsreplay.estimate.layout import boxplus
-from avsreplay.estimate.measure import innovation
+from avsreplay.estimate.deskew import deskew, with_scan_duration
+from avsreplay.estimate.error_state import boxplus
+from avsreplay.estimate.measurement import innovation_vector
 from avsreplay.geometry import Pose
 from avsreplay.records import Belief
 
@@ -95,8 +95,8 @@ def test_the_innovation_of_a_carried_scan_is_late_h_times_the_priors_error(begin
         guess = prior.belief.x.T_ac
         found = guess.inverse().apply(deskew(seen, times, prior))  # in the prior's {C}: p + J' d
         d = np.linalg.lstsq(J, np.einsum("ij,ij->i", n, found - p), rcond=None)[0]
-        alpha = innovation(prior.belief.x, guess @ Pose(geometry.exp(d[:3]), d[3:]))
-        told = late(prior, M, times)
+        alpha = innovation_vector(prior.belief.x, guess @ Pose(geometry.exp(d[:3]), d[3:]))
+        told = with_scan_duration(prior, M, times)
         error = np.linalg.norm(alpha - told.H @ dx)
         assert error < 0.015 * np.linalg.norm(alpha)
         assert error < 0.25 * np.linalg.norm(alpha - prior.H @ dx)
@@ -105,15 +105,15 @@ def test_the_innovation_of_a_carried_scan_is_late_h_times_the_priors_error(begin
 def test_a_flash_scan_tests_the_motion_at_its_instant() -> None:
     now = skewed(0.1, 0.2, 1.0)[2]
     prior = predict(now)
-    assert late(prior, np.zeros((6, 6)), np.zeros(500)) is prior
-    assert late(prior, np.zeros((6, 6)), np.zeros(0)) is prior
+    assert with_scan_duration(prior, np.zeros((6, 6)), np.zeros(500)) is prior
+    assert with_scan_duration(prior, np.zeros((6, 6)), np.zeros(0)) is prior
 
 
 def test_points_all_late_by_the_same_time_test_the_pose_then() -> None:
     """Turned into {C}, H is that of the prior carried on to the instant they were measured at."""
     now = skewed(0.1, 0.2, 1.0)[2]
     prior = predict(now)
-    told = late(prior, 0.5 * np.eye(6), np.full(500, 0.5))
+    told = with_scan_duration(prior, 0.5 * np.eye(6), np.full(500, 0.5))
     estimator = Estimator(EstimatorParams(), Belief(0, now, np.eye(20) * 1e-6), 2.0)
     then = estimator.predict(estimator.initial(0, now.T_ac), 500_000_000)
     turn = now.T_ac.R @ then.belief.x.T_ac.R.T

@@ -1,6 +1,7 @@
-"""The adaptive constrained filter and the maximum-likelihood fit."""
+"""State estimation: the noise-adaptive constrained Kalman filter and the maximum-likelihood batch fit."""
 
-from avsreplay.estimate.estimator import Estimator, Prediction, Track
+from avsreplay.estimate.estimator import Estimator
 from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.track import Prediction, Track
 
 __all__ = ["Estimator", "EstimatorParams", "Prediction", "Track"]

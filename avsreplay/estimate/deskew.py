@@ -1,7 +1,8 @@
-"""Motion inside a scan: points measured at their own instants carried to the scan's instant by the predicted motion.
+"""Motion during a scan: points measured at their own instants are moved to the scan's instant by the predicted motion.
 
-What is carried takes the prediction's error along, so the scan's pose is no measurement at the scan's instant: ``late``
-says what it is one of. Without it the prior is taken for news, and the estimate for surer than it is.
+The error of the prediction moves with the points, so the scan's pose is not a measurement at the scan's instant alone:
+``with_scan_duration`` gives its Jacobian. Without it, part of the prior would be used as new information, and the
+covariance would be too small.
 """
 
 from __future__ import annotations
@@ -13,28 +14,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.estimate.arc import Path
-from avsreplay.estimate.estimator import Prediction
-from avsreplay.estimate.measure import sensitivity, to_camera, to_fixture
-from avsreplay.estimate.motion import moved
+from avsreplay.estimate.dynamics import propagate_state, rotation_path
+from avsreplay.estimate.measurement import measurement_jacobian, to_camera, to_fixture
+from avsreplay.estimate.track import Prediction
 from avsreplay.geometry import Array
 from avsreplay.records import State
 
-__all__ = ["deskew", "late"]
-
-_KNOTS = 65  # instants the motion is worked out at; between them rotation and position go straight
+_KNOTS = 65  # instants at which the motion is computed; in between, rotation and position are interpolated linearly
 
 
 def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) -> Array:
-    """Points (n, 3) in {A} as they would be if all were measured at the scan's instant.
+    """Points in {A} as if all had been measured at the scan's instant: p(0) = T_ac(0) T_ac(t)^-1 p(t).
 
-    A point on the target moves with it: p(0) = T_ac(0) T_ac(t)^-1 p(t), by the prior's motion. Its error is that of
-    the predicted rate and velocity times the span of the scan, not the motion itself.
+    The remaining error is that of the predicted rate and velocity times the duration of the scan.
 
     Args:
-        points: (n, 3) [m].
+        points: (n, 3) in {A} [m].
         times_s: (n,) instant of each relative to the scan's [s].
         prediction: the scan's prior.
+
+    Returns:
+        (n, 3) points in {A} [m].
 
     Raises:
         ValueError: shapes differ, or a time is not finite.
@@ -45,21 +45,21 @@ def deskew(points: NDArray[Any], times_s: NDArray[Any], prediction: Prediction) 
     if not len(times) or float(np.ptp(times)) == 0.0 == float(times[0]):
         return points
     knots = np.linspace(min(float(times.min()), 0.0), max(float(times.max()), 0.0), _KNOTS)
-    rotations, offsets = _back(prediction.belief.x, knots)
-    place = np.clip((times - knots[0]) / (knots[1] - knots[0]), 0.0, _KNOTS - 1.0)
-    low = np.minimum(place.astype(int), _KNOTS - 2)
-    part = (place - low)[:, None]
-    carried = [np.einsum("nij,nj->ni", rotations[k], points) + offsets[k] for k in (low, low + 1)]
-    return np.asarray((1.0 - part) * carried[0] + part * carried[1])
+    rotations, offsets = _to_scan_instant(prediction.belief.x, knots)
+    position = np.clip((times - knots[0]) / (knots[1] - knots[0]), 0.0, _KNOTS - 1.0)
+    low = np.minimum(position.astype(int), _KNOTS - 2)
+    part = (position - low)[:, None]
+    moved = [np.einsum("nij,nj->ni", rotations[k], points) + offsets[k] for k in (low, low + 1)]
+    return np.asarray((1.0 - part) * moved[0] + part * moved[1])
 
 
-def late(prediction: Prediction, instants: Array, times_s: NDArray[Any]) -> Prediction:
-    """The prediction with the H (6, 20) of a scan that it carried to its instant itself, its lag and its blur.
+def with_scan_duration(prediction: Prediction, instants: Array, times_s: NDArray[Any]) -> Prediction:
+    """The prediction with the H (6, 20), the lag and the blur of a scan that was deskewed by the same prediction.
 
-    A point measured at tau and carried by the prior shows the prior's error at tau: delta(tau) in {C}, whatever
-    instant it is carried to. Over a scan delta is taken as straight, so the registered pose shows
-    delta(first) + (M - first) delta', by the mean instants M. Taken for the pose of one instant, the lag tr M / 6, it
-    is off by (M - lag) delta': the blur.
+    A point measured at tau and moved by the prior shows the prior's error at tau: delta(tau) in {C}, whatever instant
+    it is moved to. Over a scan delta is taken as linear in time, so the registered pose shows
+    delta(first) + (M - first) delta', with the mean instants M. Treated as the pose at one instant, the lag tr M / 6,
+    it is off by (M - lag) delta': the blur.
 
     Args:
         prediction: the scan's prior, that of ``deskew``.
@@ -71,24 +71,24 @@ def late(prediction: Prediction, instants: Array, times_s: NDArray[Any]) -> Pred
     x, first, last = prediction.belief.x, float(np.min(times_s)), float(np.max(times_s))
     if first == 0.0 == last:
         return prediction
-    G, lag_s, blur = _fixture_rows(x, first), float(np.trace(instants)) / 6.0, None
+    G, lag_s, blur = _fixture_jacobian(x, first), float(np.trace(instants)) / 6.0, None
     if last > first:
-        slope = (_fixture_rows(x, last) - G) / (last - first)
+        slope = (_fixture_jacobian(x, last) - G) / (last - first)
         rest = (instants - lag_s * np.eye(6)) @ slope
         G = G + (instants - first * np.eye(6)) @ slope
         blur = rest @ prediction.belief.P @ rest.T
     return replace(prediction, H=to_camera(x.T_ac.q, x.q_bc) @ G, lag_s=lag_s, blur=blur)
 
 
-def _fixture_rows(x: State, h: float) -> Array:
-    """(6, 20) error of the pose h seconds on, d = [theta; v] in {C} [rad, m], by the error states now."""
-    then, Phi = moved(x, h)
-    return to_fixture(then.T_ac.q, x.q_bc) @ sensitivity(then) @ Phi
+def _fixture_jacobian(x: State, h: float) -> Array:
+    """(6, 20) error of the pose h seconds later, d = [theta; v] in {C} [rad, m], by the error states now."""
+    then, Phi = propagate_state(x, h)
+    return to_fixture(then.T_ac.q, x.q_bc) @ measurement_jacobian(then) @ Phi
 
 
-def _back(x: State, knots: Array) -> tuple[Array, Array]:
-    """R (k, 3, 3) and offset (k, 3) of T_ac(0) T_ac(t)^-1 at ``knots`` about now."""
-    q_ab, _ = Path(x).at(knots)
+def _to_scan_instant(x: State, knots: Array) -> tuple[Array, Array]:
+    """R (k, 3, 3) and offset (k, 3) of T_ac(0) T_ac(t)^-1 at ``knots`` relative to the scan's instant."""
+    q_ab, _ = rotation_path(x).at(knots)
     A_t, now = geometry.matrix(q_ab), x.T_ac
     q_ac = geometry.multiply(q_ab, x.q_bc)
     t_ac = x.r_a + knots[:, None] * x.v_a + A_t @ x.c_b

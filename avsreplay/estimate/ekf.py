@@ -1,59 +1,89 @@
-"""The constrained update (eq:innovation, eq:K_phi): K = gamma beta K^u, in Joseph's form as beta spoils optimality."""
+"""The constrained update (eq:innovation, eq:K_phi, eq:sigma_bounds): K = gamma beta K^u, in Joseph's form.
+
+beta scales the two sigma rows of the gain (rows 12, 13) so that sigma stays inside its bounds. A scaled gain is not
+optimal, hence Joseph's form.
+"""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from avsreplay.estimate import _motion
-from avsreplay.estimate.constrain import shrink
-from avsreplay.estimate.layout import SIGMA, boxplus
-from avsreplay.estimate.robust import GATE
+from avsreplay.estimate.error_state import SIGMA, boxplus
+from avsreplay.estimate.noise import GATE
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation, State
 
-__all__ = ["gain", "innovate", "joseph", "update", "update_in_chart", "widened"]
 
+def innovation_of(
+    P: Array, H: Array, alpha: Array, R: Array, robust: bool = False, correlated_share: float = 0.0
+) -> Innovation:
+    """The innovation alpha (6,) with its covariance S = H P H' + R, its NIS and its Cauchy weight.
 
-def innovate(P: Array, H: Array, alpha: Array, R: Array, robust: bool = False, share: float = 0.0) -> Innovation:
-    """The innovation's covariance S = H P H' + R and its sizes.
-
-    ``robust`` weighs a pose down whose NIS is beyond the 99.99 % point, by Cauchy's weight, as the fit does.
-    ``share``: of R, what neighbouring scans have in common.
+    Args:
+        P: (20, 20) prior covariance.
+        H: (6, 20) measurement Jacobian.
+        alpha: (6,) innovation [m, half-angle].
+        R: (6, 6) measurement noise.
+        robust: give a pose whose NIS is above the 99.99 % point the Cauchy weight GATE / NIS; otherwise it is 1.
+        correlated_share: the part of R that neighbouring scans have in common.
     """
-    seen = H @ P @ H.T + R
-    S = np.asarray(0.5 * (seen + seen.T), dtype=np.float64)
+    unsymmetric = H @ P @ H.T + R
+    S = np.asarray(0.5 * (unsymmetric + unsymmetric.T), dtype=np.float64)
     half = min(1.0, float(np.sqrt(alpha[3:] @ alpha[3:])))
     distance = float(np.sqrt(alpha[:3] @ alpha[:3]))
     nis = float(alpha @ np.linalg.solve(S, alpha))
     weight = GATE / nis if robust and nis > GATE else 1.0
-    return Innovation(alpha, S, R, nis, distance, 2.0 * float(np.arcsin(half)), weight, share)
+    return Innovation(alpha, S, R, nis, distance, 2.0 * float(np.arcsin(half)), weight, correlated_share)
 
 
 def gain(P: Array, H: Array, S: Array) -> Array:
-    """K^u (20, 6) = P H' S^-1, solved."""
+    """The unconstrained gain K^u (20, 6) = P H' S^-1, solved."""
     return np.asarray(np.linalg.solve(S, H @ P).T, dtype=np.float64)
 
 
-def update(prior: Belief, H: Array, seen: Innovation, margin: float, colour: Array) -> tuple[Belief, int]:
-    """Posterior of a healthy epoch (gamma 1), and how many sigma bounds acted. ``colour`` (2,) as in ``widened``."""
-    R = widened(seen.R, colour / seen.weight)
-    K = gain(prior.P, H, seen.S + (R - seen.R))
-    betas, hits = shrink(prior.x.sigma, K[SIGMA] @ seen.alpha, margin)
+def constrained_update(
+    prior: Belief, H: Array, innovation: Innovation, margin: float, inflation: Array
+) -> tuple[Belief, int]:
+    """Posterior of a healthy epoch (gamma 1) by the paper's gain, and how many sigma bounds acted.
+
+    ``inflation`` (2,) of attitude and position is that of ``inflated``.
+    """
+    R = inflated(innovation.R, inflation / innovation.weight)
+    K = gain(prior.P, H, innovation.S + (R - innovation.R))
+    betas, hits = sigma_bounds(prior.x.sigma, K[SIGMA] @ innovation.alpha, margin)
     if hits:
         K[12] *= betas[0]
         K[13] *= betas[1]
     P = joseph(prior.P, H, K, R)
-    return Belief(prior.t_ns, boxplus(prior.x, K @ seen.alpha), 0.5 * (P + P.T)), hits
+    return Belief(prior.t_ns, boxplus(prior.x, K @ innovation.alpha), 0.5 * (P + P.T)), hits
 
 
-def update_in_chart(prior: Belief, H: Array, seen: Innovation, colour: Array) -> Belief:
-    """The same update displaced through the chart, where inertia cannot leave its bounds and beta has nothing to do.
+def sigma_bounds(sigma: Array, step: Array, margin: float) -> tuple[tuple[float, float], int]:
+    """(beta1, beta2) and how many bounds acted, for the step d_i = k_i' e from the prior sigma (2,) (eq:sigma_bounds).
 
-    Gain, Joseph's form and the displacement, mean and P by the chart's derivatives, are one call of the extension.
+    Where |sigma_i + d_i| > 1 - m, beta_i puts the posterior on the bound: (sgn(sigma_i + d_i)(1 - m) - sigma_i) / d_i.
     """
-    x, say = prior.x, colour / seen.weight
+    betas = [_beta(s, d, 1.0 - margin) for s, d in zip(sigma.tolist(), step.tolist(), strict=True)]
+    return (betas[0], betas[1]), sum(beta != 1.0 for beta in betas)
+
+
+def _beta(sigma: float, d: float, bound: float) -> float:
+    free = sigma + d
+    return 1.0 if abs(free) <= bound or d == 0.0 else (math.copysign(bound, free) - sigma) / d
+
+
+def chart_update(prior: Belief, H: Array, innovation: Innovation, inflation: Array) -> Belief:
+    """The same update with the state displaced through the chart, where inertia has no bounds and beta is not needed.
+
+    Gain, Joseph's form and the displacement of mean and P by the chart's Jacobians are one call of the extension.
+    """
+    x, factors = prior.x, inflation / innovation.weight
+    alpha, S, R = innovation.alpha, innovation.S, innovation.R
     *mean, P = _motion.correct(
-        x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, prior.P, H, seen.alpha, seen.S, seen.R, say.tolist()
+        x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, prior.P, H, alpha, S, R, factors.tolist()
     )
     return Belief(prior.t_ns, State(*mean), P)
 
@@ -66,10 +96,10 @@ def joseph(P: Array, H: Array, K: Array, R: Array) -> Array:
     return out
 
 
-def widened(R: Array, colour: Array) -> Array:
-    """R times ``colour`` (2,), of attitude and position: errors that stay from scan to scan say less than white ones.
+def inflated(R: Array, inflation: Array) -> Array:
+    """R times ``inflation`` (2,), of attitude and position: correlated errors carry less information than white ones.
 
-    The innovation's own S is not widened: it is as wide as one scan is.
+    S of the innovation itself is not inflated: a single scan has the noise R.
     """
-    c = np.sqrt(np.repeat(colour[::-1], 3))
+    c = np.sqrt(np.repeat(inflation[::-1], 3))
     return np.asarray(R * np.outer(c, c))

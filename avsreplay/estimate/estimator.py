@@ -1,8 +1,8 @@
-"""The estimator as the replay uses it: one frozen track in, one out.
+"""The estimator as the replay uses it: pure functions from one immutable track to the next.
 
-Modes: ``near`` speaks from a given start until the first healthy scan, ``start`` from the first poses of a cold one,
-``fit`` from the maximum-likelihood fit over all poses so far, ``filter`` afterwards. The filter is set against such a
-fit now and then; where it is contradicted, the fit speaks again.
+Modes: ``near`` uses a given start until the first healthy scan, ``start`` the first poses of a cold start, ``fit`` the
+maximum-likelihood fit over all poses so far, ``filter`` the Kalman filter afterwards. The filter is compared with a fit
+at intervals; where the fit contradicts it, the fit is used again.
 """
 
 from __future__ import annotations
@@ -10,29 +10,27 @@ from __future__ import annotations
 from dataclasses import replace
 
 from avsreplay.errors import UsageError
-from avsreplay.estimate import ekf, horizon
-from avsreplay.estimate.fitting import Fitting
-from avsreplay.estimate.measure import innovation, sensitivity
-from avsreplay.estimate.motion import propagate
+from avsreplay.estimate import dynamics, ekf
+from avsreplay.estimate.batch_schedule import BatchSchedule
+from avsreplay.estimate.initialise import guessed_belief
+from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.noise import Noise
 from avsreplay.estimate.params import EstimatorParams, Start
-from avsreplay.estimate.start import guessed_belief
 from avsreplay.estimate.track import Prediction, Track
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory
 
-__all__ = ["Estimator", "Prediction", "Track"]
-
 
 class Estimator:
-    """The 20-state adaptive constrained filter, and the fit that it begins with and answers to.
+    """The 20-state noise-adaptive constrained Kalman filter and the batch fit that initialises and checks it.
 
     Args:
-        params: settings; lengths left out are taken from ``extent_m``, the target's bounding diagonal [m].
+        params: settings; lengths left out are taken from ``extent_m``.
         start: the first belief where one is given.
+        extent_m: the target's bounding diagonal [m].
 
     Raises:
-        UsageError: a near start is asked for and none is given.
+        UsageError: a near start is requested and none is given.
     """
 
     def __init__(self, params: EstimatorParams, start: Belief | None, extent_m: float) -> None:
@@ -42,64 +40,96 @@ class Estimator:
             raise UsageError("a near start is asked for and the log gives none", where="estimator.start", hint=hint)
         self.start = start if params.start in (Start.AUTO, Start.NEAR) else None
         self.noise = Noise(self.params, extent_m)
-        self.fitting = Fitting(self.params, self.noise, self.start)
+        self.batch = BatchSchedule(self.params, self.noise, self.start)
         self._robust = params.robust and params.start is not Start.PAPER
+        self._by_gain = self.params.by_gain
+        self._torque, self._force = self.params.torque_noise_radps15, self.params.force
 
     def initial(self, t_ns: int, T_ac: Pose) -> Track:
-        """The track before the first scan: the given start, else a body at rest at the pose ``T_ac``."""
+        """The track before the first scan: the given start, else a body at rest at a pose.
+
+        Args:
+            t_ns: instant of the first scan [ns].
+            T_ac: pose of {C} in {A}, used where no start is given.
+        """
         if self.start is not None:
             return Track(self.start, "near")
         mode = "filter" if self.params.start is Start.PAPER else "start"
         return Track(guessed_belief(t_ns, T_ac, self.params), mode)
 
     def predict(self, track: Track, t_ns: int) -> Prediction:
-        """The prior at ``t_ns`` (eq:KF_propagate)."""
-        belief, Phi = propagate(track.belief, t_ns, self.params.torque_noise_radps15, self.params.force)
-        return Prediction(belief, Phi, sensitivity(belief.x), track.window)
+        """The predicted mean and covariance at an instant (eq:KF_propagate).
+
+        Args:
+            track: after the last scan.
+            t_ns: instant of the scan [ns].
+
+        Raises:
+            UsageError: the instant is too far from the last scan to predict the rotation.
+        """
+        belief, Phi = dynamics.propagate(track.belief, t_ns, self._torque, self._force)
+        return Prediction(belief, Phi, measurement_jacobian(belief.x), track.window)
 
     def innovate(self, prediction: Prediction, alignment: Alignment) -> Innovation:
-        """alpha, S and R of a measured pose, and the weight it is given."""
+        """The innovation of a registered pose: alpha, S, R, NIS and the Cauchy weight of the pose in the update.
+
+        Args:
+            prediction: of this scan.
+            alignment: a measured pose.
+        """
         x = prediction.belief.x
         R = self.noise.of(alignment, x, prediction.window)
-        alpha, share = innovation(x, alignment.T_ac), self.noise.share(alignment)
-        return ekf.innovate(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
+        alpha, share = innovation_vector(x, alignment.T_ac), self.noise.correlated_share(alignment)
+        return ekf.innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
 
     def update(
-        self, track: Track, prediction: Prediction, seen: Innovation | None, gamma: int, converged: bool = True
+        self, track: Track, prediction: Prediction, innovation: Innovation | None, gamma: int, converged: bool = True
     ) -> Track:
-        """The posterior; with gamma 0 or nothing seen the prior stands, exactly.
+        """The posterior. With gamma 0 or no innovation it equals the prior exactly.
 
-        A fit gives way to the filter once its estimate has ``converged`` (t_1), as the last scan's row says.
+        Args:
+            track: after the last scan.
+            prediction: of this scan.
+            innovation: None where the scan gave no pose.
+            gamma: 1 for a healthy scan, 0 for a faulty one.
+            converged: t_1 was reached at the last scan. A fit hands over to the filter only then.
         """
-        if seen is None or gamma == 0:
+        if innovation is None or gamma == 0:
             return replace(track, belief=prediction.belief)
-        if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
-            return self.fitting.begun(track, prediction, seen, converged)
-        return self.fitting.audited(self._filtered(track, prediction, seen))
+        if track.mode in ("start", "fit") or (track.mode == "near" and not self._by_gain):
+            return self.batch.initialised(track, prediction, innovation, converged)
+        return self.batch.check_against_batch(self._filtered(track, prediction, innovation))
 
     def motion(self, belief: Belief) -> Trajectory:
-        """The grasp point after ``belief``'s instant, for the planner."""
-        return horizon.trajectory(belief.x)
+        """The predicted path of the grasp point after the belief's instant."""
+        return dynamics.grasp_trajectory(belief.x)
 
     def forecast(self, belief: Belief, times_s: Array) -> Forecast:
-        """Predicted 1 sigma of the grasp point at ``times_s`` after ``belief``'s instant."""
-        return horizon.forecast(belief, times_s, self.params.torque_noise_radps15, self.params.force)
+        """Predicted 1 sigma of the grasp point.
 
-    def _filtered(self, track: Track, prediction: Prediction, seen: Innovation) -> Track:
+        Args:
+            belief: mean and covariance now.
+            times_s: (n,) >= 0, ascending [s after the belief's instant].
+        """
+        return dynamics.grasp_forecast(belief, times_s, self._torque, self._force)
+
+    def _filtered(self, track: Track, prediction: Prediction, innovation: Innovation) -> Track:
         """The filter's posterior, its noise window and its memory of poses."""
-        colour = self.noise.colour(track, prediction.belief, seen)
-        if self.params.by_gain and track.cold is None:
-            belief, hits = ekf.update(prediction.belief, prediction.H, seen, self.params.sigma_margin, colour)
+        prior = prediction.belief
+        dt_ns = prior.t_ns - track.belief.t_ns
+        inflation = self.noise.inflation(track.inflation, prior.x.w_b, dt_ns, innovation.share)
+        if self._by_gain and track.batch is None:
+            belief, hits = ekf.constrained_update(prior, prediction.H, innovation, self.params.sigma_margin, inflation)
         else:
-            belief, hits = ekf.update_in_chart(prediction.belief, prediction.H, seen, colour), 0
+            belief, hits = ekf.chart_update(prior, prediction.H, innovation, inflation), 0
         return replace(
             track,
             belief=belief,
             mode="filter",
-            window=self.noise.remembered(prediction, seen, belief, colour),
+            window=self.noise.updated(prediction.window, prior.x, prediction.H, innovation, belief, inflation),
             sigma_hits=track.sigma_hits + hits,
-            r_floors=track.r_floors + self.noise.floors(seen.R),
-            R=seen.R,
-            fixes=self.fitting.remembered(track, prediction, seen),
+            r_floors=track.r_floors + self.noise.floors(innovation.R),
+            R=innovation.R,
+            fixes=self.batch.remembered(track, prediction, innovation),
             since=track.since + 1,
         )

@@ -1,21 +1,151 @@
-"""The measurement noise in force: the registration's word or R0, adapted by the window, and its correlation in time."""
+"""The measurement noise R: registration covariance or R0, adapted from residuals, and its correlation in time.
+
+Adaptation (eq:R_resudua2) uses a ring buffer that is summed anew at each epoch, so that rounding errors do not
+accumulate. Two rules. ``matrix`` is the paper's: R = mean of r r' + H P+ H', six by six, over R0. ``scale`` keeps the
+shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
+attitude, s^2 = mean of tr(R_b^-1 (r r' + H P+ H')) / 3 over the block. It estimates two numbers from a window instead
+of 21, so its own scatter does not spoil the consistency. The mean uses the weights of the updates: outliers are no
+noise.
+"""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
+
 import numpy as np
 
-from avsreplay.estimate import adapt
-from avsreplay.estimate.adapt import NoiseWindow
-from avsreplay.estimate.measure import noise_of, residual
+from avsreplay.estimate.measurement import registration_noise, residual
 from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource, Start
-from avsreplay.estimate.track import WHITE, Prediction, Track
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import Alignment, Belief, Innovation, State
 
-__all__ = ["Noise"]
-
+GATE = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom: a pose above it is an outlier
+BOUND = 52.4  # the same with 20 degrees of freedom: a state
+NO_INFLATION = frozen(np.ones(2))
 _ONES = frozen(np.ones(6))
-_FREE_RAD = 1.0  # standard deviation of an attitude direction the view leaves free
+_FREE_RAD = 1.0  # standard deviation of an attitude direction that a degenerate view does not determine
+_MANY_OUTLIERS = 0.1  # of the window's weight
+_LAGS = (5, 10, 20, 40)
+
+
+def weigh(chi2: Array, redescend: bool) -> tuple[Array, Array]:
+    """M-estimator weights and costs (n,) of chi2 (n,): quadratic up to GATE, beyond it Cauchy's, or else Huber's."""
+    over = np.maximum(chi2 / GATE, 1.0)
+    if redescend:
+        return 1.0 / over, np.where(over > 1.0, GATE * (1.0 + np.log(over)), chi2)
+    return 1.0 / np.sqrt(over), np.where(over > 1.0, GATE * (2.0 * np.sqrt(over) - 1.0), chi2)
+
+
+def integrated_autocorrelation(e: Array) -> float:
+    """1 + 2 sum of the autocorrelations of rows e (n, 3), over the lags with the largest significant (3 sigma) sum."""
+    n, e = len(e), np.ascontiguousarray(e).reshape(-1)
+    total = float(e @ e)
+    lags = [k for k in _LAGS if k <= n // 8]
+    rho = [float(e[3 * k :] @ e[: -3 * k]) / total * n / (n - k) for k in range(1, max(lags, default=0) + 1)]
+    sums = [(sum(rho[:k]), 3.0 * np.sqrt(k / (3.0 * n))) for k in lags]
+    return 1.0 + 2.0 * max((found for found, bound in sums if found > bound), default=0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseEpoch:
+    """One healthy epoch: outer (6, 6) = r r' + H P+ H', its trace by block relative to the base R, its weight."""
+
+    outer: Array
+    ratios: tuple[float, float]
+    weight: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NoiseWindow:
+    """The last healthy epochs, oldest first, at most the window's length.
+
+    Attributes:
+        factors: (6,) standard deviations relative to the base R, position three times, attitude three times; 1 until
+            the window is full.
+        many_outliers: more than a tenth of the weight is lost: the poses contradict the estimate.
+    """
+
+    epochs: tuple[NoiseEpoch, ...]
+    factors: Array
+    many_outliers: bool
+
+    @classmethod
+    def empty(cls) -> NoiseWindow:
+        """A window without epochs."""
+        return cls((), frozen(np.ones(6)), False)
+
+
+def push(
+    window: NoiseWindow, residual: Array, HPH: Array, base: Array, length: int, weight: float = 1.0
+) -> NoiseWindow:
+    """The window with one more epoch: residual (6,) after the update, H P+ H' (6, 6), the base R that was used."""
+    outer = residual[:, None] * residual + HPH
+    position, attitude = np.linalg.solve(_blocks(base), _blocks(outer)).trace(axis1=1, axis2=2).tolist()
+    epoch = NoiseEpoch(outer, (position / 3.0, attitude / 3.0), weight)
+    return _summed((*window.epochs[-length + 1 :], epoch), length)
+
+
+def _blocks(A: Array) -> Array:
+    """(2, 3, 3) position and attitude blocks of (6, 6)."""
+    return A.reshape(2, 3, 2, 3).diagonal(axis1=0, axis2=2).transpose(2, 0, 1)
+
+
+def _summed(epochs: tuple[NoiseEpoch, ...], length: int) -> NoiseWindow:
+    weight = position = attitude = 0.0
+    for epoch in epochs:
+        weight += epoch.weight
+        position += epoch.weight * epoch.ratios[0]
+        attitude += epoch.weight * epoch.ratios[1]
+    many_outliers = weight < (1.0 - _MANY_OUTLIERS) * len(epochs)
+    if len(epochs) < length:
+        return NoiseWindow(epochs, np.ones(6), many_outliers)
+    s, t = math.sqrt(position / weight), math.sqrt(attitude / weight)
+    return NoiseWindow(epochs, np.array((s, s, s, t, t, t)), many_outliers)
+
+
+def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
+    """The paper's R: R0 until the window is full, then the mean over it."""
+    if len(window.epochs) < length:
+        return R0
+    weight = sum(epoch.weight for epoch in window.epochs)
+    return np.asarray(sum(epoch.weight * epoch.outer for epoch in window.epochs) / weight)
+
+
+def filled(base: Array, factors: Array, length: int) -> NoiseWindow:
+    """A full window with the noise ``factors`` (2,) of attitude and position that a fit found on ``base`` (6, 6)."""
+    attitude, position = factors.tolist()
+    s = factors[::-1].repeat(3)
+    return _summed((NoiseEpoch(base * np.outer(s, s), (position**2, attitude**2), 1.0),) * length, length)
+
+
+def floored(R: Array, R0: Array, fraction: float) -> Array:
+    """R with its eigenvalues, in units of R0, raised to at least ``fraction``."""
+    try:
+        np.linalg.cholesky(R - fraction * R0)
+    except np.linalg.LinAlgError:
+        values, axes = _eigen(R, R0)
+        half = axes * np.sqrt(np.maximum(values, fraction))
+        return half @ half.T
+    return R
+
+
+def at_floor(R: Array, R0: Array, fraction: float) -> int:
+    """How many eigenvalues of R, in units of R0, lie on the floor."""
+    bound = fraction * (1.0 + 1e-6)
+    try:
+        np.linalg.cholesky(R - bound * R0)
+    except np.linalg.LinAlgError:
+        return int(np.sum(_eigen(R, R0)[0] <= bound))
+    return 0
+
+
+def _eigen(R: Array, R0: Array) -> tuple[Array, Array]:
+    """Values (6,) and axes (6, 6) with R = axes diag(values) axes' and R0 = axes axes'."""
+    root = np.linalg.cholesky(R0)
+    inside = np.linalg.solve(root, np.linalg.solve(root, R).T)
+    values, vectors = np.linalg.eigh(0.5 * (inside + inside.T))
+    return values, root @ vectors
 
 
 class Noise:
@@ -33,48 +163,52 @@ class Noise:
         self._free = (_FREE_RAD, 0.5 * extent_m)
 
     def of(self, alignment: Alignment, x: State, window: NoiseWindow) -> Array:
-        """The base R under the window's adaptation, floored."""
+        """The base R adapted by the window, with the floor applied."""
         R = self._base(alignment, x)
         if self.params.adapt is Adaptation.MATRIX:
-            R = adapt.matrix_noise(window, self._R0, self.params.window)
+            R = matrix_noise(window, self._R0, self.params.window)
         elif self.params.adapt is Adaptation.SCALE:
             R = R * (window.factors[:, None] * window.factors)
-        return adapt.floored(R, self._R0, self.params.r_floor)
+        return floored(R, self._R0, self.params.r_floor)
 
     def base(self, R: Array, window: NoiseWindow) -> Array:
-        """The base R of an R that ``of`` gave with this window."""
+        """The base R of an R that ``of`` returned with this window."""
         s = window.factors if self.params.adapt is Adaptation.SCALE else _ONES
         return np.asarray(R / (s[:, None] * s))
 
     def floors(self, R: Array) -> int:
-        """How many eigenvalues of R stand on the floor."""
-        return adapt.at_floor(R, self._R0, self.params.r_floor)
+        """How many eigenvalues of R lie on the floor."""
+        return at_floor(R, self._R0, self.params.r_floor)
 
-    def share(self, alignment: Alignment) -> float:
-        """Of R, what the poses of neighbouring scans have in common."""
+    def correlated_share(self, alignment: Alignment) -> float:
+        """The share of R that the poses of neighbouring scans have in common."""
         return self.params.share(alignment.inliers, alignment.rms_m / self._extent_m)
 
-    def colour(self, track: Track, prior: Belief, seen: Innovation) -> Array:
-        """(2,) how many times less than white ones the poses say; the paper's own filter takes them as white."""
-        if track.colour is not None:
-            return track.colour
-        if self.params.start is Start.PAPER:
-            return WHITE
-        turn = float(np.linalg.norm(prior.x.w_b)) * (prior.t_ns - track.belief.t_ns) * 1e-9
-        return np.full(2, self.params.colour(turn, seen.share))
+    def inflation(self, known: Array | None, w_b: Array, dt_ns: int, correlated_share: float) -> Array:
+        """(2,) factor on R for errors correlated in time: that of the last fit, else from the rotation between scans.
 
-    def remembered(self, prediction: Prediction, seen: Innovation, posterior: Belief, colour: Array) -> NoiseWindow:
-        """The window with this epoch's a posteriori residual z - h(x+), its ratios against the base R.
-
-        H P+ H' is taken without the widening: what the fit took up of one scan is what white noise would leave.
+        The paper's filter takes the errors as white.
         """
-        left = residual(posterior.x, prediction.belief.x, seen.alpha)
-        HPH = prediction.H @ posterior.P @ prediction.H.T * (2.0 / float(colour[0] + colour[1]))
-        window = prediction.window
-        return adapt.push(window, left, HPH, self.base(seen.R, window), self.params.window, seen.weight)
+        if known is not None:
+            return known
+        if self.params.start is Start.PAPER:
+            return NO_INFLATION
+        turn = float(np.linalg.norm(w_b)) * dt_ns * 1e-9
+        return np.full(2, self.params.colour(turn, correlated_share))
+
+    def updated(
+        self, window: NoiseWindow, prior: State, H: Array, innovation: Innovation, posterior: Belief, inflation: Array
+    ) -> NoiseWindow:
+        """The window with this epoch's a-posteriori residual z - h(x+), relative to the base R.
+
+        H P+ H' is divided by the inflation: it is then what an update with white noise would leave.
+        """
+        left = residual(posterior.x, prior, innovation.alpha)
+        HPH = H @ posterior.P @ H.T * (2.0 / float(inflation[0] + inflation[1]))
+        return push(window, left, HPH, self.base(innovation.R, window), self.params.window, innovation.weight)
 
     def _base(self, alignment: Alignment, x: State) -> Array:
         if self.params.noise is NoiseSource.R0 or self.params.adapt is Adaptation.MATRIX:
             return self._R0
-        R = noise_of(alignment, x, self._free)
+        R = registration_noise(alignment, x, self._free)
         return self._R0 if R is None else R

@@ -1,4 +1,4 @@
-"""A reference for logs without truth: one fit over all poses, forward and backward, as a function of time."""
+"""A reference for logs without ground truth: one batch fit over all poses of a log, as a function of time."""
 
 from __future__ import annotations
 
@@ -8,32 +8,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avsreplay.errors import UsageError
-from avsreplay.estimate.arc import Path
+from avsreplay.estimate.batch import BatchFit, FitParams, Poses, fit
 from avsreplay.estimate.chart import Chart, to_chart
-from avsreplay.estimate.cold import poses_of, prior_of, rough_state
-from avsreplay.estimate.fit import FitParams, Fitted, Poses, fit
+from avsreplay.estimate.dynamics import rotation_path
+from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.params import EstimatorParams
-from avsreplay.estimate.start import PoseFix
 from avsreplay.estimate.track import Track
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
 
-__all__ = ["Reference", "healthy_pose", "reference_fit", "reference_of"]
-
 _FEWEST = 4
-_FIRST_TURN = np.pi  # the window begins at half a turn and doubles
+_FIRST_TURN = np.pi  # the window starts at half a turn and doubles
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reference:
-    """The motion that fits all poses best.
+    """The motion with the maximum likelihood over all poses.
 
     Attributes:
-        fitted: the fit, residuals and all.  epoch_ns, end_ns: instants of the first and the last pose; in between
-            ``at``: instant [ns] -> state.
+        fitted: the fit with its residuals.  epoch_ns, end_ns: instants of the first and the last pose.
+        at: instant [ns] between these -> state.
     """
 
-    fitted: Fitted
+    fitted: BatchFit
     epoch_ns: int
     end_ns: int
     at: Callable[[int], State]
@@ -46,12 +43,12 @@ def reference_fit(
     extent_m: float,
     params: EstimatorParams | None = None,
 ) -> Reference:
-    """Fit the whole of a log's poses T_ac, in time order.
+    """Fit all poses T_ac of a log, in time order.
 
     Args:
-        t_ns: instants, ascending.
+        t_ns: instants, ascending [ns].
         poses: T_ac.
-        covariances: (6, 6) each, of d = [theta; v] in {C}; None takes R0 for all (the residuals rescale it).
+        covariances: (6, 6) each, of d = [theta; v] in {C} [rad, m]; None takes R0 for all (the residuals rescale it).
         extent_m: bounding diagonal of the target [m].
         params: the estimator's; None is the default.
 
@@ -59,12 +56,12 @@ def reference_fit(
         UsageError: fewer than four poses.
     """
     settings = (params or EstimatorParams()).resolved(extent_m)
-    given = covariances or [_plain(settings)] * len(poses)
+    given = covariances or [_r0_covariance(settings)] * len(poses)
     return reference_of([PoseFix(t, pose, C) for t, pose, C in zip(t_ns, poses, given, strict=True)], settings)
 
 
 def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference:
-    """Fit the whole of a log's poses, in time order; ``params`` with auto values filled in.
+    """Fit all poses of a log, in time order; ``params`` with auto values filled in.
 
     Raises:
         UsageError: fewer than four poses.
@@ -79,19 +76,19 @@ def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference
 
 
 def healthy_pose(track: Track, t_ns: int, T_ac: Pose, params: EstimatorParams) -> PoseFix:
-    """The pose a healthy scan gave, at its own instant and with its covariance where the track remembers it."""
-    return track.fixes[-1] if track.fixes else PoseFix(t_ns, T_ac, _plain(params))
+    """The pose of a healthy scan, at its own instant and with its covariance where the track remembers it."""
+    return track.fixes[-1] if track.fixes else PoseFix(t_ns, T_ac, _r0_covariance(params))
 
 
-def _plain(params: EstimatorParams) -> Array:
+def _r0_covariance(params: EstimatorParams) -> Array:
     """R0 as a covariance of d = [theta; v]."""
     variances = np.diagonal(params.R0)
     return np.diag(np.concatenate([4.0 * variances[3:], variances[:3]]))
 
 
-def _grown(poses: Poses, start: Chart, params: EstimatorParams) -> Fitted:
-    """The fit over half a turn, a turn, two, ..., all, each from the last."""
-    prior, rules = prior_of(poses, params), FitParams(max_steps=60)
+def _grown(poses: Poses, start: Chart, params: EstimatorParams) -> BatchFit:
+    """The fit over half a turn, a turn, two, ..., all, each started from the previous one."""
+    prior, rules = weak_prior(poses, params), FitParams(max_steps=60)
     chart = start
     for count in _windows(poses, start):
         chart = fit(poses.upto(count), chart, prior, replace(rules, rescale=False)).chart
@@ -99,7 +96,7 @@ def _grown(poses: Poses, start: Chart, params: EstimatorParams) -> Fitted:
 
 
 def _windows(poses: Poses, start: Chart) -> list[int]:
-    """How many poses each growing window holds, short of all."""
+    """The number of poses in each growing window, without the last, which has all."""
     rate = float(np.linalg.norm(start.w_c))
     span = _FIRST_TURN / rate if rate > 0.0 else np.inf
     counts = []
@@ -112,7 +109,7 @@ def _windows(poses: Poses, start: Chart) -> list[int]:
 
 
 def _motion(x: State, first_ns: int, last_ns: int) -> Callable[[int], State]:
-    path = Path(x)
+    path = rotation_path(x)
 
     def at(t_ns: int) -> State:
         """The state at an instant within the poses' span."""

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from watched import fold
 
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.measure import innovation, sensitivity
+from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.params import Start
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams
 
@@ -37,7 +37,7 @@ def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]
     for length in LENGTHS:
         ahead = estimator.predict(track, track.belief.t_ns + round(length * 1e9)).belief
         k = int(np.argmin(np.abs(world.times - SEEN_S - length)))
-        error, H = innovation(ahead.x, world.states[k].T_ac), sensitivity(ahead.x)
+        error, H = innovation_vector(ahead.x, world.states[k].T_ac), measurement_jacobian(ahead.x)
         S = H @ ahead.P @ H.T
         sizes = np.sqrt([np.trace(S[:3, :3]), 4.0 * np.trace(S[3:, 3:])])
         angle = np.degrees(2.0 * np.arcsin(min(1.0, float(np.linalg.norm(error[3:])))))

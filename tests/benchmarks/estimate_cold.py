@@ -18,9 +18,9 @@ from watched import fold
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.measure import sensitivity
+from avsreplay.estimate.chart import nees
+from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.estimate.params import Start
-from avsreplay.estimate.relabel import nees
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams, Criterion
 from avsreplay.records import Belief
 
@@ -67,7 +67,7 @@ def one(seed: int, start: Start) -> Outcome:
 
 def _predicted(belief: Belief) -> tuple[float, float]:
     """1 sigma of the pose: position [m], attitude [deg]."""
-    H = sensitivity(belief.x)
+    H = measurement_jacobian(belief.x)
     S = H @ belief.P @ H.T
     return float(np.sqrt(np.trace(S[:3, :3]))), float(np.degrees(2.0 * np.sqrt(np.trace(S[3:, 3:]))))
 

@@ -13,8 +13,8 @@ import numpy as np
 
 from avsreplay import geometry, settings
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.deskew import deskew, late
-from avsreplay.estimate.relabel import nees
+from avsreplay.estimate.chart import nees
+from avsreplay.estimate.deskew import deskew, with_scan_duration
 from avsreplay.monitor.faults import FaultDetector, FaultParams
 from avsreplay.records import AlignStatus
 from avsreplay.register import RegisterParams, Registrar
@@ -66,7 +66,9 @@ def errors(rate: float, seconds: float, mode: str) -> tuple[np.ndarray, int, int
         points = scan.points if mode == "raw" else deskew(scan.points, scan.times_s, prediction)
         alignment = registrar.register(points, prediction.belief.x.T_ac)
         if mode == "told" and alignment.measured:
-            prediction = late(prediction, registrar.instants(points, scan.times_s, alignment.T_ac), scan.times_s)
+            prediction = with_scan_duration(
+                prediction, registrar.instants(points, scan.times_s, alignment.T_ac), scan.times_s
+            )
         lost = alignment.status in (AlignStatus.NO_OVERLAP, AlignStatus.NO_POINTS, AlignStatus.FAILED)
         seen = None if lost else estimator.innovate(prediction, alignment)
         gamma = detector.judge(scan.status, alignment, seen, prediction.belief).gamma

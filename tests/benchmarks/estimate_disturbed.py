@@ -12,8 +12,8 @@ import numpy as np
 import tumbling
 
 from avsreplay.estimate import Estimator, EstimatorParams
+from avsreplay.estimate.chart import nees
 from avsreplay.estimate.params import Start
-from avsreplay.estimate.relabel import nees
 
 HZ, SECONDS, MARKS = 2.0, 150.0, (50.0, 100.0, 150.0)
 

@@ -15,8 +15,8 @@ import numpy as np
 import tumbling
 
 from avsreplay.estimate import Estimator, EstimatorParams
+from avsreplay.estimate.chart import nees
 from avsreplay.estimate.params import Constraint, Start
-from avsreplay.estimate.relabel import nees
 
 
 def one(seed: int, constraint: Constraint, fine: float, wide: float) -> float:

@@ -15,11 +15,11 @@ import tumbling
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, Prediction, Track
-from avsreplay.estimate.arc import arc
+from avsreplay.estimate.batch import FitParams, Poses, fit
+from avsreplay.estimate.batch_schedule import CHECK_GROWTH, FEWEST_TO_CHECK
 from avsreplay.estimate.chart import to_chart
-from avsreplay.estimate.cold import prior_of
-from avsreplay.estimate.fit import FitParams, Poses, fit
-from avsreplay.estimate.fitting import _AUDIT_GROWTH, _FEWEST_TO_AUDIT
+from avsreplay.estimate.dynamics import rotation_history
+from avsreplay.estimate.initialise import weak_prior
 from avsreplay.estimate.params import Constraint, Start
 from avsreplay.records import Alignment, Belief
 
@@ -79,8 +79,8 @@ def audit_ms(scans: int) -> tuple[float, float]:
     """An audit of the filter with so many poses remembered, and its share of each scan until the next [ms]."""
     estimator, track, _, _ = tracked(EstimatorParams(start=Start.NEAR), scans)
     due = replace(track, since=len(track.fixes))
-    whole = 1e3 * least(lambda: estimator.fitting.audited(due), 1)
-    return whole, whole / max(_FEWEST_TO_AUDIT, _AUDIT_GROWTH * len(track.fixes))
+    whole = 1e3 * least(lambda: estimator.batch.check_against_batch(due), 1)
+    return whole, whole / max(FEWEST_TO_CHECK, CHECK_GROWTH * len(track.fixes))
 
 
 def fit_s(n: int, seconds: float) -> tuple[float, float, int]:
@@ -94,9 +94,9 @@ def fit_s(n: int, seconds: float) -> tuple[float, float, int]:
         np.array([a.T_ac.t for a in seen]),
         np.array([a.covariance for a in seen]),
     )
-    prior = prior_of(poses, EstimatorParams().resolved(2.0))
+    prior = weak_prior(poses, EstimatorParams().resolved(2.0))
     start = to_chart(world.states[0]).moved(np.repeat([5e-3, 2e-4, 5e-3, 1e-4, 0.05, 0.02], [3, 3, 3, 3, 5, 3]))
-    once = least(lambda: arc(world.states[0], world.times), 2)
+    once = least(lambda: rotation_history(world.states[0], world.times), 2)
     begun = time.process_time()
     fitted = fit(poses, start, prior, FitParams())
     off = float(geometry.angle(geometry.multiply(geometry.conjugate(fitted.x.T_ac.q), world.states[0].T_ac.q)))
@@ -118,7 +118,7 @@ def main() -> None:
         print(f"audit over {scans:4d} poses: {whole:6.1f} ms, amortised {share:.2f} ms a scan")
     for n, seconds in ((200, 100.0),) if quick else ((200, 100.0), (600, 120.0), (5000, 1000.0)):
         once, whole, steps = fit_s(n, seconds)
-        print(f"fit of {n:5d} poses over {seconds:6.0f} s: {whole:6.3f} s, {steps} steps; arc {1e3 * once:.1f} ms")
+        print(f"fit of {n:5d} poses over {seconds:6.0f} s: {whole:6.3f} s, {steps} steps; rotation {1e3 * once:.1f} ms")
 
 
 if __name__ == "__main__":

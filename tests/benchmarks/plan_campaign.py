@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.layout import boxplus
-from avsreplay.estimate.motion import propagate
+from avsreplay.estimate.dynamics import propagate
+from avsreplay.estimate.error_state import boxplus
 from avsreplay.geometry import Pose
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams, ConvergenceTrack
 from avsreplay.plan import Guidance, PlannerInput, PlanParams, Supervisor, SupervisorParams, Tolerance, miss

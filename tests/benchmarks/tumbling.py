@@ -13,7 +13,7 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from avsreplay import geometry
-from avsreplay.estimate.layout import boxplus
+from avsreplay.estimate.error_state import boxplus
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Belief, State
 

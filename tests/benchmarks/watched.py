@@ -29,7 +29,7 @@ def fold(
         seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, *noise))
         track = estimator.update(track, prediction, seen, 1, words[0].converged)
         seen_so_far = watch.observe(seen_so_far, seen, 1)
-        honest = watch.judge(seen_so_far).consistent is True and not track.window.doubtful
+        honest = watch.judge(seen_so_far).consistent is True and not track.window.many_outliers
         forecast = estimator.forecast(track.belief, tests[0].params.times_s)
         words = [test.judge(word, track.belief, forecast, honest) for test, word in zip(tests, words, strict=True)]
         yield t, x, track, words

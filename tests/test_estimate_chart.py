@@ -7,13 +7,19 @@ import pytest
 import tumbling
 
 from avsreplay import geometry
-from avsreplay.estimate import motion
-from avsreplay.estimate.layout import boxminus, boxplus
-from avsreplay.estimate.naming import NAMINGS, Naming
-from avsreplay.estimate.relabel import nearest, nees, relabel, relabel_covariance
+from avsreplay.estimate import dynamics
+from avsreplay.estimate.chart import (
+    AXIS_PERMUTATIONS,
+    AxisPermutation,
+    nearest_permutation,
+    nees,
+    permute_axes,
+    permute_covariance,
+)
+from avsreplay.estimate.error_state import boxminus, boxplus
 from avsreplay.records import Belief, State
 
-EACH = pytest.mark.parametrize("naming", NAMINGS, ids=lambda n: "".join(map(str, n.perm)))
+EACH = pytest.mark.parametrize("naming", AXIS_PERMUTATIONS, ids=lambda n: "".join(map(str, n.perm)))
 
 
 @pytest.fixture
@@ -22,49 +28,49 @@ def world() -> tumbling.World:
 
 
 def test_there_are_24_proper_rotations() -> None:
-    assert len({tuple(n.R_bn.ravel()) for n in NAMINGS}) == 24
-    assert all(np.linalg.det(n.R_bn) == pytest.approx(1.0) for n in NAMINGS)
+    assert len({tuple(n.R_bn.ravel()) for n in AXIS_PERMUTATIONS}) == 24
+    assert all(np.linalg.det(n.R_bn) == pytest.approx(1.0) for n in AXIS_PERMUTATIONS)
 
 
 @EACH
-def test_sigma_is_that_of_the_permuted_moments(world: tumbling.World, naming: Naming) -> None:
+def test_sigma_is_that_of_the_permuted_moments(world: tumbling.World, naming: AxisPermutation) -> None:
     moments = world.moments[list(naming.perm)]
-    assert relabel(world.states[0], naming).sigma == pytest.approx(tumbling.ratios(moments), abs=1e-14)
+    assert permute_axes(world.states[0], naming).sigma == pytest.approx(tumbling.ratios(moments), abs=1e-14)
 
 
 @EACH
-def test_the_motion_is_the_same(world: tumbling.World, naming: Naming) -> None:
+def test_the_motion_is_the_same(world: tumbling.World, naming: AxisPermutation) -> None:
     x = world.states[0]
     for h in (0.0, 7.0):
-        step = motion.flow(x.w_b, x.sigma, h)
-        y = relabel(x, naming)
-        far = motion.advance(y, motion.flow(y.w_b, y.sigma, h), h)
-        want = motion.advance(x, step, h)
+        step = dynamics.flow(x.w_b, x.sigma, h)
+        y = permute_axes(x, naming)
+        far = dynamics.advance(y, dynamics.flow(y.w_b, y.sigma, h), h)
+        want = dynamics.advance(x, step, h)
         assert np.abs(far.T_ac.matrix - want.T_ac.matrix).max() < 1e-12
         assert np.abs(far.fixture_velocity - want.fixture_velocity).max() < 1e-13
 
 
 @EACH
-def test_the_covariance_follows(world: tumbling.World, naming: Naming) -> None:
+def test_the_covariance_follows(world: tumbling.World, naming: AxisPermutation) -> None:
     x, eps = world.states[0], 1e-6
     P = np.diag(np.linspace(1.0, 2.0, 20))
     J = np.empty((20, 20))
     for k in range(20):
         d = np.zeros(20)
         d[k] = eps
-        J[:, k] = boxminus(relabel(boxplus(x, d), naming), relabel(boxplus(x, -d), naming)) / (2 * eps)
-    assert np.abs(relabel_covariance(P, x, naming) - J @ P @ J.T).max() < 1e-7
+        J[:, k] = boxminus(permute_axes(boxplus(x, d), naming), permute_axes(boxplus(x, -d), naming)) / (2 * eps)
+    assert np.abs(permute_covariance(P, x, naming) - J @ P @ J.T).max() < 1e-7
 
 
 @EACH
-def test_nees_does_not_know_the_names(world: tumbling.World, naming: Naming) -> None:
+def test_nees_does_not_know_the_names(world: tumbling.World, naming: AxisPermutation) -> None:
     x = world.states[0]
     d = np.random.Generator(np.random.PCG64(0)).normal(size=20) * 1e-3
     belief = Belief(0, boxplus(x, d), np.eye(20) * 1e-6)
-    named, size = nearest(belief, relabel(x, naming))
+    named, size = nearest_permutation(belief, permute_axes(x, naming))
     assert size == pytest.approx(float(d @ d) * 1e6, rel=1e-9)
     assert np.abs(boxminus(named, x)).max() < 1e-12
-    assert nees(belief, relabel(x, naming)) == pytest.approx(nees(belief, x), rel=1e-9)
+    assert nees(belief, permute_axes(x, naming)) == pytest.approx(nees(belief, x), rel=1e-9)
     assert nees(belief, x) == pytest.approx(size, rel=0.05)
 
 

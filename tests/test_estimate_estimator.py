@@ -10,12 +10,12 @@ import tumbling
 from scipy.stats import chi2
 
 from avsreplay import geometry
-from avsreplay.estimate import Estimator, EstimatorParams, adapt, ekf
-from avsreplay.estimate.constrain import shrink
-from avsreplay.estimate.layout import boxminus
-from avsreplay.estimate.measure import sensitivity
+from avsreplay.estimate import Estimator, EstimatorParams, ekf, noise
+from avsreplay.estimate.chart import nees
+from avsreplay.estimate.ekf import sigma_bounds
+from avsreplay.estimate.error_state import boxminus
+from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.estimate.params import Adaptation, Constraint, NoiseSource
-from avsreplay.estimate.relabel import nees
 from avsreplay.geometry import Pose
 from avsreplay.records import Belief, Innovation, State
 
@@ -31,7 +31,7 @@ def spread(rng: np.random.Generator, size: int = 20) -> np.ndarray:
 @pytest.mark.parametrize("sigma", [-0.95, -0.2, 0.5, 0.9])
 @pytest.mark.parametrize("step", [-3.0, -0.5, -1e-3, 0.0, 0.04, 0.5, 2.5])
 def test_the_bound_holds_and_beta_only_shortens(sigma: float, step: float) -> None:
-    (beta, other), hits = shrink(np.array([sigma, 0.0]), np.array([step, 0.1]), 0.01)
+    (beta, other), hits = sigma_bounds(np.array([sigma, 0.0]), np.array([step, 0.1]), 0.01)
     assert abs(sigma + beta * step) <= 0.99 + 1e-15
     assert 0.0 <= beta <= 1.0
     assert other == 1.0
@@ -40,7 +40,7 @@ def test_the_bound_holds_and_beta_only_shortens(sigma: float, step: float) -> No
 
 def test_the_papers_beta_would_leave_the_bound() -> None:
     """Erratum: sigma 0.9 and a step of 0.5 leave the printed rule (which acts on |k'e| > 1 only) at 1.4."""
-    betas, hits = shrink(np.array([0.9, 0.0]), np.array([0.5, 0.0]), 0.01)
+    betas, hits = sigma_bounds(np.array([0.9, 0.0]), np.array([0.5, 0.0]), 0.01)
     assert hits == 1
     assert 0.9 + betas[0] * 0.5 == pytest.approx(0.99)
 
@@ -49,9 +49,9 @@ def test_update_is_bayes_where_nothing_binds() -> None:
     rng = np.random.Generator(np.random.PCG64(0))
     x = tumbling.draw(1, seconds=1.0).states[0]
     x = State(x.q_ab, x.w_b, x.r_a, x.v_a, np.zeros(2), x.c_b, x.q_bc)
-    P, R, H = spread(rng) * 1e-3, spread(rng, 6), sensitivity(x)
-    seen = ekf.innovate(P, H, rng.normal(size=6) * 1e-3, R)
-    posterior, hits = ekf.update(Belief(0, x, P), H, seen, 0.01, WHITE)
+    P, R, H = spread(rng) * 1e-3, spread(rng, 6), measurement_jacobian(x)
+    seen = ekf.innovation_of(P, H, rng.normal(size=6) * 1e-3, R)
+    posterior, hits = ekf.constrained_update(Belief(0, x, P), H, seen, 0.01, WHITE)
     info = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
     assert hits == 0
     assert np.abs(posterior.P - info).max() < 1e-9 * np.abs(info).max()
@@ -63,10 +63,10 @@ def test_constrained_update_stays_symmetric_and_positive() -> None:
     rng = np.random.Generator(np.random.PCG64(1))
     x = tumbling.draw(2, seconds=1.0).states[0]
     x = State(x.q_ab, x.w_b, x.r_a, x.v_a, [0.95, -0.9], x.c_b, x.q_bc)
-    P, R, H = spread(rng), 1e-4 * np.eye(6), sensitivity(x)
+    P, R, H = spread(rng), 1e-4 * np.eye(6), measurement_jacobian(x)
     K = ekf.gain(P, H, H @ P @ H.T + R)
     alpha = np.linalg.pinv(K[12:14]) @ np.array([0.5, -0.8])
-    posterior, hits = ekf.update(Belief(0, x, P), H, ekf.innovate(P, H, alpha, R), 0.01, WHITE)
+    posterior, hits = ekf.constrained_update(Belief(0, x, P), H, ekf.innovation_of(P, H, alpha, R), 0.01, WHITE)
     assert hits == 2
     assert posterior.x.sigma == pytest.approx([0.99, -0.99])
     assert np.array_equal(posterior.P, posterior.P.T)
@@ -80,7 +80,7 @@ def test_constrained_update_stays_symmetric_and_positive() -> None:
 def test_joseph_is_the_spread_of_errors_under_any_gain() -> None:
     rng = np.random.Generator(np.random.PCG64(3))
     P, R = spread(rng), spread(rng, 6)
-    H, K = sensitivity(tumbling.draw(3, seconds=1.0).states[0]), rng.normal(size=(20, 6)) * 0.1
+    H, K = measurement_jacobian(tumbling.draw(3, seconds=1.0).states[0]), rng.normal(size=(20, 6)) * 0.1
     e = rng.multivariate_normal(np.zeros(20), P, size=20000)
     v = rng.multivariate_normal(np.zeros(6), R, size=20000)
     after = e - (e @ H.T + v) @ K.T
@@ -141,9 +141,9 @@ def test_gamma_zero_leaves_the_prior_exactly() -> None:
     assert plain.update(track, prediction, seen, 1).mode == "filter"
 
 
-def fill(window: adapt.NoiseWindow, residuals: np.ndarray, length: int) -> adapt.NoiseWindow:
+def fill(window: noise.NoiseWindow, residuals: np.ndarray, length: int) -> noise.NoiseWindow:
     for r in residuals:
-        window = adapt.push(window, r, np.zeros((6, 6)), np.eye(6), length)
+        window = noise.push(window, r, np.zeros((6, 6)), np.eye(6), length)
     return window
 
 
@@ -151,19 +151,19 @@ def test_ring_buffer_agrees_with_the_recursion() -> None:
     """The paper's recursion, started as a running mean, gives the same sum to rounding."""
     r = np.random.Generator(np.random.PCG64(4)).normal(size=(200, 6))
     w, Sigma = 12, np.zeros((6, 6))
-    window = adapt.NoiseWindow.empty()
+    window = noise.NoiseWindow.empty()
     for k in range(len(r)):
         new = np.outer(r[k], r[k])
         Sigma = (k * Sigma + new) / (k + 1) if k < w else Sigma + (new - np.outer(r[k - w], r[k - w])) / w
         window = fill(window, r[k : k + 1], w)
         if k + 1 >= w:
-            assert np.abs(adapt.matrix_noise(window, np.eye(6), w) - Sigma).max() < 1e-13
+            assert np.abs(noise.matrix_noise(window, np.eye(6), w) - Sigma).max() < 1e-13
 
 
 def test_before_a_full_window_r0_stands() -> None:
     R0 = np.diag(np.arange(1.0, 7.0))
-    window = fill(adapt.NoiseWindow.empty(), np.ones((5, 6)), 6)
-    assert adapt.matrix_noise(window, R0, 6) is R0
+    window = fill(noise.NoiseWindow.empty(), np.ones((5, 6)), 6)
+    assert noise.matrix_noise(window, R0, 6) is R0
     assert np.array_equal(window.factors, np.ones(6))
     assert not np.array_equal(fill(window, np.full((1, 6), 3.0), 6).factors, np.ones(6))
 
@@ -174,12 +174,12 @@ def test_floor_acts_on_eigenvalues_in_units_of_r0_and_is_counted() -> None:
     root = np.linalg.cholesky(R0)
     turn = np.linalg.qr(rng.normal(size=(6, 6)))[0]
     R = root @ turn @ np.diag([1e-8, 1e-5, 0.1, 0.5, 1.0, 2.0]) @ turn.T @ root.T
-    raised = adapt.floored(R, R0, 1e-4)
+    raised = noise.floored(R, R0, 1e-4)
     inside = np.linalg.solve(root, np.linalg.solve(root, raised).T)
     assert np.linalg.eigvalsh(inside) == pytest.approx([1e-4, 1e-4, 0.1, 0.5, 1.0, 2.0], rel=1e-6)
-    assert adapt.at_floor(raised, R0, 1e-4) == 2
-    assert adapt.floored(R, R0, 1e-9) is R
-    assert adapt.at_floor(R, R0, 1e-9) == 0
+    assert noise.at_floor(raised, R0, 1e-4) == 2
+    assert noise.floored(R, R0, 1e-9) is R
+    assert noise.at_floor(R, R0, 1e-9) == 0
 
 
 @pytest.mark.parametrize("rule", [Adaptation.SCALE, Adaptation.MATRIX])
@@ -294,7 +294,7 @@ def test_auto_lengths_scale_with_the_target(extent: float) -> None:
 
 
 def test_innovation_angle_is_the_full_angle() -> None:
-    seen: Innovation = ekf.innovate(
+    seen: Innovation = ekf.innovation_of(
         np.eye(20), np.zeros((6, 20)), np.array([3.0, 4.0, 0, np.sin(0.3), 0, 0]), np.eye(6)
     )
     assert seen.distance_m == pytest.approx(5.0)

@@ -1,4 +1,4 @@
-"""Where each of the 20 error states stands (eq:x), and the quaternion steps that belong to them.
+"""The 20 error states (eq:x): their order, and the operations x (+) d and x (-) y on the state.
 
 dq_v and dmu_v are HALF-angle vectors in {B}: q = dq (x) q_hat is ``q_hat * dq`` and mu = mu_hat (x) dmu is
 ``dmu * mu_hat`` in Hamilton's product. All other states are additive.
@@ -13,8 +13,6 @@ import numpy as np
 from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, State
 
-__all__ = ["DIM", "DMU", "DQ", "RHO", "SIGMA", "VARRHO", "VEL", "W", "boxminus", "boxplus", "hamilton", "rotation"]
-
 DIM = 20
 DQ, W, RHO, VEL, SIGMA, VARRHO, DMU = (BLOCKS[name] for name in BLOCKS)
 
@@ -22,7 +20,7 @@ Quad = tuple[float, float, float, float]
 
 
 def hamilton(a: Array | Quad, b: Array | Quad) -> Quad:
-    """Hamilton's product of two quaternions [x y z w], in scalars: the hot path's form of geometry.multiply."""
+    """Hamilton's product of two quaternions [x y z w], in scalars: faster than geometry.multiply for a single pair."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return (
@@ -34,7 +32,7 @@ def hamilton(a: Array | Quad, b: Array | Quad) -> Quad:
 
 
 def rotation(q: Array) -> Array:
-    """R (3, 3) of a unit quaternion (4,): the hot path's form of geometry.matrix."""
+    """R (3, 3) of a unit quaternion (4,): faster than geometry.matrix for a single quaternion."""
     x, y, z, w = q.tolist()
     return np.array(
         (
@@ -45,10 +43,26 @@ def rotation(q: Array) -> Array:
     )
 
 
+def conjugate_quad(q: Array) -> Quad:
+    """The inverse of a unit quaternion (4,), in scalars."""
+    x, y, z, w = q.tolist()
+    return -x, -y, -z, w
+
+
+def _half_angle(v: Array) -> Quad:
+    """The unit quaternion with vector part v (3,); a vector longer than 1 is cut to a half turn."""
+    x, y, z = v.tolist()
+    n2 = x * x + y * y + z * z
+    if n2 < 1.0:
+        return x, y, z, math.sqrt(1.0 - n2)
+    n = math.sqrt(n2)
+    return x / n, y / n, z / n, 0.0
+
+
 def boxplus(x: State, d: Array) -> State:
     """The state displaced by the error d (20,): x (+) d."""
-    q = hamilton(_quad(x.q_ab), _half_angle(d[DQ]))
-    mu = hamilton(_half_angle(d[DMU]), _quad(x.q_bc))
+    q = hamilton(x.q_ab.tolist(), _half_angle(d[DQ]))
+    mu = hamilton(_half_angle(d[DMU]), x.q_bc.tolist())
     return State(
         _unit(q), x.w_b + d[W], x.r_a + d[RHO], x.v_a + d[VEL], x.sigma + d[SIGMA], x.c_b + d[VARRHO], _unit(mu)
     )
@@ -57,37 +71,17 @@ def boxplus(x: State, d: Array) -> State:
 def boxminus(a: State, b: State) -> Array:
     """The error d (20,) with ``boxplus(b, d)`` equal to a: a (-) b."""
     d = np.empty(DIM)
-    d[DQ] = _vector(hamilton(_conjugate(b.q_ab), _quad(a.q_ab)))
-    d[DMU] = _vector(hamilton(_quad(a.q_bc), _conjugate(b.q_bc)))
+    d[DQ] = _vector(hamilton(conjugate_quad(b.q_ab), a.q_ab.tolist()))
+    d[DMU] = _vector(hamilton(a.q_bc.tolist(), conjugate_quad(b.q_bc)))
     d[W], d[RHO], d[VEL] = a.w_b - b.w_b, a.r_a - b.r_a, a.v_a - b.v_a
     d[SIGMA], d[VARRHO] = a.sigma - b.sigma, a.c_b - b.c_b
     return d
 
 
-def _quad(q: Array) -> Quad:
-    x, y, z, w = q.tolist()
-    return x, y, z, w
-
-
-def _conjugate(q: Array) -> Quad:
-    x, y, z, w = q.tolist()
-    return -x, -y, -z, w
-
-
 def _vector(q: Quad) -> tuple[float, float, float]:
-    """Vector part, of the sign with w >= 0."""
+    """Vector part of q or -q, whichever has w >= 0."""
     x, y, z, w = q
     return (x, y, z) if w >= 0.0 else (-x, -y, -z)
-
-
-def _half_angle(v: Array) -> Quad:
-    """The quaternion whose vector part is v; beyond a half turn the nearest one, a half turn."""
-    x, y, z = v.tolist()
-    n2 = x * x + y * y + z * z
-    if n2 < 1.0:
-        return x, y, z, math.sqrt(1.0 - n2)
-    n = math.sqrt(n2)
-    return x / n, y / n, z / n, 0.0
 
 
 def _unit(q: Quad) -> Array:

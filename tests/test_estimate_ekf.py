@@ -9,11 +9,17 @@ import pytest
 import tumbling
 
 from avsreplay.estimate import _motion, ekf
-from avsreplay.estimate.chart import LEAST_GAP, to_chart, to_errors, to_state
-from avsreplay.estimate.layout import boxminus
-from avsreplay.estimate.measure import sensitivity
-from avsreplay.estimate.naming import NAMINGS
-from avsreplay.estimate.relabel import relabel, relabel_covariance
+from avsreplay.estimate.chart import (
+    AXIS_PERMUTATIONS,
+    LEAST_GAP,
+    permute_axes,
+    permute_covariance,
+    to_chart,
+    to_errors,
+    to_state,
+)
+from avsreplay.estimate.error_state import boxminus
+from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.records import Belief, Innovation, State
 
 WHITE = np.ones(2)
@@ -48,13 +54,13 @@ def spread_of(x: State, rng: np.random.Generator) -> np.ndarray:
 def aimed(x: State, size: float, rng: np.random.Generator, colour: np.ndarray = WHITE) -> tuple[float, float]:
     """How far extension and oracle differ after a step of a given size: in the mean, and in P by its sigmas."""
     P, R = spread_of(x, rng), np.diag(rng.uniform(1.0, 2.0, 6)) * 1e-4
-    H, S, alpha = sensitivity(x), np.eye(6), np.eye(6)[0]
+    H, S, alpha = measurement_jacobian(x), np.eye(6), np.eye(6)[0]
     H[0] = rng.normal(size=20)
     H[0] *= size / max(1e-300, np.abs(P @ H[0])[[0, 1, 2, 6, 7, 8, 14, 15, 16, 17, 18, 19]].max())
-    wide = ekf.widened(R, colour)
+    wide = ekf.inflated(R, colour)
     K = ekf.gain(P, H, S + (wide - R))
     want, P_want = retract(x, ekf.joseph(P, H, K, wide), K @ alpha)
-    got = ekf.update_in_chart(Belief(0, x, P), H, Innovation(alpha, S, R, 0.0, 0.0, 0.0), colour)
+    got = ekf.chart_update(Belief(0, x, P), H, Innovation(alpha, S, R, 0.0, 0.0, 0.0), colour)
     assert np.array_equal(got.P, got.P.T)
     s = np.sqrt(np.diag(P_want))
     signs = max(np.abs(got.x.q_ab - want.q_ab).max(), np.abs(got.x.q_bc - want.q_bc).max())
@@ -87,11 +93,11 @@ def test_update_of_a_body_with_equal_moments_is_that_of_nearly_the_same_body(m: 
     """Between equals rounding puts the hair on either side; the motion and M agree to the hair."""
     x, rng = of_eigenvalues(some_state(3), m), np.random.Generator(np.random.PCG64(5))
     P, R = spread_of(x, rng), np.eye(6) * 1e-3
-    H = sensitivity(x)
-    seen = ekf.innovate(P, H, rng.normal(size=6) * 0.02, R)
+    H = measurement_jacobian(x)
+    seen = ekf.innovation_of(P, H, rng.normal(size=6) * 0.02, R)
     K = ekf.gain(P, H, seen.S)
     want, _ = retract(x, ekf.joseph(P, H, K, R), K @ seen.alpha)
-    got = ekf.update_in_chart(Belief(0, x, P), H, seen, WHITE)
+    got = ekf.chart_update(Belief(0, x, P), H, seen, WHITE)
     assert np.abs(to_chart(got.x).minus(to_chart(want))).max() < 3.0 * LEAST_GAP
     assert np.all(np.linalg.eigvalsh(got.P) > 0.0)
 
@@ -113,19 +119,19 @@ def test_steps_beyond_a_half_turn_and_new_names(seed: int) -> None:
     assert covariance < 1e-9
 
 
-@pytest.mark.parametrize("naming", NAMINGS[1::3])
+@pytest.mark.parametrize("naming", AXIS_PERMUTATIONS[1::3])
 def test_names_of_axes_do_not_matter(naming) -> None:
     """The same body by other names gets the same update: no oracle."""
     x, rng = some_state(7), np.random.Generator(np.random.PCG64(8))
     P, R = spread_of(x, rng), np.eye(6) * 1e-4
-    y, P_y = relabel(x, naming), relabel_covariance(P, x, naming)
+    y, P_y = permute_axes(x, naming), permute_covariance(P, x, naming)
     told = []
     alpha = rng.normal(size=6) * 0.05
     renamed = np.concatenate([alpha[:3], naming.R_bn.T @ alpha[3:]])
     for state, covariance, seen_as in ((x, P, alpha), (y, P_y, renamed)):
-        H = sensitivity(state)
-        seen = ekf.innovate(covariance, H, seen_as, R)
-        told.append(ekf.update_in_chart(Belief(0, state, covariance), H, seen, WHITE))
+        H = measurement_jacobian(state)
+        seen = ekf.innovation_of(covariance, H, seen_as, R)
+        told.append(ekf.chart_update(Belief(0, state, covariance), H, seen, WHITE))
     a, b = told
     assert np.abs(to_chart(a.x).minus(to_chart(b.x))).max() < 1e-12
     J = [np.linalg.inv(to_errors(to_chart(belief.x))) for belief in (a, b)]
@@ -135,10 +141,10 @@ def test_names_of_axes_do_not_matter(naming) -> None:
 
 def test_what_is_no_number_stays_none_and_ends() -> None:
     x, rng = some_state(1), np.random.Generator(np.random.PCG64(0))
-    P, H, S = spread_of(x, rng), sensitivity(x), np.eye(6)
+    P, H, S = spread_of(x, rng), measurement_jacobian(x), np.eye(6)
     bad = replace(x, w_b=np.array([np.nan, 0.0, 0.0]), sigma=np.array([np.nan, 1.0]))
     for state, covariance, alpha in ((bad, P, np.ones(6)), (x, P * np.nan, np.ones(6)), (x, P, np.ones(6) * np.inf)):
-        got = ekf.update_in_chart(Belief(0, state, covariance), H, Innovation(alpha, S, S, 0.0, 0.0, 0.0), WHITE)
+        got = ekf.chart_update(Belief(0, state, covariance), H, Innovation(alpha, S, S, 0.0, 0.0, 0.0), WHITE)
         assert not np.all(np.isfinite(got.P))
     with pytest.raises(TypeError):
         _motion.correct(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, P, H[:5], np.ones(6), S, S, (1.0, 1.0))

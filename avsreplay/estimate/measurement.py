@@ -1,7 +1,7 @@
-"""What a measured pose says of the state (eq:h_nonlin): z, h, H, and the noise in their units.
+"""The measurement model (eq:innovation): z = (rho, deta_v) of a registered pose, its Jacobian H, its noise R.
 
-z = (rho, deta_v) with deta = mu_hat^-1 (x) eta (x) q_hat^-1, in Hamilton's product q_hat^-1 * eta * mu_hat^-1, of the
-sign with w >= 0. The errors are zero after each update, so h's attitude part is zero and H is taken there.
+deta = mu_hat^-1 (x) eta (x) q_hat^-1, in Hamilton's product q_hat^-1 * eta * mu_hat^-1, of the sign with w >= 0. The
+errors are zero after each update, so the attitude part of h is zero and H is taken there.
 """
 
 from __future__ import annotations
@@ -10,28 +10,15 @@ import math
 
 import numpy as np
 
-from avsreplay.estimate.layout import DIM, DMU, DQ, RHO, hamilton, rotation
+from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, Quad, conjugate_quad, hamilton, rotation
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, State
 
-__all__ = [
-    "in_camera",
-    "in_fixture",
-    "innovation",
-    "measured_pose",
-    "noise_of",
-    "residual",
-    "sensitivity",
-    "to_camera",
-    "to_fixture",
-]
-
 Triple = tuple[float, float, float]
-Quad = tuple[float, float, float, float]
 
 
 def _constant() -> Array:
-    """The part of H (6, 20) that never changes."""
+    """The part of H (6, 20) that does not depend on the state."""
     H = np.zeros((6, DIM))
     H[:3, RHO] = H[3:, DQ] = H[3:, DMU] = np.eye(3)
     return H
@@ -40,7 +27,7 @@ def _constant() -> Array:
 _CONSTANT = _constant()
 
 
-def sensitivity(x: State) -> Array:
+def measurement_jacobian(x: State) -> Array:
     """H (6, 20) at zero error: [-2A(q)[c x] 0 I 0 0 A(q) 0; I 0 0 0 0 0 I]."""
     A = rotation(x.q_ab)
     cx, cy, cz = x.c_b.tolist()
@@ -50,32 +37,32 @@ def sensitivity(x: State) -> Array:
     return H
 
 
-def innovation(x: State, T_ac: Pose) -> Array:
+def innovation_vector(x: State, T_ac: Pose) -> Array:
     """The innovation alpha (6,) = z - h at zero error: [m in {A}, half-angle vector in {B}]."""
-    q = hamilton(hamilton(_inverse(x.q_ab), T_ac.q.tolist()), _inverse(x.q_bc))
+    q = hamilton(hamilton(conjugate_quad(x.q_ab), T_ac.q.tolist()), conjugate_quad(x.q_bc))
     return _difference(T_ac.t.tolist(), _fixture(x), q)
 
 
 def residual(posterior: State, prior: State, alpha: Array) -> Array:
-    """Z - h(x+) (6,) of the pose that gave ``alpha`` at the prior."""
-    place, deta = _seen(prior, alpha)
-    left = hamilton(_inverse(posterior.q_ab), prior.q_ab.tolist())
-    right = hamilton(prior.q_bc.tolist(), _inverse(posterior.q_bc))
-    return _difference(place, _fixture(posterior), hamilton(hamilton(left, deta), right))
+    """Z - h(x+) (6,) of the pose whose innovation at the prior is ``alpha``."""
+    position, deta = _measured(prior, alpha)
+    left = hamilton(conjugate_quad(posterior.q_ab), prior.q_ab.tolist())
+    right = hamilton(prior.q_bc.tolist(), conjugate_quad(posterior.q_bc))
+    return _difference(position, _fixture(posterior), hamilton(hamilton(left, deta), right))
 
 
 def measured_pose(x: State, alpha: Array) -> Pose:
-    """The pose T_ac that ``innovation`` made alpha of: its inverse in the second argument."""
-    place, deta = _seen(x, alpha)
-    return Pose(np.array(hamilton(hamilton(x.q_ab.tolist(), deta), x.q_bc.tolist())), np.array(place))
+    """The pose T_ac whose innovation at x is ``alpha``: the inverse of ``innovation_vector``."""
+    position, deta = _measured(x, alpha)
+    return Pose(np.array(hamilton(hamilton(x.q_ab.tolist(), deta), x.q_bc.tolist())), np.array(position))
 
 
-def noise_of(alignment: Alignment, x: State, free: tuple[float, float]) -> Array | None:
-    """R (6, 6) [m, half-angle] from the registration's own word on d = [theta; v] in {C}, None if it says nothing.
+def registration_noise(alignment: Alignment, x: State, free: tuple[float, float]) -> Array | None:
+    """R (6, 6) [m, half-angle] from the registration's covariance of d = [theta; v] in {C}; None if it gives none.
 
-    Attitude A(mu) theta / 2 in {B}, position R_ac v in {A}: both of one sign, so the cross terms stay. Where the view
-    is degenerate the covariance is taken from ``info``, its free directions at the standard deviations ``free``
-    (rad, m): the scan then still tells what it does see.
+    Attitude is A(mu) theta / 2 in {B}, position R_ac v in {A}: both of one sign, so the cross terms stay. For a
+    degenerate view the covariance is computed from ``info``, with the standard deviations ``free`` (rad, m) along the
+    unobservable directions, so that the observable directions of the scan are still used.
     """
     if alignment.covariance is not None:
         C = alignment.covariance
@@ -94,7 +81,7 @@ def in_camera(C: Array, q_ac: Array, q_bc: Array) -> Array:
 
 
 def in_fixture(R: Array, q_ac: Array, q_bc: Array) -> Array:
-    """``in_camera``'s inverse."""
+    """The inverse of ``in_camera``."""
     J = to_fixture(q_ac, q_bc)
     C: Array = J @ R @ J.T
     return 0.5 * (C + C.T)
@@ -108,14 +95,14 @@ def to_camera(q_ac: Array, q_bc: Array) -> Array:
 
 
 def to_fixture(q_ac: Array, q_bc: Array) -> Array:
-    """``to_camera``'s inverse."""
+    """The inverse of ``to_camera``."""
     J = np.zeros((6, 6))
     J[:3, 3:], J[3:, :3] = 2.0 * rotation(q_bc).T, rotation(q_ac).T
     return J
 
 
-def _seen(x: State, alpha: Array) -> tuple[Triple, Quad]:
-    """Position and deta of the pose that gave ``alpha`` at x."""
+def _measured(x: State, alpha: Array) -> tuple[Triple, Quad]:
+    """Position and deta of the pose whose innovation at x is ``alpha``."""
     (x0, y0, z0), (dx, dy, dz, vx, vy, vz) = _fixture(x), alpha.tolist()
     w = math.sqrt(max(0.0, 1.0 - vx * vx - vy * vy - vz * vz))
     return (x0 + dx, y0 + dy, z0 + dz), (vx, vy, vz, w)
@@ -132,13 +119,8 @@ def _fixture(x: State) -> Triple:
     )
 
 
-def _difference(place: Triple, other: Triple, q: Quad) -> Array:
+def _difference(position: Triple, other: Triple, q: Quad) -> Array:
     """(6,) difference of two positions, and the vector part of q, of the sign with w >= 0."""
     s = 1.0 if q[3] >= 0.0 else -1.0
-    dx, dy, dz = place[0] - other[0], place[1] - other[1], place[2] - other[2]
+    dx, dy, dz = position[0] - other[0], position[1] - other[1], position[2] - other[2]
     return np.array((dx, dy, dz, s * q[0], s * q[1], s * q[2]))
-
-
-def _inverse(q: Array) -> Quad:
-    x, y, z, w = q.tolist()
-    return -x, -y, -z, w

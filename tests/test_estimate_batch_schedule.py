@@ -11,17 +11,14 @@ import tumbling
 from scipy.stats import chi2
 
 from avsreplay.estimate import Estimator, EstimatorParams, Track
-from avsreplay.estimate.audit import contradicted, start_at
-from avsreplay.estimate.chart import to_chart, to_errors
-from avsreplay.estimate.cold import given_prior, poses_of, prior_of, refit, rough_state
-from avsreplay.estimate.drift import disturbed, memory_s
-from avsreplay.estimate.ekf import innovate
-from avsreplay.estimate.fit import FitParams, fit
-from avsreplay.estimate.layout import boxplus
+from avsreplay.estimate.batch import FitParams, fit
+from avsreplay.estimate.batch_covariance import covariance_of, memory_s, process_noise_pass
+from avsreplay.estimate.batch_schedule import chart_at, contradicted
+from avsreplay.estimate.chart import nees, to_chart, to_errors
+from avsreplay.estimate.ekf import innovation_of
+from avsreplay.estimate.error_state import boxplus
+from avsreplay.estimate.initialise import PoseFix, batch_estimate, given_prior, poses_of, rough_state, weak_prior
 from avsreplay.estimate.params import Constraint, Start
-from avsreplay.estimate.relabel import nees
-from avsreplay.estimate.spread import spread
-from avsreplay.estimate.start import PoseFix
 from avsreplay.monitor.consistency import Consistency, ConsistencyParams
 from avsreplay.records import Belief, State
 
@@ -61,10 +58,10 @@ def frozen_scanner(first: int, count: int, states: list[State]):
 def test_a_pose_loses_its_say_beyond_the_gate_and_none_before() -> None:
     P, H, R = np.zeros((20, 20)), np.zeros((6, 20)), np.eye(6)
     for size in (0.0, 1.0, 5.0, 5.27, 5.29, 20.0, 1e6):
-        seen = innovate(P, H, np.array([size, 0, 0, 0, 0, 0]), R, robust=True)
+        seen = innovation_of(P, H, np.array([size, 0, 0, 0, 0, 0]), R, robust=True)
         assert seen.nis == pytest.approx(size**2)
         assert seen.weight == pytest.approx(min(1.0, chi2.ppf(0.9999, 6) / max(size**2, 1e-9)), rel=1e-3)
-        assert innovate(P, H, seen.alpha, R).weight == 1.0
+        assert innovation_of(P, H, seen.alpha, R).weight == 1.0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -82,16 +79,16 @@ def test_a_right_filter_is_left_alone() -> None:
     recalls = 0
     for seed in range(20):
         world = tumbling.draw(seed, seconds=100.0, sigma_max=0.85)
-        recalls += last(world.times, world.states, WHITE, seed).recalls
+        recalls += last(world.times, world.states, WHITE, seed).reinitialised
     assert recalls <= 1
 
 
 def test_poses_that_contradict_the_filter_withdraw_its_word() -> None:
     world = tumbling.draw(1, seconds=100.0, sigma_max=0.85)
     tracks = list(fold(world.times, world.states, WHITE, 1, frozen_scanner(120, 8, world.states)))
-    assert not tracks[119].window.doubtful
-    assert any(track.window.doubtful for track in tracks[120:130])
-    assert not tracks[-1].window.doubtful
+    assert not tracks[119].window.many_outliers
+    assert any(track.window.many_outliers for track in tracks[120:130])
+    assert not tracks[-1].window.many_outliers
 
 
 def test_one_wild_pose_does_not_make_the_innovations_inconsistent() -> None:
@@ -100,7 +97,7 @@ def test_one_wild_pose_does_not_make_the_innovations_inconsistent() -> None:
     for k in range(50):
         alpha = rng.normal(size=6) * (100.0 if k == 25 else 1.0)
         for robust in (True, False):
-            seen = innovate(np.zeros((20, 20)), np.zeros((6, 20)), alpha, np.eye(6), robust)
+            seen = innovation_of(np.zeros((20, 20)), np.zeros((6, 20)), alpha, np.eye(6), robust)
             if robust:
                 wild = monitor.observe(wild, seen, 1)
             else:
@@ -112,7 +109,7 @@ def test_one_wild_pose_does_not_make_the_innovations_inconsistent() -> None:
 def test_the_papers_start_stays_the_papers() -> None:
     world = tumbling.draw(2, seconds=40.0)
     track = last(world.times, world.states, replace(WHITE, start=Start.PAPER), 2, frozen_scanner(30, 3, world.states))
-    assert track.recalls == 0
+    assert track.reinitialised == 0
     assert track.fixes == ()
     assert {epoch.weight for epoch in track.window.epochs} == {1.0}
 
@@ -126,16 +123,16 @@ def fixes(seed: int, seconds: float) -> tuple[PoseFix, ...]:
 def test_without_pushes_the_pass_is_the_fit_and_with_them_it_knows_less() -> None:
     found = fixes(4, 100.0)
     poses, params = poses_of(found), WHITE.resolved(2.0)
-    prior = prior_of(poses, params)
+    prior = weak_prior(poses, params)
     fitted = fit(poses, to_chart(rough_state(found)), prior, FitParams())
-    plain = spread(poses, fitted, prior, FitParams())
-    calm = disturbed(plain, poses, prior, FitParams(), 0.0, 0.0).fitted
+    plain = covariance_of(poses, fitted, prior, FitParams())
+    calm = process_noise_pass(plain, poses, prior, FitParams(), 0.0, 0.0).fitted
     scale = np.sqrt(np.outer(np.diag(fitted.P_chart), np.diag(fitted.P_chart)))
     assert np.abs((calm.P_chart - fitted.P_chart) / scale).max() < 1e-4
     y = calm.chart.minus(fitted.chart)
     assert y @ np.linalg.solve(fitted.P_chart, y) < 0.01
     for torque, force in ((1e-6, 0.0), (1e-5, 0.0), (0.0, 1e-4)):
-        wide = disturbed(plain, poses, prior, FitParams(), torque, force).fitted.P_chart
+        wide = process_noise_pass(plain, poses, prior, FitParams(), torque, force).fitted.P_chart
         least = np.linalg.eigvalsh((wide - fitted.P_chart) / scale)
         assert least[0] > -1e-4
         assert least[-1] > 1e-3
@@ -160,7 +157,7 @@ def test_a_pushed_body_is_told_honestly(start: Start) -> None:
 
 def test_contradiction_counts_in_the_fits_own_spread() -> None:
     found = fixes(4, 100.0)
-    cold = refit(found, WHITE.resolved(2.0), FitParams())
+    cold = batch_estimate(found, WHITE.resolved(2.0), FitParams())
     assert not contradicted(cold.belief, cold.belief)
     sizes = np.sqrt(np.linalg.eigvalsh(cold.belief.P))
     axis = np.linalg.eigh(cold.belief.P)[1][:, -1]
@@ -172,7 +169,7 @@ def test_contradiction_counts_in_the_fits_own_spread() -> None:
 
 def test_the_fit_begins_where_the_belief_came_from() -> None:
     world = tumbling.draw(3, seconds=60.0)
-    chart = start_at(Belief(round(world.times[-1] * 1e9), world.states[-1], np.eye(20)), 0)
+    chart = chart_at(Belief(round(world.times[-1] * 1e9), world.states[-1], np.eye(20)), 0)
     assert np.abs(chart.minus(to_chart(world.states[0]))).max() < 1e-7
 
 
@@ -217,7 +214,7 @@ def test_a_given_start_that_is_wrong_is_left_out(constraint: Constraint) -> None
             prediction = estimator.predict(track, round(t * 1e9))
             seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, POS_M, ROT_RAD))
             track = estimator.update(track, prediction, seen, 1)
-        assert track.recalls == 1
+        assert track.reinitialised == 1
         assert nees(track.belief, x) < BAND_20[1]
 
 
@@ -225,6 +222,6 @@ def test_a_right_start_is_kept() -> None:
     for seed in range(6):
         world = tumbling.draw(seed, seconds=30.0, sigma_max=0.85)
         track = last(world.times, world.states, WHITE, seed)
-        assert track.recalls == 0
-        assert track.cold is not None
-        assert not track.cold.forsaken
+        assert track.reinitialised == 0
+        assert track.batch is not None
+        assert not track.batch.prior_rejected

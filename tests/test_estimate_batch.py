@@ -12,17 +12,14 @@ from scipy.stats import chi2
 from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.arc import arc
-from avsreplay.estimate.chart import Chart, to_chart, to_errors, to_state
-from avsreplay.estimate.cold import poses_of, prior_of, rough_state
-from avsreplay.estimate.fit import FitParams, Pin, Poses, Prior, cost, fit, pinned
-from avsreplay.estimate.layout import boxminus
-from avsreplay.estimate.motion import flow, transition
+from avsreplay.estimate.batch import FitParams, Pin, Poses, Prior, cost, fit, pinned
+from avsreplay.estimate.batch_covariance import belief_at, covariance_of
+from avsreplay.estimate.chart import Chart, nees, to_chart, to_errors, to_state
+from avsreplay.estimate.dynamics import flow, rotation_history, transition
+from avsreplay.estimate.error_state import boxminus
+from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.reference import reference_fit
-from avsreplay.estimate.relabel import nees
-from avsreplay.estimate.spread import belief_at, spread
-from avsreplay.estimate.start import PoseFix
 from avsreplay.geometry import Pose
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams
 from avsreplay.records import Belief, State
@@ -43,7 +40,7 @@ def grown(fixes: tuple[PoseFix, ...], *counts: int):
     chart = to_chart(rough_state(fixes))
     for count in counts:
         poses = poses_of(fixes[:count])
-        prior = prior_of(poses, WHITE)
+        prior = weak_prior(poses, WHITE)
         fitted = fit(poses, chart, prior, FitParams())
         chart = fitted.chart
     return poses, fitted, prior
@@ -96,7 +93,7 @@ def test_equal_moments_are_no_singular_point() -> None:
 def test_arc_is_the_motion_and_its_derivative(seed: int) -> None:
     world = tumbling.draw(seed, rate=0.3, seconds=60.0)
     x = world.states[0]
-    path = arc(x, world.times)
+    path = rotation_history(x, world.times)
     for k in (0, 1, 50, 120):
         there, h = world.states[k], float(world.times[k])
         assert float(geometry.angle(geometry.multiply(geometry.conjugate(there.q_ab), path.q[k]))) < 1e-9
@@ -107,12 +104,12 @@ def test_arc_is_the_motion_and_its_derivative(seed: int) -> None:
 
 def test_the_step_follows_the_cost() -> None:
     """The normal equations' right side is minus the gradient of the cost, prior and robust weights included."""
-    from avsreplay.estimate.fit import _Problem
+    from avsreplay.estimate.batch import _Problem
 
     fixes = list(seen(tumbling.draw(3, seconds=20.0), 3))
     fixes[7] = replace(fixes[7], T_ac=fixes[7].T_ac @ Pose(geometry.exp([0.3, 0, 0]), np.array([0.2, 0, 0])))
     poses = poses_of(tuple(fixes))
-    prior = prior_of(poses, WHITE)
+    prior = weak_prior(poses, WHITE)
     c = to_chart(tumbling.draw(3, seconds=20.0).states[0]).moved(np.full(20, 1e-3))
     pin = Pin(c, np.arange(20.0), 0.3, 0.5)
     problem = _Problem(poses, prior, FitParams(), np.array([1.3, 0.7]), pin)
@@ -143,7 +140,7 @@ def test_fit_from_nothing_finds_the_truth_within_its_covariance(seed: int) -> No
     _, fitted, _ = grown(seen(world, seed), 21, 41, 81, 141, 201)
     assert nees(Belief(0, fitted.x, fitted.P), world.states[0]) < chi2.ppf(0.9999, 20)
     assert fitted.factors == pytest.approx([1.0, 1.0], abs=0.12)
-    assert fitted.colour == pytest.approx([1.0, 1.0])
+    assert fitted.inflation == pytest.approx([1.0, 1.0])
 
 
 def test_fit_is_the_optimum_from_any_side() -> None:
@@ -181,7 +178,7 @@ def test_residuals_that_stay_widen_the_covariance() -> None:
         pose = x.T_ac @ Pose(geometry.exp(sizes[:3] * e[:3]), sizes[3:] * e[3:])
         fixes.append(PoseFix(round(t * 1e9), pose, np.diag(sizes**2)))
     _, fitted, _ = grown(tuple(fixes), 51, 101, 201, 501)
-    assert np.all(fitted.colour > 4.0)
+    assert np.all(fitted.inflation > 4.0)
     assert nees(Belief(0, fitted.x, fitted.P), world.states[0]) < 4 * 20
 
 
@@ -191,9 +188,9 @@ def test_a_bent_likelihood_is_seen_and_mended() -> None:
     for seed in (3, 6, 9, 15, 2):
         world = tumbling.draw(seed, seconds=40.0)
         poses, fitted, prior = grown(seen(world, seed), 21, 41, 81)
-        found = spread(poses, fitted, prior, FitParams())
-        assert not found.settled
-        plain.append(nees(belief_at(replace(found, bends=()), 0, 40.0), world.states[-1]) / 20)
+        found = covariance_of(poses, fitted, prior, FitParams())
+        assert not found.gaussian
+        plain.append(nees(belief_at(replace(found, directions=()), 0, 40.0), world.states[-1]) / 20)
         mended.append(nees(belief_at(found, 0, 40.0), world.states[-1]) / 20)
     assert np.mean(plain) > 3.0
     assert np.mean(mended) < 1.6
@@ -203,8 +200,8 @@ def test_a_bent_likelihood_is_seen_and_mended() -> None:
 def test_a_long_arc_settles() -> None:
     world = tumbling.draw(4)
     poses, fitted, prior = grown(seen(world, 4), 21, 81, 201)
-    found = spread(poses, fitted, prior, FitParams())
-    assert found.settled
+    found = covariance_of(poses, fitted, prior, FitParams())
+    assert found.gaussian
     here = belief_at(found, 5, 100.0)
     assert nees(here, world.states[-1]) == pytest.approx(nees(Belief(0, fitted.x, fitted.P), world.states[0]), rel=0.2)
 
@@ -270,7 +267,7 @@ def test_too_few_poses() -> None:
     fixes = seen(tumbling.draw(0, seconds=1.0), 0)[:2]
     poses = poses_of(fixes)
     with pytest.raises(ValueError, match="2 poses"):
-        fit(poses, to_chart(rough_state(fixes)), prior_of(poses, WHITE), FitParams())
+        fit(poses, to_chart(rough_state(fixes)), weak_prior(poses, WHITE), FitParams())
 
 
 def test_poses_can_be_cut() -> None:

@@ -1,12 +1,12 @@
 """Maximum likelihood of the 20 initial values over all healthy poses: Levenberg-Marquardt on the manifold.
 
 The motion is taken as deterministic; each pose's residual d = [theta; v] stands in {C}, where its covariance is given.
-Jacobians are H Phi chained, in the coordinates of ``chart``, which keep the inertia physical without a bound. A prior,
-given or weak, keeps directions finite that the poses do not tell yet. A pose beyond the 99.99 % point of chi-square
-with 6 degrees of freedom is weighted down (Huber's weight on the way in, Cauchy's at the end), others are not touched,
-so honest noise costs nothing. The poses' noise may be rescaled by two factors, attitude and position, taken from the
-residuals themselves; where these are correlated in time, as registration's are, the covariance is widened by their
-integrated autocorrelation.
+Jacobians are H Phi, in the coordinates of ``chart``, which keep the inertia physical without a bound. A prior, given or
+weak, keeps directions finite that the poses do not determine yet. The likelihood is that of an M-estimator: a pose
+above the 99.99 % point of chi-square with 6 degrees of freedom gets Huber's weight in the first descent and Cauchy's in
+the last; other poses keep the weight 1, so that Gaussian noise costs no efficiency. Two factors on the poses' noise,
+attitude and position, may be estimated from the residuals; where the residuals are correlated in time, as those of
+registration are, the covariance is inflated by their integrated autocorrelation.
 """
 
 from __future__ import annotations
@@ -18,35 +18,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.estimate.arc import Arc, arc
 from avsreplay.estimate.chart import RATE, Chart, to_errors, to_state
-from avsreplay.estimate.layout import DIM, DMU, RHO, SIGMA, VARRHO, VEL
-from avsreplay.estimate.robust import colour_of, weigh
+from avsreplay.estimate.dynamics import RotationHistory, rotation_history
+from avsreplay.estimate.error_state import DIM, DMU, RHO, SIGMA, VARRHO, VEL
+from avsreplay.estimate.noise import integrated_autocorrelation, weigh
 from avsreplay.geometry import Array, skew
 from avsreplay.records import State
 
-__all__ = ["FitParams", "Fitted", "Pin", "Poses", "Prior", "cost", "fit", "linearised", "pinned"]
-
 _FEWEST_FOR_FACTORS = 12
-_WILD_RADPS = 0.5  # a step that adds more to the rate than this and the rate itself is not tried
-_PIN_TOL = 0.02  # half chi-square: how well a held fit needs to be known
+_LARGEST_RADPS = 0.5  # a step that changes the rate by more than this plus the rate itself is not tried
+_PIN_TOL = 0.02  # half chi-square: tolerance of a fit with one direction fixed
 
 
 @dataclass(frozen=True, slots=True)
 class FitParams:
-    """How far the fit goes."""
+    """Rules of the batch fit."""
 
-    # most steps of Levenberg-Marquardt
+    # largest number of Levenberg-Marquardt steps
     max_steps: int = 40
-    # a step is the last one when it gains less than this in half chi-square
+    # stop when a step is expected to reduce half chi-square by less than this
     gain_tol: float = 1e-3
-    # take the two noise factors from the residuals
+    # estimate the two noise factors from the residuals
     rescale: bool = True
-    # how many times less than white ones the poses say at least, for their errors' correlation in time
-    least_colour: float = 1.0
-    # directions, weakest first, whose cost is tried for bending
+    # lower bound of the correlation inflation of the poses' noise
+    least_inflation: float = 1.0
+    # directions, weakest first, that are tested for a non-Gaussian likelihood
     try_directions: int = 3
-    # the cost two sigma away may be this many times the normal one before the direction counts as bent
+    # a direction is non-Gaussian where the cost two sigma away is this many times the Gaussian one, or 1 over it
     bend_max: float = 2.0
 
 
@@ -75,13 +73,13 @@ class Poses:
         return len(self.times_s)
 
     def upto(self, count: int) -> Poses:
-        """The first ``count`` of them."""
+        """The first ``count`` poses."""
         return Poses(self.times_s[:count], self.q[:count], self.t[:count], self.C[:count])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """A normal belief about the initial values: mean and covariance P (20, 20) of the chart's coordinates."""
+    """A Gaussian prior of the initial values: mean and covariance P (20, 20) of the chart coordinates."""
 
     mean: Chart
     P: Array
@@ -93,15 +91,15 @@ class Prior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fitted:
-    """What the poses say.
+class BatchFit:
+    """The result of a fit.
 
     Attributes:
         chart: initial values at the epoch.  P_chart: (20, 20) their covariance.
-        half_chi2: cost, half the weighted chi-square with the prior's share, at ``effective``.
+        half_chi2: cost, half the weighted chi-square including the prior, at ``effective``.
         d: (n, 6) residuals in {C} [rad, m].  weights: (n,) in (0, 1].  factors: (2,) of attitude and position noise.
-        colour: (2,) 1 + 2 sum of the residuals' autocorrelations: how many times less the poses say than if white.
-        steps: taken.  converged: the last step gained too little to go on.
+        inflation: (2,) 1 + 2 sum of the residuals' autocorrelations: the factor on the variance of the poses.
+        steps: taken.  converged: the stopping rule was met within the allowed steps.
     """
 
     chart: Chart
@@ -110,7 +108,7 @@ class Fitted:
     d: Array
     weights: Array
     factors: Array
-    colour: Array
+    inflation: Array
     steps: int
     converged: bool
 
@@ -128,8 +126,8 @@ class Fitted:
 
     @property
     def effective(self) -> Array:
-        """(2,) noise factors the covariance stands on: of white noise that would say as little as the poses do."""
-        return np.asarray(self.factors * np.sqrt(self.colour))
+        """(2,) noise factors of the covariance: those of white noise that carries the same information."""
+        return np.asarray(self.factors * np.sqrt(self.inflation))
 
     @property
     def rms(self) -> tuple[float, float]:
@@ -138,12 +136,12 @@ class Fitted:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Seen:
-    """The poses as a state has them: residuals d (n, 6), weights, cost; the motion x and path they come from."""
+class _Residuals:
+    """Residuals d (n, 6) of the poses at a state, weights, cost; and the motion they come from."""
 
     chart: Chart
     x: State
-    path: Arc
+    path: RotationHistory
     A_ab: Array
     d: Array
     weights: Array
@@ -151,8 +149,8 @@ class _Seen:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Here:
-    """Linearisation at a state: residuals d (n, 6), derivative J (n, 6, 20) in the chart, weights, cost."""
+class _Linearised:
+    """Linearisation at a state: residuals d (n, 6), Jacobian J (n, 6, 20) in the chart, weights, cost."""
 
     chart: Chart
     d: Array
@@ -163,7 +161,7 @@ class _Here:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pin:
-    """A wish that row . (chart - centre) be ``target``, to ``one_sigma``: holds one direction fixed."""
+    """A pseudo-measurement row . (chart - centre) = ``target`` with ``one_sigma``: it fixes one direction."""
 
     centre: Chart
     row: Array
@@ -171,7 +169,7 @@ class Pin:
     one_sigma: float
 
     def error(self, chart: Chart) -> float:
-        """How far off, in 1 sigma."""
+        """Deviation from the target, in 1 sigma."""
         return (float(self.row @ chart.minus(self.centre)) - self.target) / self.one_sigma
 
 
@@ -184,27 +182,27 @@ class _Problem:
         self.factors = factors
         self.prior_info = _inverse(prior.P)
 
-    def at(self, chart: Chart) -> _Here:
-        return self.linear(self.seen(chart))
+    def at(self, chart: Chart) -> _Linearised:
+        return self.linear(self.residuals(chart))
 
-    def seen(self, chart: Chart) -> _Seen:
+    def residuals(self, chart: Chart) -> _Residuals:
         x, p = to_state(chart), self.poses
-        path = arc(x, p.times_s)
+        path = rotation_history(x, p.times_s)
         A_ab, d = geometry.matrix(path.q), np.empty((len(p), 6))
         d[:, :3] = geometry.log(geometry.multiply(geometry.conjugate(p.q), geometry.multiply(path.q, x.q_bc)))
         off_a = x.r_a + p.times_s[:, None] * x.v_a + A_ab @ x.c_b - p.t
         d[:, 3:] = (p.R_ca @ off_a[:, :, None])[:, :, 0]
-        return _Seen(chart, x, path, A_ab, d, *self._say(chart, d))
+        return _Residuals(chart, x, path, A_ab, d, *self._weighted(chart, d))
 
-    def again(self, here: _Here) -> _Here:
-        """The same place, under the factors and the kind of weights now in force."""
-        weights, cost = self._say(here.chart, here.d)
+    def reweighted(self, here: _Linearised) -> _Linearised:
+        """The same linearisation with the present noise factors and weight function."""
+        weights, cost = self._weighted(here.chart, here.d)
         return replace(here, weights=weights, cost=cost)
 
-    def linear(self, seen: _Seen) -> _Here:
-        """With the derivative, H Phi chained and taken into the chart."""
-        x, p, turn = seen.x, self.poses, seen.path.S[:, :3]
-        A_cb, R_cb = geometry.matrix(x.q_bc).T.copy(), p.R_ca @ seen.A_ab
+    def linear(self, at: _Residuals) -> _Linearised:
+        """The Jacobian H Phi in chart coordinates."""
+        x, p, turn = at.x, self.poses, at.path.S[:, :3]
+        A_cb, R_cb = geometry.matrix(x.q_bc).T.copy(), p.R_ca @ at.A_ab
         J = np.zeros((len(p), 6, DIM))
         for rows, by_turn in ((slice(0, 3), 2.0 * A_cb @ turn), (slice(3, 6), -2.0 * (R_cb @ skew(x.c_b)) @ turn)):
             J[:, rows, :6], J[:, rows, SIGMA] = by_turn[:, :, :6], by_turn[:, :, 6:]
@@ -212,11 +210,11 @@ class _Problem:
         J[:, 3:, RHO] = p.R_ca
         J[:, 3:, VEL] = p.R_ca * p.times_s[:, None, None]
         J[:, 3:, VARRHO] = R_cb
-        J = (J.reshape(-1, DIM) @ to_errors(seen.chart)).reshape(J.shape)
-        return _Here(seen.chart, seen.d, J, seen.weights, seen.cost)
+        J = (J.reshape(-1, DIM) @ to_errors(at.chart)).reshape(J.shape)
+        return _Linearised(at.chart, at.d, J, at.weights, at.cost)
 
-    def normal(self, here: _Here) -> tuple[Array, Array]:
-        """A (20, 20) and b (20,) of the step: A step = b."""
+    def normal(self, here: _Linearised) -> tuple[Array, Array]:
+        """Normal equations of the step: A (20, 20) step = b (20,)."""
         e, J = self.rows(here)
         J = J.reshape(-1, DIM)
         A = J.T @ J + self.prior_info
@@ -227,8 +225,8 @@ class _Problem:
             b -= row * self.pin.error(here.chart)
         return A, b
 
-    def rescaled(self, here: _Here, P: Array) -> Array:
-        """Factors (2,) from the residuals: mean of d' C^-1 d and of what the fit took up of it, J P J'."""
+    def rescaled(self, here: _Linearised, P: Array) -> Array:
+        """Noise factors (2,) from the residuals: mean of d' C^-1 d plus J P J', the part that the fit absorbed."""
         w, found = here.weights, []
         for rows in (slice(0, 3), slice(3, 6)):
             info, d, J = _inverse(self.poses.C[:, rows, rows]), here.d[:, rows], here.J[:, rows]
@@ -236,24 +234,24 @@ class _Problem:
             found.append(np.sqrt(float(w @ size) / (3.0 * float(w.sum()))))
         return np.array(found)
 
-    def colour(self, here: _Here) -> Array:
+    def inflation(self, here: _Linearised) -> Array:
         """(2,) 1 + 2 sum of the residuals' autocorrelations, of attitude and position."""
         e = self.whitened(here.d[:, :, None])[:, :, 0] * np.sqrt(here.weights)[:, None]
-        return np.array([colour_of(e[:, :3]), colour_of(e[:, 3:])])
+        return np.array([integrated_autocorrelation(e[:, :3]), integrated_autocorrelation(e[:, 3:])])
 
-    def rows(self, here: _Here) -> tuple[Array, Array]:
-        """Residuals (n, 6) and derivative (n, 6, 20), whitened and weighted: each of unit variance."""
+    def rows(self, here: _Linearised) -> tuple[Array, Array]:
+        """Residuals (n, 6) and Jacobian (n, 6, 20), whitened and weighted: each of unit variance."""
         columns = np.concatenate([here.J, here.d[:, :, None]], axis=2)
         both = self.whitened(columns) * np.sqrt(here.weights)[:, None, None]
         return both[:, :, DIM], both[:, :, :DIM]
 
     def whitened(self, columns: Array) -> Array:
-        """Columns (n, 6, k) in units of the noise."""
+        """Columns (n, 6, k) whitened by the noise."""
         out: Array = (self.poses.root / np.repeat(self.factors, 3)) @ columns
         return out
 
-    def _say(self, chart: Chart, d: Array) -> tuple[Array, float]:
-        """Weights (n,) of residuals, and the cost."""
+    def _weighted(self, chart: Chart, d: Array) -> tuple[Array, float]:
+        """M-estimator weights (n,) of the residuals, and the cost."""
         e = self.whitened(d[:, :, None])
         chi2 = np.einsum("nij,nij->n", e, e)
         weights, robust = weigh(chi2, self.redescend)
@@ -268,42 +266,42 @@ def _inverse(A: NDArray[Any]) -> Array:
     return np.asarray(np.linalg.inv(A), dtype=np.float64)
 
 
-def fit(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Array | None = None) -> Fitted:
-    """Fit from ``start``. The noise factors begin at ``factors`` and are refined where ``params.rescale`` says so.
+def fit(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Array | None = None) -> BatchFit:
+    """Fit from ``start``. The noise factors begin at ``factors`` and are refined where ``params.rescale`` is set.
 
-    Residuals show a correlation in time only once there are many; until then ``params.least_colour`` stands for it.
+    The residuals' correlation in time can be estimated only once there are many; ``params.least_inflation`` bounds it.
 
     Raises:
         ValueError: fewer than three poses.
     """
     if len(poses) < 3:
         raise ValueError(f"{len(poses)} poses, three at least are needed")
-    least = np.sqrt(np.full(2, params.least_colour))
+    least = np.sqrt(np.full(2, params.least_inflation))
     problem = _Problem(poses, prior, params, least if factors is None else factors)
     problem.redescend = False
     here, steps, done = _descend(problem, problem.at(start), params.max_steps)
     problem.redescend = True
-    here, more, done = _descend(problem, problem.again(here), params.max_steps)
+    here, more, done = _descend(problem, problem.reweighted(here), params.max_steps)
     steps += more
-    plain, colour = problem.factors / least, least**2
+    plain, inflation = problem.factors / least, least**2
     if params.rescale and len(poses) >= _FEWEST_FOR_FACTORS:
         for _ in range(2):
             plain = problem.rescaled(here, _inverse(problem.normal(here)[0]))
-            colour = np.maximum(problem.colour(here), params.least_colour)
-            problem.factors = plain * np.sqrt(colour)
-            here, more, done = _descend(problem, problem.again(here), params.max_steps)
+            inflation = np.maximum(problem.inflation(here), params.least_inflation)
+            problem.factors = plain * np.sqrt(inflation)
+            here, more, done = _descend(problem, problem.reweighted(here), params.max_steps)
             steps += more
     P = _inverse(problem.normal(here)[0])
-    return Fitted(here.chart, P, here.cost, here.d, here.weights, plain, colour, steps, done)
+    return BatchFit(here.chart, P, here.cost, here.d, here.weights, plain, inflation, steps, done)
 
 
 def cost(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: Array) -> float:
-    """Half chi-square of initial values, the prior's share included."""
-    return _Problem(poses, prior, params, factors).seen(chart).cost
+    """Half chi-square of initial values, including the prior."""
+    return _Problem(poses, prior, params, factors).residuals(chart).cost
 
 
 def linearised(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: Array) -> tuple[Array, Array]:
-    """Residuals (n, 6) and their derivative (n, 6, 20) in the chart, whitened and weighted: each of unit variance."""
+    """Residuals (n, 6) and their Jacobian (n, 6, 20) in the chart, whitened and weighted: each of unit variance."""
     problem = _Problem(poses, prior, params, factors)
     return problem.rows(problem.at(chart))
 
@@ -311,21 +309,22 @@ def linearised(poses: Poses, chart: Chart, prior: Prior, params: FitParams, fact
 def pinned(
     poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Array, pin: Pin
 ) -> tuple[Chart, Array]:
-    """The fit with one direction held, and its covariance (20, 20) in the chart."""
+    """The fit with one direction fixed, and its covariance (20, 20) in the chart."""
     rough = replace(params, gain_tol=max(params.gain_tol, _PIN_TOL))
     problem = _Problem(poses, prior, rough, factors, pin)
     here = _descend(problem, problem.at(start), rough.max_steps)[0]
     return here.chart, _inverse(problem.normal(here)[0])
 
 
-def _descend(problem: _Problem, here: _Here, max_steps: int) -> tuple[_Here, int, bool]:
+def _descend(problem: _Problem, here: _Linearised, max_steps: int) -> tuple[_Linearised, int, bool]:
+    """Levenberg-Marquardt: the minimum, the steps taken, and whether the stopping rule was met."""
     damping = 1e-3
     A, b = problem.normal(here)
     for count in range(1, max_steps + 1):
         step = np.asarray(np.linalg.solve(A + damping * np.diag(np.diagonal(A)), b), dtype=np.float64)
         expected = float(step @ b) - 0.5 * float(step @ A @ step)
-        wild = float(np.linalg.norm(step[RATE])) > _WILD_RADPS + float(np.linalg.norm(here.chart.w_c))
-        trial = None if wild else problem.seen(here.chart.moved(step))
+        too_large = float(np.linalg.norm(step[RATE])) > _LARGEST_RADPS + float(np.linalg.norm(here.chart.w_c))
+        trial = None if too_large else problem.residuals(here.chart.moved(step))
         gain = 0.0 if trial is None else here.cost - trial.cost
         if trial is not None and gain > 0.0:
             damping = max(damping * (0.1 if gain > 0.5 * expected else 0.5), 1e-9)
@@ -333,6 +332,6 @@ def _descend(problem: _Problem, here: _Here, max_steps: int) -> tuple[_Here, int
             A, b = problem.normal(here)
         else:
             damping *= 8.0
-        if (abs(expected) < problem.params.gain_tol and not wild) or damping > 1e9:
+        if (abs(expected) < problem.params.gain_tol and not too_large) or damping > 1e9:
             return here, count, True
     return here, max_steps, False

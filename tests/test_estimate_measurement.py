@@ -7,9 +7,15 @@ import pytest
 import tumbling
 
 from avsreplay import geometry
-from avsreplay.estimate.layout import boxminus, boxplus
-from avsreplay.estimate.measure import innovation, measured_pose, noise_of, residual, sensitivity
-from avsreplay.estimate.motion import grasp_rows
+from avsreplay.estimate.dynamics import grasp_jacobian
+from avsreplay.estimate.error_state import boxminus, boxplus
+from avsreplay.estimate.measurement import (
+    innovation_vector,
+    measured_pose,
+    measurement_jacobian,
+    registration_noise,
+    residual,
+)
 from avsreplay.geometry import Pose
 from avsreplay.records import Alignment, AlignStatus, State
 
@@ -34,28 +40,30 @@ def test_error_sides_are_the_papers(x: State) -> None:
 
 
 def test_perfect_pose_has_no_innovation(x: State) -> None:
-    assert np.abs(innovation(x, x.T_ac)).max() < 1e-15
+    assert np.abs(innovation_vector(x, x.T_ac)).max() < 1e-15
 
 
 def test_sensitivity_is_the_derivative(x: State) -> None:
-    H, eps = sensitivity(x), 1e-6
+    H, eps = measurement_jacobian(x), 1e-6
     for k in range(20):
         d = np.zeros(20)
         d[k] = eps
-        column = (innovation(x, boxplus(x, d).T_ac) - innovation(x, boxplus(x, -d).T_ac)) / (2 * eps)
+        column = (innovation_vector(x, boxplus(x, d).T_ac) - innovation_vector(x, boxplus(x, -d).T_ac)) / (2 * eps)
         assert np.abs(column - H[:, k]).max() < 1e-9, k
 
 
 def test_measured_pose_inverts_the_innovation(x: State) -> None:
     pose = x.T_ac @ Pose(geometry.exp([0.5, -1.2, 0.3]), np.array([0.1, 0.2, 0.3]))
-    back = measured_pose(x, innovation(x, pose))
+    back = measured_pose(x, innovation_vector(x, pose))
     assert np.abs(back.matrix - pose.matrix).max() < 1e-14
 
 
 def test_half_angle_noise(x: State) -> None:
     one_degree = np.radians(1.0)
     C = np.diag([one_degree**2] * 3 + [0.01**2] * 3)
-    R = noise_of(Alignment(x.T_ac, 1, True, 9, 9, 0.0, np.linalg.inv(C), AlignStatus.ALIGNED, C), x, (1.0, 1.0))
+    R = registration_noise(
+        Alignment(x.T_ac, 1, True, 9, 9, 0.0, np.linalg.inv(C), AlignStatus.ALIGNED, C), x, (1.0, 1.0)
+    )
     assert np.sqrt(np.diag(R)) == pytest.approx(np.repeat([0.01, one_degree / 2], 3))
 
 
@@ -64,24 +72,26 @@ def test_noise_is_the_spread_of_innovations(x: State) -> None:
     root = np.linalg.qr(rng.normal(size=(6, 6)))[0] * np.geomspace(1e-4, 3e-3, 6)
     C = root @ root.T
     d = rng.normal(size=(4000, 6)) @ root.T
-    noises = [innovation(x, x.T_ac @ Pose(geometry.exp(-e[:3]), -e[3:])) for e in d]  # T_true = T_meas Exp(d)
-    R = noise_of(Alignment(x.T_ac, 1, True, 9, 9, 0.0, np.linalg.inv(C), AlignStatus.ALIGNED, C), x, (1.0, 1.0))
+    noises = [innovation_vector(x, x.T_ac @ Pose(geometry.exp(-e[:3]), -e[3:])) for e in d]  # T_true = T_meas Exp(d)
+    R = registration_noise(
+        Alignment(x.T_ac, 1, True, 9, 9, 0.0, np.linalg.inv(C), AlignStatus.ALIGNED, C), x, (1.0, 1.0)
+    )
     white = np.linalg.solve(np.linalg.cholesky(R), np.transpose(noises))
     assert np.abs(white @ white.T / 4000 - np.eye(6)).max() < 0.1
 
 
 def test_a_free_direction_is_not_measured(x: State) -> None:
     info = np.diag([1e6, 1e6, 1e6, 0.0, 1e6, 1e6])
-    R = noise_of(Alignment(x.T_ac, 1, True, 9, 9, 0.0, info, AlignStatus.DEGENERATE), x, (1.0, 4.0))
+    R = registration_noise(Alignment(x.T_ac, 1, True, 9, 9, 0.0, info, AlignStatus.DEGENERATE), x, (1.0, 4.0))
     free = x.T_ac.R[:, 0]
     assert free @ R[:3, :3] @ free == pytest.approx(16.0)
     assert np.linalg.eigvalsh(R[:3, :3])[1] < 1.1e-6
     blind = Alignment(x.T_ac, 1, True, 9, 9, 0.0, np.zeros((6, 6)), AlignStatus.DEGENERATE)
-    assert noise_of(blind, x, (1.0, 4.0)) is None
+    assert registration_noise(blind, x, (1.0, 4.0)) is None
 
 
 def test_grasp_rows_are_the_derivative(x: State) -> None:
-    J, eps = grasp_rows(geometry.matrix(x.q_ab)[None], x.w_b[None], x.c_b)[0], 1e-6
+    J, eps = grasp_jacobian(geometry.matrix(x.q_ab)[None], x.w_b[None], x.c_b)[0], 1e-6
 
     def seen(y: State) -> np.ndarray:
         turn = geometry.multiply(geometry.multiply(geometry.conjugate(x.q_ab), y.T_ac.q), geometry.conjugate(x.q_bc))
@@ -96,4 +106,4 @@ def test_grasp_rows_are_the_derivative(x: State) -> None:
 def test_residual_is_the_innovation_at_the_posterior(x: State) -> None:
     pose = x.T_ac @ Pose(geometry.exp([0.02, -0.05, 0.01]), np.array([0.1, 0.2, 0.3]))
     posterior = boxplus(x, np.linspace(-0.02, 0.03, 20))
-    assert np.abs(residual(posterior, x, innovation(x, pose)) - innovation(posterior, pose)).max() < 1e-14
+    assert np.abs(residual(posterior, x, innovation_vector(x, pose)) - innovation_vector(posterior, pose)).max() < 1e-14

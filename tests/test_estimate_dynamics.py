@@ -12,9 +12,9 @@ from scipy.integrate import solve_ivp
 
 from avsreplay import geometry
 from avsreplay.errors import UsageError
-from avsreplay.estimate import _motion, horizon, motion
-from avsreplay.estimate.arc import Path, arc
-from avsreplay.estimate.layout import boxminus, boxplus
+from avsreplay.estimate import _motion, dynamics
+from avsreplay.estimate.dynamics import rotation_history, rotation_path
+from avsreplay.estimate.error_state import boxminus, boxplus
 from avsreplay.records import Belief, State
 
 CALM = (0.0, 0.0, 0.0)
@@ -27,7 +27,7 @@ def some_state(seed: int, rate: float = 0.15) -> tuple[State, np.ndarray]:
 
 
 def after(x: State, h: float) -> State:
-    return motion.advance(x, motion.flow(x.w_b, x.sigma, h), h)
+    return dynamics.advance(x, dynamics.flow(x.w_b, x.sigma, h), h)
 
 
 @pytest.mark.parametrize("h", STEPS)
@@ -64,14 +64,14 @@ def test_a_body_at_rest_stays() -> None:
 
 def test_b_is_trace_over_moment() -> None:
     _, moments = some_state(3)
-    assert motion.disturbance(tumbling.ratios(moments)) == pytest.approx(moments.sum() / moments)
+    assert dynamics.disturbance(tumbling.ratios(moments)) == pytest.approx(moments.sum() / moments)
 
 
 @pytest.mark.parametrize("h", [0.2, 1.0, 12.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_phi_is_the_derivative_of_the_step(seed: int, h: float) -> None:
     x, _ = some_state(seed)
-    Phi = motion.transition(motion.flow(x.w_b, x.sigma, h), x.sigma, h)
+    Phi = dynamics.transition(dynamics.flow(x.w_b, x.sigma, h), x.sigma, h)
     eps, base = 1e-5, after(x, h)
     for k in range(20):
         d = np.zeros(20)
@@ -85,7 +85,7 @@ def test_phi_and_noise_solve_their_differential_equation(h: float) -> None:
     x, moments = some_state(5)
     torque, force = 2e-4, 3e-4
     P0 = np.diag(np.linspace(0.5, 2.0, 20)) * 1e-4
-    belief, Phi = motion.propagate(Belief(0, x, P0), round(h * 1e9), torque, force)
+    belief, Phi = dynamics.propagate(Belief(0, x, P0), round(h * 1e9), torque, force)
     want_Phi, want_P = by_integration(x, moments, P0, h, torque, force)
     assert np.abs(Phi - want_Phi).max() < 1e-10 * np.abs(want_Phi).max()
     assert np.abs(belief.P - want_P).max() < 1e-10 * np.abs(want_P).max()
@@ -123,19 +123,19 @@ def test_three_ratios_join_to_two() -> None:
     sigma, eps = np.array([0.3, -0.6]), 1e-6
     for k in range(2):
         d = np.eye(2)[k] * eps
-        slope = (motion.sigma3(sigma + d) - motion.sigma3(sigma - d)) / (2 * eps)
-        assert motion.sigma_join(sigma)[2, k] == pytest.approx(slope, rel=1e-9)
+        slope = (dynamics.sigma3(sigma + d) - dynamics.sigma3(sigma - d)) / (2 * eps)
+        assert dynamics.sigma_join(sigma)[2, k] == pytest.approx(slope, rel=1e-9)
 
 
 def test_trajectory_is_the_motion_and_its_velocity_the_slope() -> None:
     x, moments = some_state(2, rate=0.3)
     times = np.array([0.0, 0.31, 4.0, 17.3, 60.0])
-    position, velocity = horizon.trajectory(x)(times)
+    position, velocity = dynamics.grasp_trajectory(x)(times)
     truth = tumbling.follow(times, moments, x)
     assert np.abs(position - [s.T_ac.t for s in truth]).max() < 1e-9
     assert np.abs(velocity - [s.fixture_velocity for s in truth]).max() < 1e-9
     with pytest.raises(ValueError, match="before now"):
-        horizon.trajectory(x)(np.array([-1.0]))
+        dynamics.grasp_trajectory(x)(np.array([-1.0]))
 
 
 def test_forecast_is_the_spread_of_displaced_motions() -> None:
@@ -143,7 +143,7 @@ def test_forecast_is_the_spread_of_displaced_motions() -> None:
     rng = np.random.Generator(np.random.PCG64(1))
     root = np.linalg.qr(rng.normal(size=(20, 20)))[0] * np.geomspace(1e-5, 1e-3, 20)
     belief, times = Belief(0, x, root @ root.T), np.array([0.0, 3.0, 20.0])
-    seen = horizon.forecast(belief, times, 0.0, 0.0)
+    seen = dynamics.grasp_forecast(belief, times, 0.0, 0.0)
     poses, speeds, turns = [], [], []
     for _ in range(600):
         far = [after(boxplus(x, root @ rng.normal(size=20)), t) for t in times]
@@ -164,10 +164,10 @@ def test_forecast_adds_the_disturbance_of_every_step() -> None:
     x, _ = some_state(7)
     torque, force, P0 = 1e-3, 2e-3, np.eye(20) * 1e-12
     times = np.array([5.0, 30.0])
-    seen = horizon.forecast(Belief(0, x, P0), times, torque, force)
+    seen = dynamics.grasp_forecast(Belief(0, x, P0), times, torque, force)
     for i, t in enumerate(times):
-        then, _ = motion.propagate(Belief(0, x, P0), round(t * 1e9), torque, force)
-        J = motion.grasp_rows(geometry.matrix(then.x.q_ab)[None], then.x.w_b[None], x.c_b)[0]
+        then, _ = dynamics.propagate(Belief(0, x, P0), round(t * 1e9), torque, force)
+        J = dynamics.grasp_jacobian(geometry.matrix(then.x.q_ab)[None], then.x.w_b[None], x.c_b)[0]
         want = np.sqrt(np.diag(J @ then.P @ J.T).reshape(3, 3).sum(axis=1)) * [1, 1, 2]
         assert (seen.pos_1s_m[i], seen.vel_1s_mps[i], seen.rot_1s_rad[i]) == pytest.approx(tuple(want), rel=1e-11)
 
@@ -175,7 +175,7 @@ def test_forecast_adds_the_disturbance_of_every_step() -> None:
 def test_a_gap_of_years_is_refused_in_one_line() -> None:
     x, _ = some_state(1)
     with pytest.raises(UsageError, match="too far to predict"):
-        motion.propagate(Belief(0, x, np.eye(20)), 10**18, 0.0, 0.0)
+        dynamics.propagate(Belief(0, x, np.eye(20)), 10**18, 0.0, 0.0)
 
 
 def noise_by_quadrature(x: State, moments: np.ndarray, h: float, torque: float) -> np.ndarray:
@@ -188,7 +188,7 @@ def noise_by_quadrature(x: State, moments: np.ndarray, h: float, torque: float) 
     for low, high in itertools.pairwise(edges):
         for node, weight in zip(nodes, weights, strict=True):
             t = 0.5 * (low + high) + 0.5 * (high - low) * node
-            pushed = motion.flow(after(x, t).w_b, x.sigma, h - t).S[:, :6] @ G
+            pushed = dynamics.flow(after(x, t).w_b, x.sigma, h - t).S[:, :6] @ G
             Q += 0.5 * weight * abs(high - low) * pushed @ pushed.T
     return Q
 
@@ -199,13 +199,13 @@ def test_noise_is_every_push_carried_to_the_end(seed: int, h: float) -> None:
     x, moments = some_state(seed)
     want = noise_by_quadrature(x, moments, h, 2e-3)
     scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
-    assert np.abs((motion.flow(x.w_b, x.sigma, h, 2e-3).Q - want) / scale).max() < 1e-10
+    assert np.abs((dynamics.flow(x.w_b, x.sigma, h, 2e-3).Q - want) / scale).max() < 1e-10
 
 
 def test_noise_of_a_body_at_rest_is_the_textbook_one() -> None:
     sigma, torque, h = np.array([0.2, -0.4]), 3e-4, 0.7
-    Q = motion.flow(np.zeros(3), sigma, h, torque).Q
-    push = np.diag((np.array(motion.disturbance(sigma)) * torque) ** 2)
+    Q = dynamics.flow(np.zeros(3), sigma, h, torque).Q
+    push = np.diag((np.array(dynamics.disturbance(sigma)) * torque) ** 2)
     want = np.block([[push * h**3 / 12.0, push * h**2 / 4.0], [push * h**2 / 4.0, push * h]])  # dq' = w / 2
     assert np.abs(Q - want).max() < 1e-15 * np.abs(want).max()
 
@@ -214,13 +214,13 @@ def test_noise_of_a_body_at_rest_is_the_textbook_one() -> None:
 def test_sensitivity_is_the_derivative_by_three_ratios_either_way(h: float) -> None:
     """Each of sigma1..3 apart, as the extension takes them, and a start of any attitude error and rate."""
     x, _ = some_state(9, rate=0.3)
-    q, ratios = np.array([0.0, 0.0, 0.0, 1.0]), np.array(motion.ratios(x.sigma))
+    q, ratios = np.array([0.0, 0.0, 0.0, 1.0]), np.array(dynamics.ratios(x.sigma))
 
     def moved(w: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         q1, w1, _, _ = _motion.follow(q, w, tuple(s), CALM, np.array([h]))
         return q1[0], w1[0]
 
-    end, S = moved(x.w_b, ratios)[0], motion.flow(x.w_b, x.sigma, h).S
+    end, S = moved(x.w_b, ratios)[0], dynamics.flow(x.w_b, x.sigma, h).S
     assert np.abs(S[:3, :3] - geometry.matrix(end).T).max() < 1e-13
     assert not S[3:, :3].any()
     for k in range(6):
@@ -245,33 +245,33 @@ def test_fast_bodies_follow_the_full_inertia_tensor(rate: float) -> None:
 def test_slender_and_flat_bodies(sigma: tuple[float, float]) -> None:
     """The rate may grow manifold between two cuts of a long step."""
     w, s = np.array([0.05, 0.4, -0.3]), np.array(sigma)
-    s1, s2, s3 = motion.ratios(s)
+    s1, s2, s3 = dynamics.ratios(s)
     rates = lambda _, u: [s1 * u[1] * u[2], s2 * u[0] * u[2], s3 * u[0] * u[1]]  # noqa: E731
     truth = solve_ivp(rates, (0.0, 60.0), w, method="DOP853", rtol=1e-13, atol=1e-15).y[:, -1]
-    assert np.abs(motion.flow(w, s, 60.0).w - truth).max() < 1e-9
+    assert np.abs(dynamics.flow(w, s, 60.0).w - truth).max() < 1e-9
 
 
 def test_many_instants_are_the_steps_between_them() -> None:
     x, _ = some_state(4, rate=0.3)
     times = np.array([0.0, 0.4, 0.4, 7.0, 3.0, 31.0, -5.0])
-    seen = arc(x, times)
+    seen = rotation_history(x, times)
     for k, t in enumerate(times):
-        step = motion.flow(x.w_b, x.sigma, t)
-        Phi = motion.transition(step, x.sigma, t)
+        step = dynamics.flow(x.w_b, x.sigma, t)
+        Phi = dynamics.transition(step, x.sigma, t)
         assert np.abs(seen.w[k] - step.w).max() < 1e-12
-        assert np.abs(geometry.matrix(seen.q[k]) - geometry.matrix(motion.advance(x, step, t).q_ab)).max() < 1e-12
+        assert np.abs(geometry.matrix(seen.q[k]) - geometry.matrix(dynamics.advance(x, step, t).q_ab)).max() < 1e-12
         assert np.abs(seen.S[k] - Phi[:6, [0, 1, 2, 3, 4, 5, 12, 13]]).max() < 1e-10
 
 
 def test_a_path_is_the_same_motion_in_any_order() -> None:
     x, _ = some_state(4, rate=0.3)
     times = np.array([80.0, 0.0, -3.0, 12.3, 79.9, 1e-9, 200.0, 12.3])
-    q, w = Path(x).at(times)
+    q, w = rotation_path(x).at(times)
     for k, t in enumerate(times):
         there = after(x, t)
         assert np.abs(w[k] - there.w_b).max() < 1e-11
         assert np.abs(geometry.matrix(q[k]) - geometry.matrix(there.q_ab)).max() < 1e-11
-    path = Path(x)
+    path = rotation_path(x)
     again = [path.at(np.array([t])) for t in times[::-1]][::-1]
     assert np.array_equal(q, [one[0] for one, _ in again])
     assert np.array_equal(w, [one[0] for _, one in again])
@@ -279,7 +279,7 @@ def test_a_path_is_the_same_motion_in_any_order() -> None:
 
 def test_a_path_of_a_body_at_rest_stays_in_one_place() -> None:
     x = State([0, 0, 0, 1.0], np.zeros(3), np.zeros(3), np.zeros(3), [0.2, -0.4], np.zeros(3), [0, 0, 0, 1.0])
-    q, w = Path(x).at(np.array([0.0, 1e9, -5.0]))
+    q, w = rotation_path(x).at(np.array([0.0, 1e9, -5.0]))
     assert np.array_equal(q, np.tile(x.q_ab, (3, 1)))
     assert not w.any()
 
@@ -288,27 +288,27 @@ def test_a_path_of_a_body_at_rest_stays_in_one_place() -> None:
 def test_what_is_not_finite_or_turns_for_ever_is_refused(bad: float) -> None:
     x, _ = some_state(1)
     with pytest.raises(ValueError, match="finite"):
-        motion.flow(x.w_b, x.sigma, bad)
+        dynamics.flow(x.w_b, x.sigma, bad)
     with pytest.raises(ValueError, match="finite"):
-        Path(x).at(np.array([0.0, bad]))
+        rotation_path(x).at(np.array([0.0, bad]))
     with pytest.raises(ValueError, match="finite"):
-        motion.flow(np.array([0.1, bad, 0.0]), x.sigma, 1.0)
+        dynamics.flow(np.array([0.1, bad, 0.0]), x.sigma, 1.0)
     with pytest.raises(ValueError, match="finite"):
-        arc(x, np.array([0.0, 1.0, bad]))
+        rotation_history(x, np.array([0.0, 1.0, bad]))
 
 
 def test_a_forecast_of_what_spins_too_fast_is_infinite() -> None:
     x = replace(some_state(1)[0], w_b=np.array([1e6, 0.0, 1.0]))
-    seen = horizon.forecast(Belief(0, x, np.eye(20)), np.array([1.0, 30.0]), 1e-4, 1e-4)
+    seen = dynamics.grasp_forecast(Belief(0, x, np.eye(20)), np.array([1.0, 30.0]), 1e-4, 1e-4)
     assert np.all(np.isinf([seen.pos_1s_m, seen.vel_1s_mps, seen.rot_1s_rad]))
     with pytest.raises(ValueError, match="ascend"):
-        horizon.forecast(Belief(0, x, np.eye(20)), np.array([3.0, 1.0]), 0.0, 0.0)
+        dynamics.grasp_forecast(Belief(0, x, np.eye(20)), np.array([3.0, 1.0]), 0.0, 0.0)
 
 
 def test_noise_rides_along_without_touching_the_motion() -> None:
     x, _ = some_state(8)
-    ratios, times = motion.ratios(x.sigma), np.array([0.3, 9.0, 30.0])
-    noisy = _motion.follow(x.q_ab, x.w_b, ratios, motion.push(x.sigma, 1e-3), times)
+    ratios, times = dynamics.ratios(x.sigma), np.array([0.3, 9.0, 30.0])
+    noisy = _motion.follow(x.q_ab, x.w_b, ratios, dynamics.torque_density(x.sigma, 1e-3), times)
     calm = _motion.follow(x.q_ab, x.w_b, ratios, CALM, times)
     assert all(np.abs(a - b).max() < 1e-10 for a, b in zip(noisy[:3], calm[:3], strict=True))
     assert not calm[3].any()

@@ -10,8 +10,8 @@ import pytest
 import tumbling
 from click.testing import CliRunner
 
-from avsreplay.estimate import variants
-from avsreplay.estimate.motion import sigma3, sigma_join
+from avsreplay.estimate import parameter_sets
+from avsreplay.estimate.dynamics import sigma3, sigma_join
 from avsreplay.monitor.observability import gramian, measure, observe, weakest
 
 LOG = Path(__file__).parent.parent / "fixtures" / "tumble.mcap"
@@ -19,7 +19,7 @@ LOG = Path(__file__).parent.parent / "fixtures" / "tumble.mcap"
 
 def test_three_ratios_join_to_the_two_state_step() -> None:
     x = tumbling.draw(2, seconds=1.0).states[0]
-    _, sets = variants.step(x, 0.7)
+    _, sets = parameter_sets.step_of_sets(x, 0.7)
     join = np.zeros((21, 20))
     join[:12, :12] = np.eye(12)
     join[12:15, 12:14] = sigma_join(x.sigma)
@@ -32,7 +32,7 @@ def test_three_ratios_join_to_the_two_state_step() -> None:
 def test_each_ratio_moves_the_motion_as_its_column_says() -> None:
     """A free sigma3 is no body; its column is the derivative of Euler's equations all the same."""
     x = tumbling.draw(2, seconds=1.0).states[0]
-    Phi = variants.step(x, 0.01)[1]["three"][0]
+    Phi = parameter_sets.step_of_sets(x, 0.01)[1]["three"][0]
     w, h = x.w_b, 0.01
     want = np.diag([w[1] * w[2], w[0] * w[2], w[0] * w[1]]) * h
     assert np.abs(Phi[3:6, 12:15] - want).max() < 2e-3 * np.abs(want).max() + 1e-8
@@ -42,10 +42,10 @@ def test_each_ratio_moves_the_motion_as_its_column_says() -> None:
 def test_knowing_more_never_makes_it_worse() -> None:
     world = tumbling.draw(4, seconds=60.0)
     x = world.states[0]
-    scales = variants.prior_1s(np.full(20, 0.1), x.sigma)
+    scales = parameter_sets.prior_1s(np.full(20, 0.1), x.sigma)
     folds = {name: gramian(scale) for name, scale in scales.items()}
     for h in np.diff(world.times, prepend=0.0):
-        x, steps = variants.step(x, float(h))
+        x, steps = parameter_sets.step_of_sets(x, float(h))
         folds = {name: observe(folds[name], *steps[name], 1) for name in folds}
     found = {name: measure(fold) for name, fold in folds.items()}
     assert {name: (f.rank, f.size) for name, f in found.items()} == {
@@ -56,7 +56,7 @@ def test_knowing_more_never_makes_it_worse() -> None:
     raw = {name: f.log10_cond for name, f in found.items()}
     assert raw["known"] < raw["two"] <= raw["three"] + 1e-9
     for name, fold in folds.items():
-        assert len(weakest(fold, 2, variants.BLOCKS_OF[name])) == 2
+        assert len(weakest(fold, 2, parameter_sets.BLOCKS_OF[name])) == 2
 
 
 @pytest.mark.skipif(not LOG.exists(), reason="fixtures/tumble.mcap is not here")

@@ -1,7 +1,7 @@
 """The same motion with other parameter sets, for the observability of each (the paper's claim on two ratios).
 
-``two``: the 20 states as they are. ``three``: sigma1, sigma2, sigma3 apart, 21 states. ``known``: sigma, varrho and mu
-known, the 12 states of motion.
+``two``: the 20 states as they are. ``three``: sigma1, sigma2, sigma3 independent, 21 states. ``known``: sigma, varrho
+and mu known, the 12 states of motion.
 """
 
 from __future__ import annotations
@@ -11,13 +11,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from avsreplay.estimate.layout import DIM, SIGMA
-from avsreplay.estimate.measure import sensitivity
-from avsreplay.estimate.motion import advance, flow, sigma_join, transition
+from avsreplay.estimate.dynamics import advance, flow, sigma_join, transition
+from avsreplay.estimate.error_state import DIM, SIGMA
+from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, State
-
-__all__ = ["BLOCKS_OF", "SETS", "prior_1s", "step"]
 
 SETS = ("two", "three", "known")
 _MOTION = 12
@@ -31,11 +29,11 @@ BLOCKS_OF: Mapping[str, Mapping[str, slice]] = MappingProxyType(
 )
 
 
-def step(x: State, h: float) -> tuple[State, dict[str, tuple[Array, Array]]]:
-    """The state h seconds on, and Phi (n, n) and H (6, n) of each set over that step."""
+def step_of_sets(x: State, h: float) -> tuple[State, dict[str, tuple[Array, Array]]]:
+    """The state h seconds later, and Phi (n, n) and H (6, n) of each set over that step."""
     moved = flow(x.w_b, x.sigma, h)
     then = advance(x, moved, h)
-    Phi, H = transition(moved, x.sigma, h), sensitivity(then)
+    Phi, H = transition(moved, x.sigma, h), measurement_jacobian(then)
     wide = np.eye(DIM + 1)
     wide[:_MOTION, :_MOTION] = Phi[:_MOTION, :_MOTION]
     wide[:6, _THREE["sigma"]] = moved.S[:, 6:]
@@ -48,7 +46,7 @@ def step(x: State, h: float) -> tuple[State, dict[str, tuple[Array, Array]]]:
 
 
 def prior_1s(one_sigma: Array, sigma: Array) -> dict[str, Array]:
-    """Prior standard deviations (n,) of each set from the 20; sigma3's follows from those of sigma1 and sigma2."""
+    """Prior standard deviations (n,) of each set from the 20; that of sigma3 follows from sigma1 and sigma2."""
     third = np.sqrt(np.sum((sigma_join(sigma)[2] * one_sigma[SIGMA]) ** 2))
     return {
         "two": one_sigma,

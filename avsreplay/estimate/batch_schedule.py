@@ -1,0 +1,156 @@
+"""When the batch fit runs: it provides the estimate at the start, and replaces a filter that it contradicts.
+
+The innovations of single steps cannot show every error: a biased scan or two that passed the fault rule move the
+parameters of a converged filter by many of its own sigma, and the next innovations look normal. A fit to the last poses
+gives such scans a low weight and does not share the error. Where the two differ by more than the covariance of the fit
+allows, the fit replaces the filter's estimate.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import replace
+from operator import attrgetter
+
+import numpy as np
+
+from avsreplay.estimate import ekf
+from avsreplay.estimate.batch import FitParams, Prior
+from avsreplay.estimate.batch_covariance import memory_s, propagate_chart
+from avsreplay.estimate.chart import Chart, to_chart, to_errors
+from avsreplay.estimate.dynamics import propagate_state
+from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, first_belief, given_prior
+from avsreplay.estimate.measurement import in_fixture, measured_pose
+from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
+from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
+from avsreplay.estimate.track import Prediction, Track
+from avsreplay.records import Belief, Innovation
+
+FEWEST_TO_FIT = 3
+FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
+_RECENT = 0.1  # of the fit's memory: disturbances have changed little of a start given so long ago
+_GAUSSIAN_HALF_RAD = 0.2  # 1 sigma of the given attitude above which it is not Gaussian any more
+_LONGEST_S = 1e9  # range of nanoseconds
+_instant = attrgetter("t_ns")
+
+
+class BatchSchedule:
+    """Runs batch fits to the healthy poses so far.
+
+    Args:
+        params: settings, auto values filled in.
+        noise: the measurement noise model.
+        start: the given belief, None where there is none. It is left out once the poses contradict it.
+    """
+
+    def __init__(self, params: EstimatorParams, noise: Noise, start: Belief | None) -> None:
+        self.params, self.noise, self.start = params, noise, start
+        self.checked_poses = 0 if params.start is Start.PAPER else params.audit_poses
+        self._prior = None if start is None or params.start is Start.PAPER else given_prior(start)
+        self._rules = FitParams(rescale=params.adapt is not Adaptation.OFF)
+        self._memory_ns = round(min(memory_s(params.torque_noise_radps15), _LONGEST_S) * 1e9)
+
+    def initialised(self, track: Track, prediction: Prediction, innovation: Innovation, converged: bool) -> Track:
+        """The track after a healthy pose while the fit is in use: a new fit if enough poses have come since the last.
+
+        Between fits the filter's update is applied only if the likelihood is Gaussian; otherwise the fit is propagated.
+        """
+        track = replace(track, fixes=self._with(track, prediction, innovation), R=innovation.R, since=track.since + 1)
+        if len(track.fixes) < FEWEST_TO_FIT:
+            return replace(track, belief=self._first(track, prediction, innovation))
+        last = track.batch
+        if last is None or track.since >= max(1.0, self._growth(last) * last.count):
+            forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
+            start = chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
+            result = batch_estimate(
+                track.fixes, self.params, self._rules, last, start, self._given(track.fixes[0].t_ns)
+            )
+            rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
+            track = replace(track, reinitialised=track.reinitialised + rejected)
+            return self._adopted(track, result, result.gaussian and converged)
+        if last.gaussian:
+            belief = ekf.chart_update(prediction.belief, prediction.H, innovation, last.inflation)
+            return replace(track, belief=belief)
+        return replace(track, belief=prediction.belief)
+
+    def _growth(self, last: BatchResult) -> float:
+        """The share by which the poses grow until the next fit; a Gaussian likelihood is propagated well in between."""
+        return CHECK_GROWTH if last.gaussian else self.params.refit_growth
+
+    def remembered(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
+        """The newest poses, for ``check_against_batch``."""
+        return self._with(track, prediction, innovation)[-self.checked_poses :] if self.checked_poses else ()
+
+    def check_against_batch(self, track: Track) -> Track:
+        """The filter's track, or the fit's where a fit to the same poses contradicts it.
+
+        A fit with a non-Gaussian likelihood replaces the filter only where the poses themselves contradict the filter.
+        """
+        enough = max(FEWEST_TO_CHECK, CHECK_GROWTH * len(track.fixes))
+        many_outliers = track.window.many_outliers
+        if not self.checked_poses or track.since < (FEWEST_WITH_OUTLIERS if many_outliers else enough):
+            return track
+        epoch_ns = track.fixes[0].t_ns
+        rejected = track.batch is not None and track.batch.prior_rejected
+        begin, given = chart_at(track.belief, epoch_ns), None if rejected else self._given(epoch_ns)
+        result = batch_estimate(track.fixes, self.params, self._rules, start=begin, given=given)
+        if (result.gaussian or many_outliers) and contradicted(track.belief, result.belief):
+            return replace(self._adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
+        return replace(track, since=0)
+
+    def _first(self, track: Track, prediction: Prediction, innovation: Innovation) -> Belief:
+        """The belief after the first poses, too few for a fit."""
+        if self.start is None:
+            return first_belief(track.fixes, self.params)
+        return ekf.chart_update(prediction.belief, prediction.H, innovation, NO_INFLATION)
+
+    def _given(self, t_ns: int) -> Prior | None:
+        """The given start, propagated to the first pose; None where disturbances or time have made it useless."""
+        if self.start is None or self._prior is None or t_ns - self.start.t_ns > _RECENT * self._memory_ns:
+            return None
+        x, step = propagate_chart(self._prior.mean, (t_ns - self.start.t_ns) * 1e-9)
+        P = step @ self._prior.P @ step.T
+        return Prior(to_chart(x), P) if float(np.sqrt(np.trace(P[:3, :3]))) < _GAUSSIAN_HALF_RAD else None
+
+    def _adopted(self, track: Track, result: BatchResult, to_filter: bool) -> Track:
+        """The track with the estimate of a fit; ``to_filter``: the filter continues from it."""
+        window = filled(self.noise.base(track.R, track.window), result.factors, self.params.window)
+        mode = "filter" if to_filter else "fit"
+        return replace(
+            track, belief=result.belief, mode=mode, window=window, batch=result, since=0, inflation=result.inflation
+        )
+
+    def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
+        """The poses within the fit's memory, including this one."""
+        oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns, key=_instant)
+        return (*track.fixes[oldest:], self._fix(prediction, innovation))
+
+    def _fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
+        """The healthy pose at its own instant: a scan deskewed by the prior's motion is moved back by it."""
+        x, lag_ns = prediction.belief.x, round(prediction.lag_s * 1e9)
+        pose = measured_pose(x, innovation.alpha)
+        C = in_fixture(self.noise.base(innovation.R, prediction.window), pose.q, x.q_bc)
+        if prediction.blur is not None:
+            C = C + prediction.blur
+        if lag_ns:
+            then, _ = propagate_state(x, lag_ns * 1e-9)
+            pose = then.T_ac @ x.T_ac.inverse() @ pose
+        return PoseFix(prediction.belief.t_ns + lag_ns, pose, C, lag_ns, innovation.share)
+
+
+def chart_at(belief: Belief, t_ns: int) -> Chart:
+    """The belief's mean propagated to another instant, as a starting point of a fit."""
+    there, _ = propagate_state(belief.x, (t_ns - belief.t_ns) * 1e-9)
+    return to_chart(there)
+
+
+def contradicted(belief: Belief, fitted: Belief) -> bool:
+    """Is the belief's mean outside the 99.99 % region of the fit, at one instant?
+
+    Both use the same poses, so a consistent belief differs by less than the fit's covariance. The difference is taken
+    in the chart, where the order of the axes has no effect.
+    """
+    there = to_chart(fitted.x)
+    T = to_errors(there)
+    y = T @ to_chart(belief.x).minus(there)
+    return float(y @ np.linalg.solve(fitted.P, y)) > BOUND

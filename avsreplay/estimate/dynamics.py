@@ -1,0 +1,246 @@
+"""Torque-free motion in the inertia ratios (eq:dot_omega, Eq:F, Eq:G): state, transition matrix, noise, forecast.
+
+Rate, attitude, their derivatives and their noise come from one Taylor series, in the extension ``_motion``. The
+attitude block of the state transition matrix Phi is A(q_rel)' exactly. The extension differentiates by three
+independent sigma; ``transition`` applies the chain rule for sigma3(sigma1, sigma2).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.errors import UsageError
+from avsreplay.estimate import _motion
+from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W, hamilton, rotation
+from avsreplay.geometry import IDENTITY_QUAT, Array, skew
+from avsreplay.records import Belief, Forecast, State, Trajectory
+
+Triple = tuple[float, float, float]
+
+MOST_RAD = 2e4  # largest rotation of a single step: some seconds of work
+_I3, _I20 = np.eye(3), np.eye(DIM)
+_NO_TORQUE = (0.0, 0.0, 0.0)
+
+
+def _diagonal(rows: slice, columns: slice) -> slice:
+    """The diagonal of a 3x3 block of a (20, 20) matrix, as a slice of its 400 entries."""
+    first = DIM * rows.start + columns.start
+    return slice(first, first + 2 * DIM + 3, DIM + 1)
+
+
+_POSITION, _MIXED, _VELOCITY = _diagonal(RHO, RHO), _diagonal(RHO, VEL), _diagonal(VEL, VEL)
+_MIXED_MIRROR = _diagonal(VEL, RHO)
+
+
+def sigma3(sigma: Array) -> float:
+    """The dependent inertia ratio, -(s1 + s2) / (1 + s1 s2) (eq:sigma_constraint)."""
+    s1, s2 = float(sigma[0]), float(sigma[1])
+    return -(s1 + s2) / (1.0 + s1 * s2)
+
+
+def sigma_join(sigma: Array) -> Array:
+    """(3, 2) Jacobian of (s1, s2, s3) with respect to (s1, s2)."""
+    s1, s2 = float(sigma[0]), float(sigma[1])
+    d = (1.0 + s1 * s2) ** 2
+    return np.array([[1.0, 0.0], [0.0, 1.0], [(s2 * s2 - 1.0) / d, (s1 * s1 - 1.0) / d]])
+
+
+def disturbance(sigma: Array) -> Triple:
+    """Diagonal of B(sigma) = tr I / (Ixx, Iyy, Izz), as printed."""
+    s1, s2 = float(sigma[0]), float(sigma[1])
+    return (
+        1.0 + (2.0 + s1 * s2 + s1) / (1.0 - s2),
+        1.0 + (2.0 + s1 * s2 - s2) / (1.0 + s1),
+        1.0 + (2.0 + s1 - s2) / (1.0 + s1 * s2),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flow:
+    """The rotational part of a step.
+
+    Attributes:
+        w: (3,) rate at the end, in {B} [rad/s].  q: (4,) attitude of {B} at the end relative to {B} at the start.
+        S: (6, 9) derivative of (dq_v, w) at the end with respect to (dq_v, w, s1, s2, s3) at the start.
+        Q: (6, 6) covariance that the disturbance torque adds to (dq_v, w).
+    """
+
+    w: Array
+    q: Array
+    S: Array
+    Q: Array
+
+
+def flow(w: Array, sigma: Array, h: float, torque: float = 0.0) -> Flow:
+    """Rotation over h seconds (either sign) from rate ``w`` (3,); ``torque``: root density of eps_tau [rad/s^1.5].
+
+    Raises:
+        ValueError: a rate or time that is not finite, or a step of more than a million radians.
+    """
+    q, w, S, Q = _motion.follow(IDENTITY_QUAT, w, ratios(sigma), torque_density(sigma, torque), np.array((h,)))
+    return Flow(w[0], q[0], S[0], Q[0])
+
+
+def ratios(sigma: Array) -> Triple:
+    """(s1, s2, s3) from the two that are states."""
+    return float(sigma[0]), float(sigma[1]), sigma3(sigma)
+
+
+def torque_density(sigma: Array, torque: float) -> Triple:
+    """Variance that the disturbance torque adds to the rate per second [rad2/s3]: the diagonal of torque^2 B B'."""
+    if torque == 0.0:
+        return 0.0, 0.0, 0.0
+    x, y, z = disturbance(sigma)
+    return (torque * x) ** 2, (torque * y) ** 2, (torque * z) ** 2
+
+
+def transition(step: Flow, sigma: Array, h: float) -> Array:
+    """State transition matrix Phi (20, 20) of a step of h seconds from a state with ``sigma``."""
+    Phi = _I20.copy()
+    Phi[:6, :6] = step.S[:, :6]
+    Phi[:6, SIGMA] = step.S[:, 6:] @ sigma_join(sigma)
+    Phi.reshape(-1)[_MIXED] = h
+    return Phi
+
+
+def process_noise(step: Flow, h: float, force: float) -> Array:
+    """Process noise Q_d (20, 20) of a step; ``force`` is the root density of eps_f [m/s^1.5]."""
+    Q = np.zeros((DIM, DIM))
+    Q[:6, :6] = step.Q
+    density, h = force * force, abs(h)
+    entries = Q.reshape(-1)
+    entries[_POSITION] = density * h**3 / 3.0
+    entries[_MIXED] = entries[_MIXED_MIRROR] = density * h**2 / 2.0
+    entries[_VELOCITY] = density * h
+    return Q
+
+
+def advance(x: State, step: Flow, h: float) -> State:
+    """The state after a step of h seconds."""
+    q_ab = np.array(hamilton(x.q_ab.tolist(), step.q.tolist()))
+    return State(q_ab, step.w, x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+
+
+def propagate_state(x: State, h: float) -> tuple[State, Array]:
+    """The state h seconds later (either sign) without disturbance, and Phi (20, 20) of the step."""
+    step = flow(x.w_b, x.sigma, h)
+    return advance(x, step, h), transition(step, x.sigma, h)
+
+
+def propagate(belief: Belief, t_ns: int, torque: float, force: float) -> tuple[Belief, Array]:
+    """Belief at t_ns and Phi of the step (eq:state-prop, eq:cov-prop). A step back in time adds no noise.
+
+    Raises:
+        UsageError: the step turns the target by more than ``MOST_RAD``.
+    """
+    h = (t_ns - belief.t_ns) * 1e-9
+    x = belief.x
+    if abs(h) * max(map(abs, x.w_b.tolist())) > MOST_RAD:
+        what = f"a scan comes {h:.4g} s after the one before, too far to predict its pose"
+        raise UsageError(what, where=f"stamp {t_ns}", hint="leave out what is beyond the gap with --start or --end")
+    step = flow(x.w_b, x.sigma, h, torque)
+    Phi = transition(step, x.sigma, h)
+    P = Phi @ belief.P @ Phi.T
+    if h > 0.0:
+        P += process_noise(step, h, force)
+    return Belief(t_ns, advance(x, step, h), 0.5 * (P + P.T)), Phi
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RotationHistory:
+    """Rotation at n instants from one initial state.
+
+    Attributes:
+        q: (n, 4) attitude q_ab.  w: (n, 3) rate in {B} [rad/s].
+        S: (n, 6, 8) derivative of (dq_v, w) at each instant with respect to (dq_v, w, sigma) at the start.
+    """
+
+    q: Array
+    w: Array
+    S: Array
+
+
+def rotation_history(x: State, times_s: Array) -> RotationHistory:
+    """Rotation from ``x`` at 0 to each of ``times_s`` (n,) [s], of either sign; each is reached from the one before."""
+    times = np.asarray(times_s, dtype=np.float64)
+    q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), _NO_TORQUE, times)
+    return RotationHistory(q, w, np.concatenate([S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)], axis=2))
+
+
+def rotation_path(x: State) -> _motion.Path:
+    """Rotation from ``x`` at arbitrary instants; intermediate states are kept, so repeated queries are cheap.
+
+    Returns:
+        An object whose ``at(times_s)`` (n,) [s] gives attitude q_ab (n, 4) and rate in {B} (n, 3) [rad/s]. It raises
+        ValueError for a time that is not finite or more than a million radians away.
+    """
+    return _motion.Path(x.q_ab, x.w_b, ratios(x.sigma))
+
+
+def grasp_trajectory(x: State) -> Trajectory:
+    """Times (n,) >= 0 [s after now] -> positions and velocities (n, 3) of the grasp point in {A}, undisturbed."""
+    path, arm = rotation_path(x), geometry.skew(x.c_b)  # w x c = w' [c x]
+
+    def at(times: Array) -> tuple[Array, Array]:
+        times = np.asarray(times, dtype=np.float64)
+        if times.size and not (float(times.min()) >= 0.0 and float(times.max()) < np.inf):
+            raise ValueError("times must be finite and not before now")
+        q, w = path.at(times)
+        A = geometry.matrix(q)
+        position = x.r_a + times[:, None] * x.v_a + A @ x.c_b
+        velocity = x.v_a + (A @ (w @ arm)[:, :, None])[:, :, 0]
+        return position, velocity
+
+    return at
+
+
+def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) -> Forecast:
+    """Predicted 1 sigma of the grasp point at ``times_s`` (n,) >= 0, ascending [s after now] (section 8).
+
+    The values are infinite where the target would turn by more than ``MOST_RAD``.
+
+    Raises:
+        ValueError: times that do not ascend from 0.
+    """
+    times = np.asarray(times_s, dtype=np.float64)
+    if times.ndim != 1 or np.any(times[:1] < 0.0) or np.any(times[1:] < times[:-1]):
+        raise ValueError("times must ascend from 0")
+    x = belief.x
+    if float(np.abs(x.w_b).max()) * float(times.max(initial=0.0)) > MOST_RAD:
+        return Forecast(times, *np.full((3, len(times)), np.inf))
+    _, w, S, Q = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), torque_density(x.sigma, torque), times)
+    A_ab = rotation(x.q_ab) @ np.swapaxes(S[:, :3, :3], 1, 2)  # the attitude block of S is A(q_rel)'
+    J = grasp_jacobian(A_ab, w, x.c_b)
+    rotational = J[:, :, :6]
+    J_Phi = J.copy()
+    J_Phi[:, :, :6] = rotational @ S[:, :, :6]
+    J_Phi[:, :, SIGMA] = rotational @ (S[:, :, 6:] @ sigma_join(x.sigma))
+    J_Phi[:, :, VEL] += times[:, None, None] * J[:, :, RHO]
+    rows = np.sum((J_Phi @ belief.P) * J_Phi, axis=2) + np.sum((rotational @ Q) * rotational, axis=2)
+    variances = rows.reshape(-1, 3, 3).sum(axis=2)
+    variances[:, 0] += 3.0 * force**2 * times**3 / 3.0
+    variances[:, 1] += 3.0 * force**2 * times
+    position, velocity, half_angle = np.sqrt(np.maximum(variances, 0.0)).T
+    return Forecast(times, position, velocity, 2.0 * half_angle)
+
+
+def grasp_jacobian(A_ab: Array, w_b: Array, c_b: Array) -> Array:
+    """Jacobian (n, 9, 20) of the grasp point's position [m], velocity [m/s] and half-angle attitude (section 8).
+
+    Args:
+        A_ab: (n, 3, 3) attitudes.
+        w_b: (n, 3) rates [rad/s].
+        c_b: (3,) the fixture in {B} [m].
+    """
+    turning, arm = skew(w_b), skew(c_b)
+    J = np.zeros((len(A_ab), 9, DIM))
+    J[:, :3, VARRHO] = A_ab
+    J[:, 3:6, VARRHO] = A_ab @ turning
+    J[:, 3:6, W] = -A_ab @ arm
+    J[:, :3, DQ] = 2.0 * J[:, 3:6, W]
+    J[:, 3:6, DQ] = -2.0 * A_ab @ skew(turning @ c_b)
+    J[:, :3, RHO] = J[:, 3:6, VEL] = J[:, 6:, DQ] = J[:, 6:, DMU] = _I3
+    return J

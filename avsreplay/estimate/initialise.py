@@ -1,0 +1,220 @@
+"""Start without a belief: rate from the first poses, then a batch fit over all of them.
+
+The first belief has zero sigma and varrho, and mu is the identity. Its covariance is that of one linearised fit: the
+prior's information plus H' R^-1 H of each pose propagated back along the motion, so that rate, velocity and their
+correlations with the unknown parameters agree with the poses.
+
+The fit is repeated each time the poses have grown by a stated share (``refit`` decides when). It is final once its
+likelihood is Gaussian (``batch_covariance`` finds no non-Gaussian direction) and every direction is determined by the
+poses rather than by the prior: the filter may then start from its mean and covariance. A body with an unobservable
+direction stays with the fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, cost, fit
+from avsreplay.estimate.batch_covariance import BatchCovariance, belief_at, covariance_of, process_noise_pass
+from avsreplay.estimate.chart import Chart, to_chart
+from avsreplay.estimate.dynamics import propagate_state
+from avsreplay.estimate.error_state import DIM, boxplus, hamilton
+from avsreplay.estimate.measurement import in_camera, measurement_jacobian
+from avsreplay.estimate.noise import BOUND
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Belief, State
+
+_PAIR_RAD = 0.7
+_DRAWS, _EDGE = 500, 0.99
+_DETERMINED = 0.5  # of the prior's sigma: a direction with a larger posterior sigma is determined by the prior
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseFix:
+    """A healthy pose T_ac at an instant.
+
+    Attributes:
+        C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
+        lag_ns: the instant relative to that of its scan: a scan of finite duration shows the pose at its middle.
+        correlated_share: the part of C that neighbouring poses have in common.
+    """
+
+    t_ns: int
+    T_ac: Pose
+    C: Array
+    lag_ns: int = 0
+    correlated_share: float = 0.0
+
+    @property
+    def scan_ns(self) -> int:
+        """Instant of its scan."""
+        return self.t_ns - self.lag_ns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BatchResult:
+    """The last batch fit: its values at the epoch (the first pose) and the resulting belief.
+
+    Attributes:
+        epoch_ns: instant of the first pose.  chart: values there, where the next fit starts.  count: poses.
+        factors, inflation: (2,) noise factors and correlation inflation, of attitude and position.
+        belief: at the last pose.  gaussian: the filter may start from it.
+        prior_rejected: the poses contradict the given start, and it was left out.
+    """
+
+    epoch_ns: int
+    chart: Chart
+    count: int
+    factors: Array
+    inflation: Array
+    belief: Belief
+    gaussian: bool
+    prior_rejected: bool = False
+
+
+def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
+    """A body at rest at a guessed pose, with the start's wide standard deviations."""
+    return Belief(t_ns, _at_pose(T_ac, np.zeros(3), np.zeros(3)), np.diag(params.start_1s**2))
+
+
+def first_belief(fixes: tuple[PoseFix, ...], params: EstimatorParams) -> Belief:
+    """The belief at the last pose's scan: rate and velocity from all poses, at rest from a single one."""
+    last = fixes[-1]
+    x, _ = propagate_state(_at_pose(last.T_ac, *mean_rates(fixes)), -last.lag_ns * 1e-9)
+    info = np.diag(params.start_1s**-2.0)
+    for fix in fixes:
+        h = (fix.t_ns - last.scan_ns) * 1e-9
+        then, Phi = propagate_state(x, h)
+        H = measurement_jacobian(then) @ Phi
+        info += H.T @ np.linalg.solve(in_camera(fix.C, fix.T_ac.q, x.q_bc), H)
+    P = np.linalg.inv(info)
+    return Belief(last.scan_ns, x, 0.5 * (P + P.T))
+
+
+def mean_rates(fixes: tuple[PoseFix, ...]) -> tuple[Array, Array]:
+    """Mean rate in {C} [rad/s] and velocity in {A} [m/s] over the poses; zero for one pose or no time between them."""
+    h = (fixes[-1].t_ns - fixes[0].t_ns) * 1e-9
+    if h <= 0.0:
+        return np.zeros(3), np.zeros(3)
+    turns = [geometry.log(np.array(hamilton(geometry.conjugate(a.T_ac.q), b.T_ac.q))) for a, b in pairwise(fixes)]
+    return np.sum(turns, axis=0) / h, (fixes[-1].T_ac.t - fixes[0].T_ac.t) / h
+
+
+def _at_pose(T_ac: Pose, w: Array, v: Array) -> State:
+    return State(T_ac.q, w, T_ac.t, v, np.zeros(2), np.zeros(3), geometry.IDENTITY_QUAT)
+
+
+def poses_of(fixes: tuple[PoseFix, ...]) -> Poses:
+    """The fixes as input of the fit, times from the first."""
+    t0 = fixes[0].t_ns
+    return Poses(
+        np.array([(f.t_ns - t0) * 1e-9 for f in fixes]),
+        np.array([f.T_ac.q for f in fixes]),
+        np.array([f.T_ac.t for f in fixes]),
+        np.array([f.C for f in fixes]),
+    )
+
+
+def weak_prior(poses: Poses, params: EstimatorParams) -> Prior:
+    """The prior of a cold start: a sphere at rest at the first pose, centred at its fixture, everything wide."""
+    mean = Chart(poses.q[0], np.zeros(3), poses.t[0], np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.eye(3))
+    arm = params.length("start_varrho_1s_m")
+    speed = params.length("start_vel_1s_mps") + params.start_rate_1s_radps * arm
+    widths = [2.0, params.start_rate_1s_radps, 4.0 * arm, speed, params.start_log_inertia_1s, arm]
+    return Prior(mean, np.diag(np.repeat(widths, [3, 3, 3, 3, 5, 3]) ** 2))
+
+
+def given_prior(belief: Belief) -> Prior:
+    """A given belief in chart coordinates, by Monte Carlo.
+
+    The Jacobian would not do: where two moments are nearly equal, the effect of the axes mu on the inertia depends on
+    how far the moments differ, which the linearisation does not contain.
+    """
+    mean, root = to_chart(belief.x), np.linalg.cholesky(belief.P)
+    draws = np.random.Generator(np.random.PCG64(0)).standard_normal((_DRAWS, DIM)) @ root.T
+    y = np.array([to_chart(_bounded(boxplus(belief.x, d))).minus(mean) for d in np.concatenate([draws, -draws])])
+    return Prior(mean, y.T @ y / len(y))
+
+
+def _bounded(x: State) -> State:
+    return replace(x, sigma=np.clip(x.sigma, -_EDGE, _EDGE))
+
+
+def rough_state(fixes: tuple[PoseFix, ...]) -> State:
+    """A sphere that spins about its fixture at the poses' median rate, which single outliers do not affect.
+
+    Neighbouring poses give a coarse rate; pairs about 0.7 rad of rotation apart then give a finer one.
+    """
+    coarse = _median_rates(fixes, 1)[0]
+    step = (fixes[-1].t_ns - fixes[0].t_ns) * 1e-9 / max(1, len(fixes) - 1)
+    angle = float(np.linalg.norm(coarse)) * step
+    apart = int(np.clip(_PAIR_RAD / max(angle, 1e-3), 1, max(1, len(fixes) // 2)))
+    w, v = _median_rates(fixes[: 3 * apart], apart)
+    return _at_pose(fixes[0].T_ac, w, v)
+
+
+def _median_rates(fixes: tuple[PoseFix, ...], apart: int) -> tuple[Array, Array]:
+    """Rate in {C} and velocity in {A}: medians over pairs of poses ``apart``."""
+    found = [mean_rates((a, b)) for a, b in zip(fixes, fixes[apart:], strict=False)]
+    return np.median([w for w, _ in found], axis=0), np.median([v for _, v in found], axis=0)
+
+
+def batch_estimate(
+    fixes: tuple[PoseFix, ...],
+    params: EstimatorParams,
+    rules: FitParams,
+    last: BatchResult | None = None,
+    start: Chart | None = None,
+    given: Prior | None = None,
+) -> BatchResult:
+    """Fit all poses, from ``start`` or the values of the last fit; ``given`` is the prior at the first pose.
+
+    The given prior is left out once the poses contradict it.
+    """
+    poses = poses_of(fixes)
+    prior = weak = weak_prior(poses, params)
+    if start is None:
+        start = to_chart(rough_state(fixes)) if last is None else last.chart
+    share = float(np.mean([f.correlated_share for f in fixes]))
+    rules = replace(rules, least_inflation=params.colour(_mean_turn(poses), share))
+    factors = None if last is None else last.factors * np.sqrt(last.inflation)
+    fitted = fit(poses, start, weak, rules, factors)
+    rejected = last is not None and last.prior_rejected
+    if given is not None and not rejected:
+        joint = fit(poses, start, given, rules, factors)
+        rejected = _contradicts(poses, fitted, weak, joint, given, rules)
+        fitted, prior = (fitted, weak) if rejected else (joint, given)
+    found = covariance_of(poses, fitted, prior, rules)
+    found = process_noise_pass(found, poses, prior, rules, params.torque_noise_radps15, params.force)
+    now_ns = fixes[-1].scan_ns
+    belief = belief_at(found, now_ns, (now_ns - fixes[0].t_ns) * 1e-9)
+    gaussian = _determined(found, weak)
+    chart = fitted.chart
+    return BatchResult(fixes[0].t_ns, chart, len(poses), fitted.factors, fitted.inflation, belief, gaussian, rejected)
+
+
+def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior, rules: FitParams) -> bool:
+    """Is the cost of the poses with the given prior too much above the cost without it, at the fitted noise?
+
+    If the given prior is right, twice the difference is at most chi-square with 20 degrees of freedom.
+    """
+    alone = cost(poses, fitted.chart, weak, rules, fitted.effective)
+    return 2.0 * (cost(poses, joint.chart, given, rules, fitted.effective) - alone) > BOUND
+
+
+def _mean_turn(poses: Poses) -> float:
+    """Mean rotation from one pose to the next [rad]."""
+    steps = geometry.multiply(geometry.conjugate(poses.q[:-1]), poses.q[1:])
+    return float(np.mean(geometry.angle(steps)))
+
+
+def _determined(found: BatchCovariance, weak: Prior) -> bool:
+    """Is the likelihood Gaussian, and every direction determined by the poses?"""
+    fitted = found.fitted
+    ratio = np.linalg.eigvalsh(fitted.P_chart / np.outer(weak.one_sigma, weak.one_sigma))[-1]
+    return found.gaussian and bool(ratio < _DETERMINED**2) and fitted.converged
