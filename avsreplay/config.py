@@ -1,6 +1,6 @@
-"""The stages' parameter classes put together: one strict TOML table each.
+"""The configuration of a run: the parameter classes of all stages, one TOML table each.
 
-Precedence: flag over environment over ``--config`` file over the log's own ``[run]`` table over default. The effective
+Precedence: option, environment variable, ``--config`` file, the log's own ``[run]`` table, default. The effective
 configuration is saved with every result.
 """
 
@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from avsreplay import settings
-from avsreplay.errors import UsageError
 from avsreplay.estimate import EstimatorParams
 from avsreplay.geometry import Pose
 from avsreplay.monitor.consistency import ConsistencyParams
@@ -22,8 +20,8 @@ from avsreplay.monitor.convergence import ConvergenceParams
 from avsreplay.monitor.faults import FaultParams
 from avsreplay.plan import PlanParams, SupervisorParams
 from avsreplay.register import RegisterParams
-
-__all__ = ["Against", "Guess", "RunConfig", "load_config", "parse_pose"]
+from avsreplay.settings import Settings, setting
+from avsreplay.toml_document import Document, build, load, override
 
 
 class Guess(Enum):
@@ -41,30 +39,42 @@ class Against(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class RunConfig:
-    """Everything that a replay may be told."""
+class RunConfig(Settings):
+    """All settings of a replay."""
 
-    # the registration's guess: the filter's prediction (closed loop) or the last healthy pose (open loop)
-    guess: Guess = Guess.PREDICTED
-    # first pose: "log" (what the log says), "truth", "auto" (acquisition), or "x,y,z,qx,qy,qz,qw" of {C} in {A}
-    init: str = "log"
-    # carry points with times of their own to the scan's instant by the predicted motion
-    deskew: bool = True
-    # search without a guess once a faulty scan finds the prediction too unsure to be one
-    reacquire: bool = True
-    # what errors are against: "truth" (the log's), or "fit" (one motion fitted to all healthy poses of a first pass)
-    reference: Against = Against.TRUTH
-    register: RegisterParams = field(default_factory=RegisterParams)
-    estimator: EstimatorParams = field(default_factory=EstimatorParams)
-    faults: FaultParams = field(default_factory=FaultParams)
-    consistency: ConsistencyParams = field(default_factory=ConsistencyParams)
-    convergence: ConvergenceParams = field(default_factory=ConvergenceParams)
-    plan: PlanParams = field(default_factory=PlanParams)
-    supervisor: SupervisorParams = field(default_factory=SupervisorParams)
-    # the fixture's outward axis in {C}: the robot comes in along it
-    fixture_axis_c: tuple[float, float, float] = (1.0, 0.0, 0.0)
+    guess: Guess = setting(
+        Guess.PREDICTED,
+        "Initial guess of registration: the filter's prediction (closed loop) or the last healthy pose (open loop).",
+    )
+    init: str = setting(
+        "log",
+        "Initial pose: from the log (log), the true pose (truth), a global search (auto), or the pose of {C} in {A}"
+        " as x,y,z,qx,qy,qz,qw.",
+    )
+    deskew: bool = setting(
+        True, "Move points that have their own times to the scan's instant, along the predicted motion."
+    )
+    reacquire: bool = setting(
+        True, "Search globally when a scan is faulty and the prediction is too uncertain to be a guess."
+    )
+    reference: Against = setting(
+        Against.TRUTH,
+        "What errors refer to: the log's true poses (truth), or one motion fitted to all healthy poses of a first"
+        " pass (fit).",
+    )
+    register: RegisterParams = setting(RegisterParams, "Registration.")
+    estimator: EstimatorParams = setting(EstimatorParams, "Estimation.")
+    faults: FaultParams = setting(FaultParams, "Fault detection.")
+    consistency: ConsistencyParams = setting(ConsistencyParams, "Consistency of the innovations.")
+    convergence: ConvergenceParams = setting(ConvergenceParams, "Convergence.")
+    plan: PlanParams = setting(PlanParams, "Planning.")
+    supervisor: SupervisorParams = setting(SupervisorParams, "Supervision.")
+    fixture_axis_c: tuple[float, float, float] = setting(
+        (1.0, 0.0, 0.0), "Unit vector of the fixture's outward axis in {C}, along which the robot approaches."
+    )
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ValueError for an initial pose that is none, or an axis that is not a unit vector."""
         if self.init not in ("log", "truth", "auto"):
             parse_pose(self.init)
         if abs(math.hypot(*self.fixture_axis_c) - 1.0) > 1e-6:
@@ -89,23 +99,19 @@ def load_config(file: Path | None, log_table: Mapping[str, Any], assignments: Se
 
     Args:
         file: TOML file, or None.
-        log_table: the log's own ``[run]`` table.
-        assignments: ``a.b=c`` from flags.
+        log_table: The log's own ``[run]`` table.
+        assignments: ``a.b=value`` from options.
 
     Raises:
-        UnreadableInput, UsageError: naming file and line, or the flag.
+        UnreadableInput: The file cannot be read.
+        UsageError: A key or value is wrong; the message names file and line, or the option.
     """
-    of_log = settings.Document("the log's [run] table", log_table)
-    settings.build(RunConfig, of_log)  # a wrong key there is the log's fault and is named so
-    of_file = settings.load(file) if file else settings.Document("configuration", {})
-    settings.build(RunConfig, of_file)
-    merged = settings.Document(of_file.name, _over(log_table, of_file.table), of_file.text)
-    try:
-        return settings.build(RunConfig, settings.override(merged, assignments))
-    except UsageError as error:
-        if not assignments:
-            raise
-        raise UsageError(error.what, where=f"among {', '.join(assignments)}", hint=error.hint) from None
+    of_log = Document("the log's [run] table", log_table)
+    build(RunConfig, of_log)
+    of_file = load(file) if file else Document("configuration", {})
+    build(RunConfig, of_file)
+    merged = Document(of_file.name, _over(log_table, of_file.table), of_file.text)
+    return build(RunConfig, override(merged, assignments))
 
 
 def _over(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:

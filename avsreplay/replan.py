@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from avsreplay import geometry, plan, settings
+from avsreplay import geometry, plan, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.dynamics import grasp_trajectory, propagate
@@ -127,7 +127,7 @@ def _check_beliefs(beliefs: Sequence[Belief], path: Path) -> None:
 
 def _table(cls: Any, config: Mapping[str, Any], name: str) -> Any:
     known = {k: v for k, v in config.get(name, {}).items() if v is not None}
-    return settings.build(cls, settings.Document("run.json", {name: known}), (name,))
+    return toml_document.build(cls, toml_document.Document("run.json", {name: known}), (name,))
 
 
 def _extent(result: Result, path: Path) -> float:

@@ -1,81 +1,197 @@
-"""Strict TOML into frozen dataclasses: unknown keys and wrong types are errors with file and line.
+"""Settings, each declared once: default, unit, range, scaling with the target's extent, and meaning.
 
-Parameters are dataclasses that live beside their algorithm; this is the one door through which text becomes
-such an object, for configuration, scenarios and campaigns alike.
+A parameter class is a frozen dataclass that derives from ``Settings`` and declares each field with ``setting``. The
+validation, the values taken from the target's extent, the help texts, the printed configuration and docs/settings.md
+are derived from these declarations. ``toml_document`` reads such a class from TOML and writes it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import enum
-import re
-import tomllib
+import math
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self
 
-from avsreplay.errors import UnreadableInput, UsageError
 
-__all__ = ["Document", "build", "dump", "load", "override", "parse"]
+@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """The declaration of one setting.
 
-T = TypeVar("T")
-_Path = tuple[str | int, ...]
-MAX_BYTES = 1 << 20
-_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
-_KEY = re.compile(r"^\s*([A-Za-z0-9_\-.\"']+)\s*=")
+    Attributes:
+        doc: Its meaning, one sentence.
+        unit: Its unit, "" without one.
+        above: Lower bound that is not allowed itself.
+        low: Lower bound that is allowed.
+        below: Upper bound that is not allowed itself.
+        high: Upper bound that is allowed.
+        infinite: Whether infinite values are allowed.
+        of_extent: Where the setting is not given: its value as a fraction of the target's extent.
+        unset: Where the setting is not given and does not scale with the extent: what applies instead.
+    """
+
+    doc: str
+    unit: str = ""
+    above: float | None = None
+    low: float | None = None
+    below: float | None = None
+    high: float | None = None
+    infinite: bool = False
+    of_extent: float | None = None
+    unset: str = ""
+
+    @property
+    def range(self) -> str:
+        """The range in words, "" without bounds."""
+        lower = (
+            f"above {self.above:g}"
+            if self.above is not None
+            else f"at least {self.low:g}"
+            if self.low is not None
+            else ""
+        )
+        upper = (
+            f"below {self.below:g}"
+            if self.below is not None
+            else f"at most {self.high:g}"
+            if self.high is not None
+            else ""
+        )
+        return " and ".join(part for part in (lower, upper) if part)
+
+    @property
+    def automatic(self) -> str:
+        """What applies where the setting is not given, "" where it always has a value."""
+        per_second = " per second" if self.unit == "m/s" else ""
+        return self.unset if self.of_extent is None else f"{self.of_extent:g} of the target's extent{per_second}"
+
+    def check(self, name: str, value: Any) -> None:
+        """Raise SettingError where a number, or one of a tuple of numbers, is outside the range."""
+        several = isinstance(value, tuple)
+        for number in value if several else (value,):
+            if isinstance(number, (int, float)) and not isinstance(number, bool) and not self._allows(number):
+                unit = f" [{self.unit}]" if self.unit else ""
+                each = "each value " if several else ""
+                shown = list(value) if several else value
+                raise SettingError(name, f"{name} is {shown}, {each}must be {self.range or 'finite'}{unit}")
+
+    def _allows(self, number: float) -> bool:
+        inside = (
+            (self.above is None or number > self.above)
+            and (self.low is None or number >= self.low)
+            and (self.below is None or number < self.below)
+            and (self.high is None or number <= self.high)
+        )
+        return inside and (
+            isinstance(number, int) or math.isfinite(number) or (self.infinite and not math.isnan(number))
+        )
+
+
+class SettingError(ValueError):
+    """A value outside its declared range; ``name`` is the field."""
+
+    def __init__(self, name: str, message: str) -> None:
+        super().__init__(message)
+        self.name = name
+
+
+def setting(default: Any = dataclasses.MISSING, doc: str = "", **declared: Any) -> Any:
+    """A field of a ``Settings`` class.
+
+    Args:
+        default: Default value; a class (a nested table, ``dict`` or ``list``) is called for each object. A field
+            without one must be given.
+        doc: Its meaning, one plain sentence.
+        **declared: The other attributes of ``Setting``.
+    """
+    metadata = {"setting": Setting(doc=doc, **declared)}
+    if isinstance(default, type) and not issubclass(default, enum.Enum):
+        return dataclasses.field(default_factory=default, metadata=metadata)
+    return dataclasses.field(default=default, metadata=metadata)
+
+
+class Settings:
+    """Base of every parameter class. Creating one checks every range; it raises ValueError naming the field."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        for each in dataclasses.fields(self):  # type: ignore[arg-type]
+            declared_of(each).check(each.name, getattr(self, each.name))
+        self.check()
+
+    def check(self) -> None:
+        """Raise ValueError where values do not fit together; a class with such conditions overrides this."""
+
+    def resolved(self, extent_m: float) -> Self:
+        """The same with every setting that scales with the target filled in.
+
+        Args:
+            extent_m: The target's extent, the diagonal of its bounding box [m].
+
+        Raises:
+            ValueError: The extent is not positive and finite.
+        """
+        if not 0.0 < extent_m < math.inf:
+            raise ValueError(f"extent_m is {extent_m}, must be positive and finite")
+        filled = {}
+        for each in dataclasses.fields(self):  # type: ignore[arg-type]
+            fraction = declared_of(each).of_extent
+            if fraction is not None and getattr(self, each.name) is None:
+                filled[each.name] = fraction * extent_m
+        return dataclasses.replace(self, **filled)  # type: ignore[type-var]
+
+
+def declared_of(field: dataclasses.Field[Any]) -> Setting:
+    """The declaration of a field (an empty one where it was not declared with ``setting``)."""
+    found: Setting = field.metadata.get("setting", Setting(doc=""))
+    return found
+
+
+def given(value: float | None) -> float:
+    """A value that ``resolved`` has filled in. Raises ValueError where it has not."""
+    if value is None:
+        raise ValueError("a setting that scales with the target has no value yet: call resolved(extent_m) first")
+    return value
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Document:
-    """A parsed TOML text that can say on which line a key stands."""
+class Entry:
+    """One setting of a tree of tables: full dotted key, declaration, type and default (MISSING: must be given)."""
 
-    name: str
-    table: Mapping[str, Any]
-    text: str = ""
+    key: str
+    declared: Setting
+    hint: Any
+    default: Any
 
-    def where(self, path: Sequence[str | int]) -> str:
-        """``name:line`` of the key at ``path`` (array-of-tables entries by index), ``name`` if it has no line."""
-        line = _line_of(self.text, path)
-        return f"{self.name}:{line}" if line else self.name
-
-
-def load(path: str | Path) -> Document:
-    """Read a TOML file. Raises UnreadableInput where it cannot be read, UsageError where it is not TOML."""
-    path = Path(path)
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise UnreadableInput("larger than 1 MiB, not a settings file", where=str(path), hint="name a TOML file")
-        text = path.read_bytes().decode("utf-8")
-    except FileNotFoundError:
-        raise UnreadableInput("no such file", where=str(path), hint="check the path") from None
-    except UnicodeDecodeError:
-        raise UnreadableInput("not UTF-8 text", where=str(path), hint="name a TOML file") from None
-    except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be read", where=str(path), hint="check the path") from None
-    return parse(text, str(path))
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The values of an enumeration, () of anything else."""
+        kind = _inner(self.hint)
+        return tuple(m.value for m in kind) if isinstance(kind, type) and issubclass(kind, enum.Enum) else ()
 
 
-def parse(text: str, name: str) -> Document:
-    """Parse TOML text; ``name`` is what errors call it."""
-    try:
-        return Document(name, tomllib.loads(text), text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        message = str(error) or "nested too deeply"
-        raise UsageError(f"not valid TOML: {message}", where=name, hint="mend the syntax") from None
+def entries(cls: Any, prefix: str = "") -> Iterator[Entry]:
+    """Every setting of a class and of the tables inside it, in order of declaration."""
+    hints = typing.get_type_hints(cls)
+    for each in dataclasses.fields(cls):
+        key, inner = f"{prefix}{each.name}", _inner(hints[each.name])
+        if dataclasses.is_dataclass(inner):
+            yield from entries(inner, f"{key}.")
+        else:
+            default = each.default if each.default_factory is dataclasses.MISSING else each.default_factory()
+            yield Entry(key, declared_of(each), hints[each.name], default)
 
 
-def build(cls: type[T], document: Document, path: Sequence[str | int] = ()) -> T:
-    """The dataclass ``cls`` from the table at ``path`` (an absent table gives the defaults).
-
-    Raises UsageError for an unknown key, a missing one, a wrong type or a value the class refuses (ValueError).
-    """
-    table: Any = document.table
-    for part in path:
-        table = table[part] if isinstance(part, int) else table.get(part, {})
-    return typing.cast(T, _build(cls, table, document, tuple(path)))
+def _inner(hint: Any) -> Any:
+    """The type inside an optional one, or inside a tuple of any length."""
+    args = typing.get_args(hint)
+    if typing.get_origin(hint) in (typing.Union, types.UnionType):
+        return _inner(next(a for a in args if a is not type(None)))
+    return args[0] if typing.get_origin(hint) is tuple and args[1:] == (Ellipsis,) else hint
 
 
 def dump(value: Any) -> Any:
@@ -89,125 +205,3 @@ def dump(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [dump(v) for v in value]
     return str(value) if isinstance(value, Path) else value
-
-
-def override(document: Document, assignments: Sequence[str]) -> Document:
-    """``a.b=c`` assignments over a document; the value is TOML, or a bare word taken as a string."""
-    table = _deep_copy(document.table)
-    for assignment in assignments:
-        key, sep, raw = assignment.partition("=")
-        if not sep or not key.strip():
-            raise UsageError(
-                f"'{assignment}' is not of the form a.b=value", where="--set", hint="for example --set horn.r_max_m=0.2"
-            )
-        try:
-            value = tomllib.loads(f"v = {raw}")["v"]
-        except tomllib.TOMLDecodeError:
-            value = raw.strip()
-        *parents, leaf = key.strip().split(".")
-        node = table
-        for parent in parents:
-            node = node.setdefault(parent, {})
-            if not isinstance(node, dict):
-                raise UsageError(f"'{parent}' is not a table", where=f"--set {assignment}", hint="check the key")
-        node[leaf] = value
-    return Document(document.name if document.text else "--set", table, document.text)
-
-
-def _deep_copy(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {k: _deep_copy(v) for k, v in value.items()}
-    return [_deep_copy(v) for v in value] if isinstance(value, list) else value
-
-
-def _build(cls: Any, table: Any, document: Document, path: _Path) -> Any:
-    if not isinstance(table, Mapping):
-        raise UsageError(f"'{_dotted(path)}' must be a table", where=document.where(path), hint="write it as [table]")
-    hints = typing.get_type_hints(cls)
-    known = {f.name: f for f in dataclasses.fields(cls) if f.init}
-    for key in table:
-        if key not in known:
-            close = difflib.get_close_matches(key, known, 1)
-            hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(known)}"
-            raise UsageError(f"unknown key '{_dotted((*path, key))}'", where=document.where((*path, key)), hint=hint)
-    missing = [n for n, f in known.items() if n not in table and f.default is f.default_factory is dataclasses.MISSING]
-    if missing:
-        raise UsageError(f"missing key '{_dotted((*path, missing[0]))}'", where=document.where(path), hint="add it")
-    values = {key: _coerce(hints[key], value, document, (*path, key)) for key, value in table.items()}
-    try:
-        return cls(**values)
-    except ValueError as error:
-        raise UsageError(str(error), where=document.where(path), hint="correct the value") from None
-
-
-def _coerce(hint: Any, value: Any, document: Document, path: _Path) -> Any:
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin in (typing.Union, types.UnionType):
-        if value is None:
-            return None
-        return _coerce(next(a for a in args if a is not type(None)), value, document, path)
-    if dataclasses.is_dataclass(hint):
-        return _build(hint, value, document, path)
-    if origin is tuple and isinstance(value, list):
-        return _coerce_tuple(args, value, document, path)
-    if isinstance(hint, type) and issubclass(hint, enum.Enum):
-        allowed = [m.value for m in hint]
-        if value in allowed:
-            return hint(value)
-        raise UsageError(
-            f"'{_dotted(path)}' is {value!r}",
-            where=document.where(path),
-            hint=f"one of: {', '.join(map(str, allowed))}",
-        )
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if hint is Path and isinstance(value, str):
-        return Path(value)
-    if hint is Any or (
-        isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
-    ):
-        return value
-    raise UsageError(
-        f"'{_dotted(path)}' must be {_type_name(hint)}, not {value!r}",
-        where=document.where(path),
-        hint="correct the value",
-    )
-
-
-def _coerce_tuple(args: tuple[Any, ...], value: list[Any], document: Document, path: _Path) -> tuple[Any, ...]:
-    if len(args) == 2 and args[1] is Ellipsis:
-        args = (args[0],) * len(value)
-    if len(args) != len(value):
-        wrong = f"'{_dotted(path)}' must have {len(args)} values, not {len(value)}"
-        raise UsageError(wrong, where=document.where(path), hint="correct the value")
-    return tuple(_coerce(a, v, document, (*path, i)) for i, (a, v) in enumerate(zip(args, value, strict=True)))
-
-
-def _dotted(path: Sequence[str | int]) -> str:
-    return ".".join(str(p) for p in path)
-
-
-def _type_name(hint: Any) -> str:
-    names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
-    return names.get(hint, f"a list like {hint}" if typing.get_origin(hint) is tuple else str(hint))
-
-
-def _line_of(text: str, path: Sequence[str | int]) -> int | None:
-    """The line a key stands on; falls back to the nearest parent that has one."""
-    lines: dict[tuple[str | int, ...], int] = {}
-    table: tuple[str | int, ...] = ()
-    counts: dict[tuple[str | int, ...], int] = {}
-    for number, line in enumerate(text.splitlines(), 1):
-        header, key = _HEADER.match(line), _KEY.match(line)
-        if header:
-            table = tuple(p.strip().strip("\"'") for p in header[2].split("."))
-            if header[1] == "[[":
-                counts[table] = counts.get(table, -1) + 1
-                table = (*table, counts[table])
-            lines.setdefault(table, number)
-        elif key:
-            lines.setdefault((*table, *(p.strip().strip("\"'") for p in key[1].split("."))), number)
-    for length in range(len(path), 0, -1):
-        if tuple(path[:length]) in lines:
-            return lines[tuple(path[:length])]
-    return None

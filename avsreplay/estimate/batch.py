@@ -24,6 +24,7 @@ from avsreplay.estimate.error_state import DIM, DMU, RHO, SIGMA, VARRHO, VEL
 from avsreplay.estimate.noise import integrated_autocorrelation, weigh
 from avsreplay.geometry import Array, skew
 from avsreplay.records import State
+from avsreplay.settings import Settings, setting
 
 _FEWEST_FOR_FACTORS = 12
 _LARGEST_RADPS = 0.5  # a step that changes the rate by more than this plus the rate itself is not tried
@@ -31,21 +32,23 @@ _PIN_TOL = 0.02  # half chi-square: tolerance of a fit with one direction fixed
 
 
 @dataclass(frozen=True, slots=True)
-class FitParams:
-    """Rules of the batch fit."""
+class FitParams(Settings):
+    """Settings of the batch fit."""
 
-    # largest number of Levenberg-Marquardt steps
-    max_steps: int = 40
-    # stop when a step is expected to reduce half chi-square by less than this
-    gain_tol: float = 1e-3
-    # estimate the two noise factors from the residuals
-    rescale: bool = True
-    # lower bound of the correlation inflation of the poses' noise
-    least_inflation: float = 1.0
-    # directions, weakest first, that are tested for a non-Gaussian likelihood
-    try_directions: int = 3
-    # a direction is non-Gaussian where the cost two sigma away is this many times the Gaussian one, or 1 over it
-    bend_max: float = 2.0
+    max_steps: int = setting(40, "Largest number of Levenberg-Marquardt steps.", low=1)
+    gain_tol: float = setting(
+        1e-3, "The iteration ends when a step reduces half the chi-square by less than this.", low=0.0
+    )
+    rescale: bool = setting(True, "Estimate the two noise factors from the residuals.")
+    least_inflation: float = setting(
+        1.0, "Smallest factor by which the correlation of pose errors in time inflates their covariance.", above=0.0
+    )
+    try_directions: int = setting(
+        3, "Number of directions, least observable first, in which the profile likelihood is tested.", low=0
+    )
+    bend_max: float = setting(
+        2.0, "Ratio of the cost at 2 sigma to that of a Gaussian from which a direction is non-Gaussian.", above=0.0
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
+from avsreplay.settings import Settings, setting
+
 
 class ClockChoice(Enum):
     """Which clock ``Scan.t_ns`` is on."""
@@ -16,64 +18,58 @@ class ClockChoice(Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SourceOptions:
-    """How to read a source. Every field has a default; None is "not asked for".
+class SourceOptions(Settings):
+    """How to read a source: topics, frames, the part that is replayed, and clock."""
 
-    Attributes:
-        topic: the cloud topic; None picks the only one.
-        truth_topic: PoseStamped, PoseWithCovarianceStamped, Odometry, TransformStamped; None: ``/truth/pose``.
-        truth_frame: truth is the pose of this frame by the log's /tf chain, in the cloud's (or the fixed) frame.
-        truth_file: poses beside the log (TUM, KITTI, EuRoC, Stanford ``.conf``).
-        truth_gap_s: widest gap between two truth poses that is interpolated across.
-        model: a model file, in place of the log's own.  cloud_model: it may be without faces.
-        clock: see ClockChoice.
-        start_s, end_s: window after the first scan [s), duration_s: its length, start_offset_s: the same as start_s.
-        n_scans: at most so many.  every: every n-th scan, each with its own time.
-        crop_box: keep points within (xmin, ymin, zmin, xmax, ymax, zmax) [m] of the cloud's frame.
-        crop_range: keep points whose distance from the origin lies within (min, max) [m].
-        fixed_frame: take clouds to this frame by the log's /tf chain at each scan's time.
-        sensor_topic: take clouds to the fixed frame by this topic's pose of the sensor at each scan's time.
-        rate_hz: scans a second of a folder.  strict: any loss is an error (exit 3).
-        max_message_mib: largest message, chunk or attachment read.
-    """
+    topic: str | None = setting(None, "Topic of the clouds.", unset="the only one")
+    truth_topic: str | None = setting(
+        None,
+        "Topic of the true poses: PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped.",
+        unset="/truth/pose",
+    )
+    truth_frame: str | None = setting(
+        None, "Frame whose pose, by the log's /tf tree and in the clouds' (or the fixed) frame, is the true pose."
+    )
+    truth_file: Path | None = setting(None, "File of true poses beside the log (TUM, KITTI, EuRoC, Stanford .conf).")
+    truth_gap_s: float = setting(
+        1.0, "Widest gap between two true poses that is interpolated across.", unit="s", low=0.0
+    )
+    model: Path | None = setting(None, "Model file.", unset="the log's own model")
+    cloud_model: bool = setting(False, "The model may be a point cloud without faces.")
+    clock: ClockChoice = setting(ClockChoice.HEADER, "Clock of the scans' times.")
+    start_s: float | None = setting(None, "Begin, after the first scan.", unit="s")
+    start_offset_s: float | None = setting(None, "The same as start_s.", unit="s")
+    end_s: float | None = setting(None, "End (not included), after the first scan.", unit="s", unset="the last scan")
+    duration_s: float | None = setting(None, "Length of the part that is replayed.", unit="s", unset="up to the end")
+    n_scans: int | None = setting(None, "Largest number of scans.", low=1, unset="all")
+    every: int = setting(1, "Take every n-th scan, each at its own time.", low=1)
+    crop_box: tuple[float, float, float, float, float, float] | None = setting(
+        None,
+        "Keep points within (xmin, ymin, zmin, xmax, ymax, zmax) of the cloud's frame.",
+        unit="m",
+        infinite=True,
+    )
+    crop_range: tuple[float, float] | None = setting(
+        None, "Keep points whose distance from the origin is within (min, max).", unit="m", low=0.0, infinite=True
+    )
+    fixed_frame: str | None = setting(
+        None, "Frame into which the clouds are transformed by the log's /tf tree at each scan's time."
+    )
+    sensor_topic: str | None = setting(
+        None, "Topic of the sensor's pose, with which the clouds are transformed into the fixed frame."
+    )
+    rate_hz: float = setting(1.0, "Scan rate of a folder of scans.", unit="Hz", above=0.0, high=1e6)
+    strict: bool = setting(False, "Any loss of data is an error (exit code 3).")
+    max_message_mib: int = setting(
+        128, "Largest message, chunk or attachment that is read.", unit="MiB", low=1, high=4096
+    )
 
-    topic: str | None = None
-    truth_topic: str | None = None
-    truth_frame: str | None = None
-    truth_file: Path | None = None
-    truth_gap_s: float = 1.0
-    model: Path | None = None
-    cloud_model: bool = False
-    clock: ClockChoice = ClockChoice.HEADER
-    start_s: float | None = None
-    start_offset_s: float | None = None
-    end_s: float | None = None
-    duration_s: float | None = None
-    n_scans: int | None = None
-    every: int = 1
-    crop_box: tuple[float, float, float, float, float, float] | None = None
-    crop_range: tuple[float, float] | None = None
-    fixed_frame: str | None = None
-    sensor_topic: str | None = None
-    rate_hz: float = 1.0
-    strict: bool = False
-    max_message_mib: int = 128
-
-    def __post_init__(self) -> None:
-        if self.every < 1:
-            raise ValueError(f"every is {self.every}, must be 1 or more")
-        if self.n_scans is not None and self.n_scans < 1:
-            raise ValueError(f"n_scans is {self.n_scans}, must be 1 or more")
-        if not 0.0 < self.rate_hz <= 1e6:
-            raise ValueError(f"rate_hz is {self.rate_hz}, must be above 0 and at most 1e6")
-        if self.truth_gap_s < 0.0:
-            raise ValueError(f"truth_gap_s is {self.truth_gap_s}, must not be negative")
-        if not 1 <= self.max_message_mib <= 4096:
-            raise ValueError(f"max_message_mib is {self.max_message_mib}, must be 1 to 4096")
+    def check(self) -> None:
+        """Raise ValueError where a crop keeps nothing."""
         box = self.crop_box
         if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
             raise ValueError(f"crop_box {box} is empty")
-        if self.crop_range is not None and not 0.0 <= self.crop_range[0] < self.crop_range[1]:
+        if self.crop_range is not None and not self.crop_range[0] < self.crop_range[1]:
             raise ValueError(f"crop_range {self.crop_range} is empty")
 
     @property

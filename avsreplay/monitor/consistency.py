@@ -9,28 +9,33 @@ import numpy as np
 
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import BLOCKS, Innovation
+from avsreplay.settings import Settings, setting
 
 __all__ = ["Consistency", "ConsistencyParams", "ConsistencyTrack", "Verdicts", "block_nees", "mean_band"]
 
 
 @dataclass(frozen=True, slots=True)
-class ConsistencyParams:
+class ConsistencyParams(Settings):
     """The innovation test that may withdraw ``converged``."""
 
-    # healthy epochs in the window
-    window: int = 50
-    # healthy epochs before a word is said
-    least: int = 15
-    # probability of the two-sided band a right filter stays inside
-    level: float = 0.9999
-    # the mean NIS may pass its band by this factor: registration errors are not quite white
-    slack: float = 2.0
+    window: int = setting(50, "Healthy scans in the window of the test.", low=2)
+    least: int = setting(15, "Healthy scans from which the test is made.", low=2)
+    level: float = setting(
+        0.9999,
+        "Probability of the two-sided band in which the mean NIS of a correct filter lies.",
+        above=0.0,
+        below=1.0,
+    )
+    slack: float = setting(
+        2.0,
+        "Factor by which the mean NIS may exceed the band, because registration errors are not quite white.",
+        low=1.0,
+    )
 
-    def __post_init__(self) -> None:
-        if not 2 <= self.least <= self.window:
-            raise ValueError(f"least is {self.least}, window is {self.window}: 2 <= least <= window")
-        if not 0.0 < self.level < 1.0 or not self.slack >= 1.0:
-            raise ValueError(f"level is {self.level} (in (0, 1)), slack is {self.slack} (1 at least)")
+    def check(self) -> None:
+        """Raise ValueError where the test needs more scans than its window holds."""
+        if self.least > self.window:
+            raise ValueError(f"least is {self.least}, must not exceed window = {self.window}")
 
 
 def mean_band(dof: int, count: int, level: float) -> tuple[float, float]:

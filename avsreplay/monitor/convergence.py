@@ -9,14 +9,14 @@ innovations are consistent.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
-from typing import Any
 
 import numpy as np
 
 from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, Belief, Forecast
+from avsreplay.settings import Settings, given, setting
 
 __all__ = ["Convergence", "ConvergenceParams", "ConvergenceTrack", "Criterion", "block_1s"]
 
@@ -29,56 +29,37 @@ class Criterion(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class ConvergenceParams:
-    """Limits on 1 sigma, each the root of the block's trace, and how long they must hold."""
+class ConvergenceParams(Settings):
+    """Limits on the 1 sigma of each block (root of its trace), and how long they must hold."""
 
-    # which test decides
-    criterion: Criterion = Criterion.PREDICTIVE
-    # how long the test must hold without a break [s]
-    dwell_s: float = 2.0
-    # predictive: how far ahead the grasp point is predicted [s]
-    horizon_s: float = 30.0
-    # predictive: instants over the horizon
-    horizon_steps: int = 6
-    # predictive: position of the grasp point [m]; auto: 0.01 of the extent
-    grasp_pos_m: float | None = None
-    # predictive: its velocity [m/s]; auto: 0.002 of the extent per second
-    grasp_vel_mps: float | None = None
-    # predictive: its attitude [deg]
-    grasp_rot_deg: float = 3.0
-    # covariance: attitude of {B} [deg]
-    attitude_deg: float = 3.0
-    # covariance: angular rate [rad/s]
-    rate_radps: float = 0.003
-    # covariance: centre of mass [m]; auto: 0.01 of the extent
-    position_m: float | None = None
-    # covariance: its velocity [m/s]; auto: 0.001 of the extent per second
-    velocity_mps: float | None = None
-    # covariance: the two inertia ratios
-    sigma: float = 0.05
-    # covariance: fixture in {B} [m]; auto: 0.01 of the extent
-    varrho_m: float | None = None
-    # covariance: misalignment of the fixture [deg]
-    mu_deg: float = 3.0
-
-    def __post_init__(self) -> None:
-        for name in self.__dataclass_fields__:
-            value = getattr(self, name)
-            if isinstance(value, (int, float)) and not 0.0 <= value < math.inf:
-                raise ValueError(f"{name} is {value}, must be finite and not negative")
-        if self.horizon_steps < 1:
-            raise ValueError(f"horizon_steps is {self.horizon_steps}, must be 1 at least")
-
-    def resolved(self, extent_m: float) -> ConvergenceParams:
-        """The same with every auto value filled in from the target's extent [m]."""
-        if not 0.0 < extent_m < math.inf:
-            raise ValueError(f"extent_m is {extent_m}, must be positive and finite")
-        fractions = {"grasp_pos_m": 0.01, "grasp_vel_mps": 0.002, "position_m": 0.01, "velocity_mps": 0.001}
-        fractions["varrho_m"] = 0.01
-        filled: dict[str, Any] = {
-            k: f * extent_m if getattr(self, k) is None else getattr(self, k) for k, f in fractions.items()
-        }
-        return replace(self, **filled)
+    criterion: Criterion = setting(
+        Criterion.PREDICTIVE,
+        "Test that decides: the covariance of every block, as in the paper (covariance), or the predicted 1 sigma of"
+        " the grasp point over the horizon (predictive).",
+    )
+    dwell_s: float = setting(2.0, "Time for which the test must hold without interruption.", unit="s", low=0.0)
+    horizon_s: float = setting(30.0, "predictive: How far ahead the grasp point is predicted.", unit="s", low=0.0)
+    horizon_steps: int = setting(6, "predictive: Number of instants over the horizon.", low=1)
+    grasp_pos_m: float | None = setting(
+        None, "predictive: Limit on the grasp point's position.", unit="m", low=0.0, of_extent=0.01
+    )
+    grasp_vel_mps: float | None = setting(
+        None, "predictive: Limit on the grasp point's velocity.", unit="m/s", low=0.0, of_extent=0.002
+    )
+    grasp_rot_deg: float = setting(3.0, "predictive: Limit on the grasp point's attitude.", unit="deg", low=0.0)
+    attitude_deg: float = setting(3.0, "covariance: Limit on the attitude of {B}.", unit="deg", low=0.0)
+    rate_radps: float = setting(0.003, "covariance: Limit on the angular rate.", unit="rad/s", low=0.0)
+    position_m: float | None = setting(
+        None, "covariance: Limit on the position of the mass centre.", unit="m", low=0.0, of_extent=0.01
+    )
+    velocity_mps: float | None = setting(
+        None, "covariance: Limit on the velocity of the mass centre.", unit="m/s", low=0.0, of_extent=0.001
+    )
+    sigma: float = setting(0.05, "covariance: Limit on the two inertia ratios.", low=0.0)
+    varrho_m: float | None = setting(
+        None, "covariance: Limit on the fixture's position in {B}.", unit="m", low=0.0, of_extent=0.01
+    )
+    mu_deg: float = setting(3.0, "covariance: Limit on the misalignment of the fixture.", unit="deg", low=0.0)
 
     @property
     def times_s(self) -> Array:
@@ -92,18 +73,12 @@ class ConvergenceParams:
         return {
             "attitude": half * self.attitude_deg,
             "rate": self.rate_radps,
-            "position": _given(self.position_m),
-            "velocity": _given(self.velocity_mps),
+            "position": given(self.position_m),
+            "velocity": given(self.velocity_mps),
             "sigma": self.sigma,
-            "varrho": _given(self.varrho_m),
+            "varrho": given(self.varrho_m),
             "mu": half * self.mu_deg,
         }
-
-
-def _given(value: float | None) -> float:
-    if value is None:
-        raise ValueError("auto value not filled in: call resolved(extent_m) first")
-    return value
 
 
 def block_1s(P: Array) -> dict[str, float]:
@@ -163,6 +138,6 @@ class Convergence:
 
     def _predicted(self, forecast: Forecast) -> bool:
         p = self.params
-        limits = (_given(p.grasp_pos_m), _given(p.grasp_vel_mps), math.radians(p.grasp_rot_deg))
+        limits = (given(p.grasp_pos_m), given(p.grasp_vel_mps), math.radians(p.grasp_rot_deg))
         seen = (forecast.pos_1s_m, forecast.vel_1s_mps, forecast.rot_1s_rad)
         return all(bool(np.all(values <= limit)) for values, limit in zip(seen, limits, strict=True))

@@ -8,12 +8,13 @@ predicted 1 sigma of the same norm, sqrt(tr S_rho + (2 L)^2 tr S_half), so the f
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 
 from avsreplay.records import Alignment, AlignStatus, Belief, Innovation, Reason, ScanStatus, Verdict
+from avsreplay.settings import Settings, setting
 
 __all__ = ["FaultDetector", "FaultParams", "Policy", "pose_limit", "weighted_norm"]
 
@@ -26,42 +27,32 @@ class Policy(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class FaultParams:
-    """Limits of the fault rule."""
+class FaultParams(Settings):
+    """Limits of fault detection."""
 
-    # any: every test alone is a fault; all: the fit and the pose test must both fail (as printed)
-    policy: Policy = Policy.ANY
-    # fit error at and above which a scan is faulty [m]; auto: 0.01 of the extent
-    rms_max_m: float | None = None
-    # pose innovation at and above which a scan is faulty, in the weighted norm [m]; auto: 0.02 of the extent
-    alpha_max_m: float | None = None
-    # characteristic length that turns an angle into metres [m]; auto: 0.25 of the extent
-    length_m: float | None = None
-    # the pose limit is never below this many predicted 1 sigma
-    sigmas: float = 4.0
-    # inliers a scan must have
-    min_inliers: int = 50
-    # inliers over points a scan must have
-    min_inlier_ratio: float = 0.3
-
-    def __post_init__(self) -> None:
-        for name in ("rms_max_m", "alpha_max_m", "length_m", "sigmas"):
-            value = getattr(self, name)
-            if value is not None and not (0.0 < value < math.inf):
-                raise ValueError(f"{name} is {value}, must be positive and finite")
-        if self.min_inliers < 0 or not 0.0 <= self.min_inlier_ratio <= 1.0:
-            raise ValueError(f"min_inliers is {self.min_inliers}, min_inlier_ratio is {self.min_inlier_ratio}")
-
-    def resolved(self, extent_m: float) -> FaultParams:
-        """The same with every auto value filled in from the target's extent [m]."""
-        if not 0.0 < extent_m < math.inf:
-            raise ValueError(f"extent_m is {extent_m}, must be positive and finite")
-        return replace(
-            self,
-            rms_max_m=self.rms_max_m or 0.01 * extent_m,
-            alpha_max_m=self.alpha_max_m or 0.02 * extent_m,
-            length_m=self.length_m or 0.25 * extent_m,
-        )
+    policy: Policy = setting(
+        Policy.ANY,
+        "How the fit test and the pose test are joined: either one alone is a fault (any), or a fault needs both to"
+        " fail, as printed in the paper (all).",
+    )
+    rms_max_m: float | None = setting(
+        None, "Rms residual of the fit from which a scan is faulty.", unit="m", above=0.0, of_extent=0.01
+    )
+    alpha_max_m: float | None = setting(
+        None, "Pose innovation, in the weighted norm, from which a scan is faulty.", unit="m", above=0.0, of_extent=0.02
+    )
+    length_m: float | None = setting(
+        None,
+        "Characteristic length that converts an angle to a length in the weighted norm.",
+        unit="m",
+        above=0.0,
+        of_extent=0.25,
+    )
+    sigmas: float = setting(
+        4.0, "The limit on the pose innovation is never below this multiple of its predicted 1 sigma.", above=0.0
+    )
+    min_inliers: int = setting(50, "Inliers that a healthy scan needs.", low=0)
+    min_inlier_ratio: float = setting(0.3, "Ratio of inliers to points that a healthy scan needs.", low=0.0, high=1.0)
 
 
 def weighted_norm(seen: Innovation, length_m: float) -> float:

@@ -8,63 +8,56 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from avsreplay.geometry import Array
 from avsreplay.records import Trajectory
+from avsreplay.settings import Settings, setting
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """What a plan must respect besides thrust. None switches a limit off, unless its comment says auto."""
+class Limits(Settings):
+    """Constraints of a plan besides thrust; one that is not set is switched off, unless it scales with the target."""
 
-    # half-angle of the approach cone at the grasp point [deg], below 90
-    cone_deg: float | None = None
-    # the cone holds within this distance of the grasp point [m]; auto: 0.25 of the extent
-    cone_range_m: float | None = None
-    # half-angle in the last metres, along the fixture's axis [deg], below 90
-    final_deg: float | None = None
-    # how long the last metres are [m]; auto: 0.06 of the extent
-    final_range_m: float | None = None
-    # radius of both cones at the grasp point itself [m]; auto: 0.00125 of the extent
-    mouth_m: float | None = None
-    # largest speed of the robot in {A} [m/s]
-    speed_max_mps: float | None = None
-    # largest acceleration relative to the grasp point at contact [m/s2]
-    contact_accel_mps2: float | None = None
-    # radius of the sphere round the mass centre to keep out of [m]
-    keepout_m: float | None = None
-    # within this distance of the grasp point the sphere does not hold [m]; auto: 0.06 of the extent
-    keepout_release_m: float | None = None
-    # thrust intervals of a constrained plan
-    nodes: int = 100
-    # step of the search over the capture time [s]
-    scan_s: float = 0.25
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{f.name} is {value}, must be a finite number above 0")
-        for name in ("cone_deg", "final_deg"):
-            if (getattr(self, name) or 0.0) >= 90.0:
-                raise ValueError(f"{name} is {getattr(self, name)}, must be below 90")
-        if self.nodes < 8:
-            raise ValueError(f"nodes is {self.nodes}, must be at least 8")
+    cone_deg: float | None = setting(
+        None, "Half-angle of the approach cone at the grasp point.", unit="deg", above=0.0, below=90.0
+    )
+    cone_range_m: float | None = setting(
+        None, "Distance to the grasp point within which the cone holds.", unit="m", above=0.0, of_extent=0.25
+    )
+    final_deg: float | None = setting(
+        None,
+        "Half-angle of the cone along the fixture's axis in the final approach.",
+        unit="deg",
+        above=0.0,
+        below=90.0,
+    )
+    final_range_m: float | None = setting(None, "Length of the final approach.", unit="m", above=0.0, of_extent=0.06)
+    mouth_m: float | None = setting(
+        None, "Radius of both cones at the grasp point.", unit="m", above=0.0, of_extent=0.00125
+    )
+    speed_max_mps: float | None = setting(None, "Largest speed of the robot in {A}.", unit="m/s", above=0.0)
+    contact_accel_mps2: float | None = setting(
+        None, "Largest acceleration relative to the grasp point at contact.", unit="m/s2", above=0.0
+    )
+    keepout_m: float | None = setting(None, "Radius of the keep-out sphere about the mass centre.", unit="m", above=0.0)
+    keepout_release_m: float | None = setting(
+        None,
+        "Distance to the grasp point within which the keep-out sphere does not hold.",
+        unit="m",
+        above=0.0,
+        of_extent=0.06,
+    )
+    nodes: int = setting(100, "Thrust intervals of a constrained plan.", low=8)
+    scan_s: float = setting(0.25, "Step of the search over the capture time.", unit="s", above=0.0)
 
     @property
     def any(self) -> bool:
         """Is there a limit at all?"""
         named = (self.cone_deg, self.final_deg, self.speed_max_mps, self.contact_accel_mps2, self.keepout_m)
         return any(value is not None for value in named)
-
-    def resolved(self, extent_m: float) -> Limits:
-        """With every length taken from the target's extent [m] where it was left out."""
-        shares = {"cone_range_m": 0.25, "final_range_m": 0.06, "mouth_m": 0.00125, "keepout_release_m": 0.06}
-        left_out = {name: share * extent_m for name, share in shares.items() if getattr(self, name) is None}
-        return replace(self, **left_out)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

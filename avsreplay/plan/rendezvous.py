@@ -18,6 +18,7 @@ from avsreplay.geometry import Array
 from avsreplay.plan.path import CostatePath, SampledGoal, sample_goal
 from avsreplay.plan.reachable_set import Gauge, gauge
 from avsreplay.records import Plan, PlanStatus, Trajectory
+from avsreplay.settings import Settings, setting
 
 MAX_STEPS = 400
 STRETCH_S = 30.0  # the goal is sampled over this time span at once; most captures need no more
@@ -27,32 +28,29 @@ RESIDUAL_LIMIT = 1e-8  # largest terminal error of a solution, in metres and in 
 
 
 @dataclass(frozen=True, slots=True)
-class PlanParams:
-    """Parameters of the robot and of the planner."""
+class PlanParams(Settings):
+    """Capability of the robot, and how it plans."""
 
-    a_max_mps2: float = 0.05  # largest acceleration of the robot's end-effector
-    horizon_s: float = 120.0  # latest capture looked for, after the instant of planning
-    latency_s: float = 0.0  # the robot coasts for this long before the plan's thrust begins
-    replan_period_s: float = 1.0  # a new plan is made at the first scan this long after the last one
-    grid_s: float = 0.2  # spacing of the samples of the goal
-    robot_position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # end-effector in {A} when planning
-    robot_velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)  # its velocity in {A}
+    a_max_mps2: float = setting(0.05, "Largest acceleration of the end-effector.", unit="m/s2", above=0.0)
+    horizon_s: float = setting(120.0, "Latest capture considered, after the instant of planning.", unit="s", above=0.0)
+    latency_s: float = setting(
+        0.0, "Time between planning and the first thrust, in which the robot coasts.", unit="s", low=0.0
+    )
+    replan_period_s: float = setting(
+        1.0, "A new plan is made at the first scan this long after the previous plan.", unit="s", above=0.0
+    )
+    grid_s: float = setting(0.2, "Spacing of the samples of the goal trajectory.", unit="s", above=0.0)
+    robot_position_m: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "Position of the end-effector in {A} when planning.", unit="m"
+    )
+    robot_velocity_mps: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "Velocity of the end-effector in {A} when planning.", unit="m/s"
+    )
 
-    def __post_init__(self) -> None:
-        _positive("a_max_mps2", self.a_max_mps2)
-        _positive("horizon_s", self.horizon_s)
-        _positive("replan_period_s", self.replan_period_s)
-        _positive("grid_s", self.grid_s)
-        if not 0.0 <= self.latency_s < self.horizon_s:
-            raise ValueError(f"latency_s is {self.latency_s}, must be in [0, horizon_s = {self.horizon_s})")
-        for name in ("robot_position_m", "robot_velocity_mps"):
-            if not all(math.isfinite(v) for v in getattr(self, name)):
-                raise ValueError(f"{name} is {getattr(self, name)}, must be finite")
-
-
-def _positive(name: str, value: float) -> None:
-    if not (math.isfinite(value) and value > 0.0):
-        raise ValueError(f"{name} is {value}, must be a finite number above 0")
+    def check(self) -> None:
+        """Raise ValueError where the latency leaves nothing of the horizon."""
+        if self.latency_s >= self.horizon_s:
+            raise ValueError(f"latency_s is {self.latency_s}, must be below horizon_s = {self.horizon_s}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

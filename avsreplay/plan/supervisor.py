@@ -14,6 +14,8 @@ from dataclasses import dataclass, fields, replace
 from enum import Enum
 from types import MappingProxyType
 
+from avsreplay.settings import Settings, setting
+
 
 class Action(Enum):
     """Actions of the robot."""
@@ -28,41 +30,36 @@ class Action(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class SupervisorParams:
-    """Capture tolerances and time limits of the supervisor. None: a fraction of the target's extent."""
+class SupervisorParams(Settings):
+    """Capture tolerances and time limits of the supervisor."""
 
-    # capture tolerance on position [m]; auto: 0.0025 of the extent
-    capture_pos_m: float | None = None
-    # capture tolerance on relative speed [m/s]; auto: 0.00125 of the extent a second
-    capture_speed_mps: float | None = None
-    # capture tolerance on the gripper's angle [deg]
-    capture_angle_deg: float = 2.0
-    # predicted 1 sigma (root of the trace) times this must be inside the tolerances
-    sigmas: float = 3.0
-    # the last plan is flown to its end from this time to go on
-    commit_s: float = 0.5
-    # vision may be lost for this long before the prediction has to be good enough to the end
-    patience_s: float = 1.5
-    # healthy scans in a row that end a hold
-    recover_scans: int = 2
-    # a hold or retreat longer than this is an abort
-    hold_limit_s: float = 60.0
-    # distance of the approach point from the grasp point along the fixture's axis [m]; auto: 0.125 of the extent
-    standoff_m: float | None = None
-    # how far away a retreat goes [m]; auto: 0.5 of the extent
-    retreat_m: float | None = None
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{f.name} is {value}, must be a finite number above 0")
-
-    def resolved(self, extent_m: float) -> SupervisorParams:
-        """Return the parameters with every missing length set to its fraction of the target's extent [m]."""
-        shares = {"capture_pos_m": 0.0025, "capture_speed_mps": 0.00125, "standoff_m": 0.125, "retreat_m": 0.5}
-        left_out = {name: share * extent_m for name, share in shares.items() if getattr(self, name) is None}
-        return replace(self, **left_out)  # type: ignore[arg-type]
+    capture_pos_m: float | None = setting(None, "Capture tolerance on position.", unit="m", above=0.0, of_extent=0.0025)
+    capture_speed_mps: float | None = setting(
+        None, "Capture tolerance on relative speed.", unit="m/s", above=0.0, of_extent=0.00125
+    )
+    capture_angle_deg: float = setting(2.0, "Capture tolerance on the gripper's angle.", unit="deg", above=0.0)
+    sigmas: float = setting(
+        3.0, "The predicted 1 sigma (root of the trace) times this must be within the tolerances.", above=0.0
+    )
+    commit_s: float = setting(
+        0.5, "With less time to go than this the last plan is flown to its end.", unit="s", above=0.0
+    )
+    patience_s: float = setting(
+        1.5,
+        "Time without a healthy scan after which the prediction must be good enough to the end of the plan.",
+        unit="s",
+        above=0.0,
+    )
+    recover_scans: int = setting(2, "Consecutive healthy scans that end a hold.", low=1)
+    hold_limit_s: float = setting(60.0, "A hold or retreat that lasts longer becomes an abort.", unit="s", above=0.0)
+    standoff_m: float | None = setting(
+        None,
+        "Distance of the approach point from the grasp point along the fixture's axis.",
+        unit="m",
+        above=0.0,
+        of_extent=0.125,
+    )
+    retreat_m: float | None = setting(None, "Distance of a retreat.", unit="m", above=0.0, of_extent=0.5)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,17 +1,13 @@
-"""What registration may be told; every length left to ``None`` is a stated fraction of the model's extent."""
+"""Settings of registration; lengths that are not given scale with the model's extent."""
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass
 
 from avsreplay.register.facing import Camera
+from avsreplay.settings import Settings, given, setting
 
 __all__ = ["AcquireParams", "Limits", "RegisterParams"]
-
-REACH_OF_EXTENT = 0.15  # a guess off by 24 deg moves a surface's far points by about this much
-GATE_OF_EXTENT = 0.01
-EPS_OF_EXTENT = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,66 +30,76 @@ class Limits:
 
 
 @dataclass(frozen=True, slots=True)
-class AcquireParams:
-    """Parameters of the search for a pose without a guess. Raises ValueError naming a value that cannot be right."""
+class AcquireParams(Settings):
+    """Parameters of the global search: registration without an initial guess."""
 
-    starts: int = 600  # attitudes tried; seven times as many in the second effort
-    coarse_points: int = 150  # points of the scan in the first selection
-    coarse_passes: int = 8  # plane passes a start in the first selection
-    middle_starts: int = 60  # starts kept for the second selection
-    middle_points: int = 400  # points in the second selection
-    middle_passes: int = 15  # plane passes in the second selection
-    fine_starts: int = 6  # different poses registered on the model itself
-    fine_points: int = 1500  # points they are registered and ranked with
-    enough_ratio: float = 0.95  # share of the scan on the model that ends the search at the first effort
-    least_ratio: float = 0.7  # smaller than that nothing was found
-    margin: float = 0.01  # a second pose that leaves so little more of the scan unexplained is as good
-
-    def __post_init__(self) -> None:
-        for each in fields(self):
-            value = getattr(self, each.name)
-            if isinstance(each.default, int) and value < 1:
-                raise ValueError(f"{each.name} is {value}, it must be at least 1")
-            if isinstance(each.default, float) and not 0.0 <= value <= 1.0:
-                raise ValueError(f"{each.name} is {value}, it must be within 0 and 1")
+    starts: int = setting(600, "Attitudes tried; the second effort tries seven times as many.", low=1)
+    coarse_points: int = setting(150, "Points of the scan used in the first selection.", low=1)
+    coarse_passes: int = setting(8, "Point-to-plane iterations per attitude in the first selection.", low=1)
+    middle_starts: int = setting(60, "Attitudes kept for the second selection.", low=1)
+    middle_points: int = setting(400, "Points of the scan used in the second selection.", low=1)
+    middle_passes: int = setting(15, "Point-to-plane iterations per attitude in the second selection.", low=1)
+    fine_starts: int = setting(6, "Different poses that are registered on the model itself.", low=1)
+    fine_points: int = setting(1500, "Points of the scan with which these are registered and ranked.", low=1)
+    enough_ratio: float = setting(0.95, "Inlier ratio that ends the search after the first effort.", low=0.0, high=1.0)
+    least_ratio: float = setting(0.7, "With a smaller inlier ratio no pose was found.", low=0.0, high=1.0)
+    margin: float = setting(
+        0.01,
+        "A second pose whose share of unexplained points exceeds the best one's by less makes the result ambiguous.",
+        low=0.0,
+        high=1.0,
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class RegisterParams:
-    """Parameters of registration. Raises ValueError naming a value that cannot be right."""
+class RegisterParams(Settings):
+    """Parameters of registration."""
 
-    backend: str = "horn"  # entry-point name of the back end
-    reach_m: float | None = None  # first rejection distance [m]; auto: 0.15 of the model's extent
-    gate_m: float | None = None  # last rejection distance, and the ruler's [m]; auto: 0.01 of the extent
-    n_max: int = 200  # passes before a registration counts as not converged
-    eps_rad: float = 1e-5  # a pass that turns the pose by less has settled [rad]
-    eps_m: float | None = None  # a pass that moves it by less has settled [m]; auto: 1e-6 of the extent
-    noise_m: float | None = None  # 1 sigma of a point across the surface [m]; auto: from each scan's residuals
-    min_inliers: int = 30  # fewer points on the model: no overlap
-    min_inlier_ratio: float = 0.02  # a smaller share of the scan on the model: no overlap
-    camera: Camera = Camera.AUTO  # where the scans were taken from: auto, origin or none
-    subsample_m: float = 0.0  # keep one point a voxel of this size [m]; 0: keep all
-    threads: int = 1  # threads of a back end that gives the same bits for any number
-    acquire: AcquireParams = field(default_factory=AcquireParams)  # the search without a guess
+    backend: str = setting("horn", "Registration back end, by its entry-point name ('avsreplay backends' lists them).")
+    reach_m: float | None = setting(
+        None, "Rejection distance of a correspondence in the first iteration.", unit="m", above=0.0, of_extent=0.15
+    )
+    gate_m: float | None = setting(
+        None,
+        "Rejection distance in the last iteration; a point closer to the model than this is an inlier.",
+        unit="m",
+        above=0.0,
+        of_extent=0.01,
+    )
+    n_max: int = setting(200, "Iterations after which a registration counts as not converged.", low=1)
+    eps_rad: float = setting(
+        1e-5, "The iteration ends when a step rotates the pose by less than this.", unit="rad", above=0.0
+    )
+    eps_m: float | None = setting(
+        None, "The iteration ends when a step moves the pose by less than this.", unit="m", above=0.0, of_extent=1e-6
+    )
+    noise_m: float | None = setting(
+        None,
+        "1 sigma of a point's error normal to the surface.",
+        unit="m",
+        above=0.0,
+        unset="estimated from the residuals of each scan",
+    )
+    min_inliers: int = setting(30, "With fewer inliers a scan has no overlap with the model.", low=1)
+    min_inlier_ratio: float = setting(
+        0.02, "With a smaller share of inliers a scan has no overlap with the model.", low=0.0, high=1.0
+    )
+    camera: Camera = setting(
+        Camera.AUTO, "Position of the camera: the origin of the scan's frame, unknown (none), or detected (auto)."
+    )
+    subsample_m: float = setting(
+        0.0, "Edge length of the voxels of which one point each is kept; 0 keeps all points.", unit="m", low=0.0
+    )
+    threads: int = setting(1, "Largest number of threads of a back end; the result does not depend on it.", low=1)
+    acquire: AcquireParams = setting(AcquireParams, "The global search.")
 
-    def __post_init__(self) -> None:
-        for name in ("reach_m", "gate_m", "eps_m", "noise_m", "eps_rad"):
-            value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} is {value}, it must be a positive number")
-        for name in ("n_max", "min_inliers", "threads"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}, it must be at least 1")
-        if not 0.0 <= self.min_inlier_ratio <= 1.0:
-            raise ValueError(f"min_inlier_ratio is {self.min_inlier_ratio}, it must be within 0 and 1")
-        if not (math.isfinite(self.subsample_m) and self.subsample_m >= 0.0):
-            raise ValueError(f"subsample_m is {self.subsample_m}, it must be 0 or a positive length")
+    def check(self) -> None:
+        """Raise ValueError where the two rejection distances are in the wrong order."""
         if self.reach_m is not None and self.gate_m is not None and self.gate_m > self.reach_m:
-            raise ValueError(f"gate_m is {self.gate_m}, it must not exceed reach_m = {self.reach_m}")
+            raise ValueError(f"gate_m is {self.gate_m}, must not exceed reach_m = {self.reach_m}")
 
     def limits(self, extent_m: float) -> Limits:
         """These parameters for a model of this extent [m] (the diagonal of its bounding box)."""
-        reach = self.reach_m if self.reach_m is not None else REACH_OF_EXTENT * extent_m
-        gate = self.gate_m if self.gate_m is not None else GATE_OF_EXTENT * extent_m
-        eps = self.eps_m if self.eps_m is not None else EPS_OF_EXTENT * extent_m
-        return Limits(max(reach, gate), min(gate, reach), self.n_max, self.eps_rad, eps, self.threads)
+        filled = self.resolved(extent_m)
+        reach, gate = given(filled.reach_m), given(filled.gate_m)
+        return Limits(max(reach, gate), min(gate, reach), self.n_max, self.eps_rad, given(filled.eps_m), self.threads)

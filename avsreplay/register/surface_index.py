@@ -31,10 +31,11 @@ from avsreplay.errors import MissingBackend, UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register import index_cache
+from avsreplay.settings import Settings, setting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class IcpParams:
+class IcpParams(Settings):
     """Parameters of the ICP loop.
 
     Rejection rule: a point is used while its distance to the surface is below the gate; after each pass
@@ -43,26 +44,27 @@ class IcpParams:
     ``eps_m``, and the gate changed by less than 1 %. Only Horn passes (point to point) can end the loop.
     """
 
-    n_max: int = 100  # largest number of passes, of both kinds
-    n_plane: int = 6  # point-to-plane passes before Horn's; fewer are made once their step is below the stopping rule
-    gate_m: float | None = None  # first rejection distance [m]; auto: the reach of the index
-    tighten: float = 3.0  # the gate in units of the rms of the last pass; 0: constant gate
-    floor_m: float | None = None  # smallest gate [m]; auto: 1/500 of the extent of the model
-    eps_rad: float = 1e-5  # stop below this rotation [rad]
-    eps_m: float | None = None  # and below this displacement of the centroid [m]; auto: 1e-6 of the extent
-    threads: int = 1  # the result is identical, to the bit, for any number
-    facing: bool = False  # match only faces that face the camera (origin of {A}); for meshes with outward faces
-    keep: bool = True  # keep a correspondence while it provably cannot change; the result is identical, to the bit
+    n_max: int = setting(100, "Largest number of passes of both kinds.", low=1)
+    n_plane: int = setting(
+        6, "Point-to-plane passes before Horn's; fewer are made once a step meets the stopping rule.", low=0
+    )
+    gate_m: float | None = setting(None, "First rejection distance.", unit="m", low=0.0, unset="the reach of the index")
+    tighten: float = setting(3.0, "Gate in units of the rms of the last pass; 0 keeps it constant.", low=0.0)
+    floor_m: float | None = setting(None, "Smallest gate.", unit="m", low=0.0, unset="1/500 of the model's extent")
+    eps_rad: float = setting(1e-5, "Stopping rule: rotation of the last step.", unit="rad", low=0.0)
+    eps_m: float | None = setting(
+        None, "Stopping rule: displacement of the inliers' centroid.", unit="m", low=0.0, of_extent=1e-6
+    )
+    threads: int = setting(1, "Largest number of threads; the result is identical to the bit for any number.", low=1)
+    facing: bool = setting(False, "Match only faces that face the camera (origin of {A}); needs outward faces.")
+    keep: bool = setting(
+        True, "Keep a correspondence while it provably cannot change; the result is identical to the bit."
+    )
 
-    def __post_init__(self) -> None:
-        if self.n_max < 1 or not 0 <= self.n_plane <= self.n_max:
-            raise ValueError(f"need n_max >= 1 and 0 <= n_plane <= n_max, got {self.n_max} and {self.n_plane}")
-        for name in ("gate_m", "tighten", "floor_m", "eps_rad", "eps_m"):
-            value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} must be finite and not negative, got {value}")
-        if self.threads < 1:
-            raise ValueError(f"threads must be at least 1, got {self.threads}")
+    def check(self) -> None:
+        """Raise ValueError where more point-to-plane passes are asked for than passes."""
+        if self.n_plane > self.n_max:
+            raise ValueError(f"n_plane is {self.n_plane}, must not exceed n_max = {self.n_max}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)

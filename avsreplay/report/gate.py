@@ -9,7 +9,8 @@ from pathlib import Path
 
 from avsreplay.errors import CheckFailed, UsageError
 from avsreplay.report.compare import METRICS
-from avsreplay.settings import build, load
+from avsreplay.settings import Settings, setting
+from avsreplay.toml_document import build, load
 
 __all__ = ["GateRules", "Outcome", "Rule", "check_gate", "github_lines", "judge", "junit", "load_rules"]
 
@@ -18,23 +19,24 @@ _RELATIVE = _LIMITS[2:]
 
 
 @dataclass(frozen=True, slots=True)
-class Rule:
+class Rule(Settings):
     """One rule on one metric; all limits given must hold.
 
     A run without the metric breaks the rule, unless ``optional``.
     """
 
-    metric: str
-    min: float | None = None  # least value
-    max: float | None = None  # greatest value
-    min_ratio: float | None = None  # least multiple of the baseline's value
-    max_ratio: float | None = None  # greatest multiple of the baseline's value
-    max_increase: float | None = None  # most above the baseline's value
-    max_decrease: float | None = None  # most below the baseline's value
-    optional: bool = False  # pass where the run has no such figure
-    note: str = ""  # why; printed with the outcome
+    metric: str = setting(doc="The metric that is limited.")
+    min: float | None = setting(None, "Smallest value.")
+    max: float | None = setting(None, "Largest value.")
+    min_ratio: float | None = setting(None, "Smallest multiple of the baseline's value.")
+    max_ratio: float | None = setting(None, "Largest multiple of the baseline's value.")
+    max_increase: float | None = setting(None, "Largest increase over the baseline's value.")
+    max_decrease: float | None = setting(None, "Largest decrease below the baseline's value.")
+    optional: bool = setting(False, "Whether a run without the metric passes.")
+    note: str = setting("", "The reason, printed with the outcome.")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ValueError for an unknown metric or a rule without a limit."""
         known = [m.name for m in METRICS]
         if self.metric not in known:
             raise ValueError(f"unknown metric '{self.metric}'; known: {', '.join(known)}")
@@ -58,12 +60,13 @@ class Rule:
 
 
 @dataclass(frozen=True, slots=True)
-class GateRules:
+class GateRules(Settings):
     """The file: ``[[rule]]`` tables."""
 
-    rule: tuple[Rule, ...] = ()
+    rule: tuple[Rule, ...] = setting((), "The rules.")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ValueError where there is no rule."""
         if not self.rule:
             raise ValueError("no [[rule]] in the file")
 

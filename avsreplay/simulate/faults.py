@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from avsreplay.records import Label
+from avsreplay.settings import Settings, setting
 from avsreplay.simulate.scanner import Returns
 
 __all__ = ["FaultParams", "Kind", "active", "clutter", "label", "occlude", "strength"]
@@ -68,25 +69,21 @@ _DEFAULTS: dict[Kind, tuple[float | None, bool]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class FaultParams:
-    """One table [[fault]]: a kind over [start_s, start_s + duration_s) after the first instant."""
+class FaultParams(Settings):
+    """One table [[fault]]: a kind of fault over [start_s, start_s + duration_s)."""
 
-    # what goes wrong
-    kind: Kind
-    # beginning of the window, seconds after the first instant
-    start_s: float
-    # length of the window
-    duration_s: float
-    # how much; its meaning and default depend on the kind
-    strength: float | None = None
-    # what the label says; None: the kind's own
-    harmful: bool | None = None
+    kind: Kind = setting(doc="What goes wrong.")
+    start_s: float = setting(doc="Begin of the fault, after the first scan is due.", unit="s", low=0.0)
+    duration_s: float = setting(doc="Length of the fault.", unit="s", above=0.0)
+    strength: float | None = setting(
+        None, "Strength; its meaning and range depend on the kind.", unset="the default of the kind"
+    )
+    harmful: bool | None = setting(
+        None, "Whether the label says that no good pose can come from such a scan.", unset="as usual for the kind"
+    )
 
-    def __post_init__(self) -> None:
-        if not self.start_s >= 0.0:
-            raise ValueError(f"start_s = {self.start_s} must not be negative")
-        if not 0.0 < self.duration_s < math.inf:
-            raise ValueError(f"duration_s = {self.duration_s} must be positive")
+    def check(self) -> None:
+        """Raise ValueError where the strength does not fit the kind."""
         default, _ = _DEFAULTS[self.kind]
         if self.strength is not None and default is None:
             raise ValueError(f"a fault of kind '{self.kind.value}' has no strength")

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
+from avsreplay.settings import Settings, setting
 from avsreplay.simulate.inertia import Body
 
 __all__ = ["Motion", "MotionParams"]
@@ -30,32 +31,36 @@ Rows = Sequence[Sequence[float]]
 
 
 @dataclass(frozen=True, slots=True)
-class MotionParams:
-    """The table [motion]: the target at the start, and what disturbs it."""
+class MotionParams(Settings):
+    """The table [motion]: the target's initial state, and its disturbances."""
 
-    # q_ac, attitude of the fixture in the camera at the start
-    attitude_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
-    # angular rate of the target, in {C}'s axes
-    rate_radps: tuple[float, float, float] = (0.0, 0.0, 0.1)
-    # mass centre in the camera at the start
-    position_m: tuple[float, float, float] = (0.0, 0.0, 5.0)
-    # velocity of the mass centre in the camera
-    velocity_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    # 1 sigma of the disturbance torque over the trace of the inertia, each axis of {C}, held over a step
-    torque_std_radps2: float = 0.0
-    # 1 sigma of the disturbance force over the mass, each axis of {A}, held over a step
-    force_std_mps2: float = 0.0
-    # how long a disturbance is held
-    disturbance_step_s: float = 1.0
+    attitude_xyzw: tuple[float, float, float, float] = setting(
+        (0.0, 0.0, 0.0, 1.0), "q_ac, initial attitude of the fixture in the camera frame."
+    )
+    rate_radps: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.1), "Initial angular rate of the target, in the axes of {C}.", unit="rad/s"
+    )
+    position_m: tuple[float, float, float] = setting(
+        (0.0, 0.0, 5.0), "Initial position of the mass centre in {A}.", unit="m"
+    )
+    velocity_mps: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "Initial velocity of the mass centre in {A}.", unit="m/s"
+    )
+    torque_std_radps2: float = setting(
+        0.0,
+        "1 sigma of the disturbance torque over the trace of the inertia, each axis of {C}.",
+        unit="rad/s^2",
+        low=0.0,
+    )
+    force_std_mps2: float = setting(
+        0.0, "1 sigma of the disturbance force per unit mass, each axis of {A}.", unit="m/s^2", low=0.0
+    )
+    disturbance_step_s: float = setting(1.0, "Time for which a disturbance is constant.", unit="s", above=0.0)
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ValueError where the attitude is not a unit quaternion."""
         if not math.isclose(math.hypot(*self.attitude_xyzw), 1.0, abs_tol=1e-3):
             raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
-        for name in ("torque_std_radps2", "force_std_mps2"):
-            if not getattr(self, name) >= 0.0:
-                raise ValueError(f"{name} = {getattr(self, name)} must not be negative")
-        if not self.disturbance_step_s > 0.0:
-            raise ValueError(f"disturbance_step_s = {self.disturbance_step_s} must be positive")
 
 
 class Motion:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Array, frozen, rotate
 from avsreplay.records import Surface
+from avsreplay.settings import Settings, setting
 from avsreplay.simulate.caster import Caster, Engine
 from avsreplay.simulate.motion import Motion
 
@@ -36,48 +37,36 @@ class View(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class ScannerParams:
-    """The table [scanner]: grid, field of view and noise. The camera looks along +z of {A}, x to the right."""
+class ScannerParams(Settings):
+    """The table [scanner]: rays, field of view and noise. The camera looks along +z of {A}, x to the right."""
 
-    # flash or raster
-    pattern: Pattern = Pattern.FLASH
-    # full angles of the field of view, across and down
-    fov_deg: tuple[float, float] = (44.0, 44.0)
-    # rectangle, or the cone inside it
-    view: View = View.RECTANGLE
-    # rays across and down
-    rays: tuple[int, int] = (128, 128)
-    # duration of a raster scan, from its stamp on
-    scan_s: float = 0.0
-    # 1 sigma of the range, along the ray
-    noise_m: float = 0.008
-    # part of the returns whose range is anything between range_min_m and range_max_m
-    outlier_ratio: float = 0.02
-    # part of the returns that are lost
-    dropout_ratio: float = 0.0
-    # returns at a flatter angle to the surface than this are lost (angle from the normal)
-    max_incidence_deg: float = 85.0
-    # nearest and farthest range there is a return from
-    range_min_m: float = 0.5
-    range_max_m: float = 12.0
-    # who casts the rays: auto, embree, exact
-    engine: Engine = Engine.AUTO
+    pattern: Pattern = setting(Pattern.FLASH, "All rays at the stamp (flash), or row by row over scan_s (raster).")
+    fov_deg: tuple[float, float] = setting(
+        (44.0, 44.0), "Full angles of the field of view, horizontal and vertical.", unit="deg", above=0.0, below=170.0
+    )
+    view: View = setting(View.RECTANGLE, "Outline of the field of view: the rectangle, or the cone inscribed in it.")
+    rays: tuple[int, int] = setting((128, 128), "Rays horizontally and vertically.", low=1, high=4096)
+    scan_s: float = setting(0.0, "Duration of a raster scan, which begins at its stamp.", unit="s", low=0.0)
+    noise_m: float = setting(0.008, "1 sigma of the range, along the ray.", unit="m", low=0.0)
+    outlier_ratio: float = setting(
+        0.02, "Share of the returns with a range anywhere between range_min_m and range_max_m.", low=0.0, high=1.0
+    )
+    dropout_ratio: float = setting(0.0, "Share of the returns that are lost.", low=0.0, high=1.0)
+    max_incidence_deg: float = setting(
+        85.0,
+        "Largest angle between the ray and the surface normal at which there is a return.",
+        unit="deg",
+        above=0.0,
+        high=90.0,
+    )
+    range_min_m: float = setting(0.5, "Smallest range of a return.", unit="m", low=0.0)
+    range_max_m: float = setting(12.0, "Largest range of a return.", unit="m", above=0.0)
+    engine: Engine = setting(Engine.AUTO, "Ray casting: embree, exact (numpy), or embree where it is installed (auto).")
 
-    def __post_init__(self) -> None:
-        if not all(0.0 < angle < 170.0 for angle in self.fov_deg):
-            raise ValueError(f"fov_deg = {list(self.fov_deg)} must lie between 0 and 170")
-        if not all(1 <= n <= 4096 for n in self.rays):
-            raise ValueError(f"rays = {list(self.rays)} must lie between 1 and 4096")
-        for name in ("outlier_ratio", "dropout_ratio"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name} = {getattr(self, name)} must lie between 0 and 1")
-        for name in ("noise_m", "scan_s"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} = {getattr(self, name)} must not be negative")
-        if not 0.0 <= self.range_min_m < self.range_max_m:
+    def check(self) -> None:
+        """Raise ValueError where the ranges, or pattern and duration, do not go together."""
+        if self.range_min_m >= self.range_max_m:
             raise ValueError(f"range_min_m = {self.range_min_m} must be below range_max_m = {self.range_max_m}")
-        if not 0.0 < self.max_incidence_deg <= 90.0:
-            raise ValueError(f"max_incidence_deg = {self.max_incidence_deg} must lie between 0 and 90")
         if (self.pattern is Pattern.RASTER) != (self.scan_s > 0.0):
             raise ValueError(f"scan_s = {self.scan_s}: positive for a raster scan, 0 for a flash")
 

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avsreplay import geometry, settings
+from avsreplay import geometry, toml_document
 from avsreplay.errors import UsageError
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
+from avsreplay.settings import Settings, setting
 from avsreplay.simulate.faults import FaultParams
 from avsreplay.simulate.motion import MotionParams
 from avsreplay.simulate.scanner import ScannerParams
@@ -22,77 +23,60 @@ from avsreplay.simulate.target import TargetParams
 __all__ = ["Scenario", "ScenarioParams", "StartParams", "belief", "load_scenario", "scenario_of"]
 
 MAX_SCANS = 10_000_000
+DRAWN = "drawn from its 1 sigma"
 Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class StartParams:
-    """The table [start]: the first belief, as standard deviations each axis and, where wished, the very offsets.
+class StartParams(Settings):
+    """The table [start]: the initial belief, as a standard deviation per axis and, if wanted, the exact errors.
 
-    An offset left out is drawn from its standard deviation with the scenario's seed.
+    An offset (mean minus truth) that is not given is drawn from its standard deviation with the scenario's seed.
     """
 
-    # 1 sigma of the angular rate, and mean minus truth, in {B}
-    rate_std_radps: float = 0.005
-    rate_offset_radps: Triple | None = None
-    # of sigma_1 and sigma_2
-    sigma_std: float = 0.05
-    sigma_offset: tuple[float, float] | None = None
-    # of the fixture's place in {B}
-    varrho_std_m: float = 0.05
-    varrho_offset_m: Triple | None = None
-    # of mu, as a turn (full angle) about {B}'s axes
-    mu_std_deg: float = 1.0
-    mu_offset_deg: Triple | None = None
-    # of the mass centre in {A}
-    position_std_m: float = 0.03
-    position_offset_m: Triple | None = None
-    # of its velocity in {A}
-    velocity_std_mps: float = 0.003
-    velocity_offset_mps: Triple | None = None
-    # of the attitude of {B}, as a turn (full angle) about its axes
-    attitude_std_deg: float = 1.0
-    attitude_offset_deg: Triple | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("rate_std_radps", "sigma_std", "varrho_std_m", "mu_std_deg", "position_std_m", "velocity_std_mps"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} = {getattr(self, name)} must be positive")
-        if not 0.0 < self.attitude_std_deg < math.inf:
-            raise ValueError(f"attitude_std_deg = {self.attitude_std_deg} must be positive")
+    rate_std_radps: float = setting(0.005, "1 sigma of the angular rate in {B}.", unit="rad/s", above=0.0)
+    rate_offset_radps: Triple | None = setting(None, "Error of the angular rate.", unit="rad/s", unset=DRAWN)
+    sigma_std: float = setting(0.05, "1 sigma of sigma_1 and sigma_2.", above=0.0)
+    sigma_offset: tuple[float, float] | None = setting(None, "Error of sigma_1 and sigma_2.", unset=DRAWN)
+    varrho_std_m: float = setting(0.05, "1 sigma of the fixture's position in {B}.", unit="m", above=0.0)
+    varrho_offset_m: Triple | None = setting(None, "Error of the fixture's position.", unit="m", unset=DRAWN)
+    mu_std_deg: float = setting(1.0, "1 sigma of mu, as a rotation about the axes of {B}.", unit="deg", above=0.0)
+    mu_offset_deg: Triple | None = setting(None, "Error of mu.", unit="deg", unset=DRAWN)
+    position_std_m: float = setting(0.03, "1 sigma of the mass centre in {A}.", unit="m", above=0.0)
+    position_offset_m: Triple | None = setting(None, "Error of the mass centre.", unit="m", unset=DRAWN)
+    velocity_std_mps: float = setting(
+        0.003, "1 sigma of the velocity of the mass centre in {A}.", unit="m/s", above=0.0
+    )
+    velocity_offset_mps: Triple | None = setting(None, "Error of that velocity.", unit="m/s", unset=DRAWN)
+    attitude_std_deg: float = setting(
+        1.0, "1 sigma of the attitude of {B}, as a rotation about its axes.", unit="deg", above=0.0
+    )
+    attitude_offset_deg: Triple | None = setting(None, "Error of the attitude.", unit="deg", unset=DRAWN)
 
 
 @dataclass(frozen=True, slots=True)
-class ScenarioParams:
-    """The whole file."""
+class ScenarioParams(Settings):
+    """A scenario file."""
 
-    # what to call it
-    name: str = "scenario"
-    # of every random draw
-    seed: int = 0
-    # length of the log
-    duration_s: float = 120.0
-    # scans a second
-    rate_hz: float = 5.0
-    target: TargetParams = field(default_factory=TargetParams)
-    motion: MotionParams = field(default_factory=MotionParams)
-    scanner: ScannerParams = field(default_factory=ScannerParams)
-    fault: tuple[FaultParams, ...] = ()
-    # the first belief; without the table the log starts cold
-    start: StartParams | None = None
-    # settings of the replay for this log, handed through untouched
-    run: Any = field(default_factory=dict)
+    name: str = setting("scenario", "Name of the scenario.")
+    seed: int = setting(0, "Seed of every random draw.", low=0, below=2**63)
+    duration_s: float = setting(120.0, "Length of the log.", unit="s", above=0.0)
+    rate_hz: float = setting(5.0, "Scan rate.", unit="Hz", above=0.0)
+    target: TargetParams = setting(TargetParams, "The target.")
+    motion: MotionParams = setting(MotionParams, "The target's motion.")
+    scanner: ScannerParams = setting(ScannerParams, "The scanner.")
+    fault: tuple[FaultParams, ...] = setting((), "The injected faults, one table [[fault]] each.")
+    start: StartParams | None = setting(
+        None, "The initial belief.", unset="the log has none, and the estimator starts cold"
+    )
+    run: Any = setting(dict, "Settings of the replay for this log (docs/settings.md).")
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.seed < 1 << 63:
-            raise ValueError(f"seed = {self.seed} must lie between 0 and 2^63")
-        for name in ("duration_s", "rate_hz"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"{name} = {getattr(self, name)} must be positive")
+    def check(self) -> None:
+        """Raise ValueError where the scans are none, too many, or longer than the time between them."""
         if not 1.0 <= self.duration_s * self.rate_hz <= MAX_SCANS:
             raise ValueError(f"{self.duration_s} s at {self.rate_hz} Hz is not between 1 and {MAX_SCANS} scans")
         if self.scanner.scan_s * self.rate_hz > 1.0 + 1e-9:
-            raise ValueError(f"scan_s = {self.scanner.scan_s} is longer than the time between scans")
+            raise ValueError(f"scanner.scan_s = {self.scanner.scan_s} is longer than the time between scans")
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +107,13 @@ def load_scenario(path: Path | None = None, seed: int | None = None) -> Scenario
     """
     if path is None:
         text = resources.files("avsreplay.simulate").joinpath("builtin.toml").read_text(encoding="utf-8")
-        return scenario_of(settings.parse(text, "built-in scenario"), seed)
-    return scenario_of(settings.load(path), seed, Path(path).parent)
+        return scenario_of(toml_document.parse(text, "built-in scenario"), seed)
+    return scenario_of(toml_document.load(path), seed, Path(path).parent)
 
 
-def scenario_of(document: settings.Document, seed: int | None = None, folder: Path | None = None) -> Scenario:
+def scenario_of(document: toml_document.Document, seed: int | None = None, folder: Path | None = None) -> Scenario:
     """The scenario of a parsed document."""
-    params = settings.build(ScenarioParams, document)
+    params = toml_document.build(ScenarioParams, document)
     if not isinstance(params.run, dict):
         raise UsageError("'run' must be a table", where=document.where(("run",)), hint="write it as [run]")
     if seed is not None:

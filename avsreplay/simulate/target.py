@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Surface
+from avsreplay.settings import Settings, setting
 from avsreplay.simulate.inertia import Body, body_of, with_axes
 from avsreplay.simulate.shapes import Solid, box, extrusion, frustum, join, moved, shell
 
@@ -32,22 +33,27 @@ class Shape(Enum):
     CUBE = "cube"  # fully symmetric: the pose has 24 equals
 
 
+FROM_MESH = "from the mesh, of uniform density"
+
+
 @dataclass(frozen=True, slots=True)
-class TargetParams:
-    """The table [target]: which model, and its mass properties where the mesh's own are not wanted."""
+class TargetParams(Settings):
+    """The table [target]: the model, and its mass properties where those of the mesh are not wanted."""
 
-    # a target made in code; not used where a model is named
-    shape: Shape = Shape.SATELLITE
-    # STL, OBJ or PLY in metres in {C}; a relative name is beside the scenario file; empty: the built-in shape
-    model: str = ""
-    # principal moments of {B} per unit mass; None: from the mesh (uniform density)
-    moments_m2: tuple[float, float, float] | None = None
-    # mu = q_bc, the turn from {C} to {B}; None: from the mesh
-    axes_xyzw: tuple[float, float, float, float] | None = None
-    # mass centre in {C}; None: from the mesh
-    mass_centre_m: tuple[float, float, float] | None = None
+    shape: Shape = setting(Shape.SATELLITE, "A built-in target; not used where a model is given.")
+    model: str = setting(
+        "", "STL, OBJ or PLY file in metres in {C}, relative to the scenario file; empty for the built-in shape."
+    )
+    moments_m2: tuple[float, float, float] | None = setting(
+        None, "Principal moments of inertia of {B} per unit mass.", unit="m^2", above=0.0, unset=FROM_MESH
+    )
+    axes_xyzw: tuple[float, float, float, float] | None = setting(
+        None, "mu = q_bc, the rotation from {C} to {B}.", unset=FROM_MESH
+    )
+    mass_centre_m: tuple[float, float, float] | None = setting(None, "Mass centre in {C}.", unit="m", unset=FROM_MESH)
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ValueError where the mass properties are not those of a rigid body."""
         if self.moments_m2 is not None and not _triangle(self.moments_m2):
             raise ValueError(
                 f"moments_m2 = {list(self.moments_m2)} are not those of a body: each below the others' sum"

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from avsreplay import settings
+from avsreplay import toml_document
+from avsreplay.settings import Settings, setting
 
 __all__ = ["Axis", "Campaign", "Case", "Criterion", "Draw", "DrawKind", "LoadedCampaign", "load_campaign"]
 
@@ -29,101 +30,85 @@ class DrawKind(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Axis:
-    """One table [[grid]]: every value is combined with every value of the other axes."""
+class Axis(Settings):
+    """One table [[grid]]: every value is combined with every value of the other tables."""
 
-    # scenario.<key> or run.<key>; a number picks from a list, as in scenario.fault.0.strength
-    key: str
-    # what it takes
-    values: Any
+    key: str = setting(doc="scenario.<key> or run.<key>; a number selects an entry, as in scenario.fault.0.strength.")
+    values: Any = setting(doc="The list of its values.")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ValueError for a wrong key or an empty list."""
         _check_key(self.key)
         if not isinstance(self.values, list) or not self.values:
-            raise ValueError(f"values of '{self.key}' must be a list with something in it")
+            raise ValueError(f"values of '{self.key}' must be a list that is not empty")
 
 
 @dataclass(frozen=True, slots=True)
-class Case:
-    """One table [[case]]: settings that go together; cases are alternatives, each crossed with the grid."""
+class Case(Settings):
+    """One table [[case]]: settings that go together; cases are alternatives, each combined with the grid."""
 
-    # what to call it in tables
-    name: str
-    # what it sets, by key
-    set: Any = field(default_factory=dict)
+    name: str = setting(doc="Name of the case in tables.")
+    set: Any = setting(dict, "Settings of the case, by key.")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ValueError for a wrong key."""
         _check_set(self.set)
 
 
 @dataclass(frozen=True, slots=True)
-class Draw:
+class Draw(Settings):
     """One table [[draw]]: a value drawn anew for every repeat, the same for all combinations of that repeat."""
 
-    # scenario.<key> or run.<key>
-    key: str
-    kind: DrawKind
-    low: float = 0.0
-    high: float = 1.0
-    values: Any = field(default_factory=list)
+    key: str = setting(doc="scenario.<key> or run.<key>.")
+    kind: DrawKind = setting(doc="Distribution of the value.")
+    low: float = setting(0.0, "Smallest value; the mean of a normal distribution.")
+    high: float = setting(1.0, "Largest value; the standard deviation of a normal distribution.")
+    values: Any = setting(list, "The values of a choice.")
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """Raise ValueError where the bounds do not fit the distribution."""
         _check_key(self.key)
         if self.kind is DrawKind.CHOICE and not (isinstance(self.values, list) and self.values):
             raise ValueError(f"a choice for '{self.key}' needs values")
         if self.kind is DrawKind.NORMAL and not self.high >= 0.0:
             raise ValueError(f"standard deviation (high) of '{self.key}' must not be negative")
-        if self.kind is not DrawKind.NORMAL and not -math.inf < self.low <= self.high < math.inf:
+        if self.kind is not DrawKind.NORMAL and self.low > self.high:
             raise ValueError(f"low = {self.low} of '{self.key}' must not exceed high = {self.high}")
         if self.kind is DrawKind.LOG_UNIFORM and not self.low > 0.0:
             raise ValueError(f"low = {self.low} of '{self.key}' must be positive")
 
 
 @dataclass(frozen=True, slots=True)
-class Criterion:
-    """One table [[success]]: a run is a success by this name where the metric is there and within the limits."""
+class Criterion(Settings):
+    """One table [[success]]: a run succeeds where the metric has a value and is within the limits."""
 
-    name: str
-    # a column of the results
-    metric: str
-    min: float = -math.inf
-    max: float = math.inf
+    name: str = setting(doc="Name of the criterion in tables.")
+    metric: str = setting(doc="A column of the results.")
+    min: float = setting(-math.inf, "Smallest value.", infinite=True)
+    max: float = setting(math.inf, "Largest value.", infinite=True)
 
 
 @dataclass(frozen=True, slots=True)
-class Campaign:
-    """The whole file."""
+class Campaign(Settings):
+    """A campaign file."""
 
-    # what to call it
-    name: str = "campaign"
-    # of every draw, and through it of every run's own seed
-    seed: int = 0
-    # runs of every combination
-    repeats: int = 1
-    # scenario file beside this one; empty: the built-in scenario
-    scenario: str = ""
-    # several scenario files, each one a value of the axis "scenario"
-    scenarios: tuple[str, ...] = ()
-    # model of the target in place of the scenario's or the logs' own
-    model: str = ""
-    # recorded logs instead of a scenario, each one a value of the axis "log"
-    logs: tuple[str, ...] = ()
-    # settings of the replay, a file as for `avsreplay run --config`
-    config: str = ""
-    # keep one line a scan (scans.parquet), which the ROC curves are made of
-    scans: bool = True
-    # settings of every run
-    set: Any = field(default_factory=dict)
-    grid: tuple[Axis, ...] = ()
-    case: tuple[Case, ...] = ()
-    draw: tuple[Draw, ...] = ()
-    success: tuple[Criterion, ...] = ()
+    name: str = setting("campaign", "Name of the campaign.")
+    seed: int = setting(0, "Seed of every draw, and through it of every run's own seed.", low=0, below=2**63)
+    repeats: int = setting(1, "Runs of every combination.", low=1, high=MAX_REPEATS)
+    scenario: str = setting("", "Scenario file, relative to this one; empty for the built-in scenario.")
+    scenarios: tuple[str, ...] = setting((), "Several scenario files, each one a value of the axis 'scenario'.")
+    model: str = setting("", "Model of the target in place of the scenario's or the logs' own.")
+    logs: tuple[str, ...] = setting((), "Recorded logs in place of a scenario, each one a value of the axis 'log'.")
+    config: str = setting("", "File with settings of the replay, as for 'avsreplay run --config'.")
+    scans: bool = setting(True, "Keep one line per scan (scans.parquet), from which the ROC curves are made.")
+    set: Any = setting(dict, "Settings of every run.")
+    grid: tuple[Axis, ...] = setting((), "What is varied.")
+    case: tuple[Case, ...] = setting((), "Alternatives.")
+    draw: tuple[Draw, ...] = setting((), "What is drawn.")
+    success: tuple[Criterion, ...] = setting((), "What counts as a success.")
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.repeats <= MAX_REPEATS:
-            raise ValueError(f"repeats = {self.repeats} must lie between 1 and {MAX_REPEATS}")
-        if not 0 <= self.seed < 1 << 63:
-            raise ValueError(f"seed = {self.seed} must lie between 0 and 2^63")
+    def check(self) -> None:
+        """Raise ValueError where entries exclude each other or a name occurs twice."""
         if sum(map(bool, (self.logs, self.scenario, self.scenarios))) > 1:
             raise ValueError("scenario, scenarios and logs exclude each other")
         _check_set(self.set)
@@ -155,8 +140,8 @@ class LoadedCampaign:
 
 def load_campaign(path: Path) -> LoadedCampaign:
     """Read a campaign file. Raises UnreadableInput or UsageError with file and line."""
-    document = settings.load(path)
-    return LoadedCampaign(settings.build(Campaign, document), Path(path).parent, str(path))
+    document = toml_document.load(path)
+    return LoadedCampaign(toml_document.build(Campaign, document), Path(path).parent, str(path))
 
 
 def _check_key(key: str) -> None:

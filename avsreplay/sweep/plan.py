@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 import avsreplay
-from avsreplay import geometry, settings
+from avsreplay import geometry, toml_document
 from avsreplay.config import RunConfig
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.simulate import load_scenario, scenario_of
@@ -144,14 +144,14 @@ def _base_tables(loaded: LoadedCampaign) -> dict[str, Mapping[str, Any]]:
 
 
 def _table(path: Path | None) -> Mapping[str, Any]:
-    return settings.parse(load_scenario(path).text, str(path or "built-in scenario")).table
+    return toml_document.parse(load_scenario(path).text, str(path or "built-in scenario")).table
 
 
 def _base_run(loaded: LoadedCampaign) -> tuple[str, ...]:
     if not loaded.campaign.config:
         return ()
-    document = settings.load(loaded.folder / loaded.campaign.config)
-    settings.build(RunConfig, document)
+    document = toml_document.load(loaded.folder / loaded.campaign.config)
+    toml_document.build(RunConfig, document)
     return tuple(f"{key}={toml_value(value)}" for key, value in _leaves(document.table))
 
 
@@ -166,7 +166,7 @@ def _inputs(loaded: LoadedCampaign, bases: Mapping[str, Mapping[str, Any]]) -> d
 
 def _model_of(scenario: str, folder: Path) -> str:
     """Path of the model that a scenario's text names, empty where it names none."""
-    model = settings.parse(scenario, "scenario").table.get("target", {}).get("model") if scenario else None
+    model = toml_document.parse(scenario, "scenario").table.get("target", {}).get("model") if scenario else None
     return str(folder / model) if model else ""
 
 
@@ -187,8 +187,8 @@ def _try_all(plan: Plan, axes: list[list[tuple[str, Any]]]) -> None:
         task = plan._task(chosen, 0)
         try:
             if task.scenario:
-                scenario_of(settings.parse(task.scenario, plan.loaded.name))
-            settings.build(RunConfig, settings.override(settings.Document("", {}), task.assignments))
+                scenario_of(toml_document.parse(task.scenario, plan.loaded.name))
+            toml_document.build(RunConfig, toml_document.override(toml_document.Document("", {}), task.assignments))
         except UsageError as error:
             at = f"{plan.loaded.name}, {key} = {value}" if key else plan.loaded.name
             raise UsageError(error.what, where=at, hint=error.hint) from None

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from avsreplay import settings
+from avsreplay import toml_document
 from avsreplay.errors import AvsError
 from avsreplay.job import Job, Run
 from avsreplay.log import SourceOptions
@@ -73,7 +73,7 @@ def _log(task: Task, folder: Path) -> Path:
     """The log to replay: the task's own, or its scenario recorded into ``folder``."""
     if task.log:
         return Path(task.log)
-    scenario = scenario_of(settings.parse(task.scenario, "scenario"), folder=Path(task.folder))
+    scenario = scenario_of(toml_document.parse(task.scenario, "scenario"), folder=Path(task.folder))
     model = Path(task.model) if task.model else None
     record_scenario(scenario, folder / "run.mcap", RecordOptions(model=model, compression="none"))
     return folder / "run.mcap"

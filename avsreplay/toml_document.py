@@ -1,0 +1,284 @@
+"""TOML documents: reading one into a parameter class (``settings``), overriding keys, and writing one.
+
+An unknown key, a missing one, a wrong type or a value out of range is a UsageError that names the file and the line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import enum
+import re
+import tomllib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.settings import Entry, SettingError, dump, entries
+
+T = TypeVar("T")
+_Path = tuple[str | int, ...]
+MAX_BYTES = 1 << 20
+_SIMILAR = 0.7  # similarity from which a known key is suggested in place of an unknown one
+_HEADER = re.compile(r"^\s*(\[\[?)\s*([^\[\]]+?)\s*\]\]?\s*(?:#.*)?$")
+_KEY = re.compile(r"^\s*([A-Za-z0-9_\-.\"']+)\s*=")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Document:
+    """A parsed TOML text that knows the line of a key; ``origins`` names keys that came from elsewhere."""
+
+    name: str
+    table: Mapping[str, Any]
+    text: str = ""
+    origins: Mapping[tuple[str, ...], str] = dataclasses.field(default_factory=dict)
+
+    def where(self, path: Sequence[str | int]) -> str:
+        """``name:line`` of the key at ``path`` (array-of-tables entries by index), ``name`` if it has no line."""
+        wanted = tuple(map(str, path))
+        given_by = [name for key, name in self.origins.items() if key[: len(wanted)] == wanted]
+        if given_by:
+            return ", ".join(given_by)
+        line = _line_of(self.text, path)
+        return f"{self.name}:{line}" if line else self.name
+
+
+def load(path: str | Path) -> Document:
+    """Read a TOML file. Raises UnreadableInput where it cannot be read, UsageError where it is not TOML."""
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise UnreadableInput("larger than 1 MiB, not a settings file", where=str(path), hint="name a TOML file")
+        text = path.read_bytes().decode("utf-8")
+    except FileNotFoundError:
+        raise UnreadableInput("no such file", where=str(path), hint="check the path") from None
+    except UnicodeDecodeError:
+        raise UnreadableInput("not UTF-8 text", where=str(path), hint="name a TOML file") from None
+    except (OSError, ValueError) as error:
+        what = getattr(error, "strerror", None) or "cannot be read"
+        raise UnreadableInput(what, where=str(path), hint="check the path") from None
+    return parse(text, str(path))
+
+
+def parse(text: str, name: str) -> Document:
+    """Parse TOML text; ``name`` is what error messages call it."""
+    try:
+        return Document(name, tomllib.loads(text), text)
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        message = str(error) or "nested too deeply"
+        raise UsageError(f"not valid TOML: {message}", where=name, hint="correct the syntax") from None
+
+
+def override(document: Document, assignments: Sequence[str]) -> Document:
+    """The document with ``a.b=value`` assignments applied; a value is TOML, or else taken as text."""
+    table, origins = _deep_copy(document.table), dict(document.origins)
+    for assignment in assignments:
+        key, sep, raw = assignment.partition("=")
+        if not sep or not key.strip():
+            hint = "for example --set register.gate_m=0.2"
+            raise UsageError(f"'{assignment}' is not of the form a.b=value", where="--set", hint=hint)
+        try:
+            value = tomllib.loads(f"v = {raw}")["v"]
+        except (tomllib.TOMLDecodeError, RecursionError):
+            value = raw.strip()
+        path = tuple(key.strip().split("."))
+        node = table
+        for parent in path[:-1]:
+            node = node.setdefault(parent, {})
+            if not isinstance(node, dict):
+                raise UsageError(f"'{parent}' is not a table", where=f"--set {assignment}", hint="check the key")
+        node[path[-1]] = value
+        origins[path] = f"--set {assignment}"
+    return Document(document.name, table, document.text, origins)
+
+
+def _deep_copy(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {k: _deep_copy(v) for k, v in value.items()}
+    return [_deep_copy(v) for v in value] if isinstance(value, list) else value
+
+
+def build(cls: type[T], document: Document, path: Sequence[str | int] = ()) -> T:
+    """The dataclass ``cls`` from the table at ``path`` of a document (an absent table gives the defaults).
+
+    Raises:
+        UsageError: An unknown key, a missing one, a wrong type, or a value that the class refuses.
+    """
+    table: Any = document.table
+    for part in path:
+        table = table[part] if isinstance(part, int) else table.get(part, {})
+    return typing.cast(T, _Builder(cls, document, tuple(path)).table(cls, table, tuple(path)))
+
+
+class _Builder:
+    """Builds one object; it knows the document for places and the whole tree of keys for suggestions."""
+
+    def __init__(self, cls: Any, document: Document, path: _Path) -> None:
+        self.document = document
+        self.cls, self.prefix = cls, "".join(f"{part}." for part in path)
+
+    def table(self, cls: Any, table: Any, path: _Path) -> Any:
+        """The dataclass ``cls`` from a table."""
+        if not isinstance(table, Mapping):
+            raise self.error(path, f"'{_dotted(path)}' must be a table", "write it as [table]")
+        hints = typing.get_type_hints(cls)
+        known = {f.name: f for f in dataclasses.fields(cls) if f.init}
+        unknown = next((key for key in table if key not in known), None)
+        if unknown is not None:
+            hint = self.nearest(path, unknown, table[unknown], known)
+            raise self.error((*path, unknown), f"unknown key '{_dotted((*path, unknown))}'", hint)
+        required = (n for n, f in known.items() if f.default is f.default_factory is dataclasses.MISSING)
+        missing = next((name for name in required if name not in table), None)
+        if missing:
+            raise self.error(path, f"missing key '{_dotted((*path, missing))}'", "add it")
+        values = {key: self.value(hints[key], value, (*path, key)) for key, value in table.items()}
+        try:
+            return cls(**values)
+        except SettingError as error:
+            prefix = f"{_dotted(path)}." if path else ""
+            raise self.error((*path, error.name), f"{prefix}{error}", "correct the value") from None
+        except ValueError as error:
+            raise self.error(path, str(error), "correct the value") from None
+
+    def value(self, hint: Any, value: Any, path: _Path) -> Any:
+        """A value of the type that a field declares."""
+        origin, args = typing.get_origin(hint), typing.get_args(hint)
+        if origin in (typing.Union, types.UnionType):
+            return None if value is None else self.value(next(a for a in args if a is not type(None)), value, path)
+        if dataclasses.is_dataclass(hint):
+            return self.table(hint, value, path)
+        if origin is tuple and isinstance(value, (list, tuple)):
+            return self._tuple(args, value, path)
+        if isinstance(hint, type) and issubclass(hint, enum.Enum):
+            return self._member(hint, value, path)
+        if hint is float and isinstance(value, int) and not isinstance(value, bool) and abs(value) <= 1 << 1023:
+            return float(value)
+        if hint is Path and isinstance(value, str):
+            return Path(value)
+        plain = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
+        if hint is Any or plain:
+            return value
+        shown = repr(value) if len(repr(value)) <= 60 else f"{repr(value)[:57]}..."
+        raise self.error(path, f"'{_dotted(path)}' must be {_type_name(hint)}, not {shown}", "correct the value")
+
+    def _member(self, kind: type[enum.Enum], value: Any, path: _Path) -> enum.Enum:
+        allowed = [member.value for member in kind]
+        if value in allowed:
+            return kind(value)
+        raise self.error(path, f"'{_dotted(path)}' is {value!r}", f"one of: {', '.join(map(str, allowed))}")
+
+    def _tuple(self, args: tuple[Any, ...], value: Sequence[Any], path: _Path) -> tuple[Any, ...]:
+        if len(args) == 2 and args[1] is Ellipsis:
+            args = (args[0],) * len(value)
+        if len(args) != len(value):
+            raise self.error(
+                path, f"'{_dotted(path)}' must have {len(args)} values, not {len(value)}", "correct the value"
+            )
+        return tuple(self.value(a, v, (*path, i)) for i, (a, v) in enumerate(zip(args, value, strict=True)))
+
+    def nearest(self, path: _Path, key: str, value: Any, known: Mapping[str, Any]) -> str:
+        """A hint that names the known key most like an unknown one, of this table or of any other."""
+        inside: _Path = (key,)
+        while isinstance(value, Mapping) and value:  # an unknown table: what it holds tells which one was meant
+            name, value = next(iter(value.items()))
+            inside = (*inside, name)
+        whole, leaf = _dotted((*path, *inside)), str(inside[-1])
+
+        def likeness(entry: str) -> tuple[float, float]:
+            in_full = difflib.SequenceMatcher(None, whole, entry).ratio()
+            return max(in_full, difflib.SequenceMatcher(None, leaf, entry.rpartition(".")[2]).ratio()), in_full
+
+        here = [_dotted((*path, name)) for name in known]
+        best = max([*here, *(entry.key for entry in entries(self.cls, self.prefix))], key=likeness)
+        if likeness(best)[0] >= _SIMILAR:
+            return f"did you mean '{best}'?"
+        return f"known keys: {', '.join(known)}"
+
+    def error(self, path: _Path, what: str, hint: str) -> UsageError:
+        """A UsageError that names the place of ``path``."""
+        return UsageError(what, where=self.document.where(path), hint=hint)
+
+
+def _dotted(path: Sequence[str | int]) -> str:
+    return ".".join(str(p) for p in path)
+
+
+def _type_name(hint: Any) -> str:
+    names = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+    return names.get(hint, f"a list like {hint}" if typing.get_origin(hint) is tuple else str(hint))
+
+
+def _line_of(text: str, path: Sequence[str | int]) -> int | None:
+    """The line of a key, or of its nearest parent that has one."""
+    lines: dict[tuple[str | int, ...], int] = {}
+    table: tuple[str | int, ...] = ()
+    counts: dict[tuple[str | int, ...], int] = {}
+    for number, line in enumerate(text.splitlines(), 1):
+        header, key = _HEADER.match(line), _KEY.match(line)
+        if header:
+            table = tuple(p.strip().strip("\"'") for p in header[2].split("."))
+            if header[1] == "[[":
+                counts[table] = counts.get(table, -1) + 1
+                table = (*table, counts[table])
+            lines.setdefault(table, number)
+        elif key:
+            lines.setdefault((*table, *(p.strip().strip("\"'") for p in key[1].split("."))), number)
+    for length in range(len(path), 0, -1):
+        if tuple(path[:length]) in lines:
+            return lines[tuple(path[:length])]
+    return None
+
+
+def write(value: Any, name: str = "") -> str:
+    """A parameter object as commented TOML that ``build`` reads back; a setting without a value is a comment.
+
+    Args:
+        value: The object.
+        name: First line of comment, "" for none.
+    """
+    lines = [f"# {name}"] if name else []
+    table = ""
+    for entry in sorted(entries(type(value)), key=lambda each: "." in each.key):  # a key after a table is the table's
+        parent, _, leaf = entry.key.rpartition(".")
+        if parent != table:
+            lines += ["", f"[{parent}]"]
+            table = parent
+        current = value
+        for part in entry.key.split("."):
+            current = getattr(current, part)
+        lines += ["", *_commented(entry), _assignment(leaf, current, entry)]
+    return "\n".join(lines).lstrip("\n") + "\n"
+
+
+def _commented(entry: Entry) -> list[str]:
+    import textwrap
+
+    declared, facts = entry.declared, []
+    if declared.range:
+        facts.append(declared.range)
+    if entry.choices:
+        facts.append(f"one of: {', '.join(entry.choices)}")
+    if entry.default is not None:
+        facts.append(f"default {toml_value(entry.default)}")
+    unit = f" [{declared.unit}]" if declared.unit else ""
+    text = f"{declared.doc}{unit}" + (f" ({'; '.join(facts)})" if facts else "")
+    return textwrap.wrap(text, 118, initial_indent="# ", subsequent_indent="# ", break_on_hyphens=False)
+
+
+def _assignment(leaf: str, value: Any, entry: Entry) -> str:
+    if value is None:
+        return f"# {leaf} is not set: {entry.declared.automatic or 'off'}"
+    return f"{leaf} = {toml_value(value)}"
+
+
+def toml_value(value: Any) -> str:
+    """A value as TOML on one line."""
+    import tomli_w
+
+    text = tomli_w.dumps({"v": dump(value)}).removeprefix("v = ").rstrip("\n")
+    if isinstance(value, (tuple, list)):  # on one line; line breaks inside texts are escaped
+        text = re.sub(r"\n\s*", " ", text).replace("[ ", "[").replace(", ]", "]")
+    return text
