@@ -158,8 +158,9 @@ class _Builder:
             return float(value)
         if hint is Path and isinstance(value, str):
             return Path(value)
-        plain = isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
-        if hint is Any or plain:
+        if hint is Any or (
+            isinstance(hint, type) and isinstance(value, hint) and isinstance(value, bool) == (hint is bool)
+        ):
             return value
         shown = repr(value) if len(repr(value)) <= 60 else f"{repr(value)[:57]}..."
         raise self.error(path, f"'{_dotted(path)}' must be {_type_name(hint)}, not {shown}", "correct the value")

@@ -106,7 +106,7 @@ def test_one_run_is_judged_by_absolute_rules_only():
         ("", r"no \[\[rule\]\]"),
         ('[[rule]]\nmetric = "nope"\nmax = 1', "unknown metric 'nope'"),
         ('[[rule]]\nmetric = "t1_s"', "has no limit"),
-        ('[[rule]]\nmetric = "t1_s"\nmx = 1', r"rules\.toml:3: unknown key 'rule\.0\.mx'; did you mean 'max'"),
+        ('[[rule]]\nmetric = "t1_s"\nmx = 1', r"rules\.toml:3: unknown key 'rule\.0\.mx'; did you mean 'rule\.0\.max'"),
         ('[[rule]]\nmetric = "t1_s"\nmax = "1"', r":3: 'rule\.0\.max' must be a number"),
         ("[[rule", "not valid TOML"),
     ],

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from avsreplay import geometry, settings
+from avsreplay import geometry, toml_document
 from avsreplay.geometry import Pose
 from avsreplay.register import Registrar
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
@@ -21,7 +21,7 @@ position_m = [0.1, -0.1, 4.5]
 
 @pytest.fixture(scope="module")
 def scans():
-    simulated = simulate(scenario_of(settings.parse(SCENARIO, "second look")), builtin_surface())
+    simulated = simulate(scenario_of(toml_document.parse(SCENARIO, "second look")), builtin_surface())
     return list(simulated.scans())
 
 

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from numpy.testing import assert_allclose
 
-from avsreplay import geometry, settings
+from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.records import ScanStatus
 from avsreplay.simulate import EPOCH_NS, builtin_surface, load_scenario, scenario_of, simulate
@@ -33,7 +33,7 @@ outlier_ratio = 0.0
 
 
 def scenario(extra="", seed=None):
-    return scenario_of(settings.parse(SMALL + extra, "test.toml"), seed)
+    return scenario_of(toml_document.parse(SMALL + extra, "test.toml"), seed)
 
 
 def scans(extra="", seed=None):
@@ -260,7 +260,7 @@ def test_a_run_table_is_handed_through():
         (fault("occlusion", strength=1.5), 11, "out of range"),
         (fault("clutter", start=-1.0), 11, "start_s"),
         ("[target]\nshape = 'boat'\n", 12, "satellite"),
-        ("[start]\nmu_std_deg = 0.0\n", 11, "mu_std_deg"),
+        ("[start]\nmu_std_deg = 0.0\n", 12, "mu_std_deg"),
         ("[motion.x]\ny = 1\n", 11, "unknown key"),
     ],
 )
@@ -283,7 +283,7 @@ def test_wrong_scenarios_are_refused_with_file_and_line(extra, line, words):
 )
 def test_impossible_totals_are_refused(text):
     with pytest.raises(UsageError):
-        scenario_of(settings.parse(text, "x.toml"))
+        scenario_of(toml_document.parse(text, "x.toml"))
 
 
 def test_missing_and_broken_files_are_one_line(tmp_path):

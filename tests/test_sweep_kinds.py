@@ -7,7 +7,7 @@ from pathlib import Path
 import estimate_faults
 import pytest
 
-from avsreplay import settings
+from avsreplay import toml_document
 from avsreplay.report.episodes import Episode, Peak
 from avsreplay.simulate import load_scenario
 from avsreplay.simulate.faults import Kind
@@ -100,7 +100,7 @@ def test_the_campaign_of_faults_has_every_kind_at_three_strengths():
     tasks = [point.task for point in expand(load_campaign(CAMPAIGN)).points() if point.repeat == 0]
     how = {kind: set() for kind in Kind}
     for task in tasks:
-        for fault in settings.parse(task.scenario, "scenario").table["fault"]:
+        for fault in toml_document.parse(task.scenario, "scenario").table["fault"]:
             strength = fault.get("strength")
             how[Kind(fault["kind"])].add(fault["duration_s"] if strength is None else strength)
     assert {kind.value: len(found) for kind, found in how.items()} == {kind.value: 3 for kind in Kind}

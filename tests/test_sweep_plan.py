@@ -165,7 +165,7 @@ def test_logs_are_an_axis(tmp_path):
         ('[[grid]]\nkey = "scenario.scanner.noise_m"\nvalues = [0.1, -1.0]\n', "noise_m = -1.0"),
         ('[[grid]]\nkey = "run.faults.polcy"\nvalues = ["any"]\n', "policy"),
         ('[[grid]]\nkey = "faults.policy"\nvalues = ["any"]\n', "must begin with"),
-        ('[[grid]]\nkey = "scenario.seed"\nvalues = []\n', "something in it"),
+        ('[[grid]]\nkey = "scenario.seed"\nvalues = []\n', "not empty"),
         ('[set]\n"scenario.fault.9.start_s" = 1.0\n', "does not lead to a place"),
         ('[set]\n"scenario.name.x" = 1.0\n', "does not lead to a place"),
         ("repeats = 0\n", "repeats"),

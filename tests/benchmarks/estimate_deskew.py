@@ -11,7 +11,7 @@ import argparse
 
 import numpy as np
 
-from avsreplay import geometry, settings
+from avsreplay import geometry, toml_document
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.chart import nees
 from avsreplay.estimate.deskew import deskew, with_scan_duration
@@ -55,7 +55,7 @@ def errors(rate: float, seconds: float, mode: str) -> tuple[np.ndarray, int, int
     axis = np.array([0.60, 0.64, -0.48])
     x, y, z = axis / np.linalg.norm(axis) * rate
     surface = builtin_surface()
-    run = simulate(scenario_of(settings.parse(SCENARIO.format(seconds=seconds, x=x, y=y, z=z), "raster")), surface)
+    run = simulate(scenario_of(toml_document.parse(SCENARIO.format(seconds=seconds, x=x, y=y, z=z), "raster")), surface)
     registrar = Registrar(surface, RegisterParams())
     estimator = Estimator(EstimatorParams(), run.header.start, surface.extent)
     detector = FaultDetector(FaultParams(), surface.extent)

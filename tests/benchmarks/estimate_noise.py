@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avsreplay import geometry, settings
+from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array
 from avsreplay.log import parse_surface, read_surface
 from avsreplay.records import AlignStatus, Surface
@@ -88,7 +88,7 @@ def scenario(surface: Surface, noise: float, rays: int, seed: int, scans: int) -
 def whitened(surface: Surface, registrar: Registrar, text: str) -> tuple[Array, Array]:
     """(n, 6) whitened errors along one tumble, NaN where the view is degenerate; (n,) inliers (rms / extent)^2."""
     out, edge = [], []
-    for scan in simulate(scenario_of(settings.parse(text, "noise")), surface).scans():
+    for scan in simulate(scenario_of(toml_document.parse(text, "noise")), surface).scans():
         found = registrar.register(scan.points, scan.truth)
         error = found.T_ac.inverse() @ scan.truth
         d = np.concatenate([geometry.log(error.q), error.t])

@@ -22,7 +22,7 @@ from pathlib import Path
 
 from fuzz_inputs import case, seeds
 
-from avsreplay import settings
+from avsreplay import toml_document
 from avsreplay.errors import AvsError
 from avsreplay.log import SourceOptions, open_source, parse_surface
 from avsreplay.log.bytes_io import BadMessage
@@ -47,7 +47,7 @@ def check(name: str, data: bytes, folder: Path, deep: bool) -> str:
         if kind in ("cdr", "ros1"):
             decode_cloud(data, kind)
         elif kind == "toml":
-            settings.parse(data.decode("utf-8", "replace"), name)
+            toml_document.parse(data.decode("utf-8", "replace"), name)
         elif name.startswith("model"):
             parse_surface(data, name)
         else:

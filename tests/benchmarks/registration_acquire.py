@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from avsreplay import geometry, settings
+from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
 from avsreplay.log import read_surface
 from avsreplay.log.ply import read_ply
@@ -40,7 +40,7 @@ def built_in(count: int, distance_m: float, seed: int) -> list[Case]:
             f"seed = {k}\nduration_s = 1.0\nrate_hz = 5.0\n[motion]\nattitude_xyzw = {q}\n"
             f"rate_radps = [0.0, 0.0, 0.0]\nposition_m = [0.15, -0.1, {distance_m}]\n"
         )
-        scan = next(iter(simulate(scenario_of(settings.parse(text, "acquire")), surface).scans()))
+        scan = next(iter(simulate(scenario_of(toml_document.parse(text, "acquire")), surface).scans()))
         assert scan.truth is not None
         cases.append((scan.points, scan.truth))
     return cases

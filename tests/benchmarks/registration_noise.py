@@ -12,7 +12,7 @@ import argparse
 
 import numpy as np
 
-from avsreplay import geometry, settings
+from avsreplay import geometry, toml_document
 from avsreplay.register import Registrar
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
 
@@ -33,7 +33,7 @@ def scenario(seed: int, duration_s: float) -> str:
 def whitened(seed: int, duration_s: float) -> np.ndarray:
     """(n, 6) whitened errors of the registration along one tumble, NaN where the view is degenerate."""
     surface = builtin_surface()
-    simulated = simulate(scenario_of(settings.parse(scenario(seed, duration_s), "noise")), surface)
+    simulated = simulate(scenario_of(toml_document.parse(scenario(seed, duration_s), "noise")), surface)
     registrar, out = Registrar(surface), []
     for scan in simulated.scans():
         found = registrar.register(scan.points, scan.truth)
