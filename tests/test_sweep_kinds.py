@@ -7,7 +7,7 @@ from pathlib import Path
 import estimate_faults
 import pytest
 
-from avsreplay import toml_document
+from avsreplay import settings, toml_document
 from avsreplay.report.episodes import Episode, Peak
 from avsreplay.simulate import load_scenario
 from avsreplay.simulate.faults import Kind
