@@ -17,7 +17,7 @@ import avsreplay
 from avsreplay import settings, toml_document
 from avsreplay.config import RunConfig, load_config
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.estimate.fit import FitParams
+from avsreplay.estimate.batch import FitParams
 from avsreplay.log import SourceOptions
 from avsreplay.plan import Limits
 from avsreplay.register.surface_index import IcpParams

@@ -258,7 +258,7 @@ def test_a_run_table_is_handed_through():
         (fault("clutter", strenght=1), 15, "strength"),
         (fault("dropped", strength=1.0), 11, "no strength"),
         (fault("occlusion", strength=1.5), 11, "out of range"),
-        (fault("clutter", start=-1.0), 11, "start_s"),
+        (fault("clutter", start=-1.0), 13, "start_s"),
         ("[target]\nshape = 'boat'\n", 12, "satellite"),
         ("[start]\nmu_std_deg = 0.0\n", 12, "mu_std_deg"),
         ("[motion.x]\ny = 1\n", 11, "unknown key"),
