@@ -27,13 +27,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from avsreplay.config import RunConfig
     from avsreplay.errors import AvsError
-    from avsreplay.job import Job, Run, replay
     from avsreplay.rows import Row
+    from avsreplay.run import Job, Run, replay
 
 __version__ = "0.1.0"
 __all__ = ["AvsError", "Job", "Row", "Run", "RunConfig", "__version__", "replay"]
 
-_HOME = {"AvsError": "errors", "Job": "job", "Row": "rows", "Run": "job", "RunConfig": "config", "replay": "job"}
+_HOME = {"AvsError": "errors", "Job": "run", "Row": "rows", "Run": "run", "RunConfig": "config", "replay": "run"}
 
 
 def __getattr__(name: str) -> Any:

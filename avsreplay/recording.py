@@ -9,7 +9,7 @@ from pathlib import Path
 
 from avsreplay.errors import UsageError
 from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
-from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface
+from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
 from avsreplay.simulate import Engine, Scenario, builtin_surface, load_scenario, simulate
 
 __all__ = ["RecordOptions", "Recorded", "Ticker", "record", "record_scenario", "record_source", "surface_for"]
@@ -95,7 +95,7 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
         _writer(output, simulation.header, options) as writer,
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
-        tally = _fold(scans, writer, true_clock=True)
+        tally = _fold(scans, simulation.truth_of, writer, true_clock=True)
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
     slow = "embreex is not installed: rays were cast by the exact engine, which is slower"
     return replace(tally.recorded(output, simulation.header), note=slow if by_hand else "")
@@ -113,7 +113,7 @@ def record_source(
     with open_source(source, reading) as opened:
         header, due = opened.header, opened.info().scans
         with _writer(output, header, options) as writer, _ticked(ticker, opened.scans(), due) as scans:
-            tally = _fold(scans, writer, true_clock=False)
+            tally = _fold(scans, opened.truth_of, writer, true_clock=False)
         return tally.recorded(output, header, tuple(opened.losses))
 
 
@@ -153,15 +153,16 @@ class _Tally:
         return label.kind, start, end, label.harmful
 
 
-def _fold(scans: Iterable[Scan], writer: LogWriter, true_clock: bool) -> _Tally:
+def _fold(scans: Iterable[Scan], truth_of: Callable[[Scan], Truth], writer: LogWriter, true_clock: bool) -> _Tally:
     tally = _Tally()
     for scan in scans:
         if scan.status is ScanStatus.DAMAGED:
             tally.damaged += 1
             continue
         writer.write(scan)
-        if scan.truth is not None:
-            writer.write_truth(scan.log_ns, scan.log_ns if true_clock else scan.t_ns, scan.truth, scan.body)
+        truth = truth_of(scan)
+        if truth.pose is not None:
+            writer.write_truth(scan.log_ns, scan.log_ns if true_clock else scan.t_ns, truth.pose, truth.state)
         tally.add(scan)
     return tally
 

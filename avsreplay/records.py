@@ -19,27 +19,6 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 
-__all__ = [
-    "BLOCKS",
-    "AlignStatus",
-    "Alignment",
-    "Belief",
-    "Fit",
-    "Forecast",
-    "Innovation",
-    "Label",
-    "LogHeader",
-    "Plan",
-    "PlanStatus",
-    "Reason",
-    "Scan",
-    "ScanStatus",
-    "State",
-    "Surface",
-    "Trajectory",
-    "Verdict",
-]
-
 BLOCKS: Mapping[str, slice] = MappingProxyType(
     {
         "attitude": slice(0, 3),  # dq_v, half angle, {B}
@@ -175,8 +154,8 @@ class Scan:
         points: (n, 3) finite, float32 or float64, possibly strided, in {A} [m].
         times_s: (n,) instant of each point relative to ``t_ns`` [s], or None.
         dropped_points: how many non-finite points were left out.
-        truth: pose T_ac at t_ns where the log has one.  body: full true state where the log has it.
-        fault: label of the injected fault, None outside every window.
+        frame: coordinate frame that the message names, "" for none.
+        note: what was wrong with the message or its stamp.
     """
 
     seq: int
@@ -185,11 +164,18 @@ class Scan:
     status: ScanStatus = ScanStatus.OK
     times_s: NDArray[Any] | None = None
     dropped_points: int = 0
-    truth: Pose | None = None
-    body: State | None = None
-    fault: str | None = None
     note: str | None = None
     log_ns: int = 0
+    frame: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """Ground truth at a scan, for scoring only: T_ac, full state and label of the injected fault, None if unknown."""
+
+    pose: Pose | None = None
+    state: State | None = None
+    fault: str | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

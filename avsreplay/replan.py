@@ -31,7 +31,7 @@ from avsreplay.plan.limits import margin
 from avsreplay.records import Belief, Plan, State
 from avsreplay.report import load_result
 from avsreplay.report.result import Result
-from avsreplay.results import read_beliefs
+from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
 
 __all__ = ["Replanning", "Saved", "load_saved"]

@@ -13,7 +13,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import IDENTITY_QUAT
 from avsreplay.records import State
 from avsreplay.report import write_rows, write_tum
-from avsreplay.results import mean_vector
+from avsreplay.result_dir import mean_vector
 from avsreplay.rows import Row
 
 STEP_S, SCANS = 0.5, 140

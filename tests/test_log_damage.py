@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from log_cases import SECOND, header, scans, write
 from mcap.stream_reader import StreamReader
+from true_scans import true_scans
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.log import Loss, SourceOptions, open_source
@@ -53,7 +54,7 @@ def data_end_of(data: bytes, at: int) -> int:
 
 def read(path: Path, **options: object) -> tuple[list[Scan], list[Loss]]:
     with open_source(path, SourceOptions(**options)) as source:  # type: ignore[arg-type]
-        return list(source.scans()), source.losses
+        return list(true_scans(source)), source.losses
 
 
 def same(scan: Scan) -> bool:

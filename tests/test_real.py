@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from true_scans import true_scans
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def bunny(shared_data):
 
     folder = shared_data / "stanford-bunny"
     with open_source(folder, SourceOptions(model=folder / "bun_zipper.ply")) as source:
-        return source.header.surface, [(s.points, s.truth) for s in source.scans() if s.truth is not None]
+        return source.header.surface, [(s.points, s.truth) for s in true_scans(source) if s.truth is not None]
 
 
 @pytest.mark.parametrize("off_deg", [5.0, 15.0, 24.0])

@@ -11,16 +11,15 @@ from click.testing import CliRunner
 from avsreplay.cli.bench import command, measure
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Pose, exp
-from avsreplay.records import Scan
 from avsreplay.register.proving import proving_pose, proving_surface, view
 
 
-def _scans(count: int, truth: bool = True) -> list[Scan]:
+def _scans(count: int, truth: bool = True) -> list[tuple[np.ndarray, Pose | None]]:
     surface, step = proving_surface(), Pose(exp([0.004, 0.0, 0.01]), np.zeros(3))
     scans, pose = [], proving_pose()
-    for k in range(count):
+    for _ in range(count):
         points = pose.apply(view(surface, 2000, pose.inverse().t))
-        scans.append(Scan(k, k * 10**9, points, truth=pose if truth else None))
+        scans.append((points, pose if truth else None))
         pose = pose @ step
     return scans
 
@@ -41,7 +40,7 @@ def test_every_scan_but_the_first_is_counted(monkeypatch: pytest.MonkeyPatch, tr
 def test_a_scan_of_nothing_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("avsreplay.cli.bench._peak_mib", lambda *_: None)
     scans = _scans(3)
-    away = Scan(3, 3 * 10**9, scans[-1].points + 100.0, truth=scans[-1].truth)
+    away = (scans[-1][0] + 100.0, scans[-1][1])
     (tally,) = measure(["horn"], proving_surface(), [*scans, away])
     assert tally.failures == 1
 

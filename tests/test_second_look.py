@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
 from avsreplay.geometry import Pose
@@ -22,7 +23,7 @@ position_m = [0.1, -0.1, 4.5]
 @pytest.fixture(scope="module")
 def scans():
     simulated = simulate(scenario_of(toml_document.parse(SCENARIO, "second look")), builtin_surface())
-    return list(simulated.scans())
+    return list(true_scans(simulated))
 
 
 def test_no_far_guess_ends_beside_the_truth(scans):

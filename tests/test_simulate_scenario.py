@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.testing import assert_allclose
+from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
@@ -37,7 +38,7 @@ def scenario(extra="", seed=None):
 
 
 def scans(extra="", seed=None):
-    return list(simulate(scenario(extra, seed), SURFACE).scans())
+    return list(true_scans(simulate(scenario(extra, seed), SURFACE)))
 
 
 def fault(kind, start=2.0, duration=1.0, **more):
@@ -190,7 +191,7 @@ def test_labels_are_half_open_windows_on_the_log_clock():
     (found,) = simulation.header.labels
     assert (found.kind, found.harmful, found.strength) == ("clutter", False, 0.5)
     inside = [s.seq for s in simulation.scans() if found.start_ns <= s.log_ns < found.end_ns]
-    assert inside == [4, 5] == [s.seq for s in simulation.scans() if s.fault == "clutter"]
+    assert inside == [4, 5] == [s.seq for s in true_scans(simulation) if s.fault == "clutter"]
 
 
 def test_a_label_says_harmful_by_kind_unless_the_scenario_says_otherwise():
@@ -309,7 +310,7 @@ def test_a_model_is_named_beside_the_scenario(tmp_path):
 def test_the_ready_scenarios_see_their_target(path):
     loaded = load_scenario(path)
     simulation = simulate(loaded, builtin_surface(loaded.params.target.shape))
-    first = next(simulation.scans())
+    first = next(true_scans(simulation))
     assert len(first.points) > 100
     assert loaded.params.name == path.stem
 

@@ -12,9 +12,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from avsreplay.geometry import Pose
-    from avsreplay.records import Alignment, Scan, Surface
+    from avsreplay.records import Alignment, Surface
     from avsreplay.register import Registrar
+
+    TrueScan = tuple[NDArray[Any], Pose | None]
 
 __all__ = ["Tally", "command", "measure"]
 
@@ -77,7 +81,8 @@ def command(log: Path, backends: str, model: Path | None, topic: str | None, sca
     if not names:
         raise UsageError("no back end is named", where="--backends", hint="for example --backends horn,kiss")
     with open_source(log, SourceOptions(topic=topic, model=model, n_scans=scans)) as source:
-        surface, taken = source.header.surface, list(source.scans())
+        surface = source.header.surface
+        taken = [(scan.points, source.truth_of(scan).pose) for scan in source.scans()]
     if surface is None:
         raise UsageError("the log has no model", where=str(log), hint="name one with --model")
     summaries = [tally.summary() for tally in measure(names, surface, taken)]
@@ -87,8 +92,10 @@ def command(log: Path, backends: str, model: Path | None, topic: str | None, sca
         _print(summaries)
 
 
-def measure(names: list[str], surface: Surface, scans: list[Scan]) -> list[Tally]:
+def measure(names: list[str], surface: Surface, scans: list[TrueScan]) -> list[Tally]:
     """Every back end on every scan that has points; all on one scan before any goes on to the next.
+
+    A scan is its points (n, 3) in {A} [m] and the true pose T_ac, or None.
 
     Raises UsageError or MissingBackend for a name that cannot be built, before anything is timed.
     """
@@ -99,34 +106,35 @@ def measure(names: list[str], surface: Surface, scans: list[Scan]) -> list[Tally
         begun = time.perf_counter()
         registrars.append(_registrar(name, surface))
         tallies.append(Tally(name, build_s=time.perf_counter() - begun))
-    usable = [scan for scan in scans if len(scan.points)]
+    usable = [scan for scan in scans if len(scan[0])]
     last: list[Pose | None] = [None] * len(names)
     truth: Pose | None = None
     for scan in tracked(usable, len(usable), "bench"):
         for k, (tally, registrar) in enumerate(zip(tallies, registrars, strict=True)):
             last[k] = _one(tally, registrar, scan, truth if truth is not None else last[k])
-        truth = scan.truth
+        truth = scan[1]
     for tally in tallies:
         tally.peak_mib = _peak_mib(tally.name, surface, usable[:MEMORY_SCANS])
     return tallies
 
 
-def _one(tally: Tally, registrar: Registrar, scan: Scan, guess: Pose | None) -> Pose | None:
+def _one(tally: Tally, registrar: Registrar, scan: TrueScan, guess: Pose | None) -> Pose | None:
     """Register one scan, count it, and give the next guess; the first scan is acquired and not counted."""
     from avsreplay.records import AlignStatus
 
+    points, truth = scan
     if guess is None:
-        found = registrar.acquire(scan.points)
+        found = registrar.acquire(points)
         return found.T_ac if found.status is AlignStatus.ALIGNED else None
     begun = time.perf_counter()
-    found = registrar.register(scan.points, guess)
+    found = registrar.register(points, guess)
     tally.ms.append(1e3 * (time.perf_counter() - begun))
     tally.passes.append(found.iterations)
     if found.status is not AlignStatus.ALIGNED:
         tally.failures += 1
         return guess
-    if scan.truth is not None:
-        _count_error(tally, scan.truth, found)
+    if truth is not None:
+        _count_error(tally, truth, found)
     return found.T_ac
 
 
@@ -146,19 +154,18 @@ def _registrar(name: str, surface: Surface) -> Registrar:
     return Registrar(surface, RegisterParams(backend=name))
 
 
-def _peak_mib(name: str, surface: Surface, scans: list[Scan]) -> float | None:
+def _peak_mib(name: str, surface: Surface, scans: list[TrueScan]) -> float | None:
     """Peak memory of a fresh process that builds the back end and registers three scans; None where it is not told."""
     if sys.platform == "win32":
         return None
     from concurrent.futures import ProcessPoolExecutor
     from multiprocessing import get_context
 
-    work = [(scan.points, scan.truth) for scan in scans]
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        return pool.submit(_peak_of_run, name, surface, work).result()
+        return pool.submit(_peak_of_run, name, surface, scans).result()
 
 
-def _peak_of_run(name: str, surface: Surface, work: list[tuple[Any, Pose | None]]) -> float:
+def _peak_of_run(name: str, surface: Surface, work: list[TrueScan]) -> float:
     import resource
 
     registrar = _registrar(name, surface)

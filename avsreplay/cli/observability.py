@@ -10,9 +10,9 @@ import click
 
 if TYPE_CHECKING:
     from avsreplay.estimate.reference import Reference
-    from avsreplay.job import Run
     from avsreplay.monitor.observability import Gramian
     from avsreplay.rows import Row
+    from avsreplay.run import Run
 
 __all__ = ["command"]
 
@@ -41,7 +41,7 @@ that motion: with sigma1 and sigma2 as parameters, with the three sigma apart, a
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 def command(log: Path, marks: int, weakest: int, as_json: bool, **flags: Any) -> None:
     """Show what the measurements of LOG can and cannot tell."""
-    from avsreplay.job import Run
+    from avsreplay.run import Run
 
     with Run(_job(log, flags)) as run:
         found = _document(run, marks, weakest)
@@ -52,8 +52,8 @@ def command(log: Path, marks: int, weakest: int, as_json: bool, **flags: Any) ->
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Any:
-    from avsreplay.job import Job
     from avsreplay.log import SourceOptions
+    from avsreplay.run import Job
 
     init, assignments = flags.pop("init"), flags.pop("assignments")
     given = {name: value for name, value in flags.items() if value is not None}
@@ -62,7 +62,7 @@ def _job(log: Path, flags: dict[str, Any]) -> Any:
 
 
 def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
-    from avsreplay.job import HealthyPoses
+    from avsreplay.run import HealthyPoses
 
     poses = HealthyPoses(run.config.estimator.resolved(run.surface.extent))
     rows = list(run.rows([poses]))

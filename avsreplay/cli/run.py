@@ -17,10 +17,10 @@ from avsreplay.errors import DataLost, UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from avsreplay.job import Job, Listener, Run
     from avsreplay.report import Summary
-    from avsreplay.results import ResultDirectory
+    from avsreplay.result_dir import ResultDirectory
     from avsreplay.rows import Row
+    from avsreplay.run import Job, Listener, Run
 
 __all__ = ["command"]
 
@@ -99,8 +99,8 @@ def command(log: Path, **flags: Any) -> None:
 
     LOG is an MCAP, a ROS bag or a folder of scans. A log written by 'avsreplay record' runs with no flag.
     """
-    from avsreplay.job import Run
-    from avsreplay.results import ResultDirectory
+    from avsreplay.result_dir import ResultDirectory
+    from avsreplay.run import Run
 
     wanted = Wanted(**{field.name: flags.pop(field.name) for field in fields(Wanted)})
     wanted.check()
@@ -138,7 +138,7 @@ class Wanted:
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Job:
-    from avsreplay.job import Job
+    from avsreplay.run import Job
 
     named = {key: flags.pop(name) for name, key in ASSIGNED.items()}
     config_file, more, starts = flags.pop("config_file"), flags.pop("assignments"), flags.pop("starts")
@@ -168,16 +168,17 @@ def _replayed(
 ) -> tuple[list[Row], Summary, dict[str, Any], float]:
     """Rows, summary, run facts and scans a second; with a target everything is kept there."""
     from avsreplay.cli.progress import tracked
-    from avsreplay.keepers import ResultKeeper
-    from avsreplay.rerun_stream import RerunStream
+    from avsreplay.result_dir import RerunStream, ResultWriter
 
-    keeper = ResultKeeper(target, run.surface, run.registrar) if target else None
+    keeper = ResultWriter(target, run.surface, run.registrar) if target else None
     viewer = RerunStream(run.surface) if to_rerun else None
     listeners: list[Listener] = [viewer] if viewer else []
     with keeper or nullcontext():
         begun = time.perf_counter()
         listeners += keeper.listeners if keeper else ()
-        rows = list(tracked(run.rows(listeners), len(run), "replaying"))
+        if run.config.reference.value == "fit":
+            run.fit_reference(tracked)
+        rows = list(run.rows(listeners, tracked))
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
             viewer.close()

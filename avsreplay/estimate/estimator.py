@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from avsreplay.errors import UsageError
 from avsreplay.estimate import dynamics, ekf
 from avsreplay.estimate.batch_schedule import BatchSchedule
@@ -112,6 +114,11 @@ class Estimator:
             times_s: (n,) >= 0, ascending [s after the belief's instant].
         """
         return dynamics.grasp_forecast(belief, times_s, self._torque, self._force)
+
+    def pose_covariance(self, belief: Belief) -> Array:
+        """The (6, 6) covariance of the pose of {C}: position in {A} [m], half-angle vector in {B} [rad]."""
+        H = measurement_jacobian(belief.x)
+        return np.asarray(H @ belief.P @ H.T)
 
     def _filtered(self, track: Track, prediction: Prediction, innovation: Innovation) -> Track:
         """The filter's posterior, its noise window and its memory of poses."""

@@ -135,6 +135,7 @@ def _pass(source: Source) -> tuple[_Tally, list[int]]:
     for scan in source.scans(prefetch=1):
         times.append(scan.t_ns)
         last = _count(tally, scan, last)
+        tally.with_truth += source.truth_of(scan).pose is not None
     return tally, times
 
 
@@ -142,7 +143,6 @@ def _count(tally: _Tally, scan: Scan, last: bytes) -> bytes:
     tally.scans += 1
     tally.points += len(scan.points)
     tally.dropped += scan.dropped_points
-    tally.with_truth += scan.truth is not None
     if scan.status is ScanStatus.DAMAGED:
         tally.damaged.append((scan.seq, scan.note or ""))
     elif not len(scan.points):

@@ -18,7 +18,7 @@ from avsreplay.log.cloud_stream import CloudStream, ahead
 from avsreplay.log.ground_truth import Guides
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import Cloud
-from avsreplay.records import LogHeader, Scan, ScanStatus, State
+from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
 
 _BLOCK = 1 << 20
 
@@ -97,6 +97,12 @@ class Source:
         scans = (self._scan(seq, i) for seq, i in enumerate(self._selected))
         return ahead(scans, prefetch) if prefetch else scans
 
+    def truth_of(self, scan: Scan) -> Truth:
+        """Return the ground truth at one of this source's scans: pose, full state and injected fault, where known."""
+        lookup, place = self._guides.truth, self._selected[scan.seq]
+        pose = None if lookup is None else lookup(scan.t_ns, place, scan.frame)
+        return Truth(pose, self._body_at(scan.t_ns), self._fault(scan.log_ns))
+
     def payloads(self) -> Iterator[tuple[bytes | memoryview, str]]:
         """The clouds as they stand in the log, with their encoding; none for a folder of files."""
         for at in self._selected:
@@ -163,7 +169,6 @@ class Source:
 
     def _finish(self, seq: int, place: int, cloud: Cloud | None, note: str | None) -> Scan:
         placed, log_ns = self._placed[place], self._feed.log_ns[place]
-        frame = "" if cloud is None else cloud.frame
         return Scan(
             seq=seq,
             t_ns=placed.t_ns,
@@ -171,11 +176,9 @@ class Source:
             status=_status(cloud, placed),
             times_s=None if cloud is None else cloud.times_s,
             dropped_points=0 if cloud is None else cloud.dropped,
-            truth=None if self._guides.truth is None else self._guides.truth(placed.t_ns, place, frame),
-            body=self._body_at(placed.t_ns),
-            fault=self._fault(log_ns),
             note=note,
             log_ns=log_ns,
+            frame="" if cloud is None else cloud.frame,
         )
 
     def _body_at(self, t_ns: int) -> State | None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface
+from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.simulate import faults
 from avsreplay.simulate.caster import Engine
 from avsreplay.simulate.faults import FaultParams, Kind
@@ -51,19 +51,27 @@ class Simulation:
         """The full true state at an instant of the log clock."""
         return self._motion.state((log_ns - EPOCH_NS) / NS)
 
+    def truth_of(self, scan: Scan) -> Truth:
+        """Return the ground truth at one of this simulation's scans: pose, full state and injected fault."""
+        state = self.truth(scan.log_ns)
+        return Truth(state.T_ac, state, next((kind.value for kind in self._faults(scan.log_ns)), None))
+
+    def _faults(self, log_ns: int) -> dict[Kind, FaultParams]:
+        return faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
+
     def scans(self) -> Iterator[Scan]:
         """The scans in the recorder's order; a dropped one leaves a gap in ``seq``."""
         last: Scan | None = None
         for k in range(self.count):
             scan = self._scan(k, last)
             if scan is not None:
-                if scan.fault != Kind.FROZEN.value:
+                if next(iter(self._faults(scan.log_ns)), None) is not Kind.FROZEN:
                     last = scan
                 yield scan
 
     def _scan(self, k: int, last: Scan | None) -> Scan | None:
         log_ns = EPOCH_NS + round(k * NS / self._scenario.params.rate_hz)
-        now = faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
+        now = self._faults(log_ns)
         if Kind.DROPPED in now:
             return None
         body_now = self.truth(log_ns)
@@ -77,9 +85,6 @@ class Simulation:
             points=returns.points,
             times_s=returns.times_s.astype(np.float32) if timed else None,
             status=ScanStatus.OK if len(returns.ranges) else ScanStatus.EMPTY,
-            truth=body_now.T_ac,
-            body=body_now,
-            fault=next((kind.value for kind in now), None),
         )
         if Kind.FROZEN in now and last is not None:
             scan = replace(scan, points=last.points, times_s=last.times_s, status=last.status)

@@ -15,11 +15,11 @@ import numpy as np
 
 from avsreplay import toml_document
 from avsreplay.errors import AvsError
-from avsreplay.job import Job, Run
 from avsreplay.log import SourceOptions
 from avsreplay.recording import RecordOptions, record_scenario
 from avsreplay.records import Label, Scan
 from avsreplay.rows import Row
+from avsreplay.run import Job, ReplayedScan, Run
 from avsreplay.simulate import scenario_of
 from avsreplay.sweep.kinds import episode_lines
 from avsreplay.sweep.metrics import metrics
@@ -83,16 +83,14 @@ def _replayed(task: Task, log: Path) -> Outcome:
     options = SourceOptions(model=Path(task.model)) if task.log and task.model else SourceOptions()
     with Run(Job(source=log, options=options, assignments=task.assignments, prefetch=0)) as run:
         length_m = run.config.faults.resolved(run.surface.extent).length_m or 0.0
-        heard: list[Scan] = []
+        lines: list[tuple[Any, ...]] = []
 
-        def hear(scan: Scan, *_rest: object) -> None:
-            heard[:] = [scan]
+        def keep(scan: ReplayedScan) -> None:
+            lines.append(_line(scan.row, scan.outcome.scan, run.source.header.labels, length_m))
 
-        lines, last = [], None
-        for row in run.rows([hear]):
+        last = None
+        for row in run.rows([keep] if task.scans else []):
             last = row
-            if task.scans:
-                lines.append(_line(row, heard[0], run.source.header.labels, length_m))
         summary = run.summary()
         episodes = episode_lines(summary.faults.episodes)
         return Outcome(task.id, "ok", None, metrics(summary, last), tuple(lines), episodes)

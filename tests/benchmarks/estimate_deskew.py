@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
+from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
 from avsreplay.estimate import Estimator, EstimatorParams
@@ -60,7 +61,7 @@ def errors(rate: float, seconds: float, mode: str) -> tuple[np.ndarray, int, int
     estimator = Estimator(EstimatorParams(), run.header.start, surface.extent)
     detector = FaultDetector(FaultParams(), surface.extent)
     track, found, total = None, [], 0
-    for k, scan in enumerate(run.scans()):
+    for k, scan in enumerate(true_scans(run)):
         track = track or estimator.initial(scan.t_ns, scan.truth)
         prediction = estimator.predict(track, scan.t_ns)
         points = scan.points if mode == "raw" else deskew(scan.points, scan.times_s, prediction)

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array
@@ -88,7 +89,7 @@ def scenario(surface: Surface, noise: float, rays: int, seed: int, scans: int) -
 def whitened(surface: Surface, registrar: Registrar, text: str) -> tuple[Array, Array]:
     """(n, 6) whitened errors along one tumble, NaN where the view is degenerate; (n,) inliers (rms / extent)^2."""
     out, edge = [], []
-    for scan in simulate(scenario_of(toml_document.parse(text, "noise")), surface).scans():
+    for scan in true_scans(simulate(scenario_of(toml_document.parse(text, "noise")), surface)):
         found = registrar.register(scan.points, scan.truth)
         error = found.T_ac.inverse() @ scan.truth
         d = np.concatenate([geometry.log(error.q), error.t])

@@ -10,17 +10,18 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from true_scans import true_scans
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
-from avsreplay.job import Job, Run
 from avsreplay.log import open_source
+from avsreplay.run import Job, Run
 
 
 def steps(log: Path) -> tuple[Array, Array]:
     """Rotation vectors (n, 3) in {A} from each true pose to the next [rad], and seconds between them (n,)."""
     with open_source(log) as source:
-        poses = [(scan.t_ns, scan.truth.q) for scan in source.scans() if scan.truth is not None]
+        poses = [(scan.t_ns, scan.truth.q) for scan in true_scans(source) if scan.truth is not None]
     if len(poses) < 2:
         raise SystemExit(f"{log}: fewer than two true poses")
     q = np.array([q for _, q in poses])

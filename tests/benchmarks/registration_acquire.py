@@ -14,6 +14,7 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
+from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
 from avsreplay.geometry import Array, Pose
@@ -40,7 +41,7 @@ def built_in(count: int, distance_m: float, seed: int) -> list[Case]:
             f"seed = {k}\nduration_s = 1.0\nrate_hz = 5.0\n[motion]\nattitude_xyzw = {q}\n"
             f"rate_radps = [0.0, 0.0, 0.0]\nposition_m = [0.15, -0.1, {distance_m}]\n"
         )
-        scan = next(iter(simulate(scenario_of(toml_document.parse(text, "acquire")), surface).scans()))
+        scan = next(true_scans(simulate(scenario_of(toml_document.parse(text, "acquire")), surface)))
         assert scan.truth is not None
         cases.append((scan.points, scan.truth))
     return cases

@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
+from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
 from avsreplay.register import Registrar
@@ -35,7 +36,7 @@ def whitened(seed: int, duration_s: float) -> np.ndarray:
     surface = builtin_surface()
     simulated = simulate(scenario_of(toml_document.parse(scenario(seed, duration_s), "noise")), surface)
     registrar, out = Registrar(surface), []
-    for scan in simulated.scans():
+    for scan in true_scans(simulated):
         found = registrar.register(scan.points, scan.truth)
         error = found.T_ac.inverse() @ scan.truth
         d = np.concatenate([geometry.log(error.q), error.t])

@@ -14,8 +14,8 @@ import statistics
 import time
 from pathlib import Path
 
-from avsreplay.job import Job, Run
 from avsreplay.register import Registrar
+from avsreplay.run import Job, Run
 
 
 def timed(log: Path, n_scans: int | None) -> tuple[int, float, float]:

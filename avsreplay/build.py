@@ -1,0 +1,86 @@
+"""Creates the stages from configuration and log header: the only place where names become objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from avsreplay.config import RunConfig, parse_pose
+from avsreplay.errors import UsageError
+from avsreplay.estimate import Estimator
+from avsreplay.estimate.params import Start
+from avsreplay.geometry import Pose
+from avsreplay.monitor.consistency import Consistency
+from avsreplay.monitor.convergence import Convergence
+from avsreplay.monitor.faults import FaultDetector
+from avsreplay.pipeline import Monitors, PipelineState, Stages
+from avsreplay.plan import Guidance, Supervisor
+from avsreplay.records import LogHeader, Scan, Surface, Truth
+from avsreplay.register import Registrar
+
+
+def stages(
+    config: RunConfig,
+    header: LogHeader,
+    surface: Surface,
+    registrar: Registrar,
+    truth_of: Callable[[Scan], Truth],
+) -> Stages:
+    """Create the chain for one log.
+
+    Args:
+        config: effective configuration.
+        header: of the log.
+        surface: model of the target.
+        registrar: of that model; one may serve several chains.
+        truth_of: truth at a scan; used for the first pose alone, where the configuration starts from the truth.
+
+    Raises:
+        UsageError: a near start is asked for and the log gives none.
+    """
+    start = header.start if config.init == "log" or config.estimator.start is Start.NEAR else None
+    supervision = config.supervisor.resolved(surface.extent)
+    return Stages(
+        registrar=registrar,
+        estimator=Estimator(config.estimator, start, surface.extent),
+        faults=FaultDetector(config.faults, surface.extent),
+        monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
+        guidance=Guidance(config.plan, Supervisor(supervision)),
+        standoff_c=(supervision.standoff_m or 0.0) * np.array(config.fixture_axis_c),
+        guess=config.guess,
+        deskew=config.deskew,
+        reacquire=config.reacquire,
+        initialise=_initialise(config, header, truth_of),
+    )
+
+
+def first_state(ready: Stages) -> PipelineState:
+    """Return the state before the first scan."""
+    start = ready.estimator.start
+    prior_1s = ready.estimator.params.start_1s if start is None else np.sqrt(np.diag(start.P))
+    return PipelineState(ready.monitors.initial(prior_1s))
+
+
+def _initialise(
+    config: RunConfig, header: LogHeader, truth_of: Callable[[Scan], Truth]
+) -> Callable[[Scan], tuple[Pose | None, str]]:
+    """Where the first pose comes from; "log" is the log's first belief, else its truth, else acquisition."""
+    if config.init == "auto":
+        return lambda _scan: (None, "acquired")
+    if config.init in ("truth", "log"):
+        start = header.start
+        if config.init == "log" and start is not None:
+            return lambda _scan: (start.x.T_ac, "start")
+        return lambda scan: _true_pose(truth_of(scan), required=config.init == "truth")
+    pose = parse_pose(config.init)
+    return lambda _scan: (pose, "given")
+
+
+def _true_pose(truth: Truth, required: bool) -> tuple[Pose | None, str]:
+    if truth.pose is not None:
+        return truth.pose, "truth"
+    if not required:
+        return None, "acquired"
+    hint = "name its truth with --truth-topic, or give --init auto"
+    raise UsageError("the log has no true pose at its first scan", where="--init truth", hint=hint)

@@ -1,0 +1,208 @@
+"""What one scan leaves behind, typed: the outcome of the pipeline, and its score against ground truth.
+
+``pipeline.step`` makes the Outcome without access to ground truth; ``score.Scorer`` makes the Score afterwards;
+``rows.Row.of`` turns the two into columns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import BLOCKS, Alignment, Belief, Forecast, Innovation, Plan, Scan, ScanStatus, Verdict
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class MonitorReport:
+    """What the monitors report after a scan.
+
+    Attributes:
+        ogm_rank: numerical rank of the scaled observability Gramian, at most 20.
+        ogm_log10_cond: log10 of its condition number, None below full rank.
+        ogm_log10_cond_scaled: the same after scaling by the prior standard deviations.
+        consistent: the innovations agree with their covariance; None before there are enough of them.
+        nis_mean: mean NIS over the consistency window.
+        autocorrelation: lag-1 autocorrelation of the whitened innovations in that window.
+        converged: the planner may rely on the estimate.
+        covariance_holds: every block of the covariance is below its limit (the paper's criterion).
+        predictive_holds: the predicted standard deviations of the grasp point are below their limits.
+        unconverged: blocks whose covariance is above its limit.
+        forecast: predicted standard deviations of the grasp point over the convergence horizon.
+    """
+
+    ogm_rank: int
+    ogm_log10_cond: float | None
+    ogm_log10_cond_scaled: float | None
+    consistent: bool | None
+    nis_mean: float | None
+    autocorrelation: float | None
+    converged: bool
+    covariance_holds: bool
+    predictive_holds: bool
+    unconverged: tuple[str, ...]
+    forecast: Forecast
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Outcome:
+    """What the pipeline made of one scan.
+
+    Attributes:
+        scan: the scan itself.
+        start_ns: instant of the first scan of the replay.
+        guess: where the initial guess of the registration came from.
+        alignment: the graded pose.
+        innovation: None where no pose was measured.
+        verdict: gamma and its reason.
+        belief: estimate after the update.
+        pose: estimated T_ac, the pose of {C} in {A}.
+        pose_covariance: (6, 6) covariance of that pose: position in {A} [m], half-angle vector in {B} [rad].
+        estimator: estimator in use: near, start, fit or filter.
+        sigma_hits: how often the bounds of the inertia ratios limited the gain so far.
+        r_floors: how many eigenvalues of R were raised to their lower limit so far.
+        recalls: how often the filter or the given start was replaced by a fit so far.
+        monitors: observability, consistency and convergence.
+        action: command of the supervisor to the robot.
+        rule: rule of the supervisor that gave it.
+        plan: capture plan in force, None before the first.
+    """
+
+    scan: Scan
+    start_ns: int
+    guess: str
+    alignment: Alignment
+    innovation: Innovation | None
+    verdict: Verdict
+    belief: Belief
+    pose: Pose
+    pose_covariance: Array
+    estimator: str
+    sigma_hits: int
+    r_floors: int
+    recalls: int
+    monitors: MonitorReport
+    action: str
+    rule: str
+    plan: Plan | None
+
+
+@dataclass(frozen=True, slots=True)
+class PoseError:
+    """Difference of two poses: distance of their origins [m] and angle between their attitudes [deg]."""
+
+    distance_m: float
+    angle_deg: float
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureError:
+    """Gripper against true grasp point at the planned instant; NaN where the truth does not tell."""
+
+    distance_m: float
+    speed_mps: float
+    angle_deg: float
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Score:
+    """An outcome compared with ground truth; None where there is no truth for it.
+
+    Attributes:
+        fault: label of the fault injected into this scan.
+        reference: what the errors are taken against: "truth", or "fit" (a motion fitted to all healthy poses).
+        estimate: error of the estimated pose.
+        registration: error of the measured pose.
+        nees: normalised estimation error squared of the 20 states, for the best order of the principal axes.
+        nees_blocks: the same of each block of the state by itself.
+        planned: error of a plan made at this scan at its planned instant of capture.
+        captured: error of the capture where the gripper has closed since the last scan.
+    """
+
+    fault: str | None = None
+    reference: str | None = None
+    estimate: PoseError | None = None
+    registration: PoseError | None = None
+    nees: float | None = None
+    nees_blocks: Mapping[str, float] = field(default_factory=dict)
+    planned: CaptureError | None = None
+    captured: CaptureError | None = None
+
+
+T = TypeVar("T")
+Value = Callable[[Outcome, Score], T]
+"""Takes the value of a column from an outcome and its score."""
+
+
+def finite(value: float | None) -> float | None:
+    """Return the value, or None where it is NaN or infinite."""
+    return float(value) if value is not None and np.isfinite(value) else None
+
+
+def if_innovation(get: Callable[[Innovation], float]) -> Value[float | None]:
+    """Take a value of the innovation, None where nothing was measured."""
+    return lambda o, s: None if o.innovation is None else get(o.innovation)
+
+
+def if_planned(get: Callable[[Outcome, Plan], float]) -> Value[float | None]:
+    """Take a value of the capture plan in force, None where there is none."""
+    return lambda o, s: get(o, o.plan) if o.plan is not None and o.plan.found else None
+
+
+def if_measured(get: Callable[[Pose], float]) -> Value[float | None]:
+    """Take a value of the registration's pose, None where nothing was measured."""
+    return lambda o, s: float(get(o.alignment.T_ac)) if o.alignment.measured else None
+
+
+def if_points(get: Callable[[Outcome], T]) -> Value[T | None]:
+    """Take a value of the registration, None where the scan holds no point."""
+    return lambda o, s: get(o) if len(o.scan.points) else None
+
+
+def pose_error_values(get: Callable[[Score], PoseError | None]) -> tuple[Value[float | None], Value[float | None]]:
+    """Take distance and angle of a pose error, None without truth."""
+    return (
+        lambda o, s: None if (error := get(s)) is None else error.distance_m,
+        lambda o, s: None if (error := get(s)) is None else error.angle_deg,
+    )
+
+
+def capture_error_values(
+    get: Callable[[Score], CaptureError | None],
+) -> tuple[Value[float | None], Value[float | None], Value[float | None]]:
+    """Take distance, speed and angle of a capture error, None where there is none."""
+    return (
+        lambda o, s: None if (error := get(s)) is None else finite(error.distance_m),
+        lambda o, s: None if (error := get(s)) is None else finite(error.speed_mps),
+        lambda o, s: None if (error := get(s)) is None else finite(error.angle_deg),
+    )
+
+
+def deviation(block: str, k: int | None = None) -> Value[float | None]:
+    """Return the root of the trace of a block of P, or the standard deviation of one of its states."""
+    where = BLOCKS[block] if k is None else BLOCKS[block].start + k
+    return lambda o, s: float(np.sqrt(np.diag(o.belief.P)[where].sum()))
+
+
+def full_angle_deg(variance: float) -> float:
+    """Return the standard deviation of a full angle [deg] from the variance of the half angle [rad^2]."""
+    return float(np.degrees(2.0 * np.sqrt(max(float(variance), 0.0))))
+
+
+def position_1s_m(covariance: Array) -> float:
+    """Return the root of the trace of the position block [m]."""
+    return float(np.sqrt(max(np.diag(covariance)[:3].sum(), 0.0)))
+
+
+def since_start_s(outcome: Outcome, t_ns: int) -> float:
+    """Return the seconds from the first scan of the replay."""
+    return (t_ns - outcome.start_ns) * 1e-9
+
+
+def status(outcome: Outcome) -> str:
+    """Return the status of the alignment, or of the scan where that is not ok."""
+    scan = outcome.scan.status
+    return outcome.alignment.status.value if scan is ScanStatus.OK else scan.value

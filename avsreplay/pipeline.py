@@ -1,0 +1,288 @@
+"""The processing chain: one scan in, one outcome out. Read ``step`` first.
+
+scan -> registration -> innovation -> verdict (gamma) -> estimate -> monitors -> guidance -> outcome. The predicted pose
+is the initial guess of the registration; that is the only feedback, apart from the convergence flag of the previous
+scan, which lets the filter take over from the batch fit. Nothing here has access to ground truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.config import Guess
+from avsreplay.estimate import Estimator, Prediction, Track
+from avsreplay.estimate.deskew import deskew, with_scan_duration
+from avsreplay.geometry import Array, Pose
+from avsreplay.monitor import observability
+from avsreplay.monitor.consistency import Consistency, ConsistencyTrack
+from avsreplay.monitor.convergence import Convergence, ConvergenceTrack
+from avsreplay.monitor.faults import FaultDetector
+from avsreplay.monitor.observability import Gramian
+from avsreplay.outcome import MonitorReport, Outcome
+from avsreplay.plan import Guidance, GuidanceState, PlannerInput
+from avsreplay.plan.guidance import Segment
+from avsreplay.records import Alignment, Innovation, Scan, Trajectory, Verdict
+from avsreplay.register import Registrar
+
+MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measurement:
+    """A registered scan.
+
+    Attributes:
+        alignment: the graded pose.
+        guess: where its initial guess came from: start, truth, given, predicted, last or acquired.
+        instants: (6, 6) mean instant of the measurement for each direction [s], see ``Registrar.instants``; None where
+            all points count as measured at the scan's instant.
+    """
+
+    alignment: Alignment
+    guess: str
+    instants: Array | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MonitorState:
+    """What the monitors carry from scan to scan."""
+
+    gramian: Gramian
+    consistency: ConsistencyTrack
+    convergence: ConvergenceTrack
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Monitors:
+    """Observability, consistency and convergence; they do not change the estimate."""
+
+    consistency: Consistency
+    convergence: Convergence
+
+    def initial(self, prior_1s: Array) -> MonitorState:
+        """Return the state before the first scan; ``prior_1s`` (20,) are the prior standard deviations."""
+        return MonitorState(observability.gramian(prior_1s), self.consistency.initial(), self.convergence.initial())
+
+    def observe(
+        self,
+        state: MonitorState,
+        estimator: Estimator,
+        prior: Prediction,
+        innovation: Innovation | None,
+        gamma: int,
+        track: Track,
+    ) -> tuple[MonitorState, MonitorReport]:
+        """Take one scan: its prior, innovation and gamma, and the estimate after it."""
+        gramian = observability.observe(state.gramian, prior.Phi, prior.H, gamma)
+        rank = observability.measure(gramian)
+        consistency = self.consistency.observe(state.consistency, innovation, gamma)
+        window = self.consistency.judge(consistency)
+        consistent = window.consistent and not track.window.many_outliers
+        forecast = estimator.forecast(track.belief, self.convergence.params.times_s)
+        convergence = self.convergence.judge(state.convergence, track.belief, forecast, consistent is True)
+        report = MonitorReport(
+            ogm_rank=rank.rank,
+            ogm_log10_cond=rank.log10_cond,
+            ogm_log10_cond_scaled=rank.log10_cond_scaled,
+            consistent=consistent,
+            nis_mean=window.nis_mean,
+            autocorrelation=window.autocorrelation,
+            converged=convergence.converged,
+            covariance_holds=convergence.covariance_holds,
+            predictive_holds=convergence.predictive_holds,
+            unconverged=convergence.unknown,
+            forecast=forecast,
+        )
+        return MonitorState(gramian, consistency, convergence), report
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Stages:
+    """The stages of the chain, configured for one log.
+
+    Attributes:
+        standoff_c: (3,) approach point in {C} [m].
+        deskew: move points with times of their own to the scan's instant by the predicted motion.
+        reacquire: register without a guess where the prediction is too uncertain to be one.
+        initialise: first scan -> T_ac to begin with (None: acquire it), and where it comes from.
+    """
+
+    registrar: Registrar
+    estimator: Estimator
+    faults: FaultDetector
+    monitors: Monitors
+    guidance: Guidance
+    standoff_c: Array
+    guess: Guess
+    deskew: bool
+    reacquire: bool
+    initialise: Callable[[Scan], tuple[Pose | None, str]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PipelineState:
+    """What is carried from scan to scan.
+
+    Attributes:
+        monitors: state of the monitors.
+        guidance: plan in force and robot, None before the first scan.
+        track: the estimate, None before the first scan.
+        last_pose: last healthy measured pose, None before one.
+        origin: where the first pose came from.
+        start_ns: instant of the first scan.
+    """
+
+    monitors: MonitorState
+    guidance: GuidanceState | None = None
+    track: Track | None = None
+    last_pose: Pose | None = None
+    origin: str = ""
+    start_ns: int = 0
+
+    @property
+    def captured_ns(self) -> int | None:
+        """Instant at which the gripper closed, None before it."""
+        return None if self.guidance is None else self.guidance.captured_ns
+
+
+def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineState, Outcome]:
+    """Process one scan. A bad scan still produces an outcome."""
+    state, track, measurement = _track(stages, state, scan)
+    predicted = stages.estimator.predict(track, scan.t_ns)
+    measurement = measurement or _register(stages, state, scan, predicted)
+    prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
+    if not verdict.gamma and _prediction_lost(stages, scan, predicted):
+        measurement = _acquire(stages, scan, _deskewed(stages, state, scan, predicted), "acquired")
+        prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
+    gamma, converged = verdict.gamma, state.monitors.convergence.converged
+    track = stages.estimator.update(track, prior, innovation, gamma, converged)
+    monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, innovation, gamma, track)
+    seen = _planner_input(stages, track, scan.t_ns, gamma, report.converged)
+    guidance = stages.guidance.step(state.guidance or stages.guidance.initial(scan.t_ns), seen)
+    outcome = Outcome(
+        scan=scan,
+        start_ns=state.start_ns,
+        guess=measurement.guess,
+        alignment=measurement.alignment,
+        innovation=innovation,
+        verdict=verdict,
+        belief=track.belief,
+        pose=track.belief.x.T_ac,
+        pose_covariance=stages.estimator.pose_covariance(track.belief),
+        estimator=track.mode,
+        sigma_hits=track.sigma_hits,
+        r_floors=track.r_floors,
+        recalls=track.reinitialised,
+        monitors=report,
+        action=guidance.decision.action.value,
+        rule=guidance.decision.rule,
+        plan=guidance.plan,
+    )
+    last_pose = measurement.alignment.T_ac if gamma else state.last_pose
+    return replace(state, monitors=monitors, guidance=guidance, track=track, last_pose=last_pose), outcome
+
+
+def fold(stages: Stages, state: PipelineState, scans: Iterable[Scan]) -> Iterator[tuple[PipelineState, Outcome]]:
+    """Apply ``step`` to the scans one at a time, so that memory holds one scan and not one log."""
+    for scan in scans:
+        state, outcome = step(stages, state, scan)
+        yield state, outcome
+
+
+def planned_segment(state: PipelineState) -> Segment | None:
+    """The flight of the capture plan that was made at the last scan, None where none was made or none is flown."""
+    guidance, track = state.guidance, state.track
+    if guidance is None or track is None or guidance.plan is None or guidance.segment.path is None:
+        return None
+    return guidance.segment if guidance.plan.t_ns == track.belief.t_ns else None
+
+
+def _track(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineState, Track, Measurement | None]:
+    """The track so far, or a new one at the first scan. An acquired start is repeated until a scan is healthy."""
+    if state.track is not None and not (state.origin == "acquired" and state.last_pose is None):
+        return state, state.track, None
+    pose, origin = stages.initialise(scan)
+    measurement = None
+    if pose is None:
+        measurement = _acquire(stages, scan, scan.points, origin)
+        pose = measurement.alignment.T_ac
+    start_ns = scan.t_ns if state.track is None else state.start_ns
+    return replace(state, origin=origin, start_ns=start_ns), stages.estimator.initial(scan.t_ns, pose), measurement
+
+
+def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> Measurement:
+    """Register the scan from the guess that the configuration asks for."""
+    points = _deskewed(stages, state, scan, predicted)
+    guess, origin = predicted.belief.x.T_ac, "predicted"
+    if state.last_pose is None:
+        origin = state.origin
+    elif stages.guess is Guess.LAST:
+        guess, origin = state.last_pose, "last"
+    return _measurement(stages, scan, points, stages.registrar.register(points, guess), origin)
+
+
+def _acquire(stages: Stages, scan: Scan, points: NDArray[Any], origin: str) -> Measurement:
+    """Register the scan without a guess."""
+    return _measurement(stages, scan, points, stages.registrar.acquire(points), origin)
+
+
+def _measurement(stages: Stages, scan: Scan, points: NDArray[Any], alignment: Alignment, origin: str) -> Measurement:
+    if scan.times_s is None or not (stages.deskew and alignment.measured):
+        return Measurement(alignment, origin)
+    return Measurement(alignment, origin, stages.registrar.instants(points, scan.times_s, alignment.T_ac))
+
+
+def _judge(
+    stages: Stages, scan: Scan, predicted: Prediction, measurement: Measurement
+) -> tuple[Prediction, Innovation | None, Verdict]:
+    """The prior at the instant of the measurement, the innovation (None: nothing measured) and the verdict."""
+    if scan.times_s is not None and measurement.instants is not None:
+        predicted = with_scan_duration(predicted, measurement.instants, scan.times_s)
+    alignment = measurement.alignment
+    innovation = stages.estimator.innovate(predicted, alignment) if alignment.measured else None
+    return predicted, innovation, stages.faults.judge(scan.status, alignment, innovation, predicted.belief)
+
+
+def _prediction_lost(stages: Stages, scan: Scan, predicted: Prediction) -> bool:
+    """Whether 3 standard deviations of the predicted pose exceed a quarter of the registration's reach, or 15 deg."""
+    if not stages.reacquire or not len(scan.points):
+        return False
+    variance = np.diag(predicted.H @ predicted.belief.P @ predicted.H.T)
+    position, half_angle = 3.0 * np.sqrt(variance[:3].sum()), 3.0 * np.sqrt(variance[3:].sum())
+    position_limit = MAX_POSITION_3S_OF_REACH * stages.registrar.limits.reach_m
+    return bool(position > position_limit or 2.0 * half_angle > MAX_ATTITUDE_3S_RAD)
+
+
+def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> NDArray[Any]:
+    """The points at the scan's instant: moved by the predicted motion where they have times and a motion is known."""
+    motion_known = state.last_pose is not None or stages.estimator.start is not None
+    if scan.times_s is None or not (stages.deskew and motion_known):
+        return scan.points
+    return deskew(scan.points, scan.times_s, predicted)
+
+
+def _planner_input(stages: Stages, track: Track, t_ns: int, gamma: int, converged: bool) -> PlannerInput:
+    """What guidance may know after a scan: estimate and forecast, never the truth."""
+    estimator, belief = stages.estimator, track.belief
+
+    @cache
+    def standoff() -> Trajectory:
+        x = belief.x
+        away = replace(x, c_b=x.c_b + geometry.matrix(x.q_bc) @ stages.standoff_c)
+        return estimator.motion(replace(belief, x=away))
+
+    return PlannerInput(
+        t_ns=t_ns,
+        gamma=gamma,
+        converged=converged,
+        goal=estimator.motion(belief),
+        forecast=lambda times_s: estimator.forecast(belief, times_s),
+        standoff=lambda times_s: standoff()(times_s),
+    )

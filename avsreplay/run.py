@@ -1,0 +1,257 @@
+"""One run: opens the log, builds the stages, folds the scans, scores and summarises them.
+
+The command line, the Python API and a sweep all use this module.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from avsreplay import pipeline, settings
+from avsreplay.build import first_state, stages
+from avsreplay.config import Against, RunConfig, load_config
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.estimate.initialise import PoseFix
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
+from avsreplay.log import Source, SourceOptions, open_source
+from avsreplay.outcome import Outcome
+from avsreplay.pipeline import PipelineState, Stages
+from avsreplay.records import Belief, Scan, ScanStatus, State, Surface, Truth
+from avsreplay.register import Registrar
+from avsreplay.report import Summary
+from avsreplay.report.summary import SummaryFold
+from avsreplay.rows import Row
+from avsreplay.score import Scorer, matched_truth
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayedScan:
+    """One scan of a run: the pipeline's outcome and state after it, the truth, and the row."""
+
+    outcome: Outcome
+    state: PipelineState
+    truth: Truth
+    row: Row
+
+
+Listener = Callable[[ReplayedScan], None]
+"""Called after each scan; listeners keep what is written beside the rows."""
+
+Progress = Callable[[Iterable[Scan], int, str], Iterable[Scan]]
+"""Shows progress: (scans, how many there are, what is done with them) -> the same scans."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """What to run.
+
+    Attributes:
+        source: log, bag or folder.  options: how to read it.
+        config_file: TOML of a RunConfig.  assignments: ``a.b=c`` over it, from flags.
+        prefetch: scans decoded ahead while one registers; never changes a result.
+    """
+
+    source: Path
+    options: SourceOptions = field(default_factory=SourceOptions)
+    config_file: Path | None = None
+    assignments: tuple[str, ...] = ()
+    prefetch: int = 2
+
+
+class HealthyPoses:
+    """Collects the healthy poses of a run, for a fit to all of them. May serve as a listener.
+
+    Args:
+        params: of the estimator, with auto values resolved.
+    """
+
+    def __init__(self, params: EstimatorParams) -> None:
+        self._params, self._fixes = params, list[PoseFix]()
+
+    def __call__(self, scan: ReplayedScan) -> None:
+        """Take one scan of a run."""
+        self.add(scan.state, scan.outcome)
+
+    def add(self, state: PipelineState, outcome: Outcome) -> None:
+        """Take the outcome of one scan and the state after it."""
+        if outcome.verdict.gamma and state.track is not None and state.last_pose is not None:
+            self._fixes.append(healthy_pose(state.track, outcome.scan.t_ns, state.last_pose, self._params))
+
+    def reference(self) -> Reference:
+        """Fit one motion to all of them. Raises UsageError where they are too few."""
+        return reference_of(self._fixes, self._params)
+
+
+class Run:
+    """An open run; a context manager. ``rows`` may be taken once.
+
+    Attributes:
+        source: the open log.  config: the effective configuration.  surface: the model in force.
+        registrar: of that model.
+    """
+
+    def __init__(self, job: Job) -> None:
+        """Open the log and index the model.
+
+        Raises:
+            UnreadableInput: the log or the model cannot be read.
+            UsageError: a key, flag or topic is wrong.
+            MissingBackend: the back end is not installed.
+        """
+        self.job = job
+        self.source: Source = open_source(job.source, job.options)
+        try:
+            header = self.source.header
+            self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
+            self.surface: Surface = self._model()
+            self.registrar = Registrar(self.surface, self.config.register)
+            self._stages = self._new_stages()
+        except BaseException:
+            self.source.close()
+            raise
+        labelled = bool(header.labels) or header.seed is not None
+        self._fold = SummaryFold(labels=header.labels if labelled else None, truth=header.truth)
+        self._reference: Reference | None = None
+        self._reference_instants: list[int] = []
+        self._end: tuple[Belief, State] | None = None
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.source.close()
+
+    def __len__(self) -> int:
+        """How many scans are due."""
+        return len(self.source)
+
+    def fit_reference(self, progress: Progress | None = None) -> Reference:
+        """Replay the log once and fit one motion to all healthy poses; errors are then taken against it.
+
+        ``rows`` does so itself, without progress, where ``reference`` is "fit" and this was not called before.
+
+        Raises:
+            UsageError: fewer than four healthy poses.
+        """
+        ready = self._new_stages()
+        poses, instants = HealthyPoses(ready.estimator.params), set[int]()
+        for state, outcome in pipeline.fold(ready, first_state(ready), self._scans(progress, "fitting")):
+            poses.add(state, outcome)
+            if outcome.scan.status is not ScanStatus.CLOCK:
+                instants.add(outcome.scan.t_ns)
+        self._reference = poses.reference()
+        self._reference_instants = sorted(instants)
+        return self._reference
+
+    def rows(self, listeners: Iterable[Listener] = (), progress: Progress | None = None) -> Iterator[Row]:
+        """Replay the log row by row.
+
+        Raises:
+            UnreadableInput: the log holds no scan.
+            UsageError: the first pose or the reference cannot be had.
+        """
+        if not len(self.source):
+            hint = "widen the selection, or see 'avsreplay info'"
+            raise UnreadableInput("no scan to replay", where=str(self.job.source), hint=hint)
+        if self.config.reference is Against.FIT and self._reference is None:
+            self.fit_reference(progress)
+        listeners, ready = tuple(listeners), self._stages
+        scorer = self._scorer()
+        for state, outcome in pipeline.fold(ready, first_state(ready), self._scans(progress, "replaying")):
+            truth = self._truth_of(outcome.scan)
+            row = Row.of(outcome, scorer.score(state, outcome, truth))
+            self._fold.add(row)
+            if truth.state is not None:
+                self._end = outcome.belief, truth.state
+            scan = ReplayedScan(outcome, state, truth, row)
+            for listener in listeners:
+                listener(scan)
+            yield row
+
+    @property
+    def truth(self) -> State | None:
+        """True state at the last scan that has one, its principal axes in the order of the estimate's."""
+        return self.source.header.truth if self._end is None else matched_truth(*self._end)
+
+    def summary(self) -> Summary:
+        """Summarise the rows taken so far."""
+        clock, losses = self.source.clock, self.source.losses
+        counts = {"losses": len(losses), "lost_messages": sum(loss.messages or 0 for loss in losses)}
+        counts |= {"stamps_unset": clock.unset, "stamps_jumped": clock.jumps}
+        counts |= {"stamps_equal": clock.equal, "stamps_back": clock.back}
+        return replace(self._fold.result(self.truth), counts=counts)
+
+    def facts(self) -> dict[str, Any]:
+        """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""
+        surface = self.surface
+        return {
+            "log": {"name": self.job.source.name, "sha256": self.source.sha256, "scans": len(self.source)},
+            "model": {"name": Path(surface.name).name, "sha256": surface.sha256, "extent_m": surface.extent},
+            "clock": settings.dump(self.source.clock),
+            "selection": settings.dump(self.job.options),
+            "config": settings.dump(self.config),
+        }
+
+    def _new_stages(self) -> Stages:
+        return stages(self.config, self.source.header, self.surface, self.registrar, self.source.truth_of)
+
+    def _scans(self, progress: Progress | None, what: str) -> Iterable[Scan]:
+        scans = self.source.scans(self.job.prefetch)
+        return progress(scans, len(self.source), what) if progress else scans
+
+    def _scorer(self) -> Scorer:
+        """Against the truth of the log, or against the reference within its span."""
+        reference, poses = self._reference, self.source.truth_poses()
+        if reference is not None:
+            inside = [t for t in self._reference_instants if reference.epoch_ns <= t <= reference.end_ns]
+            poses = [(t_ns, reference.at(t_ns).T_ac) for t_ns in inside]
+        return Scorer(self._stages.estimator, poses, self.config.reference.value)
+
+    def _truth_of(self, scan: Scan) -> Truth:
+        """The truth at a scan; where a reference is asked for, that in place of the true pose."""
+        truth = self.source.truth_of(scan)
+        if self._reference is None:
+            return truth
+        try:
+            pose = self._reference.at(scan.t_ns).T_ac
+        except ValueError:  # before the first or after the last healthy pose
+            pose = None
+        return replace(truth, pose=pose, state=None)
+
+    def _model(self) -> Surface:
+        surface = self.source.header.surface
+        if surface is None:
+            raise UsageError("the log holds no model", where=str(self.job.source), hint="name one with --model FILE")
+        return surface
+
+
+def _run_table(scenario: str) -> Mapping[str, Any]:
+    """The ``[run]`` table of the log's own scenario."""
+    table: Mapping[str, Any] = tomllib.loads(scenario).get("run", {}) if scenario else {}
+    return table
+
+
+def replay(source: str | Path, *assignments: str, **options: Any) -> Iterator[Row]:
+    """Replay a log, row by row: ``for row in avsreplay.replay("log.mcap", "faults.policy=all", n_scans=100)``.
+
+    Args:
+        source: log, bag or folder of scans.
+        *assignments: settings ``a.b=c`` as for ``--set``.
+        **options: how to read the log, see log.SourceOptions.
+
+    Yields:
+        One row for every scan.
+
+    Raises:
+        AvsError: where the log, the model or a setting cannot be used; its ``str`` is one line.
+    """
+    with Run(Job(source=Path(source), options=SourceOptions(**options), assignments=assignments)) as run:
+        yield from run.rows()

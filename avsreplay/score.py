@@ -1,0 +1,98 @@
+"""Every value that needs ground truth: errors, NEES and plan misses. Runs after ``pipeline.step``, which never sees it.
+
+The reference is the truth in the log, or a motion fitted to all healthy poses of the log (``run.fit_reference``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.estimate import Estimator
+from avsreplay.estimate.chart import nearest_permutation, nees
+from avsreplay.estimate.error_state import boxminus
+from avsreplay.geometry import Pose
+from avsreplay.monitor.consistency import block_nees
+from avsreplay.outcome import CaptureError, Outcome, PoseError, Score
+from avsreplay.pipeline import PipelineState, planned_segment
+from avsreplay.plan import Motion, interpolated, miss
+from avsreplay.plan.guidance import Segment
+from avsreplay.records import Belief, State, Truth
+
+
+class Scorer:
+    """Scores the outcomes of a replay in their order.
+
+    Args:
+        estimator: predicts the attitude at the end of a planned flight.
+        poses: true poses T_ac by instant, ascending; with fewer than four, plans are not scored.
+        reference: what the errors are taken against, "truth" or "fit".
+    """
+
+    def __init__(self, estimator: Estimator, poses: Sequence[tuple[int, Pose]], reference: str) -> None:
+        self._estimator, self._reference = estimator, reference
+        self._epoch_ns = poses[0][0] if poses else 0
+        self._motion: Motion | None = None
+        if len(poses) >= 4:
+            times = np.array([(t_ns - self._epoch_ns) * 1e-9 for t_ns, _ in poses])
+            self._motion = interpolated(times, [pose for _, pose in poses])
+        self._segment: Segment | None = None
+        self._planned: CaptureError | None = None
+        self._captured_ns: int | None = None
+
+    def score(self, state: PipelineState, outcome: Outcome, truth: Truth) -> Score:
+        """Compare an outcome, and the pipeline's state after it, with the truth at its scan."""
+        captured = self._planned if state.captured_ns != self._captured_ns else None
+        self._captured_ns = state.captured_ns
+        planned = self._new_plan(state)
+        if truth.pose is None:
+            return Score(fault=truth.fault, planned=planned, captured=captured)
+        total, blocks = _nees(outcome, truth.state)
+        return Score(
+            fault=truth.fault,
+            reference=self._reference,
+            estimate=pose_error(outcome.pose, truth.pose),
+            registration=pose_error(outcome.alignment.T_ac, truth.pose) if outcome.alignment.measured else None,
+            nees=total,
+            nees_blocks=blocks,
+            planned=planned,
+            captured=captured,
+        )
+
+    def _new_plan(self, state: PipelineState) -> CaptureError | None:
+        """The error of the capture plan whose flight began at this scan, None where none did."""
+        segment = planned_segment(state)
+        if segment is None or segment is self._segment:
+            return None
+        self._segment, self._planned = segment, self._capture_error(state, segment)
+        return self._planned
+
+    def _capture_error(self, state: PipelineState, segment: Segment) -> CaptureError | None:
+        if self._motion is None or segment.path is None or state.track is None:
+            return None
+        attitude = self._estimator.predict(state.track, segment.end_ns).belief.x.T_ac.q
+        found = miss(segment.path, (segment.t_ns - self._epoch_ns) * 1e-9, self._motion, attitude)
+        if not np.isfinite(found.distance_m):
+            return None
+        return CaptureError(found.distance_m, found.speed_mps, found.angle_deg)
+
+
+def pose_error(pose: Pose, truth: Pose) -> PoseError:
+    """Distance [m] and angle [deg] between two poses."""
+    turn = geometry.multiply(geometry.conjugate(truth.q), pose.q)
+    return PoseError(float(np.linalg.norm(pose.t - truth.t)), float(np.degrees(geometry.angle(turn))))
+
+
+def matched_truth(belief: Belief, truth: State) -> State:
+    """The true state with its principal axes in the order that is nearest to the estimate's."""
+    return nearest_permutation(belief, truth)[0]
+
+
+def _nees(outcome: Outcome, truth: State | None) -> tuple[float | None, Mapping[str, float]]:
+    """NEES of all states and of each block. A cold start's first poses are no normal belief yet and have none."""
+    if truth is None or outcome.estimator == "start":
+        return None, {}
+    belief = outcome.belief
+    return nees(belief, truth), block_nees(boxminus(matched_truth(belief, truth), belief.x), belief.P)
