@@ -29,8 +29,7 @@ from avsreplay.plan import (
 )
 from avsreplay.plan.limits import margin
 from avsreplay.records import Belief, Plan, State
-from avsreplay.report import load_result
-from avsreplay.report.result import Result
+from avsreplay.report.result import Result, load_result
 from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
 

@@ -24,8 +24,7 @@ from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
 from avsreplay.records import Belief, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.register import Registrar
-from avsreplay.report import Summary
-from avsreplay.report.summary import SummaryFold
+from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
 from avsreplay.score import Scorer, matched_truth
 

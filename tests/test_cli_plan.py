@@ -12,7 +12,8 @@ from avsreplay.cli.plan import command
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import IDENTITY_QUAT
 from avsreplay.records import State
-from avsreplay.report import write_rows, write_tum
+from avsreplay.report.export import write_tum
+from avsreplay.report.jsonl import write_rows
 from avsreplay.result_dir import mean_vector
 from avsreplay.rows import Row
 

@@ -7,10 +7,14 @@ import json
 import numpy as np
 import pytest
 
-from avsreplay import report
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
+from avsreplay.report.export import write_tum
+from avsreplay.report.jsonl import write_rows
+from avsreplay.report.result import facts_record, load_result
+from avsreplay.report.summary import Summary
+from avsreplay.report.view import PathView, View, read_view, thin_cloud, thin_surface, write_view
 
 TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.25, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))
 
@@ -19,24 +23,24 @@ TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.25, -0.4], [0.
 def folder(tmp_path, make_rows):
     rows = make_rows(40)
     labels = [Label("full_occlusion", rows[20].t_ns, rows[25].t_ns, True, 0.5)]
-    report.write_rows(tmp_path / "rows.jsonl", rows)
-    facts = report.facts_record(labels=labels, truth=TRUTH, counts={"lost": 3})
+    write_rows(tmp_path / "rows.jsonl", rows)
+    facts = facts_record(labels=labels, truth=TRUTH, counts={"lost": 3})
     (tmp_path / "run.json").write_text(json.dumps({"facts": facts, "seed": 7}))
-    report.write_tum(tmp_path / "truth.tum", [(r.t_ns, Pose(exp([0, 0, 0.3]), [1, 2, 3])) for r in rows])
-    report.write_view(tmp_path / "view.npz", _view())
-    return tmp_path, report.Summary.fold(rows, labels=labels, truth=TRUTH, counts={"lost": 3})
+    write_tum(tmp_path / "truth.tum", [(r.t_ns, Pose(exp([0, 0, 0.3]), [1, 2, 3])) for r in rows])
+    write_view(tmp_path / "view.npz", _view())
+    return tmp_path, Summary.fold(rows, labels=labels, truth=TRUTH, counts={"lost": 3})
 
 
 def _view():
     surface = _ball(20)
-    vertices, faces = report.thin_surface(surface)
+    vertices, faces = thin_surface(surface)
     clouds = [
-        report.thin_cloud(0, np.arange(30.0).reshape(10, 3), np.arange(10.0)),
-        report.thin_cloud(1, np.zeros((0, 3))),
-        report.thin_cloud(2, np.ones((5, 3))),
+        thin_cloud(0, np.arange(30.0).reshape(10, 3), np.arange(10.0)),
+        thin_cloud(1, np.zeros((0, 3))),
+        thin_cloud(2, np.ones((5, 3))),
     ]
-    paths = [report.PathView(5, np.zeros((4, 3), np.float32)), report.PathView(9, np.ones((2, 3), np.float32), 0.25)]
-    return report.View(vertices, faces, tuple(clouds), tuple(paths))
+    paths = [PathView(5, np.zeros((4, 3), np.float32)), PathView(9, np.ones((2, 3), np.float32), 0.25)]
+    return View(vertices, faces, tuple(clouds), tuple(paths))
 
 
 def _ball(n):
@@ -47,7 +51,7 @@ def _ball(n):
 
 def test_the_summary_comes_back_as_it_was(folder):
     path, summary = folder
-    result = report.load_result(path)
+    result = load_result(path)
     assert result.summary == summary
     assert result.header["seed"] == 7
     assert [t for t, _ in result.poses] == [r.t_ns for r in result.rows]
@@ -55,12 +59,12 @@ def test_the_summary_comes_back_as_it_was(folder):
 
 
 def test_lone_rows_are_a_result(folder):
-    result = report.load_result(folder[0] / "rows.jsonl")
+    result = load_result(folder[0] / "rows.jsonl")
     assert (result.view, result.header, len(result.rows)) == (None, {}, 40)
 
 
 def test_the_view_comes_back_and_its_bytes_are_stable(folder, tmp_path):
-    view, back = _view(), report.read_view(folder[0] / "view.npz")
+    view, back = _view(), read_view(folder[0] / "view.npz")
     np.testing.assert_array_equal(view.faces, back.faces)
     for one, two in zip(view.clouds, back.clouds, strict=True):
         assert one.seq == two.seq
@@ -68,14 +72,14 @@ def test_the_view_comes_back_and_its_bytes_are_stable(folder, tmp_path):
     np.testing.assert_array_equal(back.clouds[0].residual_m, np.arange(10.0))
     assert back.clouds[2].residual_m is None
     assert [p.miss_m for p in back.paths] == [None, 0.25]
-    report.write_view(tmp_path / "again.npz", view)
+    write_view(tmp_path / "again.npz", view)
     assert (tmp_path / "again.npz").read_bytes() == (folder[0] / "view.npz").read_bytes()
 
 
 @pytest.mark.parametrize("most", [50, 300, 2000])
 def test_a_thin_cloud_keeps_its_ends(most):
     points = np.random.default_rng(0).normal(size=(1234, 3))
-    cloud = report.thin_cloud(0, points, points[:, 0], most=most)
+    cloud = thin_cloud(0, points, points[:, 0], most=most)
     assert len(cloud.points) == min(most, 1234)
     np.testing.assert_allclose(cloud.points[[0, -1]], points[[0, -1]], rtol=1e-6)
     np.testing.assert_array_equal(cloud.points[:, 0], cloud.residual_m)
@@ -83,7 +87,7 @@ def test_a_thin_cloud_keeps_its_ends(most):
 
 def test_a_thin_surface_is_small_and_still_there():
     ball = _ball(80)
-    vertices, faces = report.thin_surface(ball, most=1000)
+    vertices, faces = thin_surface(ball, most=1000)
     assert 200 < len(faces) <= 1000
     assert len(np.unique(np.sort(faces, axis=1), axis=0)) == len(faces)
     radius = np.linalg.norm(vertices, axis=1)
@@ -93,21 +97,21 @@ def test_a_thin_surface_is_small_and_still_there():
 
 def test_a_small_surface_is_left_alone():
     ball = _ball(10)
-    vertices, faces = report.thin_surface(ball)
+    vertices, faces = thin_surface(ball)
     np.testing.assert_array_equal(faces, ball.faces)
     np.testing.assert_array_equal(vertices, ball.vertices.astype(np.float32))
 
 
 def test_a_bare_cloud_is_thinned_by_its_vertices():
     points = np.random.default_rng(0).normal(size=(20_000, 3))
-    vertices, faces = report.thin_surface(Surface(points, np.zeros((0, 3), np.int32), "c", ""))
+    vertices, faces = thin_surface(Surface(points, np.zeros((0, 3), np.int32), "c", ""))
     assert faces.shape == (0, 3)
     assert 500 < len(vertices) <= 4000
 
 
 def test_no_rows_is_one_line(tmp_path):
     with pytest.raises(UnreadableInput, match=r"rows\.jsonl: no such file"):
-        report.load_result(tmp_path)
+        load_result(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -127,10 +131,10 @@ def test_no_rows_is_one_line(tmp_path):
 def test_a_damaged_file_is_one_line(folder, name, text, match):
     (folder[0] / name).write_text(text)
     if match is None:
-        report.load_result(folder[0])
+        load_result(folder[0])
         return
     with pytest.raises(UnreadableInput, match=match):
-        report.load_result(folder[0])
+        load_result(folder[0])
 
 
 @pytest.mark.parametrize("missing", ["faces", "cloud_size", "path_miss"])
@@ -140,7 +144,7 @@ def test_a_view_with_a_part_missing_or_wrong(folder, missing):
     del arrays[missing]
     np.savez(path, **arrays)
     with pytest.raises(UnreadableInput):
-        report.read_view(path)
+        read_view(path)
     np.savez(path, **arrays, **{missing: np.array([[0, 1, 10**6]], np.int32)})
     with pytest.raises(UnreadableInput):
-        report.read_view(path)
+        read_view(path)

@@ -10,18 +10,19 @@ import sys
 
 import pytest
 
-from avsreplay import report
 from avsreplay.records import Label
-from avsreplay.report.table.console import Palette, decimals, head
-from avsreplay.report.table.scans import choose_rows
+from avsreplay.report.scan_table import choose_rows, head, state_cell
+from avsreplay.report.summary import Summary
+from avsreplay.report.summary_tables import print_tables
+from avsreplay.report.table import decimals, make_console
 from avsreplay.rows import columns
 
 
 def _printed(rows, *, width=None, encoding="utf-8", **flags) -> str:
     raw = io.BytesIO()
     stream = io.TextIOWrapper(raw, encoding=encoding, newline="\n")
-    summary = report.Summary.fold(rows, labels=flags.pop("labels", None))
-    report.print_tables(report.make_console(stream, width=width), rows, summary, **flags)
+    summary = Summary.fold(rows, labels=flags.pop("labels", None))
+    print_tables(make_console(stream, width=width), rows, summary, **flags)
     stream.flush()
     return raw.getvalue().decode(encoding)
 
@@ -75,7 +76,7 @@ def test_every_and_all(make_rows):
     rows = make_rows(100)
     assert [r.seq for r in choose_rows(rows, every=40)[0]] == [0, 40, 80]
     assert choose_rows(rows, every=40)[1] == "every 40th of 100 scans"
-    assert len(choose_rows(rows, all=True)[0]) == 100
+    assert len(choose_rows(rows, show_all=True)[0]) == 100
 
 
 def test_a_flickering_detector_does_not_flood_the_table(make_rows):
@@ -85,12 +86,9 @@ def test_a_flickering_detector_does_not_flood_the_table(make_rows):
 
 @pytest.mark.parametrize(("gamma", "reason"), [(1, "ok"), (0, "no_scan"), (0, "pose_jump")])
 def test_the_three_states_differ_without_colour(gamma, reason):
-    signs = {
-        Palette.of(report.make_console(io.StringIO())).state(g, r).plain[0]
-        for g, r in ((1, "ok"), (0, "no_scan"), (0, "pose_jump"))
-    }
+    signs = {state_cell(g, r).signed()[0] for g, r in ((1, "ok"), (0, "no_scan"), (0, "pose_jump"))}
     assert len(signs) == 3
-    assert reason in Palette.of(report.make_console(io.StringIO())).state(gamma, reason).plain
+    assert reason in state_cell(gamma, reason).signed()
 
 
 def test_an_ascii_stream_gets_ascii(make_rows):

@@ -8,11 +8,11 @@ import pytest
 
 from avsreplay.report.episodes import Peak
 from avsreplay.sweep.kinds import KindOfFault
-from avsreplay.sweep.page import build_page, words
+from avsreplay.sweep.page import build_sweep_page, words
 from avsreplay.sweep.statistics import ScoreHistogram, consistency, quantiles, rate, typical
 from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary
 
-VOID = {"meta"}
+VOID = {"meta", "link"}
 
 
 class Checker(HTMLParser):
@@ -53,25 +53,26 @@ def summary():
 
 
 def test_the_page_is_well_formed_and_needs_nothing_else(summary):
-    page = build_page(summary)
+    page = build_sweep_page(summary)
     checker = Checker()
     checker.feed(page)
     assert checker.open == []
-    assert checker.links == []
+    assert checker.links == ["data:,"]
     assert "script" not in checker.seen
-    assert "http" not in page
-    assert page == build_page(summary)
+    assert "http:" not in page
+    assert "https:" not in page
+    assert page == build_sweep_page(summary)
 
 
 def test_text_from_the_campaign_is_escaped(summary):
-    page = build_page(summary)
+    page = build_sweep_page(summary)
     assert "<b>" not in page
     assert "name=&lt;b&gt;plain&lt;/b&gt;" in page
-    assert "<title>a &amp; b</title>" in page
+    assert "<title>a &amp; b - avsreplay</title>" in page
 
 
 def test_figures_stand_where_their_numbers_are(summary):
-    page = build_page(summary)
+    page = build_sweep_page(summary)
     (dot, *_) = re.findall(r'class="dot" cx="([\d.]+)"', page)
     ends = re.findall(r'<text x="([\d.]+)" y="32" text-anchor="middle">([\d.]+)<', page)
     (x0, low), (x1, high) = ends[0], ends[-1]
@@ -81,7 +82,7 @@ def test_figures_stand_where_their_numbers_are(summary):
 
 
 def test_the_curve_rises_and_stays_in_its_frame(summary):
-    points = re.search(r'<polyline[^>]*points="([^"]+)"', build_page(summary))[1]
+    points = re.search(r'<polyline[^>]*points="([^"]+)"', build_sweep_page(summary))[1]
     places = [tuple(map(float, p.split(","))) for p in points.split()]
     assert all(60 <= x <= 480 and 20 <= y <= 440 for x, y in places)
     assert [x for x, _ in places] == sorted(x for x, _ in places)
@@ -89,8 +90,8 @@ def test_the_curve_rises_and_stays_in_its_frame(summary):
 
 
 def _cells(text):
-    rows = re.findall(r"<tr>(<td>.*?)</tr>", text[text.index("By kind of fault") :])
-    return [re.findall(r"<td>(.*?)</td>", row) for row in rows]
+    rows = re.findall(r"<tr>(<th scope=.row.*?)</tr>", text[text.index("By kind of fault") :])
+    return [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in rows]
 
 
 def test_faults_by_kind_stand_together_false_alarms_first(summary):
@@ -112,7 +113,7 @@ def test_faults_by_kind_stand_together_false_alarms_first(summary):
     none = KindOfFault(False, (), (), 200, rate(1, 200))
     kinds = {"clutter": clutter, "frozen": frozen, "none": none}
     cells = tuple(dataclasses.replace(cell, kinds=kinds) for cell in summary.cells)
-    page = build_page(dataclasses.replace(summary, cells=cells, detector=None))
+    page = build_sweep_page(dataclasses.replace(summary, cells=cells, detector=None))
     checker = Checker()
     checker.feed(page)
     assert checker.open == []
@@ -126,15 +127,15 @@ def test_faults_by_kind_stand_together_false_alarms_first(summary):
 def test_without_faults_there_is_no_table_of_them(summary):
     none = {"none": KindOfFault(False, (), (), 200, rate(1, 200))}
     cells = tuple(dataclasses.replace(cell, kinds=none) for cell in summary.cells)
-    assert "By kind of fault" not in build_page(dataclasses.replace(summary, cells=cells))
+    assert "By kind of fault" not in build_sweep_page(dataclasses.replace(summary, cells=cells))
 
 
 def test_an_empty_campaign_has_a_page_too():
-    assert "0 of 3 runs done: none." in build_page(SweepSummary("x", 3, 0, {}, (), None))
+    assert "0 of 3 runs done: none." in build_sweep_page(SweepSummary("x", 3, 0, {}, (), None))
 
 
 def test_words_of_a_combination():
     assert words({"scenario.scanner.noise_m": 0.1, "run.faults.policy": "any", "case": "a"}) == (
         "scanner.noise_m=0.1, faults.policy=any, case=a"
     )
-    assert words({}) == "as it is"
+    assert words({}) == "no change"

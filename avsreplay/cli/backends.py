@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from avsreplay.register.contract import Finding
     from avsreplay.register.port import Availability
-
-__all__ = ["command"]
 
 
 EPILOG = """\b
@@ -39,7 +39,8 @@ def _list(as_json: bool) -> None:
     if as_json:
         _print_json([dataclasses.asdict(state) for state in states])
     else:
-        _print_table(("name", "installed", "version", "what it is", "how to get it"), map(_state_row, states))
+        heads = ("name", "installed", "version", "what it is", "how to install it")
+        _print_table("Registration back ends", heads, map(_state_row, states))
 
 
 def _state_row(state: Availability) -> tuple[str, ...]:
@@ -54,7 +55,7 @@ def _check(name: str, as_json: bool) -> None:
     if as_json:
         _print_json({"backend": name, "findings": [dataclasses.asdict(finding) for finding in findings]})
     else:
-        _print_table(("law", "holds", "found"), map(_finding_row, findings))
+        _print_table(f"Contract of {name}", ("law", "holds", "found"), map(_finding_row, findings))
     broken = [finding.law for finding in findings if not finding.held]
     if broken:
         raise CheckFailed(f"{len(broken)} of {len(findings)} laws broken: {'; '.join(broken)}", where=name)
@@ -68,11 +69,7 @@ def _print_json(value: Any) -> None:
     click.echo(json.dumps(value, indent=2))
 
 
-def _print_table(heads: tuple[str, ...], rows: Any) -> None:
-    from rich.console import Console
-    from rich.table import Table
+def _print_table(title: str, heads: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> None:
+    from avsreplay.report.table import Table, make_console, print_table
 
-    table = Table(*heads)
-    for row in rows:
-        table.add_row(*row)
-    Console(width=120).print(table)
+    print_table(make_console(plain_width=120), Table(title, heads, tuple(rows), align="l"))

@@ -20,10 +20,11 @@ if TYPE_CHECKING:
 
     TrueScan = tuple[NDArray[Any], Pose | None]
 
-__all__ = ["Tally", "command", "measure"]
-
 MEMORY_SCANS = 3
-HEADS = ("back end", "build s", "ms median", "ms p95", "passes", "rot deg rms", "pos mm rms", "failures", "peak MiB")
+HEADS = (
+    *("back end", "build\n[s]", "median\n[ms]", "95 %\n[ms]", "iterations\nmedian", "rotation\nrms [deg]"),
+    *("position\nrms [mm]", "failures", "peak\n[MiB]"),
+)
 
 
 @dataclass(slots=True)
@@ -177,14 +178,17 @@ def _peak_of_run(name: str, surface: Surface, work: list[TrueScan]) -> float:
 
 
 def _print(summaries: list[dict[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
+    from avsreplay.report.table import Table, make_console, number, print_table
 
-    table = Table(*HEADS)
     keys = ("build_s", "median_ms", "p95_ms", "median_passes", "rot_err_rms_deg", "pos_err_rms_mm")
-    digits = (2, 2, 2, 0, 4, 3)
-    for row in summaries:
-        cells = ["-" if row[key] is None else f"{row[key]:.{n}f}" for key, n in zip(keys, digits, strict=True)]
-        peak = "-" if row["peak_mib"] is None else f"{row['peak_mib']:.0f}"
-        table.add_row(row["backend"], *cells, f"{row['failures']} of {row['scans']}", peak)
-    Console(width=120).print(table)
+    specs = (".2f", ".2f", ".2f", ".0f", ".4f", ".3f")
+    rows = tuple(
+        (
+            row["backend"],
+            *(number(row[key], spec) for key, spec in zip(keys, specs, strict=True)),
+            f"{row['failures']} of {row['scans']}",
+            number(row["peak_mib"], ".0f"),
+        )
+        for row in summaries
+    )
+    print_table(make_console(plain_width=120), Table("Registration back ends on this log", HEADS, rows))

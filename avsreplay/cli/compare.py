@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from rich.console import Console
-
-    from avsreplay.report.gate import Outcome
-    from avsreplay.report.result import Result
-
-__all__ = ["command"]
+from avsreplay.errors import UsageError
+from avsreplay.report import gate as gates
+from avsreplay.report.atomic import atomic_text
+from avsreplay.report.compare import METRICS, first_divergence, metrics
+from avsreplay.report.result import Result, load_result
+from avsreplay.settings import dump
 
 EPILOG = """\b
 Examples:
@@ -39,8 +39,6 @@ Exit codes: 0 ok, 1 a rule was broken, 2 usage, 3 unreadable input."""
 def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
     if not wanted or ctx.resilient_parsing:
         return
-    from avsreplay.report.compare import METRICS
-
     for metric in METRICS:
         click.echo(f"{metric.name:22} {metric.doc}")
     ctx.exit()
@@ -75,87 +73,64 @@ def command(
 
     RESULTS are directories written by 'avsreplay run -o' or their rows.jsonl; the first is the baseline.
     """
-    from avsreplay.errors import UsageError
-    from avsreplay.report import load_result, make_console
-    from avsreplay.report.gate import check_gate
-
     if (junit or github) and not gate:
         raise UsageError("--junit and --github need --gate", hint="name the rules with --gate rules.toml")
     if output and output.exists() and not overwrite:
-        raise UsageError("is already there", where=str(output), hint="name another with -o, or add --overwrite")
-    found = _named([load_result(path) for path in results])
-    outcomes = _judged(found, gate) if gate else []
+        raise UsageError("already exists", where=str(output), hint="name another with -o, or add --overwrite")
+    runs = _with_distinct_names([load_result(path) for path in results])
+    figures = [(run.name, metrics(run.summary)) for run in runs]
+    outcomes = gates.judge(gates.load_rules(gate), figures) if gate else []
     if as_json:
-        click.echo(_document(found, outcomes))
+        click.echo(_document(runs, outcomes))
     else:
-        _print(make_console(), found, outcomes)
-    _write(found, outcomes, junit, output)
-    if github:
-        _annotate(outcomes, to_stderr=as_json)
-    check_gate(outcomes)
+        _print(runs, outcomes)
+    _write(runs, outcomes, junit, output)
+    for line in gates.github_lines(outcomes) if github else ():
+        click.echo(line, err=as_json)
+    gates.check_gate(outcomes)
 
 
-def _named(found: list[Result]) -> list[Result]:
-    """Runs of one name are told apart by a number."""
-    from dataclasses import replace
-
-    names = [result.name for result in found]
-    return [
-        replace(r, name=f"{r.name}#{names[: k + 1].count(r.name)}") if names.count(r.name) > 1 else r
-        for k, r in enumerate(found)
-    ]
-
-
-def _judged(found: Sequence[Result], gate: Path) -> list[Outcome]:
-    from avsreplay.report.compare import metrics
-    from avsreplay.report.gate import judge, load_rules
-
-    return judge(load_rules(gate), [(result.name, metrics(result.summary)) for result in found])
+def _with_distinct_names(runs: list[Result]) -> list[Result]:
+    """Runs of the same name get a number."""
+    names = [run.name for run in runs]
+    so_far: Counter[str] = Counter()
+    out = []
+    for run in runs:
+        so_far[run.name] += 1
+        out.append(replace(run, name=f"{run.name}#{so_far[run.name]}") if names.count(run.name) > 1 else run)
+    return out
 
 
-def _print(console: Console, found: Sequence[Result], outcomes: Sequence[Outcome]) -> None:
-    from avsreplay.report.compare import first_divergence, metrics
-    from avsreplay.report.table.compare import print_comparison, print_divergence, print_gate
+def _print(runs: Sequence[Result], outcomes: Sequence[gates.RuleOutcome]) -> None:
+    from avsreplay.report.comparison_tables import comparison_tables, divergence_line, gate_table
+    from avsreplay.report.table import make_console, print_line, print_table
 
-    print_comparison(console, [(result.name, metrics(result.summary)) for result in found])
-    for other in found[1:]:
-        print_divergence(console, found[0].name, other.name, first_divergence(found[0].rows, other.rows))
-    if outcomes:
-        print_gate(console, outcomes)
+    console, base = make_console(), runs[0]
+    for table in comparison_tables([(run.name, metrics(run.summary)) for run in runs]):
+        print_table(console, table)
+    for other in runs[1:]:
+        print_line(console, divergence_line(base.name, other.name, first_divergence(base.rows, other.rows)))
+    print_table(console, gate_table(outcomes))
 
 
-def _document(found: Sequence[Result], outcomes: Sequence[Outcome]) -> str:
-    import json
-
-    from avsreplay.report.compare import first_divergence, metrics
-    from avsreplay.settings import dump
-
-    runs = [{"name": result.name, "metrics": metrics(result.summary)} for result in found]
-    for run, result in zip(runs[1:], found[1:], strict=True):
-        parted = first_divergence(found[0].rows, result.rows, first=1)
-        first = dump(parted.differences[0]) if parted.differences else None
-        run["divergence"] = {"cells": parted.count, "by_column": dict(parted.by_column), "first": first}
-    whole = {"format": "avsreplay-compare/1", "runs": runs, "gate": dump(list(outcomes))}
+def _document(runs: Sequence[Result], outcomes: Sequence[gates.RuleOutcome]) -> str:
+    records = [{"name": run.name, "metrics": metrics(run.summary)} for run in runs]
+    for record, run in zip(records[1:], runs[1:], strict=True):
+        found = first_divergence(runs[0].rows, run.rows, first=1)
+        first = dump(found.differences[0]) if found.differences else None
+        record["divergence"] = {"cells": found.count, "by_column": dict(found.by_column), "first": first}
+    whole = {"format": "avsreplay-compare/1", "runs": records, "gate": dump(list(outcomes))}
     return json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
 
 
-def _write(found: Sequence[Result], outcomes: Sequence[Outcome], junit: Path | None, output: Path | None) -> None:
-    from avsreplay.report.atomic import atomic_text
-
+def _write(
+    runs: Sequence[Result], outcomes: Sequence[gates.RuleOutcome], junit: Path | None, output: Path | None
+) -> None:
     if junit:
-        from avsreplay.report.gate import junit as junit_xml
-
         with atomic_text(junit) as stream:
-            stream.write(junit_xml(outcomes))
+            stream.write(gates.junit(outcomes))
     if output:
-        from avsreplay.report.page.comparison import build_comparison
+        from avsreplay.report.page import build_comparison
 
         with atomic_text(output) as stream:
-            stream.write(build_comparison(found, outcomes))
-
-
-def _annotate(outcomes: Sequence[Outcome], *, to_stderr: bool) -> None:
-    from avsreplay.report.gate import github_lines
-
-    for line in github_lines(outcomes):
-        click.echo(line, err=to_stderr)
+            stream.write(build_comparison(runs, outcomes))

@@ -7,8 +7,6 @@ from click.shell_completion import get_completion_class
 
 from avsreplay.errors import UsageError
 
-__all__ = ["command"]
-
 EPILOG = """\b
 Examples:
   eval "$(avsreplay completion bash)"                              in ~/.bashrc

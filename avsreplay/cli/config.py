@@ -7,8 +7,6 @@ from pathlib import Path
 
 import click
 
-__all__ = ["command"]
-
 EPILOG = """\b
 Examples:
   avsreplay config --dump

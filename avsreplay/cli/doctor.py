@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from avsreplay.log.doctor import Finding
     from avsreplay.log.repair import Repaired
 
-__all__ = ["command"]
-
 
 EPILOG = """\b
 Examples:
@@ -78,27 +76,19 @@ def _document(source: Path, findings: list[Finding], output: Path | None, done: 
 
 
 def _print(source: Path, findings: list[Finding], output: Path | None, done: Repaired | None) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     from avsreplay.cli.info import WIDTH
     from avsreplay.log.bytes_io import shown
+    from avsreplay.report.table import Table, TableCell, make_console, print_line, print_table
 
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=WIDTH)
-    table = Table(title=Text(shown(source)), title_justify="left")
-    for head in ("severity", "about", "finding", "at"):
-        table.add_column(head, overflow="fold")
-    colours = {"error": "red", "warning": "yellow", "note": "cyan", "ok": "green"}
-    for finding in findings:
-        value = finding.severity.value
-        places = ", ".join(map(str, finding.places))
-        table.add_row(Text(value, colours[value]), finding.about, Text(shown(finding.text)), places)
-    console.print(table)
+    marks = {"error": "bad", "warning": "warn", "note": "", "ok": "good"}
+    rows = tuple(
+        (TableCell(f.severity.value, marks[f.severity.value]), f.about, shown(f.text), ", ".join(map(str, f.places)))
+        for f in findings
+    )
+    console = make_console(plain_width=WIDTH)
+    print_table(console, Table(shown(source), ("severity", "about", "finding", "at"), rows, align="l"))
     if done is not None:
         kept = f"{done.messages} messages, {done.attachments} attachments, {done.records} metadata records"
-        console.print(Text(shown(f"repaired: {output}: {kept}")))
+        print_line(console, shown(f"repaired: {output}: {kept}"))
         for line in done.dropped:
-            console.print(Text(shown(f"left out: {line}")))
+            print_line(console, shown(f"left out: {line}"))

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from avsreplay.errors import UsageError
-
-__all__ = ["command"]
+from avsreplay.report import export
+from avsreplay.report.result import load_result
 
 EPILOG = """\b
 Examples:
@@ -36,21 +36,19 @@ def command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) 
 
     CSV and Parquet hold every column of every scan, units in the heads; TUM and KITTI hold poses of {C} in {A}.
     """
-    from avsreplay import report
-
     if output.exists() and not overwrite:
         raise UsageError("is already there", where=str(output), hint="name another, or add --overwrite")
-    found = report.load_result(result)
+    found = load_result(result)
     if kind == "csv":
-        report.write_csv(output, found.rows)
+        export.write_csv(output, found.rows)
         click.echo(f"{output}: {len(found.rows)} rows")
         return
     if kind == "parquet":
-        report.write_parquet(output, found.rows)
+        export.write_parquet(output, found.rows)
         click.echo(f"{output}: {len(found.rows)} rows")
         return
-    trajectory = found.poses if poses == "truth" else report.row_poses(found.rows, poses)  # type: ignore[arg-type]
-    count = (report.write_tum if kind == "tum" else report.write_kitti)(output, trajectory)
+    trajectory = found.poses if poses == "truth" else export.row_poses(found.rows, poses)  # type: ignore[arg-type]
+    count = (export.write_tum if kind == "tum" else export.write_kitti)(output, trajectory)
     if not count:
         output.unlink()
         raise UsageError(f"the result has no {poses} poses", where=str(result), hint="choose others with --poses")

@@ -11,8 +11,7 @@ import click
 
 if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss
-
-__all__ = ["command", "document", "loss_line"]
+    from avsreplay.report.table import Table
 
 WIDTH = 120  # off a terminal, so that the text does not depend on where it goes
 
@@ -79,25 +78,15 @@ def loss_line(loss: Loss) -> str:
 
 
 def _print(info: LogInfo) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     from avsreplay.log.bytes_io import shown
+    from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
-    console = Console(highlight=False, soft_wrap=True)
-    if not console.is_terminal:
-        console = Console(highlight=False, soft_wrap=True, width=WIDTH)
-    facts = Table.grid(padding=(0, 2))
-    for name, value in _facts(info):
-        facts.add_row(name, Text(shown(value)))
-    console.print(facts)
-    if info.topics:
-        console.print(_topics(info))
-    if info.faults:
-        console.print(_faults(info))
+    console = make_console(plain_width=WIDTH)
+    print_table(console, facts_table("Log", [(name, shown(value)) for name, value in _facts(info)]))
+    print_table(console, _topics(info))
+    print_table(console, _faults(info))
     for loss in info.losses:
-        console.print(Text("lost: " + loss_line(loss)))
+        print_line(console, "lost: " + loss_line(loss))
 
 
 def _facts(info: LogInfo) -> list[tuple[str, str]]:
@@ -138,36 +127,30 @@ def _clock(clock: ClockSummary) -> str:
     return "; ".join([text, *found, *([clock.note] if clock.note else [])])
 
 
-def _topics(info: LogInfo) -> Any:
-    from rich.table import Table
-    from rich.text import Text
-
+def _topics(info: LogInfo) -> Table:
     from avsreplay.log.bytes_io import shown
+    from avsreplay.report.table import Table, number
 
-    table = Table(title="topics", title_justify="left")
-    for head in ("topic", "type", "encoding"):
-        table.add_column(head, overflow="fold")
-    for head in ("messages", "rate [Hz]", "span [s]"):
-        table.add_column(head, justify="right")
-    for topic in info.topics:
-        rate = "-" if topic.rate_hz is None else f"{topic.rate_hz:.3f}"
-        span = "-"
-        if topic.first_ns is not None and topic.last_ns is not None:
-            span = f"{(topic.last_ns - topic.first_ns) * 1e-9:.3f}"
-        words = (Text(shown(w)) for w in (topic.name, topic.type, topic.encoding))
-        table.add_row(*words, str(topic.count), rate, span)
-    return table
+    rows = tuple(
+        (
+            *map(shown, (topic.name, topic.type, topic.encoding)),
+            str(topic.count),
+            number(topic.rate_hz, ".3f"),
+            "-"
+            if topic.first_ns is None or topic.last_ns is None
+            else f"{(topic.last_ns - topic.first_ns) * 1e-9:.3f}",
+        )
+        for topic in info.topics
+    )
+    return Table("Topics", ("topic", "type", "encoding", "messages", "rate\n[Hz]", "span\n[s]"), rows, align="lllr")
 
 
-def _faults(info: LogInfo) -> Any:
-    from rich.table import Table
-    from rich.text import Text
-
+def _faults(info: LogInfo) -> Table:
     from avsreplay.log.bytes_io import shown
+    from avsreplay.report.table import Table
 
-    table = Table("fault", title="faults injected", title_justify="left")
-    for head in ("start [s]", "end [s]", "harmful"):
-        table.add_column(head, justify="right")
-    for kind, start, end, harmful in info.faults:
-        table.add_row(Text(shown(kind)), f"{start:.3f}", f"{end:.3f}", "yes" if harmful else "no")
-    return table
+    rows = tuple(
+        (shown(kind), f"{start:.3f}", f"{end:.3f}", "yes" if harmful else "no")
+        for kind, start, end, harmful in info.faults
+    )
+    return Table("Injected faults", ("fault", "start\n[s]", "end\n[s]", "harmful"), rows)

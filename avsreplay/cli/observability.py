@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from avsreplay.rows import Row
     from avsreplay.run import Run
 
-__all__ = ["command"]
-
 WIDTH = 100
 HEADS = {"two": "two sigma", "three": "three sigma", "known": "all known"}
 
@@ -108,26 +106,23 @@ def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[
 
 
 def _print(found: dict[str, Any]) -> None:
-    from rich.box import SIMPLE
-    from rich.console import Console
-    from rich.table import Table
+    from avsreplay.report.table import Table, make_console, print_line, print_table
 
     title = f"Observability Gramian, {found['healthy_scans']} scans: rank, log10 of its condition raw and scaled"
-    table = Table(title=title, title_justify="left", box=SIMPLE)
-    table.add_column("\nt [s]", justify="right", no_wrap=True)
-    for head in HEADS.values():
-        for column in (f"{head}\nrank", "\nraw", "\nscaled"):
-            table.add_column(column, justify="right", no_wrap=True)
-    for line in found["lines"]:
-        table.add_row(f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name])))
-    console = Console(width=WIDTH, highlight=False)
-    console.print(table)
+    heads = [head for name in HEADS.values() for head in (f"{name}\nrank", "\nraw", "\nscaled")]
+    rows = tuple(
+        (f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name]))) for line in found["lines"]
+    )
+    console = make_console(plain_width=WIDTH)
+    print_table(console, Table(title, ("t\n[s]", *heads), rows, align="r"))
     for name, words in found["weakest"].items():
         if words:
-            console.print(f"weakest, {HEADS[name]}: " + "; ".join(words))
+            print_line(console, f"weakest, {HEADS[name]}: " + "; ".join(words))
 
 
 def _cells(found: dict[str, Any]) -> tuple[str, str, str]:
-    conditions = (found["log10_cond"], found["log10_cond_scaled"])
-    raw, scaled = ("-" if value is None else f"{value:.2f}" for value in conditions)
+    from avsreplay.report.table import number
+
+    conditions = (number(found[name], ".2f") for name in ("log10_cond", "log10_cond_scaled"))
+    raw, scaled = conditions
     return f"{found['rank']}/{found['of']}", raw, scaled

@@ -8,13 +8,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from avsreplay.plan import Execution, Limits, Miss, PlanParams, Spread
     from avsreplay.records import Plan
     from avsreplay.replan import Replanning, Saved
-
-__all__ = ["command"]
+    from avsreplay.report.table import Table
 
 EPILOG = """\b
 Examples:
@@ -203,34 +200,31 @@ def _print(
     hindsight: list[tuple[float, Plan, Miss | None]],
     execution: Execution | None,
 ) -> None:
-    from avsreplay.report import make_console
+    from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
     console = make_console()
-    _print_plan(console, planning, index, made, spread)
-    _print_hindsight(console, hindsight)
-    if execution is not None:
-        _print_execution(console, execution, planning)
-
-
-def _print_plan(console: Console, planning: Replanning, index: int, made: Plan, spread: Spread | None) -> None:
-    from avsreplay.report.table.console import new_table
-
     at_s = planning.saved.rows[index].t_s
-    table = new_table(console, f"Plan made at {at_s:.2f} s")
-    table.add_column("what")
-    table.add_column("value")
-    table.add_row("status", made.status.value)
+    print_table(console, facts_table(f"Plan made at {at_s:.2f} s", _plan_facts(planning, at_s, made, spread)))
+    print_table(console, _hindsight_table(hindsight))
+    if execution is not None:
+        print_table(console, _execution_table(execution))
+        for line in _outcome_lines(execution, planning):
+            print_line(console, line)
+
+
+def _plan_facts(planning: Replanning, at_s: float, made: Plan, spread: Spread | None) -> list[tuple[str, str]]:
+    facts = [("status", made.status.value)]
     if made.found:
-        table.add_row("capture", f"at {at_s + made.t_go_s:.3f} s, {made.t_go_s:.4f} s after planning")
-        table.add_row("terminal errors", f"{made.position_error_m:.1e} m, {made.velocity_error_mps:.1e} m/s")
-        table.add_row("largest |u|", f"{made.u_max:.6g} of {made.a_max:.6g} m/s2")
-    basis = "certified; the limits aside" if planning.limits.any else "certified"
-    table.add_row("no capture before", f"{made.lower_bound_s:.4f} s after planning ({basis})")
+        facts += [
+            ("capture", f"at {at_s + made.t_go_s:.3f} s, {made.t_go_s:.4f} s after planning"),
+            ("terminal errors", f"{made.position_error_m:.1e} m, {made.velocity_error_mps:.1e} m/s"),
+            ("largest |u|", f"{made.u_max:.6g} of {made.a_max:.6g} m/s2"),
+        ]
+    basis = "certified without the limits" if planning.limits.any else "certified"
+    facts.append(("no capture before", f"{made.lower_bound_s:.4f} s after planning ({basis})"))
     if made.thrust is not None:
-        table.add_row("limits", f"checked between nodes, worst {made.violation_m:.1e} m")
-    for name, value in _spread_rows(spread):
-        table.add_row(name, value)
-    console.print(table)
+        facts.append(("limits", f"checked between nodes, worst {made.violation_m:.1e} m"))
+    return facts + _spread_rows(spread)
 
 
 def _spread_rows(spread: Spread | None) -> list[tuple[str, str]]:
@@ -249,48 +243,46 @@ def _spread_rows(spread: Spread | None) -> list[tuple[str, str]]:
     ]
 
 
-def _print_hindsight(console: Console, hindsight: list[tuple[float, Plan, Miss | None]]) -> None:
-    from avsreplay.report.table.console import new_table
+def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
+    from avsreplay.report.table import Table
 
-    if not any(found for _, _, found in hindsight):
-        return
-    table = new_table(console, "Hindsight: each plan against the truth at its end")
-    for name in (
-        "made at\n[s]",
-        "status",
-        "capture\n[s]",
-        "early by\n[s]",
-        "miss\n[mm]",
-        "speed\n[mm/s]",
-        "angle\n[deg]",
-    ):
-        table.add_column(name, justify="left" if name == "status" else "right")
-    for at_s, made, found in hindsight:
-        if found is not None:
-            cells = (f"{1e3 * found.distance_m:.2f}", f"{1e3 * found.speed_mps:.2f}", f"{found.angle_deg:.3f}")
-            table.add_row(f"{at_s:.2f}", made.status.value, f"{at_s + made.t_go_s:.2f}", f"{found.lead_s:.2f}", *cells)
-    console.print(table)
-    left_out = sum(1 for _, _, found in hindsight if found is None)
-    if left_out:
-        console.print(f"{left_out} further plans end after the log, or were not found")
+    rows = tuple(
+        (
+            f"{at_s:.2f}",
+            made.status.value,
+            f"{at_s + made.t_go_s:.2f}",
+            f"{found.lead_s:.2f}",
+            f"{1e3 * found.distance_m:.2f}",
+            f"{1e3 * found.speed_mps:.2f}",
+            f"{found.angle_deg:.3f}",
+        )
+        for at_s, made, found in hindsight
+        if found is not None
+    )
+    left_out = len(hindsight) - len(rows)
+    return Table(
+        "Hindsight: each plan against the truth at its end",
+        ("made at\n[s]", "status", "capture\n[s]", "early by\n[s]", "miss\n[mm]", "speed\n[mm/s]", "angle\n[deg]"),
+        rows,
+        align="rlr",
+        note=f"{left_out} further plans end after the log, or were not found" if left_out else "",
+    )
 
 
-def _print_execution(console: Console, execution: Execution, planning: Replanning) -> None:
-    from avsreplay.report.table.console import new_table
+def _execution_table(execution: Execution) -> Table:
+    from avsreplay.report.table import Table
 
-    table = new_table(console, "CostatePath under the supervisor")
-    for name in ("from\n[s]", "action", "rule"):
-        table.add_column(name, justify="right" if name.startswith("from") else "left")
-    for t_s, action, rule in execution.actions:
-        table.add_row(f"{t_s:.2f}", action, rule)
-    console.print(table)
-    console.print(f"outcome: {execution.outcome(planning.tolerance)}")
+    rows = tuple((f"{t_s:.2f}", action, rule) for t_s, action, rule in execution.actions)
+    return Table("Flight under the supervisor", ("from\n[s]", "action", "rule"), rows, align="rl")
+
+
+def _outcome_lines(execution: Execution, planning: Replanning) -> list[str]:
+    lines = [f"outcome: {execution.outcome(planning.tolerance)}"]
     if execution.miss is not None:
         m = execution.miss
-        console.print(
-            f"gripper closed at {m.at_s:.3f} s: {1e3 * m.distance_m:.2f} mm off, "
-            f"{1e3 * m.speed_mps:.2f} mm/s, {m.angle_deg:.3f} deg"
-        )
+        error = f"{1e3 * m.distance_m:.2f} mm off, {1e3 * m.speed_mps:.2f} mm/s, {m.angle_deg:.3f} deg"
+        lines.append(f"gripper closed at {m.at_s:.3f} s: {error}")
+    return lines
 
 
 def _export(planning: Replanning, made: Plan, path: Path) -> None:

@@ -10,8 +10,6 @@ from typing import Any, TypeVar
 
 import click
 
-__all__ = ["READING_FLAGS", "Numbers", "reading_flags"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 

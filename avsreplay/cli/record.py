@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from avsreplay.recording import Recorded
     from avsreplay.records import Scan
 
-__all__ = ["command"]
-
 EPILOG = """\b
 Examples:
   avsreplay record -o tumble.mcap                       the built-in scenario

@@ -8,8 +8,6 @@ import click
 
 from avsreplay.errors import UnreadableInput, UsageError
 
-__all__ = ["command", "write_page"]
-
 EPILOG = """\b
 Examples:
   avsreplay run tumble.mcap -o results/ --report
@@ -39,9 +37,9 @@ def command(result: Path, output: Path | None, title: str | None, overwrite: boo
 
 def write_page(result: Path, target: Path, title: str | None = None) -> str:
     """Build the page of ``result``, write it to ``target`` whole or not at all, and say so in one line."""
-    from avsreplay.report import load_result
     from avsreplay.report.atomic import atomic_text
     from avsreplay.report.page import build_page
+    from avsreplay.report.result import load_result
 
     found = load_result(result)
     if not found.rows:

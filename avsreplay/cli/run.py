@@ -17,12 +17,11 @@ from avsreplay.errors import DataLost, UsageError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from avsreplay.report import Summary
+    from avsreplay.report.golden import GoldenResult
+    from avsreplay.report.summary import Summary
     from avsreplay.result_dir import ResultDirectory
     from avsreplay.rows import Row
     from avsreplay.run import Job, Listener, Run
-
-__all__ = ["command"]
 
 EPILOG = """\b
 Examples:
@@ -206,34 +205,37 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
 
 
 def _print(wanted: Wanted, rows: Sequence[Row], summary: Summary, record: dict[str, Any], scans_per_s: float) -> None:
-    from avsreplay import report
-
     if wanted.as_json:
-        click.echo(report.dump_document(rows, summary, record), nl=False)
+        from avsreplay.report.export import dump_document
+
+        click.echo(dump_document(rows, summary, record), nl=False)
         return
-    report.print_tables(
-        report.make_console(),
-        rows,
-        summary,
-        every=wanted.table_every,
-        all=wanted.table_all,
-        plain=wanted.plain,
-        scans_per_s=scans_per_s,
-    )
+    from avsreplay.report.summary_tables import print_tables
+    from avsreplay.report.table import make_console
+
+    choice = {"every": wanted.table_every, "show_all": wanted.table_all, "plain": wanted.plain}
+    print_tables(make_console(), rows, summary, scans_per_s=scans_per_s, **choice)  # type: ignore[arg-type]
 
 
 def _gate(wanted: Wanted, rows: Sequence[Row]) -> None:
-    from avsreplay import report
+    from avsreplay.report.golden import compare_golden, update_golden
 
     if wanted.update_golden:
-        report.update_golden(wanted.update_golden, rows)
+        update_golden(wanted.update_golden, rows)
         click.echo(f"golden rows written: {wanted.update_golden} ({len(rows)} scans)", err=True)
     if wanted.golden:
-        result = report.compare_golden(wanted.golden, rows)
+        result = compare_golden(wanted.golden, rows)
         if not result.ok:
-            report.print_golden(report.make_console(sys.stderr if wanted.as_json else sys.stdout), result)
+            _print_differences(result, to_stderr=wanted.as_json)
         result.check(str(wanted.golden))
         click.echo(f"golden rows agree: {wanted.golden} ({result.rows} scans)", err=True)
+
+
+def _print_differences(result: GoldenResult, *, to_stderr: bool) -> None:
+    from avsreplay.report.comparison_tables import golden_table
+    from avsreplay.report.table import make_console, print_table
+
+    print_table(make_console(sys.stderr if to_stderr else sys.stdout), golden_table(result))
 
 
 def _own_up(run: Run) -> None:

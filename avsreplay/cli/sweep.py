@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -14,14 +13,10 @@ import click
 from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from avsreplay.sweep import Journal, Plan
     from avsreplay.sweep.plan import Task
-    from avsreplay.sweep.summary import Cell, Detector, SweepSummary
+    from avsreplay.sweep.summary import SweepSummary
     from avsreplay.sweep.worker import Outcome
-
-__all__ = ["command"]
 
 EPILOG = """\b
 Examples:
@@ -121,82 +116,15 @@ def _plan_text(plan: Plan) -> str:
 
 
 def _print(summary: SweepSummary) -> None:
-    from rich.console import Console
+    from avsreplay.report.table import make_console, print_line, print_table
+    from avsreplay.sweep.page import cell_table, detector_table, kinds_table
 
-    console = Console(width=None if sys.stdout.isatty() else 120, highlight=False)
+    console = make_console(plain_width=120)
     status = ", ".join(f"{count} {word}" for word, count in summary.status.items())
-    console.print(f"{summary.name}: {summary.done} of {summary.planned} runs done ({status or 'none'})")
-    for number, cell in enumerate(summary.cells):
-        if cell.runs:
-            console.print(_cell_table(number, cell))
+    print_line(console, f"{summary.name}: {summary.done} of {summary.planned} runs done ({status or 'none'})")
+    cells = [(number, cell) for number, cell in enumerate(summary.cells) if cell.runs]
+    for number, cell in cells:
+        print_table(console, cell_table(number, cell))
     if summary.detector is not None and summary.detector.harmful:
-        console.print(_detector_table(summary.detector))
-    if any(cell.kinds.keys() - {"none"} for cell in summary.cells):
-        console.print(_kinds_table(summary))
-
-
-def _cell_table(number: int, cell: Cell) -> Table:
-    from rich.markup import escape
-    from rich.table import Table
-
-    from avsreplay.sweep.page import words
-    from avsreplay.sweep.summary import HEADLINES
-
-    table = Table(title=escape(f"{number}: {words(cell.values)} ({cell.runs} runs)"), title_justify="left")
-    for name in ("", "runs", "5 %", "median", "95 %", "95 % interval"):
-        table.add_column(name, justify="left" if not name else "right")
-    for name, found in cell.metrics.items():
-        if found is not None:
-            numbers = (f"{v:.4g}" for v in (found.q05, found.median, found.q95))
-            table.add_row(
-                escape(HEADLINES[name]),
-                str(found.count),
-                *numbers,
-                f"{found.median_low:.4g} to {found.median_high:.4g}",
-            )
-    for name, share in cell.rates.items():
-        if share is not None:
-            span = f"{share.low:.1%} to {share.high:.1%}"
-            table.add_row(name, f"{share.successes}/{share.count}", "", f"{share.share:.1%}", "", span)
-    if cell.nees is not None:
-        nees, band = cell.nees, f"1 is right; {cell.nees.low:.3f} to {cell.nees.high:.3f}"
-        table.add_row("NEES per state at the end (mean)", str(nees.count), "", f"{nees.mean_per_dof:.3f}", "", band)
-    return table
-
-
-def _detector_table(detector: Detector) -> Table:
-    from rich.table import Table
-
-    heads = ("test", "detected", "others flagged", "area under ROC", "threshold at 1 % false", "detected there")
-    table = Table(
-        *heads,
-        title=f"fault tests over {detector.harmful} harmful and {detector.other} other scans",
-        title_justify="left",
-    )
-    if detector.detected is not None and detector.false is not None:
-        table.add_row("rule in force", f"{detector.detected.share:.2%}", f"{detector.false.share:.2%}", "", "", "")
-    for name, curve in detector.curves.items():
-        if curve is not None:
-            threshold, detected = curve.at_one_percent
-            table.add_row(f"{name} alone", "", "", f"{curve.area:.4f}", f"{threshold:.4g}", f"{detected:.2%}")
-    return table
-
-
-def _kinds_table(summary: SweepSummary) -> Table:
-    """A line a kind of fault and combination; a rule between kinds."""
-    from rich.box import SIMPLE
-    from rich.table import Table
-
-    from avsreplay.sweep.kinds_table import KIND_HEADS, kind_rows
-
-    title = "by kind of fault: times in s, errors in mm and deg; ~: harmless by its label; none: outside every window"
-    table = Table(title=title, title_justify="left", box=SIMPLE, padding=0, pad_edge=False)
-    for place, head in enumerate(KIND_HEADS):
-        table.add_column(head, justify="right" if place else "left", no_wrap=True)
-    last = ""
-    for row in kind_rows([(number, cell) for number, cell in enumerate(summary.cells) if cell.runs]):
-        if row[0] != last and last:
-            table.add_section()
-        table.add_row(row[0] if row[0] != last else "", *row[1:])
-        last = row[0]
-    return table
+        print_table(console, detector_table(summary.detector))
+    print_table(console, kinds_table(cells), tight=True)

@@ -9,8 +9,6 @@ import avsreplay
 
 PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", "clarabel", "click", "rich")
 
-__all__ = ["version_text", "versions"]
-
 
 def versions() -> dict[str, str]:
     """Versions of the package, Python and the libraries it stands on; "missing" where one is not installed."""

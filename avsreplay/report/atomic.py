@@ -10,8 +10,6 @@ from typing import IO
 
 from avsreplay.errors import UnreadableInput
 
-__all__ = ["atomic_path", "atomic_text"]
-
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:

@@ -8,8 +8,6 @@ from typing import Any
 from avsreplay.report.jsonl import field_types
 from avsreplay.rows import Column, columns
 
-__all__ = ["columns_page", "row_schema", "schema_text"]
-
 _HEAD = """# Columns of a row
 
 One row a scan, in `rows.jsonl`, CSV, Parquet and `--json`. Made by `python -m avsreplay.report.columns_page`

@@ -8,11 +8,9 @@ from dataclasses import dataclass
 
 from avsreplay.report.golden import GoldenResult, compare_records
 from avsreplay.report.jsonl import plain
-from avsreplay.report.spread import Spread
 from avsreplay.report.summary import Errors, Summary
+from avsreplay.report.summary_parts import Statistics
 from avsreplay.rows import Row, columns
-
-__all__ = ["METRICS", "Metric", "first_divergence", "metrics"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +23,7 @@ class Metric:
     of: Callable[[Summary], float | None]
 
 
-def _spread(pick: Callable[[Summary], Spread | None], figure: str) -> Callable[[Summary], float | None]:
+def _spread(pick: Callable[[Summary], Statistics | None], figure: str) -> Callable[[Summary], float | None]:
     def get(summary: Summary) -> float | None:
         spread = pick(summary)
         return None if spread is None else float(getattr(spread, figure))

@@ -16,9 +16,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise, takewhile
 
 from avsreplay.records import Label
-from avsreplay.report.spread import median
-
-__all__ = ["GAP", "Coast", "Episode", "FaultAccount", "Mark", "Peak", "account", "coasts", "gaps"]
+from avsreplay.report.summary_parts import median
 
 GAP = 1.5
 

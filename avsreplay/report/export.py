@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import csv
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
@@ -17,9 +18,11 @@ from avsreplay.errors import MissingBackend
 from avsreplay.geometry import Pose
 from avsreplay.report.atomic import atomic_path, atomic_text
 from avsreplay.report.jsonl import field_types, plain
+from avsreplay.report.summary import Summary
 from avsreplay.rows import Row, columns
+from avsreplay.settings import dump
 
-__all__ = ["StampedPose", "row_poses", "stamp_text", "write_csv", "write_kitti", "write_parquet", "write_tum"]
+FORMAT = "avsreplay-run/1"
 
 StampedPose = tuple[int, Pose]
 """(t_ns, T_ac): an instant and the pose of {C} in {A} at it."""
@@ -98,3 +101,38 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
     table = {f.name: [plain(getattr(row, f.name)) for row in rows] for f in dataclasses.fields(Row)}
     with atomic_path(path) as part:
         pq.write_table(pa.table(table, schema=schema), part)
+
+
+def document(rows: Iterable[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """``{"format", "header", "summary", "rows"}``; nothing in it that JSON cannot say (NaN is null)."""
+    names = [f.name for f in dataclasses.fields(Row)]
+    return {
+        "format": FORMAT,
+        "header": _strict(dump(dict(header or {}))),
+        "summary": summary_record(summary),
+        "rows": [{name: plain(getattr(row, name)) for name in names} for row in rows],
+    }
+
+
+def summary_record(summary: Summary) -> dict[str, Any]:
+    """The summary as plain JSON values, with the derived figures people ask for."""
+    record: dict[str, Any] = _strict(dump(summary))
+    record["faults"]["false_alarm_rate"] = summary.faults.false_alarm_rate
+    record["faults"]["longest_recovery_s"] = summary.faults.longest_recovery_s
+    return record
+
+
+def dump_document(rows: Iterable[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> str:
+    """The document as text, one line a row, ending in a line end."""
+    whole = document(rows, summary, header)
+    lines = ",\n".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in whole.pop("rows"))
+    head = json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
+    return f'{head[:-2]},\n "rows": [\n{lines}\n ]\n}}\n'
+
+
+def _strict(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _strict(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_strict(v) for v in value]
+    return plain(value)

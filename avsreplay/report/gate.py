@@ -12,8 +12,6 @@ from avsreplay.report.compare import METRICS
 from avsreplay.settings import Settings, setting
 from avsreplay.toml_document import build, load
 
-__all__ = ["GateRules", "Outcome", "Rule", "check_gate", "github_lines", "judge", "junit", "load_rules"]
-
 _LIMITS = ("min", "max", "min_ratio", "max_ratio", "max_increase", "max_decrease")
 _RELATIVE = _LIMITS[2:]
 
@@ -72,7 +70,7 @@ class GateRules(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class RuleOutcome:
     """What one rule says of one run; ``why`` is the limit that was broken, with both numbers."""
 
     run: str
@@ -89,7 +87,7 @@ def load_rules(path: str | Path) -> tuple[Rule, ...]:
 
 def judge(
     rules: Sequence[Rule], runs: Sequence[tuple[str, Mapping[str, float | None]]], *, baseline: bool = True
-) -> list[Outcome]:
+) -> list[RuleOutcome]:
     """Every rule on every run but the baseline, which is the first; without a baseline, absolute rules on all.
 
     Raises UsageError for a relative rule without a baseline.
@@ -103,21 +101,23 @@ def judge(
     return [_outcome(rule, name, figures, base) for name, figures in runs[1:] for rule in rules]
 
 
-def _outcome(rule: Rule, run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]) -> Outcome:
+def _outcome(
+    rule: Rule, run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]
+) -> RuleOutcome:
     value = figures.get(rule.metric)
     if value is None:
-        return Outcome(run, rule, None, rule.optional, "" if rule.optional else "the run has no such figure")
+        return RuleOutcome(run, rule, None, rule.optional, "" if rule.optional else "the run has no such figure")
     reference = base.get(rule.metric)
     if rule.relative and reference is None:
-        return Outcome(run, rule, value, rule.optional, "" if rule.optional else "the baseline has no such figure")
+        return RuleOutcome(run, rule, value, rule.optional, "" if rule.optional else "the baseline has no such figure")
     for name, limit in rule.limits.items():
         low, high = _bounds(name, limit, reference or 0.0)
         if not low <= value <= high:
             bound = high if value > high else low
             sign = ">" if value > high else "<"
             from_base = f" (baseline {reference:.6g})" if name in _RELATIVE else ""
-            return Outcome(run, rule, value, False, f"{value:.6g} {sign} {bound:.6g}, {name} {limit:g}{from_base}")
-    return Outcome(run, rule, value, True)
+            return RuleOutcome(run, rule, value, False, f"{value:.6g} {sign} {bound:.6g}, {name} {limit:g}{from_base}")
+    return RuleOutcome(run, rule, value, True)
 
 
 def _bounds(name: str, limit: float, reference: float) -> tuple[float, float]:
@@ -132,7 +132,7 @@ def _bounds(name: str, limit: float, reference: float) -> tuple[float, float]:
     }[name]
 
 
-def check_gate(outcomes: Sequence[Outcome]) -> None:
+def check_gate(outcomes: Sequence[RuleOutcome]) -> None:
     """Raise CheckFailed naming the first broken rule."""
     broken = [o for o in outcomes if not o.ok]
     if broken:
@@ -141,7 +141,7 @@ def check_gate(outcomes: Sequence[Outcome]) -> None:
         raise CheckFailed(what, where="--gate", hint=o.rule.note or None)
 
 
-def junit(outcomes: Sequence[Outcome]) -> str:
+def junit(outcomes: Sequence[RuleOutcome]) -> str:
     """JUnit XML: a suite a run, a case a rule. No times in it: the same outcomes give the same bytes."""
     root = ET.Element("testsuites", name="avsreplay gate")
     for run in dict.fromkeys(o.run for o in outcomes):
@@ -156,7 +156,7 @@ def junit(outcomes: Sequence[Outcome]) -> str:
     return ET.tostring(root, encoding="unicode", xml_declaration=False) + "\n"
 
 
-def github_lines(outcomes: Sequence[Outcome]) -> list[str]:
+def github_lines(outcomes: Sequence[RuleOutcome]) -> list[str]:
     """GitHub workflow commands: an error a broken rule, one notice where all hold."""
     broken = [o for o in outcomes if not o.ok]
     if not broken:

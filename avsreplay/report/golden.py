@@ -15,8 +15,6 @@ from avsreplay.errors import CheckFailed, UnreadableInput
 from avsreplay.report.jsonl import plain, read_records, write_rows
 from avsreplay.rows import Column, Row, columns
 
-__all__ = ["ABSENT", "Difference", "GoldenResult", "compare_golden", "compare_records", "update_golden"]
-
 ABSENT = "(absent)"
 
 

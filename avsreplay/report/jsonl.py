@@ -20,8 +20,6 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.report.atomic import atomic_text
 from avsreplay.rows import Row
 
-__all__ = ["RowWriter", "dump_row", "field_types", "parse_row", "plain", "read_records", "read_rows", "write_rows"]
-
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
 _MAX_LINE = 1 << 20
 

@@ -9,8 +9,6 @@ from typing import Any
 
 from avsreplay.report.atomic import atomic_text
 
-__all__ = ["viewer_layout", "write_layout"]
-
 _ORANGE, _BLUE, _GREEN = "#D55E00", "#0072B2", "#009E73"
 
 

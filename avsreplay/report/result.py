@@ -20,8 +20,6 @@ from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, read_view
 from avsreplay.rows import Row
 
-__all__ = ["Result", "facts_record", "load_result", "read_tum"]
-
 _STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")
 
 

@@ -14,13 +14,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 
 from avsreplay.records import BLOCKS, Label, State
-from avsreplay.report.capture import Capture, CaptureFold
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
-from avsreplay.report.parameters import Parameter, parameters
-from avsreplay.report.spread import Spread, median
+from avsreplay.report.summary_parts import Capture, CaptureFold, Parameter, Statistics, median, parameters
 from avsreplay.rows import Row
-
-__all__ = ["Convergence", "Errors", "Observability", "Share", "Summary", "SummaryFold"]
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
 BLOCK_BANDS = {2: (0.05064, 7.3778), 3: (0.2158, 9.3484)}  # the same with 2 and 3
@@ -31,8 +27,8 @@ NEES_BAND = (9.5908, 34.1696)  # the same with 20
 class Errors:
     """Translation [m] and rotation [deg] errors over the same scans; None without truth."""
 
-    position_m: Spread | None
-    rotation_deg: Spread | None
+    position_m: Statistics | None
+    rotation_deg: Statistics | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +85,8 @@ class Summary:
     pose_coasting: Errors
     registration_healthy: Errors
     registration_flagged: Errors
-    fit_error_m: Spread | None
-    iterations: Spread | None
+    fit_error_m: Statistics | None
+    iterations: Statistics | None
     faults: FaultAccount
     coasts: tuple[Coast, ...]
     parameters: tuple[Parameter, ...]
@@ -210,8 +206,8 @@ class SummaryFold:
             pose_coasting=self._errors("", "coasting"),
             registration_healthy=self._errors("reg_", "healthy"),
             registration_flagged=self._errors("reg_", "coasting"),
-            fit_error_m=Spread.of(self._values.get("rms_m/healthy", [])),
-            iterations=Spread.of(self._values.get("iterations/healthy", [])),
+            fit_error_m=Statistics.of(self._values.get("rms_m/healthy", [])),
+            iterations=Statistics.of(self._values.get("iterations/healthy", [])),
             faults=account(self._marks, self._labels),
             coasts=tuple(coasts(self._marks)),
             parameters=parameters(last, truth or self._truth) if last else (),
@@ -242,7 +238,7 @@ class SummaryFold:
 
     def _errors(self, prefix: str, state: str) -> Errors:
         position = self._values.get(f"{prefix}pos_err_m/{state}", [])
-        return Errors(Spread.of(position), Spread.of(self._values.get(f"{prefix}rot_err_deg/{state}", [])))
+        return Errors(Statistics.of(position), Statistics.of(self._values.get(f"{prefix}rot_err_deg/{state}", [])))
 
     def _observability(self) -> Observability:
         row = self._last

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from avsreplay import settings
-from avsreplay.report import Summary
+from avsreplay.report.summary import Summary
 from avsreplay.rows import Row
 
 __all__ = ["metrics"]

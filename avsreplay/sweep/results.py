@@ -15,7 +15,7 @@ from typing import Any
 from avsreplay import __version__
 from avsreplay.errors import MissingBackend
 from avsreplay.sweep.journal import Journal
-from avsreplay.sweep.page import build_page
+from avsreplay.sweep.page import build_sweep_page
 from avsreplay.sweep.plan import Plan, Point
 from avsreplay.sweep.summary import SweepSummary, summarise
 from avsreplay.sweep.worker import SCAN_COLUMNS, Outcome
@@ -39,7 +39,7 @@ def write_results(plan: Plan, journal: Journal, folder: Path) -> SweepSummary:
     summary = summarise(plan, done, journal.outcomes())
     text = json.dumps({"version": __version__, **summary.document()}, indent=1, allow_nan=False)
     _replace(folder / "summary.json", text.encode() + b"\n")
-    _replace(folder / "report.html", build_page(summary).encode())
+    _replace(folder / "report.html", build_sweep_page(summary).encode())
     return summary
 
 

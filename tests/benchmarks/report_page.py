@@ -15,11 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
-from avsreplay import report
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Surface
 from avsreplay.report.jsonl import field_types
 from avsreplay.report.page import build_page
+from avsreplay.report.summary import Summary
+from avsreplay.report.view import View, thin_cloud, thin_surface
 from avsreplay.rows import Row
 from avsreplay.simulate import builtin_surface
 
@@ -53,16 +54,16 @@ def made_up(n: int, seed: int = 0) -> tuple[list[Row], list[tuple[int, Pose]]]:
     return rows, poses
 
 
-def clouds(rows: list[Row], poses: list[tuple[int, Pose]], surface: Surface) -> report.View:
+def clouds(rows: list[Row], poses: list[tuple[int, Pose]], surface: Surface) -> View:
     """300 noisy points of the model a scan."""
     rng = np.random.Generator(np.random.PCG64(1))
     kept = []
     for row, (_, pose) in zip(rows, poses, strict=True):
         chosen = surface.vertices[rng.integers(0, len(surface.vertices), 300)]
         noise = rng.normal(0.0, 0.008, chosen.shape)
-        kept.append(report.thin_cloud(row.seq, pose.apply(chosen + noise), np.linalg.norm(noise, axis=1)))
-    vertices, faces = report.thin_surface(surface)
-    return report.View(vertices, faces, tuple(kept))
+        kept.append(thin_cloud(row.seq, pose.apply(chosen + noise), np.linalg.norm(noise, axis=1)))
+    vertices, faces = thin_surface(surface)
+    return View(vertices, faces, tuple(kept))
 
 
 def opened(path: Path, times: int) -> tuple[float, float] | None:
@@ -107,7 +108,7 @@ def main() -> None:
     print("|---|---|---|---|---|")
     for n in (600,) if quick else (600, 6000):
         rows, poses = made_up(n)
-        view, summary = clouds(rows, poses, surface), report.Summary.fold(rows)
+        view, summary = clouds(rows, poses, surface), Summary.fold(rows)
         begun = time.perf_counter()
         page = build_page(rows, summary, {}, poses=poses, view=view)
         built = time.perf_counter() - begun

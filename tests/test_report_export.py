@@ -14,12 +14,21 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avsreplay import report
 from avsreplay.errors import MissingBackend, UnreadableInput
 from avsreplay.geometry import Pose, exp
 from avsreplay.report.columns_page import columns_page, row_schema, schema_text
-from avsreplay.report.export import stamp_text
-from avsreplay.report.jsonl import dump_row, field_types, parse_row
+from avsreplay.report.export import (
+    document,
+    dump_document,
+    row_poses,
+    stamp_text,
+    write_csv,
+    write_kitti,
+    write_parquet,
+    write_tum,
+)
+from avsreplay.report.jsonl import dump_row, field_types, parse_row, read_rows, write_rows
+from avsreplay.report.summary import Summary
 from avsreplay.rows import Row, columns
 
 ROOT = Path(__file__).parent.parent
@@ -27,8 +36,8 @@ ROOT = Path(__file__).parent.parent
 
 def test_rows_survive_the_file_to_the_last_bit(tmp_path, make_rows):
     rows = make_rows(50, x_m=0.1 + 0.2, t_ns=2**62 + 1)
-    assert report.write_rows(tmp_path / "a.jsonl", rows) == 50
-    assert report.read_rows(tmp_path / "a.jsonl") == rows
+    assert write_rows(tmp_path / "a.jsonl", rows) == 50
+    assert read_rows(tmp_path / "a.jsonl") == rows
 
 
 def test_keys_stand_in_the_order_of_the_fields(make_rows):
@@ -75,14 +84,14 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, make_rows):
     path = tmp_path / "a.jsonl"
     path.write_text("before")
     with pytest.raises(ZeroDivisionError):
-        report.write_rows(path, (row for row in make_rows(3) if 1 / (2 - row.seq)))
+        write_rows(path, (row for row in make_rows(3) if 1 / (2 - row.seq)))
     assert path.read_text() == "before"
     assert [p.name for p in tmp_path.iterdir()] == ["a.jsonl"]
 
 
 def test_a_folder_that_is_not_there_is_one_line(tmp_path, make_rows):
     with pytest.raises(UnreadableInput, match="No such file"):
-        report.write_rows(tmp_path / "no" / "a.jsonl", make_rows(1))
+        write_rows(tmp_path / "no" / "a.jsonl", make_rows(1))
 
 
 @pytest.mark.parametrize(
@@ -102,15 +111,15 @@ def test_bad_rows_are_one_line_with_the_place(tmp_path, text, match):
     path = tmp_path / "a.jsonl"
     path.write_text(text)
     with pytest.raises(UnreadableInput, match=match):
-        report.read_rows(path)
+        read_rows(path)
 
 
 def test_text_that_is_no_text(tmp_path):
     (tmp_path / "a.jsonl").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UnreadableInput, match="not UTF-8"):
-        report.read_rows(tmp_path / "a.jsonl")
+        read_rows(tmp_path / "a.jsonl")
     with pytest.raises(UnreadableInput, match="no such file"):
-        report.read_rows(tmp_path / "b.jsonl")
+        read_rows(tmp_path / "b.jsonl")
 
 
 @given(st.integers(-(2**62), 2**62))
@@ -123,8 +132,8 @@ def test_stamps_are_exact(t_ns):
 
 def test_tum_and_kitti_give_the_poses_back(tmp_path, make_rows):
     poses = [(5 + k, Pose(exp([0.1 * k, -0.2, 0.3]), [k / 3, 2.0, 3.0])) for k in range(5)]
-    assert report.write_tum(tmp_path / "a.tum", poses) == 5
-    assert report.write_kitti(tmp_path / "a.kitti", poses) == 5
+    assert write_tum(tmp_path / "a.tum", poses) == 5
+    assert write_kitti(tmp_path / "a.kitti", poses) == 5
     tum, kitti = np.loadtxt(tmp_path / "a.tum"), np.loadtxt(tmp_path / "a.kitti")
     for k, (_, pose) in enumerate(poses):
         np.testing.assert_array_equal(tum[k, 1:], [*pose.t, *pose.q])
@@ -133,15 +142,15 @@ def test_tum_and_kitti_give_the_poses_back(tmp_path, make_rows):
 
 def test_rows_without_a_registration_give_no_pose(make_rows):
     rows = make_rows(40, blackout=range(10, 16))
-    assert len(list(report.row_poses(rows, "registration"))) == 34
-    estimates = list(report.row_poses(rows, "estimate"))
+    assert len(list(row_poses(rows, "registration"))) == 34
+    estimates = list(row_poses(rows, "estimate"))
     assert [t for t, _ in estimates] == [r.t_ns for r in rows]
     np.testing.assert_allclose(estimates[7][1].t, [1.07, 0.2, 5.0])
 
 
 def test_csv_has_every_column_and_empty_cells_for_null(tmp_path, make_rows):
     rows = make_rows(30)
-    report.write_csv(tmp_path / "a.csv", rows)
+    write_csv(tmp_path / "a.csv", rows)
     with (tmp_path / "a.csv").open(newline="") as stream:
         table = list(csv.DictReader(stream))
     assert list(table[0]) == [c.name for c in columns()]
@@ -152,7 +161,7 @@ def test_csv_has_every_column_and_empty_cells_for_null(tmp_path, make_rows):
 def test_parquet_keeps_types_units_and_values(tmp_path, make_rows):
     pq = pytest.importorskip("pyarrow.parquet")
     rows = make_rows(30)
-    report.write_parquet(tmp_path / "a.parquet", rows)
+    write_parquet(tmp_path / "a.parquet", rows)
     table = pq.read_table(tmp_path / "a.parquet")
     assert table.schema.field("rms_m").metadata[b"unit"] == b"m"
     assert [Row(**record) for record in table.to_pylist()] == rows
@@ -161,21 +170,21 @@ def test_parquet_keeps_types_units_and_values(tmp_path, make_rows):
 def test_parquet_without_its_extra_is_one_line(tmp_path, make_rows, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(MissingBackend, match="avsreplay\\[report\\]"):
-        report.write_parquet(tmp_path / "a.parquet", make_rows(1))
+        write_parquet(tmp_path / "a.parquet", make_rows(1))
 
 
 def test_the_document_is_strict_json(make_rows):
     rows = make_rows(30, rms_m=math.nan)
-    summary = report.Summary.fold(rows)
-    text = report.dump_document(rows, summary, {"seed": 7, "empty": {}})
+    summary = Summary.fold(rows)
+    text = dump_document(rows, summary, {"seed": 7, "empty": {}})
     whole = json.loads(text, parse_constant=pytest.fail)
-    assert whole == report.document(rows, summary, {"seed": 7, "empty": {}})
+    assert whole == document(rows, summary, {"seed": 7, "empty": {}})
     assert list(whole) == ["format", "header", "summary", "rows"]
     assert [parse_row(r, "x") for r in whole["rows"]] == [dataclasses.replace(r, rms_m=None) for r in rows]
 
 
 def test_the_document_of_no_rows_is_json_too():
-    assert json.loads(report.dump_document([], report.Summary.fold([])))["rows"] == []
+    assert json.loads(dump_document([], Summary.fold([])))["rows"] == []
 
 
 def test_the_column_list_of_the_docs_is_in_step():

@@ -12,18 +12,20 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from avsreplay import report
 from avsreplay.cli.compare import command
 from avsreplay.errors import AvsError, CheckFailed, UnreadableInput, UsageError
 from avsreplay.records import Label
 from avsreplay.report.compare import METRICS, first_divergence, metrics
-from avsreplay.report.gate import Outcome, Rule, check_gate, github_lines, judge, junit, load_rules
-from avsreplay.report.page.comparison import build_comparison
-from avsreplay.report.table.sparks import print_sparks, spark
+from avsreplay.report.gate import Rule, RuleOutcome, check_gate, github_lines, judge, junit, load_rules
+from avsreplay.report.jsonl import write_rows
+from avsreplay.report.page import build_comparison
+from avsreplay.report.result import load_result
+from avsreplay.report.scan_table import print_sparks, spark
+from avsreplay.report.summary import Summary
 
 
 def _summary(rows):
-    return report.Summary.fold(rows, labels=[Label("full_occlusion", rows[20].t_ns, rows[25].t_ns)])
+    return Summary.fold(rows, labels=[Label("full_occlusion", rows[20].t_ns, rows[25].t_ns)])
 
 
 def test_every_metric_has_a_value_or_none(make_rows):
@@ -43,7 +45,7 @@ def test_figures_are_the_summarys(make_rows):
 
 
 def test_no_rows_have_no_figures_and_no_zeros(make_rows):
-    figures = metrics(report.Summary.fold([]))
+    figures = metrics(Summary.fold([]))
     assert figures["pose_pos_rmse_m"] is None
     assert figures["false_alarms"] is None
     assert figures["healthy_ratio"] is None
@@ -125,8 +127,8 @@ EVIL = 'a<b> & "c":,%\n::error::d'
 
 def _outcomes():
     return [
-        Outcome("run", Rule("t1_s", max=10), 5.0, True),
-        Outcome(EVIL, Rule("t1_s", max=10, note="later is useless"), 11.0, False, "11 > 10, max 10"),
+        RuleOutcome("run", Rule("t1_s", max=10), 5.0, True),
+        RuleOutcome(EVIL, Rule("t1_s", max=10, note="later is useless"), 11.0, False, "11 > 10, max 10"),
     ]
 
 
@@ -163,7 +165,7 @@ def runs(tmp_path, make_rows):
     worse = [dataclasses.replace(r, pos_err_m=2 * r.pos_err_m) for r in make_rows(40)]
     for name, rows in (("base", make_rows(40)), ("same", make_rows(40)), ("worse", worse)):
         (tmp_path / name).mkdir()
-        report.write_rows(tmp_path / name / "rows.jsonl", rows)
+        write_rows(tmp_path / name / "rows.jsonl", rows)
     (tmp_path / "rules.toml").write_text('[[rule]]\nmetric = "pose_pos_rmse_m"\nmax_ratio = 1.5\nnote = "no regress"\n')
     return tmp_path
 
@@ -242,7 +244,7 @@ def test_the_page_overlays_the_runs_and_keeps_what_is_there(runs):
 
 
 def test_the_page_says_what_the_gate_said(runs):
-    results = [report.load_result(runs / name) for name in ("base", "worse")]
+    results = [load_result(runs / name) for name in ("base", "worse")]
     assert "1 of 2 rules broken" in build_comparison(results, _outcomes())
     assert "All 1 rules hold" in build_comparison(results, _outcomes()[:1])
 

@@ -1,21 +1,41 @@
-"""Which charts a page has and what is on them: plain data, drawn by ``charts.js``."""
+"""Which charts a page has and what is drawn on them, as plain data for ``charts.js``; arrays as base64 text."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+import json
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from avsreplay import geometry
 from avsreplay.records import State
 from avsreplay.report.episodes import Episode
-from avsreplay.report.page.packing import values
 from avsreplay.report.summary import NEES_BAND, NIS_BAND
 from avsreplay.rows import Row
 
-__all__ = ["Columns", "charts", "derived", "spans"]
+_TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "u4": "<u4", "u1": "u1"}
+
+
+def pack(array: ArrayLike, kind: str) -> dict[str, str]:
+    """``{"type", "data"}`` of an array of kind f8, f4, i4, i2, u4 or u1, flattened."""
+    flat = np.ascontiguousarray(np.asarray(array), dtype=_TYPES[kind]).reshape(-1)
+    return {"type": kind, "data": base64.b64encode(flat.tobytes()).decode("ascii")}
+
+
+def values(rows: Iterable[Row], name: str) -> NDArray[np.float64]:
+    """A column as floats (n,), NaN where a row has nothing to say."""
+    found = (getattr(row, name) for row in rows)
+    return np.array([np.nan if v is None else float(v) for v in found], dtype=np.float64)
+
+
+def embed(value: Any) -> str:
+    """JSON that may stand inside a script element: no ``<``, no line separators, no NaN."""
+    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
 
 Columns = dict[str, NDArray[np.float64]]
 Chart = dict[str, Any]

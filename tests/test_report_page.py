@@ -15,15 +15,16 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from avsreplay import report
 from avsreplay.cli.report import command
 from avsreplay.errors import AvsError
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State
-from avsreplay.report.page import build_page
-from avsreplay.report.page.charts import charts, derived, spans
-from avsreplay.report.page.packing import embed
-from avsreplay.report.page.scene import scene
+from avsreplay.report.charts import charts, derived, embed, spans
+from avsreplay.report.jsonl import write_rows
+from avsreplay.report.page import build_page, render
+from avsreplay.report.result import load_result
+from avsreplay.report.summary import Summary
+from avsreplay.report.view import PathView, View, scene, thin_cloud
 
 ROOT = Path(__file__).resolve().parents[1]
 TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.3, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))
@@ -34,14 +35,12 @@ FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 
 def _view(rows):
     rng = np.random.Generator(np.random.PCG64(1))
     clouds = [
-        report.thin_cloud(r.seq, rng.normal([1, 0, 5], 1.0, (400, 3)), np.abs(rng.normal(size=400)) * 0.01)
+        thin_cloud(r.seq, rng.normal([1, 0, 5], 1.0, (400, 3)), np.abs(rng.normal(size=400)) * 0.01)
         for r in rows
         if r.gamma
     ]
-    path = report.PathView(
-        rows[min(12, len(rows) - 1)].t_ns, np.linspace([0, 0, 0], [1, 0, 5], 20).astype(np.float32), 0.02
-    )
-    return report.View(BOX, FACES, tuple(clouds), (path,))
+    path = PathView(rows[min(12, len(rows) - 1)].t_ns, np.linspace([0, 0, 0], [1, 0, 5], 20).astype(np.float32), 0.02)
+    return View(BOX, FACES, tuple(clouds), (path,))
 
 
 def _labels(rows):
@@ -50,7 +49,7 @@ def _labels(rows):
 
 def _page(rows, **more):
     poses = [(r.t_ns, Pose(exp([0, 0, 0.02 * r.seq]), [1.0, 0.2, 5.0])) for r in rows]
-    summary = report.Summary.fold(rows, labels=_labels(rows), truth=TRUTH)
+    summary = Summary.fold(rows, labels=_labels(rows), truth=TRUTH)
     given = {"truth": TRUTH, "poses": poses, "view": _view(rows), "title": "tumble"} | more
     return build_page(rows, summary, {"config": {"backend": "horn"}}, **given)
 
@@ -97,7 +96,7 @@ EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\u2028\"'
 
 def test_words_from_files_cannot_become_markup(make_rows):
     rows = make_rows(30, fault=EVIL, reason=EVIL, gamma=0)
-    summary = report.Summary.fold(rows, counts={EVIL: 1})
+    summary = Summary.fold(rows, counts={EVIL: 1})
     page = build_page(rows, summary, {EVIL: EVIL}, title=EVIL)
     assert "<img" not in page
     assert "alert(1)</script>" not in page
@@ -137,7 +136,7 @@ def test_points_survive_packing_to_half_a_step(make_rows):
 
 def test_a_scan_far_away_or_of_one_point_can_be_packed(make_rows):
     rows = make_rows(3)
-    view = report.View(BOX, FACES, (report.thin_cloud(0, [[1e6, 0, 0]]), report.thin_cloud(9, [[0, 0, 0]])))
+    view = View(BOX, FACES, (thin_cloud(0, [[1e6, 0, 0]]), thin_cloud(9, [[0, 0, 0]])))
     packed = scene(rows, {}, view)["clouds"]
     assert _floats(packed["scan"], "<i4").tolist() == [0]
     assert packed["cap_m"] is None
@@ -152,7 +151,7 @@ def test_spans_are_runs_of_one_word(make_rows):
 def test_a_label_that_left_no_scan_is_drawn_too(make_rows):
     rows = [r for r in make_rows(40) if r.seq != 12]
     dropped = Label("dropped", rows[11].t_ns + 1, rows[12].t_ns - 1)
-    found = spans(rows, report.Summary.fold(rows, labels=[*_labels(rows), dropped]).faults.episodes)
+    found = spans(rows, Summary.fold(rows, labels=[*_labels(rows), dropped]).faults.episodes)
     assert [(s["word"], s["first"]) for s in found if s["lane"] == "injected"] == [
         ("full_occlusion", 19),
         ("dropped", 11),
@@ -196,7 +195,7 @@ def test_a_long_run_is_thinned_in_clouds_not_in_columns(make_rows):
 
 def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     rows = make_rows(30)
-    report.write_rows(tmp_path / "rows.jsonl", rows)
+    write_rows(tmp_path / "rows.jsonl", rows)
     done = CliRunner().invoke(command, [str(tmp_path)])
     assert done.exit_code == 0, done.output
     assert "<title>" in (tmp_path / "report.html").read_text(encoding="utf-8")
@@ -237,10 +236,10 @@ def _lab(linear):
 
 @pytest.mark.parametrize("eye", EYES)
 def test_line_colours_differ_to_every_eye(eye):
-    """Five times a just noticeable difference of about 2 in CIELAB, in both themes."""
-    style = (ROOT / "avsreplay/report/page/assets/page.css").read_text(encoding="utf-8")
+    """Five times a just noticeable difference of about 2 in CIELAB, in both themes, and where a page has no script."""
+    style = render("page.css")
     themes = [re.findall(r"--c\d: (#\w{6})", block) for block in re.findall(r":root[^{]*\{(.*?)\}", style, re.S)]
-    assert [len(theme) for theme in themes] == [6, 6]
+    assert [len(theme) for theme in themes] == [6, 6, 6]
     for theme in themes:
         seen = [_lab(np.array(EYES[eye]) @ _linear(colour)) for colour in theme]
         assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(seen, 2)) > 10
@@ -309,6 +308,7 @@ def _pin(browser, chart="position"):
     return browser.execute_script(script, f"#chart-{chart} .pin")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
 @pytest.mark.parametrize("dark", [False, True])
 def test_it_loads_without_a_word_on_the_console(opened, width, dark):
@@ -319,12 +319,14 @@ def test_it_loads_without_a_word_on_the_console(opened, width, dark):
     assert len(browser.find_elements("css selector", ".chart canvas")) >= 12
 
 
+@pytest.mark.slow
 def test_600_scans_are_interactive_within_two_seconds(opened, make_rows):
     ready = "return document.documentElement.dataset.ready"
     rows = make_rows(600, blackout=range(300, 360))
     assert min(int(opened(rows=rows).execute_script(ready)) for _ in range(3)) < 2000
 
 
+@pytest.mark.slow
 def test_the_slider_moves_the_pins_the_words_and_the_3d_view(opened):
     browser = opened()
     _slide(browser, 10)
@@ -338,6 +340,7 @@ def test_the_slider_moves_the_pins_the_words_and_the_3d_view(opened):
     assert _text(browser, "#chart-fit output") == "\u2013"
 
 
+@pytest.mark.slow
 def test_hover_reads_every_chart_at_once_and_lets_go(opened, make_rows):
     from selenium.webdriver import ActionChains
 
@@ -357,6 +360,7 @@ def test_hover_reads_every_chart_at_once_and_lets_go(opened, make_rows):
     assert _text(browser, "#now") == resting
 
 
+@pytest.mark.slow
 def test_a_drag_zooms_all_charts_and_reset_undoes_it(opened):
     from selenium.webdriver import ActionChains
 
@@ -376,6 +380,7 @@ def test_a_drag_zooms_all_charts_and_reset_undoes_it(opened):
     assert _pin(browser, "nees") == pytest.approx(before["nees"], abs=1)
 
 
+@pytest.mark.slow
 def test_a_click_chooses_a_scan_and_jump_goes_to_a_fault(opened):
     browser = opened()
     browser.find_element("css selector", "#chart-position .u-over").click()
@@ -386,6 +391,7 @@ def test_a_click_chooses_a_scan_and_jump_goes_to_a_fault(opened):
     assert browser.execute_script("return document.getElementById('slider').value") == "20"
 
 
+@pytest.mark.slow
 def test_keys_alone_will_do(opened):
     from selenium.webdriver import Keys
 
@@ -415,6 +421,7 @@ def test_keys_alone_will_do(opened):
     assert scene_canvas.screenshot_as_png != before
 
 
+@pytest.mark.slow
 def test_a_legend_key_hides_its_line(opened):
     browser = opened()
     canvas = browser.find_element("css selector", "#chart-position canvas")
@@ -426,6 +433,7 @@ def test_a_legend_key_hides_its_line(opened):
     assert canvas.screenshot_as_png != before
 
 
+@pytest.mark.slow
 def test_play_runs_to_the_end_and_stops(opened):
     browser = opened()
     _slide(browser, 55)
@@ -437,6 +445,7 @@ def test_play_runs_to_the_end_and_stops(opened):
     assert _text(browser, "#now").startswith("scan 59 ")
 
 
+@pytest.mark.slow
 def test_the_theme_button_turns_everything(opened):
     browser = opened()
     canvas = browser.find_element("css selector", "#chart-position canvas")
@@ -447,6 +456,7 @@ def test_the_theme_button_turns_everything(opened):
     assert canvas.screenshot_as_png != before
 
 
+@pytest.mark.slow
 def test_text_stands_out_from_its_ground_in_both_themes(opened):
     """WCAG contrast of 4.5 for text, 3 for lines."""
     script = """const s = getComputedStyle(document.documentElement);
@@ -459,7 +469,7 @@ def test_text_stands_out_from_its_ground_in_both_themes(opened):
         "--accent",
         "--good",
         "--bad",
-        "--so",
+        "--warn",
         "--c0",
         "--c1",
         "--c2",
@@ -481,6 +491,7 @@ def _contrast(one, two):
     return (high + 0.05) / (low + 0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2])
 def test_a_tiny_run_without_anything_else_loads(opened, make_rows, n):
     rows = make_rows(n, pos_err_m=None, rot_err_deg=None)
@@ -489,13 +500,14 @@ def test_a_tiny_run_without_anything_else_loads(opened, make_rows, n):
     assert _text(browser, "#now").startswith("scan 0 ")
 
 
+@pytest.mark.slow
 def test_a_comparison_overlays_and_reads_runs_of_different_rates(browser, tmp_path, make_rows):
-    from avsreplay.report.page.comparison import build_comparison
+    from avsreplay.report.page import build_comparison
 
     for name, rows in (("one", make_rows(60)), ("two", make_rows(60)[::2])):
         (tmp_path / name).mkdir()
-        report.write_rows(tmp_path / name / "rows.jsonl", rows)
-    results = [report.load_result(tmp_path / name) for name in ("one", "two")]
+        write_rows(tmp_path / name / "rows.jsonl", rows)
+    results = [load_result(tmp_path / name) for name in ("one", "two")]
     path = tmp_path / "c.html"
     path.write_text(build_comparison(results), encoding="utf-8")
     browser.get(path.as_uri())

@@ -1,0 +1,213 @@
+"""One builder for every HTML page: of a run, of a comparison, of a campaign. Self-contained, no network, no server.
+
+Text reaches a page through Jinja templates with autoescape. Charts are drawn by uPlot (50 kB, MIT, bundled) and the
+3D view by plain WebGL, so that a page is its data plus 0.1 MB.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from typing import Any, Protocol
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from avsreplay.records import State
+from avsreplay.report.charts import Chart, Columns, charts, derived, embed, pack, spans, values
+from avsreplay.report.compare import metrics
+from avsreplay.report.comparison_tables import comparison_table, gate_table
+from avsreplay.report.export import StampedPose
+from avsreplay.report.gate import RuleOutcome
+from avsreplay.report.summary import Summary
+from avsreplay.report.summary_tables import fact_lines, in_one_line, summary_tables
+from avsreplay.report.table import Table, as_cell, facts_table
+from avsreplay.report.view import View, scene
+from avsreplay.rows import Row
+
+_SCRIPTS = ("uPlot.iife.min.js", "charts.js", "scene.js", "page.js")
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A heading with a paragraph, between the tables of a page."""
+
+    heading: str
+    text: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """Preformatted text that is shown on request."""
+
+    title: str
+    text: str
+
+
+Part = Table | Section | Folded | Markup
+"""What stands under the charts, in order; Markup is a figure made by ``render``."""
+
+
+class SavedRun(Protocol):
+    """What a page needs of a saved result."""
+
+    @property
+    def name(self) -> str:
+        """What the run is called."""
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """One per scan."""
+
+    @property
+    def summary(self) -> Summary:
+        """Of the same rows."""
+
+
+@cache
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("avsreplay.report", "assets"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["cell"] = as_cell
+    return environment
+
+
+def render(template: str, **context: Any) -> Markup:
+    """A template of ``assets/`` with every value escaped."""
+    return Markup(_environment().get_template(template).render(**context))
+
+
+def build(title: str, verdict: str, parts: Iterable[Part], data: Mapping[str, Any] | None = None) -> str:
+    """Build a page.
+
+    Args:
+        title: of the page and its first heading.
+        verdict: the line under it.
+        parts: tables, headings, figures and folded text, in order; a table without rows is left out.
+        data: charts and 3D view for the scripts; without it the page has no script.
+
+    Returns:
+        The page as text; the same arguments give the same bytes.
+    """
+    listed = [(_kind(part), part) for part in parts if not isinstance(part, Table) or part.rows]
+    style = Markup(_asset("uPlot.min.css") if data else "") + render("page.css")
+    script = Markup("\n".join(map(_asset, _SCRIPTS))) if data else ""
+    embedded = Markup(embed(data)) if data else ""
+    return str(
+        render("page.html", title=title, verdict=verdict, parts=listed, style=style, script=script, data=embedded)
+    )
+
+
+def _kind(part: Part) -> str:
+    return "figure" if isinstance(part, Markup) else type(part).__name__.lower()
+
+
+def _asset(name: str) -> str:
+    return (files("avsreplay.report") / "assets" / name).read_text(encoding="utf-8")
+
+
+def build_page(
+    rows: Sequence[Row],
+    summary: Summary,
+    header: Mapping[str, Any] | None = None,
+    *,
+    title: str = "run",
+    truth: State | None = None,
+    poses: Iterable[StampedPose] = (),
+    view: View | None = None,
+) -> str:
+    """The page of one run.
+
+    Args:
+        rows: one per scan.
+        summary: of the same rows.
+        header: ``run.json``, folded away at the end.
+        title: what the run is called.
+        truth: true parameters, drawn as horizontal lines.
+        poses: true poses of {C} in {A}.
+        view: model, clouds and paths for the 3D view.
+
+    Returns:
+        The page as text.
+    """
+    columns = derived(rows)
+    t1 = summary.convergence.t1_s
+    data = {
+        "runs": [{"name": title, "t": pack(values(rows, "t_s"), "f8"), "columns": _packed(columns)}],
+        "charts": charts(columns, truth),
+        "spans": spans(rows, summary.faults.episodes),
+        "marks": [] if t1 is None else [{"t": t1, "label": "t_1"}],
+        "states": [[row.gamma, row.reason, row.fault or ""] for row in rows],
+        "scans": [row.seq for row in rows],
+        "scene": scene(rows, dict(poses), view),
+    }
+    parts: list[Part] = [*summary_tables(summary, rows), facts_table("Run", fact_lines(summary))]
+    if header:
+        text = json.dumps(header, indent=2, ensure_ascii=False, default=str)
+        parts.append(Folded("Configuration and versions", text))
+    return build(title, in_one_line(summary), parts, data)
+
+
+def _packed(columns: Columns) -> dict[str, Any]:
+    return {name: pack(column, "f4") for name, column in columns.items()}
+
+
+def build_comparison(runs: Sequence[SavedRun], outcomes: Sequence[RuleOutcome] = ()) -> str:
+    """The page of several runs: their metrics in a table, their charts over each other.
+
+    Args:
+        runs: the first is the baseline, whose flagged scans are shaded.
+        outcomes: of a gate.
+
+    Returns:
+        The page as text.
+    """
+    columns = [derived(run.rows) for run in runs]
+    data = {
+        "runs": [
+            {"name": run.name, "t": pack(values(run.rows, "t_s"), "f8"), "columns": _packed(own)}
+            for run, own in zip(runs, columns, strict=True)
+        ],
+        "charts": _overlaid(runs, columns),
+        "spans": spans(runs[0].rows),
+        "marks": [],
+        "states": None,
+        "scene": None,
+    }
+    figures = [(run.name, metrics(run.summary)) for run in runs]
+    names = ", ".join(run.name for run in runs)
+    line = f"{len(runs)} runs: {names}.{_gate_sentence(outcomes)}"
+    return build("Comparison", line, [comparison_table(figures, meaning=True), gate_table(outcomes)], data)
+
+
+def _gate_sentence(outcomes: Sequence[RuleOutcome]) -> str:
+    if not outcomes:
+        return ""
+    broken = sum(not o.ok for o in outcomes)
+    return f" {broken} of {len(outcomes)} rules broken." if broken else f" All {len(outcomes)} rules hold."
+
+
+def _overlaid(runs: Sequence[SavedRun], columns: Sequence[Columns]) -> list[Chart]:
+    """One chart for each line of the single-run charts, with a line per run."""
+    everything: Columns = {name: column for own in reversed(columns) for name, column in own.items()}
+    out = []
+    for chart in charts(everything):
+        for line in chart["series"]:
+            series = [
+                {**line, "run": k, "label": run.name, "colour": k, "dash": k % 2 == 1}
+                for k, run in enumerate(runs)
+                if line["column"] in columns[k]
+            ]
+            alone = len(chart["series"]) == 1
+            title = chart["title"] if alone else f"{chart['title']}: {line['label']}"
+            levels = chart["levels"] if alone else []
+            out.append(chart | {"key": line["column"], "title": title, "series": series, "bands": [], "levels": levels})
+    return out

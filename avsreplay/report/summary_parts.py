@@ -1,0 +1,175 @@
+"""Parts of a run's summary: statistics of a list of numbers, estimated constants, planning.
+
+Sums are correctly rounded, so a statistic does not depend on the order of its values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.records import State
+from avsreplay.rows import Row
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Root mean square, mean, median, standard deviation (over n), least and greatest of ``count`` values."""
+
+    count: int
+    rmse: float
+    mean: float
+    median: float
+    std: float
+    min: float
+    max: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> Statistics | None:
+        """None for no value at all."""
+        if not values:
+            return None
+        n = len(values)
+        mean = math.fsum(values) / n
+        rmse = math.sqrt(math.fsum(v * v for v in values) / n)
+        std = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / n)
+        return cls(n, rmse, mean, median(values), std, min(values), max(values))
+
+
+def median(values: Sequence[float]) -> float:
+    """The middle value, or the mean of the two middle ones. ``values`` must not be empty."""
+    ordered, half = sorted(values), len(values) // 2
+    return ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """An estimated constant at the last scan.
+
+    Attributes:
+        estimate, truth: its components, in ``unit``.  error: length of their difference (rotation angle for mu).
+        one_sigma: root of the trace of its covariance.
+    """
+
+    name: str
+    unit: str
+    estimate: tuple[float, ...]
+    truth: tuple[float, ...] | None
+    error: float | None
+    one_sigma: float | None
+
+
+def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
+    """Inertia ratios, varrho and mu of a row, against ``truth`` where it is known."""
+    sigma = (None, None) if truth is None else ((float(truth.sigma[0]),), (float(truth.sigma[1]),))
+    found = [
+        _vector("sigma1", "", (row.sigma1,), sigma[0], row.sigma1_1s),
+        _vector("sigma2", "", (row.sigma2,), sigma[1], row.sigma2_1s),
+        _vector(
+            "c (varrho)", "m", (row.cx_m, row.cy_m, row.cz_m), None if truth is None else _tuple(truth.c_b), row.c_1s_m
+        ),
+        _attitude(row, truth),
+    ]
+    return tuple(p for p in found if p is not None)
+
+
+def _tuple(values: geometry.Array | None) -> tuple[float, ...] | None:
+    return None if values is None else tuple(float(v) for v in values)
+
+
+def _vector(
+    name: str, unit: str, values: tuple[float | None, ...], truth: tuple[float, ...] | None, one_sigma: float | None
+) -> Parameter | None:
+    estimate = tuple(v for v in values if v is not None)
+    if len(estimate) != len(values):
+        return None
+    error = None if truth is None else math.dist(estimate, truth)
+    return Parameter(name, unit, estimate, truth, error, one_sigma)
+
+
+def _attitude(row: Row, truth: State | None) -> Parameter | None:
+    """Attitude mu as a rotation vector [deg]; its error is the angle of mu_true^-1 mu."""
+    q = (row.mux, row.muy, row.muz, row.muw)
+    if None in q:
+        return None
+    estimate = _tuple(np.degrees(geometry.log(np.array(q, dtype=np.float64)))) or ()
+    if truth is None:
+        return Parameter("mu", "deg", estimate, None, None, row.mu_1s_deg)
+    apart = geometry.multiply(geometry.conjugate(truth.q_bc), np.array(q, dtype=np.float64))
+    error = math.degrees(float(geometry.angle(apart)))
+    return Parameter("mu", "deg", estimate, _tuple(np.degrees(geometry.log(truth.q_bc))), error, row.mu_1s_deg)
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureMiss:
+    """Where the true grasp point was when the gripper closed: distance, relative speed, attitude error."""
+
+    position_m: float
+    speed_mps: float | None
+    rotation_deg: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """Planned instants of capture, since the first scan; a replan is a row where the plan differs from the one before.
+
+    Attributes:
+        last_s, first_s: of the last and the first plan.  std_s, range_s: over all replans.
+        status: the planner's last word.
+        hindsight_m: by how much each plan, flown as made, would have missed the true grasp point.
+        miss: of the closed gripper, None where it never closed or truth is not known.
+        actions: scans under each of the supervisor's actions.
+    """
+
+    replans: int
+    first_s: float | None
+    last_s: float | None
+    std_s: float | None
+    range_s: float | None
+    status: str | None
+    hindsight_m: Statistics | None = None
+    miss: CaptureMiss | None = None
+    actions: Mapping[str, int] = field(default_factory=dict)
+
+
+class CaptureFold:
+    """Takes rows one by one."""
+
+    def __init__(self) -> None:
+        self._plans: list[tuple[str | None, float | None]] = []
+        self._hindsight: list[float] = []
+        self._actions: Counter[str] = Counter()
+        self._miss: CaptureMiss | None = None
+
+    def add(self, row: Row) -> None:
+        """Take the next row."""
+        plan = (row.plan_status, row.capture_time_s)
+        if plan != (None, None) and (not self._plans or plan != self._plans[-1]):
+            self._plans.append(plan)
+        if row.hindsight_m is not None:
+            self._hindsight.append(row.hindsight_m)
+        if row.action:
+            self._actions[row.action] += 1
+        if row.capture_miss_m is not None:
+            self._miss = CaptureMiss(row.capture_miss_m, row.capture_miss_mps, row.capture_miss_deg)
+
+    def result(self) -> Capture:
+        """What the rows so far came to."""
+        times = [t for _, t in self._plans if t is not None]
+        spread = Statistics.of(times)
+        return Capture(
+            replans=len(times),
+            first_s=times[0] if times else None,
+            last_s=times[-1] if times else None,
+            std_s=spread.std if spread else None,
+            range_s=spread.max - spread.min if spread else None,
+            status=self._plans[-1][0] if self._plans else None,
+            hindsight_m=Statistics.of(self._hindsight),
+            miss=self._miss,
+            actions=dict(sorted(self._actions.items())),
+        )

@@ -1,0 +1,249 @@
+"""The tables of one run, the same for terminal and page, and what is said of it in single lines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+from rich.console import Console
+
+from avsreplay.report.episodes import Episode
+from avsreplay.report.scan_table import print_sparks, scan_table
+from avsreplay.report.summary import Summary
+from avsreplay.report.summary_parts import Capture, Parameter, Statistics
+from avsreplay.report.table import Table, TableCell, decimals, facts_table, number, print_table
+from avsreplay.rows import Row
+
+_STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
+
+
+def print_tables(
+    console: Console,
+    rows: Sequence[Row],
+    summary: Summary,
+    *,
+    every: int | None = None,
+    show_all: bool = False,
+    scans_per_s: float | None = None,
+    plain: bool = False,
+) -> None:
+    """Print the per-scan table, curves on a wide terminal, and the summary.
+
+    Args:
+        console: where to print.
+        rows: one per scan.
+        summary: of the same rows.
+        every: print every N-th scan.
+        show_all: print all scans.
+        scans_per_s: measured speed; it is printed and never written to a file.
+        plain: leave the curves out.
+    """
+    if rows:
+        print_table(console, scan_table(console, rows, every=every, show_all=show_all), tight=True)
+        if not plain:
+            print_sparks(console, rows)
+    for table in summary_tables(summary, rows):
+        print_table(console, table)
+    print_table(console, facts_table("Run", fact_lines(summary, scans_per_s=scans_per_s)))
+
+
+def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, ...]:
+    """Errors, injected faults, parameters and consistency; a table without content has no rows."""
+    return error_table(summary), fault_table(summary, rows), parameter_table(summary), consistency_table(summary)
+
+
+def error_table(summary: Summary) -> Table:
+    """Statistics of the pose and registration errors, in mm (m from 1 m on) and degrees."""
+    groups = (
+        ("pose, healthy", summary.pose_healthy),
+        ("pose, coasting", summary.pose_coasting),
+        ("registration", summary.registration_healthy),
+    )
+    found: list[tuple[str, str, Statistics | None]] = []
+    for name, errors in groups:
+        found += [(name, "m", errors.position_m), (name, "deg", errors.rotation_deg)]
+    found.append(("fit error rms", "m", summary.fit_error_m))
+    title = "Errors against the fitted motion" if summary.reference == "fit" else "Errors"
+    rows = tuple(_error_row(name, unit, spread) for name, unit, spread in found if spread is not None)
+    return Table(title, ("of", "unit", "n", *_STATISTICS), rows, align="llr")
+
+
+def _error_row(name: str, unit: str, spread: Statistics) -> tuple[str, ...]:
+    unit, factor = ("mm", 1000.0) if unit == "m" and spread.rmse < 1.0 else (unit, 1.0)
+    spec = f".{decimals([factor * spread.rmse], 2)}f"
+    return name, unit, str(spread.count), *(format(factor * getattr(spread, s), spec) for s in _STATISTICS)
+
+
+def consistency_table(summary: Summary) -> Table:
+    """Normalised errors squared per degree of freedom against their two-sided 95 % chi-square bands."""
+    whole = [("NIS", summary.nis, 6), ("NEES", summary.nees, 20)]
+    blocks = [(f"NEES {name}", share, 1) for name, share in summary.nees_blocks.items()]
+    rows = tuple(
+        (
+            name,
+            str(share.count),
+            f"{share.median / size:.2f}",
+            f"{100.0 * share.inside:.1f}",
+            f"{share.low / size:.2f} to {share.high / size:.2f}",
+        )
+        for name, share, size in (*whole, *blocks)
+        if share is not None
+    )
+    heads = ("statistic", "n", "median", "inside 95 % band [%]", "band")
+    return Table("Consistency (per degree of freedom; 1 is expected)", heads, rows)
+
+
+def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
+    """Injected faults; with ``rows`` the first cell leads to the fault's first scan."""
+    heads = ("kind", "from\n[s]", "to\n[s]", "scans\nflagged", "verdict", "delay\n[s]", "recovery\n[s]")
+    lines = tuple(
+        (
+            TableCell(e.kind, scan=_nearest_row(e, rows)),
+            f"{e.start_s:.1f}",
+            f"{e.end_s:.1f}",
+            f"{e.flagged}/{e.scans}",
+            _verdict(e),
+            number(e.delay_s, ".2f"),
+            "never" if e.lost else number(e.recover_s, ".2f"),
+        )
+        for e in summary.faults.episodes
+    )
+    return Table("Injected faults", heads, lines, align="lrrrlr")
+
+
+def _nearest_row(episode: Episode, rows: Sequence[Row]) -> int | None:
+    return min(range(len(rows)), key=lambda k: abs(rows[k].t_s - episode.start_s), default=None)
+
+
+def _verdict(episode: Episode) -> TableCell:
+    if episode.detected:
+        return TableCell("detected" if episode.scans else "detected as a gap", "good")
+    return TableCell("missed", "bad") if episode.harmful else TableCell("harmless, used", "warn")
+
+
+def parameter_table(summary: Summary) -> Table:
+    """Estimated constants against the true ones."""
+    heads = ("parameter", "unit", "estimate", "truth", "error", "1 sigma")
+    rows = tuple((p.name, p.unit, *_parameter_values(p)) for p in summary.parameters)
+    return Table("Parameters at the last scan", heads, rows, align="llr")
+
+
+def _parameter_values(p: Parameter) -> list[str]:
+    scalars = [number(v, ".4f", "") for v in (p.error, p.one_sigma)]
+    vectors = ["" if v is None else " ".join(f"{x:.4f}" for x in v) for v in (p.estimate, p.truth)]
+    return [*vectors, *scalars]
+
+
+def in_one_line(summary: Summary) -> str:
+    """Scans used, faults, errors, t_1 and planned capture."""
+    parts = [f"{summary.healthy} of {summary.scans} scans used", *_fault_words(summary), *_error_words(summary)]
+    t1, capture = summary.convergence.t1_s, summary.capture.last_s
+    parts.append("not converged" if t1 is None else f"converged at {t1:.1f} s")
+    parts.append("no capture planned" if capture is None else f"capture planned at {capture:.2f} s")
+    miss = summary.capture.miss
+    parts += [] if miss is None else [f"gripper closed {_mm(miss.position_m)} from the true grasp point"]
+    return "; ".join(parts) + "."
+
+
+def _fault_words(summary: Summary) -> list[str]:
+    faults = summary.faults
+    if not faults.known:
+        return [f"{faults.false_alarms} flagged"] if faults.false_alarms else []
+    return [
+        f"{faults.detected} of {faults.injected} harmful faults detected",
+        f"{faults.false_alarms} false alarms ({100 * faults.false_alarm_rate:.2f} %)",
+    ]
+
+
+def _error_words(summary: Summary) -> list[str]:
+    position, rotation = summary.pose_healthy.position_m, summary.pose_healthy.rotation_deg
+    if position is None or rotation is None:
+        return ["no truth to compare with"]
+    return [f"pose error {1000 * position.rmse:.3g} mm and {rotation.rmse:.3g} deg rms in healthy scans"]
+
+
+def fact_lines(summary: Summary, *, scans_per_s: float | None = None) -> list[tuple[str, str]]:
+    """(name, value) of everything that takes one line: scans, faults, filter, plan, counts, speed."""
+    facts = [*_scan_facts(summary), *_fault_facts(summary), *_filter_facts(summary), *_plan_facts(summary)]
+    facts += [(name, str(count)) for name, count in summary.counts.items() if count]
+    if scans_per_s is not None:
+        facts.append(("speed", f"{scans_per_s:.1f} scans/s"))
+    return facts
+
+
+def _scan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
+    interval = "" if summary.interval_s is None else f", one every {summary.interval_s:.3g} s"
+    yield "scans", f"{summary.scans} in {summary.duration_s:.2f} s{interval}"
+    yield "used", f"{summary.healthy} healthy (gamma 1), {summary.coasting} coasting{_counted(summary.reasons)}"
+    if summary.gaps:
+        yield "gaps", f"{summary.gaps} intervals longer than 1.5 x the median"
+    coast = summary.longest_coast
+    if coast is not None:
+        error = ""
+        if coast.pos_err_m is not None and coast.rot_err_deg is not None:
+            error = f"; error at its end {_mm(coast.pos_err_m)}, {coast.rot_err_deg:.3f} deg"
+        yield "longest coast", f"{coast.scans} scans, {coast.duration_s:.2f} s{error}"
+
+
+def _counted(counts: Mapping[str, int]) -> str:
+    return ": " + ", ".join(f"{name} {count}" for name, count in counts.items()) if counts else ""
+
+
+def _fault_facts(summary: Summary) -> Iterable[tuple[str, str]]:
+    faults = summary.faults
+    if not faults.known:
+        yield "flagged", f"{faults.false_alarms} scans; the log does not state the injected faults"
+        return
+    events = f"{faults.injected} injected, {faults.detected} detected, {faults.missed} missed"
+    scans = f"{faults.harmful_scans - faults.missed_scans} of {faults.harmful_scans} harmful scans flagged"
+    rate = 100.0 * faults.false_alarm_rate
+    yield "harmful faults", f"{events}; {scans}"
+    yield "false alarms", f"{faults.false_alarms} of {faults.unlabelled} scans without a fault ({rate:.2f} %)"
+    if faults.longest_recovery_s is not None:
+        yield "recovery", f"at most {faults.longest_recovery_s:.2f} s after the first scan past a fault"
+
+
+def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
+    for name, share in (("NIS", summary.nis), ("NEES", summary.nees)):
+        if share is not None:
+            band = f"[{share.low:.1f}, {share.high:.1f}]"
+            yield name, f"median {share.median:.2f}; {100 * share.inside:.1f} % inside the 95 % band {band}"
+    if summary.sigma_hits is not None:
+        floors = f", eigenvalue floor of R active {summary.r_floors} times" if summary.r_floors is not None else ""
+        yield "constraints", f"sigma bound active {summary.sigma_hits} times{floors}"
+    if summary.recalls is not None:
+        taken = f"{summary.weighed_down} healthy poses down-weighted (NIS above its 99.99 % point)"
+        yield "outliers", f"{taken}; estimate reinitialised {summary.recalls} times"
+    seen = summary.observability
+    if seen.rank is not None:
+        full = "never full" if seen.full_rank_s is None else f"full from {seen.full_rank_s:.2f} s"
+        raw, scaled = (number(value, ".1f", "none") for value in (seen.log10_cond, seen.log10_cond_scaled))
+        yield "Gramian", f"rank {seen.rank} of 20 ({full}); log10 condition {raw} raw, {scaled} scaled"
+
+
+def _plan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
+    t1, capture = summary.convergence, summary.capture
+    end = "" if t1.at_end else "; not at the last scan"
+    back = f"; withdrawn {t1.withdrawn} times" if t1.withdrawn else ""
+    yield "t_1", "not reached" if t1.t1_s is None else f"{t1.t1_s:.2f} s{back}{end}"
+    if capture.last_s is None:
+        yield "capture", f"no plan ({capture.status or 'the planner was not called'})"
+    else:
+        spread = f"std {capture.std_s:.3f} s, range {capture.range_s:.3f} s"
+        yield "capture", f"planned at {capture.last_s:.2f} s; {spread} over {capture.replans} plans"
+    yield from _flight_facts(capture)
+
+
+def _flight_facts(capture: Capture) -> Iterable[tuple[str, str]]:
+    if capture.hindsight_m is not None:
+        found, n = capture.hindsight_m, capture.hindsight_m.count
+        yield "hindsight", f"{n} plans miss by {_mm(found.median)} in the median, {_mm(found.max)} at most"
+    if capture.miss is not None:
+        speed = "" if capture.miss.speed_mps is None else f", {1000 * capture.miss.speed_mps:.3g} mm/s"
+        turn = "" if capture.miss.rotation_deg is None else f", {capture.miss.rotation_deg:.3g} deg"
+        yield "gripper", f"closed {_mm(capture.miss.position_m)}{speed}{turn} from the true grasp point"
+    if capture.actions:
+        yield "robot", ", ".join(f"{action} {count} scans" for action, count in capture.actions.items())
+
+
+def _mm(metres: float) -> str:
+    return f"{1000 * metres:.3g} mm"
