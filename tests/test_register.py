@@ -12,13 +12,12 @@ from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import AlignStatus, Fit, Surface
 from avsreplay.register import RegisterParams, Registrar
-from avsreplay.register.assess import assess, evidence
-from avsreplay.register.facing import Camera, View, is_outward
-from avsreplay.register.freedom import free_directions
-from avsreplay.register.proving import plate_scan, proving_pose, proving_surface, view
-from avsreplay.register.quaternion_fit import best_motion, horn_matrix
+from avsreplay.register.contract import boxes, example_pose, plate_scan, view
+from avsreplay.register.quality import grade, residuals, unobservable_directions
+from avsreplay.register.reference import best_motion, horn_matrix
 from avsreplay.register.sampling import sample, thin
 from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.visibility import Camera, Visibility, is_outward
 
 RNG_SEED = 11
 
@@ -29,7 +28,7 @@ def _rng() -> np.random.Generator:
 
 @pytest.fixture(scope="module")
 def surface() -> Surface:
-    return proving_surface()
+    return boxes()
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +38,7 @@ def registrar(surface: Surface) -> Registrar:
 
 @pytest.fixture(scope="module")
 def scan(surface: Surface) -> np.ndarray:
-    T_ac = proving_pose()
+    T_ac = example_pose()
     return T_ac.apply(view(surface, 6000, T_ac.inverse().t))
 
 
@@ -76,7 +75,7 @@ def test_horn_matrix_is_scalar_first() -> None:
 
 @pytest.mark.parametrize("backend", ["horn", "reference"])
 def test_exact_scan_comes_back_to_rounding(surface: Surface, scan: np.ndarray, backend: str) -> None:
-    T_ac = proving_pose()
+    T_ac = example_pose()
     guess = T_ac @ Pose(exp(np.radians([2.0, -3.0, 1.5])), np.array([0.04, -0.05, 0.03]))
     params = RegisterParams(backend=backend, eps_rad=1e-7, eps_m=1e-7, n_max=1000)  # Horn alone settles slowly
     found = Registrar(surface, params).register(scan, guess)
@@ -91,7 +90,7 @@ def test_horn_and_reference_end_at_the_same_pose(surface: Surface, scan: np.ndar
     """Plane passes first or not, kernel or numpy: the fixed point of Horn's pass is one."""
     rng = _rng()
     noisy = scan + rng.normal(0.0, 0.008, scan.shape)
-    guess = proving_pose() @ Pose(exp([0.01, 0.02, -0.01]), np.array([0.02, 0.0, -0.02]))
+    guess = example_pose() @ Pose(exp([0.01, 0.02, -0.01]), np.array([0.02, 0.0, -0.02]))
     params = RegisterParams(camera=Camera.NONE, eps_rad=1e-7, eps_m=1e-7, n_max=1000)
     first = Registrar(surface, params).register(noisy, guess)
     second = Registrar(surface, replace(params, backend="reference")).register(noisy, guess)
@@ -101,7 +100,7 @@ def test_horn_and_reference_end_at_the_same_pose(surface: Surface, scan: np.ndar
 
 
 def test_empty_and_missing_points_keep_the_guess(registrar: Registrar) -> None:
-    guess = proving_pose()
+    guess = example_pose()
     for points in (np.empty((0, 3)), np.full((4, 3), np.nan, dtype=np.float32)):
         found = registrar.register(points, guess)
         assert found.status is AlignStatus.NO_POINTS
@@ -110,9 +109,9 @@ def test_empty_and_missing_points_keep_the_guess(registrar: Registrar) -> None:
 
 
 def test_subsampling_keeps_the_pose(surface: Surface, scan: np.ndarray) -> None:
-    found = Registrar(surface, RegisterParams(subsample_m=0.1)).register(scan, proving_pose())
+    found = Registrar(surface, RegisterParams(subsample_m=0.1)).register(scan, example_pose())
     assert 100 < found.points < len(scan) / 1.5
-    assert np.linalg.norm(found.T_ac.t - proving_pose().t) < 1e-4
+    assert np.linalg.norm(found.T_ac.t - example_pose().t) < 1e-4
 
 
 class _Raising:
@@ -133,7 +132,7 @@ class _NotFinite(_Raising):
 @pytest.mark.parametrize("fake", [_Raising, _NotFinite])
 def test_a_back_ends_trouble_is_a_status(monkeypatch, surface: Surface, scan: np.ndarray, fake) -> None:
     monkeypatch.setattr("avsreplay.register.registrar.load", lambda name: fake)
-    found = Registrar(surface).register(scan, proving_pose())
+    found = Registrar(surface).register(scan, example_pose())
     assert found.status is AlignStatus.FAILED
     assert np.isfinite(found.T_ac.matrix).all()
 
@@ -143,15 +142,15 @@ def test_a_back_ends_trouble_is_a_status(monkeypatch, surface: Surface, scan: np
 
 def test_information_is_the_curvature_of_the_cost(surface: Surface, registrar: Registrar, scan: np.ndarray) -> None:
     """J of the ruler against finite differences of the residuals, in d of T_ac_true = T_ac @ Exp(d)."""
-    T_ac = proving_pose()
+    T_ac = example_pose()
     model = SurfaceIndex.build(surface, 0.5)
-    base = evidence(model, View(surface), scan, T_ac.inverse(), 0.05)
+    base = residuals(model, Visibility(surface), scan, T_ac.inverse(), 0.05)
     h = 1e-6
     for k in range(6):
         d = np.zeros(6)
         d[k] = h
         moved = T_ac @ Pose(exp(-d[:3]), -d[3:])  # the measured pose that is off by d (first order)
-        shifted = evidence(model, View(surface), scan, moved.inverse(), 0.05)
+        shifted = residuals(model, Visibility(surface), scan, moved.inverse(), 0.05)
         if shifted.inliers != base.inliers:
             pytest.fail("the step changed the inliers")
         slope = (shifted.e - base.e) / h
@@ -160,7 +159,7 @@ def test_information_is_the_curvature_of_the_cost(surface: Surface, registrar: R
 
 
 def test_covariance_shrinks_with_points_and_grows_with_noise(surface: Surface, registrar: Registrar) -> None:
-    T_ac, rng = proving_pose(), _rng()
+    T_ac, rng = example_pose(), _rng()
     exact = {n: T_ac.apply(view(surface, n, T_ac.inverse().t)) for n in (3000, 12000)}
 
     def trace(n: int, sigma: float) -> float:
@@ -173,14 +172,16 @@ def test_covariance_shrinks_with_points_and_grows_with_noise(surface: Surface, r
 
 def test_no_overlap_whatever_the_flag_says(surface: Surface, scan: np.ndarray) -> None:
     params = RegisterParams()
-    far = Fit(Pose(proving_pose().inverse().q, np.full(3, 1e3)), 1, True)
-    found = assess(SurfaceIndex.build(surface, 0.5), View(surface), scan, far, params.limits(surface.extent), params)
+    far = Fit(Pose(example_pose().inverse().q, np.full(3, 1e3)), 1, True)
+    found = grade(
+        SurfaceIndex.build(surface, 0.5), Visibility(surface), scan, far, params.limits(surface.extent), params
+    )
     assert found.status is AlignStatus.NO_OVERLAP
     assert (found.inliers, found.covariance) == (0, None)
 
 
 def test_not_converged_is_said_and_graded(surface: Surface, scan: np.ndarray) -> None:
-    guess = proving_pose() @ Pose(exp([0.05, 0.0, 0.0]), np.zeros(3))
+    guess = example_pose() @ Pose(exp([0.05, 0.0, 0.0]), np.zeros(3))
     found = Registrar(surface, RegisterParams(n_max=2)).register(scan, guess)
     assert found.status is AlignStatus.NOT_CONVERGED
     assert found.iterations == 2
@@ -192,7 +193,7 @@ def test_instants_say_which_pose_a_moving_scan_is_registered_at(
     registrar: Registrar, surface: Surface, scan: np.ndarray, late_far: bool
 ) -> None:
     """The target drifts by t d1 while it is scanned, along one side or at random: the pose found is off by M d1."""
-    T_ac, rng = proving_pose(), _rng()
+    T_ac, rng = example_pose(), _rng()
     body = T_ac.inverse().apply(scan)
     times = rng.uniform(0.0, 1.0, len(scan))
     if late_far:
@@ -208,7 +209,7 @@ def test_instants_say_which_pose_a_moving_scan_is_registered_at(
 
 
 def test_points_of_one_instant_have_it_in_every_direction(registrar: Registrar, scan: np.ndarray) -> None:
-    M = registrar.instants(scan, np.full(len(scan), 0.3), proving_pose())
+    M = registrar.instants(scan, np.full(len(scan), 0.3), example_pose())
     np.testing.assert_allclose(M, 0.3 * np.eye(6), atol=1e-12)
 
 
@@ -226,7 +227,7 @@ def _plane(normal: np.ndarray, about: np.ndarray) -> tuple[np.ndarray, np.ndarra
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_plane_slides_along_two_axes_and_turns_about_the_third(axis: int) -> None:
     names = "xyz"
-    found = free_directions(*_plane(np.eye(3)[axis], np.array([3.0, -2.0, 1.0])))
+    found = unobservable_directions(*_plane(np.eye(3)[axis], np.array([3.0, -2.0, 1.0])))
     others = [f"slides along {names[k]}" for k in range(3) if k != axis]
     assert sorted(found) == sorted([*others, f"turns about {names[axis]}"])
 
@@ -236,7 +237,7 @@ def test_a_cylinder_slides_along_and_turns_about_its_axis() -> None:
     angle, z = rng.uniform(0, 2 * np.pi, 2000), rng.uniform(-1, 1, 2000)
     n = np.stack([np.cos(angle), np.sin(angle), np.zeros(2000)], axis=1)
     points = 0.5 * n + np.array([0, 0, 1.0]) * z[:, None]
-    assert sorted(free_directions(np.hstack([np.cross(points, n), n]), points.mean(0))) == [
+    assert sorted(unobservable_directions(np.hstack([np.cross(points, n), n]), points.mean(0))) == [
         "slides along z",
         "turns about z",
     ]
@@ -245,21 +246,21 @@ def test_a_cylinder_slides_along_and_turns_about_its_axis() -> None:
 def test_a_sphere_turns_about_everything_and_a_full_view_about_nothing(surface: Surface) -> None:
     n = _rng().normal(size=(3000, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
-    assert sorted(free_directions(np.hstack([np.cross(n, n), n]), np.zeros(3))) == [
+    assert sorted(unobservable_directions(np.hstack([np.cross(n, n), n]), np.zeros(3))) == [
         f"turns about {axis}" for axis in "xyz"
     ]
     points, normals = sample(surface, 3000)
-    assert free_directions(np.hstack([np.cross(points, normals), normals]), points.mean(0)) == ()
+    assert unobservable_directions(np.hstack([np.cross(points, normals), normals]), points.mean(0)) == ()
 
 
 def test_a_slanted_slide_is_named_by_its_direction() -> None:
-    found = free_directions(*_plane(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.zeros(3)))
+    found = unobservable_directions(*_plane(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.zeros(3)))
     assert "slides along z" in found
     assert any(words.startswith("slides along (") for words in found)
 
 
 def test_a_degenerate_view_has_no_covariance(registrar: Registrar) -> None:
-    T_ac = proving_pose()
+    T_ac = example_pose()
     found = registrar.register(T_ac.apply(plate_scan()), T_ac)
     assert found.status is AlignStatus.DEGENERATE
     assert found.covariance is None
@@ -283,34 +284,34 @@ def test_outward_is_told_from_inward_open_and_cloud(surface: Surface) -> None:
 
 
 def test_the_camera_is_the_origin_where_it_can_be(surface: Surface, scan: np.ndarray) -> None:
-    model, T_ca = SurfaceIndex.build(surface, 0.5), proving_pose().inverse()
-    np.testing.assert_array_equal(View(surface).camera_c(model, scan, T_ca), T_ca.t)
-    np.testing.assert_array_equal(View(surface, Camera.ORIGIN).camera_c(model, scan, T_ca), T_ca.t)
-    assert View(surface, Camera.NONE).camera_c(model, scan, T_ca) is None
+    model, T_ca = SurfaceIndex.build(surface, 0.5), example_pose().inverse()
+    np.testing.assert_array_equal(Visibility(surface).camera_c(model, scan, T_ca), T_ca.t)
+    np.testing.assert_array_equal(Visibility(surface, Camera.ORIGIN).camera_c(model, scan, T_ca), T_ca.t)
+    assert Visibility(surface, Camera.NONE).camera_c(model, scan, T_ca) is None
     inward = replace(surface, faces=surface.faces[:, ::-1])
-    assert View(inward).camera_c(model, scan, T_ca) is None
+    assert Visibility(inward).camera_c(model, scan, T_ca) is None
 
 
 def test_a_camera_inside_the_model_or_behind_the_measured_sides_is_not_believed(surface: Surface) -> None:
-    model, T_ca = SurfaceIndex.build(surface, 0.5), proving_pose().inverse()
+    model, T_ca = SurfaceIndex.build(surface, 0.5), example_pose().inverse()
     near = view(surface, 3000, T_ca.t)
-    assert View(surface).camera_c(model, near, Pose.identity()) is None
+    assert Visibility(surface).camera_c(model, near, Pose.identity()) is None
     behind = view(surface, 3000, -T_ca.t)  # the sides that a camera on the other side would see
-    assert View(surface).camera_c(model, proving_pose().apply(behind), T_ca) is None
+    assert Visibility(surface).camera_c(model, example_pose().apply(behind), T_ca) is None
 
 
 def test_sight_points_from_the_scan_to_the_camera(surface: Surface, scan: np.ndarray) -> None:
-    sight = View(surface).sight(scan)
-    assert sight @ (-proving_pose().t / np.linalg.norm(proving_pose().t)) > 0.95
-    assert View(surface).sight(proving_pose().inverse().apply(scan)) is None
-    assert View(surface, Camera.NONE).sight(scan) is None
+    sight = Visibility(surface).direction_to_camera(scan)
+    assert sight @ (-example_pose().t / np.linalg.norm(example_pose().t)) > 0.95
+    assert Visibility(surface).direction_to_camera(example_pose().inverse().apply(scan)) is None
+    assert Visibility(surface, Camera.NONE).direction_to_camera(scan) is None
 
 
 @pytest.mark.parametrize("offset", [0.06, -0.06])
 def test_a_thin_panel_is_not_laid_on_its_back(offset: float) -> None:
     """Half a panel's thickness off along the sight, either way: only one side of it can have been measured."""
-    surface = proving_surface()
-    T_ac = proving_pose()
+    surface = boxes()
+    T_ac = example_pose()
     scan = T_ac.apply(view(surface, 6000, T_ac.inverse().t)) + _rng().normal(0, 0.004, (1, 3))
     sight = T_ac.t / np.linalg.norm(T_ac.t)
     found = Registrar(surface).register(scan, Pose(T_ac.q, T_ac.t + offset * sight))

@@ -71,6 +71,7 @@ def test_a_harmed_file_is_built_anew(surface: Surface, tmp_path: Path, harm: str
     assert SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path).restored
 
 
+@pytest.mark.slow
 def test_no_payload_leads_a_search_astray(surface: Surface, tmp_path: Path) -> None:
     """Payloads with a right checksum but random words in them: refused, or searched without leaving the arrays."""
     SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)

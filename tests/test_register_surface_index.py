@@ -23,7 +23,9 @@ MOVE = Pose(exp([0.05, -0.08, 0.06]), [0.03, -0.02, 0.04])
 Build = Callable[[Surface, float], Any]  # of a SurfaceIndex or an OracleIndex, which have the same methods
 
 
-@pytest.fixture(params=[SurfaceIndex.build, OracleIndex], ids=["kernel", "oracle"])
+@pytest.fixture(
+    params=[SurfaceIndex.build, pytest.param(OracleIndex, marks=pytest.mark.slow)], ids=["kernel", "oracle"]
+)
 def build(request: pytest.FixtureRequest) -> Build:
     return request.param
 
@@ -117,6 +119,7 @@ def test_the_gate_never_grows_nor_passes_its_floor(build: Build) -> None:
     assert gates[-1] == 0.02
 
 
+@pytest.mark.slow
 def test_kernel_and_oracle_make_the_same_steps() -> None:
     mesh = shape()
     scan = MOVE.apply(on(mesh, 1000, 12) + 0.004 * rng(13).standard_normal((1000, 3)))

@@ -1,4 +1,4 @@
-"""``avsreplay backends``: what is installed, what is not and how to get it; and the contract a back end must keep."""
+"""``avsreplay backends``: the registration back ends, how to install those that are missing, and their laws."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from avsreplay.register.contract import Finding
-    from avsreplay.register.port import Availability
+    from avsreplay.register.backend import Availability
 
 
 EPILOG = """\b
@@ -22,10 +22,10 @@ Examples:
 
 
 @click.command("backends", epilog=EPILOG)
-@click.option("--check", "name", metavar="NAME", help="Run the contract's laws on this back end; exit 1 if one fails.")
+@click.option("--check", "name", metavar="NAME", help="Check the laws of the contract on this back end; exit 1 if one fails.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
 def command(name: str | None, as_json: bool) -> None:
-    """List the registration back ends: what is installed, and how to get what is not."""
+    """List the registration back ends, and how to install those that are missing."""
     if name is None:
         _list(as_json)
     else:
@@ -33,13 +33,13 @@ def command(name: str | None, as_json: bool) -> None:
 
 
 def _list(as_json: bool) -> None:
-    from avsreplay.register.port import available
+    from avsreplay.register.backend import available
 
     states = available()
     if as_json:
         _print_json([dataclasses.asdict(state) for state in states])
     else:
-        heads = ("name", "installed", "version", "what it is", "how to install it")
+        heads = ("name", "installed", "version", "description", "how to install")
         _print_table("Registration back ends", heads, map(_state_row, states))
 
 
@@ -55,7 +55,7 @@ def _check(name: str, as_json: bool) -> None:
     if as_json:
         _print_json({"backend": name, "findings": [dataclasses.asdict(finding) for finding in findings]})
     else:
-        _print_table(f"Contract of {name}", ("law", "holds", "found"), map(_finding_row, findings))
+        _print_table(f"Contract of {name}", ("law", "holds", "measured"), map(_finding_row, findings))
     broken = [finding.law for finding in findings if not finding.held]
     if broken:
         raise CheckFailed(f"{len(broken)} of {len(findings)} laws broken: {'; '.join(broken)}", where=name)

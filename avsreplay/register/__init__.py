@@ -1,9 +1,9 @@
-"""Registration of a scan against a fixed model: back ends behind one contract, one ruler for all."""
+"""Registration of scans against a fixed model: back ends behind one protocol, one quality measure for all of them."""
 
 from __future__ import annotations
 
+from avsreplay.register.backend import Availability, Backend, Target, available
 from avsreplay.register.params import Limits, RegisterParams
-from avsreplay.register.port import Availability, Backend, Target, available
 from avsreplay.register.registrar import Registrar
 
 __all__ = ["Availability", "Backend", "Limits", "RegisterParams", "Registrar", "Target", "available"]

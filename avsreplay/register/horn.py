@@ -1,4 +1,4 @@
-"""The ``horn`` back end: point-to-plane passes to come near, then Horn's quaternion ICP to its fixed point, in C++."""
+"""The ``horn`` back end: point-to-plane passes, then Horn's quaternion ICP to its fixed point, in C++."""
 
 from __future__ import annotations
 
@@ -9,10 +9,8 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Pose
 from avsreplay.records import Fit
-from avsreplay.register.port import Target
+from avsreplay.register.backend import Target
 from avsreplay.register.surface_index import IcpParams
-
-__all__ = ["HornBackend"]
 
 PLANE_PASSES = 6
 
@@ -27,13 +25,13 @@ class HornBackend:
 
     name: ClassVar[str] = "horn"
     accuracy: ClassVar[tuple[float, float]] = (0.001, 1e-05)
-    about: ClassVar[str] = "plane start, then Horn's quaternion ICP to its fixed point on the mesh itself, C++"
+    about: ClassVar[str] = "point-to-plane start, then Horn's quaternion ICP to its fixed point on the mesh itself, C++"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("avsreplay.register._kernel", "avsreplay"),)
     get: ClassVar[str] = "a C++17 compiler, then pip install ."
 
     def __init__(self, target: Target) -> None:
         limits = target.limits
-        self._model, self._view = target.model, target.view
+        self._index, self._visibility = target.index, target.visibility
         self._rule = IcpParams(
             n_max=limits.n_max,
             n_plane=min(PLANE_PASSES, limits.n_max),
@@ -45,7 +43,7 @@ class HornBackend:
         )
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
-        """See :class:`avsreplay.register.port.Backend`."""
-        facing = self._view.camera_c(self._model, points, guess) is not None
-        found = self._model.icp(points, guess, replace(self._rule, facing=facing))
+        """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
+        facing = self._visibility.camera_c(self._index, points, guess) is not None
+        found = self._index.icp(points, guess, replace(self._rule, facing=facing))
         return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged)

@@ -1,8 +1,8 @@
-"""The ``kiss`` back end: kiss-icp against a voxel map of points drawn from the model.
+"""The ``kiss`` back end: kiss-icp against a voxel map of points sampled from the model.
 
-Known of kiss-icp 1.2 and 1.3: its reach is one voxel; ``kernel`` acts as a squared length; more than one thread is not
-repeatable to the bit; a guess whose rotation is off by 2e-9 ends the interpreter; it returns a pose and nothing else,
-and returns the guess where nothing matched.
+Properties of kiss-icp 1.2 and 1.3: correspondences reach over one voxel; ``kernel`` is used as a squared length; with
+more than one thread results are not repeatable to the bit; a guess whose rotation is not orthonormal by 2e-9 aborts the
+interpreter; it returns only a pose, and returns the guess if nothing matched.
 """
 
 from __future__ import annotations
@@ -16,23 +16,21 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Pose
 from avsreplay.records import Fit
-from avsreplay.register.port import Target
+from avsreplay.register.backend import Target
 from avsreplay.register.sampling import sample
-
-__all__ = ["KissBackend"]
 
 POINTS_PER_VOXEL = 20
 SURFACE_POINTS = 100_000
 SETTLED_OF_GATE = 0.01
-STEP_OF_EPS = 10.0  # 1e-4 by default, the library's own: its last steps creep from one map point to the next
-FAR_M = 1e9  # the map is never thinned by distance
+STEP_OF_EPS = 10.0  # gives 1e-4, the default of the library: its last steps move from one map point to the next
+FAR_M = 1e9  # no part of the map is deleted because of its distance
 
 
 class KissBackend:
-    """Three maps, coarse to fine: voxels of ``reach_m`` to come near, of ``gate_m`` to settle, of their mean between.
+    """Three maps, coarse to fine, with voxels of ``reach_m``, of ``gate_m`` and of their geometric mean in between.
 
-    The iteration count is not given by the library, so ``Fit.iterations`` counts its calls. ``converged`` means that
-    one more call, begun where the last one ended, moved the model's far points by less than a hundredth of ``gate_m``.
+    The library does not return its iteration count, so ``Fit.iterations`` counts its calls. ``converged`` means that
+    one more call, started from the last result, moved the outermost points of the model by less than 0.01 ``gate_m``.
     """
 
     name: ClassVar[str] = "kiss"
@@ -56,7 +54,7 @@ class KissBackend:
         self._registration = Registration(target.limits.n_max, STEP_OF_EPS * target.limits.eps_rad, 1)
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
-        """See :class:`avsreplay.register.port.Backend`."""
+        """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         scan = np.ascontiguousarray(points, dtype=np.float64)
         T_ca = guess
         for voxel, voxel_map in self._maps:
@@ -70,7 +68,7 @@ class KissBackend:
         return Pose.from_matrix(T)
 
     def _settled(self, before: Pose, after: Pose) -> bool:
-        step = after @ before.inverse()  # in {C}: seen from the camera a turn would count as a move
+        step = after @ before.inverse()  # in {C}, where a rotation of the target does not appear as a translation
         turn, move = float(geometry.angle(step.q)), float(np.linalg.norm(step.t))
         small = SETTLED_OF_GATE * self._limits.gate_m
         return move < small and turn * self._radius_m < small

@@ -1,4 +1,4 @@
-"""The ``open3d`` back end: Open3D's point-to-plane ICP against points drawn from the model."""
+"""The ``open3d`` back end: Open3D's point-to-plane ICP against points sampled from the model."""
 
 from __future__ import annotations
 
@@ -9,25 +9,23 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Pose
 from avsreplay.records import Fit
-from avsreplay.register.port import Target
+from avsreplay.register.backend import Target
 from avsreplay.register.sampling import sample
-
-__all__ = ["Open3dBackend"]
 
 SURFACE_POINTS = 100_000
 NEIGHBOURS = 20
 
 
 class Open3dBackend:
-    """Point-to-plane, coarse to fine: matches out to ``reach_m`` to come near, then out to ``gate_m`` to settle.
+    """Point-to-plane, coarse to fine: first with correspondences up to ``reach_m``, then up to ``gate_m``.
 
-    The library gives no count of its passes and no flag: ``Fit.iterations`` counts its calls, and ``converged`` means
+    The library returns no iteration count and no flag: ``Fit.iterations`` counts its calls, and ``converged`` means
     that the last one ended with matched points.
     """
 
     name: ClassVar[str] = "open3d"
     accuracy: ClassVar[tuple[float, float]] = (0.01, 0.0001)
-    about: ClassVar[str] = "Open3D's point-to-plane ICP against points drawn from the model"
+    about: ClassVar[str] = "Open3D's point-to-plane ICP against points sampled from the model"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("open3d", "open3d"),)
     get: ClassVar[str] = "pip install 'avsreplay[open3d]'"
 
@@ -46,7 +44,7 @@ class Open3dBackend:
             self._cloud.estimate_normals(open3d.geometry.KDTreeSearchParamKNN(NEIGHBOURS))
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
-        """See :class:`avsreplay.register.port.Backend`."""
+        """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         scan = self._geometry(self._vector(np.ascontiguousarray(points, dtype=np.float64)))
         rule = self._library.ICPConvergenceCriteria(1e-8, 1e-8, self._limits.n_max)
         method = self._library.TransformationEstimationPointToPlane()

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from avsreplay.register.facing import Camera
+from avsreplay.register.visibility import Camera
 from avsreplay.settings import Settings, given, setting
-
-__all__ = ["AcquireParams", "Limits", "RegisterParams"]
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Points drawn evenly over a surface, for the back ends that know only clouds; no random numbers."""
+"""Evenly distributed points of a surface or of a scan, without random numbers."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
 
-__all__ = ["even", "sample", "thin", "without_strays"]
-
 EVEN_ROUNDS, EVEN_WITHIN = 10, (0.85, 1.2)
 STRAY_SHARE, STRAY_VOXELS, STRAY_POINTS = 0.15, 150, 10
-R2 = np.array([0.7548776662466927, 0.5698402909980532])  # plastic-number sequence: even over the unit square
+R2 = np.array([0.7548776662466927, 0.5698402909980532])  # plastic-number sequence: low discrepancy in the unit square
 
 
 def sample(surface: Surface, count: int) -> tuple[Array, Array]:
-    """About ``count`` points by area with their face normals, (n, 3) each; a bare cloud as it is, with zero normals."""
+    """Return about ``count`` points, uniform by area, and their face normals, (n, 3) each.
+
+    A point cloud is returned as it is, with zero normals.
+    """
     if len(surface.faces) == 0:
         return np.array(surface.vertices), np.zeros_like(surface.vertices)
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
@@ -33,7 +34,7 @@ def sample(surface: Surface, count: int) -> tuple[Array, Array]:
 
 
 def thin(points: Array, voxel_m: float) -> Array:
-    """The first point of every occupied voxel of this size, in scan order. (n, 3) -> (k, 3)."""
+    """Return the first point of every occupied voxel of this size, in scan order. (n, 3) -> (k, 3)."""
     if len(points) == 0:
         return points
     cells = np.floor(points / voxel_m).astype(np.int64)
@@ -41,8 +42,8 @@ def thin(points: Array, voxel_m: float) -> Array:
     return points[np.sort(first)]
 
 
-def even(points: Array, count: int) -> Array:
-    """About ``count`` of the points, the first of every voxel, its size found by halving; (n, 3) -> (k, 3)."""
+def thin_to(points: Array, count: int) -> Array:
+    """Return about ``count`` of the points: the first of every voxel, whose size is found iteratively."""
     if len(points) <= count:
         return points
     voxel = max(3.0 * _spread(points) / np.sqrt(count), np.finfo(float).tiny)
@@ -54,11 +55,11 @@ def even(points: Array, count: int) -> Array:
     return points[np.sort(first)]
 
 
-def without_strays(points: Array) -> Array:
-    """The points of voxels that hold 0.15 or more of what the median point has around it; (n, 3) -> (k, 3).
+def without_sparse_points(points: Array) -> Array:
+    """Return the points in voxels that hold at least 0.15 of the number that the median point has in its voxel.
 
-    A stray far from everything would fill a voxel of its own and, thinned by voxels, weigh as much as a piece of
-    surface. About 150 voxels cover the scan; a scan of fewer than ten points a voxel is left as it is.
+    A single outlier far from everything would occupy a voxel of its own and, after thinning by voxels, weigh as much as
+    a piece of surface. About 150 voxels cover the scan; a scan with fewer than ten points per voxel is not changed.
     """
     if len(points) < STRAY_VOXELS * STRAY_POINTS:
         return points
@@ -72,7 +73,7 @@ def _spread(points: Array) -> float:
 
 
 def _voxels(points: Array, voxel_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """First point of every occupied voxel, the voxel of every point, and how many each holds."""
+    """First point of every occupied voxel, the voxel of every point, and the number of points in each voxel."""
     cells = np.floor((points - points.min(axis=0)) / max(voxel_m, np.finfo(float).tiny)).astype(np.int64)
     shape = cells.max(axis=0) + 1
     keys = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]

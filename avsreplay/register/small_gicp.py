@@ -1,7 +1,7 @@
-"""The ``small_gicp`` back end: generalised ICP against points drawn from the model, one thread.
+"""The ``small_gicp`` back end: generalised ICP against points sampled from the model, one thread.
 
-Known of small_gicp 1.0: clouds far apart come back as converged with no inlier; one and two threads differ in the last
-digits; an unknown method name returns the identity.
+Properties of small_gicp 1.0: clouds far apart are returned as converged with no inlier; one and two threads differ in
+the last digits; an unknown method name returns the identity.
 """
 
 from __future__ import annotations
@@ -13,26 +13,24 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Fit
-from avsreplay.register.port import Target
+from avsreplay.register.backend import Target
 from avsreplay.register.sampling import sample
-
-__all__ = ["SmallGicpBackend"]
 
 SURFACE_POINTS = 100_000
 NEIGHBOURS = 20
-SETTLED = 10.0  # its steps jitter at this many eps: the scan's covariances are not smooth in the pose
-LEAST_POINTS = 20  # fewer cannot give a neighbourhood of NEIGHBOURS
+SETTLED = 10.0  # its steps do not become smaller than this many eps: the covariances are not smooth in the pose
+LEAST_POINTS = 20  # fewer points have no neighbourhood of NEIGHBOURS
 
 
 class SmallGicpBackend:
-    """GICP, coarse to fine: matches out to ``reach_m`` to come near, then out to ``gate_m`` to settle.
+    """GICP, coarse to fine: first with correspondences up to ``reach_m``, then up to ``gate_m``.
 
-    ``Fit.iterations`` is the sum of both; ``converged`` is the library's flag of the last, and that it had an inlier.
+    ``Fit.iterations`` is the sum of both; ``converged`` is the flag of the library for the second, if it had an inlier.
     """
 
     name: ClassVar[str] = "small_gicp"
     accuracy: ClassVar[tuple[float, float]] = (0.01, 0.0001)
-    about: ClassVar[str] = "small_gicp's GICP against points drawn from the model, one thread"
+    about: ClassVar[str] = "small_gicp's GICP against points sampled from the model, one thread"
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("small_gicp", "small_gicp"),)
     get: ClassVar[str] = "pip install 'avsreplay[small_gicp]'"
 
@@ -44,7 +42,7 @@ class SmallGicpBackend:
         self._cloud, self._tree = self._prepared(sample(target.surface, SURFACE_POINTS)[0])
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
-        """See :class:`avsreplay.register.port.Backend`."""
+        """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         if len(points) < LEAST_POINTS:
             return Fit(guess, 0, False)
         scan, _ = self._prepared(np.ascontiguousarray(points, dtype=np.float64))

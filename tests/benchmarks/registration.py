@@ -22,7 +22,7 @@ import numpy as np
 
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
-from avsreplay.register.quaternion_fit import best_motion
+from avsreplay.register.reference import best_motion
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 from avsreplay.simulate import builtin_surface
 

@@ -1,7 +1,8 @@
-"""Which matches the camera can have made: a point it measured lies on a side of the model that faces it.
+"""Which faces of the model the camera can have measured: those that face it.
 
-Without this a thin panel has two sides to fall on. A guess off by half its thickness puts the measured front next to
-the model's back, and plain ICP settles there: on the built-in target begun 3 deg and 5 cm off, on every third view.
+Without this test a scan point of a thin panel can be matched to the wrong side. If the guess is off by half the
+thickness of the panel, the measured front is next to the back of the model, and plain ICP converges there: on the
+built-in target, started 3 deg and 5 cm off, in every third view.
 """
 
 from __future__ import annotations
@@ -16,29 +17,30 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register.surface_index import SurfaceIndex
 
-__all__ = ["Camera", "View", "is_outward"]
-
 CLEARANCE_OF_EXTENT = 0.25
 LEAST_FACING = 0.4
 PAIRED_EDGES = 0.95
-FAR_OF_EXTENT = 0.6  # a scan's middle this far from the origin was taken from there
-ASKED_POINTS = 500
+FAR_OF_EXTENT = 0.6  # if the median of a scan is this far from the origin, the camera was at the origin
+TESTED_POINTS = 500
 
 
 class Camera(Enum):
     """Where the scans were taken from."""
 
-    AUTO = "auto"  # {A}'s origin, where the model says which side is out and the origin is well clear of it
-    ORIGIN = "origin"  # {A}'s origin
-    NONE = "none"  # not known: both sides of a face count
+    AUTO = "auto"  # origin of {A}, if the mesh has outward faces and the origin is well outside the model
+    ORIGIN = "origin"  # origin of {A}
+    NONE = "none"  # unknown: both sides of a face are matched
 
 
-class View:
+class Visibility:
     """The facing test for one surface.
 
-    AUTO applies it where the mesh is closed and wound outwards (19 of 20 edges paired, volume positive) and the origin
-    of {A} is a quarter of the extent or more outside the model's box. Where under 40 % of the scan's plain closest
-    faces look at the origin, the camera is taken to have been elsewhere and both sides count.
+    AUTO applies it if the mesh is closed with outward faces (19 of 20 edges paired, positive volume) and the origin of
+    {A} is at least a quarter of the extent outside the bounding box of the model. If fewer than 40 % of the closest
+    faces of the scan face the origin, the camera was elsewhere and both sides are matched.
+
+    Attributes:
+        sided: the faces of this surface have a known outer side.
     """
 
     def __init__(self, surface: Surface, camera: Camera = Camera.AUTO) -> None:
@@ -48,24 +50,24 @@ class View:
         self._extent = surface.extent
         self.sided = camera is Camera.ORIGIN or (camera is Camera.AUTO and is_outward(surface))
 
-    def camera_c(self, model: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> Array | None:
-        """(3,) the camera in {C} [m] where the test applies to this scan (n, 3) in {A} at this pose, else None."""
+    def camera_c(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> Array | None:
+        """Return the camera position (3,) in {C} [m] if the test applies to this scan (n, 3) and pose, else None."""
         if not (self.sided and self._clear(T_ca.t)):
             return None
-        few = points[:: max(1, len(points) // ASKED_POINTS)]
-        found = model.closest(T_ca.apply(few))
-        foot = found.id >= 0
-        faces = np.einsum("ij,ij->i", found.normal[foot], T_ca.t - found.foot[foot]) > 0.0
-        return T_ca.t if faces.sum() >= LEAST_FACING * foot.sum() else None
+        few = points[:: max(1, len(points) // TESTED_POINTS)]
+        found = index.closest(T_ca.apply(few))
+        matched = found.id >= 0
+        facing = np.einsum("ij,ij->i", found.normal[matched], T_ca.t - found.foot[matched]) > 0.0
+        return T_ca.t if facing.sum() >= LEAST_FACING * matched.sum() else None
 
-    def sight(self, points: NDArray[Any]) -> Array | None:
-        """(3,) unit direction from a scan (n, 3) in {A} to the camera; None where the camera's place is not known."""
+    def direction_to_camera(self, points: NDArray[Any]) -> Array | None:
+        """Return the unit direction (3,) from a scan (n, 3) in {A} to the camera; None if its position is unknown."""
         centre = np.median(points, axis=0).astype(np.float64)
         distance = float(np.linalg.norm(centre))
         if not self.sided or distance < FAR_OF_EXTENT * self._extent:
             return None
-        towards: Array = -centre / distance
-        return towards
+        direction: Array = -centre / distance
+        return direction
 
     def _clear(self, camera_c: Array) -> bool:
         low, high, clear = self._box
@@ -74,7 +76,7 @@ class View:
 
 
 def is_outward(surface: Surface) -> bool:
-    """Is the mesh closed and wound outwards? Vertices at the same place count as one, so a triangle soup may be."""
+    """Test whether the mesh is closed with outward faces. Vertices at the same position are merged first."""
     if len(surface.faces) == 0:
         return False
     _, merged = np.unique(surface.vertices, axis=0, return_inverse=True)

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from avsreplay.register.assess import Evidence, counted, covariance
-from avsreplay.register.freedom import loose_directions
+from avsreplay.register.quality import Residuals, jackknife_covariance, unbounded_directions, without_dominant_patches
 
 
 def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:
@@ -15,15 +14,15 @@ def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:
     rng = np.random.default_rng(11)
     J = rng.normal(size=(20000, 6))
     e = rng.normal(0.0, 0.3, 20000)
-    P = covariance(Evidence(20000, 20000, 0.3, J, e, np.zeros(3), 0.3, np.arange(20000)))
+    P = jackknife_covariance(Residuals(20000, 20000, 0.3, J, e, np.zeros(3), 0.3, np.arange(20000)))
     oracle = 0.09 * np.linalg.inv(J.T @ J)
     np.testing.assert_allclose(P, oracle, atol=0.1 * oracle[0, 0])
 
 
-def _in_patches(seed: int) -> Evidence:
+def _in_patches(seed: int) -> Residuals:
     rng = np.random.default_rng(seed)
     J, e = rng.normal(size=(600, 6)), rng.normal(0.0, 0.3, 600)
-    return Evidence(600, 600, 0.3, J, e, np.zeros(3), 0.3, np.arange(600) // 20)
+    return Residuals(600, 600, 0.3, J, e, np.zeros(3), 0.3, np.arange(600) // 20)
 
 
 def test_covariance_is_the_jackknife_over_patches() -> None:
@@ -36,7 +35,7 @@ def test_covariance_is_the_jackknife_over_patches() -> None:
         rest = settled.patch != k
         moves.append(np.linalg.lstsq(settled.J[rest], settled.e[rest], rcond=None)[0])
     oracle = np.array(moves).T @ np.array(moves)
-    np.testing.assert_allclose(covariance(settled), oracle, rtol=1e-6, atol=1e-9 * oracle.max())
+    np.testing.assert_allclose(jackknife_covariance(settled), oracle, rtol=1e-6, atol=1e-9 * oracle.max())
 
 
 def test_what_one_patch_holds_alone_is_not_held() -> None:
@@ -44,11 +43,11 @@ def test_what_one_patch_holds_alone_is_not_held() -> None:
     found = _in_patches(4)
     J = found.J.copy()
     J[found.patch != 7, 5] = 0.0
-    left = counted(replace(found, J=J))
+    left = without_dominant_patches(replace(found, J=J))
     assert len(left.J) == 580
     assert np.all(left.J[:, 5] == 0.0)
     assert left.patch.max() == 28
-    assert counted(found) is found
+    assert without_dominant_patches(found) is found
 
 
 def test_patches_are_left_out_until_none_holds_a_motion_alone() -> None:
@@ -57,13 +56,13 @@ def test_patches_are_left_out_until_none_holds_a_motion_alone() -> None:
     J = found.J.copy()
     for patch in range(30):
         J[found.patch == patch, 5] *= {7: 1.0, 8: 1e-2, 9: 1e-4}.get(patch, 0.0)
-    left = counted(replace(found, J=J))
+    left = without_dominant_patches(replace(found, J=J))
     assert np.all(left.J[:, 5] == 0.0)
     assert len(left.J) == 540
 
 
 def test_a_motion_known_no_better_than_the_targets_size_is_loose() -> None:
     P = np.diag([1e-8, 1e-8, 4.0, 1e-8, 1e12, 1e-8])
-    assert loose_directions(P, 3.0) == ("turns about z", "slides along y")
-    assert loose_directions(P, 3e6) == ("turns about z",)
-    assert loose_directions(np.eye(6) * 1e-6, 3.0) == ()
+    assert unbounded_directions(P, 3.0) == ("turns about z", "slides along y")
+    assert unbounded_directions(P, 3e6) == ("turns about z",)
+    assert unbounded_directions(np.eye(6) * 1e-6, 3.0) == ()

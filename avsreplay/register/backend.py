@@ -1,7 +1,7 @@
-"""The port every back end answers to: a protocol, a name in an entry-point group, and the laws of ``contract``.
+"""The protocol of a registration back end, and the entry-point group in which back ends are registered.
 
-A back end is a class ``Backend(target)`` registered under the entry-point group ``avsreplay.backends``. It returns a
-pose, a count of passes and its own flag, nothing more: ``assess`` grades every pose with one ruler.
+A back end is a class ``Backend(target)`` under the entry-point group ``avsreplay.backends``. It returns a pose, an
+iteration count and its own convergence flag, nothing more: ``quality.grade`` measures the quality of every pose.
 """
 
 from __future__ import annotations
@@ -19,23 +19,28 @@ from avsreplay.geometry import Pose
 from avsreplay.records import Fit, Surface
 
 if TYPE_CHECKING:
-    from avsreplay.register.facing import View
     from avsreplay.register.params import Limits
     from avsreplay.register.surface_index import SurfaceIndex
-
-__all__ = ["GROUP", "Availability", "Backend", "Target", "available", "build", "load", "names"]
+    from avsreplay.register.visibility import Visibility
 
 GROUP = "avsreplay.backends"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """What a back end is built from: the surface in {C}, its exact index, the limits, and where the camera was."""
+    """What a back end is built from.
+
+    Attributes:
+        surface: mesh or point cloud of the target, vertices in {C} [m].
+        index: exact closest points on this surface.
+        limits: rejection distances and stopping rule.
+        visibility: which faces the camera can have measured.
+    """
 
     surface: Surface
-    model: SurfaceIndex
+    index: SurfaceIndex
     limits: Limits
-    view: View
+    visibility: Visibility
 
 
 class Backend(Protocol):
@@ -44,15 +49,15 @@ class Backend(Protocol):
     name: str
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
-        """The pose T_ca that lays the scan on the model.
+        """Return the pose T_ca that aligns the scan {A} to the model {C}.
 
         Args:
             points: (n, 3) finite, n >= 1, float32 or float64, possibly strided, in {A} [m].
-            guess: first T_ca, the inverse of the predicted pose.
+            guess: initial T_ca, the inverse of the predicted pose.
 
         Returns:
-            T_ca, the passes made and whether the back end holds its result for settled. Where nothing pulls, the
-            guess and False. Anything it raises, and any pose that is not finite, becomes the status FAILED.
+            T_ca, the number of iterations and whether the iteration converged. If no point has a correspondence, the
+            guess and False. An exception, or a pose that is not finite, becomes the status FAILED.
         """
 
 
@@ -61,11 +66,14 @@ Factory = Callable[[Target], Backend]
 
 @dataclass(frozen=True, slots=True)
 class Availability:
-    """One line of ``avsreplay backends``.
+    """State of one back end, as listed by ``avsreplay backends``.
 
     Attributes:
-        name: entry-point name.  installed: can it be built here.  version: of the library behind it, "" if none.
-        about: what it does, in one line.  get: how to get it, "" where it is installed.
+        name: entry-point name.
+        installed: it can be built on this installation.
+        version: version of the library that it uses, "" if none.
+        about: what it does, in one line.
+        get: how to install it, "" if it is installed.
     """
 
     name: str
@@ -76,17 +84,22 @@ class Availability:
 
 
 def names() -> tuple[str, ...]:
-    """Every registered name, sorted; a name registered twice counts once."""
+    """Return every registered name, sorted, each once."""
     return tuple(sorted({entry.name for entry in metadata.entry_points(group=GROUP)}))
 
 
 def load(name: str) -> Factory:
-    """The back end's class. Raises UsageError for an unknown name, MissingBackend where its library is not here."""
+    """Return the class of a back end.
+
+    Raises:
+        UsageError: unknown name.
+        MissingBackend: its library is not installed.
+    """
     entry = _entry(name)
     try:
         factory = entry.load()
     except ImportError as error:
-        raise _missing(name, f"its module does not load ({error})", "reinstall what provides it") from None
+        raise _missing(name, f"cannot be imported ({error})", "reinstall the package that provides it") from None
     state = _availability(name, factory)
     if not state.installed:
         raise _missing(name, "is not installed", state.get)
@@ -94,16 +107,16 @@ def load(name: str) -> Factory:
 
 
 def build(name: str, factory: Factory, target: Target) -> Backend:
-    """The back end itself. Raises MissingBackend where its library is there but does not load."""
+    """Build the back end. Raises MissingBackend if its library is installed but cannot be imported."""
     try:
         return factory(target)
     except ImportError as error:
         get = str(getattr(factory, "get", "install the package that provides it"))
-        raise _missing(name, f"does not load ({error})", get) from None
+        raise _missing(name, f"cannot be imported ({error})", get) from None
 
 
 def available() -> tuple[Availability, ...]:
-    """The state of every registered back end, by name; builds none and imports no registration library."""
+    """Return the state of every registered back end, by name. Does not import any registration library."""
     return tuple(_state(name) for name in names())
 
 
@@ -111,11 +124,11 @@ def _state(name: str) -> Availability:
     try:
         return _availability(name, _entry(name).load())
     except ImportError as error:
-        return Availability(name, False, "", f"does not load: {error}", "reinstall what provides it")
+        return Availability(name, False, "", f"cannot be imported: {error}", "reinstall the package that provides it")
 
 
 def _availability(name: str, factory: Any) -> Availability:
-    """Read from the class: ``requires`` (module, distribution), ``about`` and ``get``; all may be absent."""
+    """Read the class attributes ``requires`` (module, distribution), ``about`` and ``get``; each is optional."""
     requires: tuple[tuple[str, str], ...] = getattr(factory, "requires", ())
     missing = [module for module, _ in requires if importlib.util.find_spec(module) is None]
     version = "" if missing or not requires else _version(requires[0][1])
@@ -134,10 +147,10 @@ def _entry(name: str) -> metadata.EntryPoint:
     found = [entry for entry in metadata.entry_points(group=GROUP) if entry.name == name]
     if not found:
         known = ", ".join(names())
-        hint = f"one of: {known}" if known else "install avsreplay ('pip install .'), which registers its own"
+        hint = f"one of: {known}" if known else "install avsreplay ('pip install .') to register its own back ends"
         raise UsageError(f"no registration back end is called '{name}'", where="--backend", hint=hint)
-    return min(found, key=lambda entry: entry.value)  # the same one on every run, were a name registered twice
+    return min(found, key=lambda entry: entry.value)  # the same one in every run if a name is registered twice
 
 
 def _missing(name: str, what: str, get: str) -> MissingBackend:
-    return MissingBackend(f"back end '{name}' {what}", where="--backend", hint=f"get it with: {get}")
+    return MissingBackend(f"back end '{name}' {what}", where="--backend", hint=f"install it with: {get}")

@@ -11,12 +11,12 @@ from click.testing import CliRunner
 from avsreplay.cli.bench import command, measure
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Pose, exp
-from avsreplay.register.proving import proving_pose, proving_surface, view
+from avsreplay.register.contract import boxes, example_pose, view
 
 
 def _scans(count: int, truth: bool = True) -> list[tuple[np.ndarray, Pose | None]]:
-    surface, step = proving_surface(), Pose(exp([0.004, 0.0, 0.01]), np.zeros(3))
-    scans, pose = [], proving_pose()
+    surface, step = boxes(), Pose(exp([0.004, 0.0, 0.01]), np.zeros(3))
+    scans, pose = [], example_pose()
     for _ in range(count):
         points = pose.apply(view(surface, 2000, pose.inverse().t))
         scans.append((points, pose if truth else None))
@@ -24,10 +24,10 @@ def _scans(count: int, truth: bool = True) -> list[tuple[np.ndarray, Pose | None
     return scans
 
 
-@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.parametrize("truth", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_every_scan_but_the_first_is_counted(monkeypatch: pytest.MonkeyPatch, truth: bool) -> None:
     monkeypatch.setattr("avsreplay.cli.bench._peak_mib", lambda *_: 1.0)
-    tallies = measure(["horn", "small_gicp"], proving_surface(), _scans(4, truth))
+    tallies = measure(["horn", "small_gicp"], boxes(), _scans(4, truth))
     for tally in tallies:
         record = tally.summary()
         assert (record["scans"], record["failures"], record["peak_mib"]) == (3, 0, 1.0)
@@ -41,7 +41,7 @@ def test_a_scan_of_nothing_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr("avsreplay.cli.bench._peak_mib", lambda *_: None)
     scans = _scans(3)
     away = (scans[-1][0] + 100.0, scans[-1][1])
-    (tally,) = measure(["horn"], proving_surface(), [*scans, away])
+    (tally,) = measure(["horn"], boxes(), [*scans, away])
     assert tally.failures == 1
 
 
@@ -53,10 +53,10 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
     for arguments, error in asked.items():
         assert isinstance(CliRunner().invoke(command, list(arguments)).exception, error)
     with pytest.raises(UsageError):
-        measure(["no_such"], proving_surface(), [])
+        measure(["no_such"], boxes(), [])
 
 
 def test_a_missing_library_is_said_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("avsreplay.register.kiss.KissBackend.requires", (("no_such_module", "kiss-icp"),))
     with pytest.raises(MissingBackend):
-        measure(["kiss"], proving_surface(), _scans(1))
+        measure(["kiss"], boxes(), _scans(1))

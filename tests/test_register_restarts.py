@@ -26,6 +26,7 @@ def scans():
     return list(true_scans(simulated))
 
 
+@pytest.mark.slow
 def test_no_far_guess_ends_beside_the_truth(scans):
     registrar, rng = Registrar(builtin_surface()), np.random.default_rng(0)
     left = []

@@ -14,10 +14,10 @@ from avsreplay.log import read_surface
 from avsreplay.log.ply import read_ply
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar
+from avsreplay.register.contract import boxes, view
+from avsreplay.register.global_search import VisibleCentroids, attitudes, directions
 from avsreplay.register.params import AcquireParams
-from avsreplay.register.proving import proving_surface, view
-from avsreplay.register.sampling import even, without_strays
-from avsreplay.register.starts import VisibleCentres, attitudes, directions
+from avsreplay.register.sampling import thin_to, without_sparse_points
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SEED = 5
@@ -38,14 +38,15 @@ def _any_pose(rng: np.random.Generator) -> Pose:
 
 @pytest.fixture(scope="module")
 def registrar() -> Registrar:
-    return Registrar(proving_surface())
+    return Registrar(boxes())
 
 
+@pytest.mark.slow
 def test_any_attitude_is_found_without_a_guess(registrar: Registrar) -> None:
     rng = np.random.default_rng(SEED)
     for _ in range(10):
         truth = _any_pose(rng)
-        found = registrar.acquire(_scan(proving_surface(), truth, rng))
+        found = registrar.acquire(_scan(boxes(), truth, rng))
         assert found.status is AlignStatus.ALIGNED
         step = truth.inverse() @ found.T_ac
         assert np.degrees(geometry.angle(step.q)) < 0.5
@@ -53,17 +54,18 @@ def test_any_attitude_is_found_without_a_guess(registrar: Registrar) -> None:
 
 
 def test_a_search_repeats_to_the_bit(registrar: Registrar) -> None:
-    scan = _scan(proving_surface(), _any_pose(np.random.default_rng(1)), np.random.default_rng(2))
-    first, again = registrar.acquire(scan), Registrar(proving_surface()).acquire(scan)
+    scan = _scan(boxes(), _any_pose(np.random.default_rng(1)), np.random.default_rng(2))
+    first, again = registrar.acquire(scan), Registrar(boxes()).acquire(scan)
     assert first.T_ac.matrix.tobytes() == again.T_ac.matrix.tobytes()
 
 
 def _box(size: tuple[float, float, float]) -> Surface:
-    whole = proving_surface()
+    whole = boxes()
     vertices = whole.vertices[:8] / np.array([2.0, 1.6, 2.4]) * np.array(size)
     return replace(whole, vertices=vertices, faces=whole.faces[:12], name="box")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [(1.0, 1.0, 1.0), (2.0, 1.0, 0.6)], ids=["cube", "brick"])
 def test_a_symmetric_target_is_said_to_be_ambiguous(size: tuple[float, float, float]) -> None:
     rng = np.random.default_rng(SEED)
@@ -75,6 +77,7 @@ def test_a_symmetric_target_is_said_to_be_ambiguous(size: tuple[float, float, fl
         assert found.weakest.startswith("turned ")
 
 
+@pytest.mark.slow
 def test_another_thing_is_not_found(registrar: Registrar) -> None:
     rng = np.random.default_rng(SEED)
     cloud = rng.normal(size=(3000, 3))
@@ -92,9 +95,9 @@ def test_an_empty_scan_and_a_handful_of_points_are_answered(registrar: Registrar
 def test_a_scan_in_another_frame_than_the_cameras_is_found() -> None:
     """The scan moved into a frame whose origin lies in the target: that is no camera, and nothing says where it was."""
     rng = np.random.default_rng(SEED)
-    registrar = Registrar(proving_surface())
+    registrar = Registrar(boxes())
     truth = _any_pose(rng)
-    scan = _scan(proving_surface(), truth, rng)
+    scan = _scan(boxes(), truth, rng)
     motion = Pose(np.array([0.5, 0.1, -0.4, 0.7]), np.zeros(3)) @ Pose(geometry.IDENTITY_QUAT, -truth.t)
     found = registrar.acquire(motion.apply(scan))
     step = (motion @ truth).inverse() @ found.T_ac
@@ -123,7 +126,7 @@ def test_directions_are_even() -> None:
 def test_the_visible_centre_of_a_sphere_is_towards_the_camera() -> None:
     """Of a sphere seen from afar the image's centroid lies 2/3 of the radius nearer: mean cosine over a disc."""
     normals = directions(8000)
-    centres = VisibleCentres(2.0 * normals, normals, 4.0, count=30)
+    centres = VisibleCentroids(2.0 * normals, normals, 4.0, count=30)
     for towards in directions(30)[::5]:
         np.testing.assert_allclose(centres.of(towards), 4.0 / 3.0 * towards, atol=0.15)
 
@@ -132,10 +135,10 @@ def test_strays_are_left_out_before_thinning() -> None:
     rng = np.random.default_rng(SEED)
     surface = np.concatenate([rng.uniform(-1, 1, (4000, 2)), np.zeros((4000, 1))], axis=1)
     strays = rng.uniform(-10, 10, (80, 3))
-    kept = without_strays(np.concatenate([surface, strays]))
+    kept = without_sparse_points(np.concatenate([surface, strays]))
     assert (np.abs(kept).max(axis=1) <= 1.0).mean() > 0.995
     assert len(kept) > 3800
-    assert 120 <= len(even(kept, 150)) <= 190
+    assert 120 <= len(thin_to(kept, 150)) <= 190
 
 
 @pytest.mark.parametrize(("key", "value"), [("starts", 0), ("least_ratio", 1.5), ("margin", -0.1)])
@@ -166,6 +169,7 @@ def _off_deg(truth: Pose, found: Pose) -> float:
     return float(np.degrees(geometry.angle((truth.inverse() @ found).q)))
 
 
+@pytest.mark.slow
 def test_bunny_comes_back_from_24_degrees_and_from_nothing() -> None:
     scans = _real("stanford-bunny", "bun.conf")
     surface = read_surface(DATA / "stanford-bunny" / "bun_zipper_res3.ply")
@@ -181,6 +185,7 @@ def test_bunny_comes_back_from_24_degrees_and_from_nothing() -> None:
         assert _off_deg(truth, registrar.acquire(points[::4]).T_ac) < 2.0, name
 
 
+@pytest.mark.slow
 def test_dragon_is_tracked_over_24_degree_steps_within_half_a_degree_and_half_a_millimetre() -> None:
     scans = _real("stanford-dragon", "dragonStandRight.conf")
     surface = read_surface(DATA / "stanford-dragon" / "dragon_vrip_res3.ply")

@@ -1,0 +1,299 @@
+"""Quality of a registered pose, measured in the same way for every back end: inliers, rms, information, status.
+
+With p_c = T_ca p_a, closest point c and face normal n, the error d = [theta; v] in {C}, T_ac_true = T_ac @ Exp(d),
+appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over the inliers give all that follows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose, frozen
+from avsreplay.records import Alignment, AlignStatus, Fit
+from avsreplay.register.params import Limits, RegisterParams
+from avsreplay.register.surface_index import Closest, SurfaceIndex
+from avsreplay.register.visibility import Visibility
+
+PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
+LEAST_PATCHES = 24
+# Covariance that the jackknife misses (closest points near edges are biased), by tests/benchmarks/estimate_noise.py.
+COVARIANCE_FACTOR = 1.1
+DOMINANT = 0.5  # a patch that contributes more than this share of the information on some motion is left out
+SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
+ALONE = 1e-9  # keeps a motion finite that only one patch determines
+NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
+FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
+AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Residuals:
+    """Residuals of the inliers at a pose, all in {C}.
+
+    Attributes:
+        points: points of the scan.
+        inliers: points nearer than the gate to the model, or to its faces that face the camera if that is known.
+        rms_m: rms of their distances.
+        J: (k, 6) rows [p x n, n].
+        e: (k,) n . (p - closest point) [m].
+        centre: (3,) centroid of the inliers.
+        noise_m: robust standard deviation of e.
+        patch: (k,) number of the patch of the model on which each inlier lies.
+        normals: (m, 6, 6) sums of J'J over each of the m patches.
+        gradients: (m, 6) sums of e J over each patch.
+    """
+
+    points: int
+    inliers: int
+    rms_m: float
+    J: Array
+    e: Array
+    centre: Array
+    noise_m: float
+    patch: NDArray[np.intp]
+    normals: Array = field(init=False)
+    gradients: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        normals, gradients = _patch_sums(self.J, self.e, self.patch)
+        object.__setattr__(self, "normals", normals)
+        object.__setattr__(self, "gradients", gradients)
+
+
+def residuals(
+    index: SurfaceIndex,
+    visibility: Visibility,
+    points: NDArray[Any],
+    T_ca: Pose,
+    gate_m: float,
+    noise_m: float | None = None,
+) -> Residuals:
+    """Return the residuals of ``points`` (n, 3) in {A} [m] at ``T_ca``; ``noise_m`` None: estimated from them."""
+    moved, found, near = _matched(index, visibility, points, T_ca, gate_m)
+    p, n = moved[near], found.normal[near]
+    e = np.einsum("ij,ij->i", n, p - found.foot[near])
+    count = len(p)
+    rms = float(np.sqrt(found.d2[near].mean())) if count else float("nan")
+    centre = p.mean(axis=0) if count else np.zeros(3)
+    J = _jacobian(p, n)
+    noise = noise_m or _noise(e, gate_m)
+    return Residuals(len(points), count, rms, J, e, centre, noise, _patches(p, PATCH_OF_EXTENT * index.extent_m))
+
+
+def instants(
+    index: SurfaceIndex,
+    visibility: Visibility,
+    points: NDArray[Any],
+    times_s: NDArray[Any],
+    T_ca: Pose,
+    gate_m: float,
+) -> Array:
+    """Return M (6, 6) [s]: a pose error d(t) = d0 + t d1 during the scan is registered as d0 + M d1.
+
+    Point k, measured at ``times_s[k]``, has the residual J_k d(t_k). Least squares give M = N^-1 (sum of t J'J) with
+    N = J'J. Motions that no inlier observes are given the mean of all times.
+    """
+    moved, found, near = _matched(index, visibility, points, T_ca, gate_m)
+    times = np.asarray(times_s, dtype=np.float64)
+    mean = float(times.mean()) if len(times) else 0.0
+    J = _jacobian(moved[near], found.normal[near])
+    M: Array = mean * np.eye(6) + np.linalg.pinv(J.T @ J, hermitian=True) @ ((J.T * (times[near] - mean)) @ J)
+    return M
+
+
+def _matched(
+    index: SurfaceIndex, visibility: Visibility, points: NDArray[Any], T_ca: Pose, gate_m: float
+) -> tuple[Array, Closest, NDArray[np.bool_]]:
+    """Points in {C} (n, 3), their closest points on the model, and which are inliers (n,)."""
+    moved = T_ca.apply(points)
+    found = index.closest(moved, camera_c=visibility.camera_c(index, points, T_ca))
+    return moved, found, found.d2 < gate_m**2
+
+
+def _jacobian(p: Array, n: Array) -> Array:
+    """J (k, 6) of points p and normals n (k, 3)."""
+    return np.hstack([np.cross(p, n), n])
+
+
+def _patches(p: Array, size_m: float) -> NDArray[np.intp]:
+    """Number of the cubic cell in which each point lies; each point is its own patch if there are too few cells."""
+    cells = np.floor(p / size_m).astype(np.int64)
+    cells -= cells.min(axis=0, initial=0)
+    code = (cells[:, 0] * (cells[:, 1].max(initial=0) + 1) + cells[:, 1]) * (cells[:, 2].max(initial=0) + 1)
+    patch = np.unique(code + cells[:, 2], return_inverse=True)[1].reshape(-1)
+    return patch if patch.max(initial=0) >= LEAST_PATCHES else np.arange(len(p))
+
+
+def _noise(e: Array, gate_m: float) -> float:
+    floor = NOISE_FLOOR_OF_GATE * gate_m
+    return max(SIGMA_PER_MEDIAN * float(np.median(np.abs(e))), floor) if len(e) else floor
+
+
+def jackknife_covariance(found: Residuals) -> Array:
+    """Return the delete-a-block jackknife covariance (6, 6) of d = [theta; v], with patches of the model as blocks.
+
+    Errors within a patch may be correlated (the model is wrong there, a range error at grazing incidence, outliers near
+    the surface); patches are taken as independent. Without patch p, with sums N_p = J'J and g_p = sum of e J, d moves
+    by (N - N_p)^-1 g_p = N^-1 (I - N_p N^-1)^-1 g_p: a patch with high leverage moves it by more than its residuals.
+    """
+    inverse = np.linalg.pinv(found.normals.sum(axis=0), hermitian=True)
+    left = (1.0 + ALONE) * np.eye(6) - found.normals @ inverse
+    moved = np.linalg.solve(left, found.gradients[:, :, None])[:, :, 0] @ inverse
+    P: Array = moved.T @ moved
+    return 0.5 * (P + P.T)
+
+
+def without_dominant_patches(found: Residuals) -> Residuals:
+    """Return the residuals without the patches that give more than ``DOMINANT`` of the information on some motion.
+
+    Example: the barely visible side of a box is determined by a few points next to its edge, which may belong to the
+    neighbouring side.
+    """
+    while True:
+        share = found.normals @ np.linalg.pinv(found.normals.sum(axis=0), hermitian=True)
+        lone = np.trace(share, axis1=1, axis2=2) > DOMINANT  # the largest eigenvalue is at most the trace
+        lone[lone] = np.linalg.eigvals(share[lone]).real.max(axis=1, initial=0.0) > DOMINANT
+        keep = ~lone[found.patch]
+        if not lone.any() or np.count_nonzero(keep) < 6:
+            return found
+        patch = np.unique(found.patch[keep], return_inverse=True)[1].reshape(-1)
+        found = replace(found, J=found.J[keep], e=found.e[keep], patch=patch)
+
+
+def _patch_sums(J: Array, e: Array, patch: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Sums of J'J (m, 6, 6) and of e J (m, 6) over each patch."""
+    count = int(patch.max(initial=-1)) + 1
+    normals = np.empty((count, 6, 6))
+    for a in range(6):
+        for b in range(a + 1):
+            normals[:, a, b] = normals[:, b, a] = np.bincount(patch, J[:, a] * J[:, b], count)
+    g = np.empty((count, 6))
+    for a in range(6):
+        g[:, a] = np.bincount(patch, J[:, a] * e, count)
+    return normals, g
+
+
+def grade(
+    index: SurfaceIndex,
+    visibility: Visibility,
+    points: NDArray[Any],
+    fit: Fit,
+    limits: Limits,
+    params: RegisterParams,
+) -> Alignment:
+    """Measure the quality of the pose of a back end.
+
+    Too few inliers give NO_OVERLAP whatever the convergence flag of the back end says.
+    """
+    if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
+        return not_measured(len(points), AlignStatus.FAILED)
+    found = residuals(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m)
+    overlap = found.inliers >= max(params.min_inliers, params.min_inlier_ratio * found.points)
+    found = without_dominant_patches(found) if overlap else found
+    info = frozen(found.J.T @ found.J / found.noise_m**2)
+    weakest = unobservable_directions(found.J, found.centre) if overlap else ()
+    P: Array | None = COVARIANCE_FACTOR * jackknife_covariance(found) if overlap and not weakest else None
+    unbounded = () if P is None else unbounded_directions(P, index.extent_m)
+    if P is not None and unbounded:
+        info, P, weakest = frozen(np.linalg.pinv(P, hermitian=True)), None, unbounded
+    return Alignment(
+        T_ac=fit.T_ca.inverse(),
+        iterations=fit.iterations,
+        converged=fit.converged,
+        points=found.points,
+        inliers=found.inliers,
+        rms_m=found.rms_m,
+        info=info,
+        status=_status(overlap, fit.converged, bool(weakest)),
+        covariance=None if P is None else frozen(P),
+        weakest=", ".join(weakest),
+    )
+
+
+def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:
+    """Return an alignment without a measurement: the guess is kept, no inliers, no information."""
+    pose = T_ac if T_ac is not None else Pose.identity()
+    return Alignment(pose, 0, False, points, 0, float("nan"), frozen(np.zeros((6, 6))), status)
+
+
+def _status(overlap: bool, converged: bool, free: bool) -> AlignStatus:
+    if not overlap:
+        return AlignStatus.NO_OVERLAP
+    if not converged:
+        return AlignStatus.NOT_CONVERGED
+    return AlignStatus.DEGENERATE if free else AlignStatus.ALIGNED
+
+
+def scaled_information(J: Array, centre: Array) -> tuple[Array, float]:
+    """Return the mean of J'J (6, 6) with rotations about ``centre`` in units of the rms radius L, and L [m].
+
+    Each diagonal entry is the mean squared change of surface distance per squared unit of point motion, between 0 and
+    about 1, whatever the size of the target.
+    """
+    n = J[:, 3:]
+    turns = J[:, :3] - np.cross(centre, n)  # (p - centre) x n
+    radius = float(np.sqrt(np.mean(np.sum(turns**2, axis=1))))
+    scaled = np.hstack([turns / max(radius, np.finfo(float).tiny), n])
+    return scaled.T @ scaled / len(J), radius
+
+
+def unobservable_directions(J: Array, centre: Array) -> tuple[str, ...]:
+    """Name every motion whose scaled information is below ``FREE_BELOW``; empty if all six are observable."""
+    info, _ = scaled_information(J, centre)
+    values, vectors = np.linalg.eigh(info)
+    free = vectors[:, values < FREE_BELOW].T
+    return tuple(_words(row) for row in _sparse_basis(free))
+
+
+def unbounded_directions(P: Array, extent_m: float) -> tuple[str, ...]:
+    """Name every motion whose standard deviation by P (6, 6) is at least the extent (rotations: 1 rad)."""
+    scale = np.repeat([1.0, 1.0 / extent_m], 3)
+    values, vectors = np.linalg.eigh(P * np.outer(scale, scale))
+    return tuple(_words(row) for row in _sparse_basis(vectors[:, values >= 1.0].T))
+
+
+def turn_words(step: Pose) -> str:
+    """Describe a rigid motion in {C}: "turned 180 deg about x"."""
+    degrees = float(np.degrees(geometry.angle(step.q)))
+    if degrees < 1.0:
+        return f"moved along {_axis(step.t)}"
+    return f"turned {degrees:.0f} deg about {_axis(geometry.log(step.q))}"
+
+
+def _sparse_basis(rows: Array) -> Array:
+    """Basis of the same space by elimination with full pivoting: one motion per row, as few axes as possible."""
+    basis = rows.copy()
+    used: list[int] = []
+    for k in range(len(basis)):
+        left = np.abs(basis[k:])
+        left[:, used] = 0.0
+        row, column = divmod(int(np.argmax(left)), basis.shape[1])
+        basis[[k, k + row]] = basis[[k + row, k]]
+        basis[k] /= basis[k, column]
+        others = [i for i in range(len(basis)) if i != k]
+        basis[others] -= np.outer(basis[others, column], basis[k])
+        used.append(column)
+    basis = basis[np.argsort(used)]
+    unit: Array = basis / np.linalg.norm(basis, axis=1, keepdims=True)
+    return unit
+
+
+def _words(motion: Array) -> str:
+    turn, slide = motion[:3], motion[3:]
+    if np.linalg.norm(slide) >= np.linalg.norm(turn):
+        return f"slides along {_axis(slide)}"
+    return f"turns about {_axis(turn)}"
+
+
+def _axis(vector: Array) -> str:
+    unit = vector / np.linalg.norm(vector)
+    k = int(np.argmax(np.abs(unit)))
+    if abs(unit[k]) > AXIS_WITHIN:
+        return "xyz"[k]
+    unit = unit * np.sign(unit[k])
+    return "(" + ", ".join(f"{value + 0.0:.2f}" for value in unit) + ")"
