@@ -43,7 +43,7 @@ class ScanStatus(Enum):
 
 
 class AlignStatus(Enum):
-    """What the ruler (register.assess) found of an alignment."""
+    """What the quality check (register.quality) found of an alignment."""
 
     ALIGNED = "aligned"
     NOT_CONVERGED = "not_converged"  # n_max reached; the pose is still graded
@@ -208,7 +208,7 @@ class Fit:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Alignment:
-    """A graded pose (register.assess): one ruler for every back end.
+    """A pose with its quality, measured in the same way for every back end (register.quality).
 
     Attributes:
         T_ac: measured pose of the model in the camera (the inverse of what ICP iterates).
