@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from avsreplay.register.visibility import Camera
 from avsreplay.settings import Settings, given, setting
@@ -10,13 +10,14 @@ from avsreplay.settings import Settings, given, setting
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """The parameters a back end works with, no length left open.
+    """The parameters of a back end, every length given.
 
     Attributes:
-        reach_m: farthest a point may be from the model and still pull at the first pass.
-        gate_m: the same at the end, and for the ruler: nearer points are inliers.
-        n_max: passes.  eps_rad, eps_m: a pass that moves the pose by less ends the loop.
-        threads: at most this many; never changes a bit of the result.
+        reach_m: rejection distance of a correspondence in the first iteration [m].
+        gate_m: the same in the last iteration; nearer points are inliers [m].
+        n_max: largest number of iterations.
+        eps_rad, eps_m: an iteration that moves the pose by less ends the loop.
+        threads: largest number of threads; the result does not depend on it.
     """
 
     reach_m: float
@@ -98,6 +99,9 @@ class RegisterParams(Settings):
 
     def limits(self, extent_m: float) -> Limits:
         """These parameters for a model of this extent [m] (the diagonal of its bounding box)."""
-        filled = self.resolved(extent_m)
-        reach, gate = given(filled.reach_m), given(filled.gate_m)
-        return Limits(max(reach, gate), min(gate, reach), self.n_max, self.eps_rad, given(filled.eps_m), self.threads)
+        auto = replace(self, reach_m=None, gate_m=None).resolved(
+            extent_m
+        )  # one given length may exceed the other's auto
+        reach = given(auto.reach_m) if self.reach_m is None else self.reach_m
+        gate = given(auto.gate_m) if self.gate_m is None else self.gate_m
+        return Limits(max(reach, gate), min(gate, reach), self.n_max, self.eps_rad, given(auto.eps_m), self.threads)
