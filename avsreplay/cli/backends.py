@@ -22,7 +22,9 @@ Examples:
 
 
 @click.command("backends", epilog=EPILOG)
-@click.option("--check", "name", metavar="NAME", help="Check the laws of the contract on this back end; exit 1 if one fails.")
+@click.option(
+    "--check", "name", metavar="NAME", help="Check the laws of the contract on this back end; exit 1 if one fails."
+)
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
 def command(name: str | None, as_json: bool) -> None:
     """List the registration back ends, and how to install those that are missing."""

@@ -99,9 +99,7 @@ class RegisterParams(Settings):
 
     def limits(self, extent_m: float) -> Limits:
         """These parameters for a model of this extent [m] (the diagonal of its bounding box)."""
-        auto = replace(self, reach_m=None, gate_m=None).resolved(
-            extent_m
-        )  # one given length may exceed the other's auto
+        auto = replace(self, reach_m=None, gate_m=None).resolved(extent_m)
         reach = given(auto.reach_m) if self.reach_m is None else self.reach_m
         gate = given(auto.gate_m) if self.gate_m is None else self.gate_m
         return Limits(max(reach, gate), min(gate, reach), self.n_max, self.eps_rad, given(auto.eps_m), self.threads)
