@@ -11,8 +11,8 @@ import click
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from avsreplay.register.contract import Finding
     from avsreplay.register.backend import Availability
+    from avsreplay.register.contract import Finding
 
 
 EPILOG = """\b
