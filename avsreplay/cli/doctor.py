@@ -1,4 +1,4 @@
-"""``avsreplay doctor``: everything a log can tell of itself, and a clean copy of what is intact."""
+"""``avsreplay doctor``: checks a log and writes a repaired copy."""
 
 from __future__ import annotations
 
@@ -21,19 +21,21 @@ Examples:
 
 @click.command(name="doctor", epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
-@click.option("--topic", help="The cloud topic, where there are several.")
-@click.option("--repair", "output", type=click.Path(path_type=Path), help="Write every intact record to this file.")
+@click.option("--topic", help="The cloud topic, if there are several.")
+@click.option(
+    "--repair", "output", type=click.Path(path_type=Path), help="Write every intact record to this file (MCAP only)."
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
-@click.option("--strict", is_flag=True, help="Exit 3 where anything is lost.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
-@click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message read.")
+@click.option("--strict", is_flag=True, help="Exit with code 3 if any part is lost.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
+@click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message that is read [MiB].")
 def command(
     source: Path, topic: str | None, output: Path | None, overwrite: bool, strict: bool, as_json: bool,
     max_message_mib: int,
 ) -> None:  # fmt: skip
-    """Examine SOURCE: structure, checksums, clocks, gaps, duplicates, points, layout, truth.
+    """Check SOURCE: structure, checksums, clocks, gaps, duplicates, points, layout and truth.
 
-    Exit code 0 where nothing is lost, 4 where something is (3 with --strict).
+    The exit code is 0 if no part is lost, else 4 (3 with --strict).
     """
     from avsreplay.errors import UsageError
     from avsreplay.log import SourceOptions
@@ -64,7 +66,7 @@ def _judge(source: Path, findings: list[Finding], strict: bool) -> None:
         what = f"{len(errors)} error(s), the first: {errors[0].about}: {errors[0].text}"
         if strict:
             raise UnreadableInput(what, where=str(source), hint="repair it with --repair OUT")
-        raise DataLost(what, where=str(source), hint="--repair OUT writes what is intact")
+        raise DataLost(what, where=str(source), hint="--repair OUT copies the intact records")
 
 
 def _document(source: Path, findings: list[Finding], output: Path | None, done: Repaired | None) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""``avsreplay info``: what a log or a folder holds, before anything is run on it."""
+"""``avsreplay info``: the content of a log or a folder of scans."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss
     from avsreplay.report.table import Table
 
-WIDTH = 120  # off a terminal, so that the text does not depend on where it goes
+WIDTH = 120  # fixed if the output is not a terminal, so that the text is always the same
 
 
 EPILOG = """\b
@@ -24,13 +24,13 @@ Examples:
 
 @click.command(name="info", epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
-@click.option("--topic", help="The cloud topic, where there are several.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
-@click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message read.")
+@click.option("--topic", help="The cloud topic, if there are several.")
+@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
+@click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message that is read [MiB].")
 def command(source: Path, topic: str | None, as_json: bool, max_message_mib: int) -> None:
     """Show topics, types, counts, rates, time span, model, scenario and injected faults of SOURCE.
 
-    Exit code 4 where a part of it could not be read.
+    The exit code is 4 if a part of SOURCE could not be read.
     """
     from avsreplay.errors import DataLost, UsageError
     from avsreplay.log import SourceOptions, open_source
@@ -39,7 +39,7 @@ def command(source: Path, topic: str | None, as_json: bool, max_message_mib: int
         options = SourceOptions(topic=topic, max_message_mib=max_message_mib)
     except ValueError as error:
         raise UsageError(str(error), where="--max-message-mib", hint="give a whole number of MiB") from None
-    with open_source(source, options, look=True) as opened:
+    with open_source(source, options, inspect=True) as opened:
         info = opened.info()
     if as_json:
         click.echo(json.dumps(document(info), indent=2))
@@ -47,11 +47,11 @@ def command(source: Path, topic: str | None, as_json: bool, max_message_mib: int
         _print(info)
     if info.losses:
         what = f"{len(info.losses)} part(s) could not be read"
-        raise DataLost(what, where=info.path, hint="avsreplay doctor says more")
+        raise DataLost(what, where=info.path, hint="run avsreplay doctor for details")
 
 
 def document(info: LogInfo) -> dict[str, Any]:
-    """The JSON form: the fields of ``LogInfo``, topics with their rate."""
+    """Return the JSON document: the fields of ``LogInfo`` and the rate of each topic."""
     import dataclasses
 
     out = dataclasses.asdict(info)
@@ -64,7 +64,7 @@ def document(info: LogInfo) -> dict[str, Any]:
 
 
 def loss_line(loss: Loss) -> str:
-    """One loss in one line."""
+    """Return one line of text about a loss."""
     from avsreplay.log.bytes_io import shown
 
     parts = [f"{loss.file}: " if loss.file else "", loss.what, f" (byte {loss.offset}, {loss.bytes} bytes"]
@@ -95,7 +95,7 @@ def _facts(info: LogInfo) -> list[tuple[str, str]]:
         ("file", info.path),
         ("kind", ", ".join(filter(None, (info.kind, info.profile, info.library)))),
         ("size", f"{info.bytes} bytes"),
-        ("log clock", " ".join(filter(None, (_instant(info.start_ns), "for", span))) if span else "-"),
+        ("log clock", " ".join(filter(None, (_time(info.start_ns), "for", span))) if span else "-"),
         ("scans", str(info.scans) + (f" on {info.cloud_topic}" if info.cloud_topic else "")),
         ("model", _model(info)),
         ("truth", "yes" if info.truth else "no"),
@@ -106,10 +106,10 @@ def _facts(info: LogInfo) -> list[tuple[str, str]]:
     return rows + [(name, value) for name, value in info.notes.items()]
 
 
-def _instant(t_ns: int | None) -> str:
+def _time(t_ns: int | None) -> str:
     if t_ns is None:
         return "-"
-    if t_ns < 10**17:  # before 1973: a clock that started at zero, not a date
+    if t_ns < 10**17:  # before 1973: a clock that started at zero
         return f"from {t_ns * 1e-9:.3f} s"
     return f"from {datetime.fromtimestamp(t_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC"
 

@@ -1,4 +1,4 @@
-"""The door for bytes: logs, bags and folders in; MCAP out."""
+"""Reading of logs, bags and folders of scans; writing of logs as MCAP."""
 
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions, TopicInfo

@@ -17,15 +17,17 @@ from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.records import Label, State
 
-_CDR_LITTLE = {0x0001: "<", 0x0000: ">"}  # plain CDR; parameter lists (0x0002, 0x0003) are no ROS message
+_CDR_LITTLE = {0x0001: "<", 0x0000: ">"}  # plain CDR; parameter lists (0x0002, 0x0003) do not occur in ROS
 
 
 class Cursor:
-    """A checked walk over one message.
+    """A reader of one message; each method raises BadMessage at the end of the buffer.
 
     Attributes:
-        data: the bytes walked over (of CDR: after the four-byte encapsulation).  pos: next byte.
-        order: ``<`` or ``>``.  ros1: the wire form of ROS 1.
+        data: the bytes of the message, without the four-byte encapsulation of CDR.
+        pos: offset of the next byte.
+        order: ``<`` or ``>``.
+        ros1: whether the message is in the ROS 1 wire format.
     """
 
     __slots__ = ("data", "order", "pos", "ros1")
@@ -55,19 +57,19 @@ class Cursor:
         return value
 
     def u8(self) -> int:
-        """An octet."""
+        """Return the next octet."""
         return int(self._take("B", 1))
 
     def u32(self) -> int:
-        """An unsigned 32-bit number."""
+        """Return the next unsigned 32-bit number."""
         return int(self._take("I", 4))
 
     def i32(self) -> int:
-        """A signed 32-bit number."""
+        """Return the next signed 32-bit number."""
         return int(self._take("i", 4))
 
     def f64s(self, count: int) -> tuple[float, ...]:
-        """``count`` doubles, without a length before them."""
+        """Return the next ``count`` doubles of an array of fixed length."""
         start = self.pos if self.ros1 else (self.pos + 7) & -8
         try:
             values = struct.unpack_from(f"{self.order}{count}d", self.data, start)
@@ -77,7 +79,7 @@ class Cursor:
         return values
 
     def octets(self) -> memoryview:
-        """A sequence of octets, as a view."""
+        """Return the next sequence of octets as a view."""
         size = self.u32()
         start = self.pos
         if start + size > len(self.data):
@@ -86,24 +88,24 @@ class Cursor:
         return self.data[start : self.pos]
 
     def string(self) -> str:
-        r"""Text; bytes that are not UTF-8 are kept readable as ``\xNN``."""
+        r"""Return the next string; bytes that are not UTF-8 become ``\xNN``."""
         raw = bytes(self.octets())
         return (raw if self.ros1 else raw.rstrip(b"\x00")).decode("utf-8", "backslashreplace")
 
     def stamp(self) -> int:
-        """A time [ns]."""
+        """Return the next time [ns]."""
         seconds = self.u32() if self.ros1 else self.i32()
         return seconds * 1_000_000_000 + self.u32()
 
     def header(self) -> tuple[int, str]:
-        """A std_msgs Header: stamp [ns] and frame."""
+        """Return stamp [ns] and frame of the next std_msgs Header."""
         if self.ros1:
             self.u32()
         return self.stamp(), self.string()
 
 
 class Packer:
-    """Little-endian CDR, written front to back."""
+    """A writer of little-endian CDR; each method appends one value."""
 
     __slots__ = ("out",)
 
@@ -114,50 +116,60 @@ class Packer:
         self.out += b"\x00" * (-(len(self.out) - 4) % size)
 
     def u8(self, value: int) -> Packer:
-        """An octet."""
+        """Append an octet."""
         self.out.append(value)
         return self
 
     def u32(self, value: int) -> Packer:
-        """An unsigned 32-bit number."""
+        """Append an unsigned 32-bit number."""
         self._align(4)
         self.out += struct.pack("<I", value)
         return self
 
     def i32(self, value: int) -> Packer:
-        """A signed 32-bit number."""
+        """Append a signed 32-bit number."""
         self._align(4)
         self.out += struct.pack("<i", value)
         return self
 
     def f64s(self, *values: float) -> Packer:
-        """Doubles, without a length before them."""
+        """Append doubles as an array of fixed length."""
         self._align(8)
         self.out += struct.pack(f"<{len(values)}d", *values)
         return self
 
+    def f32s(self, *values: float) -> Packer:
+        """Append floats as an array of fixed length."""
+        self._align(4)
+        self.out += struct.pack(f"<{len(values)}f", *values)
+        return self
+
+    def pose(self, pose: Pose) -> Packer:
+        """Append a geometry_msgs Pose."""
+        return self.f64s(*pose.t, *pose.q)
+
     def string(self, text: str) -> Packer:
-        """Text with its closing NUL."""
+        """Append a string with its closing NUL."""
         raw = text.encode("utf-8") + b"\x00"
         self.u32(len(raw))
         self.out += raw
         return self
 
     def octets(self, raw: bytes) -> Packer:
-        """A sequence of octets."""
+        """Append a sequence of octets."""
         self.u32(len(raw))
         self.out += raw
         return self
 
     def header(self, t_ns: int, frame: str) -> Packer:
-        """A std_msgs Header. Raises ValueError where ``t_ns`` does not fit a ROS 2 time."""
+        """Append a std_msgs Header. Raises ValueError if ``t_ns`` does not fit a ROS 2 time."""
         seconds, nanoseconds = divmod(t_ns, 1_000_000_000)
         if not -(2**31) <= seconds < 2**31:
             raise ValueError(f"stamp {t_ns} ns does not fit a ROS 2 time")
         return self.i32(seconds).u32(nanoseconds).string(frame)
 
     def bytes(self) -> bytes:
-        """What was packed."""
+        """Return the bytes written so far."""
         return bytes(self.out)
 
 
@@ -167,7 +179,7 @@ _DATATYPE = {"float32": 7, "float64": 8}
 def point_cloud2(
     t_ns: int, frame: str, points: NDArray[Any], times_s: NDArray[Any] | None, point_type: str = "float32"
 ) -> bytes:
-    """A cloud of (n, 3) points [m] with, where given, the field ``t``: (n,) float32 [s] after the stamp."""
+    """Return a PointCloud2 of (n, 3) points [m]; ``times_s`` (n,) [s after the stamp] becomes the field ``t``."""
     names = ["x", "y", "z"]
     formats = [f"<f{4 if point_type == 'float32' else 8}"] * 3
     if times_s is not None:
@@ -187,26 +199,25 @@ def point_cloud2(
 
 
 def pose_stamped(t_ns: int, frame: str, pose: Pose) -> bytes:
-    """A geometry_msgs PoseStamped."""
-    return Packer().header(t_ns, frame).f64s(*pose.t, *pose.q).bytes()
+    """Return a geometry_msgs PoseStamped."""
+    return Packer().header(t_ns, frame).pose(pose).bytes()
 
 
 def odometry(t_ns: int, frame: str, child: str, body: State) -> bytes:
-    """A nav_msgs Odometry: the pose of {B} in {A}, the twist in {B} as ROS has it."""
+    """Return a nav_msgs Odometry: the pose of {B} in {A} and the twist in {B}."""
     v_b = geometry.rotate(geometry.matrix(body.q_ab).T, body.v_a)
     zeros = (0.0,) * 36
     packer = Packer().header(t_ns, frame).string(child).f64s(*body.r_a, *body.q_ab, *zeros)
     return packer.f64s(*v_b, *body.w_b, *zeros).bytes()
 
 
-def static_transform(t_ns: int, parent: str, child: str) -> bytes:
-    """A tf2_msgs TFMessage with one identity transform, so that a viewer finds the cloud's frame."""
-    packer = Packer().u32(1).header(t_ns, parent).string(child)
-    return packer.f64s(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0).bytes()
+def transform(t_ns: int, parent: str, child: str, pose: Pose) -> bytes:
+    """Return a tf2_msgs TFMessage with one transform T_parent_child."""
+    return Packer().u32(1).header(t_ns, parent).string(child).pose(pose).bytes()
 
 
 def diagnostic(t_ns: int, label: Label, begins: bool) -> bytes:
-    """A diagnostic_msgs DiagnosticArray saying that an injected fault begins (WARN) or ends (OK)."""
+    """Return a diagnostic_msgs DiagnosticArray: an injected fault begins (WARN) or ends (OK)."""
     message = "injected fault begins" if begins else "injected fault ends"
     values = {"start_ns": label.start_ns, "end_ns": label.end_ns, "harmful": label.harmful, "strength": label.strength}
     packer = Packer().header(t_ns, "").u32(1).u8(1 if begins else 0)
@@ -266,7 +277,7 @@ SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
 
 
 def schema_text(name: str) -> bytes:
-    """The full definition of a message type of ``SCHEMAS``."""
+    """Return the definition of a message type of ``SCHEMAS`` with its dependencies, in the ``ros2msg`` format."""
     body, dependencies = SCHEMAS[name]
     parts = [body, *(f"MSG: {dep}\n{text}" for dep, text in dependencies)]
     return ("\n" + "=" * 80 + "\n").join(p.rstrip("\n") for p in parts).encode() + b"\n"

@@ -1,7 +1,7 @@
-"""Reading of rosbag2's sqlite3 storage, through Python's own sqlite3, read-only.
+"""Reading of the sqlite3 storage of rosbag2, read-only.
 
-The database has no checksums. A damaged page makes a query fail part of the way: the pass then goes on behind it, and
-counts what it skips.
+The database has no checksums. A damaged page makes a query fail part of the way: the pass then continues behind it and
+counts the rows that it skips.
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ from avsreplay.log.index import Recording, Sink, canonical_type
 from avsreplay.log.options import Loss
 
 SQLITE_MAGIC = b"SQLite format 3\x00"
-# A message of sqlite's own may name a damaged table in bytes that are no text.
+# ValueError: an error message of sqlite may contain bytes that are not UTF-8.
 _SQLITE = (sqlite3.Error, OverflowError, ValueError)
-_HEAD = 64  # bytes of a cloud that tell its header stamp
-_STEPS = 4096  # rows tried one by one behind a damaged page, before strides double
-_MAX_ID = 1 << 62  # where the last one cannot be told: strides double, so it takes few steps
+_HEAD = 64  # the first bytes of a cloud message contain its header stamp
+_STEPS = 4096  # rows tried one by one behind a damaged page before the stride doubles
+_MAX_ID = 1 << 62  # used if the last id is unknown: the stride doubles, so few steps are needed
 
 
 class Db3File(Recording):
-    """One sqlite3 file of a ROS 2 bag, surveyed.
+    """One sqlite3 file of a ROS 2 bag, indexed on construction.
 
     Args:
-        path: the file.  limit: most bytes a message may take.
-        sinks: who takes the messages of a topic while the survey passes over them.
+        path: the file.
+        limit: largest message that is read [bytes].
+        sinks: called with every message of a topic during the pass.
 
     Raises:
-        UnreadableInput: not there, or not a bag's database.
+        UnreadableInput: the file does not exist or is not the database of a bag.
     """
 
     kind = "ros2 bag"
@@ -49,14 +50,14 @@ class Db3File(Recording):
             raise _unreadable(path, error) from None
 
     def read(self, topic: str, place: int) -> bytes | memoryview:
-        """The payload of a cloud. Raises BadMessage where it cannot be had."""
+        """Return the payload of the cloud message with this index entry. Raises BadMessage if it cannot be read."""
         row_id = self._table.clouds(topic).offset[place]
         try:
             row = self._db.execute("SELECT data FROM messages WHERE id = ?", (row_id,)).fetchone()
         except _SQLITE as error:
             raise BadMessage(f"the database is damaged: {error}") from None
         if row is None or not isinstance(row[0], bytes):
-            raise BadMessage("the message is not in the database any more")
+            raise BadMessage("the message is no longer in the database")
         return row[0]
 
     def close(self) -> None:
@@ -88,7 +89,7 @@ class Db3File(Recording):
         return int(row[0]) if row and row[0] is not None else 0
 
     def _rows(self, last: int) -> Iterator[tuple[object, ...] | None]:
-        """Messages by id; None for a stretch that cannot be read."""
+        """Yield the messages by id; None for a range that cannot be read."""
         query = "SELECT id, topic_id, timestamp, substr(data, 1, ?) FROM messages WHERE id > ? AND id <= ? ORDER BY id"
         at, failures = -1, 0
         while at < last:
@@ -119,7 +120,7 @@ class Db3File(Recording):
 
 
 def _connected(path: Path, limit: int) -> sqlite3.Connection:
-    # A write-ahead log beside the file holds messages of a recorder that was stopped hard: sqlite must see it.
+    # The write-ahead log beside the file holds messages of a recorder that was killed: sqlite must read it.
     alone = not path.with_name(path.name + "-wal").exists()
     uri = f"{path.resolve().as_uri()}?mode=ro" + ("&immutable=1" if alone else "")
     try:

@@ -1,4 +1,4 @@
-"""Examination of a log: structure, checksums, clocks, gaps, duplicates, points, truth; each finding with a severity."""
+"""Examination of a log: structure, checksums, clocks, gaps, duplicates, points and truth."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ _APART_S = 1.0
 
 
 class Severity(Enum):
-    """How bad a finding is."""
+    """Severity of a finding."""
 
-    OK = "ok"  # looked at and found good
-    NOTE = "note"  # worth knowing
-    WARNING = "warning"  # the log can be used, with care
-    ERROR = "error"  # part of the log is lost or cannot be read
+    OK = "ok"  # checked without a finding
+    NOTE = "note"  # information
+    WARNING = "warning"  # the log can be used, but its results may be affected
+    ERROR = "error"  # part of the log cannot be read
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing found: how bad, about what, in one sentence, and the bytes or scans it is about."""
+    """One finding: severity, subject, text, and the file offsets or scan numbers that it refers to."""
 
     severity: Severity
     about: str
@@ -47,7 +47,7 @@ class Finding:
 
 @dataclass(slots=True)
 class _Tally:
-    """What one pass over the scans counts."""
+    """Counts of one pass over the scans."""
 
     scans: int = 0
     points: int = 0
@@ -59,13 +59,21 @@ class _Tally:
 
 
 def examine(path: Path, options: SourceOptions | None = None) -> tuple[LogInfo, list[Finding]]:
-    """Look at everything a log can tell.
+    """Check a log completely.
+
+    Args:
+        path: the log or folder.
+        options: how it is read.
+
+    Returns:
+        The description of the source, and the findings.
 
     Raises:
-        UnreadableInput: it cannot be opened at all.  UsageError: several cloud topics and none asked for.
+        UnreadableInput: it cannot be opened.
+        UsageError: the requested topic does not exist.
     """
     options = options or SourceOptions()
-    with open_source(path, options, look=True) as source:
+    with open_source(path, options, inspect=True) as source:
         info = source.info()
         findings = [*_losses(info.losses), *_structure(path, options), *_content(info)]
         if info.scans:
@@ -76,7 +84,7 @@ def examine(path: Path, options: SourceOptions | None = None) -> tuple[LogInfo, 
 
 def _losses(losses: tuple[Loss, ...]) -> Iterator[Finding]:
     if not losses:
-        yield Finding(Severity.OK, "damage", "nothing is lost")
+        yield Finding(Severity.OK, "damage", "no part is lost")
     for loss in losses:
         span = ""
         if loss.start_ns is not None and loss.end_ns is not None:
@@ -89,24 +97,24 @@ def _losses(losses: tuple[Loss, ...]) -> Iterator[Finding]:
 
 def _structure(path: Path, options: SourceOptions) -> Iterator[Finding]:
     if not is_mcap(path):
-        yield Finding(Severity.NOTE, "checksums", "this format has none: damage inside a message cannot be seen")
+        yield Finding(Severity.NOTE, "checksums", "this format has none: damage inside a message cannot be detected")
         return
     file = McapFile(path, options.max_message_mib << 20)
     try:
         if file.closed_properly and file.summary.trouble:
-            text = f"not to be trusted: {file.summary.trouble}; other readers may refuse the file"
+            text = f"invalid: {file.summary.trouble}; other readers may reject the file"
             yield Finding(Severity.ERROR, "summary", text)
         elif file.closed_properly and not file.summary.start:
-            yield Finding(Severity.WARNING, "summary", "none: other readers are slow or refuse the file")
+            yield Finding(Severity.WARNING, "summary", "missing: other readers are slow or reject the file")
         if file.unchecked:
-            yield Finding(Severity.WARNING, "checksums", f"{file.unchecked} chunks carry none")
+            yield Finding(Severity.WARNING, "checksums", f"{file.unchecked} chunks have none")
         if file.closed_properly and not file.data_checksum_holds():
-            text = "the checksum over the whole of the data does not hold"
+            text = "the checksum over the data section is wrong"
             yield Finding(Severity.ERROR, "checksums", text)
         elif not file.unchecked and not file.losses:
-            yield Finding(Severity.OK, "checksums", "all hold")
+            yield Finding(Severity.OK, "checksums", "all are correct")
         if file.profile != "ros2":
-            yield Finding(Severity.NOTE, "profile", f"'{shown(file.profile)}', not ros2: some readers will not open it")
+            yield Finding(Severity.NOTE, "profile", f"'{shown(file.profile)}', not ros2: some readers do not open it")
         yield from _schemas(file)
     finally:
         file.close()
@@ -123,11 +131,11 @@ def _schemas(file: McapFile) -> Iterator[Finding]:
 
 def _content(info: LogInfo) -> Iterator[Finding]:
     if not info.scans:
-        yield Finding(Severity.WARNING, "scans", "no cloud topic with a message, or several and none was asked for")
+        yield Finding(Severity.WARNING, "scans", "no cloud topic with a message, or several of which none was chosen")
     if info.model is None:
-        yield Finding(Severity.NOTE, "model", "none inside: give --model to run it")
+        yield Finding(Severity.NOTE, "model", "the log has none: give --model to run it")
     elif not info.model_faces:
-        yield Finding(Severity.NOTE, "model", f"{shown(info.model)} has no faces: it serves as a cloud")
+        yield Finding(Severity.NOTE, "model", f"{shown(info.model)} has no faces: it is used as a point cloud")
 
 
 def _pass(source: Source) -> tuple[_Tally, list[int]]:
@@ -158,15 +166,17 @@ def _clocks(clock: ClockSummary) -> Iterator[Finding]:
     if clock.note:
         yield Finding(Severity.WARNING, "clock", clock.note)
     elif abs(clock.offset_s) > _APART_S:
-        text = f"header and log clock are {clock.offset_s:+.3f} s apart; scans go by the {clock.clock} clock"
+        text = (
+            f"header and log clock are {clock.offset_s:+.3f} s apart; scan times are taken from the {clock.clock} clock"
+        )
         yield Finding(Severity.NOTE, "clock", text)
     for name, words in (
         ("unset", "stamps are unset"),
         ("jumps", "stamps jump"),
-        ("equal", "stamps are equal to the one before"),
-        ("back", "stamps lie before the one before"),
-        ("header_steps", "lasting steps of the header clock"),
-        ("log_steps", "lasting steps of the log clock"),
+        ("equal", "stamps are equal to the previous one"),
+        ("back", "stamps are before the previous one"),
+        ("header_steps", "permanent steps of the header clock"),
+        ("log_steps", "permanent steps of the log clock"),
     ):
         if count := getattr(clock, name):
             yield Finding(Severity.WARNING, "clock", f"{count} {words}")
@@ -197,7 +207,7 @@ def _scans(tally: _Tally) -> Iterator[Finding]:
         text = f"{len(tally.empty)} of {tally.scans} have no finite point"
         yield Finding(Severity.WARNING, "scans", text, tuple(tally.empty[:_NAMED]))
     if tally.repeated:
-        text = f"{len(tally.repeated)} are the same bytes as the one before"
+        text = f"{len(tally.repeated)} are identical to the previous scan"
         yield Finding(Severity.WARNING, "duplicates", text, tuple(tally.repeated[:_NAMED]))
     total = tally.points + tally.dropped
     share = tally.dropped / total if total else 0.0
@@ -209,7 +219,7 @@ def _scans(tally: _Tally) -> Iterator[Finding]:
 
 
 def _layout(source: Source) -> Iterator[Finding]:
-    """The fields of the clouds, and whether they stay the same."""
+    """Report the fields of the clouds and whether they change."""
     layouts: Counter[str] = Counter()
     for payload, encoding in source.payloads():
         try:

@@ -15,12 +15,12 @@ from avsreplay.log.pose_messages import POSE_TYPES, TF_TYPE, PoseTrack, TfBuffer
 from avsreplay.log.writer import BODY_TOPIC, TRUTH_TOPIC
 
 TruthLookup = Callable[[int, int, str], Pose | None]
-"""(instant [ns], place in the feed, frame of the cloud) -> T_ac, None where there is none."""
+"""(time [ns], number of the scan, frame of the cloud) -> T_ac or None."""
 
 
 @dataclass(frozen=True, slots=True)
 class Guides:
-    """Lookups for one source; None where it has none. ``track`` is the whole of the truth where it is one track."""
+    """Lookups by time for one source; None if it has no such data. ``track`` is the truth if it is a single track."""
 
     truth: TruthLookup | None = None
     track: PoseTrack | None = None
@@ -30,7 +30,7 @@ class Guides:
 
 @dataclass(slots=True)
 class MessageGuides:
-    """Collects truth, state and transforms while a log is surveyed.
+    """Collects poses, states and transforms while a log is read.
 
     Args:
         options: how the log is read.
@@ -48,7 +48,7 @@ class MessageGuides:
         self._tf = TfBuffer(gap, by_log)
 
     def sinks(self) -> dict[str, Sink]:
-        """Who takes which topic."""
+        """Return the sink of each topic."""
         out = {self.options.truth_topic or TRUTH_TOPIC: _poses_only(self._truth), BODY_TOPIC: _poses_only(self._body)}
         if self.options.sensor_topic is not None:
             out[self.options.sensor_topic] = _poses_only(self._sensor)
@@ -57,7 +57,7 @@ class MessageGuides:
         return out
 
     def check(self, topics: Sequence[TopicInfo], where: str) -> None:
-        """Raise UsageError where a topic or frame that was asked for is not there."""
+        """Raise UsageError if a requested topic or frame does not exist."""
         for role, name in (("truth", self.options.truth_topic), ("sensor", self.options.sensor_topic)):
             found = next((t for t in topics if t.name == name), None)
             if name is not None and (found is None or found.type not in POSE_TYPES):
@@ -70,7 +70,7 @@ class MessageGuides:
                 raise UsageError(f"no frame '{shown(frame)}'", where=where, hint=hint)
 
     def guides(self) -> Guides:
-        """The lookups, once the survey is done."""
+        """Return the lookups, after the log was read."""
         truth, track = self._truth_lookup()
         return Guides(truth, track, self._body if len(self._body) else None, self._sensor_lookup())
 
@@ -96,7 +96,7 @@ class MessageGuides:
 
 
 def file_truth(found: TimedPoses, gap_s: float) -> tuple[TruthLookup, PoseTrack | None]:
-    """A lookup in a pose file, by time where it has times, else line by scan; and its track where it has times."""
+    """Return a lookup in a pose file and its track: by time if the file has times, else by line without a track."""
     if found.t_ns is None:
         poses = found.poses
         return (lambda _t_ns, place, _frame: poses[place] if place < len(poses) else None), None

@@ -1,7 +1,7 @@
-"""What a log says of itself, as one metadata record of exact JSON and the model as an attachment.
+"""The header of a log: scenario, seed, fault labels and start state in one MCAP metadata record of JSON values.
 
-Floats are written by their shortest exact form, so a header read back is the header written, bit for bit.
-A metadata record has no checksum in MCAP; ours carries one over its own values.
+Floats are written in their shortest exact form, so that a header read back equals the one written, bit for bit. MCAP
+has no checksum for metadata records; this record contains one over its own values.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")
 
 
 def encode_header(header: LogHeader) -> dict[str, str]:
-    """The metadata record of a header (without its surface's bytes)."""
+    """Return the metadata record of a header; the model itself is an attachment."""
     values = {
         "format": FORMAT,
         "scenario": header.scenario,
@@ -37,13 +37,13 @@ def encode_header(header: LogHeader) -> dict[str, str]:
 
 
 def decode_header(values: Mapping[str, str]) -> LogHeader:
-    """The header of a metadata record, without its surface.
+    """Return the header of a metadata record, without the model.
 
-    Raises ValueError where the record's checksum or a value in it is wrong.
+    Raises ValueError if its checksum or one of its values is wrong.
     """
     rest = {k: v for k, v in values.items() if k != "crc32"}
     if values.get("crc32") != f"{_checksum(rest):08x}":
-        raise ValueError("the checksum of the header record does not hold")
+        raise ValueError("the checksum of the header record is wrong")
     if values.get("format") != FORMAT:
         raise ValueError(f"header record of format {values.get('format')!r}, this version reads {FORMAT}")
     try:
@@ -84,7 +84,7 @@ def _loads(text: str) -> Any:
 
 
 def _no_number(name: str) -> None:
-    raise ValueError(f"{name} is no number")
+    raise ValueError(f"{name} is not a number")
 
 
 def _to_seed(value: Any) -> int | None:
@@ -97,7 +97,7 @@ def _to_label(values: Any) -> Label:
     label = Label(**values)
     whole = type(label.start_ns) is int and type(label.end_ns) is int and type(label.harmful) is bool
     if not isinstance(label.kind, str) or not whole or not isinstance(label.strength, (int, float, type(None))):
-        raise ValueError("a label that is none")
+        raise ValueError("a fault label with a value of the wrong type")
     return label
 
 
@@ -107,7 +107,7 @@ def _to_state(values: Any) -> State | None:
     state = State(**{name: np.array(values[name], dtype=np.float64) for name in _STATE})
     lengths = np.linalg.norm(state.q_ab), np.linalg.norm(state.q_bc)
     if not all(abs(length - 1.0) < 1e-6 for length in lengths) or np.abs(state.sigma).max() >= 1.0:
-        raise ValueError("a state that is none: its quaternions are not unit, or a sigma is not below 1")
+        raise ValueError("an invalid state: a quaternion is not of unit length, or a sigma is not below 1")
     return state
 
 

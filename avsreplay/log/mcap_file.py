@@ -1,8 +1,8 @@
-"""Reading of MCAP: one linear pass that checks every checksum and finds its way again past damage.
+"""Reading of MCAP: one linear pass that verifies every checksum and resumes after damage.
 
-The pass needs no index and no summary: it takes what is intact, lists what is not, counts topics, keeps where each
-cloud is and hands truth to its sinks. Clouds are then read by place. The summary, where it is whole, serves to know
-channels whose first chunk is lost and messages that nothing else tells of.
+The pass needs neither index nor summary: it reads intact records, lists damaged ones, counts messages per topic, notes
+the position of every cloud and passes poses to their sinks. Clouds are read later by position. An intact summary
+provides the channels whose first chunk is lost and the number of messages that are missing.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.log import mcap_format as mcap
 from avsreplay.log.bytes_io import BadMessage, ByteFile, shown
 from avsreplay.log.index import MAX_NS, Recording, Sink
-from avsreplay.log.mcap_format import Channel, ChunkStore, Fields, Summary, Tap, read_summary
+from avsreplay.log.mcap_format import Channel, ChunkStore, Fields, RecordSink, Summary, read_summary
 from avsreplay.log.mcap_salvage import ChannelTable, begins_record, first_chunk, hides_chunk, next_record
 from avsreplay.log.options import Loss
 from avsreplay.log.surface import MODEL_ENDINGS
@@ -29,25 +29,30 @@ _MAX_LOSSES = 10_000
 
 
 class McapFile(Recording):
-    """One MCAP file, surveyed.
+    """One MCAP file, indexed on construction.
 
     Args:
-        path: the file.  limit: most bytes a message, chunk or attachment may take.
-        sinks: who takes the messages of a topic while the survey passes over them.
-        tap: who takes every intact record besides (for a repair).
+        path: the file.
+        limit: largest message, chunk or attachment that is read [bytes].
+        sinks: called with every message of a topic during the pass.
+        copy_to: receives every intact record (for a repair).
 
     Attributes:
-        closed_properly: is there an end of data?  summary: the section behind it, as far as it can be trusted.
-        data_end: (offset, checksum) of the end of data.  unchecked: chunks that carry no checksum.
+        closed_properly: whether the file has a data-end record.
+        summary: the summary section as far as it is valid.
+        data_end: (offset, checksum) of the data-end record.
+        unchecked: number of chunks without a checksum.
 
     Raises:
-        UnreadableInput: not there, empty, or not MCAP.
+        UnreadableInput: the file does not exist, is empty or is not MCAP.
     """
 
     kind = "mcap"
 
-    def __init__(self, path: Path, limit: int, sinks: dict[str, Sink] | None = None, tap: Tap | None = None) -> None:
-        self._tap = tap
+    def __init__(
+        self, path: Path, limit: int, sinks: dict[str, Sink] | None = None, copy_to: RecordSink | None = None
+    ) -> None:
+        self._copy_to = copy_to
         super().__init__(path, limit, sinks)
         self.closed_properly = False
         self.summary, self.data_end, self.unchecked = Summary(), (0, 0), 0
@@ -55,7 +60,7 @@ class McapFile(Recording):
         self._model: tuple[str, int, int] | None = None
         self._bad_chunk: Loss | None = None
         self._resume: int | None = None
-        self._trusted = 8  # all before is borne out by a checksum
+        self._trusted = 8  # everything before this offset is confirmed by a checksum
         self._orphans = self._seen = 0
         self._file = ByteFile(path)
         self._size = self._file.size
@@ -67,11 +72,11 @@ class McapFile(Recording):
             raise
 
     def channels(self) -> dict[int, Channel]:
-        """Channels by id."""
+        """Return the channels by id."""
         return dict(self._channels.by_id)
 
     def data_checksum_holds(self) -> bool:
-        """Does the checksum over all records, which covers what no other one does, hold? True where there is none."""
+        """Return whether the checksum over the whole data section is correct; True if the file has none."""
         end, expected = self.data_end
         crc, at = 0, 0
         while expected and at < end:
@@ -80,7 +85,7 @@ class McapFile(Recording):
         return crc == expected
 
     def attachment(self) -> tuple[str, bytes] | None:
-        """The model the file carries: the first attachment that is a mesh file."""
+        """Return name and bytes of the first attachment that is a mesh file, None if there is none."""
         if self._model is None:
             return None
         name, offset, size = self._model
@@ -101,11 +106,13 @@ class McapFile(Recording):
         if len(self.losses) >= _MAX_LOSSES:
             self._lose(Loss("damaged at too many places: the rest is not read", at, self._size - at))
         elif not self.closed_properly:
-            self._lose(Loss("the file was not closed: what its recorder still held is lost", self._size, 0))
+            self._lose(
+                Loss("the file was not closed: messages that its recorder had not yet written are lost", self._size, 0)
+            )
         self._account(summary)
 
     def _step(self, at: int, summary: Summary) -> int:
-        """Take one record and return where the next one begins."""
+        """Process one record and return the offset of the next one."""
         if at + 9 > self._size:
             self._lose(Loss("the file is cut inside a record", at, self._size - at))
             return self._size
@@ -133,7 +140,7 @@ class McapFile(Recording):
         elif opcode < 0x80:
             raise BadMessage(f"a record of unknown kind 0x{opcode:02x}")
         elif end - at > _LEAST_CHUNK and (hides_chunk(self._file, at, end) or self._swallowed(at, end) is not None):
-            raise BadMessage("a chunk whose kind is damaged")
+            raise BadMessage("a chunk with a damaged opcode")
 
     def _content(self, at: int, end: int) -> Fields:
         if end - at > self._limit:
@@ -148,16 +155,16 @@ class McapFile(Recording):
         fields = self._content(at, end)
         name, values = fields.text(), fields.mapping()
         if fields.at != len(fields.view):
-            raise BadMessage("a metadata record with bytes left over")
+            raise BadMessage("a metadata record longer than its content")
         self.metadata.setdefault(name, values)
-        if self._tap is not None:
-            self._tap.metadata(name, values)
+        if self._copy_to is not None:
+            self._copy_to.metadata(name, values)
 
     def _take_message(self, at: int, end: int) -> None:
         if end - at < 31:
-            raise BadMessage("a message shorter than its head")
-        if len(self._chunks):  # no writer mixes the two, and nothing vouches for it: more likely a flipped kind
-            raise BadMessage("a message outside the chunks of a file with chunks")
+            raise BadMessage("a message shorter than its fixed fields")
+        if len(self._chunks):  # no writer mixes the two: more likely a damaged opcode
+            raise BadMessage("a message outside the chunks of a chunked file")
         payload = self._content(at, end).view
         self._message(payload, 0, len(payload), -1, at + 9)
 
@@ -184,16 +191,16 @@ class McapFile(Recording):
         if crc and zlib.crc32(checked) != crc:
             if self._swallowed(at, end) is not None:
                 raise BadMessage("an attachment whose length is damaged")
-            self._lose(Loss(f"the checksum of attachment '{shown(name)}' does not hold", at, end - at))
+            self._lose(Loss(f"the checksum of attachment '{shown(name)}' is wrong", at, end - at))
             return
         if self._model is None and name.lower().endswith(MODEL_ENDINGS):
             self._model = (name, start, size)
-        if self._tap is not None:
-            self._tap.attachment(name, media, times, data)
+        if self._copy_to is not None:
+            self._copy_to.attachment(name, media, times, data)
 
     def _take_data_end(self, at: int, end: int) -> None:
         if end - at != 13:
-            raise BadMessage("the end of data is malformed")
+            raise BadMessage("the data-end record is malformed")
         self.closed_properly = True
         self.data_end = (at, int.from_bytes(self._file.read(at + 9, 4), "little"))
 
@@ -219,7 +226,7 @@ class McapFile(Recording):
                 self._channels.channel(Fields(view[begin:stop]))
 
     def _swallowed(self, at: int, end: int) -> int | None:
-        """Where a whole chunk begins inside a bad one: bytes were taken out, and its frame reaches too far."""
+        """Return the offset of an intact chunk inside a damaged record whose declared length is too large."""
         inner = first_chunk(self._file, at + 1, end)
         if inner is None:
             return None
@@ -232,7 +239,7 @@ class McapFile(Recording):
 
     def _message(self, view: memoryview, begin: int, end: int, container: int, offset: int) -> None:
         if end - begin < 22:
-            raise BadMessage("a message shorter than its head")
+            raise BadMessage("a message shorter than its fixed fields")
         channel_id = view[begin] | view[begin + 1] << 8
         channel = self._channels.by_id.get(channel_id) or self._guessed(channel_id, view[begin + 22 : end])
         self._seen += 1
@@ -244,33 +251,33 @@ class McapFile(Recording):
             int.from_bytes(view[begin + 14 : begin + 22], "little"),
         )
         self._table.add(channel.topic, times, view[begin + 22 : end], (container, offset + 22))
-        if self._tap is not None:
+        if self._copy_to is not None:
             sequence = int.from_bytes(view[begin + 2 : begin + 6], "little")
-            self._tap.message(channel, sequence, times, view[begin + 22 : end])
+            self._copy_to.message(channel, sequence, times, view[begin + 22 : end])
 
     def _guessed(self, number: int, payload: memoryview) -> Channel | None:
         channel = None if self.summary.definitions else self._channels.guess(number, payload, self.library)
         if channel is not None:
-            self._lose(Loss(f"the definition of a channel, taken by its bytes for {channel.type}", 0, 0))
+            self._lose(Loss(f"the definition of a channel, recognised by its messages as {channel.type}", 0, 0))
         return channel
 
     def _lose(self, loss: Loss) -> None:
         self.losses.append(replace(loss, file=self.path.name))
 
     def _settle(self) -> None:
-        """A bad chunk is put on the list once the index records behind it have told its messages."""
+        """List the last damaged chunk, after the message indexes behind it have given its message count."""
         if self._bad_chunk is not None:
             self._lose(self._bad_chunk)
             self._bad_chunk = None
 
     def _resync(self, at: int, summary: Summary, why: str) -> int:
-        """The next place after ``at`` where the file makes sense again."""
+        """Return the next offset after ``at`` where a readable record begins."""
         inner = self._swallowed(self._trusted - 1, at)
-        if inner is not None:  # a record before this one reached too far
+        if inner is not None:  # the record before this one declared too many bytes
             self._lose(Loss(why, inner, 0))
             self._trusted = inner + 1
             return inner
-        self._trusted = at  # searched once: never again
+        self._trusted = at  # this part is searched once only
         stop = summary.start - 13 if summary.start else self._size
         chunked = bool(len(self._chunks)) or not self._seen
         found = next_record(self._file, at + 1, stop, frozenset(self._channels.by_id), chunked)
@@ -279,12 +286,12 @@ class McapFile(Recording):
         return resume
 
     def _adopt(self, summary: Summary) -> None:
-        """Channels from a whole summary, in case the chunk that defines them is lost."""
+        """Add the channels of an intact summary, in case the chunk that defines them is lost."""
         for opcode, fields in summary.definitions:
             (self._channels.schema if opcode == mcap.SCHEMA else self._channels.channel)(fields)
 
     def _account(self, summary: Summary) -> None:
-        """Messages that the summary counts and nothing else tells of."""
+        """List the messages that the summary counts and the pass did not find."""
         if self._orphans:
             self._lose(Loss("messages of a channel whose definition is lost", 0, 0, messages=self._orphans))
         known = self._seen + sum(loss.messages or 0 for loss in self.losses if loss.chunks)
@@ -293,7 +300,7 @@ class McapFile(Recording):
         if missing > 0 and len(blind) == 1:
             self.losses[self.losses.index(blind[0])] = replace(blind[0], messages=missing)
         elif missing > 0:
-            self._lose(Loss("messages that the summary counts and the file does not hold", 0, 0, messages=missing))
+            self._lose(Loss("messages that the summary counts and the file does not contain", 0, 0, messages=missing))
 
 
 _HANDLERS: dict[int, Callable[[McapFile, int, int], None]] = {

@@ -24,7 +24,7 @@ _SIGNATURE = re.compile(rb"(?=\x06[\s\S]{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3
 
 @dataclass(frozen=True, slots=True)
 class Channel:
-    """A channel with its schema's name and text."""
+    """A channel with the name, encoding and text of its schema."""
 
     id: int
     topic: str
@@ -37,7 +37,7 @@ class Channel:
 
 @dataclass(frozen=True, slots=True)
 class ChunkHead:
-    """What a chunk says of itself; ``data_at`` counts from the record's opcode."""
+    """The fields before a chunk's data; ``data_at`` is the offset of the data from the record's opcode."""
 
     start_ns: int
     end_ns: int
@@ -49,7 +49,7 @@ class ChunkHead:
 
 
 class Fields:
-    """A walk over one record's content. Raises BadMessage past its end."""
+    """A reader of one record's fields; each method raises BadMessage at the end of the record."""
 
     __slots__ = ("at", "view")
 
@@ -57,7 +57,7 @@ class Fields:
         self.view, self.at = view, 0
 
     def number(self, size: int) -> int:
-        """An unsigned little-endian number."""
+        """Return the next unsigned little-endian number."""
         raw = self.view[self.at : self.at + size]
         if len(raw) < size:
             raise BadMessage("a record ends inside a number")
@@ -65,18 +65,18 @@ class Fields:
         return int.from_bytes(raw, "little")
 
     def take(self, size: int) -> memoryview:
-        """So many bytes."""
+        """Return the next ``size`` bytes."""
         if self.at + size > len(self.view):
             raise BadMessage(f"a record holds {len(self.view) - self.at} of {size} bytes")
         self.at += size
         return self.view[self.at - size : self.at]
 
     def text(self) -> str:
-        r"""A string; bytes that are not UTF-8 stay readable as ``\xNN``."""
+        r"""Return the next string; bytes that are not UTF-8 become ``\xNN``."""
         return bytes(self.take(self.number(4))).decode("utf-8", "backslashreplace")
 
     def mapping(self) -> dict[str, str]:
-        """A map of strings."""
+        """Return the next map of strings."""
         inner = Fields(self.take(self.number(4)))
         out: dict[str, str] = {}
         while inner.at < len(inner.view):
@@ -86,7 +86,7 @@ class Fields:
 
 
 def records(view: memoryview) -> Iterator[tuple[int, int, int]]:
-    """(opcode, begin, end) of the content of each record. Raises BadMessage where the last one is cut."""
+    """Yield (opcode, begin, end) of the content of each record. Raises BadMessage if the last one is cut."""
     at, size = 0, len(view)
     while at + 9 <= size:
         opcode, length = _HEAD.unpack_from(view, at)
@@ -99,16 +99,16 @@ def records(view: memoryview) -> Iterator[tuple[int, int, int]]:
 
 
 def chunk_head(view: memoryview | bytes, record_size: int | None = None) -> ChunkHead:
-    """Parse a chunk record from its opcode on. Raises BadMessage where its lengths contradict each other."""
+    """Parse a chunk record from its opcode on. Raises BadMessage if its lengths contradict each other."""
     if len(view) < 49 or view[0] != CHUNK:
-        raise BadMessage("no chunk")
+        raise BadMessage("not a chunk")
     _, length = _HEAD.unpack_from(view, 0)
     start, end, size, crc, name_size = _CHUNK.unpack_from(view, 9)
     if name_size > 16 or len(view) < 49 + name_size:
-        raise BadMessage("a chunk names no known compression")
+        raise BadMessage("a chunk with an unknown compression")
     name = bytes(view[41 : 41 + name_size]).decode("ascii", "replace")
     if name not in ("", "zstd", "lz4"):
-        raise BadMessage("a chunk names no known compression")
+        raise BadMessage("a chunk with an unknown compression")
     data_size = int.from_bytes(view[41 + name_size : 49 + name_size], "little")
     if length != 40 + name_size + data_size or (record_size is not None and length + 9 > record_size):
         raise BadMessage("a chunk's lengths contradict each other")
@@ -118,40 +118,41 @@ def chunk_head(view: memoryview | bytes, record_size: int | None = None) -> Chun
 
 
 def chunk_candidates(window: bytes) -> Iterator[int]:
-    """Places in ``window`` where a chunk record may begin."""
+    """Return the offsets in ``window`` where a chunk record may begin."""
     return (match.start() for match in _SIGNATURE.finditer(window))
 
 
 def is_mcap(path: Path) -> bool:
-    """Does a file begin as MCAP does?"""
+    """Return whether the file begins with the MCAP magic."""
     if not path.is_file():
         return False
     with path.open("rb") as file:
         return file.read(8) == MAGIC
 
 
-class Tap(Protocol):
-    """Takes every intact record of a file, in file order; times are (log, publish or creation) [ns]."""
+class RecordSink(Protocol):
+    """Receives every intact record of a file, in file order; times are (log, publish or creation) [ns]."""
 
     def message(self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview) -> None:
-        """A message."""
+        """Receive a message."""
 
     def attachment(self, name: str, media: str, times: tuple[int, int], data: memoryview) -> None:
-        """An attachment whose checksum holds."""
+        """Receive an attachment whose checksum is correct."""
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """A metadata record."""
+        """Receive a metadata record."""
 
 
 _COMPRESSIONS = ("", "zstd", "lz4", "bz2")
-_KEPT = 2
+_KEPT = 2  # decompressed chunks held in memory
 
 
 class ChunkStore:
-    """Chunks by number, in file order.
+    """The readable chunks of a file by number, in file order; the last two decompressed ones are kept in memory.
 
     Args:
-        file: the file they are in.  limit: most bytes a chunk may have, packed or inflated.
+        file: the file.
+        limit: largest chunk that is read, compressed or not [bytes].
     """
 
     def __init__(self, file: ByteFile, limit: int) -> None:
@@ -163,23 +164,23 @@ class ChunkStore:
         return len(self._offset)
 
     def check(self, at: int, head: ChunkHead) -> bytes:
-        """The inflated chunk at ``at``. Raises BadMessage where its checksum does not hold or it is over the limit."""
+        """Return the decompressed chunk at offset ``at``. Raises BadMessage if it is damaged or over the limit."""
         if max(head.size, head.data_size) > self._limit:
             raise BadMessage(f"a chunk of {head.size} bytes is over the limit of {self._limit}")
         data = inflate(self._file.read(at + head.data_at, head.data_size), head.compression, head.size)
         if head.crc and zlib.crc32(data) != head.crc:
-            raise BadMessage("the checksum of a chunk does not hold")
+            raise BadMessage("the checksum of a chunk is wrong")
         return data
 
     def add(self, at: int, head: ChunkHead) -> int:
-        """Take in a checked chunk and return its number."""
+        """Add a checked chunk and return its number."""
         values = (at + head.data_at, head.data_size, _COMPRESSIONS.index(head.compression), head.size)
         for column, value in zip((self._offset, self._packed, self._compression, self._size), values, strict=True):
             column.append(value)
         return len(self._offset) - 1
 
     def __getitem__(self, number: int) -> bytes:
-        """The inflated chunk. Raises BadMessage where the file has changed meanwhile."""
+        """Return the decompressed chunk. Raises BadMessage if the file has changed since it was indexed."""
         if number not in self._cache:
             if len(self._cache) >= _KEPT:
                 self._cache.pop(next(iter(self._cache)))
@@ -199,8 +200,10 @@ class Summary:
     """The summary section.
 
     Attributes:
-        start: where it begins, 0 where there is none to trust.  messages: how many the file holds, None: not said.
-        definitions: its schema and channel records.  trouble: what is wrong with it, "" where nothing is.
+        start: its offset, 0 if there is no valid one.
+        messages: number of messages in the file, None if not stated.
+        definitions: its schema and channel records.
+        trouble: what is wrong with it, empty if nothing is.
     """
 
     start: int = 0
@@ -210,7 +213,7 @@ class Summary:
 
 
 def read_summary(file: ByteFile, limit: int) -> Summary:
-    """The summary of a file, an empty one that says why where it cannot be trusted."""
+    """Return the summary of a file; if its checksum is wrong, an empty one that states why."""
     try:
         return _read(file, limit)
     except BadMessage as error:
@@ -232,12 +235,15 @@ def _read(file: ByteFile, limit: int) -> Summary:
         return _walk(start, memoryview(data)[: len(data) - 25])
     moved = _moved(file, crc)
     if moved is not None:
-        return replace(_walk(*moved), trouble="the footer points elsewhere: bytes were put in or taken out before it")
-    raise BadMessage("the checksum of the summary does not hold" if inside else "the footer points outside the file")
+        return replace(
+            _walk(*moved),
+            trouble="the offset in the footer is wrong: bytes were inserted or removed before the summary",
+        )
+    raise BadMessage("the checksum of the summary is wrong" if inside else "the footer points outside the file")
 
 
 def _moved(file: ByteFile, crc: int) -> tuple[int, memoryview] | None:
-    """Where the summary is after all, when bytes before it came or went: behind an end of data, and its sum holds."""
+    """Return the summary that follows a data-end record and matches the checksum, if the footer's offset is wrong."""
     begin = max(file.size - _SEARCHED, 8)
     window = file.read(begin, file.size - begin)
     end = len(window) - TAIL + 25

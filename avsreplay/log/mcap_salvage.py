@@ -1,4 +1,9 @@
-"""Recovery of a damaged MCAP file: the next readable record, and channels whose definition is lost."""
+"""Recovery of a damaged MCAP file: the next readable record, and channels whose definition is lost.
+
+A channel is defined in the first chunk and again in the summary; a recording that was killed and then damaged at its
+begin has lost both. A cloud is recognised by its fields. A pose is recognised only in a log written by this package,
+by a message length that no other type has.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +21,10 @@ from avsreplay.log.writer import BODY_TOPIC, LIBRARY, TRUTH_TOPIC
 
 
 class ChannelTable:
-    """Channels by id; the first definition of an id holds.
+    """Channels by id; the first definition of an id is used.
 
     Args:
-        table: where their topics are declared.
+        table: the table in which the topics are declared.
     """
 
     def __init__(self, table: MessageTable) -> None:
@@ -28,19 +33,19 @@ class ChannelTable:
         self.by_id: dict[int, Channel] = {}
 
     def schema(self, fields: Fields) -> None:
-        """Take in a schema record. Raises BadMessage."""
+        """Add a schema record. Raises BadMessage if it is malformed."""
         number, name, encoding = fields.number(2), fields.text(), fields.text()
         self._schemas.setdefault(number, (name, encoding, bytes(fields.take(fields.number(4)))))
 
     def channel(self, fields: Fields) -> None:
-        """Take in a channel record. Raises BadMessage."""
+        """Add a channel record. Raises BadMessage if it is malformed."""
         number, schema = fields.number(2), fields.number(2)
         topic, encoding = fields.text(), fields.text()
         name, form, text = self._schemas.get(schema, ("", "", b""))
         self._take(Channel(number, topic, canonical_type(name), encoding, form, text, fields.mapping()))
 
     def guess(self, number: int, payload: memoryview, library: str) -> Channel | None:
-        """Take a channel without a definition for what its message is; None where nothing tells."""
+        """Add the channel that a message without a definition seems to belong to; return None if it is unknown."""
         channel = guess_channel(number, payload, library)
         if channel is not None:
             self._take(channel)
@@ -56,7 +61,7 @@ _POSE, _ODOMETRY = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry"
 
 
 def guess_channel(number: int, payload: memoryview, library: str) -> Channel | None:
-    """The channel a message seems to be of, None where nothing tells."""
+    """Return the channel that a message seems to belong to, None if it is unknown."""
     if _is_cloud(payload):
         return Channel(number, f"/lost/channel_{number}", "sensor_msgs/msg/PointCloud2", "cdr")
     if library == LIBRARY and _is_whole(_POSE, payload, 7):
@@ -75,7 +80,7 @@ def _is_cloud(payload: memoryview) -> bool:
 
 
 def _is_whole(kind: str, payload: memoryview, doubles: int) -> bool:
-    """Does the message read as ``kind`` and end where that type ends?"""
+    """Return whether the message is valid as ``kind`` and has exactly the length of that type."""
     try:
         read_pose(kind, payload)
         cursor = Cursor(payload)
@@ -89,13 +94,13 @@ def _is_whole(kind: str, payload: memoryview, doubles: int) -> bool:
 
 
 _WINDOW = 1 << 20
-_MARGIN = 64  # a candidate is told by so many bytes behind its first
+_MARGIN = 64  # a candidate is recognised by at most so many bytes
 _MAX_CANDIDATES = 1_000_000
 _MESSAGE = re.compile(rb"(?=\x05[\s\S]{4}\x00{4}[\s\S]{2})")
 
 
 def is_chunk(file: ByteFile, at: int, stop: int) -> bool:
-    """Could a chunk record stand at ``at`` and end by ``stop``?"""
+    """Return whether a plausible chunk record begins at ``at`` and ends before ``stop``."""
     try:
         mcap.chunk_head(file.read_at_most(at, mcap.CHUNK_PREFIX), stop - at)
     except BadMessage:
@@ -104,13 +109,13 @@ def is_chunk(file: ByteFile, at: int, stop: int) -> bool:
 
 
 def begins_record(file: ByteFile, at: int) -> bool:
-    """Could a record of a known kind begin at ``at`` and end inside the file?"""
+    """Return whether a record with a known opcode begins at ``at`` and ends inside the file."""
     head = file.read_at_most(at, 9)
     return len(head) == 9 and 0 < head[0] < 16 and at + 9 + int.from_bytes(head[1:], "little") <= file.size
 
 
 def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
-    """Is a record of a private kind a chunk but for its first byte?"""
+    """Return whether a record with a private opcode is a chunk except for its first byte."""
     try:
         mcap.chunk_head(b"\x06" + file.read_at_most(at + 1, mcap.CHUNK_PREFIX - 1), end - at)
     except BadMessage:
@@ -119,12 +124,12 @@ def hides_chunk(file: ByteFile, at: int, end: int) -> bool:
 
 
 def first_chunk(file: ByteFile, at: int, last: int) -> int | None:
-    """The first place in [at, last) where a chunk may begin, wherever it ends."""
+    """Return the first offset in [at, last) where a chunk may begin, wherever it ends."""
     return _search(file, at, last, mcap.chunk_candidates, lambda place: is_chunk(file, place, file.size))
 
 
 def next_record(file: ByteFile, at: int, stop: int, channels: frozenset[int], chunked: bool) -> int | None:
-    """The next chunk in [at, stop); in a file without chunks the next message of a known channel."""
+    """Return the offset of the next chunk in [at, stop); without chunks, of the next message of a known channel."""
     if chunked:
         return _search(file, at, stop, mcap.chunk_candidates, lambda place: is_chunk(file, place, stop))
     return _search(file, at, stop, _messages, lambda place: _is_message(file, place, stop, channels))
@@ -135,7 +140,7 @@ def _messages(window: bytes) -> list[int]:
 
 
 def _is_message(file: ByteFile, at: int, stop: int, channels: frozenset[int]) -> bool:
-    """A message of a known channel behind which another record begins."""
+    """Return whether a message of a known channel is followed by another record."""
     head = file.read_at_most(at, 11)
     end = at + 9 + int.from_bytes(head[1:9], "little")
     if end > stop or end < at + 31 or int.from_bytes(head[9:11], "little") not in channels:
@@ -155,7 +160,7 @@ def _search(
         window = file.read_at_most(at, min(_WINDOW, stop - at) + _MARGIN)
         for place in candidates(window):
             tried += 1
-            if tried > _MAX_CANDIDATES:  # bytes made to look like records everywhere
+            if tried > _MAX_CANDIDATES:  # a file made to look like records everywhere
                 return None
             if at + place < stop and accept(at + place):
                 return at + place

@@ -26,21 +26,24 @@ from avsreplay.log.surface import parse_surface, read_surface
 from avsreplay.records import LogHeader, Surface
 
 
-def open_source(path: str | Path, options: SourceOptions | None = None, *, look: bool = False) -> Source:
+def open_source(path: str | Path, options: SourceOptions | None = None, *, inspect: bool = False) -> Source:
     """Open an MCAP file, a ROS 1 or 2 bag or a folder of scans.
 
     Args:
         path: the file or folder.
         options: how it is read.
-        look: open it also where there is no cloud topic, or several and none is asked for: it then has no scans.
+        inspect: also open a log without a cloud topic, or with several of which none was chosen; it has no scans then.
+
+    Returns:
+        The source; close it after use.
 
     Raises:
-        UnreadableInput: not there, empty, none of these, no cloud topic, or (``strict``) anything lost.
-        UsageError: several cloud topics and none asked for, or a topic asked for that is not there.
+        UnreadableInput: it does not exist, is empty, is of no known format, has no cloud topic, or (``strict``) is damaged.
+        UsageError: there are several cloud topics and none was chosen, or a requested topic or frame does not exist.
     """
     path, options = Path(path), options or SourceOptions()
     try:
-        source = _opened(path, options, look)
+        source = _opened(path, options, inspect)
     except OSError as error:
         raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
     try:
@@ -52,23 +55,23 @@ def open_source(path: str | Path, options: SourceOptions | None = None, *, look:
     return source
 
 
-def _opened(path: Path, options: SourceOptions, look: bool) -> Source:
+def _opened(path: Path, options: SourceOptions, inspect: bool) -> Source:
     if not path.exists():
         raise UnreadableInput("no such file", where=shown(path), hint="check the path")
-    if path.is_dir() and not is_bag_folder(path):
-        return open_folder(path, options)
+    if path.is_dir() and not _is_bag_folder(path):
+        return _open_folder(path, options)
     if not path.is_dir() and not path.is_file():
         raise UnreadableInput("neither a file nor a folder", where=shown(path), hint="give a log or a folder of scans")
-    return _messages(path, options, look)
+    return _messages(path, options, inspect)
 
 
-def _messages(path: Path, options: SourceOptions, look: bool) -> Source:
+def _messages(path: Path, options: SourceOptions, inspect: bool) -> Source:
     collected = MessageGuides(options)
-    recording = open_recording(path, options.max_message_mib << 20, collected.sinks())
+    recording = _open_recording(path, options.max_message_mib << 20, collected.sinks())
     try:
         topics = recording.topics()
         collected.check(topics, shown(path))
-        topic = _looked(recording, options, path) if look else _cloud_topic(recording, options, path)
+        topic = _optional_topic(recording, options, path) if inspect else _cloud_topic(recording, options, path)
         header, lost = _header(recording, options)
         guides = collected.guides()
         feed = MessageClouds(recording, topic)
@@ -85,7 +88,7 @@ def _named(topics: Sequence[TopicInfo], types: Sequence[str] = ()) -> str:
     return ", ".join(f"{shown(t.name)} ({shown(t.type)})" for t in chosen[:12]) + (", ..." if len(chosen) > 12 else "")
 
 
-def _looked(recording: Recording, options: SourceOptions, path: Path) -> str | None:
+def _optional_topic(recording: Recording, options: SourceOptions, path: Path) -> str | None:
     clouds = [t for t in recording.topics() if t.type in CLOUD_TYPES and t.count]
     return _cloud_topic(recording, options, path) if options.topic is not None or len(clouds) == 1 else None
 
@@ -134,12 +137,12 @@ def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tu
 
 
 def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
-    """The log's own model; one that is no model is a loss, and the log can still be run with another."""
+    """Return the model in the log; if it cannot be read it is a loss, and another model can be given."""
     try:
         found = recording.attachment()
         return (None if found is None else parse_surface(found[1], found[0])), []
     except (UnreadableInput, BadMessage) as error:
-        return None, [Loss(f"the model inside cannot be used: {shown(error)}", 0, 0)]
+        return None, [Loss(f"the model in the log cannot be read: {shown(error)}", 0, 0)]
 
 
 _STORAGE = (".mcap", ".db3")
@@ -147,15 +150,15 @@ _LISTED = re.compile(r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.
 _MAX_METADATA = 4 << 20
 
 
-def is_bag_folder(path: Path) -> bool:
-    """Does a folder hold a ROS 2 bag rather than scans?"""
+def _is_bag_folder(path: Path) -> bool:
+    """Return whether a folder contains a ROS 2 bag."""
     return path.is_dir() and any(p.suffix in (*_STORAGE, ".zstd") for p in path.iterdir())
 
 
-def open_recording(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
-    """Survey a log file by its first bytes, or all files of a bag's folder.
+def _open_recording(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
+    """Open a log file, whose first bytes tell the format, or all files of the folder of a bag.
 
-    Raises UnreadableInput where it is not there, empty or no log.
+    Raises UnreadableInput if it does not exist, is empty or is not a log.
     """
     return _folder(path, limit, sinks) if path.is_dir() else _file(path, limit, sinks)
 
@@ -175,7 +178,7 @@ def _file(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
     if head.startswith(b"\x28\xb5\x2f\xfd"):
         raise UnreadableInput("a zstd-compressed file", where=shown(path), hint="unpack it first: zstd -d")
     if not head.startswith(MAGIC) and path.suffix.lower() in (".ply", ".pcd", ".bin", ".npy", ".npz"):
-        raise UnreadableInput("one scan, not a log", where=shown(path), hint="give the folder it is in")
+        raise UnreadableInput("a single scan, not a log", where=shown(path), hint="give the folder it is in")
     return McapFile(path, limit, sinks)
 
 
@@ -189,12 +192,12 @@ def _folder(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
             part.close()
         raise
     if not parts:
-        raise UnreadableInput("none of the bag's files is there", where=shown(path), hint="check its metadata.yaml")
+        raise UnreadableInput("none of the files of the bag exists", where=shown(path), hint="check its metadata.yaml")
     return Merged(parts, "ros2 bag", losses)
 
 
 def _files(path: Path) -> tuple[list[Path], list[Loss]]:
-    """The bag's files in order, and a loss for each that its metadata names and that is not there."""
+    """Return the files of a bag in order, and a loss for each file in its metadata that is missing."""
     there = sorted((p for p in path.iterdir() if p.suffix in _STORAGE), key=lambda p: by_number(p.name))
     metadata = path / "metadata.yaml"
     if not metadata.is_file():
@@ -202,7 +205,7 @@ def _files(path: Path) -> tuple[list[Path], list[Loss]]:
     text = metadata.read_bytes()[:_MAX_METADATA].decode("utf-8", "backslashreplace")
     listed = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
     losses = [
-        Loss("a file that the bag's metadata names is not there", 0, 0, file=name)
+        Loss("a file named in the metadata of the bag is missing", 0, 0, file=name)
         for name in listed
         if not (path / name).is_file()
     ]
@@ -218,16 +221,16 @@ _TIME_FILE = "times.txt"
 _STAMPED = re.compile(r"^\d{9,10}\.\d+$|^\d{16,19}$")
 
 
-def open_folder(path: Path, options: SourceOptions) -> Source:
-    """A folder of scans as a source.
+def _open_folder(path: Path, options: SourceOptions) -> Source:
+    """Open a folder of scans.
 
-    Scans are in the order of the numbers in their names; with a ``.conf`` only those it names. Their times are, the
-    first that is there: ``times.txt`` (a time [s] a line), names that are times, the times of a pose file with one
-    line a scan, else ``rate_hz``.
+    Scans are ordered by the numbers in their names; with a ``.conf`` file only those that it names are used. Their
+    times are taken from the first of: ``times.txt`` (one time [s] per line), file names that are times, a pose file
+    with one line per scan, ``rate_hz``.
 
     Raises:
-        UnreadableInput: no scans, or a pose or time file that cannot be read.
-        UsageError: a topic was asked for, or several pose files are there and none was named.
+        UnreadableInput: there are no scans, or a pose or time file cannot be read.
+        UsageError: a topic was requested, or there are several pose files and none was chosen.
     """
     for flag, value in (("--topic", options.topic), ("--truth-topic", options.truth_topic)):
         if value is not None:

@@ -1,4 +1,4 @@
-"""What may be asked of a source, and what it says of itself and of what it lost."""
+"""Options for reading a source, and the description of a source and of its losses."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from avsreplay.settings import Settings, setting
 
 
 class ClockChoice(Enum):
-    """Which clock ``Scan.t_ns`` is on."""
+    """The clock of ``Scan.t_ns``."""
 
-    HEADER = "header"  # the stamp in the message, judged against the recorder's clock
-    LOG = "log"  # when the recorder received the message
-    PUBLISH = "publish"  # when the sender published it, where the recorder kept that
+    HEADER = "header"  # the stamp in the message, checked against the clock of the recorder
+    LOG = "log"  # time of reception by the recorder
+    PUBLISH = "publish"  # time of publication, if the recorder stored it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +74,7 @@ class SourceOptions(Settings):
 
     @property
     def window_s(self) -> tuple[float, float]:
-        """[start, end) after the first scan [s]."""
+        """Return the window [start, end) after the first scan [s]."""
         start = self.start_s if self.start_s is not None else (self.start_offset_s or 0.0)
         end = float("inf") if self.end_s is None else self.end_s
         return start, min(end, start + self.duration_s) if self.duration_s is not None else end
@@ -85,9 +85,13 @@ class Loss:
     """A part of a log that could not be read.
 
     Attributes:
-        what: one clause.  offset: byte of the file it begins at.  bytes: how many are lost.
-        chunks: chunks lost.  messages: messages lost, None where nothing tells.
-        start_ns, end_ns: span of the log clock, None where nothing tells.  file: name, where there are several.
+        what: the cause.
+        offset: offset in the file at which the loss begins.
+        bytes: number of bytes lost.
+        chunks: number of chunks lost.
+        messages: number of messages lost, None if unknown.
+        start_ns, end_ns: time span on the log clock, None if unknown.
+        file: name of the file, if there are several.
     """
 
     what: str
@@ -102,7 +106,7 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class TopicInfo:
-    """A topic of a log: name, message type, encoding, how many messages, first and last on the log clock [ns]."""
+    """A topic of a log with its message type, encoding and count, and its first and last time on the log clock [ns]."""
 
     name: str
     type: str
@@ -113,7 +117,7 @@ class TopicInfo:
 
     @property
     def rate_hz(self) -> float | None:
-        """Mean rate over the topic's span, None below two messages or without a span."""
+        """Return the mean rate [Hz], None with fewer than two messages or no time span."""
         if self.count < 2 or self.first_ns is None or self.last_ns is None or self.last_ns <= self.first_ns:
             return None
         return (self.count - 1) / ((self.last_ns - self.first_ns) * 1e-9)
@@ -121,13 +125,16 @@ class TopicInfo:
 
 @dataclass(frozen=True, slots=True)
 class ClockSummary:
-    """How the scans' instants were found.
+    """How the times of the scans were determined.
 
     Attributes:
-        clock: the clock of ``Scan.t_ns``.  scans: scans judged.
-        offset_s: median of header minus log clock.  period_s: median spacing.
-        unset, jumps, equal, back: scans placed by the log's clock, by cause.
-        header_steps, log_steps: lasting steps of either clock that were followed.
+        clock: the clock of ``Scan.t_ns``.
+        scans: number of scans.
+        offset_s: median of header clock minus log clock [s].
+        period_s: median time between scans [s].
+        unset, jumps, equal, back: number of scans whose time was taken from the log clock, by cause.
+        header_steps, log_steps: number of permanent steps of either clock that were compensated.
+        note: a remark on the choice of the clock.
     """
 
     clock: str
@@ -144,17 +151,29 @@ class ClockSummary:
 
     @property
     def placed(self) -> int:
-        """Scans whose own stamp was not used."""
+        """Return the number of scans whose own stamp was not used."""
         return self.unset + self.jumps + self.equal + self.back
 
 
 @dataclass(frozen=True, slots=True)
 class LogInfo:
-    """What ``avsreplay info`` prints.
+    """The description of a source that ``avsreplay info`` prints.
 
     Attributes:
-        kind: mcap, ros2 bag, ros1 bag, folder.  profile, library: what an MCAP file says of its writer.
-        faults: (kind, start [s], end [s], harmful), times after the log's start.
+        path: path of the source.
+        kind: mcap, ros2 bag, ros1 bag or folder.
+        bytes: size of its files.
+        topics: all topics.
+        start_ns, end_ns: first and last time on the log clock.
+        cloud_topic, scans: the cloud topic and its number of clouds.
+        profile, library: what an MCAP file states about its use and its writer.
+        model, model_vertices, model_faces, model_extent_m: name, size and extent [m] of the model.
+        scenario, seed: whether the log was simulated, and the seed.
+        truth: whether true poses are known.
+        faults: (kind, start, end [s after the start of the log], harmful) of the injected faults.
+        clock: how the times of the scans were determined.
+        losses: parts that could not be read.
+        notes: further remarks by name.
     """
 
     path: str
@@ -181,7 +200,7 @@ class LogInfo:
 
     @property
     def span_s(self) -> float | None:
-        """Length of the log [s]."""
+        """Return the length of the log [s], None if it has no messages."""
         if self.start_ns is None or self.end_ns is None:
             return None
         return (self.end_ns - self.start_ns) * 1e-9

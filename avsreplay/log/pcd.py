@@ -1,7 +1,7 @@
-"""PCD: ascii, binary and binary_compressed (LZF), with any fields.
+"""Reading of PCD files: ascii, binary and binary_compressed (LZF), with any fields.
 
-Own, because a PCD whose compressed part writes past its end, or whose header promises 2^40 points, must cost nothing:
-every size is held against the bytes that are there.
+No library is used because every declared size must be checked against the bytes of the file before memory is
+allocated, also inside the compressed part.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from avsreplay.log.bytes_io import BadFile
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _MAX_HEADER = 1 << 16
-_MAX_RATIO = 256  # LZF cannot do better than 264 bytes for 3
+_MAX_RATIO = 256  # three bytes of LZF decompress to at most 264
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class _Header:
 
     @property
     def row(self) -> np.dtype[Any]:
-        """One point of a binary file; fields that are not x, y, z keep their place only."""
+        """Return the numpy type of one point of a binary file."""
         fields = [
             (f"{name}_{i}" if name not in "xyz" else name, "<" + kind, (count,) if count > 1 else ())
             for i, (name, kind, count) in enumerate(zip(self.names, self.kinds, self.counts, strict=True))
@@ -39,7 +39,10 @@ class _Header:
 
 
 def read_pcd(data: bytes) -> NDArray[Any]:
-    """(n, 3) points, NaN where the sensor saw nothing, float32 or float64. Raises BadFile with the reason."""
+    """Return the (n, 3) points of a PCD file, float32 or float64, NaN where the sensor had no return.
+
+    Raises BadFile if the file is malformed; the text states why.
+    """
     header = _header(data)
     for axis in "xyz":
         if header.names.count(axis) != 1 or header.counts[header.names.index(axis)] != 1:
@@ -132,12 +135,12 @@ def _compressed(data: bytes, header: _Header) -> list[NDArray[Any]]:
     if packed > len(data) - at - 8:
         raise BadFile(f"a compressed part of {packed} bytes in {len(data) - at - 8} bytes")
     if size != header.points * header.row.itemsize or size > packed * _MAX_RATIO:
-        raise BadFile(f"a compressed part that promises {size} bytes")
+        raise BadFile(f"a compressed part that declares {size} bytes")
     raw = unpack_lzf(data[at + 8 : at + 8 + packed], size)
     out, start = [], dict[str, int]()
     place = 0
     for name, kind, count in zip(header.names, header.kinds, header.counts, strict=True):
-        start[name] = place  # fields stand one after another, not point by point
+        start[name] = place  # the values are stored field by field, not point by point
         place += header.points * count * int(kind[1:])
     for axis in "xyz":
         kind = header.kinds[header.names.index(axis)]
@@ -150,13 +153,13 @@ def _float(kind: str) -> str:
 
 
 def unpack_lzf(packed: bytes, size: int) -> bytes:
-    """LibLZF's format. Raises BadFile where it refers before its start, past its end, or gives other than ``size``."""
+    """Decompress LZF data to exactly ``size`` bytes. Raises BadFile if the data is malformed."""
     out = bytearray()
     at, end = 0, len(packed)
     while at < end:
         control = packed[at]
         at += 1
-        if control < 32:  # a run of literals
+        if control < 32:  # a sequence of literal bytes
             out += packed[at : at + control + 1]
             at += control + 1
             continue
@@ -172,7 +175,7 @@ def unpack_lzf(packed: bytes, size: int) -> bytes:
         if len(out) > size:
             break
     if len(out) != size or at > end:
-        raise BadFile(f"a compressed part that does not give the {size} bytes it promises")
+        raise BadFile(f"a compressed part that does not decompress to the {size} bytes it declares")
     return bytes(out)
 
 

@@ -1,7 +1,7 @@
-"""PLY: ascii and both binary orders; elements and properties that are not asked for are passed over.
+"""Reading of PLY files: ascii and both binary byte orders; unknown elements and properties are skipped.
 
-Own, because the scans at hand carry a ``range_grid`` element that readers made for meshes stop at, and because a
-header may promise 2^32 vertices: every count is checked against the bytes that are there before memory is taken.
+No library is used because the Stanford scans have a ``range_grid`` element that mesh readers do not support, and
+because every declared count must be checked against the bytes of the file before memory is allocated.
 """
 
 from __future__ import annotations
@@ -42,17 +42,18 @@ class _Element:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ply:
-    """What was read: vertex columns by name, and faces as vertex lists cut into triangles.
+    """The content of a PLY file.
 
     Attributes:
-        vertex: one array of n a property, in the file's type.  faces: (m, 3) int64.
+        vertex: one array (n,) for each vertex property, in the type of the file.
+        faces: triangles (m, 3) of vertex indices; polygons are split.
     """
 
     vertex: dict[str, NDArray[Any]]
     faces: NDArray[np.int64]
 
     def points(self) -> NDArray[Any]:
-        """(n, 3) coordinates in the file's type. Raises BadFile where x, y or z is missing."""
+        """Return the (n, 3) coordinates in the type of the file. Raises BadFile if x, y or z is missing."""
         missing = [axis for axis in "xyz" if axis not in self.vertex]
         if missing:
             raise BadFile(f"its vertices have no '{missing[0]}'")
@@ -60,7 +61,7 @@ class Ply:
 
 
 def read_ply(data: bytes) -> Ply:
-    """Parse a PLY file. Raises BadFile with the reason."""
+    """Parse the bytes of a PLY file. Raises BadFile if it is malformed; the text states why."""
     order, elements, start = _header(data)
     vertex: dict[str, NDArray[Any]] = {}
     faces = np.zeros((0, 3), dtype=np.int64)
@@ -112,7 +113,7 @@ def _element(words: list[str], limit: int) -> _Element:
         raise BadFile(f"unreadable line '{' '.join(words)[:60]}'")
     size = int(words[2][:20])
     if size > limit:
-        raise BadFile(f"promises {size} {words[1]} elements in a file of {limit} bytes")
+        raise BadFile(f"declares {size} {words[1]} elements in a file of {limit} bytes")
     return _Element(words[1], size, [])
 
 
@@ -126,7 +127,7 @@ def _property(words: list[str]) -> _Property:
 
 
 class _Text:
-    """The body of an ascii file, line by line."""
+    """The body of an ascii file."""
 
     def __init__(self, body: bytes) -> None:
         self._lines = body.splitlines()
@@ -201,7 +202,7 @@ class _Binary:
         return {p.name: table[p.name].astype(p.kind) for p in element.properties}
 
     def lists(self, element: _Element) -> list[NDArray[np.int64]]:
-        """The first list of each element; equal lengths, the common case, are read at one go."""
+        """Return the first list of each element; lists of equal length, the common case, are read at once."""
         same = self._uniform(element)
         if same is not None:
             return list(same)
@@ -241,7 +242,7 @@ class _Binary:
 
 
 def _triangles(lists: list[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Polygons as fans of triangles."""
+    """Split polygons into fans of triangles."""
     if lists and all(len(face) == 3 for face in lists):
         return np.stack(lists)
     out = [(face[0], face[i], face[i + 1]) for face in lists for i in range(1, len(face) - 1)]

@@ -1,4 +1,4 @@
-"""sensor_msgs/PointCloud2 into points: strided views where the layout allows, any layout otherwise."""
+"""Decoding of sensor_msgs/PointCloud2 with any layout; without a copy where the layout allows it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _TIME_NAMES = ("t", "time", "timestamp", "time_offset", "offset_time")
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """A PointField: name, byte offset, numpy kind (``f4``), count."""
+    """A PointField: name, byte offset, numpy type (``f4``) and count."""
 
     name: str
     offset: int
@@ -29,11 +29,16 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """A cloud before its bytes are looked at.
+    """The description of a cloud and its undecoded points.
 
     Attributes:
-        stamp_ns: header stamp.  frame: header frame.  shape: (height, width).  order: ``<`` or ``>``.
-        point_step, row_step: bytes.  data: the cloud's bytes.
+        stamp_ns: header stamp [ns].
+        frame: header frame.
+        shape: (height, width).
+        fields: the fields of a point.
+        order: byte order, ``<`` or ``>``.
+        point_step, row_step: distance between points and between rows [bytes].
+        data: the points.
     """
 
     stamp_ns: int
@@ -46,7 +51,7 @@ class Layout:
     data: memoryview
 
     def column(self, name: str) -> NDArray[Any]:
-        """(height, width) view of one field in the message's byte order. Raises BadMessage where it is not there."""
+        """Return a (height, width) view of one field. Raises BadMessage if the cloud has no such field."""
         field = next((f for f in self.fields if f.name == name), None)
         if field is None:
             raise BadMessage(f"no field '{name}' among {', '.join(f.name for f in self.fields) or 'none'}")
@@ -56,7 +61,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """Points as decoded: (n, 3) finite in the frame of the message, per-point times [s] after the stamp or None."""
+    """A decoded cloud: finite points (n, 3) [m] in ``frame``, times (n,) [s] after the stamp or None."""
 
     stamp_ns: int
     frame: str
@@ -66,7 +71,15 @@ class Cloud:
 
 
 def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
-    """A cloud with its non-finite points left out. Raises BadMessage with the reason."""
+    """Decode a cloud without its non-finite points.
+
+    Args:
+        payload: the serialised message.
+        encoding: ``cdr`` or ``ros1``.
+
+    Raises:
+        BadMessage: the message is malformed; the text states why.
+    """
     layout = read_layout(payload, encoding)
     if 0 in layout.shape:
         return Cloud(layout.stamp_ns, layout.frame, np.zeros((0, 3), np.float32), None, 0)
@@ -81,13 +94,13 @@ def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
 
 
 def _surely_finite(points: NDArray[Any]) -> bool:
-    """A finite sum has finite terms; it takes a third of the time of looking at each."""
+    """Return True if the sum of the coordinates is finite; this is three times faster than testing each of them."""
     with np.errstate(invalid="ignore", over="ignore"):
         return bool(np.isfinite(points.sum(dtype=np.float64)))
 
 
 def read_layout(payload: bytes | memoryview, encoding: str = "cdr") -> Layout:
-    """Parse and check a message without touching its points. Raises BadMessage with the reason."""
+    """Parse and check a message without decoding its points. Raises BadMessage if it is malformed."""
     cursor = Cursor(payload, encoding)
     stamp_ns, frame = cursor.header()
     height, width = cursor.u32(), cursor.u32()
@@ -95,7 +108,7 @@ def read_layout(payload: bytes | memoryview, encoding: str = "cdr") -> Layout:
     order = ">" if cursor.u8() else "<"
     point_step, row_step = cursor.u32(), cursor.u32()
     data = cursor.octets()
-    if height == 1 or row_step == 0:  # writers leave row_step unset where there is one row
+    if height == 1 or row_step == 0:  # some writers leave row_step unset if there is one row
         row_step = width * point_step
     layout = Layout(stamp_ns, frame, (height, width), fields, order, point_step, row_step, data)
     if height and width:
@@ -133,7 +146,7 @@ def _check(layout: Layout) -> None:
 
 
 def _points(layout: Layout) -> NDArray[Any]:
-    """(n, 3) float32 or float64; a view where x, y, z stand side by side in native order."""
+    """Return the points (n, 3), float32 or float64; a view if x, y and z are adjacent and in native byte order."""
     x, y, z = (layout.column(axis) for axis in "xyz")
     size = x.dtype.itemsize
     bases = [next(f.offset for f in layout.fields if f.name == axis) for axis in "xyz"]
@@ -147,7 +160,7 @@ def _points(layout: Layout) -> NDArray[Any]:
 
 
 def _times(layout: Layout) -> NDArray[np.float32] | None:
-    """Seconds after the stamp: floats are seconds, whole numbers nanoseconds, large doubles absolute seconds."""
+    """Return times [s] after the stamp: floats are seconds, integers nanoseconds, large doubles absolute seconds."""
     names = {f.name for f in layout.fields}
     if {"time_sec", "time_nsec"} <= names:
         seconds = layout.column("time_sec").reshape(-1).astype(np.int64) * 1_000_000_000
@@ -164,6 +177,6 @@ def _times(layout: Layout) -> NDArray[np.float32] | None:
 
 
 def _relative(times_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[np.float32]:
-    """Nanoseconds, absolute where they are large, to seconds after the stamp."""
+    """Convert nanoseconds to seconds after the stamp; large values are absolute times."""
     absolute = len(times_ns) > 0 and abs(int(times_ns[0])) > 10**15
     return ((times_ns - (stamp_ns if absolute else 0)) * 1e-9).astype(np.float32)

@@ -24,14 +24,14 @@ _MAX_BYTES = 256 << 20
 
 @dataclass(frozen=True, slots=True)
 class TimedPoses:
-    """Poses in the file's order, with their instants where the format has them."""
+    """Poses in file order, with their times [ns] if the format has times."""
 
     poses: tuple[Pose, ...]
     t_ns: tuple[int, ...] | None
 
 
 def read_poses(path: Path) -> TimedPoses:
-    """Read a pose file; the first line tells the format. Raises UnreadableInput with file and line."""
+    """Read a pose file; each line tells its format. Raises UnreadableInput with file and line."""
     poses, times = list[Pose](), list[int]()
     for where, words, commas in _lines(path):
         t_ns, pose = _line(words, commas, where)
@@ -41,12 +41,12 @@ def read_poses(path: Path) -> TimedPoses:
     if not poses:
         raise UnreadableInput("no pose in this file", where=shown(path), hint="give TUM, KITTI or EuRoC poses")
     if times and len(times) != len(poses):
-        raise UnreadableInput("some lines have a time and some have none", where=shown(path), hint="check the file")
+        raise UnreadableInput("some lines have a time and others do not", where=shown(path), hint="check the file")
     return TimedPoses(tuple(poses), tuple(times) or None)
 
 
 def read_times(path: Path) -> list[int]:
-    """One time [s] a line, as [ns]. Raises UnreadableInput with file and line."""
+    """Read a file with one time [s] per line; return [ns]. Raises UnreadableInput with file and line."""
     out = []
     for where, words, _ in _lines(path):
         t_ns = seconds_to_ns(words[0])
@@ -57,7 +57,7 @@ def read_times(path: Path) -> list[int]:
 
 
 def seconds_to_ns(text: str) -> int | None:
-    """Decimal seconds to nanoseconds without a detour through binary fractions; None where it is no number."""
+    """Convert decimal seconds to nanoseconds without rounding to a binary fraction; None if it is not a number."""
     try:
         value = Decimal(text)
         return int((value * 1_000_000_000).to_integral_value()) if abs(value) < 9_000_000_000 else None
@@ -66,7 +66,7 @@ def seconds_to_ns(text: str) -> int | None:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
-    """(where, words, were there commas) of each line that says something."""
+    """Yield (file and line, words, whether it has commas) of each line that is not empty or a comment."""
     try:
         if path.stat().st_size > _MAX_BYTES:
             raise UnreadableInput("larger than 256 MiB, not a pose file", where=shown(path), hint="check the file")
@@ -113,7 +113,7 @@ _MAX_CONF_BYTES = 16 << 20
 
 
 def read_conf(path: Path) -> dict[str, Pose]:
-    """T_ac of each scan by file name. Raises UnreadableInput for a line that cannot be read."""
+    """Read a ``.conf`` file: T_ac of each scan by file name. Raises UnreadableInput with file and line."""
     try:
         raw = path.read_bytes()[: _MAX_CONF_BYTES + 1]
     except OSError as error:

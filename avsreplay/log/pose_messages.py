@@ -22,7 +22,7 @@ _MAX_TRANSFORMS = 4096
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """A stamped pose of ``child`` in ``parent``: seven numbers x y z qx qy qz qw, and a twist where there is one."""
+    """A stamped pose of ``child`` in ``parent``: x y z [m] qx qy qz qw, and the twist of an Odometry message."""
 
     t_ns: int
     parent: str
@@ -32,19 +32,19 @@ class Transform:
 
 
 def read_pose(kind: str, payload: bytes | memoryview, encoding: str = "cdr") -> Transform:
-    """A pose of one of ``POSE_TYPES``. Raises BadMessage where it is cut, not finite, or no unit quaternion."""
+    """Decode a message of ``POSE_TYPES``. Raises BadMessage if it is cut or is not a valid pose."""
     return checked(POSE_TYPES[kind](Cursor(payload, encoding)))
 
 
 def checked(out: Transform) -> Transform:
-    """The transform itself. Raises BadMessage where it is not finite or its quaternion not of unit length."""
+    """Return the transform. Raises BadMessage if it is not finite or its quaternion is far from unit length."""
     if not all(map(math.isfinite, out.pose)) or not 0.5 < math.hypot(*out.pose[3:]) < 2.0:
-        raise BadMessage("a pose that is no pose")
+        raise BadMessage("a pose that is not finite or has no unit quaternion")
     return out
 
 
 def read_transforms(payload: bytes | memoryview, encoding: str = "cdr") -> list[Transform]:
-    """The transforms of a TFMessage. Raises BadMessage."""
+    """Return the transforms of a TFMessage. Raises BadMessage if it is malformed."""
     cursor = Cursor(payload, encoding)
     count = cursor.u32()
     if count > _MAX_TRANSFORMS:
@@ -80,11 +80,11 @@ POSE_TYPES: dict[str, Callable[[Cursor], Transform]] = {
 
 
 class PoseTrack:
-    """Poses x y z qx qy qz qw, with a twist where there is one, by time.
+    """Poses and, if known, twists by time; exact at the stamps, interpolated within a maximum gap, None elsewhere.
 
     Args:
-        gap_s: widest gap between two poses that is interpolated across.
-        by_log: the instants are the log clock's, not the stamps'.
+        gap_s: widest gap between two poses across which is interpolated [s].
+        by_log: use the times of the log clock instead of the stamps.
     """
 
     def __init__(self, gap_s: float, by_log: bool = False) -> None:
@@ -99,7 +99,7 @@ class PoseTrack:
         return len(self._times)
 
     def take(self, kind: str, encoding: str, log_ns: int, payload: bytes | memoryview) -> None:
-        """Add a pose message (a Sink); one that cannot be read is counted in ``damaged``."""
+        """Add a pose message (a Sink); one that cannot be decoded is counted in ``damaged``."""
         try:
             found = read_pose(kind, payload, encoding)
         except BadMessage:
@@ -110,18 +110,18 @@ class PoseTrack:
         self.add(log_ns if self._by_log or unset else found.t_ns, found.pose, found.twist)
 
     def add(self, t_ns: int, pose: tuple[float, ...], twist: tuple[float, ...] | None = None) -> None:
-        """Add a pose of seven numbers and, where there is one, a twist of six."""
+        """Add a pose x y z qx qy qz qw and, if known, a twist (linear, angular)."""
         self._times.append(t_ns)
         self._values.extend((*pose, *(twist or (float("nan"),) * 6)))
         self._order = None
 
     def pose(self, t_ns: int) -> Pose | None:
-        """The pose at an instant, None outside the track or inside too wide a gap."""
+        """Return the pose at ``t_ns``, None outside the track or inside too wide a gap."""
         row = self._at(t_ns)
         return None if row is None else Pose(row[3:7], row[:3])
 
     def body(self, t_ns: int, constants: State) -> State | None:
-        """The full state from a track of {B} with twists in {B}; sigma, varrho and mu are ``constants``'."""
+        """Return the full state from poses of {B} in {A} and twists in {B}; ``constants`` gives sigma, c_b and q_bc."""
         row = self._at(t_ns)
         if row is None or not np.isfinite(row[7:]).all():
             return None
@@ -162,10 +162,11 @@ _TF_TYPES = (TF_TYPE, "tf/msg/tfMessage")
 
 
 class TfBuffer:
-    """The transforms of a log.
+    """The transform tree of a log.
 
     Args:
-        gap_s: widest gap between two transforms that is interpolated across.  by_log: times are the log clock's.
+        gap_s: widest gap between two transforms across which is interpolated [s].
+        by_log: use the times of the log clock instead of the stamps.
     """
 
     def __init__(self, gap_s: float, by_log: bool = False) -> None:
@@ -176,7 +177,7 @@ class TfBuffer:
         self.damaged = 0
 
     def sink(self, static: bool) -> Sink:
-        """Who takes the messages of /tf (or, ``static``, of /tf_static)."""
+        """Return the sink for the messages of /tf or, if ``static``, of /tf_static."""
 
         def take(kind: str, encoding: str, log_ns: int, payload: bytes | memoryview) -> None:
             if kind not in _TF_TYPES:
@@ -201,11 +202,11 @@ class TfBuffer:
         track.add(log_ns if self._by_log else transform.t_ns, transform.pose)
 
     def frames(self) -> list[str]:
-        """Every frame that a transform names."""
+        """Return the names of all frames."""
         return sorted({*self._parents, *self._parents.values()})
 
     def pose(self, parent: str, child: str, t_ns: int) -> Pose | None:
-        """T_parent_child at an instant, None where the frames are not joined or the gap is too wide."""
+        """Return T_parent_child at ``t_ns``, None if the frames are not connected or the gap is too wide."""
         up, down = self._to_root(parent.lstrip("/"), t_ns), self._to_root(child.lstrip("/"), t_ns)
         for frame, to_frame in up:
             for other, from_frame in down:
@@ -214,7 +215,7 @@ class TfBuffer:
         return None
 
     def _to_root(self, frame: str, t_ns: int) -> list[tuple[str, Pose]]:
-        """(ancestor, T_ancestor_frame) from the frame itself up to its root, or to where the chain breaks."""
+        """Return (ancestor, T_ancestor_frame) from the frame itself to the root, or to the first missing transform."""
         out, pose = [(frame, Pose.identity())], Pose.identity()
         while frame in self._parents and len(out) <= len(self._parents):
             step = self._static[frame] if frame in self._static else self._moving[frame].pose(t_ns)

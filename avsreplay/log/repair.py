@@ -1,4 +1,4 @@
-"""A clean file from a damaged one: every intact record, nothing else, in a structure that all readers open."""
+"""Repair of an MCAP file: every intact record is copied to a new file that all readers open."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CHUNK_BYTES = 1 << 20
 
 @dataclass(slots=True)
 class Repaired:
-    """What a repair kept and left out."""
+    """Number of records that a repair copied, and the ones that it left out."""
 
     messages: int = 0
     attachments: int = 0
@@ -30,7 +30,7 @@ class Repaired:
 
 
 class _Copier:
-    """Writes what the survey of the damaged file hands it; a Tap."""
+    """A RecordSink that writes the records to a new file."""
 
     def __init__(self, stream: BinaryIO, profile: str) -> None:
         from mcap.writer import Writer
@@ -42,7 +42,7 @@ class _Copier:
         self._channels: dict[int, int] = {}
 
     def message(self, channel: Channel, sequence: int, times: tuple[int, int], payload: memoryview) -> None:
-        """Copy a message, unless it is a cloud that cannot be decoded or its time is past what readers take."""
+        """Copy a message, unless it is a cloud that cannot be decoded or its time is beyond 2^63 ns."""
         if channel.type in CLOUD_TYPES:
             try:
                 decode_cloud(payload, channel.encoding)
@@ -57,7 +57,7 @@ class _Copier:
         self.done.messages += 1
 
     def attachment(self, name: str, media: str, times: tuple[int, int], data: memoryview) -> None:
-        """Copy an attachment, unless it is a model that cannot be used."""
+        """Copy an attachment, unless it is a model file that cannot be read."""
         if name.lower().endswith(MODEL_ENDINGS):
             try:
                 parse_surface(bytes(data), name)
@@ -68,7 +68,7 @@ class _Copier:
         self.done.attachments += 1
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """Copy a metadata record, unless it is a header of ours whose checksum does not hold."""
+        """Copy a metadata record, unless it is the avsreplay header with a wrong checksum."""
         if name == HEADER_RECORD:
             try:
                 decode_header(values)
@@ -79,7 +79,7 @@ class _Copier:
         self.done.records += 1
 
     def finish(self) -> None:
-        """Write the index and the end."""
+        """Write the index and the footer."""
         self._writer.finish()
 
     def _channel(self, channel: Channel) -> int:
@@ -93,10 +93,19 @@ class _Copier:
 
 
 def repair(path: Path, output: Path, *, overwrite: bool = False, max_message_mib: int = 128) -> Repaired:
-    """Write every intact record of an MCAP file to ``output``.
+    """Write every intact record of an MCAP file to a new file.
+
+    Args:
+        path: the damaged file.
+        output: the new file.
+        overwrite: replace an existing output.
+        max_message_mib: largest message, chunk or attachment that is copied [MiB].
+
+    Returns:
+        The number of records copied and a list of those left out.
 
     Raises:
-        UsageError: the output exists, is the input, or the input is no MCAP file.
+        UsageError: the output exists or is the input, or the input is not an MCAP file.
         UnreadableInput: the input cannot be opened, or the output cannot be written.
     """
     _check(path, output, overwrite)
@@ -106,7 +115,7 @@ def repair(path: Path, output: Path, *, overwrite: bool = False, max_message_mib
     try:
         with partial.open("wb") as stream:
             copier = _Copier(stream, probe.profile)
-            McapFile(path, max_message_mib << 20, tap=copier).close()
+            McapFile(path, max_message_mib << 20, copy_to=copier).close()
             copier.finish()
         partial.replace(output)
     except OSError as error:
@@ -126,5 +135,5 @@ def _check(path: Path, output: Path, overwrite: bool) -> None:
         hint = "name another output" if output.samefile(path) else "name another output or add --overwrite"
         raise UsageError("exists already", where=shown(output), hint=hint)
     if not is_mcap(path):
-        hint = "take it over with 'avsreplay record' instead"
+        hint = "convert it with 'avsreplay record' instead"
         raise UsageError("only MCAP files are repaired", where=shown(path), hint=hint)

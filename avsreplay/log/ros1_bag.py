@@ -1,7 +1,7 @@
 """Reading of ROS 1 bags (format 2.0) by one linear pass, so that a bag without an index or cut short is read as well.
 
-Own, not rosbags: that reader wants a whole index and reserves what lengths promise. The format has no checksums; what
-tells of damage is a frame that does not fit and a compressed chunk that does not inflate.
+The rosbags library is not used because it requires an intact index and allocates the lengths that the file declares.
+The format has no checksums: damage shows as inconsistent lengths or as a chunk that cannot be decompressed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
 
 @dataclass(frozen=True, slots=True)
 class _Record:
-    """A record's fields and where its data stand in its container."""
+    """The header fields of a record and the position of its data."""
 
     op: int
     fields: dict[str, bytes]
@@ -39,21 +39,22 @@ class _Record:
         return self.data_at + self.data_size
 
     def number(self, name: str) -> int:
-        """A little-endian field. Raises BadMessage where it is missing."""
+        """Return a little-endian field. Raises BadMessage if it is missing or too long."""
         if name not in self.fields or len(self.fields[name]) > 8:
-            raise BadMessage(f"a record without a sound '{name}'")
+            raise BadMessage(f"a record without a valid '{name}'")
         return int.from_bytes(self.fields[name], "little")
 
 
 class Ros1Bag(Recording):
-    """One ROS 1 bag, surveyed.
+    """One ROS 1 bag, indexed on construction.
 
     Args:
-        path: the file.  limit: most bytes a message or chunk may take.
-        sinks: who takes the messages of a topic while the survey passes over them.
+        path: the file.
+        limit: largest message or chunk that is read [bytes].
+        sinks: called with every message of a topic during the pass.
 
     Raises:
-        UnreadableInput: not there or not to be read.
+        UnreadableInput: the file does not exist or cannot be read.
     """
 
     kind = "ros1 bag"
@@ -82,12 +83,18 @@ class Ros1Bag(Recording):
         if len(self.losses) >= _MAX_LOSSES:
             self._lose(Loss("damaged at too many places: the rest is not read", at, end - at))
         if stop is None:
-            self._lose(Loss("the bag was not closed: what its recorder still held is lost", self._file.size, 0))
+            self._lose(
+                Loss(
+                    "the bag was not closed: messages that its recorder had not yet written are lost",
+                    self._file.size,
+                    0,
+                )
+            )
         if self._orphans:
             self._lose(Loss("messages of a connection whose definition is lost", 0, 0, messages=self._orphans))
 
     def _index_at(self) -> int | None:
-        """Where the index begins, None where the bag was not closed or its head is damaged."""
+        """Return the offset of the index, None if the bag was not closed or its header is damaged."""
         try:
             head = self._record(len(ROS1_MAGIC))
             place = head.number("index_pos") if head.op == _BAG else 0
@@ -96,7 +103,7 @@ class Ros1Bag(Recording):
         return place if head.end <= place < self._file.size else None
 
     def _adopt(self, at: int | None) -> None:
-        """Connections from the index, in case the chunk that defines them is lost."""
+        """Add the connections of the index, in case the chunk that defines them is lost."""
         while at is not None and at < self._file.size:
             try:
                 record = self._record(at)
@@ -135,7 +142,7 @@ class Ros1Bag(Recording):
     def _take_chunk(self, at: int, record: _Record) -> None:
         name = record.fields.get("compression", b"").decode("ascii", "replace")
         if name not in _COMPRESSIONS:
-            raise BadMessage("a chunk names no known compression")
+            raise BadMessage("a chunk with an unknown compression")
         head = ChunkHead(0, 0, record.number("size"), 0, _COMPRESSIONS[name], record.data_at - at, record.data_size)
         try:
             data = memoryview(self._chunks.check(at, head))
@@ -174,7 +181,7 @@ class Ros1Bag(Recording):
     def _record(self, at: int) -> _Record:
         size = int.from_bytes(self._file.read(at, 4), "little")
         if size > _MAX_HEAD:
-            raise BadMessage("a record head that is too long")
+            raise BadMessage("a record header that is too long")
         raw = self._file.read(at + 4, size + 4)
         return _parsed(memoryview(raw)[:size], at + 8 + size, int.from_bytes(raw[size:], "little"))
 
@@ -190,7 +197,7 @@ class Ros1Bag(Recording):
             window = self._file.read_at_most(at, _WINDOW + _MARGIN)
             for match in _CHUNK_OP.finditer(window):
                 self._tried += 1
-                if self._tried > _MAX_CANDIDATES:  # bytes made to look like chunks everywhere
+                if self._tried > _MAX_CANDIDATES:  # a file made to look like chunks everywhere
                     return None
                 for place in range(max(at + match.start() - _MARGIN, start), at + match.start()):
                     if self._is_chunk(place, end):
@@ -217,7 +224,7 @@ class Ros1Bag(Recording):
 
 
 def _records(view: memoryview) -> Iterator[_Record]:
-    """The records of a chunk. Raises BadMessage where the last one is cut."""
+    """Yield the records of a chunk. Raises BadMessage if the last one is cut."""
     walk = Fields(view)
     while walk.at < len(view):
         head = walk.take(walk.number(4))
@@ -229,12 +236,12 @@ def _records(view: memoryview) -> Iterator[_Record]:
 def _parsed(head: memoryview, data_at: int, data_size: int) -> _Record:
     fields = _fields(head)
     if len(fields.get("op", b"")) != 1:
-        raise BadMessage("a record without a kind")
+        raise BadMessage("a record without an opcode")
     return _Record(fields["op"][0], fields, data_at, data_size)
 
 
 def _fields(view: memoryview) -> dict[str, bytes]:
-    """``name=value`` fields. Raises BadMessage."""
+    """Return the ``name=value`` fields. Raises BadMessage if they are malformed."""
     walk, out = Fields(view), dict[str, bytes]()
     while walk.at < len(view):
         name, equals, value = bytes(walk.take(walk.number(4))).partition(b"=")

@@ -28,10 +28,16 @@ _NPY_KIND = re.compile(r"[<>|=]?(?:f[248]|[iu][1248])")
 
 
 def read_points(path: Path, limit: int) -> NDArray[Any]:
-    """(n, 3) points of a file as they stand in it, float32 or float64, NaN where there is no return.
+    """Return the (n, 3) points of a file [m], float32 or float64, NaN where the sensor had no return.
 
-    Raises BadFile where the bytes are not what the ending says, OSError where they cannot be read, MissingBackend
-    where the reader of the format is not installed.
+    Args:
+        path: the file; its extension selects the format.
+        limit: largest array that is decompressed [bytes].
+
+    Raises:
+        BadFile: the content does not match the extension.
+        OSError: the file cannot be read.
+        MissingBackend: the library for the format is not installed.
     """
     return _READERS[path.suffix.lower()](path.read_bytes(), limit)
 
@@ -55,15 +61,15 @@ def _kitti(data: bytes, _limit: int) -> NDArray[Any]:
 
 
 def _npy(data: bytes, _limit: int) -> NDArray[Any]:
-    """The npy format, parsed here: numpy's own reader trusts the header's sizes and may unpickle."""
+    """Parse the npy format; numpy's own reader allocates the sizes in the header and may unpickle."""
     wide = data[6:7] in (b"\x02", b"\x03")
     start = 12 if wide else 10
     size = int.from_bytes(data[8:start], "little")
     if data[:6] != b"\x93NUMPY" or size > _MAX_NPY_HEADER or len(data) < start + size:
-        raise BadFile("not a readable npy")
+        raise BadFile("not a valid npy file")
     header = _NPY_HEADER.fullmatch(data[start : start + size].decode("latin-1").strip())
     if header is None or not _NPY_KIND.fullmatch(header["descr"]):
-        raise BadFile("an npy that is no array of plain numbers")
+        raise BadFile("an npy file that is not an array of numbers")
     shape = tuple(int(n) for n in header["shape"].split(",") if n.strip())
     descr, fortran = header["descr"], header["fortran"] == "True"
     dtype, count = np.dtype(descr), math.prod(shape)
@@ -74,7 +80,7 @@ def _npy(data: bytes, _limit: int) -> NDArray[Any]:
 
 
 def _columns(array: NDArray[Any]) -> NDArray[Any]:
-    """(..., >= 3) to (n, 3)."""
+    """Reduce an array (..., k >= 3) to its first three columns (n, 3)."""
     if array.ndim < 2 or array.shape[-1] < 3:
         raise BadFile(f"an array of shape {array.shape}, not (n, 3)")
     flat = array.reshape(-1, array.shape[-1])[:, :3]
@@ -102,7 +108,7 @@ def _las(data: bytes, limit: int) -> NDArray[Any]:
         import laspy
     except ImportError:
         raise MissingBackend("LAS needs laspy", where=".las", hint="pip install 'avsreplay[las]'") from None
-    module: Any = laspy  # its stubs leave out what its manual names
+    module: Any = laspy  # its type stubs are incomplete
     try:
         with module.open(io.BytesIO(data)) as reader:
             if reader.header.point_count * 24 > limit:
@@ -128,15 +134,24 @@ _NUMBER = re.compile(r"\d+")
 
 
 def scan_files(folder: Path, names: Sequence[str] = ()) -> list[Path]:
-    """The scans of a folder: those named, else every file of the commonest known format; sorted by number, then name.
+    """Return the scans of a folder, sorted by the numbers in their names, then by name.
 
-    Raises UnreadableInput where there are none, or a named one is not there.
+    Args:
+        folder: the folder.
+        names: the files to use; if empty, all files of the most frequent known format.
+
+    Raises:
+        UnreadableInput: there are no scans, or a named file does not exist.
     """
     if names:
         missing = [n for n in names if not (folder / n).is_file() or Path(n).name != n]
         if missing:
             hint = "remove its line or add the file"
-            raise UnreadableInput(f"scan '{shown(missing[0])}' of the pose file", where=shown(folder), hint=hint)
+            raise UnreadableInput(
+                f"the pose file names the scan '{shown(missing[0])}', which does not exist",
+                where=shown(folder),
+                hint=hint,
+            )
         return sorted((folder / n for n in names), key=lambda p: by_number(p.name))
     found = [p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in SCAN_FORMATS]
     if not found:
@@ -148,5 +163,5 @@ def scan_files(folder: Path, names: Sequence[str] = ()) -> list[Path]:
 
 
 def by_number(name: str) -> tuple[tuple[int, ...], str]:
-    """Sorts ``s_9`` before ``s_10``."""
+    """Return a sort key that puts ``s_9`` before ``s_10``."""
     return tuple(int(n) for n in _NUMBER.findall(name)), name

@@ -1,4 +1,4 @@
-"""A source of scans: whatever the bytes were, the same nouns come out."""
+"""A source of scans, independent of the format of its files."""
 
 from __future__ import annotations
 
@@ -24,11 +24,12 @@ _BLOCK = 1 << 20
 
 
 class Source:
-    """Scans of one log or folder, in the recorder's order; a context manager.
+    """The scans of one log or folder in the order of the recorder; a context manager.
 
     Attributes:
-        path: as given.  header: what the log says of itself, with the model asked for in place of its own.
-        options: how it is read.
+        path: the log or folder.
+        header: the header of the log, with the requested model in place of its own.
+        options: how the source is read.
     """
 
     def __init__(
@@ -58,31 +59,31 @@ class Source:
         self.close()
 
     def __len__(self) -> int:
-        """How many scans the selection holds."""
+        """Return the number of selected scans."""
         return len(self._selected)
 
     @property
     def losses(self) -> list[Loss]:
-        """What could not be read, in the file's order."""
+        """Return the parts that could not be read, in file order."""
         return [*self._feed.losses, *self._lost]
 
     @property
     def clock(self) -> ClockSummary:
-        """How the scans' instants were found."""
+        """Return how the times of the scans were determined."""
         return self._clock
 
     def truth_poses(self) -> list[tuple[int, Pose]]:
-        """The true pose T_ac at every scan that has one and whose stamp is sound, by instant, ascending."""
+        """Return (t_ns, true pose T_ac) of every scan that has one and whose stamp is valid, in ascending order."""
         truth = self._guides.truth
         if truth is None:
             return []
-        sound = [(p.t_ns, place) for place, p in enumerate(self._placed) if not p.note]
-        found = {t_ns: truth(t_ns, place, "") for t_ns, place in sound}
+        valid = [(p.t_ns, place) for place, p in enumerate(self._placed) if not p.note]
+        found = {t_ns: truth(t_ns, place, "") for t_ns, place in valid}
         return [(t_ns, pose) for t_ns, pose in sorted(found.items(), key=lambda item: item[0]) if pose is not None]
 
     @cached_property
     def sha256(self) -> str:
-        """Of the file's bytes; of a folder or split log, of the names and bytes of the files read, in order."""
+        """Return the SHA-256 of the file; for a folder or split log, of the names and bytes of its files in order."""
         digest = hashlib.sha256()
         for path in self._files:
             if self.path.is_dir():
@@ -93,7 +94,14 @@ class Source:
         return digest.hexdigest()
 
     def scans(self, prefetch: int = 0) -> Iterator[Scan]:
-        """The scans one by one; with ``prefetch`` so many are decoded ahead on a thread of their own."""
+        """Yield the selected scans.
+
+        Args:
+            prefetch: number of scans decoded ahead on a second thread; 0 decodes each when it is requested.
+
+        Returns:
+            An iterator; a scan that cannot be decoded is yielded without points and with the status DAMAGED.
+        """
         scans = (self._scan(seq, i) for seq, i in enumerate(self._selected))
         return ahead(scans, prefetch) if prefetch else scans
 
@@ -104,7 +112,7 @@ class Source:
         return Truth(pose, self._body_at(scan.t_ns), self._fault(scan.log_ns))
 
     def payloads(self) -> Iterator[tuple[bytes | memoryview, str]]:
-        """The clouds as they stand in the log, with their encoding; none for a folder of files."""
+        """Yield the serialised cloud messages with their encoding; none for a folder."""
         for at in self._selected:
             try:
                 found = self._feed.payload(at)
@@ -114,7 +122,7 @@ class Source:
                 yield found
 
     def info(self) -> LogInfo:
-        """What ``avsreplay info`` prints."""
+        """Return the description of the source that ``avsreplay info`` prints."""
         topics = tuple(self._feed.topics())
         starts = [t.first_ns for t in topics if t.first_ns is not None] or list(self._feed.log_ns)
         ends = [t.last_ns for t in topics if t.last_ns is not None] or list(self._feed.log_ns)
@@ -146,12 +154,12 @@ class Source:
         )
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         self._feed.close()
 
     @cached_property
     def _selected(self) -> list[int]:
-        """Places of the scans asked for: the window, then every n-th, then at most so many."""
+        """Return the positions of the selected scans: the window first, then every n-th, then at most ``n_scans``."""
         if not self._placed:
             return []
         start, end = self.options.window_s
@@ -186,18 +194,18 @@ class Source:
         return None if track is None or constants is None else track.body(t_ns, constants)
 
     def _fault(self, log_ns: int) -> str | None:
-        """The label whose window [start, end) holds the instant; the latest begun where several do."""
+        """Return the kind of the fault active at ``log_ns``; if there are several, the one that began last."""
         inside = [label for label in self.header.labels if label.start_ns <= log_ns < label.end_ns]
         return max(inside, key=lambda label: label.start_ns).kind if inside else None
 
     def _taken(self, cloud: Cloud, t_ns: int) -> Cloud:
-        """Cropped, and brought to the fixed frame where one is asked for. Raises BadMessage without a pose for it."""
+        """Crop a cloud and transform it to the fixed frame. Raises BadMessage if the pose of the sensor is unknown."""
         cloud = _cropped(cloud, self.options)
         if self._guides.sensor is None:
             return cloud
         pose = self._guides.sensor(t_ns, cloud.frame)
         if pose is None:
-            raise BadMessage("no pose of the sensor at the time of the scan")
+            raise BadMessage("the pose of the sensor is unknown at the time of the scan")
         return Cloud(cloud.stamp_ns, cloud.frame, pose.apply(cloud.points), cloud.times_s, cloud.dropped)
 
 
@@ -224,8 +232,8 @@ def _cropped(cloud: Cloud, options: SourceOptions) -> Cloud:
 
 
 def refuse_losses(source: Source) -> None:
-    """Raise UnreadableInput where anything was lost (``--strict``)."""
+    """Raise UnreadableInput if any part was lost (``--strict``)."""
     if source.losses:
         first = source.losses[0]
         what = f"{len(source.losses)} losses, the first: {first.what} (byte {first.offset})"
-        raise UnreadableInput(what, where=shown(source.path), hint="leave out --strict to use what is intact")
+        raise UnreadableInput(what, where=shown(source.path), hint="leave out --strict to use the intact part")

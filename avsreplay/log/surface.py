@@ -1,4 +1,4 @@
-"""Reading of a target model: PLY by our own reader, STL, OBJ, OFF and GLB through trimesh."""
+"""Reading of the target model: PLY with the reader of this package, STL, OBJ, OFF and GLB with trimesh."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_BYTES = 512 << 20
 _SILENT = logging.NullHandler()
 _FORMATS = ("ply", "stl", "obj", "off", "glb")
 MODEL_ENDINGS = tuple(f".{name}" for name in _FORMATS)
-# What a foreign parser may raise on bytes that are not what they seem; a crash of the interpreter it cannot be.
+# Exceptions that trimesh raises for malformed files.
 _FOREIGN = (
     ArithmeticError, AssertionError, AttributeError, BufferError, EOFError, ImportError, LookupError, MemoryError,
     NameError, NotImplementedError, OSError, RuntimeError, TypeError, ValueError, struct.error, zlib.error,
@@ -34,11 +34,15 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
     """Read a model file.
 
     Args:
-        path: PLY, STL, OBJ, OFF or GLB.
-        cloud_ok: take a file without faces as a cloud model.
+        path: PLY, STL, OBJ, OFF or GLB file; lengths in metres, frame {C} of the model.
+        cloud_ok: accept a file without faces as a point-cloud model.
+
+    Returns:
+        The model with the bytes and the SHA-256 of its file.
 
     Raises:
-        UnreadableInput: not there, not a model, NaN vertices, or no faces where they are needed.
+        UnreadableInput: the file does not exist, is not a model, has vertices that are not finite, or has no faces
+            although they are needed.
     """
     path = Path(path)
     try:
@@ -53,15 +57,24 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
 
 
 def parse_surface(data: bytes, name: str, cloud_ok: bool = True) -> Surface:
-    """A model from the bytes of its file; the ending of ``name`` says which format.
+    """Parse the bytes of a model file.
 
-    Raises UnreadableInput as ``read_surface`` does.
+    Args:
+        data: the bytes of the file.
+        name: its name; the extension selects the format.
+        cloud_ok: accept a file without faces as a point-cloud model.
+
+    Returns:
+        The model.
+
+    Raises:
+        UnreadableInput: as for ``read_surface``.
     """
     return _parsed(data, PurePath(name).name, shown(name), cloud_ok)
 
 
 def surface_bytes(surface: Surface) -> bytes:
-    """The bytes of the model's file; where it has none, a binary PLY with exact (float64) vertices."""
+    """Return the bytes of the model's file; if it was not read from one, a binary PLY with float64 vertices."""
     if surface.data:
         return surface.data
     header = (
@@ -82,7 +95,7 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
         suffix = "ply"
     if suffix not in _FORMATS:
         hint = f"give a model as {', '.join(_FORMATS).upper()}"
-        raise UnreadableInput(f"'{shown(suffix)}' is not a model format known here", where=where, hint=hint)
+        raise UnreadableInput(f"'{shown(suffix)}' is not a known model format", where=where, hint=hint)
     try:
         vertices, faces = _ply(data) if suffix == "ply" else _trimesh(data, suffix)
     except _FOREIGN as error:
@@ -110,20 +123,20 @@ def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
     if suffix == "stl" and len(data) >= 84 and not data.lstrip().startswith(b"solid"):
         promised = int.from_bytes(data[80:84], "little")
         if 84 + 50 * promised > len(data):
-            raise BadFile(f"promises {promised} triangles in a file of {len(data)} bytes")
+            raise BadFile(f"declares {promised} triangles in a file of {len(data)} bytes")
     options: dict[str, Any] = {"skip_materials": True} if suffix in ("obj", "glb") else {}
-    # process=False keeps vertices as they stand; force="mesh" puts the parts of a scene together.
-    logging.getLogger("trimesh").addHandler(_SILENT)  # it logs tracebacks of what it goes on to try otherwise
+    # process=False keeps the vertices unchanged; force="mesh" joins the parts of a scene.
+    logging.getLogger("trimesh").addHandler(_SILENT)  # trimesh logs tracebacks before it tries another way
     with np.errstate(all="ignore"):
         mesh: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
     vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or (len(faces) and faces.shape[1] != 3):
-        raise BadFile("no triangles in space")
+        raise BadFile("no triangles in three dimensions")
     return _merged(vertices, faces)
 
 
 def _merged(vertices: Array, faces: NDArray[Any]) -> tuple[Array, NDArray[Any]]:
-    """One vertex where a format (STL) or its reader (OBJ with normals) has several equal ones."""
+    """Merge equal vertices, which occur in STL files and in OBJ files with normals."""
     if not np.isfinite(vertices).all():
         return vertices, faces
     _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
@@ -140,14 +153,14 @@ def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> 
         hint = "remove them in a mesh editor"
         raise UnreadableInput(f"{bad} of {len(vertices)} vertices are not finite", where=where, hint=hint)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise UnreadableInput("a face names a vertex that is not there", where=where, hint="check the file")
+        raise UnreadableInput("a face refers to a vertex that does not exist", where=where, hint="check the file")
     if not len(faces) and not cloud_ok:
         hint = "give a mesh, or --cloud-model to use its points as the model"
         raise UnreadableInput("the model has no faces", where=where, hint=hint)
 
 
 def _with_area(vertices: Array, faces: NDArray[Any]) -> NDArray[np.int32]:
-    """The triangles that have an area: display meshes carry some without, which have no closest normal."""
+    """Return the triangles whose area is not zero; the others have no normal."""
     corners = vertices[faces.reshape(-1, 3)]
     with np.errstate(over="ignore", invalid="ignore"):
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

@@ -1,6 +1,6 @@
-"""Writing of a log: MCAP, profile ros2, CDR only, small checked chunks, the model and the scenario inside.
+"""Writing of a log: MCAP, profile ros2, CDR only, in small chunks with checksums, with the model and the scenario.
 
-The bytes depend on nothing but what is written: no clock, path or library version is in the file.
+The bytes depend only on what is written: no clock, path or library version is in the file.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
-from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, static_transform
+from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.header import HEADER_RECORD, encode_header
 from avsreplay.log.surface import surface_bytes
 from avsreplay.records import Label, LogHeader, Scan, State
@@ -31,28 +31,31 @@ _TYPES = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
 }
 _INFINITE = "{sec: 9223372036, nsec: 854775807}"
-_LATCHED = (  # keep last, reliable, transient local: whole, since readers want every key
+_LATCHED = (  # keep last, reliable, transient local; complete, because readers require every key
     f"- {{history: 1, depth: 1, reliability: 1, durability: 1, deadline: {_INFINITE}, lifespan: {_INFINITE}, "
     f"liveliness: 1, liveliness_lease_duration: {_INFINITE}, avoid_ros_namespace_conventions: false}}\n"
 )
 
 
 class LogWriter:
-    """Writes one log; a context manager.
+    """Writer of one log; a context manager.
 
-    The file grows under ``<name>.partial`` and takes its own name when it is whole. An exception inside the ``with``
-    removes it; a write that fails for want of room keeps the complete chunks under the partial name and says so.
+    The file is written under ``<name>.partial`` and renamed when it is complete. An exception inside the ``with``
+    removes it. If the disk is full, the complete chunks are kept under the partial name and the error states this.
 
     Args:
-        path: the output.  header: what the log says of itself; its surface is attached.
-        overwrite: replace an existing output.  compression: ``zstd``, ``lz4`` or ``none``.
-        chunk_bytes, chunk_s: a chunk is closed and handed to the system at this size or span of the log clock.
-        streaming: write under the final name from the first byte (for a reader that follows).
-        point_type: ``float32`` or ``float64``, how coordinates are stored.
+        path: the output.
+        header: scenario, seed, labels and model; the model is attached.
+        overwrite: replace an existing output.
+        compression: ``zstd``, ``lz4`` or ``none``.
+        chunk_bytes, chunk_s: a chunk is written when it reaches this size or this span of the log clock [s].
+        streaming: write under the final name from the first byte, for a reader that follows the file.
+        point_type: type of the stored coordinates, ``float32`` or ``float64``.
 
     Raises:
         UsageError: the output exists, or its folder does not.
         UnreadableInput: the output cannot be written.
+        ValueError: an argument is out of range.
     """
 
     def __init__(
@@ -94,24 +97,34 @@ class LogWriter:
             self._discard()
 
     def write(self, scan: Scan) -> None:
-        """Append a scan's cloud, stamped ``scan.t_ns``, at ``scan.log_ns``.
+        """Append the cloud of a scan with the stamp ``scan.t_ns`` at the log time ``scan.log_ns``.
 
-        Raises ValueError for times that a log cannot hold, UnreadableInput where the disk refuses.
+        Raises:
+            ValueError: a time is outside the range of a log.
+            UnreadableInput: the output cannot be written.
         """
         payload = point_cloud2(scan.t_ns, CAMERA_FRAME, scan.points, scan.times_s, self._point_type)
         self._message(CLOUD_TOPIC, scan.log_ns, payload)
 
     def write_truth(self, log_ns: int, t_ns: int, pose: Pose, body: State | None = None) -> None:
-        """Append the true pose T_ac at ``t_ns`` and, where given, the full state of the body.
+        """Append the true pose.
 
-        Raises ValueError for times that a log cannot hold, UnreadableInput where the disk refuses.
+        Args:
+            log_ns: time on the log clock [ns].
+            t_ns: time of the pose [ns].
+            pose: T_ac.
+            body: full state of {B} in {A}, if known.
+
+        Raises:
+            ValueError: a time is outside the range of a log.
+            UnreadableInput: the output cannot be written.
         """
         self._message(TRUTH_TOPIC, log_ns, pose_stamped(t_ns, CAMERA_FRAME, pose))
         if body is not None:
             self._message(BODY_TOPIC, log_ns, odometry(t_ns, CAMERA_FRAME, BODY_FRAME, body))
 
     def close(self) -> None:
-        """Finish the file and give it its name. Raises UnreadableInput where the disk refuses."""
+        """Finish and rename the file. Raises UnreadableInput if it cannot be written."""
         if self._stream.closed:
             return
         if not self._counts:
@@ -140,7 +153,7 @@ class LogWriter:
         from mcap.writer import CompressionType, Writer
 
         kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
-        # The library closes a chunk only past its size; spans and sizes are watched here.
+        # The library closes a chunk only after it exceeds its size; sizes and spans are therefore checked here.
         self._writer: Any = Writer(self._stream, 1 << 62, kinds[compression], enable_data_crcs=True)
 
         def begin() -> None:
@@ -156,7 +169,7 @@ class LogWriter:
 
     def _message(self, topic: str, log_ns: int, payload: bytes) -> None:
         if not 0 <= log_ns < 2**63:
-            raise ValueError(f"log time {log_ns} ns is outside what a log can hold")
+            raise ValueError(f"log time {log_ns} ns is outside the range of a log")
         self._guarded(lambda: self._append_with_labels(topic, log_ns, payload))
 
     def _append_with_labels(self, topic: str, log_ns: int, payload: bytes) -> None:
@@ -166,12 +179,14 @@ class LogWriter:
         self._append(topic, log_ns, payload)
 
     def _static(self, log_ns: int) -> None:
-        self._append("/tf_static", log_ns, static_transform(log_ns, ROOT_FRAME, CAMERA_FRAME))
+        self._append("/tf_static", log_ns, transform(log_ns, ROOT_FRAME, CAMERA_FRAME, Pose.identity()))
 
     def _labels_until(self, log_ns: int | None) -> None:
         while self._labels and (log_ns is None or self._labels[0][0] <= log_ns):
             at_ns, place, label = self._labels.pop(0)
-            written_ns = at_ns if log_ns is not None else min(at_ns, self._last_ns)  # a window may outlast its log
+            written_ns = (
+                at_ns if log_ns is not None else min(at_ns, self._last_ns)
+            )  # a fault may last longer than the log
             self._guarded(partial(self._append, FAULT_TOPIC, written_ns, diagnostic(at_ns, label, place % 2 == 0)))
 
     def _append(self, topic: str, log_ns: int, payload: bytes) -> None:
@@ -214,8 +229,10 @@ class LogWriter:
             raise UnreadableInput(f"cannot be written: {error.strerror}", where=str(self._path), hint=hint) from None
 
     def _keep_complete(self) -> None:
-        """What the disk took stays up to the last complete chunk; the rest is cut off."""
-        with contextlib.suppress(OSError):  # the buffered rest does not fit either; the file is closed all the same
+        """Keep the file up to its last complete chunk."""
+        with contextlib.suppress(
+            OSError
+        ):  # the buffered bytes cannot be written either; the file is closed nevertheless
             self._stream.close()
         os.truncate(self._partial, min(self._complete, self._partial.stat().st_size))
 
@@ -225,6 +242,6 @@ class LogWriter:
 
 
 def _edges(labels: tuple[Label, ...]) -> list[tuple[int, int, Label]]:
-    """Every label's begin (even place) and end (odd place)."""
+    """Return (time, number, label) of the begin (even number) and end (odd number) of every label."""
     ends = [(max(label.start_ns, 0), 2 * i, label) for i, label in enumerate(labels)]
     return ends + [(max(label.end_ns, 0), 2 * i + 1, label) for i, label in enumerate(labels)]

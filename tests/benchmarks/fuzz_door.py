@@ -84,7 +84,7 @@ def _file(name: str, kind: str, data: bytes, folder: Path, deep: bool) -> str:
 
 
 def _scan(path: Path) -> int:
-    with open_source(path, SourceOptions(max_message_mib=MESSAGE_MIB), look=True) as source:
+    with open_source(path, SourceOptions(max_message_mib=MESSAGE_MIB), inspect=True) as source:
         source.info()
         damaged = sum(scan.status.value == "damaged" for scan in source.scans())
         return damaged + len(source.losses)
@@ -94,7 +94,7 @@ def _doctored(path: Path, folder: Path) -> None:
     examine(path, SourceOptions(max_message_mib=MESSAGE_MIB))
     clean = folder / "clean.mcap"
     repair(path, clean, max_message_mib=MESSAGE_MIB)
-    with open_source(clean, look=True) as source:
+    with open_source(clean, inspect=True) as source:
         if source.losses:
             raise AssertionError(f"a repaired file that has losses: {source.losses}")
         if any(scan.status.value == "damaged" for scan in source.scans()):

@@ -95,7 +95,7 @@ def test_a_whole_log_has_no_finding_worse_than_a_gap(whole: Path) -> None:
     assert {f.severity for f in found} <= {Severity.OK, Severity.NOTE}
     done = run("doctor", whole)
     assert done.returncode == 0
-    assert "all hold" in done.stdout
+    assert "all are correct" in done.stdout
 
 
 def test_a_damaged_log_is_told_place_by_place(damaged: Path) -> None:
@@ -173,7 +173,7 @@ def test_gaps_duplicates_points_clocks_and_layouts_are_told(tmp_path: Path) -> N
     found = about(tmp_path / "a.mcap")
     assert found["gaps"][0][0] is Severity.WARNING
     assert "the widest 20.5" in found["gaps"][0][1]
-    assert found["duplicates"] == [(Severity.WARNING, "1 are the same bytes as the one before")]
+    assert found["duplicates"] == [(Severity.WARNING, "1 are identical to the previous scan")]
     assert "1 of 20 have no finite point" in found["scans"][0][1]
     assert "0.58 % not finite" in found["points"][0][1]
     assert found["clock"][0] == (Severity.WARNING, "1 stamps jump")

@@ -137,7 +137,7 @@ def test_folders_that_are_no_source(tmp_path: Path) -> None:
     (tmp_path / "b.conf").write_text("bmesh 0.npy 0 0 0 0 0 0 1\n")
     with pytest.raises(UsageError, match="several pose files"):
         open_source(tmp_path)
-    with pytest.raises(UnreadableInput, match="one scan, not a log"):
+    with pytest.raises(UnreadableInput, match="single scan, not a log"):
         open_source(tmp_path / "0.npy")
 
 
@@ -175,7 +175,7 @@ def test_a_pcd_that_promises_a_bomb() -> None:
     data = bytearray(SEEDS["packed.pcd"].replace(b"WIDTH 24", b"WIDTH 99").replace(b"POINTS 24", b"POINTS 99"))
     at = data.index(b"binary_compressed\n") + 18
     struct.pack_into("<I", data, at + 4, 99 * 13)
-    with pytest.raises(BadFile, match="promises"):
+    with pytest.raises(BadFile, match="declares"):
         read_pcd(bytes(data))
 
 
@@ -210,8 +210,8 @@ ONE_VERTEX = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproper
 
 @pytest.mark.parametrize(("name", "content", "what"), [
     ("a.ply", b"", "empty"),
-    ("a.stl", b"\x00" * 80 + b"\xff\xff\xff\xff", "promises"),
-    ("a.xyz", b"1 2 3", "not a model format"),
+    ("a.stl", b"\x00" * 80 + b"\xff\xff\xff\xff", "declares"),
+    ("a.xyz", b"1 2 3", "not a known model format"),
     ("a.ply", ONE_VERTEX + b"end_header\n1 2 3\n", "no faces"),
     ("a.obj", b"v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n", "not finite"),
     ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "OBJ|not there"),
@@ -303,7 +303,7 @@ def test_the_ouster_bag_has_packets_and_no_clouds() -> None:
     ("multiple_files", {"/chatter": 3177}), ("test_bag_for_seek", {"topic1": 5}),
 ])  # fmt: skip
 def test_the_bags_of_rosbag2(name: str, counts: dict[str, int]) -> None:
-    with open_source(shared(f"mcap-rosbag2/{name}"), look=True) as source:
+    with open_source(shared(f"mcap-rosbag2/{name}"), inspect=True) as source:
         assert not source.losses
         assert {t.name: t.count for t in source.info().topics} == counts
     with pytest.raises(UnreadableInput, match="no PointCloud2 topic"):

@@ -294,7 +294,7 @@ def test_bytes_made_to_cost_time_cost_little(tmp_path: Path, what: str) -> None:
     data = mcap.MAGIC + pieces[what] * ((4 << 20) // len(pieces[what]))
     (tmp_path / "x.mcap").write_bytes(data)
     start = time.process_time()
-    with open_source(tmp_path / "x.mcap", look=True) as source:
+    with open_source(tmp_path / "x.mcap", inspect=True) as source:
         assert source.losses
     assert time.process_time() - start < 10.0
 
@@ -310,7 +310,7 @@ def test_a_bag_made_to_cost_time_costs_little(tmp_path: Path, what: str) -> None
     }
     (tmp_path / "x.bag").write_bytes(b"#ROSBAG V2.0\n" + pieces[what] * ((4 << 20) // len(pieces[what])))
     start = time.process_time()
-    with open_source(tmp_path / "x.bag", look=True) as source:
+    with open_source(tmp_path / "x.bag", inspect=True) as source:
         assert source.losses
     assert time.process_time() - start < 10.0
 
