@@ -25,19 +25,19 @@ def log(fixtures_folder):
 
 
 @pytest.mark.parametrize("verb", ["run", "info"])
-def test_a_file_that_is_not_there(verb, cli, tmp_path):
+def test_a_missing_file(verb, cli, tmp_path):
     check_one_line(cli(verb, tmp_path / "none.mcap"), 3, "none.mcap")
 
 
 @pytest.mark.parametrize("verb", ["run", "info"])
 @pytest.mark.parametrize("content", [b"", b"hello, this is no log", b"\x00" * 4096])
-def test_a_file_that_is_no_log(verb, content, cli, tmp_path):
+def test_a_file_that_is_not_a_log(verb, content, cli, tmp_path):
     path = tmp_path / "x.mcap"
     path.write_bytes(content)
     check_one_line(cli(verb, path), 3, "x.mcap")
 
 
-def test_a_log_cut_off_after_its_first_bytes(cli, tmp_path):
+def test_a_log_truncated_after_its_first_bytes(cli, tmp_path):
     path = tmp_path / "x.mcap"
     path.write_bytes(b"\x89MCAP0\r\n")
     check_one_line(cli("run", path), 3, "x.mcap")
@@ -68,7 +68,7 @@ def test_no_model(cli, shared_data, tmp_path):
         (b"", "m.ply"),
     ],
 )
-def test_a_model_that_cannot_be_right(text, word, cli, log, tmp_path):
+def test_an_invalid_model(text, word, cli, log, tmp_path):
     model = tmp_path / "m.ply"
     model.write_bytes(text)
     check_one_line(cli("run", log, "--model", model), 3, word)
@@ -103,7 +103,7 @@ def test_a_scenario_with_a_wrong_key(text, line, word, cli, tmp_path):
         (("--golden", "a", "--update-golden", "b"), "exclude"),
     ],
 )
-def test_a_flag_that_cannot_be_right(flags, word, cli, log):
+def test_an_invalid_option(flags, word, cli, log):
     check_one_line(cli("run", log, *flags), 2, word)
 
 
@@ -120,14 +120,14 @@ def test_an_existing_log_is_not_overwritten(cli, tmp_path):
     assert out.read_bytes() == b"precious"
 
 
-def test_output_into_a_folder_that_is_not_there(cli, tmp_path):
+def test_an_output_in_a_missing_folder(cli, tmp_path):
     done = cli("record", "-o", tmp_path / "no" / "x.mcap")
     assert done.code in (2, 3)
     assert "Traceback" not in done.err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_cloud_in_an_encoding_that_is_not_known(cli, tmp_path):
+def test_a_cloud_with_an_unknown_encoding(cli, tmp_path):
     from mcap.writer import Writer
 
     path = tmp_path / "json.mcap"
@@ -141,7 +141,7 @@ def test_a_cloud_in_an_encoding_that_is_not_known(cli, tmp_path):
     check_one_line(cli("run", path), 3, "json.mcap")
 
 
-def test_terminal_escapes_in_names_are_shown_not_sent(cli, tmp_path):
+def test_terminal_escapes_in_names_are_escaped(cli, tmp_path):
     from mcap.writer import Writer
 
     path = tmp_path / "esc.mcap"

@@ -29,7 +29,7 @@ def judged(log: list[int], header: list[int], choice: ClockChoice = ClockChoice.
 
 
 @pytest.mark.parametrize("offset", [0, 37, -SECOND // 4, 20_000_000 * SECOND, -20_000_000 * SECOND])
-def test_a_constant_offset_is_no_trouble(offset: int) -> None:
+def test_a_constant_offset_between_the_clocks_is_accepted(offset: int) -> None:
     log, header = clocks(offset_ns=offset)
     times, noted, summary = judged(log, header)
     assert times == header
@@ -37,7 +37,7 @@ def test_a_constant_offset_is_no_trouble(offset: int) -> None:
     assert summary.offset_s == pytest.approx(offset * 1e-9, abs=1e-6)
 
 
-def test_jitter_of_the_recorder_is_no_trouble() -> None:
+def test_jitter_of_the_log_clock_is_accepted() -> None:
     log, header = clocks()
     rng = np.random.Generator(np.random.PCG64(1))
     log = [t + int(j) for t, j in zip(log, rng.integers(0, STEP // 2, len(log)), strict=True)]
@@ -58,7 +58,7 @@ def test_drift_of_200_ppm_over_an_hour_is_followed() -> None:
 @pytest.mark.parametrize("at", [0, 1, 8, 30, 59])
 @pytest.mark.parametrize("jump", [3 * SECOND, -3 * SECOND, 40_000_000 * SECOND, -40_000_000 * SECOND])
 @pytest.mark.parametrize("long", [1, 2])
-def test_one_or_two_wild_stamps_are_placed_by_the_log_clock(at: int, jump: int, long: int) -> None:
+def test_isolated_wrong_stamps_are_replaced_by_the_log_clock(at: int, jump: int, long: int) -> None:
     log, header = clocks(offset_ns=123_456)
     right = list(header)
     hit = [i for i in range(at, at + long) if i < len(header)]
@@ -70,7 +70,7 @@ def test_one_or_two_wild_stamps_are_placed_by_the_log_clock(at: int, jump: int, 
     assert summary.jumps == len(hit)
 
 
-def test_an_unset_stamp_is_placed_by_the_log_clock() -> None:
+def test_an_unset_stamp_is_replaced_by_the_log_clock() -> None:
     log, header = clocks()
     right = list(header)
     header[20] = header[21] = 0
@@ -80,7 +80,7 @@ def test_an_unset_stamp_is_placed_by_the_log_clock() -> None:
     assert summary.unset == 2
 
 
-def test_a_log_that_never_sets_its_stamps_goes_by_the_log_clock() -> None:
+def test_a_log_without_stamps_uses_the_log_clock() -> None:
     log, _ = clocks()
     times, noted, summary = judged(log, [0] * len(log))
     assert times == log
@@ -88,7 +88,7 @@ def test_a_log_that_never_sets_its_stamps_goes_by_the_log_clock() -> None:
     assert "never set" in summary.note
 
 
-def test_clocks_that_start_at_zero_are_clocks() -> None:
+def test_clocks_that_start_at_zero_are_accepted() -> None:
     log = [i * STEP for i in range(20)]
     times, noted, _ = judged(log, list(log))
     assert times == log
@@ -106,7 +106,7 @@ def test_equal_stamps_and_steps_back() -> None:
     assert times == right
 
 
-def test_a_frozen_stamp_is_never_taken_for_a_new_clock() -> None:
+def test_a_constant_stamp_is_not_a_clock_step() -> None:
     log, header = clocks()
     right = list(header)
     header[20:] = [header[19]] * 40
@@ -115,7 +115,7 @@ def test_a_frozen_stamp_is_never_taken_for_a_new_clock() -> None:
     assert times == right
 
 
-def test_a_lasting_step_of_the_header_clock_is_followed_from_the_third_scan_on() -> None:
+def test_a_permanent_step_of_the_header_clock_is_followed_from_the_third_scan_on() -> None:
     log, header = clocks()
     right = list(header)
     stepped = header[:25] + [t + 7200 * SECOND for t in header[25:]]
@@ -125,7 +125,7 @@ def test_a_lasting_step_of_the_header_clock_is_followed_from_the_third_scan_on()
     assert times == right, "t_ns goes on without a break"
 
 
-def test_a_step_of_the_log_clock_leaves_the_stamps_alone() -> None:
+def test_a_step_of_the_log_clock_does_not_change_the_stamps() -> None:
     log, header = clocks()
     stepped = log[:25] + [t + 3600 * SECOND for t in log[25:]]
     times, noted, summary = judged(stepped, header)
@@ -134,7 +134,7 @@ def test_a_step_of_the_log_clock_leaves_the_stamps_alone() -> None:
     assert summary.log_steps == 1
 
 
-def test_a_blackout_is_no_jump() -> None:
+def test_a_gap_in_the_log_is_not_a_jump() -> None:
     log, header = clocks()
     kept = [i for i in range(60) if not 20 <= i < 45]
     times, noted, _ = judged([log[i] for i in kept], [header[i] for i in kept])
@@ -149,7 +149,7 @@ def test_the_chosen_clock_is_used() -> None:
     assert [p.t_ns for p in place(log, publish, header, ClockChoice.PUBLISH)[0]] == publish
 
 
-def test_empty_and_single() -> None:
+def test_no_scan_and_a_single_scan() -> None:
     assert place([], [], [], ClockChoice.HEADER)[0] == []
     assert [p.t_ns for p in place([START], [START], [START + 5], ClockChoice.HEADER)[0]] == [START + 5]
     placed, summary = place([START], [START], [0], ClockChoice.HEADER)

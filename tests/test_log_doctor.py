@@ -71,7 +71,7 @@ def about(path: Path) -> dict[str, list[tuple[Severity, str]]]:
     return out
 
 
-def test_info_tells_what_is_in_a_log(whole: Path) -> None:
+def test_info_describes_a_log(whole: Path) -> None:
     done = run("info", whole)
     assert done.returncode == 0
     for word in ("/points", "part.ply", "seed 7", "occlusion", "20 on /points", "median period 0.5000 s"):
@@ -82,7 +82,7 @@ def test_info_tells_what_is_in_a_log(whole: Path) -> None:
     assert told["topics"][1]["rate_hz"] == pytest.approx(2.0)
 
 
-def test_info_of_a_damaged_log_exits_4_and_of_none_3(damaged: Path) -> None:
+def test_info_exits_with_4_on_a_damaged_log_and_3_without_one(damaged: Path) -> None:
     done = run("info", damaged)
     assert done.returncode == 4
     assert "lost:" in done.stdout
@@ -90,7 +90,7 @@ def test_info_of_a_damaged_log_exits_4_and_of_none_3(damaged: Path) -> None:
     assert run("info", damaged.with_name("none.mcap")).returncode == 3
 
 
-def test_a_whole_log_has_no_finding_worse_than_a_gap(whole: Path) -> None:
+def test_an_intact_log_has_no_finding_worse_than_a_gap(whole: Path) -> None:
     found = examine(whole)[1]
     assert {f.severity for f in found} <= {Severity.OK, Severity.NOTE}
     done = run("doctor", whole)
@@ -98,7 +98,7 @@ def test_a_whole_log_has_no_finding_worse_than_a_gap(whole: Path) -> None:
     assert "all are correct" in done.stdout
 
 
-def test_a_damaged_log_is_told_place_by_place(damaged: Path) -> None:
+def test_every_damaged_place_is_reported(damaged: Path) -> None:
     done = run("doctor", damaged, "--json")
     assert done.returncode == 4
     findings = json.loads(done.stdout)["findings"]
@@ -108,7 +108,7 @@ def test_a_damaged_log_is_told_place_by_place(damaged: Path) -> None:
     assert run("doctor", damaged, "--strict").returncode == 3
 
 
-def test_a_repaired_log_opens_everywhere_with_all_that_was_intact(damaged: Path) -> None:
+def test_a_repaired_log_opens_in_other_readers_with_all_intact_records(damaged: Path) -> None:
     out = damaged.with_name("clean.mcap")
     done = run("doctor", damaged, "--repair", out)
     assert done.returncode == 4, "the log that was examined is still damaged"
@@ -127,7 +127,7 @@ def test_a_repaired_log_opens_everywhere_with_all_that_was_intact(damaged: Path)
         assert reader2.get_summary().statistics.message_count == sum(1 for _ in reader2.iter_messages())
 
 
-def test_repair_keeps_what_is_there_and_refuses_what_it_cannot(damaged: Path) -> None:
+def test_repair_does_not_overwrite_and_rejects_other_formats(damaged: Path) -> None:
     assert run("doctor", damaged, "--repair", damaged).returncode == 2
     other = damaged.with_name("other.mcap")
     other.write_bytes(b"mine")
@@ -156,7 +156,7 @@ def test_clouds_that_cannot_be_decoded_are_left_out_of_a_repair(tmp_path: Path) 
     assert "scans" not in about(tmp_path / "b.mcap")
 
 
-def test_gaps_duplicates_points_clocks_and_layouts_are_told(tmp_path: Path) -> None:
+def test_gaps_duplicates_points_clocks_and_layouts_are_reported(tmp_path: Path) -> None:
     clouds = []
     for i, c in enumerate(CLOUDS):
         points = CLOUDS[5].points if i == 6 else c.points.copy()
@@ -181,7 +181,7 @@ def test_gaps_duplicates_points_clocks_and_layouts_are_told(tmp_path: Path) -> N
     assert found["model"][0][0] is Severity.NOTE
 
 
-def test_a_summary_that_cannot_be_trusted_is_an_error(whole: Path) -> None:
+def test_an_invalid_summary_is_an_error(whole: Path) -> None:
     data = bytearray(whole.read_bytes())
     data[-60] ^= 1
     whole.write_bytes(data)
@@ -191,7 +191,7 @@ def test_a_summary_that_cannot_be_trusted_is_an_error(whole: Path) -> None:
     assert "summary" not in about(whole.with_name("b.mcap"))
 
 
-def test_damage_that_no_chunk_tells_is_found_by_the_checksum_over_all(whole: Path) -> None:
+def test_damage_outside_chunks_is_found_by_the_data_checksum(whole: Path) -> None:
     data = bytearray(whole.read_bytes())
     at = data.index(b"application/octet-stream")
     data[at - 30] ^= 0x20  # a time in the head of the attachment: its own checksum holds it
@@ -199,7 +199,7 @@ def test_damage_that_no_chunk_tells_is_found_by_the_checksum_over_all(whole: Pat
     assert any(severity is Severity.ERROR for texts in about(whole).values() for severity, _ in texts)
 
 
-def test_names_from_a_file_reach_the_terminal_escaped(tmp_path: Path) -> None:
+def test_control_characters_in_names_are_escaped(tmp_path: Path) -> None:
     nasty = "/p\x1b]0;owned\x07\x1b[31m\u202egnp\n"
     stream = io.BytesIO()
     writer = McapWriter(stream)
@@ -221,7 +221,7 @@ def test_names_from_a_file_reach_the_terminal_escaped(tmp_path: Path) -> None:
     assert "\\x1b" in run("info", tmp_path / "a.mcap").stdout
 
 
-def test_an_attachment_whose_name_climbs_writes_nothing_outside(tmp_path: Path) -> None:
+def test_an_attachment_with_a_parent_path_writes_nothing_outside(tmp_path: Path) -> None:
     stream = io.BytesIO()
     writer = McapWriter(stream)
     writer.start("ros2")

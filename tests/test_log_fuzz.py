@@ -26,7 +26,8 @@ from avsreplay.log.pose_messages import POSE_TYPES, read_pose, read_transforms
 CORPUS = seeds()
 
 
-def test_mutated_files_end_in_scans_or_in_one_line() -> None:
+@pytest.mark.slow
+def test_mutated_files_give_scans_or_one_error_line() -> None:
     tally, findings, peak = campaign(7, list(range(800)), 800)
     assert not findings
     assert sum(tally.values()) == 800
@@ -34,7 +35,7 @@ def test_mutated_files_end_in_scans_or_in_one_line() -> None:
     assert peak < LIMIT_MIB
 
 
-def test_an_input_is_told_by_its_campaign_and_number_alone() -> None:
+def test_a_mutation_depends_only_on_campaign_and_number() -> None:
     assert digest(CORPUS) == digest(seeds())
     assert case(3, 14, CORPUS) == case(3, 14, seeds())
     assert case(3, 14, CORPUS) != case(3, 15, CORPUS)
@@ -97,6 +98,7 @@ HEADER_LINES = st.lists(
 
 @settings(max_examples=300, deadline=None)
 @given(HEADER_LINES, st.binary(max_size=120))
+@pytest.mark.slow
 def test_any_header_of_a_scan(lines: list[str], body: bytes) -> None:
     text = "\n".join(lines).encode("utf-8", "replace")
     for reader, data in ((read_ply, b"ply\n" + text + b"\nend_header\n" + body), (read_pcd, text + b"\n" + body)):

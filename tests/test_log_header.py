@@ -21,14 +21,14 @@ def signed(values: dict[str, str]) -> dict[str, str]:
     return {**rest, "crc32": f"{record._checksum(rest):08x}"}
 
 
-def test_an_empty_header_comes_back() -> None:
+def test_an_empty_header_is_preserved() -> None:
     back = record.decode_header(record.encode_header(LogHeader()))
     assert back.scenario == ""
     assert back.seed is back.start is back.truth is None
     assert back.labels == ()
 
 
-def test_every_value_is_under_the_checksum() -> None:
+def test_every_value_is_covered_by_the_checksum() -> None:
     values = record.encode_header(HEAD)
     for name in values:
         with pytest.raises(ValueError, match=r"checksum|format"):
@@ -61,6 +61,6 @@ def with_(name: str, new: object) -> Callable[[object], object]:
     changed("truth", without("c_b")),
     changed("start", with_("P", [[1]])), changed("start", with_("x", None)), changed("start", with_("t_ns", "x")),
 ])  # fmt: skip
-def test_what_is_no_header_is_named_even_where_its_checksum_holds(name: str, text: str) -> None:
+def test_an_invalid_header_is_rejected_although_its_checksum_is_correct(name: str, text: str) -> None:
     with pytest.raises(ValueError, match="header record"):
         record.decode_header(signed({**record.encode_header(HEAD), name: text}))

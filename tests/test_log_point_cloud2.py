@@ -39,7 +39,7 @@ def message(  # type: ignore[no-untyped-def]
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_any_layout_gives_the_points_that_were_put_in(data: st.DataObject) -> None:
+def test_every_layout_gives_the_original_points(data: st.DataObject) -> None:
     height, width = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 9))
     kinds = {axis: data.draw(st.sampled_from(["f4", "f8"])) for axis in "xyz"}
     extra = data.draw(st.lists(st.sampled_from(sorted(CODES)), max_size=3))
@@ -115,7 +115,7 @@ def _good() -> bytes:
     return point_cloud2(5, "c", np.ones((10, 3), np.float32), None)
 
 
-def test_every_prefix_of_a_message_is_a_bad_message() -> None:
+def test_every_prefix_of_a_message_is_rejected() -> None:
     whole = _good()
     for size in range(len(whole) - 1):
         with pytest.raises(BadMessage):
@@ -135,12 +135,12 @@ def test_every_prefix_of_a_message_is_a_bad_message() -> None:
         ("no field 'z'", [("x", 0, "f4"), ("y", 4, "f4")], 10, 1, 12, 120),
     ],
 )
-def test_sizes_that_lie_are_bad_messages(what, fields, width, height, step, row) -> None:  # type: ignore[no-untyped-def]
+def test_wrong_sizes_are_rejected(what, fields, width, height, step, row) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(BadMessage, match=what):
         decode_cloud(message(fields, bytes(120), width, height, step, row))
 
 
-def test_unknown_datatypes_encodings_and_counts_are_bad_messages() -> None:
+def test_unknown_datatypes_encodings_and_counts_are_rejected() -> None:
     whole = bytearray(_good())
     at = whole.index(b"x\x00") + 2
     at += -(at - 4) % 4
@@ -156,7 +156,7 @@ def test_unknown_datatypes_encodings_and_counts_are_bad_messages() -> None:
         decode_cloud(bytes(whole))
 
 
-def test_names_that_are_not_utf8_stay_readable() -> None:
+def test_names_that_are_not_utf8_are_escaped() -> None:
     whole = bytearray(point_cloud2(5, "abcd", np.ones((1, 3), np.float32), None))
     at = whole.index(b"abcd")
     whole[at : at + 2] = b"\xff\x1b"

@@ -43,7 +43,7 @@ FORMATS = ["ascii.ply", "little.ply", "big.ply", "ascii.pcd", "binary.pcd", "pac
 
 
 @pytest.mark.parametrize("name", FORMATS)
-def test_every_format_gives_the_points_that_were_put_in(tmp_path: Path, name: str) -> None:
+def test_every_format_gives_the_original_points(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(SEEDS[name])
     (scan,) = read(tmp_path)
     np.testing.assert_array_equal(scan.points, POINTS)
@@ -51,7 +51,7 @@ def test_every_format_gives_the_points_that_were_put_in(tmp_path: Path, name: st
     assert scan.status is ScanStatus.OK
 
 
-def test_las_where_its_reader_is_installed(tmp_path: Path) -> None:
+def test_las_if_laspy_is_installed(tmp_path: Path) -> None:
     laspy = pytest.importorskip("laspy")
     header = laspy.LasHeader(point_format=0, version="1.2")
     header.scales = np.full(3, 1e-4)
@@ -62,7 +62,7 @@ def test_las_where_its_reader_is_installed(tmp_path: Path) -> None:
     np.testing.assert_allclose(scan.points, POINTS, atol=6e-5)
 
 
-def test_scans_come_in_the_order_of_their_numbers_a_second_apart(tmp_path: Path) -> None:
+def test_scans_are_ordered_by_number_at_one_hertz(tmp_path: Path) -> None:
     for number in (0, 2, 10, 9, 100):
         np.save(tmp_path / f"scan_{number}.npy", np.full((1, 3), float(number)))
     found = read(tmp_path)
@@ -94,7 +94,7 @@ def test_times_from_a_file_from_names_and_from_poses(tmp_path: Path) -> None:
     assert [s.t_ns for s in read(named)] == [1403636579763555584, 1403636579813555456]
 
 
-def test_kitti_poses_go_by_line(tmp_path: Path) -> None:
+def test_kitti_poses_are_matched_by_line(tmp_path: Path) -> None:
     for number in range(3):
         np.save(tmp_path / f"{number:06d}.npy", POINTS)
     poses = [Pose(geometry.exp([0, 0, 0.3 * i]), np.array([i, 0.0, 1.0])) for i in range(3)]
@@ -105,7 +105,7 @@ def test_kitti_poses_go_by_line(tmp_path: Path) -> None:
         np.testing.assert_allclose(scan.truth.matrix, pose.matrix, atol=1e-15)
 
 
-def test_a_conf_is_the_conjugate_reading_and_names_the_scans(tmp_path: Path) -> None:
+def test_a_conf_file_uses_the_conjugate_quaternion_and_names_the_scans(tmp_path: Path) -> None:
     """p_model = R(q)' p_scan + t, checked on points and not on poses."""
     rng = np.random.Generator(np.random.PCG64(4))
     q, t = geometry.normalise(rng.normal(size=4)), rng.normal(size=3)
@@ -120,14 +120,14 @@ def test_a_conf_is_the_conjugate_reading_and_names_the_scans(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("line", ["bmesh s.npy 0 0 0 0 0 1", "bmesh s.npy 0 0 0 0 0 0 0", "bmesh s.npy a b c d e f g",
                                   "bmesh gone.npy 0 0 0 0 0 0 1", "bmesh ../s.npy 0 0 0 0 0 0 1", "bmesh"])  # fmt: skip
-def test_a_conf_that_is_wrong(tmp_path: Path, line: str) -> None:
+def test_a_malformed_conf_file(tmp_path: Path, line: str) -> None:
     np.save(tmp_path / "s.npy", POINTS)
     (tmp_path / "a.conf").write_text(line + "\n")
     with pytest.raises(UnreadableInput):
         open_source(tmp_path)
 
 
-def test_folders_that_are_no_source(tmp_path: Path) -> None:
+def test_folders_that_are_not_a_source(tmp_path: Path) -> None:
     with pytest.raises(UnreadableInput, match="no scans in this folder"):
         open_source(tmp_path)
     np.save(tmp_path / "0.npy", POINTS)
@@ -151,7 +151,7 @@ def test_a_file_that_cannot_be_read_is_a_damaged_scan(tmp_path: Path) -> None:
     assert "1.npy" in found[1].note
 
 
-def test_lzf_against_its_own_definition() -> None:
+def test_lzf_against_a_reference_implementation() -> None:
     assert unpack_lzf(b"\x02abc", 3) == b"abc"
     assert unpack_lzf(b"\x00a\x20\x00", 4) == b"aaaa", "a reference that overlaps what it writes"
     assert unpack_lzf(b"\x02abc\x20\x02", 6) == b"abcabc"
@@ -166,12 +166,12 @@ def test_lzf_against_its_own_definition() -> None:
     ("TYPE F", "TYPE Q"), ("COUNT 1", "COUNT 0"), ("DATA binary_compressed", "DATA zip"), ("FIELDS x", "FIELDS q"),
     ("WIDTH 24", "WIDTH -1"),
 ])  # fmt: skip
-def test_pcd_headers_that_lie(change: tuple[str, str]) -> None:
+def test_pcd_headers_with_wrong_sizes(change: tuple[str, str]) -> None:
     with pytest.raises(BadFile):
         read_pcd(SEEDS["packed.pcd"].replace(change[0].encode(), change[1].encode(), 1))
 
 
-def test_a_pcd_that_promises_a_bomb() -> None:
+def test_a_pcd_that_declares_too_many_bytes() -> None:
     data = bytearray(SEEDS["packed.pcd"].replace(b"WIDTH 24", b"WIDTH 99").replace(b"POINTS 24", b"POINTS 99"))
     at = data.index(b"binary_compressed\n") + 18
     struct.pack_into("<I", data, at + 4, 99 * 13)
@@ -180,7 +180,7 @@ def test_a_pcd_that_promises_a_bomb() -> None:
 
 
 @pytest.mark.parametrize("size", ["4294967295", "99999999999999999999999", "-1", "x"])
-def test_ply_headers_that_lie(size: str) -> None:
+def test_ply_headers_with_wrong_sizes(size: str) -> None:
     for name in ("ascii.ply", "little.ply"):
         with pytest.raises(BadFile):
             read_ply(SEEDS[name].replace(b"vertex 24", f"vertex {size}".encode()))
@@ -197,7 +197,7 @@ def test_models_of_every_format_are_the_same_box(kind: str) -> None:
     assert not surface.vertices.flags.writeable
 
 
-def test_an_obj_needs_neither_its_materials_nor_a_neighbour(tmp_path: Path) -> None:
+def test_an_obj_is_read_without_its_material_files(tmp_path: Path) -> None:
     (tmp_path / "a.obj").write_text(
         "mtllib ../../etc/nothing.mtl\nusemtl red\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1/1/1 2 3\nf 1 1 2\n"
     )
@@ -218,14 +218,14 @@ ONE_VERTEX = b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproper
     ("a.obj", b"v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "zero area"),
     ("a.glb", b"glTF\x02\x00\x00\x00", "GLB"),
 ])  # fmt: skip
-def test_models_that_are_none(tmp_path: Path, name: str, content: bytes, what: str) -> None:
+def test_invalid_models_are_rejected(tmp_path: Path, name: str, content: bytes, what: str) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(UnreadableInput, match=what) as caught:
         read_surface(tmp_path / name)
     assert "\n" not in str(caught.value)
 
 
-def test_a_cloud_serves_as_a_model_where_that_is_asked_for(tmp_path: Path) -> None:
+def test_a_cloud_is_accepted_as_a_model_if_requested(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(SEEDS["ascii.ply"])
     with pytest.raises(UnreadableInput, match="--cloud-model"):
         read_surface(tmp_path / "a.ply")
@@ -278,7 +278,7 @@ def test_the_kinect_scene() -> None:
     assert found[1].points[:, 2].max() < 0
 
 
-def test_the_luminar_bag_goes_by_its_header_clock() -> None:
+def test_the_luminar_bag_uses_its_header_clock() -> None:
     with open_source(shared("ros1-bags/embag_luminar_pointcloud2.bag")) as source:
         found = list(true_scans(source))
         assert source.clock.placed == 0

@@ -136,7 +136,7 @@ def test_a_split_bag_is_one_log_in_the_order_of_its_numbers(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.98])
-def test_a_ros1_bag_cut_short_gives_its_whole_chunks(tmp_path: Path, share: float) -> None:
+def test_a_truncated_ros1_bag_gives_its_complete_chunks(tmp_path: Path, share: float) -> None:
     data = bag1(tmp_path / "a.bag", chunk=3000).read_bytes()
     (tmp_path / "x.bag").write_bytes(data[: int(share * len(data))])
     with open_source(tmp_path / "x.bag") as source:
@@ -146,7 +146,7 @@ def test_a_ros1_bag_cut_short_gives_its_whole_chunks(tmp_path: Path, share: floa
     assert all(s.points.tobytes() == c.points.tobytes() for s, c in zip(found, CLOUDS, strict=False))
 
 
-def test_a_damaged_chunk_of_a_ros1_bag_costs_no_other(tmp_path: Path) -> None:
+def test_a_damaged_chunk_of_a_ros1_bag_loses_only_that_chunk(tmp_path: Path) -> None:
     path = bag1(tmp_path / "a.bag", Ros1Writer.CompressionFormat.LZ4, 4000)
     data = bytearray(path.read_bytes())
     starts = [i for i in range(len(data)) if data.startswith(b"compression=lz4", i)]
@@ -175,7 +175,7 @@ def test_a_database_with_damaged_pages_gives_what_can_be_read(tmp_path: Path, le
     assert all(s.points.tobytes() in known for s in found)
 
 
-def test_a_database_cut_short_is_named_with_what_helps(tmp_path: Path) -> None:
+def test_a_truncated_database_is_reported_with_a_hint(tmp_path: Path) -> None:
     path = next(bag2(tmp_path / "bag", StoragePlugin.SQLITE3).glob("*.db3"))
     path.write_bytes(path.read_bytes()[:20_000])
     with pytest.raises(UnreadableInput, match="recover"):
@@ -189,7 +189,7 @@ def test_a_database_cut_short_is_named_with_what_helps(tmp_path: Path) -> None:
     " data BLOB GENERATED ALWAYS AS (zeroblob(id)))",
     "CREATE TABLE something_else(id INTEGER)",
 ])  # fmt: skip
-def test_a_database_that_is_no_bag(tmp_path: Path, schema: str) -> None:
+def test_a_database_that_is_not_a_bag(tmp_path: Path, schema: str) -> None:
     with sqlite3.connect(tmp_path / "x.db3") as db:
         db.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
         db.execute(schema)
@@ -210,20 +210,20 @@ def test_several_cloud_topics_are_listed_and_one_can_be_chosen(tmp_path: Path) -
         open_source(path, SourceOptions(topic="/middle"))
 
 
-def test_no_cloud_topic_names_what_there_is(tmp_path: Path) -> None:
+def test_without_a_cloud_topic_the_topics_are_listed(tmp_path: Path) -> None:
     path = mcap(tmp_path / "a.mcap", [("/gt", POSE, 5, pose_stamped(5, "c", pose(0)))])
     with pytest.raises(UnreadableInput, match=r"/gt \(geometry_msgs/msg/PoseStamped\)") as caught:
         open_source(path)
     assert caught.value.exit_code == 3
 
 
-def test_an_unknown_encoding_is_named(tmp_path: Path) -> None:
+def test_an_unknown_encoding_is_reported(tmp_path: Path) -> None:
     path = mcap(tmp_path / "a.mcap", clouds(), encoding="protobuf")
     with pytest.raises(UnreadableInput, match="unknown encoding 'protobuf'"):
         open_source(path)
 
 
-def test_a_truth_topic_that_is_not_there_or_no_pose(tmp_path: Path) -> None:
+def test_a_truth_topic_that_is_missing_or_not_a_pose(tmp_path: Path) -> None:
     path = mcap(tmp_path / "a.mcap", clouds())
     with pytest.raises(UsageError, match="no such truth topic"):
         open_source(path, SourceOptions(truth_topic="/gt"))
@@ -231,7 +231,7 @@ def test_a_truth_topic_that_is_not_there_or_no_pose(tmp_path: Path) -> None:
         open_source(path, SourceOptions(truth_topic="/points"))
 
 
-def test_truth_between_its_stamps_is_interpolated_and_past_a_gap_is_not(tmp_path: Path) -> None:
+def test_truth_is_interpolated_between_stamps_but_not_across_a_gap(tmp_path: Path) -> None:
     start, half = CLOUDS[0].t_ns, SECOND // 4
     a, b = pose(0), pose(3)
     messages = [*clouds(), ("/gt", POSE, 1, pose_stamped(start - half, "c", a)),
@@ -292,7 +292,7 @@ def moving_sensor() -> list[tuple[str, str, int, bytes]]:
     return [*clouds(frame="/lidar"), *out]
 
 
-def test_clouds_of_a_moving_sensor_are_taken_to_a_fixed_frame(tmp_path: Path) -> None:
+def test_clouds_of_a_moving_sensor_are_transformed_to_a_fixed_frame(tmp_path: Path) -> None:
     found = read(mcap(tmp_path / "a.mcap", moving_sensor()), fixed_frame="map", truth_frame="target")
     for i, (scan, c) in enumerate(zip(found, CLOUDS, strict=True)):
         T_map_lidar = pose(i).matrix @ pose(2).matrix
@@ -308,7 +308,7 @@ def test_truth_from_a_chain_in_the_sensors_own_frame(tmp_path: Path) -> None:
         np.testing.assert_allclose(scan.truth.matrix, want, atol=1e-14)
 
 
-def test_a_sensor_topic_does_the_same(tmp_path: Path) -> None:
+def test_clouds_are_transformed_by_a_sensor_topic(tmp_path: Path) -> None:
     poses = [("/cam", POSE, c.log_ns, pose_stamped(c.t_ns, "map", pose(i))) for i, c in enumerate(CLOUDS[:-1])]
     found = read(mcap(tmp_path / "a.mcap", [*clouds(), *poses]), sensor_topic="/cam")
     np.testing.assert_allclose(found[4].points, pose(4).apply(CLOUDS[4].points), atol=1e-12)
@@ -351,7 +351,7 @@ def test_pose_files_beside_a_log(tmp_path: Path) -> None:
         "",
     ],
 )
-def test_a_pose_file_that_is_none(tmp_path: Path, line: str) -> None:
+def test_a_file_that_is_not_a_pose_file(tmp_path: Path, line: str) -> None:
     path = mcap(tmp_path / "a.mcap", clouds())
     (tmp_path / "p.txt").write_text("0 0 0 0 0 0 0 1\n" * bool(line) + line + "\n")
     with pytest.raises(UnreadableInput) as caught:

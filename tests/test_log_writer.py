@@ -63,7 +63,7 @@ def assert_same_header(head: LogHeader, again: LogHeader) -> None:
     assert again.surface.name == head.surface.name
 
 
-def test_labels_fall_on_the_half_open_window(tmp_path: Path) -> None:
+def test_a_label_covers_a_half_open_window(tmp_path: Path) -> None:
     head = LogHeader(labels=(Label("clutter", 2 * SECOND, 3 * SECOND),))
     clouds = [Scan(i, t, np.ones((1, 3), np.float32), log_ns=t) for i, t in enumerate(
         [2 * SECOND - 1, 2 * SECOND, 3 * SECOND - 1, 3 * SECOND])]  # fmt: skip
@@ -145,7 +145,7 @@ def test_schema_texts_are_those_of_ros(name: str) -> None:
         assert [(m[0], m[1]) for m in members] == theirs, kind
 
 
-def test_an_output_that_is_there_is_kept(tmp_path: Path) -> None:
+def test_an_existing_output_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"mine")
     with pytest.raises(UsageError, match="overwrite"):
@@ -155,7 +155,7 @@ def test_an_output_that_is_there_is_kept(tmp_path: Path) -> None:
     assert path.read_bytes().startswith(b"\x89MCAP")
 
 
-def test_no_folder_and_no_room_are_one_line_each(tmp_path: Path) -> None:
+def test_a_missing_folder_and_a_full_disk_give_one_error_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no such folder"):
         LogWriter(tmp_path / "no" / "a.mcap", LogHeader())
     (tmp_path / "dir.mcap.partial").mkdir()
@@ -163,7 +163,7 @@ def test_no_folder_and_no_room_are_one_line_each(tmp_path: Path) -> None:
         LogWriter(tmp_path / "dir.mcap", LogHeader(), overwrite=True)
 
 
-def test_an_error_inside_leaves_nothing(tmp_path: Path) -> None:
+def test_an_exception_leaves_no_file(tmp_path: Path) -> None:
     writer = LogWriter(tmp_path / "a.mcap", LogHeader())
     bad = Scan(0, 2**70, scans(1)[0].points, log_ns=SECOND)
     with pytest.raises(ValueError, match="does not fit"), writer:
@@ -198,7 +198,7 @@ def test_a_full_disk_keeps_the_complete_chunks(tmp_path: Path, monkeypatch: pyte
     assert all(a.points.tobytes() == b.points.tobytes() for a, b in zip(back, clouds, strict=False))
 
 
-def test_float64_points_can_be_kept(tmp_path: Path) -> None:
+def test_float64_points_are_preserved(tmp_path: Path) -> None:
     cloud = np.random.Generator(np.random.PCG64(5)).normal(size=(50, 3))
     with LogWriter(tmp_path / "a.mcap", LogHeader(), point_type="float64") as writer:
         writer.write(Scan(0, SECOND, cloud, log_ns=SECOND))
@@ -208,7 +208,7 @@ def test_float64_points_can_be_kept(tmp_path: Path) -> None:
     assert back.points.tobytes() == cloud.tobytes()
 
 
-def test_reading_ahead_changes_nothing(tmp_path: Path) -> None:
+def test_reading_ahead_gives_the_same_scans(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", LogHeader(), scans(20))
     with open_source(tmp_path / "a.mcap") as source:
         plain = [(s.seq, s.t_ns, s.points.tobytes()) for s in source.scans()]
@@ -236,7 +236,7 @@ def test_selection(tmp_path: Path) -> None:
     assert times(start_s=100.0) == []
 
 
-def test_crop_keeps_what_lies_inside(tmp_path: Path) -> None:
+def test_crop_keeps_the_points_inside(tmp_path: Path) -> None:
     write(tmp_path / "a.mcap", LogHeader(), scans(2, timed=True))
     box = (-1.0, -0.5, 0.0, 1.0, 0.5, 2.0)
     with open_source(tmp_path / "a.mcap", SourceOptions(crop_box=box)) as source:

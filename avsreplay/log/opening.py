@@ -38,7 +38,7 @@ def open_source(path: str | Path, options: SourceOptions | None = None, *, inspe
         The source; close it after use.
 
     Raises:
-        UnreadableInput: it does not exist, is empty, is of no known format, has no cloud topic, or (``strict``) is damaged.
+        UnreadableInput: it does not exist, is of no known format, has no cloud topic, or (``strict``) is damaged.
         UsageError: there are several cloud topics and none was chosen, or a requested topic or frame does not exist.
     """
     path, options = Path(path), options or SourceOptions()
