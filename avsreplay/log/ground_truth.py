@@ -19,7 +19,7 @@ TruthLookup = Callable[[int, int, str], Pose | None]
 
 
 @dataclass(frozen=True, slots=True)
-class Guides:
+class GroundTruth:
     """Lookups by time for one source; None if it has no such data. ``track`` is the truth if it is a single track."""
 
     truth: TruthLookup | None = None
@@ -29,7 +29,7 @@ class Guides:
 
 
 @dataclass(slots=True)
-class MessageGuides:
+class TruthCollector:
     """Collects poses, states and transforms while a log is read.
 
     Args:
@@ -69,10 +69,10 @@ class MessageGuides:
                 hint = f"frames of its {TF_TYPE}: {', '.join(map(shown, self._tf.frames()[:20])) or 'none'}"
                 raise UsageError(f"no frame '{shown(frame)}'", where=where, hint=hint)
 
-    def guides(self) -> Guides:
+    def ground_truth(self) -> GroundTruth:
         """Return the lookups, after the log was read."""
         truth, track = self._truth_lookup()
-        return Guides(truth, track, self._body if len(self._body) else None, self._sensor_lookup())
+        return GroundTruth(truth, track, self._body if len(self._body) else None, self._sensor_lookup())
 
     @property
     def _wants_tf(self) -> bool:

@@ -12,7 +12,7 @@ from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.cloud_stream import FolderClouds, MessageClouds
 from avsreplay.log.db3_file import SQLITE_MAGIC, Db3File
-from avsreplay.log.ground_truth import Guides, MessageGuides, file_truth
+from avsreplay.log.ground_truth import GroundTruth, TruthCollector, file_truth
 from avsreplay.log.header import HEADER_RECORD, decode_header
 from avsreplay.log.index import CLOUD_TYPES, Merged, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
@@ -66,21 +66,21 @@ def _opened(path: Path, options: SourceOptions, inspect: bool) -> Source:
 
 
 def _messages(path: Path, options: SourceOptions, inspect: bool) -> Source:
-    collected = MessageGuides(options)
-    recording = _open_recording(path, options.max_message_mib << 20, collected.sinks())
+    collector = TruthCollector(options)
+    recording = _open_recording(path, options.max_message_mib << 20, collector.sinks())
     try:
         topics = recording.topics()
-        collected.check(topics, shown(path))
+        collector.check(topics, shown(path))
         topic = _optional_topic(recording, options, path) if inspect else _cloud_topic(recording, options, path)
         header, lost = _header(recording, options)
-        guides = collected.guides()
-        feed = MessageClouds(recording, topic)
+        ground_truth = collector.ground_truth()
+        clouds = MessageClouds(recording, topic)
     except BaseException:
         recording.close()
         raise
     extra = {"profile": recording.profile, "library": recording.library}
     files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-    return Source(path, feed, header, options, guides, files=files, extra=extra, losses=lost)
+    return Source(path, clouds, header, options, ground_truth, files=files, extra=extra, losses=lost)
 
 
 def _named(topics: Sequence[TopicInfo], types: Sequence[str] = ()) -> str:
@@ -240,12 +240,13 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     found = read_poses(pose_file) if pose_file is not None and not by_name else None
     files = scan_files(path, tuple(by_name))
     times = _times(path, files, found)
-    feed = FolderClouds(files, options.rate_hz, options.max_message_mib << 20, times)
+    clouds = FolderClouds(files, options.rate_hz, options.max_message_mib << 20, times)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     notes = {"source": "folder", "times": "given" if times else f"steady at {options.rate_hz!r} Hz"}
-    guides = _guides(files, feed.header_ns, by_name, found, options)
+    ground_truth = _ground_truth(files, clouds.header_ns, by_name, found, options)
     besides = [p for p in (pose_file, path / _TIME_FILE) if p is not None and p.is_file() and p.is_relative_to(path)]
-    return Source(path, feed, LogHeader(surface=surface, notes=notes), options, guides, files=[*files, *besides])
+    header = LogHeader(surface=surface, notes=notes)
+    return Source(path, clouds, header, options, ground_truth, files=[*files, *besides])
 
 
 def _pose_file(path: Path) -> Path | None:
@@ -269,10 +270,10 @@ def _times(path: Path, files: list[Path], found: TimedPoses | None) -> list[int]
     return list(found.t_ns) if found is not None and found.t_ns is not None and len(found.t_ns) == len(files) else None
 
 
-def _guides(
+def _ground_truth(
     files: list[Path], times: list[int], by_name: dict[str, Pose], found: TimedPoses | None, options: SourceOptions
-) -> Guides:
+) -> GroundTruth:
     if found is None and by_name:
         named = [(t, by_name[f.name]) for t, f in zip(times, files, strict=True)]
         found = TimedPoses(tuple(pose for _, pose in named), tuple(t for t, _ in named))
-    return Guides() if found is None else Guides(*file_truth(found, options.truth_gap_s))
+    return GroundTruth() if found is None else GroundTruth(*file_truth(found, options.truth_gap_s))

@@ -15,7 +15,7 @@ from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.clock import Placed, place
 from avsreplay.log.cloud_stream import CloudStream, ahead
-from avsreplay.log.ground_truth import Guides
+from avsreplay.log.ground_truth import GroundTruth
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import Cloud
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
@@ -35,19 +35,19 @@ class Source:
     def __init__(
         self,
         path: Path,
-        feed: CloudStream,
+        clouds: CloudStream,
         header: LogHeader,
         options: SourceOptions,
-        guides: Guides,
+        ground_truth: GroundTruth,
         *,
         files: Sequence[Path],
         extra: dict[str, str] | None = None,
         losses: tuple[Loss, ...] = (),
     ) -> None:
         self.path, self.header, self.options = path, header, options
-        self._feed, self._guides, self._files = feed, guides, tuple(files)
+        self._clouds, self._ground_truth, self._files = clouds, ground_truth, tuple(files)
         self._extra = extra or {}
-        self._placed, self._clock = place(feed.log_ns, feed.publish_ns, feed.header_ns, options.clock)
+        self._placed, self._clock = place(clouds.log_ns, clouds.publish_ns, clouds.header_ns, options.clock)
         self._lost = losses
 
     def __enter__(self) -> Source:
@@ -65,7 +65,7 @@ class Source:
     @property
     def losses(self) -> list[Loss]:
         """Return the parts that could not be read, in file order."""
-        return [*self._feed.losses, *self._lost]
+        return [*self._clouds.losses, *self._lost]
 
     @property
     def clock(self) -> ClockSummary:
@@ -74,7 +74,7 @@ class Source:
 
     def truth_poses(self) -> list[tuple[int, Pose]]:
         """Return (t_ns, true pose T_ac) of every scan that has one and whose stamp is valid, in ascending order."""
-        truth = self._guides.truth
+        truth = self._ground_truth.truth
         if truth is None:
             return []
         valid = [(p.t_ns, place) for place, p in enumerate(self._placed) if not p.note]
@@ -107,7 +107,7 @@ class Source:
 
     def truth_of(self, scan: Scan) -> Truth:
         """Return the ground truth at one of this source's scans: pose, full state and injected fault, where known."""
-        lookup, place = self._guides.truth, self._selected[scan.seq]
+        lookup, place = self._ground_truth.truth, self._selected[scan.seq]
         pose = None if lookup is None else lookup(scan.t_ns, place, scan.frame)
         return Truth(pose, self._body_at(scan.t_ns), self._fault(scan.log_ns))
 
@@ -115,7 +115,7 @@ class Source:
         """Yield the serialised cloud messages with their encoding; none for a folder."""
         for at in self._selected:
             try:
-                found = self._feed.payload(at)
+                found = self._clouds.payload(at)
             except BadMessage:
                 continue
             if found is not None:
@@ -123,20 +123,20 @@ class Source:
 
     def info(self) -> LogInfo:
         """Return the description of the source that ``avsreplay info`` prints."""
-        topics = tuple(self._feed.topics())
-        starts = [t.first_ns for t in topics if t.first_ns is not None] or list(self._feed.log_ns)
-        ends = [t.last_ns for t in topics if t.last_ns is not None] or list(self._feed.log_ns)
+        topics = tuple(self._clouds.topics())
+        starts = [t.first_ns for t in topics if t.first_ns is not None] or list(self._clouds.log_ns)
+        ends = [t.last_ns for t in topics if t.last_ns is not None] or list(self._clouds.log_ns)
         start, surface = min(starts, default=None), self.header.surface
         origin = start or 0
         labels = ((lab.kind, lab.start_ns, lab.end_ns, lab.harmful) for lab in self.header.labels)
         return LogInfo(
             path=str(self.path),
-            kind=self._feed.kind,
+            kind=self._clouds.kind,
             bytes=sum(p.stat().st_size for p in self._files),
             topics=topics,
             start_ns=start,
             end_ns=max(ends, default=None),
-            cloud_topic=self._feed.topic,
+            cloud_topic=self._clouds.topic,
             scans=len(self._placed),
             profile=self._extra.get("profile", ""),
             library=self._extra.get("library", ""),
@@ -146,7 +146,7 @@ class Source:
             model_extent_m=None if surface is None else surface.extent,
             scenario=bool(self.header.scenario),
             seed=self.header.seed,
-            truth=self._guides.truth is not None,
+            truth=self._ground_truth.truth is not None,
             faults=tuple((k, (a - origin) * 1e-9, (b - origin) * 1e-9, h) for k, a, b, h in labels),
             clock=self._clock,
             losses=tuple(self.losses),
@@ -155,7 +155,7 @@ class Source:
 
     def close(self) -> None:
         """Close the files."""
-        self._feed.close()
+        self._clouds.close()
 
     @cached_property
     def _selected(self) -> list[int]:
@@ -170,13 +170,13 @@ class Source:
     def _scan(self, seq: int, place: int) -> Scan:
         placed = self._placed[place]
         try:
-            cloud = self._taken(self._feed.load(place), placed.t_ns)
+            cloud = self._taken(self._clouds.load(place), placed.t_ns)
         except BadMessage as error:
             return self._finish(seq, place, None, shown(error))
         return self._finish(seq, place, cloud, placed.note)
 
     def _finish(self, seq: int, place: int, cloud: Cloud | None, note: str | None) -> Scan:
-        placed, log_ns = self._placed[place], self._feed.log_ns[place]
+        placed, log_ns = self._placed[place], self._clouds.log_ns[place]
         return Scan(
             seq=seq,
             t_ns=placed.t_ns,
@@ -190,7 +190,7 @@ class Source:
         )
 
     def _body_at(self, t_ns: int) -> State | None:
-        constants, track = self.header.truth, self._guides.body
+        constants, track = self.header.truth, self._ground_truth.body
         return None if track is None or constants is None else track.body(t_ns, constants)
 
     def _fault(self, log_ns: int) -> str | None:
@@ -201,9 +201,9 @@ class Source:
     def _taken(self, cloud: Cloud, t_ns: int) -> Cloud:
         """Crop a cloud and transform it to the fixed frame. Raises BadMessage if the pose of the sensor is unknown."""
         cloud = _cropped(cloud, self.options)
-        if self._guides.sensor is None:
+        if self._ground_truth.sensor is None:
             return cloud
-        pose = self._guides.sensor(t_ns, cloud.frame)
+        pose = self._ground_truth.sensor(t_ns, cloud.frame)
         if pose is None:
             raise BadMessage("the pose of the sensor is unknown at the time of the scan")
         return Cloud(cloud.stamp_ns, cloud.frame, pose.apply(cloud.points), cloud.times_s, cloud.dropped)
