@@ -1,6 +1,6 @@
 """The short fuzz campaign: mutated bytes end in scans or in one line, quickly and in little memory.
 
-The long one is ``python tests/benchmarks/fuzz_door.py``; docs/reliability.md has its figures.
+The long one is ``python tests/benchmarks/fuzz_logs.py``; docs/reliability.md has its figures.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from fuzz_door import LIMIT_MIB, campaign, check
+from fuzz_logs import LIMIT_MIB, campaign, check
 from fuzz_inputs import case, cloud1, digest, seeds
 from hypothesis import given, settings
 from hypothesis import strategies as st

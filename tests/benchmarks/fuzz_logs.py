@@ -1,4 +1,4 @@
-"""Fuzz campaign on everything that reads bytes: ``python tests/benchmarks/fuzz_door.py [--quick] [--inputs N]``.
+"""Fuzz campaign on everything that reads bytes: ``python tests/benchmarks/fuzz_logs.py [--quick] [--inputs N]``.
 
 Input i is told by (campaign, i) alone, so a finding is repeated with ``--only i``. Every input must end in scans or in
 one AvsError: a traceback, more than 10 s, more than the stated memory, a crash of the interpreter or a file written
