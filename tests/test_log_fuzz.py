@@ -10,8 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from fuzz_logs import LIMIT_MIB, campaign, check
 from fuzz_inputs import case, cloud1, digest, seeds
+from fuzz_logs import LIMIT_MIB, campaign, check
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_cases import scans
