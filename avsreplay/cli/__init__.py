@@ -7,11 +7,13 @@ A command is the object named ``command`` in ``avsreplay/cli/<name>.py``; it is 
 from __future__ import annotations
 
 import importlib
+import os
 import sys
+from collections.abc import Iterator
 
 import click
 
-from avsreplay.errors import AvsError
+from avsreplay.errors import AvsError, UsageError
 
 __all__ = ["main"]
 
@@ -46,6 +48,29 @@ Exit codes: 0 ok, 1 the check asked for failed, 2 usage,
 class _Commands(click.Group):
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 (click names it)
         return list(SUMMARIES)
+
+    def invoke(self, ctx: click.Context) -> object:
+        """Run a command; an environment variable that no command knows is an error."""
+        unknown = sorted(name for name in os.environ if name.startswith("AVSREPLAY_"))
+        if unknown:
+            known = list(self._variables(ctx))
+            unknown = [name for name in unknown if name not in known]
+        if unknown:
+            import difflib
+
+            near = difflib.get_close_matches(unknown[0], known, 1)
+            hint = f"did you mean {near[0]}?" if near else "unset it, or see 'avsreplay COMMAND --help'"
+            raise UsageError("no command has an option of this name", where=f"environment {unknown[0]}", hint=hint)
+        return super().invoke(ctx)
+
+    def _variables(self, ctx: click.Context) -> Iterator[str]:
+        """Every environment variable that stands for an option."""
+        for name in SUMMARIES:
+            command = self.get_command(ctx, name)
+            for param in command.params if command else ():
+                automatic = f"AVSREPLAY_{name}_{param.name}".upper() if isinstance(param, click.Option) else ()
+                given = param.envvar or automatic
+                yield from [given] if isinstance(given, str) else given
 
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:  # noqa: ARG002 (click names it)
         if name not in SUMMARIES:

@@ -9,6 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.setting_options import source_setting
+
 if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss
     from avsreplay.report.table import Table
@@ -24,9 +26,9 @@ Examples:
 
 @click.command(name="info", epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
-@click.option("--topic", help="The cloud topic, if there are several.")
+@source_setting("--topic")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
-@click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message that is read [MiB].")
+@source_setting("--max-message-mib", type=int, default=128, show_default=True)
 def command(source: Path, topic: str | None, as_json: bool, max_message_mib: int) -> None:
     """Show topics, types, counts, rates, time span, model, scenario and injected faults of SOURCE.
 

@@ -7,12 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.setting_options import setting
+
 if TYPE_CHECKING:
     from avsreplay.plan import Execution, Limits, Miss, PlanParams, Spread
     from avsreplay.records import Plan
     from avsreplay.replan import Replanning, Saved
     from avsreplay.report.table import Table
 
+PLAN, LIMITS = "avsreplay.plan:PlanParams", "avsreplay.plan:Limits"
 EPILOG = """\b
 Examples:
   avsreplay plan results/                          from t_1 on, with the run's settings
@@ -28,21 +31,19 @@ Exit codes: 0 ok (also where no capture lies within the horizon: the status says
 @click.command("plan", epilog=EPILOG)
 @click.argument("result", type=click.Path(path_type=Path))
 @click.option("--at", "at_s", type=float, help="Plan from this time [s]; default: from convergence.")
-@click.option("--a-max", "a_max_mps2", type=float, help="Largest acceleration [m/s2].")
-@click.option("--horizon", "horizon_s", type=float, help="Latest capture looked for [s].")
-@click.option("--latency", "latency_s", type=float, help="Coasting before thrust [s].")
-@click.option("--period", "replan_period_s", type=float, help="Replanning period in flight [s].")
-@click.option("--from", "robot_position_m", metavar="X,Y,Z", help="Robot's position in {A} [m].")
-@click.option("--cone-deg", type=float, help="Half-angle of the approach cone [deg].")
-@click.option("--cone-range", "cone_range_m", type=float, help="Within this distance the cone holds [m].")
-@click.option("--final-deg", type=float, help="Half-angle in the last metres, along the fixture's axis [deg].")
-@click.option("--final-range", "final_range_m", type=float, help="How long the last metres are [m].")
-@click.option("--speed-max", "speed_max_mps", type=float, help="Largest speed [m/s].")
-@click.option(
-    "--contact-accel", "contact_accel_mps2", type=float, help="Largest relative acceleration at contact [m/s2]."
-)
-@click.option("--keepout", "keepout_m", type=float, help="Sphere round the mass centre to keep out of [m].")
-@click.option("--keepout-release", "keepout_release_m", type=float, help="Nearer the grasp point it does not hold [m].")
+@setting("--a-max", "a_max_mps2", type=float, owner=PLAN)
+@setting("--horizon", "horizon_s", type=float, owner=PLAN)
+@setting("--latency", "latency_s", type=float, owner=PLAN)
+@setting("--period", "replan_period_s", type=float, owner=PLAN)
+@setting("--from", "robot_position_m", metavar="X,Y,Z", owner=PLAN)
+@setting("--cone-deg", type=float, owner=LIMITS)
+@setting("--cone-range", "cone_range_m", type=float, owner=LIMITS)
+@setting("--final-deg", type=float, owner=LIMITS)
+@setting("--final-range", "final_range_m", type=float, owner=LIMITS)
+@setting("--speed-max", "speed_max_mps", type=float, owner=LIMITS)
+@setting("--contact-accel", "contact_accel_mps2", type=float, owner=LIMITS)
+@setting("--keepout", "keepout_m", type=float, owner=LIMITS)
+@setting("--keepout-release", "keepout_release_m", type=float, owner=LIMITS)
 @click.option("--samples", type=click.IntRange(1), default=64, show_default=True, help="Draws from the belief.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the draws.")
 @click.option("--every", "every_s", type=float, help="Hindsight: a plan so often [s]; 2, or 20 under limits.")

@@ -10,6 +10,8 @@ from typing import Any, TypeVar
 
 import click
 
+from avsreplay.cli.setting_options import source_setting
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -37,22 +39,12 @@ class Numbers(click.ParamType[tuple[float, ...]]):
 NUMBERS = {"crop_box": Numbers(6), "crop_range": Numbers(2)}
 READING_FLAGS = ("truth_frame", "truth_gap_s", "fixed_frame", "sensor_topic", "crop_box", "crop_range")
 _OPTIONS = (
-    click.option("--truth-frame", help="Truth is the pose of this frame by the log's /tf chain."),
-    click.option("--truth-gap", "truth_gap_s", type=float, help="Widest gap in the truth interpolated across [s]."),
-    click.option("--fixed-frame", help="Take the clouds to this frame by the log's /tf chain, at each scan's time."),
-    click.option("--sensor-topic", help="Take the clouds to a fixed frame by this topic's pose of the sensor."),
-    click.option(
-        "--crop-box",
-        type=NUMBERS["crop_box"],
-        metavar="X0,Y0,Z0,X1,Y1,Z1",
-        help="Keep the points inside this box of the cloud's frame [m].",
-    ),
-    click.option(
-        "--crop-range",
-        type=NUMBERS["crop_range"],
-        metavar="MIN,MAX",
-        help="Keep the points at this distance from the sensor's origin [m].",
-    ),
+    source_setting("--truth-frame"),
+    source_setting("--truth-gap", "truth_gap_s", type=float),
+    source_setting("--fixed-frame"),
+    source_setting("--sensor-topic"),
+    source_setting("--crop-box", type=NUMBERS["crop_box"], metavar="X0,Y0,Z0,X1,Y1,Z1"),
+    source_setting("--crop-range", type=NUMBERS["crop_range"], metavar="MIN,MAX"),
 )
 
 

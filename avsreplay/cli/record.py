@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.reading import READING_FLAGS, reading_flags
+from avsreplay.cli.setting_options import source_setting
 from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
@@ -35,24 +36,22 @@ READING = (
 @click.argument("source", required=False, type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The log to write (.mcap).")
 @click.option("--seed", type=click.IntRange(0), help="Seed of a simulation, over the scenario's own.")
-@click.option("--model", type=click.Path(path_type=Path), help="Model of the target: PLY, OBJ or STL, in metres.")
-@click.option("--cloud-model", is_flag=True, help="The model may be a bare cloud, without faces.")
-@click.option("--topic", help="Cloud topic of a recorded source, where there are several.")
-@click.option("--truth-topic", help="Topic of the true poses.")
-@click.option("--truth", "truth_file", type=click.Path(path_type=Path), help="File of the true poses.")
-@click.option("--rate", "rate_hz", type=float, help="Scans a second of a folder (1 by default).")
-@click.option(
-    "--every-scan", "--every", "every", type=click.IntRange(1), help="Take every N-th scan, each at its own time."
-)
-@click.option("--start", "start_s", type=float, help="Leave out what is before, seconds after the first scan.")
-@click.option("--end", "end_s", type=float, help="Leave out what is after, seconds after the first scan.")
-@click.option("--duration", "duration_s", type=float, help="Length of what is taken over [s].")
-@click.option("--start-offset", "start_offset_s", type=float, help="The same as --start.")
-@click.option("--max-message-mib", type=click.IntRange(1), help="Largest message read.")
-@click.option("--n-scans", type=click.IntRange(1), help="At most so many scans.")
-@click.option("--clock", type=click.Choice(["header", "log", "publish"]), help="Clock of a recorded source.")
+@source_setting("--model", type=click.Path(path_type=Path))
+@source_setting("--cloud-model", is_flag=True)
+@source_setting("--topic")
+@source_setting("--truth-topic")
+@source_setting("--truth", "truth_file", type=click.Path(path_type=Path))
+@source_setting("--rate", "rate_hz", type=float)
+@source_setting("--every-scan", "--every", "every", type=int)
+@source_setting("--start", "start_s", type=float)
+@source_setting("--end", "end_s", type=float)
+@source_setting("--duration", "duration_s", type=float)
+@source_setting("--start-offset", "start_offset_s", type=float)
+@source_setting("--max-message-mib", type=int)
+@source_setting("--n-scans", type=int)
+@source_setting("--clock")
 @reading_flags
-@click.option("--strict", is_flag=True, default=None, help="Any damage of the source is an error (exit 3).")
+@source_setting("--strict", is_flag=True, default=None)
 @click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.reading import reading_flags
+from avsreplay.cli.setting_options import run_settings, source_setting, take_run_settings
 from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
@@ -34,14 +35,6 @@ Examples:
 Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
             3 unreadable input, 4 finished but data was lost."""
 
-ASSIGNED = {
-    "backend": "register.backend",
-    "policy": "faults.policy",
-    "guess": "guess",
-    "init": "init",
-    "reference": "reference",
-}
-
 
 class _Start(click.ParamType[str | float]):
     """``cold``, ``near``, ``paper`` (how the estimate begins) or a number (seconds after the first scan)."""
@@ -59,30 +52,23 @@ class _Start(click.ParamType[str | float]):
 
 @click.command("run", epilog=EPILOG)
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option("--backend", help="Registration back end; 'avsreplay backends' lists them.")
-@click.option("--model", type=click.Path(path_type=Path), help="Model of the target, in place of the log's own.")
-@click.option("--cloud-model", is_flag=True, help="The model may be a bare cloud, without faces.")
-@click.option("--topic", help="Cloud topic, where there are several.")
-@click.option("--truth-topic", help="Topic of the true poses.")
-@click.option("--truth", "truth_file", type=click.Path(path_type=Path), help="File of the true poses.")
-@click.option("--init", metavar="log|truth|auto|POSE", help="First pose; POSE is x,y,z,qx,qy,qz,qw of {C} in {A}.")
-@click.option("--guess", type=click.Choice(["predicted", "last"]), help="Registration's guess: closed or open loop.")
-@click.option("--policy", type=click.Choice(["any", "all"]), help="How the fault tests are joined.")
-@click.option("--reference", type=click.Choice(["truth", "fit"]), help="What errors are against; fit needs no truth.")
-@click.option("--no-deskew", is_flag=True, help="Take a scan's points as measured at one instant.")
-@click.option("--config", "config_file", type=click.Path(path_type=Path), help="TOML with settings, a table a stage.")
-@click.option("--set", "assignments", multiple=True, metavar="A.B=C", help="One setting; may be repeated.")
-@click.option("--clock", type=click.Choice(["header", "log", "publish"]), help="Clock the scans are placed by.")
+@source_setting("--model", type=click.Path(path_type=Path))
+@source_setting("--cloud-model", is_flag=True)
+@source_setting("--topic")
+@source_setting("--truth-topic")
+@source_setting("--truth", "truth_file", type=click.Path(path_type=Path))
+@run_settings
+@source_setting("--clock")
 @click.option("--start", "starts", type=_Start(), multiple=True, help="How the estimate begins, or where the log does.")
-@click.option("--end", "end_s", type=float, help="Leave out what is after, seconds after the first scan.")
-@click.option("--duration", "duration_s", type=float, help="Length of what is replayed [s].")
-@click.option("--start-offset", "start_offset_s", type=float, help="The same as --start SECONDS.")
-@click.option("--n-scans", type=click.IntRange(1), help="At most so many scans.")
-@click.option("--every-scan", "every", type=click.IntRange(1), help="Take every N-th scan, each at its own time.")
-@click.option("--rate", "rate_hz", type=float, help="Scans a second of a folder of scans.")
+@source_setting("--end", "end_s", type=float)
+@source_setting("--duration", "duration_s", type=float)
+@source_setting("--start-offset", "start_offset_s", type=float)
+@source_setting("--n-scans", type=int)
+@source_setting("--every-scan", "every", type=int)
+@source_setting("--rate", "rate_hz", type=float)
 @reading_flags
-@click.option("--strict", is_flag=True, default=None, help="Any damage of the log is an error (exit 3).")
-@click.option("--max-message-mib", type=click.IntRange(1), help="Largest message read.")
+@source_setting("--strict", is_flag=True, default=None)
+@source_setting("--max-message-mib", type=int)
 @click.option("--golden", type=click.Path(path_type=Path), help="Rows that must come out; exit 1 if they do not.")
 @click.option("--update-golden", type=click.Path(path_type=Path), help="Write the golden rows anew.")
 @click.option("-o", "--output", type=click.Path(path_type=Path), help="Directory for rows, trajectories and run facts.")
@@ -139,12 +125,10 @@ class Wanted:
 def _job(log: Path, flags: dict[str, Any]) -> Job:
     from avsreplay.run import Job
 
-    named = {key: flags.pop(name) for name, key in ASSIGNED.items()}
-    config_file, more, starts = flags.pop("config_file"), flags.pop("assignments"), flags.pop("starts")
-    assignments = [f"{key}={value}" for key, value in named.items() if value is not None]
-    assignments += ["deskew=false"] if flags.pop("no_deskew") else []
-    assignments += [f"estimator.start={mode}" for mode in starts if isinstance(mode, str)]
-    return Job(source=log, options=_options(flags, starts), config_file=config_file, assignments=(*more, *assignments))
+    config_file, assignments = take_run_settings(flags)
+    starts = flags.pop("starts")
+    assignments += tuple(f"estimator.start={mode}" for mode in starts if isinstance(mode, str))
+    return Job(source=log, options=_options(flags, starts), config_file=config_file, assignments=assignments)
 
 
 def _options(flags: dict[str, Any], starts: tuple[Any, ...]) -> Any:

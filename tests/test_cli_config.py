@@ -1,0 +1,123 @@
+"""``avsreplay config``, options derived from declarations, and environment variables."""
+
+import importlib
+import json
+import tomllib
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+from avsreplay import settings, toml_document
+from avsreplay.cli import SUMMARIES, group
+from avsreplay.cli.config import SECTIONS, reference_page
+from avsreplay.cli.setting_options import SettingOption, declared
+from avsreplay.config import RunConfig, load_config
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def config(*args, env=None):
+    """Output of ``avsreplay config`` as TOML; no process is started."""
+    done = CliRunner().invoke(group, ["config", *args], env=env, auto_envvar_prefix="AVSREPLAY")
+    assert done.exception is None, done.output
+    return done.output
+
+
+def test_the_reference_page_is_current():
+    page = (ROOT / "docs" / "settings.md").read_text(encoding="utf-8")
+    assert page == reference_page(), "run: avsreplay config --markdown > docs/settings.md"
+
+
+def test_the_reference_page_holds_every_setting():
+    page = reference_page()
+    for _, _, owner in SECTIONS:
+        module, _, name = owner.partition(":")
+        for entry in settings.entries(getattr(importlib.import_module(module), name)):
+            assert f"| `{entry.key}` |" in page
+
+
+def test_a_printed_configuration_gives_the_same_run(cli, fixtures_folder, tmp_path):
+    log, chosen = fixtures_folder / "tumble.mcap", ["--set", "register.gate_m=0.05", "--policy", "all"]
+    printed = cli("config", log, *chosen)
+    assert printed.code == 0, printed.err
+    (tmp_path / "c.toml").write_text(printed.out, encoding="utf-8")
+    direct = cli("run", log, "--n-scans", 4, "--json", *chosen)
+    read = cli("run", log, "--n-scans", 4, "--json", "--config", tmp_path / "c.toml")
+    assert direct.code == read.code == 0
+    plain = cli("run", log, "--n-scans", 4, "--json")
+    first, second, default = (json.loads(each.out) for each in (direct, read, plain))
+    assert first["rows"] == second["rows"]
+    assert first["header"]["config"] == second["header"]["config"] != default["header"]["config"]
+
+
+def test_the_log_brings_its_own_table(cli, tmp_path):
+    scenario = tmp_path / "s.toml"
+    scenario.write_text(
+        "duration_s = 1.0\n[scanner]\nrays = [16, 16]\n[run.faults]\npolicy = 'all'\n", encoding="utf-8"
+    )
+    assert cli("record", scenario, "-o", tmp_path / "s.mcap").code == 0
+    assert tomllib.loads(config(str(tmp_path / "s.mcap")))["faults"]["policy"] == "all"
+    assert tomllib.loads(config())["faults"]["policy"] == "any"
+
+
+def test_json_is_the_configuration_of_a_run():
+    assert json.loads(config("--json", "--policy", "all")) == settings.dump(
+        load_config(None, {}, ["faults.policy=all"])
+    )
+
+
+def test_environment_variables_are_those_of_run_and_options_come_before_them():
+    environment = {"AVSREPLAY_RUN_POLICY": "all", "AVSREPLAY_RUN_SET": "register.n_max=7 deskew=false"}
+    table = tomllib.loads(config(env=environment))
+    assert (table["faults"]["policy"], table["register"]["n_max"], table["deskew"]) == ("all", 7, False)
+    table = tomllib.loads(config("--set", "faults.policy=any", env=environment))
+    assert (table["faults"]["policy"], table["register"]["n_max"]) == ("any", 200)
+
+
+def test_a_configuration_file_may_come_from_the_environment(tmp_path):
+    (tmp_path / "c.toml").write_text("guess = 'last'\n", encoding="utf-8")
+    assert tomllib.loads(config(env={"AVSREPLAY_RUN_CONFIG": str(tmp_path / "c.toml")}))["guess"] == "last"
+
+
+@pytest.mark.parametrize("command", [["config"], ["run", "x.mcap"]])
+def test_an_unknown_environment_variable_is_an_error(command, cli):
+    done = cli(*command, env={"AVSREPLAY_RUN_POLCY": "all"})
+    assert done.code == 2
+    assert done.err.count("\n") == 1
+    assert "AVSREPLAY_RUN_POLCY" in done.err
+    assert "did you mean AVSREPLAY_RUN_POLICY?" in done.err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("--policy", "most"), "'most' is not one of any, all"),
+        (("--set", "regster.gate_m=1"), "did you mean 'register.gate_m'"),
+        (("--set", "register.gate_m=-1"), "--set register.gate_m=-1: register.gate_m is -1.0, must be above 0 [m]"),
+    ],
+)
+def test_a_wrong_value_is_one_line_that_names_the_option(arguments, words, cli):
+    done = cli("config", *arguments)
+    assert done.code == 2
+    assert "Traceback" not in done.err
+    assert words in done.err
+
+
+@pytest.mark.parametrize("name", SUMMARIES)
+def test_help_of_an_option_is_the_declared_meaning(name):
+    command = group.get_command(click.Context(group), name)
+    for option in command.params:
+        if isinstance(option, SettingOption):
+            setting = declared(option.owner, option.key).declared
+            record = option.get_help_record(click.Context(command))
+            assert setting.doc.removesuffix(".") in record[1]
+            assert setting.unit in record[1]
+
+
+def test_every_setting_is_written_with_its_meaning():
+    text = toml_document.write(RunConfig())
+    flat = " ".join(line.removeprefix("# ") for line in text.splitlines())
+    for entry in settings.entries(RunConfig):
+        assert entry.declared.doc in flat, entry.key
