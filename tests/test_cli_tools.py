@@ -58,13 +58,6 @@ def test_completion_names_the_commands(cli):
     assert {"plain,record", "plain,report"} <= set(done.out.split())
 
 
-def test_config_dump_is_a_configuration(cli, tmp_path):
-    dumped = json.loads(cli("config", "--dump", "--set", "plan.a_max_mps2=0.03").out)
-    assert dumped["plan"]["a_max_mps2"] == 0.03
-    assert set(dumped) >= {"register", "estimator", "faults", "convergence", "plan", "supervisor"}
-    assert "plan.a_max_mps2 = 0.05" in cli("config").out
-
-
 def test_version_names_what_it_stands_on(cli):
     out = cli("--version").out
     assert out.startswith("avsreplay 0.1.0")

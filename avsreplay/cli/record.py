@@ -60,7 +60,7 @@ def command(
     output: Path,
     seed: int | None,
     model: Path | None,
-    cloud_model: bool,
+    cloud_model: bool | None,
     compression: str,
     overwrite: bool,
     as_json: bool,
@@ -73,7 +73,7 @@ def command(
     """
     from avsreplay.recording import RecordOptions, record
 
-    options = RecordOptions(model=model, cloud_model=cloud_model, overwrite=overwrite, compression=compression)
+    options = RecordOptions(model=model, cloud_model=bool(cloud_model), overwrite=overwrite, compression=compression)
     done = record(source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
     click.echo(json.dumps(dataclasses.asdict(done), indent=2) if as_json else _sentence(done))
     if done.losses or done.damaged:
