@@ -28,8 +28,8 @@ class MonitorReport:
         nis_mean: mean NIS over the consistency window.
         autocorrelation: lag-1 autocorrelation of the whitened innovations in that window.
         converged: the planner may rely on the estimate.
-        covariance_holds: every block of the covariance is below its limit (the paper's criterion).
-        predictive_holds: the predicted standard deviations of the grasp point are below their limits.
+        covariance_converged: every block of the covariance is below its limit (the paper's criterion).
+        predictive_converged: the predicted standard deviations of the grasp point are below their limits.
         unconverged: blocks whose covariance is above its limit.
         forecast: predicted standard deviations of the grasp point over the convergence horizon.
     """
@@ -41,8 +41,8 @@ class MonitorReport:
     nis_mean: float | None
     autocorrelation: float | None
     converged: bool
-    covariance_holds: bool
-    predictive_holds: bool
+    covariance_converged: bool
+    predictive_converged: bool
     unconverged: tuple[str, ...]
     forecast: Forecast
 
@@ -64,10 +64,10 @@ class Outcome:
         estimator: estimator in use: near, start, fit or filter.
         sigma_hits: how often the bounds of the inertia ratios limited the gain so far.
         r_floors: how many eigenvalues of R were raised to their lower limit so far.
-        recalls: how often the filter or the given start was replaced by a fit so far.
+        reinitialised: how often the filter or the given start was replaced by a fit so far.
         monitors: observability, consistency and convergence.
         action: command of the supervisor to the robot.
-        rule: rule of the supervisor that gave it.
+        supervisor_rule: rule of the supervisor that gave it.
         plan: capture plan in force, None before the first.
     """
 
@@ -83,10 +83,10 @@ class Outcome:
     estimator: str
     sigma_hits: int
     r_floors: int
-    recalls: int
+    reinitialised: int
     monitors: MonitorReport
     action: str
-    rule: str
+    supervisor_rule: str
     plan: Plan | None
 
 
@@ -142,7 +142,7 @@ def finite(value: float | None) -> float | None:
     return float(value) if value is not None and np.isfinite(value) else None
 
 
-def if_innovation(get: Callable[[Innovation], float]) -> Value[float | None]:
+def if_innovation(get: Callable[[Innovation], float | None]) -> Value[float | None]:
     """Take a value of the innovation, None where nothing was measured."""
     return lambda o, s: None if o.innovation is None else get(o.innovation)
 

@@ -95,8 +95,8 @@ class Monitors:
             nis_mean=window.nis_mean,
             autocorrelation=window.autocorrelation,
             converged=convergence.converged,
-            covariance_holds=convergence.covariance_holds,
-            predictive_holds=convergence.predictive_holds,
+            covariance_converged=convergence.covariance_converged,
+            predictive_converged=convergence.predictive_converged,
             unconverged=convergence.unknown,
             forecast=forecast,
         )
@@ -179,10 +179,10 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         estimator=track.mode,
         sigma_hits=track.sigma_hits,
         r_floors=track.r_floors,
-        recalls=track.reinitialised,
+        reinitialised=track.reinitialised,
         monitors=report,
         action=guidance.decision.action.value,
-        rule=guidance.decision.rule,
+        supervisor_rule=guidance.decision.rule,
         plan=guidance.plan,
     )
     last_pose = measurement.alignment.T_ac if gamma else state.last_pose

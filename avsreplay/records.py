@@ -215,7 +215,7 @@ class Alignment:
         info: (6, 6) information of the error d = [theta; v], both in {C} [rad, m], where
             T_ac_true = T_ac @ Exp(d): noise-scaled, singular directions left singular.
         covariance: (6, 6) calibrated covariance of the same d, or None where the view is degenerate.
-        weakest: words for the free directions ("slides along x"), empty if none.
+        free_directions: directions that the view does not determine ("slides along x"), empty if none.
     """
 
     T_ac: Pose
@@ -227,7 +227,7 @@ class Alignment:
     info: Array
     status: AlignStatus
     covariance: Array | None = None
-    weakest: str = ""
+    free_directions: str = ""
 
     @property
     def measured(self) -> bool:

@@ -159,7 +159,7 @@ class ViewWriter:
         self._clouds.append(CloudView(thin.seq, thin.points, self._residual(thin.points, scan.outcome.pose)))
         path = self._paths.of(scan.state)
         if path is not None:
-            self._plans.append(PathView(scan.row.t_ns, np.asarray(path[1], np.float32), scan.row.hindsight_m))
+            self._plans.append(PathView(scan.row.t_ns, np.asarray(path[1], np.float32), scan.row.plan_miss_m))
 
     def _residual(self, points: NDArray[np.float32], T_ac: Pose) -> NDArray[np.float32]:
         """Distance (n,) [m] of points (n, 3) in {A} to the model at the estimated pose."""

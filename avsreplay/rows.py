@@ -1,7 +1,7 @@
-"""One row a scan, declared once: value, unit, format, golden tolerance and meaning stand beside each field.
+"""The row of a scan. Each column is declared once: value, meaning, unit, format, golden tolerance.
 
-JSONL and CSV columns, table heads, golden tolerances, the docs' column list and the JSON schema are read from here.
-A row holds results only: no wall clock, host, version or path, so the same input gives the same bytes.
+JSONL, CSV and Parquet files, tables, golden comparisons, docs/columns.md and the JSON schema are made from this
+declaration. A row holds results only, no wall clock, host, version or path: the same input gives the same bytes.
 """
 
 from __future__ import annotations
@@ -36,12 +36,16 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """What a row field means.
+    """Metadata of a row field.
 
     Attributes:
-        name: field name, with its unit as suffix where it has one.  unit: as printed in heads, "" if none.
-        fmt: format spec for people.  rtol, atol: golden tolerance (both 0: exact).  doc: one sentence.
-        table: shown in the per-scan table by default.
+        name: field name, with its unit as suffix where it has one.
+        unit: as printed in table headings, "" if none.
+        fmt: format specification for tables.
+        rtol: relative golden tolerance; 0 with ``atol`` 0 means exact.
+        atol: absolute golden tolerance.
+        doc: meaning.
+        table: shown in the per-scan table.
     """
 
     name: str
@@ -87,7 +91,7 @@ def _number(value: Value[T], doc: str, unit: str = "", fmt: str = ".4g", table: 
     return column(value, doc, unit, fmt, 1e-4, atol, table)
 
 
-def _flag(value: Value[T], doc: str, table: bool = False) -> T:
+def _exact(value: Value[T], doc: str, table: bool = False) -> T:
     return column(value, doc, table=table)
 
 
@@ -95,242 +99,172 @@ _ESTIMATE, _REGISTRATION = pose_error_values(lambda s: s.estimate), pose_error_v
 _PLANNED, _CAPTURED = capture_error_values(lambda s: s.planned), capture_error_values(lambda s: s.captured)
 
 
-def _nees(block: str) -> float | None:
+def _nees(block: str, name: str) -> float | None:
     value: Value[float | None] = lambda o, s: finite(s.nees_blocks.get(block))  # noqa: E731
-    return column(value, f"the same of the block '{block}' alone", "", ".2f", 1e-2, 1e-3)
+    return column(value, f"Normalised estimation error squared of {name}.", "", ".2f", 1e-2, 1e-3)
 
 
+# fmt: off
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """What one scan did. None where there is nothing to say: no truth, no measurement, not converged, no fault."""
+    """The result of one scan. None: does not apply (no truth, no measurement, no plan, no fault)."""
 
-    seq: int = _flag(lambda o, s: o.scan.seq, "place of the scan in the replay, from 0", table=True)
-    t_ns: int = _flag(lambda o, s: o.scan.t_ns, "instant of the scan on the chosen clock [ns]")
-    t_s: float = column(
-        lambda o, s: since_start_s(o, o.scan.t_ns), "time since the first scan", "s", ".2f", 0.0, 1e-09, table=True
-    )
-    status: str = _flag(lambda o, s: status(o), "what the door and the ruler found of the scan", table=True)
-    gamma: int = _flag(
-        lambda o, s: o.verdict.gamma, "1: healthy, used by the filter; 0: faulty, the filter coasts", table=True
-    )
-    reason: str = _flag(lambda o, s: o.verdict.reason.value, "why gamma is 0; 'ok' where it is 1", table=True)
-    guess: str = _flag(
-        lambda o, s: o.guess, "where the registration's guess came from: init, predicted, last, acquired"
-    )
-    fault: str | None = _flag(lambda o, s: s.fault, "label of the fault injected into this scan", table=True)
+    seq: int = _exact(lambda o, s: o.scan.seq, "Index of the scan in the replay, from 0.", table=True)
+    t_ns: int = _exact(lambda o, s: o.scan.t_ns, "Time of the scan on the selected clock [ns].")
+    t_s: float = column(lambda o, s: since_start_s(o, o.scan.t_ns), "Time since the first scan.",
+        "s", ".2f", 0.0, 1e-9, table=True)
+    status: str = _exact(lambda o, s: status(o), "Status of the registration; of the scan itself if that is not ok.",
+        table=True)
+    gamma: int = _exact(lambda o, s: o.verdict.gamma,
+        "1: the scan is healthy and updates the filter; 0: it is faulty and the filter only predicts.", table=True)
+    reason: str = _exact(lambda o, s: o.verdict.reason.value, "Why gamma is 0; ok where gamma is 1.", table=True)
+    guess: str = _exact(lambda o, s: o.guess, "Initial guess of the registration: predicted (by the filter), last"
+        " (healthy pose), acquired (search without a guess); until the first healthy scan the source of the first"
+        " pose: start (in the log), truth, given (on the command line) or acquired.")
+    fault: str | None = _exact(lambda o, s: s.fault, "Label of the fault that was injected into this scan.", table=True)
 
-    points: int = _flag(lambda o, s: len(o.scan.points), "finite points in the scan")
-    iterations: int | None = _flag(
-        if_points(lambda o: o.alignment.iterations), "passes of the registration", table=True
-    )
-    inliers: int | None = column(
-        if_points(lambda o: o.alignment.inliers),
-        "points within the rejection distance of the model",
-        "",
-        "d",
-        0.001,
-        3,
-    )
-    inlier_ratio: float | None = column(
-        if_points(lambda o: o.alignment.inlier_ratio), "inliers over points", "", ".3f", 0.001, 0.001, table=True
-    )
-    rms_m: float | None = column(
-        if_points(lambda o: finite(o.alignment.rms_m)),
-        "root of the mean squared fit error over the inliers",
-        "m",
-        ".5f",
-        0.0001,
-        1e-07,
-        table=True,
-    )
-    weakest: str | None = _flag(lambda o, s: o.alignment.weakest or None, "directions the view leaves free, in words")
-    reg_x_m: float | None = _metres(if_measured(lambda T: T.t[0]), "registration's pose of {C} in {A}")
-    reg_y_m: float | None = _metres(if_measured(lambda T: T.t[1]), "see reg_x_m")
-    reg_z_m: float | None = _metres(if_measured(lambda T: T.t[2]), "see reg_x_m")
-    reg_qx: float | None = _number(if_measured(lambda T: T.q[0]), "measured attitude q_ac, scalar last, w >= 0")
-    reg_qy: float | None = _number(if_measured(lambda T: T.q[1]), "see reg_qx")
-    reg_qz: float | None = _number(if_measured(lambda T: T.q[2]), "see reg_qx")
-    reg_qw: float | None = _number(if_measured(lambda T: T.q[3]), "see reg_qx")
+    points: int = _exact(lambda o, s: len(o.scan.points), "Number of finite points in the scan.")
+    iterations: int | None = _exact(if_points(lambda o: o.alignment.iterations), "Iterations of the registration.",
+        table=True)
+    inliers: int | None = column(if_points(lambda o: o.alignment.inliers),
+        "Points closer to the model than the last rejection distance.", "", "d", 1e-3, 3)
+    inlier_ratio: float | None = column(if_points(lambda o: o.alignment.inlier_ratio),
+        "Inliers divided by points.", "", ".3f", 1e-3, 1e-3, table=True)
+    rms_m: float | None = column(if_points(lambda o: finite(o.alignment.rms_m)),
+        "Root mean square distance of the inliers to the model.", "m", ".5f", 1e-4, 1e-7, table=True)
+    free_directions: str | None = _exact(lambda o, s: o.alignment.free_directions or None,
+        "Directions that the registration cannot determine, in words.")
+    reg_x_m: float | None = _metres(if_measured(lambda T: T.t[0]), "Measured position of {C} in {A}.")
+    reg_y_m: float | None = _metres(if_measured(lambda T: T.t[1]), "See reg_x_m.")
+    reg_z_m: float | None = _metres(if_measured(lambda T: T.t[2]), "See reg_x_m.")
+    reg_qx: float | None = _number(if_measured(lambda T: T.q[0]), "Measured attitude q_ac, scalar last, w >= 0.")
+    reg_qy: float | None = _number(if_measured(lambda T: T.q[1]), "See reg_qx.")
+    reg_qz: float | None = _number(if_measured(lambda T: T.q[2]), "See reg_qx.")
+    reg_qw: float | None = _number(if_measured(lambda T: T.q[3]), "See reg_qx.")
 
-    nis: float | None = column(
-        if_innovation(lambda i: i.nis),
-        "normalised innovation squared, chi-square of 6",
-        "",
-        ".2f",
-        0.001,
-        0.0001,
-        table=True,
-    )
-    weight: float | None = _number(
-        if_innovation(lambda i: i.weight),
-        "share of its say a pose is left, 1 up to the 99.99 % point of NIS",
-        atol=0.0001,
-    )
-    innov_m: float | None = _metres(if_innovation(lambda i: i.distance_m), "length of the position innovation")
-    innov_deg: float | None = column(
-        if_innovation(lambda i: float(np.degrees(i.angle_rad))),
-        "rotation angle of the innovation",
-        "deg",
-        ".3f",
-        1e-4,
-        1e-4,
-    )
+    nis: float | None = column(if_innovation(lambda i: finite(i.nis)),
+        "Normalised innovation squared; chi-square with 6 degrees of freedom if the filter is consistent.",
+        "", ".2f", 1e-3, 1e-4, table=True)
+    cauchy_weight: float | None = _number(if_innovation(lambda i: i.weight),
+        "Cauchy weight of the pose in the update; 1 up to the 99.99 % point of NIS.", atol=1e-4)
+    innov_m: float | None = _metres(if_innovation(lambda i: finite(i.distance_m)),
+        "Length of the position innovation.")
+    innov_deg: float | None = column(if_innovation(lambda i: finite(np.degrees(i.angle_rad))),
+        "Rotation angle of the attitude innovation.", "deg", ".3f", 1e-4, 1e-4)
 
-    estimator: str = _flag(lambda o, s: o.estimator, "who speaks: near, start, fit, filter")
-    x_m: float | None = _metres(lambda o, s: float(o.pose.t[0]), "estimated pose of {C} in {A}, after the update")
-    y_m: float | None = _metres(lambda o, s: float(o.pose.t[1]), "see x_m")
-    z_m: float | None = _metres(lambda o, s: float(o.pose.t[2]), "see x_m")
-    qx: float | None = _number(lambda o, s: float(o.pose.q[0]), "estimated attitude q_ac, scalar last, w >= 0")
-    qy: float | None = _number(lambda o, s: float(o.pose.q[1]), "see qx")
-    qz: float | None = _number(lambda o, s: float(o.pose.q[2]), "see qx")
-    qw: float | None = _number(lambda o, s: float(o.pose.q[3]), "see qx")
-    pos_1s_m: float | None = _number(
-        lambda o, s: position_1s_m(o.pose_covariance), "predicted 1 sigma of the position, root of the trace", "m"
-    )
-    rot_1s_deg: float | None = _number(
-        lambda o, s: full_angle_deg(np.diag(o.pose_covariance)[3:].sum()),
-        "predicted 1 sigma of the attitude, root of the trace",
-        "deg",
-    )
-    wx_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[0]), "angular rate in {B}", "rad/s")
-    wy_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[1]), "see wx_radps", "rad/s")
-    wz_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[2]), "see wx_radps", "rad/s")
-    rx_m: float | None = _metres(lambda o, s: float(o.belief.x.r_a[0]), "centre of mass in {A}")
-    ry_m: float | None = _metres(lambda o, s: float(o.belief.x.r_a[1]), "see rx_m")
-    rz_m: float | None = _metres(lambda o, s: float(o.belief.x.r_a[2]), "see rx_m")
-    vx_mps: float | None = _number(
-        lambda o, s: float(o.belief.x.v_a[0]), "velocity of the centre of mass in {A}", "m/s"
-    )
-    vy_mps: float | None = _number(lambda o, s: float(o.belief.x.v_a[1]), "see vx_mps", "m/s")
-    vz_mps: float | None = _number(lambda o, s: float(o.belief.x.v_a[2]), "see vx_mps", "m/s")
-    sigma1: float | None = _number(
-        lambda o, s: float(o.belief.x.sigma[0]), "inertia ratio (Iyy - Izz) / Ixx", fmt=".4f", table=True
-    )
-    sigma2: float | None = _number(
-        lambda o, s: float(o.belief.x.sigma[1]), "inertia ratio (Izz - Ixx) / Iyy", fmt=".4f", table=True
-    )
-    sigma1_1s: float | None = _number(deviation("sigma", 0), "1 sigma of sigma1")
-    sigma2_1s: float | None = _number(deviation("sigma", 1), "1 sigma of sigma2")
-    cx_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[0]), "fixture in {B} (varrho)")
-    cy_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[1]), "see cx_m")
-    cz_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[2]), "see cx_m")
-    c_1s_m: float | None = _number(deviation("varrho"), "1 sigma of varrho, root of the trace", "m")
-    mux: float | None = _number(lambda o, s: float(o.belief.x.q_bc[0]), "mu = q_bc, scalar last")
-    muy: float | None = _number(lambda o, s: float(o.belief.x.q_bc[1]), "see mux")
-    muz: float | None = _number(lambda o, s: float(o.belief.x.q_bc[2]), "see mux")
-    muw: float | None = _number(lambda o, s: float(o.belief.x.q_bc[3]), "see mux")
-    mu_1s_deg: float | None = _number(
-        lambda o, s: full_angle_deg(np.diag(o.belief.P)[BLOCKS["mu"]].sum()), "1 sigma of mu, root of the trace", "deg"
-    )
+    estimator: str = _exact(lambda o, s: o.estimator, "Estimator in use: near (given initial state, before the first"
+        " healthy scan), start (first poses of a cold start), fit (maximum-likelihood fit to all poses), filter.")
+    x_m: float | None = _metres(lambda o, s: float(o.pose.t[0]), "Estimated position of {C} in {A} after the update.")
+    y_m: float | None = _metres(lambda o, s: float(o.pose.t[1]), "See x_m.")
+    z_m: float | None = _metres(lambda o, s: float(o.pose.t[2]), "See x_m.")
+    qx: float | None = _number(lambda o, s: float(o.pose.q[0]), "Estimated attitude q_ac, scalar last, w >= 0.")
+    qy: float | None = _number(lambda o, s: float(o.pose.q[1]), "See qx.")
+    qz: float | None = _number(lambda o, s: float(o.pose.q[2]), "See qx.")
+    qw: float | None = _number(lambda o, s: float(o.pose.q[3]), "See qx.")
+    pos_1s_m: float | None = _number(lambda o, s: position_1s_m(o.pose_covariance),
+        "Standard deviation of the estimated position (root of the trace of its covariance).", "m")
+    rot_1s_deg: float | None = _number(lambda o, s: full_angle_deg(np.diag(o.pose_covariance)[3:].sum()),
+        "Standard deviation of the estimated attitude (root of the trace of its covariance).", "deg")
+    wx_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[0]), "Angular rate in {B}.", "rad/s")
+    wy_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[1]), "See wx_radps.", "rad/s")
+    wz_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[2]), "See wx_radps.", "rad/s")
+    rx_m: float | None = _metres(lambda o, s: float(o.belief.x.r_a[0]), "Centre of mass in {A}.")
+    ry_m: float | None = _metres(lambda o, s: float(o.belief.x.r_a[1]), "See rx_m.")
+    rz_m: float | None = _metres(lambda o, s: float(o.belief.x.r_a[2]), "See rx_m.")
+    vx_mps: float | None = _number(lambda o, s: float(o.belief.x.v_a[0]), "Velocity of the centre of mass in {A}.",
+        "m/s")
+    vy_mps: float | None = _number(lambda o, s: float(o.belief.x.v_a[1]), "See vx_mps.", "m/s")
+    vz_mps: float | None = _number(lambda o, s: float(o.belief.x.v_a[2]), "See vx_mps.", "m/s")
+    sigma1: float | None = _number(lambda o, s: float(o.belief.x.sigma[0]), "Inertia ratio (Iyy - Izz) / Ixx.",
+        fmt=".4f", table=True)
+    sigma2: float | None = _number(lambda o, s: float(o.belief.x.sigma[1]), "Inertia ratio (Izz - Ixx) / Iyy.",
+        fmt=".4f", table=True)
+    sigma1_1s: float | None = _number(deviation("sigma", 0), "Standard deviation of sigma1.")
+    sigma2_1s: float | None = _number(deviation("sigma", 1), "Standard deviation of sigma2.")
+    cx_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[0]), "Position of the fixture in {B} (varrho).")
+    cy_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[1]), "See cx_m.")
+    cz_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[2]), "See cx_m.")
+    c_1s_m: float | None = _number(deviation("varrho"), "Standard deviation of varrho (root of the trace).", "m")
+    mux: float | None = _number(lambda o, s: float(o.belief.x.q_bc[0]), "Fixture attitude mu = q_bc, scalar last.")
+    muy: float | None = _number(lambda o, s: float(o.belief.x.q_bc[1]), "See mux.")
+    muz: float | None = _number(lambda o, s: float(o.belief.x.q_bc[2]), "See mux.")
+    muw: float | None = _number(lambda o, s: float(o.belief.x.q_bc[3]), "See mux.")
+    mu_1s_deg: float | None = _number(lambda o, s: full_angle_deg(np.diag(o.belief.P)[BLOCKS["mu"]].sum()),
+        "Standard deviation of mu (root of the trace).", "deg")
 
-    pos_err_m: float | None = _error_m(_ESTIMATE[0], "distance of estimated and true position", table=True)
-    rot_err_deg: float | None = _error_deg(_ESTIMATE[1], "angle between estimated and true attitude", table=True)
-    reg_pos_err_m: float | None = _error_m(_REGISTRATION[0], "distance of measured and true position")
-    reg_rot_err_deg: float | None = _error_deg(_REGISTRATION[1], "angle between measured and true attitude")
-    reference: str | None = _flag(
-        lambda o, s: s.reference, "what the errors are against: truth, or fit (a motion fitted to all healthy poses)"
-    )
-    nees: float | None = column(
-        lambda o, s: finite(s.nees),
-        "normalised estimation error squared of 20 states, modulo relabelling",
-        "",
-        ".2f",
-        0.01,
-        0.001,
-    )
-    nees_attitude: float | None = _nees("attitude")
-    nees_rate: float | None = _nees("rate")
-    nees_position: float | None = _nees("position")
-    nees_velocity: float | None = _nees("velocity")
-    nees_sigma: float | None = _nees("sigma")
-    nees_varrho: float | None = _nees("varrho")
-    nees_mu: float | None = _nees("mu")
+    pos_err_m: float | None = _error_m(_ESTIMATE[0], "Distance of the estimated from the true position.", table=True)
+    rot_err_deg: float | None = _error_deg(_ESTIMATE[1], "Angle between estimated and true attitude.", table=True)
+    reg_pos_err_m: float | None = _error_m(_REGISTRATION[0], "Distance of the measured from the true position.")
+    reg_rot_err_deg: float | None = _error_deg(_REGISTRATION[1], "Angle between measured and true attitude.")
+    reference: str | None = _exact(lambda o, s: s.reference,
+        "What the errors are computed against: truth, or fit (one motion fitted to all healthy poses).")
+    nees: float | None = column(lambda o, s: finite(s.nees), "Normalised estimation error squared of the 20 states;"
+        " the order of the principal axes that is nearest to the estimate is used.", "", ".2f", 1e-2, 1e-3)
+    nees_attitude: float | None = _nees("attitude", "the attitude of the principal axes")
+    nees_rate: float | None = _nees("rate", "the angular rate")
+    nees_position: float | None = _nees("position", "the centre of mass")
+    nees_velocity: float | None = _nees("velocity", "its velocity")
+    nees_sigma: float | None = _nees("sigma", "the inertia ratios")
+    nees_varrho: float | None = _nees("varrho", "the fixture position")
+    nees_mu: float | None = _nees("mu", "the fixture attitude")
 
-    r_pos_m: float | None = _number(
-        if_innovation(lambda i: float(np.sqrt(np.diag(i.R)[:3].mean()))),
-        "adapted measurement noise, position, root mean diagonal",
-        "m",
-    )
-    r_rot_deg: float | None = _number(
-        if_innovation(lambda i: full_angle_deg(np.diag(i.R)[3:].mean())),
-        "adapted measurement noise, attitude, root mean diagonal",
-        "deg",
-    )
-    sigma_hits: int | None = _flag(lambda o, s: o.sigma_hits, "times a sigma bound cut the gain so far")
-    r_floors: int | None = _flag(lambda o, s: o.r_floors, "times an eigenvalue floor of R acted so far")
-    recalls: int | None = _flag(
-        lambda o, s: o.recalls, "times the poses contradicted the filter or the given start so far"
-    )
+    r_pos_m: float | None = _number(if_innovation(lambda i: float(np.sqrt(np.diag(i.R)[:3].mean()))),
+        "Adapted measurement noise of the position (root of the mean variance in R).", "m")
+    r_rot_deg: float | None = _number(if_innovation(lambda i: full_angle_deg(np.diag(i.R)[3:].mean())),
+        "Adapted measurement noise of the attitude (root of the mean variance in R).", "deg")
+    sigma_hits: int | None = _exact(lambda o, s: o.sigma_hits,
+        "How often a bound on sigma1 or sigma2 limited the Kalman gain, up to this scan.")
+    r_floors: int | None = _exact(lambda o, s: o.r_floors,
+        "How many eigenvalues of R were raised to the lower limit, up to this scan.")
+    reinitialised: int | None = _exact(lambda o, s: o.reinitialised,
+        "How often the poses contradicted the filter or the given initial state, so that a fit replaced it.")
 
-    ogm_log10_cond: float | None = column(
-        lambda o, s: o.monitors.ogm_log10_cond,
-        "log10 condition of the Gramian (null below full rank)",
-        "",
-        ".1f",
-        0.001,
-        0.01,
-        table=True,
-    )
-    ogm_log10_cond_scaled: float | None = column(
-        lambda o, s: o.monitors.ogm_log10_cond_scaled, "the same, scaled by the prior sigmas", "", ".1f", 0.001, 0.01
-    )
-    ogm_rank: int | None = _flag(
-        lambda o, s: o.monitors.ogm_rank, "numerical rank of the scaled Gramian out of 20", table=True
-    )
-    nis_mean: float | None = _number(
-        lambda o, s: o.monitors.nis_mean, "mean NIS over the consistency window (6 is right)", fmt=".2f", atol=0.0001
-    )
-    autocorrelation: float | None = _number(
-        lambda o, s: o.monitors.autocorrelation, "largest lag-1 autocorrelation of the whitened innovation", atol=0.0001
-    )
-    consistent: bool | None = _flag(lambda o, s: o.monitors.consistent, "innovations inside their chi-square band")
-    converged: bool = _flag(lambda o, s: o.monitors.converged, "may the planner rely on the estimate", table=True)
-    covariance_holds: bool | None = _flag(
-        lambda o, s: o.monitors.covariance_holds, "every block of the covariance is below its limit (the paper's test)"
-    )
-    predictive_holds: bool | None = _flag(
-        lambda o, s: o.monitors.predictive_holds, "the grasp point's predicted 1 sigma is below its limits"
-    )
-    unknown: str | None = _flag(
-        lambda o, s: ", ".join(o.monitors.unconverged) or None, "blocks above their covariance limit"
-    )
-    grasp_pos_1s_m: float | None = _number(
-        lambda o, s: float(o.monitors.forecast.pos_1s_m.max()),
-        "horizon's largest 1 sigma of the grasp point's position",
-        "m",
-    )
-    grasp_vel_1s_mps: float | None = _number(
-        lambda o, s: float(o.monitors.forecast.vel_1s_mps.max()), "horizon's largest 1 sigma of its velocity", "m/s"
-    )
-    grasp_rot_1s_deg: float | None = _number(
-        lambda o, s: float(np.degrees(o.monitors.forecast.rot_1s_rad.max())),
-        "horizon's largest 1 sigma of its attitude",
-        "deg",
-    )
+    ogm_log10_cond: float | None = column(lambda o, s: o.monitors.ogm_log10_cond,
+        "log10 of the condition number of the observability Gramian; null below full rank.",
+        "", ".1f", 1e-3, 1e-2, table=True)
+    ogm_log10_cond_scaled: float | None = column(lambda o, s: o.monitors.ogm_log10_cond_scaled,
+        "The same with each state scaled by its prior standard deviation.", "", ".1f", 1e-3, 1e-2)
+    ogm_rank: int | None = _exact(lambda o, s: o.monitors.ogm_rank,
+        "Numerical rank of the scaled observability Gramian; 20 is full.", table=True)
+    nis_mean: float | None = _number(lambda o, s: o.monitors.nis_mean,
+        "Mean NIS over the consistency window; 6 is expected.", fmt=".2f", atol=1e-4)
+    autocorrelation: float | None = _number(lambda o, s: o.monitors.autocorrelation,
+        "Lag-1 autocorrelation of the whitened innovations over that window; 0 is expected.", atol=1e-4)
+    consistent: bool | None = _exact(lambda o, s: o.monitors.consistent,
+        "The mean NIS is below the upper limit of its chi-square interval and few poses have a reduced weight.")
+    converged: bool = _exact(lambda o, s: o.monitors.converged, "The planner may rely on the estimate.", table=True)
+    covariance_converged: bool | None = _exact(lambda o, s: o.monitors.covariance_converged,
+        "The covariance of every block of states is below its limit (the paper's criterion).")
+    predictive_converged: bool | None = _exact(lambda o, s: o.monitors.predictive_converged,
+        "The predicted standard deviations of the grasp point are below their limits.")
+    unconverged_blocks: str | None = _exact(lambda o, s: ", ".join(o.monitors.unconverged) or None,
+        "Blocks of states whose covariance is above its limit.")
+    grasp_pos_1s_m: float | None = _number(lambda o, s: float(o.monitors.forecast.pos_1s_m.max()),
+        "Largest predicted standard deviation of the grasp point's position over the horizon.", "m")
+    grasp_vel_1s_mps: float | None = _number(lambda o, s: float(o.monitors.forecast.vel_1s_mps.max()),
+        "Largest predicted standard deviation of its velocity over the horizon.", "m/s")
+    grasp_rot_1s_deg: float | None = _number(lambda o, s: float(np.degrees(o.monitors.forecast.rot_1s_rad.max())),
+        "Largest predicted standard deviation of its attitude over the horizon.", "deg")
 
-    plan_status: str | None = _flag(
-        lambda o, s: None if o.plan is None else o.plan.status.value, "what the planner claims"
-    )
-    capture_time_s: float | None = _seconds(
-        if_planned(lambda o, p: since_start_s(o, p.t_ns) + p.t_go_s),
-        "planned instant of capture, since the first scan",
-        table=True,
-    )
-    t_go_s: float | None = _seconds(
-        if_planned(lambda o, p: p.t_go_s - (o.scan.t_ns - p.t_ns) * 1e-9), "time from this scan to the planned capture"
-    )
-    plan_bound_s: float | None = _seconds(
+    plan_status: str | None = _exact(lambda o, s: None if o.plan is None else o.plan.status.value,
+        "Result of the planner for the plan in force.")
+    capture_time_s: float | None = _seconds(if_planned(lambda o, p: since_start_s(o, p.t_ns) + p.t_go_s),
+        "Planned time of capture, from the first scan.", table=True)
+    t_go_s: float | None = _seconds(if_planned(lambda o, p: p.t_go_s - (o.scan.t_ns - p.t_ns) * 1e-9),
+        "Time from this scan to the planned capture.")
+    earliest_capture_s: float | None = _seconds(
         lambda o, s: None if o.plan is None else since_start_s(o, o.plan.t_ns) + o.plan.lower_bound_s,
-        "certified: no capture before, since the first scan",
-    )
-    hindsight_m: float | None = _error_m(_PLANNED[0], "plan made at this scan: miss of the true grasp point")
-    hindsight_mps: float | None = _error_m(_PLANNED[1], "the same: true relative speed at its end", "m/s")
-    hindsight_deg: float | None = _error_deg(_PLANNED[2], "the same: error of the predicted attitude there")
-    action: str = _flag(lambda o, s: o.action, "what the supervisor tells the robot", table=True)
-    rule: str = _flag(lambda o, s: o.rule, "the supervisor's rule that fired")
-    capture_miss_m: float | None = _error_m(_CAPTURED[0], "gripper closed since the last scan: true distance")
-    capture_miss_mps: float | None = _error_m(_CAPTURED[1], "the same: true relative speed", "m/s")
-    capture_miss_deg: float | None = _error_deg(_CAPTURED[2], "the same: attitude error")
+        "Certified lower bound of the time of capture, from the first scan.")
+    plan_miss_m: float | None = _error_m(_PLANNED[0],
+        "Distance of gripper and true grasp point at the end of the plan that was made at this scan.")
+    plan_miss_mps: float | None = _error_m(_PLANNED[1], "Their relative speed at that time.", "m/s")
+    plan_miss_deg: float | None = _error_deg(_PLANNED[2], "Error of the attitude predicted for that time.")
+    action: str = _exact(lambda o, s: o.action, "Command of the supervisor to the robot.", table=True)
+    supervisor_rule: str = _exact(lambda o, s: o.supervisor_rule, "Rule of the supervisor that gave this command.")
+    capture_miss_m: float | None = _error_m(_CAPTURED[0],
+        "Distance of gripper and true grasp point, where the gripper has closed since the last scan.")
+    capture_miss_mps: float | None = _error_m(_CAPTURED[1], "Their relative speed at that time.", "m/s")
+    capture_miss_deg: float | None = _error_deg(_CAPTURED[2], "Attitude error at that time.")
 
     @classmethod
     def of(cls, outcome: Outcome, score: Score) -> Row:
@@ -338,6 +272,7 @@ class Row:
         return cls(**{name: value(outcome, score) for name, value in _VALUES})
 
 
+# fmt: on
 _VALUES = tuple((f.name, f.metadata["value"]) for f in dataclasses.fields(Row))
 
 

@@ -306,7 +306,7 @@ def test_a_nearly_axisymmetric_body_can_be_captured_though_its_parameters_stay_u
         track = estimator.update(track, prediction, estimator.innovate(prediction, alignment), 1)
         held = test.judge(held, track.belief, estimator.forecast(track.belief, test.params.times_s))
     assert held.converged
-    assert not held.covariance_holds
+    assert not held.covariance_converged
     assert "mu" in held.unknown
     ahead = estimator.predict(track, 90_000_000_000).belief
     off = np.linalg.norm(ahead.x.T_ac.t - states[-1].T_ac.t)

@@ -66,7 +66,7 @@ def test_predictive_test_lets_an_unknowable_parameter_pass() -> None:
     assert fold(Convergence(ConvergenceParams(), 8.0), steps).converged
     track = fold(Convergence(PAPER, 8.0), steps)
     assert not track.converged
-    assert track.predictive_holds
+    assert track.predictive_converged
     assert track.unknown == ("sigma", "mu")
 
 
@@ -85,7 +85,7 @@ def test_an_inconsistent_filter_is_not_converged() -> None:
 def test_not_a_number_is_not_converged() -> None:
     P = np.full((20, 20), np.nan)
     nothing = Belief(0, X, P)
-    assert not fold(Convergence(PAPER, 8.0), [(nothing,)] * 3).covariance_holds
+    assert not fold(Convergence(PAPER, 8.0), [(nothing,)] * 3).covariance_converged
     assert not fold(Convergence(ConvergenceParams(), 8.0), [(belief(t), ahead(np.nan)) for t in range(9)]).converged
 
 

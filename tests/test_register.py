@@ -264,7 +264,7 @@ def test_a_degenerate_view_has_no_covariance(registrar: Registrar) -> None:
     found = registrar.register(T_ac.apply(plate_scan()), T_ac)
     assert found.status is AlignStatus.DEGENERATE
     assert found.covariance is None
-    assert "slides along x" in found.weakest
+    assert "slides along x" in found.free_directions
 
 
 # --- what the camera can see

@@ -74,7 +74,7 @@ def test_a_symmetric_target_is_said_to_be_ambiguous(size: tuple[float, float, fl
         found = registrar.acquire(_scan(_box(size), _any_pose(rng), rng))
         assert found.status is AlignStatus.AMBIGUOUS
         assert found.covariance is None
-        assert found.weakest.startswith("turned ")
+        assert found.free_directions.startswith("turned ")
 
 
 @pytest.mark.slow

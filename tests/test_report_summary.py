@@ -271,12 +271,12 @@ def test_a_planner_that_finds_nothing_has_a_word_and_no_time(make_rows):
 
 def test_hindsight_gripper_and_actions_are_told(make_rows):
     rows = make_rows(6, blackout=range(0))
-    rows[1] = dataclasses.replace(rows[1], hindsight_m=0.02)
-    rows[3] = dataclasses.replace(rows[3], hindsight_m=0.01, action="capture")
+    rows[1] = dataclasses.replace(rows[1], plan_miss_m=0.02)
+    rows[3] = dataclasses.replace(rows[3], plan_miss_m=0.01, action="capture")
     rows[4] = dataclasses.replace(rows[4], capture_miss_m=0.002, capture_miss_mps=0.001, capture_miss_deg=0.3)
     summary = Summary.fold(rows)
     capture = summary.capture
-    assert (capture.hindsight_m.count, capture.hindsight_m.max) == (2, 0.02)
+    assert (capture.plan_miss_m.count, capture.plan_miss_m.max) == (2, 0.02)
     assert (capture.miss.position_m, capture.miss.speed_mps, capture.miss.rotation_deg) == (0.002, 0.001, 0.3)
     assert capture.actions == {"approach": 5, "capture": 1}
     facts = dict(fact_lines(summary))

@@ -16,7 +16,7 @@ from avsreplay.records import Truth
 from avsreplay.run import Job, Run
 
 LOG = Path(__file__).parents[1] / "fixtures" / "tumble.mcap"
-SCORED = ("pos_err", "rot_err", "reg_pos_err", "reg_rot_err", "nees", "hindsight", "capture_miss", "plan_miss")
+SCORED = ("pos_err", "rot_err", "reg_pos_err", "reg_rot_err", "nees", "capture_miss", "plan_miss")
 
 
 def _rows(**selection):

@@ -71,5 +71,5 @@ def test_consistency_is_told_block_by_block(cli, fixtures_folder):
         assert share["low"] < share["high"]
         assert 0.0 <= share["inside"] <= 1.0
     last = document["rows"][-1]
-    assert last["covariance_holds"] is not None
-    assert last["predictive_holds"] is not None
+    assert last["covariance_converged"] is not None
+    assert last["predictive_converged"] is not None

@@ -17,7 +17,7 @@ from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
     from avsreplay.log import SourceOptions
-    from avsreplay.recording import Recorded
+    from avsreplay.record import Recorded
     from avsreplay.records import Scan
 
 EPILOG = """\b
@@ -71,7 +71,7 @@ def command(
     SOURCE is a scenario (.toml), a folder of PLY or PCD scans, a ROS 1 or ROS 2 bag, or an MCAP; without it the
     built-in scenario is simulated. The log holds the model, the scenario and the truth, and runs with no flag.
     """
-    from avsreplay.recording import RecordOptions, record
+    from avsreplay.record import RecordOptions, record
 
     options = RecordOptions(model=model, cloud_model=bool(cloud_model), overwrite=overwrite, compression=compression)
     done = record(source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress)

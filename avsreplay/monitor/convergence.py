@@ -94,15 +94,15 @@ class ConvergenceTrack:
     Attributes:
         converged: may the planner rely on the estimate now.  t1_ns: the epoch from which it first held, None before.
         since_ns: start of the present unbroken stretch, None outside one.
-        covariance_holds, predictive_holds: the two tests at this epoch, before the dwell.
+        covariance_converged, predictive_converged: the two tests at this epoch, before the dwell.
         unknown: blocks above their covariance limit.
     """
 
     converged: bool = False
     t1_ns: int | None = None
     since_ns: int | None = None
-    covariance_holds: bool = False
-    predictive_holds: bool = False
+    covariance_converged: bool = False
+    predictive_converged: bool = False
     unknown: tuple[str, ...] = ()
 
 

@@ -163,7 +163,7 @@ def far(bench: Bench) -> Finding:
 def planar(bench: Bench) -> Finding:
     """A plane leaves two translations and a rotation unobservable, and is not called aligned."""
     found = bench.registrar.register(bench.T_ac.apply(plate_scan(bench.scale)), bench.T_ac)
-    words = found.status is not AlignStatus.DEGENERATE or found.weakest != ""
+    words = found.status is not AlignStatus.DEGENERATE or found.free_directions != ""
     finding = _refused("a plane is degenerate", found, AlignStatus.DEGENERATE, AlignStatus.NOT_CONVERGED)
     return replace(finding, held=finding.held and words)
 
@@ -298,4 +298,4 @@ def _honest(found: Alignment) -> bool:
 
 def _refused(law: str, found: Alignment, *allowed: AlignStatus) -> Finding:
     held = _honest(found) and (not allowed or found.status in allowed)
-    return Finding(law, held, f"{found.status.value}{': ' + found.weakest if found.weakest else ''}")
+    return Finding(law, held, f"{found.status.value}{': ' + found.free_directions if found.free_directions else ''}")

@@ -211,7 +211,7 @@ def grade(
         info=info,
         status=_status(overlap, fit.converged, bool(weakest)),
         covariance=None if P is None else frozen(P),
-        weakest=", ".join(weakest),
+        free_directions=", ".join(weakest),
     )
 
 

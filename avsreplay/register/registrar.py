@@ -73,8 +73,8 @@ class Registrar:
 
         Returns:
             The pose T_ac with its quality. The status is NO_OVERLAP if no pose explains enough of the scan, and
-            AMBIGUOUS if a second, different pose explains it as well: ``weakest`` then names the rotation to that pose.
-            ``search`` gives both poses.
+            AMBIGUOUS if a second, different pose explains it as well: ``free_directions`` then names the rotation to
+            that pose. ``search`` gives both poses.
         """
         scan = self._scan(points)
         if len(scan) == 0:
@@ -85,7 +85,7 @@ class Registrar:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None)
         if search.ambiguous and search.second is not None:
             words = quality.turn_words(search.best.T_ca @ search.second.T_ca.inverse())
-            return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, weakest=words)
+            return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
         return found
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:

@@ -45,7 +45,7 @@ _DIRECT = (
     *("rms_m", "inlier_ratio", "nis", "innov_m", "innov_deg"),
     *("sigma1", "sigma2", "cx_m", "cy_m", "cz_m", "wx_radps", "wy_radps", "wz_radps"),
     *("nees", "ogm_log10_cond", "ogm_log10_cond_scaled", "ogm_rank"),
-    *("r_pos_m", "r_rot_deg", "capture_time_s", "plan_bound_s", "hindsight_m"),
+    *("r_pos_m", "r_rot_deg", "capture_time_s", "earliest_capture_s", "plan_miss_m"),
 )
 _WINDOW = 10
 
@@ -193,11 +193,11 @@ def _plan_charts() -> list[Chart]:
             "capture",
             "Planned capture time",
             "s",
-            [_line("capture_time_s", "planned", 0), _line("plan_bound_s", "certified: not before", 1, dash=True)],
+            [_line("capture_time_s", "planned", 0), _line("earliest_capture_s", "certified: not before", 1, dash=True)],
             bands=[("capture_time_s", 0)],
         ),
         _chart(
-            "miss", "Miss distance in hindsight", "m", [_line("hindsight_m", "of the plan made then", 1, points=True)]
+            "miss", "Miss distance in hindsight", "m", [_line("plan_miss_m", "of the plan made then", 1, points=True)]
         ),
     ]
 

@@ -1,4 +1,4 @@
-"""The column list of the docs and the JSON schema of a row, both read off ``Row``."""
+"""Makes docs/columns.md and the JSON schema of a row from the declaration of ``Row``."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from avsreplay.rows import Column, columns
 
 _HEAD = """# Columns of a row
 
-One row a scan, in `rows.jsonl`, CSV, Parquet and `--json`. Made by `python -m avsreplay.report.columns_page`
-from `avsreplay/rows.py`; a test holds the two in step. *Golden* is the tolerance of `--golden`: a value passes where
-`|got - expected| <= absolute + relative x |expected|`. Null: there is nothing to say (no truth, no measurement,
-not converged, no fault). [rows.schema.json](rows.schema.json) says the same to a program (`--schema` makes it).
+Each scan gives one row in `rows.jsonl`, CSV, Parquet and `--json`. `python -m avsreplay.report.columns_page` makes this
+page from `avsreplay/rows.py`; a test compares the two. *Golden* is the tolerance of `--golden`: a value passes if
+`|got - expected| <= absolute + relative x |expected|`. A value is null where it does not apply: no truth, no
+measurement, no plan, no fault. [rows.schema.json](rows.schema.json) is the JSON schema of a row (`--schema` makes it).
+Frames, units and symbols: [conventions](conventions.md).
 
 | column | type | unit | golden | meaning |
 |---|---|---|---|---|
@@ -21,7 +22,7 @@ not converged, no fault). [rows.schema.json](rows.schema.json) says the same to 
 
 
 def columns_page() -> str:
-    """The Markdown page."""
+    """Return the Markdown page."""
     types = field_types()
     return _HEAD + "".join(_line(c, *types[c.name]) for c in columns())
 
@@ -54,7 +55,7 @@ def row_schema() -> dict[str, Any]:
 
 
 def schema_text() -> str:
-    """The schema as it stands in the docs."""
+    """Return the schema as text."""
     return json.dumps(row_schema(), indent=1, ensure_ascii=False) + "\n"
 
 

@@ -94,7 +94,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("mu_err_deg", "deg", "error of mu at the last scan", _parameter("mu")),
     Metric("sigma_hits", "", "times a sigma bound cut the gain", lambda s: s.sigma_hits),
     Metric("weighed_down", "", "healthy scans that kept less than their say", lambda s: s.weighed_down),
-    Metric("recalls", "", "times the poses contradicted the filter or the start", lambda s: s.recalls),
+    Metric("reinitialised", "", "times the poses contradicted the filter or the start", lambda s: s.reinitialised),
     Metric("nis_median", "", "median NIS (5.35 expected)", lambda s: s.nis.median if s.nis else None),
     Metric("nis_inside", "", "share of NIS inside its 95 % band", lambda s: s.nis.inside if s.nis else None),
     Metric("nees_median", "", "median NEES (19.34 expected)", lambda s: s.nees.median if s.nees else None),
@@ -106,9 +106,9 @@ METRICS: tuple[Metric, ...] = (
     Metric("capture_s", "s", "planned instant of capture, last plan", lambda s: s.capture.last_s),
     Metric("capture_std_s", "s", "its spread over the replans", lambda s: s.capture.std_s),
     Metric(
-        "hindsight_median_m", "m", "median miss of the plans made", _spread(lambda s: s.capture.hindsight_m, "median")
+        "plan_miss_median_m", "m", "median miss of the plans made", _spread(lambda s: s.capture.plan_miss_m, "median")
     ),
-    Metric("hindsight_max_m", "m", "largest miss of the plans made", _spread(lambda s: s.capture.hindsight_m, "max")),
+    Metric("plan_miss_max_m", "m", "largest miss of the plans made", _spread(lambda s: s.capture.plan_miss_m, "max")),
     Metric("capture_miss_m", "m", "true distance when the gripper closed", _miss("position_m")),
     Metric("capture_miss_mps", "m/s", "true relative speed when the gripper closed", _miss("speed_mps")),
     Metric("capture_miss_deg", "deg", "attitude error when the gripper closed", _miss("rotation_deg")),

@@ -68,7 +68,7 @@ class Summary:
     Attributes:
         pose_healthy, pose_coasting: of the estimate.  registration_healthy, registration_flagged: of the measurement.
         reasons: why scans were flagged.  status: what door and ruler found.  counts: handed in (losses, clock).
-        weighed_down: healthy scans that kept less than their whole say.  recalls: times the poses contradicted
+        weighed_down: healthy scans that kept less than their whole say.  reinitialised: times the poses contradicted
             the filter or the given start.
         coasts: runs without a measurement.  interval_s: median between scans.  gaps: longer than 1.5 times it.
     """
@@ -93,7 +93,7 @@ class Summary:
     sigma_hits: int | None
     r_floors: int | None
     weighed_down: int
-    recalls: int | None
+    reinitialised: int | None
     nis: Share | None
     nees: Share | None
     nees_blocks: Mapping[str, Share]
@@ -158,7 +158,7 @@ class SummaryFold:
         self._status[row.status] += 1
         if row.gamma == 0:
             self._reasons[row.reason] += 1
-        elif row.weight is not None and row.weight < 1.0:
+        elif row.cauchy_weight is not None and row.cauchy_weight < 1.0:
             self._weighed_down += 1
         self._add_errors(row)
         self._add_milestones(row)
@@ -214,7 +214,7 @@ class SummaryFold:
             sigma_hits=last.sigma_hits if last else None,
             r_floors=last.r_floors if last else None,
             weighed_down=self._weighed_down,
-            recalls=last.recalls if last else None,
+            reinitialised=last.reinitialised if last else None,
             nis=_share(self._values.get("nis/healthy", []), NIS_BAND),
             nees=_share(self._values.get("nees", []), NEES_BAND),
             nees_blocks=self._blocks(),

@@ -121,7 +121,7 @@ class Capture:
     Attributes:
         last_s, first_s: of the last and the first plan.  std_s, range_s: over all replans.
         status: the planner's last word.
-        hindsight_m: by how much each plan, flown as made, would have missed the true grasp point.
+        plan_miss_m: by how much each plan, flown as made, would have missed the true grasp point.
         miss: of the closed gripper, None where it never closed or truth is not known.
         actions: scans under each of the supervisor's actions.
     """
@@ -132,7 +132,7 @@ class Capture:
     std_s: float | None
     range_s: float | None
     status: str | None
-    hindsight_m: Statistics | None = None
+    plan_miss_m: Statistics | None = None
     miss: CaptureMiss | None = None
     actions: Mapping[str, int] = field(default_factory=dict)
 
@@ -151,8 +151,8 @@ class CaptureFold:
         plan = (row.plan_status, row.capture_time_s)
         if plan != (None, None) and (not self._plans or plan != self._plans[-1]):
             self._plans.append(plan)
-        if row.hindsight_m is not None:
-            self._hindsight.append(row.hindsight_m)
+        if row.plan_miss_m is not None:
+            self._hindsight.append(row.plan_miss_m)
         if row.action:
             self._actions[row.action] += 1
         if row.capture_miss_m is not None:
@@ -169,7 +169,7 @@ class CaptureFold:
             std_s=spread.std if spread else None,
             range_s=spread.max - spread.min if spread else None,
             status=self._plans[-1][0] if self._plans else None,
-            hindsight_m=Statistics.of(self._hindsight),
+            plan_miss_m=Statistics.of(self._hindsight),
             miss=self._miss,
             actions=dict(sorted(self._actions.items())),
         )

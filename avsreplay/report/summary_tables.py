@@ -210,9 +210,9 @@ def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     if summary.sigma_hits is not None:
         floors = f", eigenvalue floor of R active {summary.r_floors} times" if summary.r_floors is not None else ""
         yield "constraints", f"sigma bound active {summary.sigma_hits} times{floors}"
-    if summary.recalls is not None:
+    if summary.reinitialised is not None:
         taken = f"{summary.weighed_down} healthy poses down-weighted (NIS above its 99.99 % point)"
-        yield "outliers", f"{taken}; estimate reinitialised {summary.recalls} times"
+        yield "outliers", f"{taken}; estimate reinitialised {summary.reinitialised} times"
     seen = summary.observability
     if seen.rank is not None:
         full = "never full" if seen.full_rank_s is None else f"full from {seen.full_rank_s:.2f} s"
@@ -234,8 +234,8 @@ def _plan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
 
 
 def _flight_facts(capture: Capture) -> Iterable[tuple[str, str]]:
-    if capture.hindsight_m is not None:
-        found, n = capture.hindsight_m, capture.hindsight_m.count
+    if capture.plan_miss_m is not None:
+        found, n = capture.plan_miss_m, capture.plan_miss_m.count
         yield "hindsight", f"{n} plans miss by {_mm(found.median)} in the median, {_mm(found.max)} at most"
     if capture.miss is not None:
         speed = "" if capture.miss.speed_mps is None else f", {1000 * capture.miss.speed_mps:.3g} mm/s"

@@ -16,7 +16,7 @@ import numpy as np
 from avsreplay import toml_document
 from avsreplay.errors import AvsError
 from avsreplay.log import SourceOptions
-from avsreplay.recording import RecordOptions, record_scenario
+from avsreplay.record import RecordOptions, record_scenario
 from avsreplay.records import Label, Scan
 from avsreplay.rows import Row
 from avsreplay.run import Job, ReplayedScan, Run

@@ -15,11 +15,11 @@ from click.testing import CliRunner
 from numpy.testing import assert_allclose
 from true_scans import true_scans
 
-from avsreplay import recording
+from avsreplay import record as recording
 from avsreplay.cli import record as command
 from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 from avsreplay.log import SourceOptions, open_source
-from avsreplay.recording import RecordOptions, record, surface_for
+from avsreplay.record import RecordOptions, record, surface_for
 from avsreplay.records import ScanStatus
 from avsreplay.simulate import load_scenario, simulate
 
