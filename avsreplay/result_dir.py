@@ -27,9 +27,8 @@ from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief, State, Surface
 from avsreplay.register import Registrar
-from avsreplay.report.export import row_poses, write_tum
+from avsreplay.report.export import row_poses, write_layout, write_tum
 from avsreplay.report.jsonl import write_rows
-from avsreplay.report.layout import write_layout
 from avsreplay.report.view import CloudView, PathView, View, thin_cloud, thin_surface, write_view
 from avsreplay.rows import Row
 from avsreplay.run import Listener, ReplayedScan

@@ -236,30 +236,3 @@ def test_an_attachment_with_a_parent_path_writes_nothing_outside(tmp_path: Path)
         done = run(args[0], inner / "a.mcap", *args[1:])
         assert "Traceback" not in done.stderr
     assert sorted(p.name for p in tmp_path.rglob("*") if p.is_file()) in (["a.mcap"], ["a.mcap", "out.mcap"])
-
-
-def test_the_flags_of_reading_are_the_fields_of_the_options() -> None:
-    import dataclasses
-
-    import click
-    from click.testing import CliRunner
-
-    from avsreplay.cli.reading import READING_FLAGS, reading_flags
-    from avsreplay.log import SourceOptions
-
-    seen: dict[str, object] = {}
-
-    @click.command()
-    @reading_flags
-    def command(**flags: object) -> None:
-        seen.update(flags)
-
-    assert set(READING_FLAGS) <= {f.name for f in dataclasses.fields(SourceOptions)}
-    assert CliRunner().invoke(command, []).exit_code == 0
-    assert seen == dict.fromkeys(READING_FLAGS)
-    args = ["--crop-box", "-1,-2,-3,1,2,3", "--crop-range", "0.5,9", "--fixed-frame", "map", "--truth-gap", "0.3"]
-    assert CliRunner().invoke(command, args).exit_code == 0
-    options = SourceOptions(**{k: v for k, v in seen.items() if v is not None})  # type: ignore[arg-type]
-    assert options.crop_box == (-1.0, -2.0, -3.0, 1.0, 2.0, 3.0)
-    assert options.truth_gap_s == 0.3
-    assert CliRunner().invoke(command, ["--crop-range", "1,2,3"]).exit_code == 2

@@ -6,20 +6,26 @@ import json
 import re
 
 import numpy as np
+import pytest
 from mcap.reader import make_reader
 
 from avsreplay.geometry import Pose
 from avsreplay.log.result_log import ResultFrame, ResultLog
 from avsreplay.records import Surface
-from avsreplay.report.layout import viewer_layout, write_layout
+from avsreplay.report.export import write_layout
 
 
 def _leaves(node):
     return [node] if isinstance(node, str) else [*_leaves(node["first"]), *_leaves(node["second"])]
 
 
-def test_the_tree_holds_every_panel_once():
-    layout = viewer_layout()
+@pytest.fixture
+def layout(tmp_path):
+    write_layout(tmp_path / "layout.json")
+    return json.loads((tmp_path / "layout.json").read_text(encoding="utf-8"))
+
+
+def test_the_tree_holds_every_panel_once(layout):
     assert sorted(_leaves(layout["layout"])) == sorted(layout["configById"])
 
 
@@ -48,14 +54,7 @@ def _topics(tmp_path):
     return {channel.topic for channel in summary.channels.values()}
 
 
-def test_every_topic_it_names_is_written(tmp_path):
-    named = set(re.findall(r'"(/[a-z_/]+)', json.dumps(viewer_layout())))
+def test_every_topic_it_names_is_written(layout, tmp_path):
+    named = set(re.findall(r'"(/[a-z_/]+)', json.dumps(layout)))
     assert named
     assert named <= _topics(tmp_path)
-
-
-def test_it_is_json_and_always_the_same(tmp_path):
-    write_layout(tmp_path / "a.json")
-    write_layout(tmp_path / "b.json")
-    assert json.loads((tmp_path / "a.json").read_text()) == viewer_layout()
-    assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()

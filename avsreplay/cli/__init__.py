@@ -1,7 +1,7 @@
-"""The command line: one file a command; nothing else prints or exits.
+"""The command line: one file per command; no other package prints or exits.
 
-A command is the object named ``command`` in ``avsreplay/cli/<name>.py``; it is imported when it is called, so that
-``avsreplay --help`` stays quick.
+A command is the object ``command`` in ``avsreplay/cli/<name>.py``; it is imported when it is called, so that
+``avsreplay --help`` is fast.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from avsreplay.errors import AvsError, UsageError
 __all__ = ["main"]
 
 SUMMARIES = {
-    "record": "Write a log: simulate a scenario, or take over scans that others recorded.",
-    "run": "Replay a log and print the tables; gate it with a golden file.",
-    "info": "Say what is in a log.",
-    "doctor": "Examine a log for damage and repair it.",
-    "backends": "List the registration back ends; check one against the contract.",
-    "bench": "Time back ends side by side on a log.",
-    "observability": "Show what the measurements can and cannot tell.",
-    "plan": "Replan the capture from a saved result.",
+    "record": "Write a log: simulate a scenario, or convert recorded scans.",
+    "run": "Replay a log, print tables, compare with a golden file.",
+    "info": "Show the content of a log.",
+    "doctor": "Check a log for damage and repair it.",
+    "backends": "List the registration back ends; run the contract tests on one.",
+    "bench": "Compare the speed and error of back ends on a log.",
+    "observability": "Show which states the measurements of a log determine.",
+    "plan": "Plan the capture again from a saved result.",
     "report": "Build the HTML report of a saved result.",
     "export": "Write a saved result as CSV, Parquet, TUM or KITTI.",
     "compare": "Compare saved results; gate one against a baseline.",
-    "sweep": "Run a campaign of many runs.",
+    "sweep": "Run a campaign of many runs and summarise it.",
     "config": "Print the effective configuration.",
     "completion": "Print the completion script of a shell.",
 }
@@ -37,11 +37,11 @@ SUMMARIES = {
 EPILOG = """\b
 Examples:
   avsreplay record -o tumble.mcap          the built-in scenario, simulated
-  avsreplay run tumble.mcap                replay it and print the tables
+  avsreplay run tumble.mcap                replay it and print tables
   avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
 
 \b
-Exit codes: 0 ok, 1 the check asked for failed, 2 usage,
+Exit codes: 0 ok, 1 a requested check failed, 2 usage,
             3 unreadable input, 4 finished but data was lost."""
 
 
@@ -107,17 +107,18 @@ def _print_version(ctx: click.Context, _param: click.Parameter, wanted: bool) ->
     expose_value=False,
     is_eager=True,
     callback=_print_version,
-    help="Show the version of avsreplay and of what it stands on.",
+    help="Show the versions of avsreplay and of its dependencies.",
 )
 def group() -> None:
-    """Record, replay and gate the chain of vision-guided capture.
+    """Record, replay and test the processing chain of vision-guided capture of a tumbling object.
 
-    Point clouds in; pose error, fault flags, observability and planned capture time out; the same bytes every time.
+    Input: point clouds of a log. Output: poses and their errors, fault flags, observability, planned capture time.
+    The same input gives the same bytes.
     """
 
 
 def main() -> None:
-    """Entry point: an AvsError is one line on stderr and its exit code; no traceback."""
+    """Entry point: an AvsError becomes one line on stderr and its exit code, without a traceback."""
     try:
         code = group.main(standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY")
     except AvsError as error:

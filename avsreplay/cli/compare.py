@@ -1,4 +1,4 @@
-"""``avsreplay compare``: saved results side by side, and a gate."""
+"""``avsreplay compare``: compares saved results and applies gate rules."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import click
 
+from avsreplay.cli.options import PATH
 from avsreplay.errors import UsageError
 from avsreplay.report import gate as gates
 from avsreplay.report.atomic import atomic_text
@@ -22,14 +23,14 @@ Examples:
   avsreplay compare baseline/ candidate/
   avsreplay compare baseline/ a/ b/ -o compare.html
   avsreplay compare baseline/ candidate/ --gate rules.toml --junit gate.xml --github
-  avsreplay compare candidate/ --gate rules.toml          absolute rules need no baseline
+  avsreplay compare candidate/ --gate rules.toml          a single run: absolute rules only
 
 \b
 A rule:
   [[rule]]
   metric = "pose_pos_rmse_m"
   max = 0.005                    also: min, max_ratio, min_ratio, max_increase, max_decrease
-  max_ratio = 1.1                to the baseline, which is the first run
+  max_ratio = 1.1                relative to the baseline, which is the first run
 'avsreplay compare --metrics' lists the metrics.
 
 \b
@@ -45,11 +46,20 @@ def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> 
 
 
 @click.command("compare", epilog=EPILOG)
-@click.argument("results", nargs=-1, required=True, type=click.Path(path_type=Path))
-@click.option("--gate", type=click.Path(path_type=Path), help="TOML with the rules a run must keep; exit 1 if not.")
-@click.option("--junit", type=click.Path(path_type=Path), help="Write the gate's outcomes as JUnit XML.")
-@click.option("--github", is_flag=True, help="Print the gate's outcomes as GitHub annotations.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Write a page with the runs' charts overlaid.")
+@click.argument("results", nargs=-1, required=True, type=PATH)
+@click.option(
+    "--gate",
+    type=PATH,
+    help="TOML file with the rules that a run must satisfy; exit code 1 if one is broken.",
+)
+@click.option("--junit", type=PATH, help="Write the outcomes of the rules as JUnit XML.")
+@click.option("--github", is_flag=True, help="Print the outcomes of the rules as GitHub annotations.")
+@click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    help="Write an HTML page with the charts of the runs over each other.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing page.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 @click.option(
@@ -69,7 +79,7 @@ def command(
     overwrite: bool,
     as_json: bool,
 ) -> None:
-    """Set saved RESULTS side by side: figures, changes, the first scan and column at which they part.
+    """Compare saved RESULTS: metrics, changes, and the first scan and column at which they differ.
 
     RESULTS are directories written by 'avsreplay run -o' or their rows.jsonl; the first is the baseline.
     """

@@ -1,4 +1,4 @@
-"""``avsreplay completion``: the script that makes a shell complete commands and flags."""
+"""``avsreplay completion``: prints the script with which a shell completes commands and options."""
 
 from __future__ import annotations
 

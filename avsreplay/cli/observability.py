@@ -1,4 +1,4 @@
-"""``avsreplay observability``: what the measurements of a log can and cannot tell, for three sets of parameters."""
+"""``avsreplay observability``: the observability Gramian of a log for three sets of estimated parameters."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+
+from avsreplay.cli.options import PATH, read_options, source_options
 
 if TYPE_CHECKING:
     from avsreplay.estimate.reference import Reference
@@ -23,22 +25,26 @@ Examples:
   avsreplay observability y.mcap --model m.ply --init truth --json
 
 \b
-The log is replayed, one motion is fitted to all of its healthy poses, and the observability Gramian is summed along
-that motion: with sigma1 and sigma2 as parameters, with the three sigma apart, and with all parameters known."""
+The log is replayed, one motion is fitted to all healthy poses, and the observability Gramian is summed along that
+motion: with sigma1 and sigma2 as parameters, with three independent sigma, and with all parameters known."""
 
 
 @click.command("observability", epilog=EPILOG)
-@click.argument("log", type=click.Path(path_type=Path))
-@click.option("--model", type=click.Path(path_type=Path), help="Model of the target, in place of the log's own.")
-@click.option("--topic", help="Cloud topic, where there are several.")
-@click.option("--truth-topic", help="Topic of the true poses (for --init truth).")
+@click.argument("log", type=PATH)
 @click.option("--init", metavar="log|truth|auto|POSE", help="First pose; POSE is x,y,z,qx,qy,qz,qw of {C} in {A}.")
 @click.option("--set", "assignments", multiple=True, metavar="A.B=C", help="One setting; may be repeated.")
-@click.option("--marks", type=click.IntRange(2, 200), default=12, show_default=True, help="Lines of the table.")
-@click.option("--weakest", type=click.IntRange(0, 20), default=3, show_default=True, help="Directions told in words.")
+@source_options
+@click.option("--marks", type=click.IntRange(2, 200), default=12, show_default=True, help="Rows of the table.")
+@click.option(
+    "--weakest",
+    type=click.IntRange(0, 20),
+    default=3,
+    show_default=True,
+    help="Number of weakly observable directions to describe.",
+)
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 def command(log: Path, marks: int, weakest: int, as_json: bool, **flags: Any) -> None:
-    """Show what the measurements of LOG can and cannot tell."""
+    """Show which states and parameters the measurements of LOG determine."""
     from avsreplay.run import Run
 
     with Run(_job(log, flags)) as run:
@@ -50,13 +56,11 @@ def command(log: Path, marks: int, weakest: int, as_json: bool, **flags: Any) ->
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Any:
-    from avsreplay.log import SourceOptions
     from avsreplay.run import Job
 
     init, assignments = flags.pop("init"), flags.pop("assignments")
-    given = {name: value for name, value in flags.items() if value is not None}
     more = (f"init={init}",) if init is not None else ()
-    return Job(source=log, options=SourceOptions(**given), assignments=(*assignments, *more))
+    return Job(source=log, options=read_options(flags), assignments=(*assignments, *more))
 
 
 def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
@@ -80,7 +84,7 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
 
 
 def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[str, Any]], dict[str, Gramian]]:
-    """A line a scan, and the Gramians at the end."""
+    """A record per scan, and the Gramians at the end."""
     from avsreplay.estimate import parameter_sets
     from avsreplay.monitor.observability import gramian, measure, observe
 

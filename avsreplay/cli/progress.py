@@ -1,4 +1,4 @@
-"""A progress bar on stderr, and only where that is a terminal."""
+"""Progress on stderr."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ T = TypeVar("T")
 
 
 def tracked(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    """The items, with a bar while they pass; nothing is printed off a terminal."""
+    """Yield the items and show a progress bar if stderr is a terminal."""
     if not sys.stderr.isatty():
         yield from items
         return

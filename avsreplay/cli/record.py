@@ -1,4 +1,4 @@
-"""``avsreplay record``: write a log, from a scenario or from scans that others recorded."""
+"""``avsreplay record``: writes a log from a scenario or from recorded scans."""
 
 from __future__ import annotations
 
@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.reading import READING_FLAGS, reading_flags
+from avsreplay.cli.options import PATH, read_options, source_options
+from avsreplay.cli.progress import tracked
 from avsreplay.cli.setting_options import source_setting
-from avsreplay.errors import DataLost, UsageError
+from avsreplay.errors import DataLost
 
 if TYPE_CHECKING:
     from avsreplay.log import SourceOptions
@@ -26,32 +27,14 @@ Examples:
   avsreplay record scenario.toml -o x.mcap --seed 7     a scenario file
   avsreplay record scans/ -o y.mcap --model m.ply       a folder of scans with a poses file
   avsreplay record drive.bag -o z.mcap --topic /points  a ROS 1 or 2 bag, or an MCAP"""
-READING = (
-    *("topic", "truth_topic", "truth_file", "rate_hz", "every", "start_s", "end_s", "duration_s", "n_scans"),
-    *("start_offset_s", "max_message_mib", "clock", "strict", *READING_FLAGS),
-)
 
 
 @click.command("record", epilog=EPILOG)
-@click.argument("source", required=False, type=click.Path(path_type=Path))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="The log to write (.mcap).")
+@click.argument("source", required=False, type=PATH)
+@click.option("-o", "--output", required=True, type=PATH, help="The log to write (.mcap).")
 @click.option("--seed", type=click.IntRange(0), help="Seed of a simulation, over the scenario's own.")
-@source_setting("--model", type=click.Path(path_type=Path))
-@source_setting("--cloud-model", is_flag=True)
-@source_setting("--topic")
-@source_setting("--truth-topic")
-@source_setting("--truth", "truth_file", type=click.Path(path_type=Path))
-@source_setting("--rate", "rate_hz", type=float)
-@source_setting("--every-scan", "--every", "every", type=int)
 @source_setting("--start", "start_s", type=float)
-@source_setting("--end", "end_s", type=float)
-@source_setting("--duration", "duration_s", type=float)
-@source_setting("--start-offset", "start_offset_s", type=float)
-@source_setting("--max-message-mib", type=int)
-@source_setting("--n-scans", type=int)
-@source_setting("--clock")
-@reading_flags
-@source_setting("--strict", is_flag=True, default=None)
+@source_options
 @click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
@@ -66,10 +49,11 @@ def command(
     as_json: bool,
     **reading: Any,
 ) -> None:
-    """Write a log: simulate a scenario, or take over scans that others recorded.
+    """Write a log: simulate a scenario, or convert recorded scans.
 
     SOURCE is a scenario (.toml), a folder of PLY or PCD scans, a ROS 1 or ROS 2 bag, or an MCAP; without it the
-    built-in scenario is simulated. The log holds the model, the scenario and the truth, and runs with no flag.
+    built-in scenario is simulated. The log holds the model, the scenario and the truth,
+    so that 'avsreplay run' needs no option.
     """
     from avsreplay.record import RecordOptions, record
 
@@ -82,16 +66,8 @@ def command(
 
 
 def _reading(flags: dict[str, Any]) -> SourceOptions | None:
-    """The flags for recorded sources, None where none was given."""
-    from avsreplay.log import ClockChoice, SourceOptions
-
-    given = {name: flags[name] for name in READING if flags[name] is not None}
-    if "clock" in given:
-        given["clock"] = ClockChoice(given["clock"])
-    try:
-        return SourceOptions(**given) if given else None
-    except ValueError as error:
-        raise UsageError(str(error), where="record", hint="correct the flag") from None
+    """The options for recorded sources, None if none was given."""
+    return read_options(flags) if any(value is not None for value in flags.values()) else None
 
 
 def _sentence(done: Recorded) -> str:
@@ -108,13 +84,4 @@ def _sentence(done: Recorded) -> str:
 
 @contextmanager
 def _progress(scans: Iterable[Scan], due: int) -> Iterator[Iterator[Scan]]:
-    """A bar on stderr, on a terminal only."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield iter(scans)
-        return
-    with Progress(console=console, transient=True) as bar:
-        yield iter(bar.track(scans, total=due or None, description="recording"))
+    yield tracked(scans, due, "recording")

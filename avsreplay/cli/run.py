@@ -1,4 +1,4 @@
-"""``avsreplay run``: replay a log, print the tables, write the result, gate it with a golden file."""
+"""``avsreplay run``: replays a log, prints tables, writes a result directory, compares with a golden file."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.reading import reading_flags
-from avsreplay.cli.setting_options import run_settings, source_setting, take_run_settings
+from avsreplay.cli.options import PATH, read_options, source_options
+from avsreplay.cli.setting_options import run_settings, take_run_settings
 from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
 
 
 class _Start(click.ParamType[str | float]):
-    """``cold``, ``near``, ``paper`` (how the estimate begins) or a number (seconds after the first scan)."""
+    """``cold``, ``near``, ``paper`` (initialisation of the estimate) or a number (seconds after the first scan)."""
 
     name = "mode|seconds"
 
@@ -51,38 +51,31 @@ class _Start(click.ParamType[str | float]):
 
 
 @click.command("run", epilog=EPILOG)
-@click.argument("log", type=click.Path(path_type=Path))
-@source_setting("--model", type=click.Path(path_type=Path))
-@source_setting("--cloud-model", is_flag=True)
-@source_setting("--topic")
-@source_setting("--truth-topic")
-@source_setting("--truth", "truth_file", type=click.Path(path_type=Path))
+@click.argument("log", type=PATH)
 @run_settings
-@source_setting("--clock")
-@click.option("--start", "starts", type=_Start(), multiple=True, help="How the estimate begins, or where the log does.")
-@source_setting("--end", "end_s", type=float)
-@source_setting("--duration", "duration_s", type=float)
-@source_setting("--start-offset", "start_offset_s", type=float)
-@source_setting("--n-scans", type=int)
-@source_setting("--every-scan", "every", type=int)
-@source_setting("--rate", "rate_hz", type=float)
-@reading_flags
-@source_setting("--strict", is_flag=True, default=None)
-@source_setting("--max-message-mib", type=int)
-@click.option("--golden", type=click.Path(path_type=Path), help="Rows that must come out; exit 1 if they do not.")
-@click.option("--update-golden", type=click.Path(path_type=Path), help="Write the golden rows anew.")
-@click.option("-o", "--output", type=click.Path(path_type=Path), help="Directory for rows, trajectories and run facts.")
+@click.option(
+    "--start", "starts", type=_Start(), multiple=True, help="Initialisation of the estimate, or start time [s]."
+)
+@source_options
+@click.option("--golden", type=PATH, help="Compare with these rows; exit code 1 if they differ.")
+@click.option("--update-golden", type=PATH, help="Write the rows to this golden file.")
+@click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    help="Write rows, trajectories, beliefs and configuration to this directory.",
+)
 @click.option("--report", "page", is_flag=True, help="Add the HTML page, report.html, to the result directory.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
-@click.option("--plain", is_flag=True, help="No small pictures of error and gamma under the tables.")
-@click.option("--rerun", "to_rerun", is_flag=True, help="Stream the run to a Rerun viewer (extra 'rerun').")
+@click.option("--plain", is_flag=True, help="Print no curves of error and gamma.")
+@click.option("--rerun", "to_rerun", is_flag=True, help="Stream the run to a Rerun viewer (needs the extra 'rerun').")
 def command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
-    LOG is an MCAP, a ROS bag or a folder of scans. A log written by 'avsreplay record' runs with no flag.
+    LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs no option.
     """
     from avsreplay.result_dir import ResultDirectory
     from avsreplay.run import Run
@@ -96,12 +89,12 @@ def command(log: Path, **flags: Any) -> None:
         if wanted.page and wanted.output:
             _page(wanted.output)
         _gate(wanted, rows)
-        _own_up(run)
+        _report_losses(run)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Wanted:
-    """What is to come out of a run, by flag."""
+    """The options that select the outputs of a run."""
 
     golden: Path | None
     update_golden: Path | None
@@ -115,11 +108,11 @@ class Wanted:
     to_rerun: bool
 
     def check(self) -> None:
-        """Raise UsageError where two flags do not go together."""
+        """Raise UsageError if two options contradict each other."""
         if self.golden and self.update_golden:
             raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
         if self.page and self.output is None:
-            raise UsageError("--report needs a result directory to stand in", hint="add -o DIR")
+            raise UsageError("--report needs a result directory", hint="add -o DIR")
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Job:
@@ -128,28 +121,14 @@ def _job(log: Path, flags: dict[str, Any]) -> Job:
     config_file, assignments = take_run_settings(flags)
     starts = flags.pop("starts")
     assignments += tuple(f"estimator.start={mode}" for mode in starts if isinstance(mode, str))
-    return Job(source=log, options=_options(flags, starts), config_file=config_file, assignments=assignments)
-
-
-def _options(flags: dict[str, Any], starts: tuple[Any, ...]) -> Any:
-    from avsreplay.log import ClockChoice, SourceOptions
-
-    given = {name: value for name, value in flags.items() if value is not None}
-    if "clock" in given:
-        given["clock"] = ClockChoice(given["clock"])
-    for start in starts:
-        if isinstance(start, float):
-            given["start_s"] = start
-    try:
-        return SourceOptions(**given)
-    except ValueError as error:
-        raise UsageError(str(error), hint="correct the flag") from None
+    flags["start_s"] = next((start for start in reversed(starts) if isinstance(start, float)), None)
+    return Job(source=log, options=read_options(flags), config_file=config_file, assignments=assignments)
 
 
 def _replayed(
     run: Run, target: ResultDirectory | None, to_rerun: bool
 ) -> tuple[list[Row], Summary, dict[str, Any], float]:
-    """Rows, summary, run facts and scans a second; with a target everything is kept there."""
+    """Replay, and return rows, summary, run record and scans per second; ``target`` receives all results."""
     from avsreplay.cli.progress import tracked
     from avsreplay.result_dir import RerunStream, ResultWriter
 
@@ -222,7 +201,7 @@ def _print_differences(result: GoldenResult, *, to_stderr: bool) -> None:
     print_table(make_console(sys.stderr if to_stderr else sys.stdout), golden_table(result))
 
 
-def _own_up(run: Run) -> None:
+def _report_losses(run: Run) -> None:
     losses = run.source.losses
     if losses:
         what = f"{len(losses)} damaged places were left out, the first: {losses[0].what}"

@@ -1,4 +1,4 @@
-"""``avsreplay sweep``: a campaign of many runs."""
+"""``avsreplay sweep``: runs a campaign of many runs and summarises it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from avsreplay.cli.options import PATH
 from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
@@ -21,26 +22,30 @@ if TYPE_CHECKING:
 EPILOG = """\b
 Examples:
   avsreplay sweep blackouts.toml -o blackouts/ --workers 2
-  avsreplay sweep blackouts.toml -o blackouts/               again: only what is not done is run
+  avsreplay sweep blackouts.toml -o blackouts/               again: only unfinished runs are executed
   avsreplay sweep blackouts.toml -o blackouts/ --scheduler tcp://head:8786
-  avsreplay sweep blackouts.toml --plan                      what would be run
+  avsreplay sweep blackouts.toml --plan                      list the runs
 
 \b
 Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished but some runs failed."""
 
 
 @click.command("sweep", epilog=EPILOG)
-@click.argument("campaign", type=click.Path(path_type=Path))
+@click.argument("campaign", type=PATH)
+@click.option("-o", "--output", type=PATH, help="Directory of the results; an existing one is continued.")
 @click.option(
-    "-o", "--output", type=click.Path(path_type=Path), help="Directory of the results; taken up again if there."
+    "--workers",
+    type=click.IntRange(0),
+    default=2,
+    show_default=True,
+    help="Number of processes; 0 runs in this process without Dask.",
 )
 @click.option(
-    "--workers", type=click.IntRange(0), default=2, show_default=True, help="Processes; 0: this one, no Dask."
+    "--scheduler", metavar="ADDRESS", help="Address of a Dask scheduler (tcp://host:port) instead of --workers."
 )
-@click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, as tcp://host:port, in place of --workers.")
-@click.option("--limit", type=click.IntRange(0), help="Run at most so many now.")
+@click.option("--limit", type=click.IntRange(0), help="Largest number of runs to execute now.")
 @click.option("--retry-failed", is_flag=True, help="Run failed and crashed runs again.")
-@click.option("--plan", "only_plan", is_flag=True, help="Say what would be run, and run nothing.")
+@click.option("--plan", "only_plan", is_flag=True, help="List the runs and execute none.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
 def command(
     campaign: Path,
@@ -54,9 +59,9 @@ def command(
 ) -> None:
     """Run a CAMPAIGN (a TOML file): a grid, a list of cases or random draws over scenarios, logs and settings.
 
-    Done runs are kept as they come: the same command takes up where it was stopped or killed. Results are one row a
-    run (results.parquet), one row a scan (scans.parquet), summary.json and report.html, and do not depend on the
-    workers.
+    Each finished run is saved at once: the same command continues after an interruption. Results are one row per run
+    (results.parquet), one row per scan (scans.parquet), summary.json and report.html. They do not depend on the number
+    of workers.
     """
     from avsreplay.sweep import Journal, execute, expand, load_campaign, write_results
     from avsreplay.sweep.results import arrow
@@ -66,8 +71,8 @@ def command(
         click.echo(_plan_text(plan))
         return
     if output is None:
-        raise UsageError("no directory for the results", where="sweep", hint="add -o DIR, or --plan to look only")
-    arrow()  # said before anything runs, not after
+        raise UsageError("no directory for the results", where="sweep", hint="add -o DIR, or --plan to list the runs")
+    arrow()  # a missing library is reported before the first run
     journal = Journal(output / "journal.txt")
     if retry_failed:
         journal.forget(("failed", "crashed"))
@@ -80,10 +85,10 @@ def command(
         click.echo(json.dumps(summary.document(), indent=1, allow_nan=False))
     else:
         _print(summary)
-    _complain(summary, journal, output)
+    _report_failures(summary, journal, output)
 
 
-def _complain(summary: SweepSummary, journal: Journal, output: Path) -> None:
+def _report_failures(summary: SweepSummary, journal: Journal, output: Path) -> None:
     if failed := summary.done - summary.status.get("ok", 0):
         first = next(o for o in journal.outcomes() if o.status != "ok")
         what = f"{failed} of {summary.done} runs failed, for example: {first.error}"
@@ -91,7 +96,7 @@ def _complain(summary: SweepSummary, journal: Journal, output: Path) -> None:
 
 
 def _waiting(plan: Plan, journal: Journal) -> Iterator[Task]:
-    """What is not done yet, each task once."""
+    """The unfinished tasks, each once."""
     seen: set[str] = set()
     for point in plan.points():
         if point.task.id not in journal and point.task.id not in seen:

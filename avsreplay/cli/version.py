@@ -11,7 +11,7 @@ PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", 
 
 
 def versions() -> dict[str, str]:
-    """Versions of the package, Python and the libraries it stands on; "missing" where one is not installed."""
+    """Versions of the package, Python and its dependencies; "missing" where one is not installed."""
     found = {"avsreplay": avsreplay.__version__, "python": platform.python_version()}
     for part in PARTS:
         try:

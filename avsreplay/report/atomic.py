@@ -1,4 +1,4 @@
-"""A file appears whole or not at all."""
+"""Files that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from avsreplay.errors import UnreadableInput
 
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
-    """A path beside ``path`` to write to; it replaces ``path`` on success and is removed on any failure.
+    """Yield a temporary path; its file replaces ``path`` on success and is removed on any failure.
 
-    Raises UnreadableInput where the folder is missing or cannot be written.
+    Raises:
+        UnreadableInput: the folder is missing or cannot be written.
     """
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -24,13 +25,13 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         part.replace(path)
     except OSError as error:
         what = error.strerror or "cannot be written"
-        raise UnreadableInput(what, where=str(path), hint="check the folder and its rights") from None
+        raise UnreadableInput(what, where=str(path), hint="check the folder and its permissions") from None
     finally:
         part.unlink(missing_ok=True)
 
 
 @contextmanager
 def atomic_text(path: str | Path) -> Iterator[IO[str]]:
-    """An open UTF-8 text file with Unix line ends that replaces ``path`` once it is closed."""
+    """Yield an open UTF-8 text file with Unix line ends that replaces ``path`` when it is closed."""
     with atomic_path(path) as part, part.open("w", encoding="utf-8", newline="\n") as stream:
         yield stream

@@ -20,19 +20,19 @@ _TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "u4": "<u4", "u1":
 
 
 def pack(array: ArrayLike, kind: str) -> dict[str, str]:
-    """``{"type", "data"}`` of an array of kind f8, f4, i4, i2, u4 or u1, flattened."""
+    """Return ``{"type", "data"}`` of a flattened array; ``kind`` is f8, f4, i4, i2, u4 or u1."""
     flat = np.ascontiguousarray(np.asarray(array), dtype=_TYPES[kind]).reshape(-1)
     return {"type": kind, "data": base64.b64encode(flat.tobytes()).decode("ascii")}
 
 
 def values(rows: Iterable[Row], name: str) -> NDArray[np.float64]:
-    """A column as floats (n,), NaN where a row has nothing to say."""
+    """A column as floats (n,), NaN where a row has no value."""
     found = (getattr(row, name) for row in rows)
     return np.array([np.nan if v is None else float(v) for v in found], dtype=np.float64)
 
 
 def embed(value: Any) -> str:
-    """JSON that may stand inside a script element: no ``<``, no line separators, no NaN."""
+    """Return JSON that is safe inside a script element: no ``<``, no line separators, no NaN."""
     text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
@@ -51,7 +51,7 @@ _WINDOW = 10
 
 
 def derived(rows: Sequence[Row]) -> Columns:
-    """Every column the charts draw, (n,) each; those that are empty are left out."""
+    """Every column that a chart draws, (n,) each; empty ones are left out."""
     out = {name: values(rows, name) for name in _DIRECT}
     out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
     for name, sigma in (("sigma1", "sigma1_1s"), ("sigma2", "sigma2_1s"), *((f"c{a}_m", "c_1s_m") for a in "xyz")):
@@ -76,7 +76,7 @@ def _band(out: Columns, name: str, sigma: NDArray[np.float64]) -> None:
 
 
 def _spread(capture_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Least and greatest of the last ten plans that differ."""
+    """Smallest and largest of the last ten distinct plans."""
     low, high = np.full_like(capture_s, np.nan), np.full_like(capture_s, np.nan)
     recent: list[float] = []
     for k, value in enumerate(capture_s):
@@ -100,7 +100,7 @@ def _chart(
     levels: Sequence[tuple[float, str, int]] = (),
     log: bool = False,
 ) -> Chart:
-    """One chart; ``bands`` are column stems with ``_lo`` and ``_hi``, ``levels`` horizontal lines."""
+    """One chart; ``bands`` are names whose columns end in ``_lo`` and ``_hi``, ``levels`` horizontal lines."""
     return {
         "key": key,
         "title": title,
@@ -113,7 +113,7 @@ def _chart(
 
 
 def charts(columns: Columns, truth: State | None = None) -> list[Chart]:
-    """The charts that have anything to show, in reading order."""
+    """The charts that have data, in reading order."""
     whole = [*_error_charts(), *_measurement_charts(), *_parameter_charts(truth), *_plan_charts()]
     kept = []
     for chart in whole:
@@ -193,7 +193,7 @@ def _plan_charts() -> list[Chart]:
             "capture",
             "Planned capture time",
             "s",
-            [_line("capture_time_s", "planned", 0), _line("earliest_capture_s", "certified: not before", 1, dash=True)],
+            [_line("capture_time_s", "planned", 0), _line("earliest_capture_s", "certified lower bound", 1, dash=True)],
             bands=[("capture_time_s", 0)],
         ),
         _chart(
@@ -203,9 +203,9 @@ def _plan_charts() -> list[Chart]:
 
 
 def spans(rows: Sequence[Row], episodes: Sequence[Episode] = ()) -> list[dict[str, Any]]:
-    """Runs of flagged scans (lane ``flagged``, by reason), of labelled ones (``injected``), of one ``action``.
+    """Intervals of flagged scans (lane "flagged", by reason), of injected faults ("injected"), of actions ("action").
 
-    Of ``episodes`` only those that left no scan are drawn, over their window.
+    Of ``episodes`` only those without any scan are drawn, over their window.
     """
     flagged = [None if row.gamma == 1 else row.reason for row in rows]
     bare = [_bare(e, rows) for e in episodes if not e.scans and rows]

@@ -1,4 +1,4 @@
-"""Several runs side by side: their figures, and where two of them first part."""
+"""The metrics by which runs are compared and gated, and the first difference between the rows of two runs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from avsreplay.rows import Row, columns
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """One figure of a run: name with its unit as suffix, unit, meaning, and how to get it (None where it has none)."""
+    """One metric of a run: name with its unit as suffix, unit, meaning, function (None without a value)."""
 
     name: str
     unit: str
@@ -64,7 +64,7 @@ def _miss(field: str) -> Callable[[Summary], float | None]:
 
 
 def _known(pick: Callable[[Summary], float]) -> Callable[[Summary], float | None]:
-    """A figure of the fault account, None where the log does not say what was injected."""
+    """A metric of the injected faults, None where the log does not state them."""
 
     def get(summary: Summary) -> float | None:
         return pick(summary) if summary.faults.known else None
@@ -82,7 +82,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("coast_end_pos_m", "m", "position error at the end of the longest coast", _coast("pos_err_m")),
     Metric("coast_end_rot_deg", "deg", "attitude error at the end of the longest coast", _coast("rot_err_deg")),
     Metric("fit_median_m", "m", "median fit error, healthy scans", _spread(lambda s: s.fit_error_m, "median")),
-    Metric("iterations_median", "", "median passes of the registration", _spread(lambda s: s.iterations, "median")),
+    Metric("iterations_median", "", "median iterations of the registration", _spread(lambda s: s.iterations, "median")),
     Metric("faults_missed", "", "harmful faults not detected", _known(lambda s: s.faults.missed)),
     Metric("scans_missed", "", "harmful scans used", _known(lambda s: s.faults.missed_scans)),
     Metric("false_alarms", "", "flagged scans without a fault", _known(lambda s: s.faults.false_alarms)),
@@ -90,35 +90,47 @@ METRICS: tuple[Metric, ...] = (
     Metric("recovery_s", "s", "longest time to recover", lambda s: s.faults.longest_recovery_s),
     Metric("sigma1_err", "", "error of sigma1 at the last scan", _parameter("sigma1")),
     Metric("sigma2_err", "", "error of sigma2 at the last scan", _parameter("sigma2")),
-    Metric("c_err_m", "m", "error of varrho at the last scan", _parameter("c (varrho)")),
+    Metric("c_err_m", "m", "error of varrho (c) at the last scan", _parameter("c (varrho)")),
     Metric("mu_err_deg", "deg", "error of mu at the last scan", _parameter("mu")),
-    Metric("sigma_hits", "", "times a sigma bound cut the gain", lambda s: s.sigma_hits),
-    Metric("weighed_down", "", "healthy scans that kept less than their say", lambda s: s.weighed_down),
-    Metric("reinitialised", "", "times the poses contradicted the filter or the start", lambda s: s.reinitialised),
+    Metric("sigma_hits", "", "times a bound on sigma was active", lambda s: s.sigma_hits),
+    Metric("weighed_down", "", "healthy poses with a Cauchy weight below 1", lambda s: s.weighed_down),
+    Metric("reinitialised", "", "times the estimate was reinitialised", lambda s: s.reinitialised),
     Metric("nis_median", "", "median NIS (5.35 expected)", lambda s: s.nis.median if s.nis else None),
     Metric("nis_inside", "", "share of NIS inside its 95 % band", lambda s: s.nis.inside if s.nis else None),
     Metric("nees_median", "", "median NEES (19.34 expected)", lambda s: s.nees.median if s.nees else None),
     Metric("nees_inside", "", "share of NEES inside its 95 % band", lambda s: s.nees.inside if s.nees else None),
     Metric("ogm_log10_cond", "", "log10 condition of the Gramian, at the end", lambda s: s.observability.log10_cond),
     Metric("ogm_rank", "", "rank of the Gramian, at the end", lambda s: s.observability.rank),
-    Metric("t1_s", "s", "first scan the planner may rely on", lambda s: s.convergence.t1_s),
-    Metric("withdrawn", "", "times convergence was taken back", lambda s: s.convergence.withdrawn),
-    Metric("capture_s", "s", "planned instant of capture, last plan", lambda s: s.capture.last_s),
-    Metric("capture_std_s", "s", "its spread over the replans", lambda s: s.capture.std_s),
     Metric(
-        "plan_miss_median_m", "m", "median miss of the plans made", _spread(lambda s: s.capture.plan_miss_m, "median")
+        "t1_s", "s", "convergence time: first scan whose estimate the planner may use", lambda s: s.convergence.t1_s
     ),
-    Metric("plan_miss_max_m", "m", "largest miss of the plans made", _spread(lambda s: s.capture.plan_miss_m, "max")),
+    Metric("withdrawn", "", "times convergence was withdrawn", lambda s: s.convergence.withdrawn),
+    Metric("capture_s", "s", "planned instant of capture, last plan", lambda s: s.capture.last_s),
+    Metric(
+        "capture_std_s", "s", "standard deviation of the planned instant over the replans", lambda s: s.capture.std_s
+    ),
+    Metric(
+        "plan_miss_median_m",
+        "m",
+        "median distance between planned and true grasp point",
+        _spread(lambda s: s.capture.plan_miss_m, "median"),
+    ),
+    Metric(
+        "plan_miss_max_m",
+        "m",
+        "largest distance between planned and true grasp point",
+        _spread(lambda s: s.capture.plan_miss_m, "max"),
+    ),
     Metric("capture_miss_m", "m", "true distance when the gripper closed", _miss("position_m")),
     Metric("capture_miss_mps", "m/s", "true relative speed when the gripper closed", _miss("speed_mps")),
     Metric("capture_miss_deg", "deg", "attitude error when the gripper closed", _miss("rotation_deg")),
     Metric("gaps", "", "intervals longer than 1.5 times the median", lambda s: s.gaps),
-    Metric("losses", "", "damaged places of the log", lambda s: s.counts.get("losses")),
+    Metric("losses", "", "damaged places in the log", lambda s: s.counts.get("losses")),
 )
 
 
 def metrics(summary: Summary) -> dict[str, float | None]:
-    """Every figure by name, None where the run has none."""
+    """Return every metric by name, None where the run has no value."""
     return {m.name: _finite(m.of(summary)) for m in METRICS}
 
 
@@ -127,7 +139,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def first_divergence(baseline: Sequence[Row], other: Sequence[Row], *, first: int = 20) -> GoldenResult:
-    """Where the rows of two runs first differ by more than the columns' golden tolerances."""
+    """Find the differences between the rows of two runs beyond the golden tolerances; ``first`` of them are kept."""
     return compare_records(_records(baseline), _records(other), first=first)
 
 

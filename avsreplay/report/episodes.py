@@ -1,11 +1,12 @@
-"""Injected faults against what the detector said, and how long it took to be back on track.
+"""Injected faults against the detector's verdicts, and the time to recover.
 
-A label is *harmful* (the scan must be flagged) or not (either word is right). A harmful label is *detected* where at
+A label is *harmful* (the scan must be flagged) or not (either verdict is right). A harmful label is *detected* where at
 least one of its scans has gamma 0 or, where no scan came at all, where a gap covers it. A flagged scan without a
 label is a *false alarm*. A *gap* is an interval between scans longer than 1.5 times the median interval.
 
-Recovery is the detector's word: a track that followed wrong poses agrees with the next ones and counts as healthy.
-What a label really did shows in the errors of the estimate: over its flagged scans, its used ones, and those after.
+Recovery is judged by gamma alone: an estimate that followed wrong poses agrees with the next ones and counts as
+healthy. The effect of a fault is seen in the errors of the estimate over its flagged scans, its used scans and the
+scans after it.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ GAP = 1.5
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """What the account needs of a row."""
+    """The part of a row that the fault account needs."""
 
     t_ns: int
     gamma: int
@@ -34,14 +35,14 @@ class Mark:
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """Largest errors of the estimate over some scans, each by itself; None without truth or without such a scan."""
+    """Largest position and attitude error over some scans; None without truth or without such a scan."""
 
     pos_err_m: float | None = None
     rot_err_deg: float | None = None
 
     @classmethod
     def of(cls, marks: Iterable[Mark]) -> Peak:
-        """Over ``marks``; errors that are None are passed over."""
+        """Peak over ``marks``; errors that are None are ignored."""
         listed = list(marks)
         return cls(
             max((m.pos_err_m for m in listed if m.pos_err_m is not None), default=None),
@@ -51,14 +52,14 @@ class Peak:
 
 @dataclass(frozen=True, slots=True)
 class Episode:
-    """One label and its fate.
+    """One injected fault.
 
     Attributes:
         start_s, end_s: its window, since the first scan.  scans: rows that carry it.  flagged: those with gamma 0.
         detected: see the module.  recover_scans: scans without a label after it that were still flagged.
         recover_s: from the first scan without a label after it to the first healthy scan (0: at once);
             None where there was nothing to recover from (neither it nor the scan after it was flagged) or no recovery.
-        strength: what its label says of it.
+        strength: as its label states.
         delay_scans, delay_s: from its first scan to the first flagged one; None where none was.
         lost: scans without a label came after it, and not one of them was healthy.
         peak_flagged, peak_used: of its scans with gamma 0 and with gamma 1.
@@ -88,7 +89,7 @@ class FaultAccount:
     """All labels of a log.
 
     Attributes:
-        known: does the log say what was injected? Without that a flagged scan is no proven false alarm.
+        known: whether the log states the injected faults; without that a flagged scan is no proven false alarm.
         injected, detected, missed: harmful labels.  missed_scans: harmful scans with gamma 1.
         false_alarms: flagged scans without a label, of ``unlabelled`` scans.
         peak_flagged, peak_used: of the scans without a label with gamma 0 and with gamma 1.
@@ -113,7 +114,7 @@ class FaultAccount:
 
     @property
     def longest_recovery_s(self) -> float | None:
-        """The worst time to recover."""
+        """The longest time to recover [s]."""
         return max((e.recover_s for e in self.episodes if e.recover_s is not None), default=None)
 
 
@@ -201,39 +202,38 @@ def _episode(
     next_ns: int | None,
 ) -> Episode:
     own = [marks[k] for k in rows]
-    flagged = sum(m.gamma == 0 for m in own)
+    flagged = [m for m in own if m.gamma == 0]
     missing = not rows and any(a <= label.end_ns and label.start_ns <= b for a, b in holes)
-    last = rows[-1] + 1 if rows else bisect_right([m.t_ns for m in marks], label.end_ns)
-    after = [m for m in marks[last:] if m.fault is None]
-    found = _first(after, gamma=1)
-    recovery = found if flagged or missing or found != (0, 0.0) else None
-    delay = _first(own, gamma=0)
+    after = marks[rows[-1] + 1 if rows else bisect_right([m.t_ns for m in marks], label.end_ns) :]
+    unlabelled = [m for m in after if m.fault is None]
+    recover_scans, recover_s = _first(unlabelled, gamma=1)
+    if not flagged and not missing and recover_scans == 0:
+        recover_scans = recover_s = None  # there was nothing to recover from
+    delay_scans, delay_s = _first(own, gamma=0)
     return Episode(
         kind=label.kind,
         harmful=label.harmful,
         start_s=(label.start_ns - t0) * 1e-9,
         end_s=(label.end_ns - t0) * 1e-9,
         scans=len(rows),
-        flagged=flagged,
-        detected=bool(flagged or missing),
-        recover_scans=recovery[0] if recovery else None,
-        recover_s=recovery[1] if recovery else None,
+        flagged=len(flagged),
+        detected=bool(flagged) or missing,
+        recover_scans=recover_scans,
+        recover_s=recover_s,
         strength=label.strength,
-        delay_scans=delay[0] if delay else None,
-        delay_s=delay[1] if delay else None,
-        lost=bool(after) and found is None,
-        peak_flagged=Peak.of(m for m in own if m.gamma == 0),
+        delay_scans=delay_scans,
+        delay_s=delay_s,
+        lost=bool(unlabelled) and not any(m.gamma == 1 for m in unlabelled),
+        peak_flagged=Peak.of(flagged),
         peak_used=Peak.of(m for m in own if m.gamma == 1),
-        peak_after=Peak.of(m for m in _until_next(marks[last:], next_ns) if m.gamma == 1),
+        peak_after=Peak.of(m for m in _until_next(after, next_ns) if m.gamma == 1),
     )
 
 
-def _first(marks: Sequence[Mark], gamma: int) -> tuple[int, float] | None:
+def _first(marks: Sequence[Mark], gamma: int) -> tuple[int, float] | tuple[None, None]:
     """Scans and seconds from the first of ``marks`` to the first of them with ``gamma``; None where none has it."""
-    for late, mark in enumerate(marks):
-        if mark.gamma == gamma:
-            return late, (mark.t_ns - marks[0].t_ns) * 1e-9
-    return None
+    place = next((k for k, mark in enumerate(marks) if mark.gamma == gamma), None)
+    return (None, None) if place is None else (place, (marks[place].t_ns - marks[0].t_ns) * 1e-9)
 
 
 def _until_next(marks: Sequence[Mark], next_ns: int | None) -> Iterable[Mark]:

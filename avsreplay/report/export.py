@@ -1,7 +1,7 @@
-"""Rows and poses in the formats other tools open: TUM, KITTI, CSV, Parquet.
+"""Rows, poses and the summary in formats that other tools open: TUM, KITTI, CSV, Parquet, JSON.
 
-Stamps are written from integer nanoseconds, never through a float; values as the shortest text that reads back
-to the same float64.
+Time stamps are written from integer nanoseconds, never through a float; values as the shortest text that reads back
+as the same float64.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import dataclasses
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,7 +26,7 @@ from avsreplay.settings import dump
 FORMAT = "avsreplay-run/1"
 
 StampedPose = tuple[int, Pose]
-"""(t_ns, T_ac): an instant and the pose of {C} in {A} at it."""
+"""(t_ns, T_ac): a time and the pose of {C} in {A} at that time."""
 
 _COLUMNS = {
     "estimate": (("qx", "qy", "qz", "qw"), ("x_m", "y_m", "z_m")),
@@ -49,12 +50,12 @@ def stamp_text(t_ns: int) -> str:
 
 
 def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
-    """TUM trajectory, ``stamp x y z qx qy qz qw`` a line, poses of {C} in {A} [s, m]. Returns the count."""
+    """Write poses of {C} in {A} as TUM, ``stamp x y z qx qy qz qw`` per line [s, m]; return their number."""
     return _write_lines(path, (f"{stamp_text(t_ns)} {_text((*pose.t, *pose.q))}" for t_ns, pose in poses))
 
 
 def write_kitti(path: str | Path, poses: Iterable[StampedPose]) -> int:
-    """KITTI trajectory: the upper 3x4 of T_ac row by row a line, no stamps [m]. Returns the count."""
+    """Write a KITTI trajectory: the upper 3x4 of T_ac row by row on a line, without stamps [m]; returns the number."""
     return _write_lines(path, (_text(pose.matrix[:3].reshape(-1)) for _, pose in poses))
 
 
@@ -72,7 +73,7 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> int:
 
 
 def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
-    """All columns, their names (with units as suffixes) in the first line; null is an empty cell."""
+    """Write all columns; their names (with units as suffixes) stand in the first line, null is an empty cell."""
     names = [c.name for c in columns()]
     with atomic_text(path) as stream:
         writer = csv.writer(stream, lineterminator="\n")
@@ -87,7 +88,11 @@ def _cell(value: Any) -> str:
 
 
 def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
-    """All columns, typed; unit and meaning stand in each field's metadata. Raises MissingBackend without pyarrow."""
+    """Write all columns, typed; the metadata of each field state unit and meaning.
+
+    Raises:
+        MissingBackend: pyarrow is not installed.
+    """
     try:
         pa: Any = import_module("pyarrow")
         pq: Any = import_module("pyarrow.parquet")
@@ -104,7 +109,7 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
 
 
 def document(rows: Iterable[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """``{"format", "header", "summary", "rows"}``; nothing in it that JSON cannot say (NaN is null)."""
+    """Return ``{"format", "header", "summary", "rows"}`` as plain JSON values (NaN is null)."""
     names = [f.name for f in dataclasses.fields(Row)]
     return {
         "format": FORMAT,
@@ -115,7 +120,7 @@ def document(rows: Iterable[Row], summary: Summary, header: Mapping[str, Any] | 
 
 
 def summary_record(summary: Summary) -> dict[str, Any]:
-    """The summary as plain JSON values, with the derived figures people ask for."""
+    """The summary as plain JSON values, with the derived figures."""
     record: dict[str, Any] = _strict(dump(summary))
     record["faults"]["false_alarm_rate"] = summary.faults.false_alarm_rate
     record["faults"]["longest_recovery_s"] = summary.faults.longest_recovery_s
@@ -123,7 +128,7 @@ def summary_record(summary: Summary) -> dict[str, Any]:
 
 
 def dump_document(rows: Iterable[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> str:
-    """The document as text, one line a row, ending in a line end."""
+    """The document as text with one line per row, ending in a line end."""
     whole = document(rows, summary, header)
     lines = ",\n".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in whole.pop("rows"))
     head = json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
@@ -136,3 +141,9 @@ def _strict(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_strict(v) for v in value]
     return plain(value)
+
+
+def write_layout(path: str | Path) -> None:
+    """Write the layout with which Foxglove and Lichtblick show ``result.mcap``: 3D view, plots, diagnostics."""
+    with atomic_text(path) as stream:
+        stream.write((files("avsreplay.report") / "assets" / "layout.json").read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""Rules a run must keep, from a TOML file, and their outcomes for people and for CI."""
+"""Rules that a run must satisfy, read from a TOML file, and their outcomes as JUnit XML and GitHub annotations."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ _RELATIVE = _LIMITS[2:]
 
 @dataclass(frozen=True, slots=True)
 class Rule(Settings):
-    """One rule on one metric; all limits given must hold.
+    """One rule on one metric; all given limits must hold.
 
-    A run without the metric breaks the rule, unless ``optional``.
+    A run without a value for the metric breaks the rule, unless ``optional``.
     """
 
     metric: str = setting(doc="The metric that is limited.")
@@ -43,12 +43,12 @@ class Rule(Settings):
 
     @property
     def limits(self) -> dict[str, float]:
-        """The limits given, by name."""
+        """The given limits by name."""
         return {name: getattr(self, name) for name in _LIMITS if getattr(self, name) is not None}
 
     @property
     def relative(self) -> bool:
-        """Does it need a baseline?"""
+        """Whether the rule needs a baseline."""
         return any(name in _RELATIVE for name in self.limits)
 
     @property
@@ -71,7 +71,7 @@ class GateRules(Settings):
 
 @dataclass(frozen=True, slots=True)
 class RuleOutcome:
-    """What one rule says of one run; ``why`` is the limit that was broken, with both numbers."""
+    """One rule applied to one run; ``why`` states the broken limit with both numbers."""
 
     run: str
     rule: Rule
@@ -81,16 +81,27 @@ class RuleOutcome:
 
 
 def load_rules(path: str | Path) -> tuple[Rule, ...]:
-    """The rules in a TOML file. Raises UnreadableInput, or UsageError with the line."""
+    """Read the rules of a TOML file.
+
+    Raises:
+        UnreadableInput: the file cannot be read.
+        UsageError: it is not valid; the message names the line.
+    """
     return build(GateRules, load(path)).rule
 
 
 def judge(
     rules: Sequence[Rule], runs: Sequence[tuple[str, Mapping[str, float | None]]], *, baseline: bool = True
 ) -> list[RuleOutcome]:
-    """Every rule on every run but the baseline, which is the first; without a baseline, absolute rules on all.
+    """Apply every rule to every run but the baseline, which is the first.
 
-    Raises UsageError for a relative rule without a baseline.
+    Args:
+        rules: to apply.
+        runs: (name, metrics) of each run.
+        baseline: False applies absolute rules to all runs; so does a single run.
+
+    Raises:
+        UsageError: a relative rule has no baseline.
     """
     if not baseline or len(runs) == 1:
         needy = next((rule for rule in rules if rule.relative), None)
@@ -106,10 +117,10 @@ def _outcome(
 ) -> RuleOutcome:
     value = figures.get(rule.metric)
     if value is None:
-        return RuleOutcome(run, rule, None, rule.optional, "" if rule.optional else "the run has no such figure")
+        return RuleOutcome(run, rule, None, rule.optional, "" if rule.optional else "the run has no value")
     reference = base.get(rule.metric)
     if rule.relative and reference is None:
-        return RuleOutcome(run, rule, value, rule.optional, "" if rule.optional else "the baseline has no such figure")
+        return RuleOutcome(run, rule, value, rule.optional, "" if rule.optional else "the baseline has no value")
     for name, limit in rule.limits.items():
         low, high = _bounds(name, limit, reference or 0.0)
         if not low <= value <= high:
@@ -142,7 +153,7 @@ def check_gate(outcomes: Sequence[RuleOutcome]) -> None:
 
 
 def junit(outcomes: Sequence[RuleOutcome]) -> str:
-    """JUnit XML: a suite a run, a case a rule. No times in it: the same outcomes give the same bytes."""
+    """JUnit XML with a suite per run and a case per rule; the same outcomes give the same bytes."""
     root = ET.Element("testsuites", name="avsreplay gate")
     for run in dict.fromkeys(o.run for o in outcomes):
         mine = [o for o in outcomes if o.run == run]
@@ -157,7 +168,7 @@ def junit(outcomes: Sequence[RuleOutcome]) -> str:
 
 
 def github_lines(outcomes: Sequence[RuleOutcome]) -> list[str]:
-    """GitHub workflow commands: an error a broken rule, one notice where all hold."""
+    """GitHub workflow commands: an error per broken rule, one notice where all hold."""
     broken = [o for o in outcomes if not o.ok]
     if not broken:
         return [f"::notice title=avsreplay gate::{len(outcomes)} rules hold"]

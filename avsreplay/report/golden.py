@@ -1,7 +1,7 @@
-"""Golden rows: compared both ways, each column with the tolerance it declares, flags and states exactly.
+"""Comparison with golden rows in both directions: numbers within their column's tolerance, flags and states exactly.
 
-A value passes where ``|got - expected| <= atol + rtol |expected|``. A row, a column or a file that one side lacks
-is a difference like any other; so is null against a value.
+A value passes where ``|got - expected| <= atol + rtol |expected|``. A row, a column or a file that is missing
+on one side is a difference; so is null against a value.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ ABSENT = "(absent)"
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One cell that does not agree; ``column`` is 'row' where a whole row is missing.
+    """One cell that differs; ``column`` is "row" where a whole row is missing.
 
     Attributes:
         seq: the scan, None where a column is missing from every row.
-        expected, got: the values, or ``ABSENT``.  tolerance: the most they may differ by, None for exact.
+        expected, got: the values, or ``ABSENT``.  tolerance: largest allowed difference, None where they must be equal.
     """
 
     seq: int | None
@@ -36,7 +36,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class GoldenResult:
-    """What a comparison found.
+    """Result of a comparison.
 
     Attributes:
         rows: rows on both sides.  differences: the first ones, in order of scan and column.
@@ -50,22 +50,24 @@ class GoldenResult:
 
     @property
     def ok(self) -> bool:
-        """Do the two agree?"""
+        """Whether the two agree."""
         return self.count == 0
 
     def check(self, where: str) -> None:
-        """Raise CheckFailed where they do not agree; ``where`` names the golden file."""
+        """Raise CheckFailed if they differ; ``where`` names the golden file."""
         if not self.ok:
             first = self.differences[0]
             at = "every scan" if first.seq is None else f"scan {first.seq}"
             what = f"{self.count} differences from the golden rows, the first at {at}, column {first.column}"
-            raise CheckFailed(what, where=where, hint="--update-golden writes the new rows, if they are right")
+            raise CheckFailed(what, where=where, hint="if the new rows are right, write them with --update-golden")
 
 
 def compare_golden(expected_path: str | Path, rows: Iterable[Row], *, first: int = 20) -> GoldenResult:
     """Compare rows with a golden file; ``first`` differences are kept, all are counted.
 
-    Raises CheckFailed where the file is missing, UnreadableInput where it is not rows.
+    Raises:
+        CheckFailed: the file does not exist.
+        UnreadableInput: it does not hold rows.
     """
     path = Path(expected_path)
     if not path.is_file():
@@ -83,7 +85,9 @@ def _by_seq(records: Iterable[tuple[str, dict[str, Any]]]) -> dict[int, dict[str
         if not isinstance(seq, int) or isinstance(seq, bool):
             raise UnreadableInput("a row without a whole number 'seq'", where=where, hint="name a rows.jsonl file")
         if seq in out:
-            raise UnreadableInput(f"scan {seq} stands twice", where=where, hint="write the file anew")
+            raise UnreadableInput(
+                f"scan {seq} occurs twice", where=where, hint="write the file again with --update-golden"
+            )
         out[seq] = record
     return out
 
@@ -91,7 +95,7 @@ def _by_seq(records: Iterable[tuple[str, dict[str, Any]]]) -> dict[int, dict[str
 def compare_records(
     expected: Mapping[int, Mapping[str, Any]], got: Mapping[int, Mapping[str, Any]], *, first: int = 20
 ) -> GoldenResult:
-    """Compare two sets of rows, scan number -> column -> value."""
+    """Compare two sets of rows (scan number -> column -> value)."""
     kept: list[Difference] = []
     by_column: dict[str, int] = {}
     for difference in _differences(expected, got):
@@ -155,7 +159,7 @@ def _is_number(value: Any) -> bool:
 
 
 def update_golden(path: str | Path, rows: Iterable[Row], *, first: int = 20) -> GoldenResult | None:
-    """Write the golden file anew, atomically; what changed against the former one (None where there was none)."""
+    """Replace the golden file and return the differences from the previous one (None if there was none)."""
     rows = list(rows)
     former = compare_golden(path, rows, first=first) if Path(path).is_file() else None
     write_rows(path, rows)

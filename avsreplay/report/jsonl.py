@@ -1,7 +1,7 @@
-"""Rows as JSON lines: one object a scan, keys in the order of ``Row``'s fields, floats as their shortest exact text.
+"""Rows as JSON lines: one object per scan, keys in the order of ``Row``'s fields, floats as the shortest exact text.
 
-A float that is not finite is written as null. Facts about the run stand elsewhere (``run.json``), so the same
-input gives the same bytes.
+A float that is not finite is written as null. Facts about the run are in ``run.json``, so that the same input gives
+the same bytes here.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _MAX_LINE = 1 << 20
 
 
 def field_types() -> dict[str, tuple[type, bool]]:
-    """Column name -> (str, int, float or bool; may it be null)."""
+    """Column name -> (str, int, float or bool; whether it may be null)."""
     hints = typing.get_type_hints(Row)
     return {name: _split(hints[name]) for name in _NAMES}
 
@@ -49,7 +49,7 @@ def dump_row(row: Row) -> str:
 
 
 class RowWriter:
-    """Writes rows one by one; the file appears when the ``with`` block ends well, and not otherwise."""
+    """Writes rows one by one; the file appears when the ``with`` block ends without an error."""
 
     def __init__(self, path: str | Path) -> None:
         self._path = Path(path)
@@ -70,7 +70,11 @@ class RowWriter:
 
 
 def write_rows(path: str | Path, rows: Iterable[Row]) -> int:
-    """Write all rows, atomically; how many. Raises UnreadableInput where the path cannot be written."""
+    """Write all rows atomically and return their number.
+
+    Raises:
+        UnreadableInput: the path cannot be written.
+    """
     with RowWriter(path) as writer:
         for row in rows:
             writer.write(row)
@@ -78,9 +82,10 @@ def write_rows(path: str | Path, rows: Iterable[Row]) -> int:
 
 
 def read_records(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Each line as (``file:line``, object), unchecked but for being a JSON object.
+    """Yield each line as (``file:line``, object) without checking the columns.
 
-    Raises UnreadableInput for a missing file, text that is not UTF-8, or a line that is not a JSON object.
+    Raises:
+        UnreadableInput: the file is missing or is not UTF-8, or a line is not a JSON object.
     """
     path = Path(path)
     try:
@@ -112,9 +117,10 @@ def _refuse(constant: str) -> Any:
 
 
 def parse_row(record: Mapping[str, Any], where: str) -> Row:
-    """A row from its JSON object. A column that may be null, or a word, may be missing (an older result lacks some).
+    """Build a row from its JSON object; a text column and one that may be null may be missing.
 
-    Raises UnreadableInput for an unknown or a missing column or a value of the wrong type.
+    Raises:
+        UnreadableInput: a column is unknown or missing, or a value has the wrong type.
     """
     types = field_types()
     for name in record:
@@ -137,5 +143,5 @@ def _checked(value: Any, name: str, kind: type, nullable: bool, where: str) -> A
 
 
 def read_rows(path: str | Path) -> list[Row]:
-    """All rows of a file. Raises UnreadableInput (see read_records, parse_row)."""
+    """All rows of a file; raises UnreadableInput as ``read_records`` and ``parse_row`` do."""
     return [parse_row(record, where) for where, record in read_records(path)]

@@ -1,6 +1,6 @@
-"""A result directory read back: rows, run facts, truth, summary, what the 3D view needs.
+"""Reads a result directory: rows, run facts, truth, summary, 3D view.
 
-``rows.jsonl`` must be there. ``run.json`` (with the ``facts`` made here), ``truth.tum`` and ``view.npz`` may be.
+``rows.jsonl`` is required; ``run.json`` (with ``facts``), ``truth.tum`` and ``view.npz`` are optional.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
 from typing import Any
 
@@ -116,8 +117,6 @@ def _stamped(line: str, where: str) -> StampedPose:
     try:
         stamp, *values = line.split()
         x, y, z, *q = (float(v) for v in values)
-        whole, _, fraction = stamp.lstrip("-").partition(".")
-        t_ns = int(whole) * 1_000_000_000 + int(fraction.ljust(9, "0")[:9] or "0")
-        return (-t_ns if stamp.startswith("-") else t_ns), Pose(q, [x, y, z])  # type: ignore[arg-type]
-    except ValueError:
+        return int((Decimal(stamp) * 1_000_000_000).to_integral_value(ROUND_DOWN)), Pose(q, [x, y, z])  # type: ignore[arg-type]
+    except (ValueError, ArithmeticError):
         raise UnreadableInput("not 'stamp x y z qx qy qz qw'", where=where, hint="name a TUM trajectory") from None

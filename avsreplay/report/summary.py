@@ -1,8 +1,8 @@
-"""What a run came to: one fold over its rows.
+"""The summary of a run: one fold over its rows.
 
 Terms: a scan is *healthy* where gamma is 1 and *coasting* where it is 0. Errors are against the log's truth. Sums are
-correctly rounded, so the summary does not depend on their order. What the clock on the wall says (scans per
-second) is no part of it.
+correctly rounded, so the summary does not depend on their order. The speed in scans per
+second is not part of it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ NEES_BAND = (9.5908, 34.1696)  # the same with 20
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Translation [m] and rotation [deg] errors over the same scans; None without truth."""
+    """Position [m] and rotation [deg] errors over the same scans; None without truth."""
 
     position_m: Statistics | None
     rotation_deg: Statistics | None
@@ -44,7 +44,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class Observability:
-    """The Gramian at the last scan, and when its rank first was 20 (None: never)."""
+    """The Gramian at the last scan, and the time of the first scan at which its rank was 20 (None: never)."""
 
     log10_cond: float | None
     log10_cond_scaled: float | None
@@ -54,7 +54,7 @@ class Observability:
 
 @dataclass(frozen=True, slots=True)
 class Convergence:
-    """t_1: the first scan on which the planner may rely on the estimate, and whether that word was taken back."""
+    """t_1: time of the first scan whose estimate the planner may use; whether it holds at the end; times withdrawn."""
 
     t1_s: float | None
     at_end: bool
@@ -63,14 +63,16 @@ class Convergence:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """All of it.
+    """Everything that is said of a run as a whole.
 
     Attributes:
-        pose_healthy, pose_coasting: of the estimate.  registration_healthy, registration_flagged: of the measurement.
-        reasons: why scans were flagged.  status: what door and ruler found.  counts: handed in (losses, clock).
-        weighed_down: healthy scans that kept less than their whole say.  reinitialised: times the poses contradicted
-            the filter or the given start.
-        coasts: runs without a measurement.  interval_s: median between scans.  gaps: longer than 1.5 times it.
+        pose_healthy, pose_coasting: errors of the estimate.
+        registration_healthy, registration_flagged: errors of the measured poses.
+        reasons: why scans were flagged.  status: scans by the status of their registration.
+        counts: losses and clock problems, given by the caller.
+        weighed_down: healthy poses with a Cauchy weight below 1.  reinitialised: reinitialisations of the estimate.
+        coasts: intervals of prediction without measurement.  interval_s: median between scans.
+        gaps: intervals between scans longer than 1.5 times the median.
     """
 
     scans: int
@@ -112,7 +114,7 @@ class Summary:
         truth: State | None = None,
         counts: Mapping[str, int] | None = None,
     ) -> Summary:
-        """Fold rows in their order; see SummaryFold."""
+        """Summarise rows in their order; the arguments are those of SummaryFold."""
         fold = SummaryFold(labels=labels, truth=truth, counts=counts)
         for row in rows:
             fold.add(row)
@@ -120,7 +122,7 @@ class Summary:
 
     @property
     def longest_coast(self) -> Coast | None:
-        """The longest run without a measurement (the first of equals)."""
+        """The longest interval without a measurement (the first of equals)."""
         return max(self.coasts, key=lambda c: c.duration_s, default=None)
 
 
@@ -128,9 +130,9 @@ class SummaryFold:
     """Takes rows one by one and keeps a few numbers of each.
 
     Args:
-        labels: faults put into the log; None where the log does not say (a recorded one).
-        truth: the true state, its axes named as the estimate's are (see estimate.relabel).
-        counts: losses and clock trouble met on the way, by name.
+        labels: injected faults; None where the log does not state them.
+        truth: the true state, with the principal axes in the order of the estimate's.
+        counts: losses and clock problems by name.
     """
 
     def __init__(
@@ -226,7 +228,7 @@ class SummaryFold:
         )
 
     def _blocks(self) -> dict[str, Share]:
-        """NEES of each block of the state per degree of freedom, and its band likewise."""
+        """NEES of each block of the state and its band, per degree of freedom."""
         out: dict[str, Share] = {}
         for name, block in BLOCKS.items():
             size = block.stop - block.start

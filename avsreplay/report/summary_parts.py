@@ -19,7 +19,7 @@ from avsreplay.rows import Row
 
 @dataclass(frozen=True, slots=True)
 class Statistics:
-    """Root mean square, mean, median, standard deviation (over n), least and greatest of ``count`` values."""
+    """Root mean square, mean, median, standard deviation (over n), smallest and largest of ``count`` values."""
 
     count: int
     rmse: float
@@ -31,7 +31,7 @@ class Statistics:
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Statistics | None:
-        """None for no value at all."""
+        """Statistics of ``values``; None without any value."""
         if not values:
             return None
         n = len(values)
@@ -42,7 +42,7 @@ class Statistics:
 
 
 def median(values: Sequence[float]) -> float:
-    """The middle value, or the mean of the two middle ones. ``values`` must not be empty."""
+    """The middle value, or the mean of the two middle values; ``values`` must not be empty."""
     ordered, half = sorted(values), len(values) // 2
     return ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
 
@@ -65,7 +65,7 @@ class Parameter:
 
 
 def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
-    """Inertia ratios, varrho and mu of a row, against ``truth`` where it is known."""
+    """Inertia ratios, varrho and mu of a row, against ``truth`` where it is given."""
     sigma = (None, None) if truth is None else ((float(truth.sigma[0]),), (float(truth.sigma[1]),))
     found = [
         _vector("sigma1", "", (row.sigma1,), sigma[0], row.sigma1_1s),
@@ -107,7 +107,7 @@ def _attitude(row: Row, truth: State | None) -> Parameter | None:
 
 @dataclass(frozen=True, slots=True)
 class CaptureMiss:
-    """Where the true grasp point was when the gripper closed: distance, relative speed, attitude error."""
+    """Distance, relative speed and attitude error of the gripper to the true grasp point when it closed."""
 
     position_m: float
     speed_mps: float | None
@@ -116,13 +116,13 @@ class CaptureMiss:
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """Planned instants of capture, since the first scan; a replan is a row where the plan differs from the one before.
+    """Planned instants of capture since the first scan; a replan is a row whose plan differs from the one before.
 
     Attributes:
         last_s, first_s: of the last and the first plan.  std_s, range_s: over all replans.
-        status: the planner's last word.
-        plan_miss_m: by how much each plan, flown as made, would have missed the true grasp point.
-        miss: of the closed gripper, None where it never closed or truth is not known.
+        status: of the last plan.
+        plan_miss_m: distance to the true grasp point at the end of each plan, flown without replanning.
+        miss: when the gripper closed; None where it never closed or without truth.
         actions: scans under each of the supervisor's actions.
     """
 
@@ -159,7 +159,7 @@ class CaptureFold:
             self._miss = CaptureMiss(row.capture_miss_m, row.capture_miss_mps, row.capture_miss_deg)
 
     def result(self) -> Capture:
-        """What the rows so far came to."""
+        """The summary of the rows so far."""
         times = [t for _, t in self._plans if t is not None]
         spread = Statistics.of(times)
         return Capture(

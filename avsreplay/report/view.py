@@ -1,7 +1,6 @@
-"""What the 3D view of a report needs, small enough to keep: a thinned model, thinned clouds, planned paths.
+"""Data of a page's 3D view: a decimated model, decimated clouds and planned paths, kept in ``view.npz``.
 
-All in one ``view.npz`` beside the rows; it is written only when a report is asked for. Nothing in it is random: clouds
-are thinned by even strides, the model by clustering its vertices on a grid.
+Decimation is deterministic: clouds by an even stride, the model by clustering its vertices on a grid.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ Faces = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudView:
-    """A few points of scan ``seq``: (n, 3) in {A} [m], and each one's distance to the model (n,) [m] or None."""
+    """Some points of scan ``seq``: (n, 3) in {A} [m], and their distances to the model (n,) [m] or None."""
 
     seq: int
     points: Floats
@@ -41,7 +40,7 @@ class CloudView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PathView:
-    """A planned path: when it was planned, (n, 3) positions in {A} [m], and by how much it would miss [m]."""
+    """A planned path: time of planning, (n, 3) positions in {A} [m], distance to the true grasp point [m]."""
 
     t_ns: int
     points: Floats
@@ -79,7 +78,7 @@ def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, F
 
 
 def _clustered(vertices: Array, faces: Faces, size: float) -> tuple[Array, Faces]:
-    """Each grid cell's vertices become their mean; faces that collapse or double go."""
+    """Replace the vertices of each grid cell by their mean; collapsed and duplicate faces are removed."""
     cells = np.floor((vertices - vertices.min(axis=0)) / size).astype(np.int64)
     _, member = np.unique(cells, axis=0, return_inverse=True)
     member = member.reshape(-1)
@@ -93,7 +92,7 @@ def _clustered(vertices: Array, faces: Faces, size: float) -> tuple[Array, Faces
 
 
 def write_view(path: str | Path, view: View) -> None:
-    """One npz, atomically; the same view gives the same bytes."""
+    """Write one npz file atomically; the same view gives the same bytes."""
     arrays = {
         "vertices": view.vertices,
         "faces": view.faces,
@@ -119,7 +118,11 @@ def _residual(cloud: CloudView) -> Floats:
 
 
 def read_view(path: str | Path) -> View:
-    """The view in a file. Raises UnreadableInput where it is missing or is not one."""
+    """Read a view.
+
+    Raises:
+        UnreadableInput: the file is missing or is not a view.
+    """
     try:
         with np.load(path, allow_pickle=False) as data:
             if sum(info.file_size for info in data.zip.infolist()) > _MOST_BYTES:
@@ -147,7 +150,7 @@ def _view(arrays: dict[str, NDArray[np.float32]]) -> View:
     faces = arrays["faces"].astype(np.int32).reshape(-1, 3)
     vertices = arrays["vertices"].reshape(-1, 3)
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise ValueError("faces name vertices that are not there")
+        raise ValueError("faces refer to vertices that do not exist")
     return View(vertices, faces, clouds, paths)
 
 
@@ -165,7 +168,7 @@ _NO_RESIDUAL = 255
 
 
 def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dict[str, Any]:
-    """Plain data. Poses as seven columns x y z qx qy qz qw; points of a cloud as 16 bit steps about its centre [m]."""
+    """Plain data for ``scene.js``: poses as columns x y z qx qy qz qw, points as 16-bit steps about a centre [m]."""
     view = view or View(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32))
     estimate = np.stack([values(rows, n) for n in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")], axis=1)
     return {
@@ -188,7 +191,7 @@ def _true_poses(rows: Sequence[Row], truth: dict[int, Pose]) -> NDArray[np.float
 
 
 def _at_most(items: Sequence[Any], most: int) -> list[Any]:
-    """At an even stride, first and last kept."""
+    """At an even stride, with the first and the last."""
     chosen = np.unique(np.linspace(0, max(len(items) - 1, 0), min(most, len(items))).astype(int))
     return [items[k] for k in chosen]
 
@@ -225,7 +228,7 @@ def _quantised(points: NDArray[np.float32]) -> tuple[NDArray[np.int16], NDArray[
 
 
 def _cap(residuals: Sequence[NDArray[np.float32]]) -> float | None:
-    """The residual at the top of the colour scale: twice the 90 % point of the middle scan, blind ones or not."""
+    """Residual at the top of the colour scale [m]: twice the median over the scans of their 90 % points."""
     if not residuals:
         return None
     return 2.0 * float(np.median([np.quantile(r, 0.9) for r in residuals])) or 1e-9

@@ -1,0 +1,98 @@
+"""Options that several commands share, and how they become ``SourceOptions``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from avsreplay.cli.setting_options import source_setting
+from avsreplay.errors import UsageError
+
+if TYPE_CHECKING:
+    from avsreplay.log import SourceOptions
+
+F = TypeVar("F", bound=Callable[..., Any])
+PATH = click.Path(path_type=Path)
+
+
+class Numbers(click.ParamType[tuple[float, ...]]):
+    """A given count of numbers, separated by commas."""
+
+    name = "numbers"
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        """A tuple of floats; anything else is a usage error."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = tuple(float(word) for word in str(value).split(","))
+        except ValueError:
+            numbers = ()
+        if len(numbers) != self.count:
+            self.fail(f"'{value}' is not {self.count} numbers separated by commas", param, ctx)
+        return numbers
+
+
+def added(*options: Callable[[F], F]) -> Callable[[F], F]:
+    """Return a decorator that adds ``options`` to a command in this order."""
+
+    def decorate(command: F) -> F:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return decorate
+
+
+source_options = added(
+    source_setting("--model", type=PATH),
+    source_setting("--cloud-model", is_flag=True),
+    source_setting("--topic"),
+    source_setting("--truth-topic"),
+    source_setting("--truth", "truth_file", type=PATH),
+    source_setting("--truth-frame"),
+    source_setting("--truth-gap", "truth_gap_s", type=float),
+    source_setting("--fixed-frame"),
+    source_setting("--sensor-topic"),
+    source_setting("--crop-box", type=Numbers(6), metavar="X0,Y0,Z0,X1,Y1,Z1"),
+    source_setting("--crop-range", type=Numbers(2), metavar="MIN,MAX"),
+    source_setting("--rate", "rate_hz", type=float),
+    source_setting("--every-scan", "every", type=int),
+    source_setting("--start-offset", "start_offset_s", type=float),
+    source_setting("--end", "end_s", type=float),
+    source_setting("--duration", "duration_s", type=float),
+    source_setting("--n-scans", type=int),
+    source_setting("--clock"),
+    source_setting("--max-message-mib", type=int),
+    source_setting("--strict", is_flag=True),
+)
+"""Options for reading a log; each has the name of its field in ``log.SourceOptions`` and is None by default."""
+
+
+def read_options(flags: Mapping[str, Any]) -> SourceOptions:
+    """The given (not None) options as ``SourceOptions``.
+
+    Raises:
+        UsageError: a value is not allowed.
+    """
+    from avsreplay.log import ClockChoice, SourceOptions
+
+    given = {name: value for name, value in flags.items() if value is not None}
+    if "clock" in given:
+        given["clock"] = ClockChoice(given["clock"])
+    try:
+        return SourceOptions(**given)
+    except ValueError as error:
+        raise UsageError(str(error), hint="correct the option") from None
+
+
+def output_is_free(output: Path | None, *, overwrite: bool) -> None:
+    """Raise UsageError if ``output`` exists and must not be replaced."""
+    if output and output.exists() and not overwrite:
+        raise UsageError("already exists", where=str(output), hint="choose another name with -o, or add --overwrite")
