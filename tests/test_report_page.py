@@ -201,7 +201,7 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     assert "<title>" in (tmp_path / "report.html").read_text(encoding="utf-8")
     again = CliRunner().invoke(command, [str(tmp_path)])
     assert isinstance(again.exception, AvsError)
-    assert "already there" in str(again.exception)
+    assert "already exists" in str(again.exception)
     assert CliRunner().invoke(command, [str(tmp_path), "--overwrite", "--title", "x"]).exit_code == 0
     (tmp_path / "none.jsonl").write_text("")
     empty = CliRunner().invoke(command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")])
