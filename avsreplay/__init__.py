@@ -1,23 +1,25 @@
-"""avsreplay: record, replay and gate the chain of vision-guided capture. THE LAW of the package stands here.
+"""avsreplay: record and replay point-cloud logs through the processing chain of vision-guided capture.
+
+The conventions that hold in every module:
 
 Frames
-    {A} camera, taken as inertial.  {B} principal axes of the target at its centre of mass.
-    {C} grapple fixture, which is also the frame of the model.  ``T_ab`` takes coordinates in b to coordinates in a.
+    {A} camera, assumed inertial.  {B} principal axes of the target, origin at its centre of mass.
+    {C} grapple fixture; the model file uses this frame.  ``T_ab`` takes coordinates in b to coordinates in a.
 Quaternions
-    ``[x y z w]``, unit, active: ``matrix(q_ab)`` takes b to a.  Code composes with Hamilton's product,
-    ``q_ac = multiply(q_ab, q_bc)``; the paper's product has its factors exchanged, a (x) b = multiply(b, a).
+    ``[x y z w]``, unit length, active: ``matrix(q_ab)`` takes b to a.  The code uses Hamilton's product,
+    ``q_ac = multiply(q_ab, q_bc)``; the paper's product has the factors in the other order, a (x) b = multiply(b, a).
 Units
-    SI and radians inside; degrees only where a person reads; a unit is the suffix of whatever leaves
-    (``pos_err_m``, ``rot_err_deg``, ``t_go_s``).  Instants are integers ``t_ns``, spans float seconds.
-State (20 error states, in this order everywhere)
+    SI units and radians; degrees in output for people only. The names of all output values end with their unit
+    (``pos_err_m``, ``rot_err_deg``, ``t_go_s``).  Instants are integer nanoseconds ``t_ns``, durations float seconds.
+State (20 error states, always in this order)
     dq_v 0:3 (half angle), w 3:6, rho_o 6:9, v 9:12, sigma 12:14, varrho 14:17, dmu_v 17:20 (half angle);
-    q = dq (x) q_hat, mu = mu_hat (x) dmu in the paper's product, all else additive.
+    q = dq (x) q_hat and mu = mu_hat (x) dmu in the paper's product; the other errors are additive.
 Alignment error
     d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d).
-Sources
-    F. Aghili, "Adaptive Visual Servo Control for Autonomous Robots"; its corrections are in ``docs/equations.md``.
+Source
+    F. Aghili, "Adaptive Visual Servo Control for Autonomous Robots"; ``docs/equations.md`` lists the corrections.
 
-Importing the package does nothing; the public names are loaded when they are first used.
+Importing the package loads no other module; the public names are loaded when they are first used.
 """
 
 from __future__ import annotations

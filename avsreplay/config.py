@@ -25,14 +25,14 @@ from avsreplay.toml_document import Document, build, load, override
 
 
 class Guess(Enum):
-    """What registration starts from."""
+    """Where the initial guess of the registration comes from."""
 
     PREDICTED = "predicted"  # closed loop: the filter's prior
     LAST = "last"  # open loop: the last healthy pose
 
 
 class Against(Enum):
-    """What errors are taken against."""
+    """What errors are computed against."""
 
     TRUTH = "truth"
     FIT = "fit"
@@ -82,7 +82,7 @@ class RunConfig(Settings):
 
 
 def parse_pose(text: str) -> Pose:
-    """``x,y,z,qx,qy,qz,qw`` as a pose. Raises ValueError saying what is wrong."""
+    """Parse ``x,y,z,qx,qy,qz,qw`` into the pose T_ac. Raises ValueError with what is wrong."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -95,7 +95,7 @@ def parse_pose(text: str) -> Pose:
 
 
 def load_config(file: Path | None, log_table: Mapping[str, Any], assignments: Sequence[str]) -> RunConfig:
-    """The effective configuration.
+    """Return the effective configuration.
 
     Args:
         file: TOML file, or None.

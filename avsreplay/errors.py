@@ -1,23 +1,14 @@
-"""One base error, one exit code each. Only the command line prints or exits."""
+"""Errors that a user can correct, each with its exit code. Only the command line prints them or exits."""
 
 from __future__ import annotations
 
-__all__ = [
-    "AvsError",
-    "CheckFailed",
-    "DataLost",
-    "MissingBackend",
-    "UnreadableInput",
-    "UsageError",
-]
-
 
 class AvsError(Exception):
-    """A trouble the user can mend: one line saying what, where and what to do.
+    """An error that the user can correct; its text is one line: where, what is wrong, what to do.
 
     Args:
         what: what is wrong, in one sentence without a full stop.
-        where: the file, key, topic or place it was found at.
+        where: file, key, topic or option that it concerns.
         hint: what to do about it.
     """
 
@@ -30,34 +21,34 @@ class AvsError(Exception):
         self.hint = hint
 
     def __str__(self) -> str:
-        """The one line a person reads."""
+        """Return the line that is printed."""
         line = f"{self.where}: {self.what}" if self.where else self.what
         return f"{line}; {self.hint}" if self.hint else line
 
 
 class CheckFailed(AvsError):
-    """The check that was asked for (a golden file, a gate) did not hold. Exit code 1."""
+    """A requested check (golden file, gate, contract) failed. Exit code 1."""
 
     exit_code = 1
 
 
 class UsageError(AvsError):
-    """A flag, key or value that cannot be right. Exit code 2."""
+    """An option, key or value is invalid. Exit code 2."""
 
     exit_code = 2
 
 
 class MissingBackend(UsageError):
-    """A back end or optional extra that is not installed. Exit code 2."""
+    """A back end or an optional dependency is not installed. Exit code 2."""
 
 
 class UnreadableInput(AvsError):
-    """A file that is not there, is not what it says, or cannot be read. Exit code 3."""
+    """A file is missing, has another format than expected, or cannot be read. Exit code 3."""
 
     exit_code = 3
 
 
 class DataLost(AvsError):
-    """The work was finished, but part of the input could not be read. Exit code 4."""
+    """The command finished, but part of the input could not be read. Exit code 4."""
 
     exit_code = 4

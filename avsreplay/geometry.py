@@ -2,8 +2,8 @@
 
 Quaternions are ``[x y z w]``, Hamilton, active: ``matrix(q_ab)`` takes coordinates in b to
 coordinates in a. ``multiply(q_ab, q_bc)`` is ``q_ac``: the matrices multiply in the same order.
-A single one goes through scalars, ten times faster than through arrays and with the same bits.
-The paper writes the same product with its factors exchanged, ``a (x) b = multiply(b, a)``.
+A single value is computed with scalars, ten times faster than with arrays and with the same bits.
+The paper's product has the factors in the other order, ``a (x) b = multiply(b, a)``.
 """
 
 from __future__ import annotations
@@ -15,29 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = [
-    "IDENTITY_QUAT",
-    "Array",
-    "Pose",
-    "angle",
-    "conjugate",
-    "exp",
-    "frozen",
-    "log",
-    "matrix",
-    "multiply",
-    "normalise",
-    "quaternion",
-    "rotate",
-    "skew",
-    "slerp",
-]
-
 Array = NDArray[np.float64]
 
 
 def frozen(values: ArrayLike, *shape: int) -> Array:
-    """A read-only float64 copy in C order; with ``shape`` given, checked against it (-1: any)."""
+    """Return a read-only float64 copy in C order; its shape is checked against ``shape`` (-1: any size)."""
     array = np.array(values, dtype=np.float64, order="C")
     if shape and array.shape != shape and not _fits(array.shape, shape):
         raise ValueError(f"expected shape {shape}, got {array.shape}")
@@ -53,7 +35,7 @@ IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])
 
 
 def skew(v: ArrayLike) -> Array:
-    """The matrix [v x] with ``skew(v) @ u == cross(v, u)``. (..., 3) -> (..., 3, 3)."""
+    """Return the matrix [v x] with ``skew(v) @ u == cross(v, u)``. (..., 3) -> (..., 3, 3)."""
     a: Array = np.asarray(v, dtype=np.float64)
     if a.ndim == 1:
         x, y, z = a.tolist()
@@ -65,7 +47,7 @@ def skew(v: ArrayLike) -> Array:
 
 
 def normalise(q: ArrayLike) -> Array:
-    """Unit quaternion of the sign with w >= 0 (where w is 0: first non-zero component > 0). (..., 4)."""
+    """Return the unit quaternion with w >= 0 (if w is 0: first non-zero component > 0). (..., 4)."""
     unit: Array = np.asarray(q, dtype=np.float64)
     if unit.ndim == 1 and unit.any():
         return _normalised(*unit.tolist())
@@ -83,7 +65,7 @@ def _normalised(x: float, y: float, z: float, w: float) -> Array:
 
 
 def multiply(q_ab: ArrayLike, q_bc: ArrayLike) -> Array:
-    """Hamilton product, ``q_ac``. (..., 4) x (..., 4) -> (..., 4)."""
+    """Return the Hamilton product ``q_ac``. (..., 4) x (..., 4) -> (..., 4)."""
     a, b = np.asarray(q_ab, dtype=np.float64), np.asarray(q_bc, dtype=np.float64)
     if a.ndim == b.ndim == 1:
         return np.array(_product(*a.tolist(), *b.tolist()))
@@ -104,12 +86,12 @@ def _product(ax: Any, ay: Any, az: Any, aw: Any, bx: Any, by: Any, bz: Any, bw: 
 
 
 def conjugate(q_ab: ArrayLike) -> Array:
-    """``q_ba``. (..., 4)."""
+    """Return the conjugate ``q_ba``. (..., 4)."""
     return np.asarray(np.multiply(q_ab, [-1.0, -1.0, -1.0, 1.0]), dtype=np.float64)
 
 
 def matrix(q_ab: ArrayLike) -> Array:
-    """R_ab = I + 2 w [v x] + 2 [v x]^2 (paper, eq:R): active. (..., 4) -> (..., 3, 3)."""
+    """Return R_ab = I + 2 w [v x] + 2 [v x]^2 (paper, eq:R): active. (..., 4) -> (..., 3, 3)."""
     q: Array = np.asarray(q_ab, dtype=np.float64)
     R = np.empty((*q.shape[:-1], 3, 3))
     x, y, z, w = q.tolist() if q.ndim == 1 else (q[..., 0], q[..., 1], q[..., 2], q[..., 3])
@@ -133,14 +115,14 @@ def matrix(q_ab: ArrayLike) -> Array:
 
 
 def rotate(R_ab: ArrayLike, v_b: ArrayLike) -> Array:
-    """R_ab v_b term by term: no fused library call, so the same bits on any processor. (..., 3, 3) x (..., 3)."""
+    """Return R_ab v_b, summed term by term for the same bits on any processor. (..., 3, 3) x (..., 3)."""
     R, v = np.asarray(R_ab, dtype=np.float64), np.asarray(v_b, dtype=np.float64)
     out: Array = R[..., :, 0] * v[..., :1] + R[..., :, 1] * v[..., 1:2] + R[..., :, 2] * v[..., 2:]
     return out
 
 
 def quaternion(R_ab: ArrayLike) -> Array:
-    """Unit quaternion of a rotation matrix, w >= 0. (..., 3, 3) -> (..., 4)."""
+    """Return the unit quaternion of a rotation matrix, w >= 0. (..., 3, 3) -> (..., 4)."""
     R = np.asarray(R_ab, dtype=np.float64)
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     four_q_qT = np.empty((*R.shape[:-2], 4, 4))  # row k is 4 q_k q: the row of the largest q_k is well conditioned
@@ -160,14 +142,14 @@ def quaternion(R_ab: ArrayLike) -> Array:
 
 
 def exp(rotvec: ArrayLike) -> Array:
-    """Quaternion of a rotation vector [rad]. (..., 3) -> (..., 4)."""
+    """Return the quaternion of a rotation vector [rad]. (..., 3) -> (..., 4)."""
     v = np.asarray(rotvec, dtype=np.float64)
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(half / np.pi) * v, np.cos(half)], axis=-1)
 
 
 def log(q: ArrayLike) -> Array:
-    """Rotation vector [rad], angle in [0, pi]. (..., 4) -> (..., 3)."""
+    """Return the rotation vector [rad], angle in [0, pi]. (..., 4) -> (..., 3)."""
     unit = normalise(q)
     v, w = unit[..., :3], unit[..., 3:]
     norm = np.linalg.norm(v, axis=-1, keepdims=True)
@@ -178,20 +160,20 @@ def log(q: ArrayLike) -> Array:
 
 
 def angle(q: ArrayLike) -> Array:
-    """Rotation angle [rad] in [0, pi]. (..., 4) -> (...)."""
+    """Return the rotation angle [rad] in [0, pi]. (..., 4) -> (...)."""
     a: Array = np.asarray(q, dtype=np.float64)
     theta: Array = 2.0 * np.arctan2(np.linalg.norm(a[..., :3], axis=-1), np.abs(a[..., 3]))
     return theta
 
 
 def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:
-    """Constant-rate interpolation from q0 (fraction 0) to q1 (1) the short way. (4) x (4) -> (4)."""
+    """Interpolate at constant rate along the shorter arc, q0 at fraction 0, q1 at 1. (4,) x (4,) -> (4,)."""
     return normalise(multiply(q0, exp(fraction * log(multiply(conjugate(q0), q1)))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:
-    """T_ab: takes coordinates in b to coordinates in a, ``p_a = R_ab p_b + t_ab_a``.
+    """Pose T_ab of frame b in frame a: takes coordinates in b to coordinates in a, ``p_a = R_ab p_b + t_ab_a``.
 
     Attributes:
         q: (4,) unit quaternion q_ab ``[x y z w]``, w >= 0.
@@ -207,36 +189,36 @@ class Pose:
 
     @classmethod
     def identity(cls) -> Pose:
-        """The pose that changes nothing."""
+        """Return the identity."""
         return cls(IDENTITY_QUAT, np.zeros(3))
 
     @classmethod
     def from_matrix(cls, T_ab: ArrayLike) -> Pose:
-        """From a (4, 4) homogeneous matrix; the rotation part is re-orthonormalised through the quaternion."""
+        """Convert a (4, 4) homogeneous matrix; the rotation is orthonormalised through its quaternion."""
         T = np.asarray(T_ab, dtype=np.float64)
         return cls(quaternion(T[:3, :3]), T[:3, 3])
 
     @property
     def R(self) -> Array:
-        """(3, 3) rotation matrix R_ab."""
+        """Return the (3, 3) rotation matrix R_ab."""
         return matrix(self.q)
 
     @property
     def matrix(self) -> Array:
-        """(4, 4) homogeneous matrix T_ab."""
+        """Return the (4, 4) homogeneous matrix T_ab."""
         out = np.eye(4)
         out[:3, :3], out[:3, 3] = self.R, self.t
         return out
 
     def inverse(self) -> Pose:
-        """T_ba."""
+        """Return the inverse T_ba."""
         q_ba = conjugate(self.q)
         return Pose(q_ba, -rotate(matrix(q_ba), self.t))
 
     def __matmul__(self, other: Pose) -> Pose:
-        """T_ab @ T_bc = T_ac."""
+        """Compose: T_ab @ T_bc = T_ac."""
         return Pose(multiply(self.q, other.q), rotate(self.R, other.t) + self.t)
 
     def apply(self, points_b: ArrayLike) -> Array:
-        """Points (..., 3) from b to a."""
+        """Transform points (..., 3) from b to a."""
         return np.asarray(points_b, dtype=np.float64) @ self.R.T + self.t

@@ -1,4 +1,4 @@
-"""Recording: a simulation or a source folded into a log writer, scan by scan. The layer that knows both."""
+"""Records a simulation or a recorded source to a log, scan by scan."""
 
 from __future__ import annotations
 
@@ -12,15 +12,13 @@ from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surf
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
 from avsreplay.simulate import Engine, Scenario, builtin_surface, load_scenario, simulate
 
-__all__ = ["RecordOptions", "Recorded", "Ticker", "record", "record_scenario", "record_source", "surface_for"]
-
 Ticker = Callable[[Iterable[Scan], int], AbstractContextManager[Iterator[Scan]]]
-"""Wraps the scans to show progress: (scans, how many are due, 0 if not known) -> a context that yields them."""
+"""Shows progress: (scans, expected number or 0 if unknown) -> a context manager that yields the scans."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordOptions:
-    """How to write: see log.LogWriter. ``model`` stands in for the scenario's or the source's own."""
+    """How to write the log, see log.LogWriter; ``model`` replaces the model of the scenario or source."""
 
     model: Path | None = None
     cloud_model: bool = False
@@ -30,14 +28,14 @@ class RecordOptions:
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What was written.
+    """What a recording contains.
 
     Attributes:
-        path: the log.  scans: clouds in it.  points: in all of them.  empty: clouds without a point.
-        damaged: messages of the source that could not be decoded and were left out.
-        span_s: first to last scan.  bytes: of the file.  model: name of the model inside, None without.
+        path: the log.  scans: number of clouds.  points: total number of points.  empty: clouds without points.
+        damaged: messages of the source that could not be decoded and were omitted.
+        span_s: time from first to last scan.  bytes: file size.  model: name of the model, None without.
         faults: labels as (kind, start [s], end [s] after the first scan, harmful).  losses: of the source.
-        note: what a user should know of how it was made, empty if nothing.
+        note: a remark for the user, empty if none.
     """
 
     path: str
@@ -63,10 +61,22 @@ def record(
     reading: SourceOptions | None = None,
     ticker: Ticker | None = None,
 ) -> Recorded:
-    """Record ``source`` to ``output``: None is the built-in scenario, a .toml a scenario, all else a recorded source.
+    """Record a source to a log.
 
-    Raises UsageError for flags that do not fit the source, and what the scenario, the model, the source or the
-    writer raise.
+    Args:
+        source: None for the built-in scenario, a scenario (.toml), or a recorded source (bag, log, folder).
+        output: log to write (.mcap).
+        seed: replaces the seed of the scenario.
+        options: how to write.
+        reading: how to read a recorded source.
+        ticker: shows progress.
+
+    Returns:
+        What was written.
+
+    Raises:
+        UsageError: an option does not apply to this kind of source, or a value in the scenario is invalid.
+        UnreadableInput: the scenario, the model or the source cannot be read.
     """
     options = options or RecordOptions()
     if source is None or source.suffix.lower() == ".toml":
@@ -80,16 +90,17 @@ def record(
 
 
 def surface_for(scenario: Scenario, model: Path | None = None, cloud_ok: bool = False) -> Surface:
-    """The model of a scenario: ``model`` where given, else the file it names, else its built-in shape.
+    """Return the model of a scenario: ``model`` if given, else the file it names, else its built-in shape.
 
-    Raises what log.read_surface raises.
+    Raises:
+        UnreadableInput: the file cannot be read.  UsageError: it holds no faces and ``cloud_ok`` is False.
     """
     path = model or scenario.model
     return read_surface(path, cloud_ok) if path is not None else builtin_surface(scenario.params.target.shape)
 
 
 def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ticker: Ticker | None = None) -> Recorded:
-    """Simulate ``scenario`` into ``output``; the truth is stamped with the true instants."""
+    """Record a simulation; the ground truth is stamped with the true instants."""
     simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model))
     with (
         _writer(output, simulation.header, options) as writer,
@@ -104,7 +115,7 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
 def record_source(
     source: Path, output: Path, reading: SourceOptions, options: RecordOptions, ticker: Ticker | None = None
 ) -> Recorded:
-    """Take over the scans, truth, labels and model of ``source``; stamps are those the clock rule chose."""
+    """Record the scans, ground truth, labels and model of a source, stamped with the selected clock."""
     if output.exists() and source.exists() and output.samefile(source):
         raise UsageError("the output is the source", where=str(output), hint="name another output")
     reading = replace(

@@ -1,7 +1,7 @@
-"""The nouns every stage speaks: frozen, float64, read-only; verbs are functions from these to these.
+"""The data types that the stages exchange: frozen dataclasses with read-only float64 arrays.
 
 Frames: {A} camera (inertial), {B} principal axes at the target's centre of mass, {C} grapple fixture, which is
-also the frame of the model. ``T_ac`` is the pose of {C} in {A}. SI units and radians; instants are ``t_ns``.
+also the frame of the model. ``T_ac`` is the pose of {C} in {A}. SI units and radians; instants are ``t_ns`` [ns].
 """
 
 from __future__ import annotations
@@ -34,28 +34,28 @@ BLOCKS: Mapping[str, slice] = MappingProxyType(
 
 
 class ScanStatus(Enum):
-    """What the door found of a scan."""
+    """What the reader found about a scan."""
 
     OK = "ok"
-    EMPTY = "empty"  # a message with no finite point
-    DAMAGED = "damaged"  # a message that could not be decoded
-    CLOCK = "clock"  # an implausible stamp: placed by the log's clock, not to be trusted in time
+    EMPTY = "empty"  # the message has no finite point
+    DAMAGED = "damaged"  # the message could not be decoded
+    CLOCK = "clock"  # the stamp is implausible; the log's clock was used instead
 
 
 class AlignStatus(Enum):
     """What the quality check (register.quality) found of an alignment."""
 
     ALIGNED = "aligned"
-    NOT_CONVERGED = "not_converged"  # n_max reached; the pose is still graded
-    DEGENERATE = "degenerate"  # the view leaves a direction free
-    NO_OVERLAP = "no_overlap"  # no or too few inliers: not aligned, whatever the back end says
+    NOT_CONVERGED = "not_converged"  # n_max iterations reached; the pose is still graded
+    DEGENERATE = "degenerate"  # the view does not determine all six directions
+    NO_OVERLAP = "no_overlap"  # too few inliers, whatever the back end reports
     NO_POINTS = "no_points"
-    AMBIGUOUS = "ambiguous"  # acquisition: a second pose fits as well
-    FAILED = "failed"  # the back end raised or returned a pose that is not finite
+    AMBIGUOUS = "ambiguous"  # global search: a second pose fits as well
+    FAILED = "failed"  # the back end raised an error or its pose is not finite
 
 
 class Reason(Enum):
-    """Why gamma is 0 (``OK``: gamma is 1). The first that holds, in this order."""
+    """Why gamma is 0 (``OK``: gamma is 1): the first condition that holds, in this order."""
 
     OK = "ok"
     NO_SCAN = "no_scan"  # empty or damaged scan
@@ -64,11 +64,11 @@ class Reason(Enum):
     FEW_INLIERS = "few_inliers"
     FIT_ERROR = "fit_error"  # rms_m >= threshold
     POSE_JUMP = "pose_jump"  # weighted innovation norm >= threshold
-    CLOCK = "clock"  # stamp steps back or jumps: the scan cannot be placed in time
+    CLOCK = "clock"  # the stamp steps back or jumps
 
 
 class PlanStatus(Enum):
-    """What the planner can claim."""
+    """Result of the planner."""
 
     OPTIMAL = "optimal"  # first feasible time, certified to the stated gap
     FEASIBLE = "feasible"  # satisfies all constraints; no claim of least time
@@ -78,11 +78,11 @@ class PlanStatus(Enum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surface:
-    """A target model in {C}: a triangle mesh, or a bare cloud where ``faces`` is empty.
+    """A target model in {C}: a triangle mesh, or a point cloud if ``faces`` is empty.
 
     Attributes:
         vertices: (n, 3) [m].  faces: (m, 3) vertex indices, int32, possibly (0, 3).
-        name: file name as given.  sha256: of the file's bytes.  data: those bytes (for the log's attachment).
+        name: file name as given.  sha256: hash of the file.  data: the file (for the attachment in a log).
     """
 
     vertices: Array
@@ -93,13 +93,13 @@ class Surface:
 
     @property
     def extent(self) -> float:
-        """Diagonal of the bounding box [m]."""
+        """Return the diagonal of the bounding box [m]."""
         return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class State:
-    """The motion of a target and its parameters (eq:x): the mean that the 20 error states surround.
+    """Motion and parameters of a target (eq:x): the mean to which the 20 error states refer.
 
     Attributes:
         q_ab: (4,) attitude of {B}.  w_b: (3,) angular rate of {B} in {A}, in {B} [rad/s].
@@ -121,21 +121,21 @@ class State:
 
     @property
     def T_ac(self) -> Pose:
-        """Pose of the fixture in the camera: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho."""
+        """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho."""
         return Pose(
             geometry.multiply(self.q_ab, self.q_bc), self.r_a + geometry.rotate(geometry.matrix(self.q_ab), self.c_b)
         )
 
     @property
     def fixture_velocity(self) -> Array:
-        """(3,) velocity of {C}'s origin in {A} [m/s] (section 8)."""
+        """Return the (3,) velocity of the origin of {C} in {A} [m/s] (section 8)."""
         speed_b = geometry.rotate(geometry.skew(self.w_b), self.c_b)
         return self.v_a + geometry.rotate(geometry.matrix(self.q_ab), speed_b)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Label:
-    """A fault put into the log on purpose: its kind over a window of the log clock."""
+    """An injected fault: its kind and the interval on the log clock in which it acts."""
 
     kind: str
     start_ns: int
@@ -146,14 +146,14 @@ class Label:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """One cloud as the door hands it on.
+    """One point cloud as the reader returns it.
 
     Attributes:
-        seq: place in the replay's order, from 0.  t_ns: instant on the chosen clock.
-        log_ns: when the recorder wrote it.
+        seq: index in the replay, from 0.  t_ns: instant on the selected clock.
+        log_ns: time at which the recorder received it.
         points: (n, 3) finite, float32 or float64, possibly strided, in {A} [m].
         times_s: (n,) instant of each point relative to ``t_ns`` [s], or None.
-        dropped_points: how many non-finite points were left out.
+        dropped_points: number of non-finite points that were removed.
         frame: coordinate frame that the message names, "" for none.
         note: what was wrong with the message or its stamp.
     """
@@ -180,11 +180,11 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogHeader:
-    """What a log says of itself, so that it runs with no flag.
+    """The metadata of a log; with them it can be replayed without options.
 
     Attributes:
-        surface: the target's model.  scenario: its TOML text, "" for a recorded log.  seed: of the simulation.
-        labels: faults put in on purpose, windows on the log clock.  start: first belief (mean and covariance).
+        surface: model of the target.  scenario: its TOML text, "" for a recorded log.  seed: of the simulation.
+        labels: injected faults.  start: initial belief (mean and covariance).
         truth: the true state at the first scan.  notes: free text by name (source, units, clock).
     """
 
@@ -199,7 +199,7 @@ class LogHeader:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """What a back end returns, nothing more: T_ca (scan {A} into model {C}), iterations, its own flag."""
+    """What a back end returns: T_ca (scan {A} into model {C}), iterations, its own convergence flag."""
 
     T_ca: Pose
     iterations: int
@@ -211,10 +211,10 @@ class Alignment:
     """A pose with its quality, measured in the same way for every back end (register.quality).
 
     Attributes:
-        T_ac: measured pose of the model in the camera (the inverse of what ICP iterates).
+        T_ac: measured pose of {C} in {A} (ICP iterates its inverse).
         info: (6, 6) information of the error d = [theta; v], both in {C} [rad, m], where
-            T_ac_true = T_ac @ Exp(d): noise-scaled, singular directions left singular.
-        covariance: (6, 6) calibrated covariance of the same d, or None where the view is degenerate.
+            T_ac_true = T_ac @ Exp(d); singular in directions that are not determined.
+        covariance: (6, 6) calibrated covariance of the same d, None if the view is degenerate.
         free_directions: directions that the view does not determine ("slides along x"), empty if none.
     """
 
@@ -231,18 +231,18 @@ class Alignment:
 
     @property
     def measured(self) -> bool:
-        """Is ``T_ac`` a measurement, however good, and not just the guess handed back?"""
+        """Return whether ``T_ac`` is a measurement and not only the initial guess."""
         return self.status not in (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED)
 
     @property
     def inlier_ratio(self) -> float:
-        """Inliers over points, 0 for an empty scan."""
+        """Return inliers / points, 0 for an empty scan."""
         return self.inliers / self.points if self.points else 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Belief:
-    """Mean and covariance at an instant.
+    """Mean and covariance of the state at an instant.
 
     Attributes:
         P: (20, 20) covariance of [dq_v, w, rho_o, v, sigma, varrho, dmu_v]; dq_v, dmu_v are HALF-angle vectors,
@@ -259,13 +259,13 @@ class Belief:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Innovation:
-    """alpha = z - h(x-) for z = (rho, deta_v) [m, half-angle], its covariance and its size.
+    """Innovation alpha = z - h(x-) of z = (rho, deta_v) [m, half angle] and its covariance.
 
     Attributes:
         alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.
         nis: alpha' S^-1 alpha.  distance_m: |d rho|.  angle_rad: rotation angle of the innovation.
-        weight: share of its say that a healthy pose is left, 1 where its NIS is not beyond belief.
-        share: of R's variance, what the poses of neighbouring scans have in common.
+        weight: Cauchy weight of the pose in the update, 1 up to the 99.99 % point of NIS.
+        share: part of the variance R that is correlated between successive scans.
     """
 
     alpha: Array
@@ -280,7 +280,7 @@ class Innovation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Verdict:
-    """The fault detector's word on one scan: gamma 1 (healthy) or 0, and why."""
+    """Result of the fault detector: gamma 1 (healthy) or 0 (faulty), and the reason."""
 
     gamma: int
     reason: Reason
@@ -288,7 +288,7 @@ class Verdict:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """Predicted 1 sigma of the grasp point over a horizon, each the root of the trace of its 3x3 covariance.
+    """Predicted standard deviations of the grasp point; each is the root of the trace of its 3x3 covariance.
 
     Attributes:
         times_s: (n,) [s after now].  pos_1s_m, vel_1s_mps, rot_1s_rad: (n,) position, velocity, attitude (full angle).

@@ -51,9 +51,11 @@ class Job:
     """What to run.
 
     Attributes:
-        source: log, bag or folder.  options: how to read it.
-        config_file: TOML of a RunConfig.  assignments: ``a.b=c`` over it, from flags.
-        prefetch: scans decoded ahead while one registers; never changes a result.
+        source: log, bag or folder of scans.
+        options: how to read it.
+        config_file: TOML file with settings, see docs/settings.md.
+        assignments: settings ``a.b=value`` that replace those of the file.
+        prefetch: number of scans decoded ahead on a second thread; does not change the result.
     """
 
     source: Path
@@ -88,11 +90,13 @@ class HealthyPoses:
 
 
 class Run:
-    """An open run; a context manager. ``rows`` may be taken once.
+    """An open run; a context manager. ``rows`` may be iterated once.
 
     Attributes:
-        source: the open log.  config: the effective configuration.  surface: the model in force.
-        registrar: of that model.
+        source: the open log.
+        config: effective configuration.
+        surface: model of the target.
+        registrar: registers scans against that model.
     """
 
     def __init__(self, job: Job) -> None:

@@ -49,3 +49,12 @@ def test_help_loads_no_heavy_library():
 def test_no_module_outgrows_its_room():
     long = {p: n for p in ROOT.glob("avsreplay/**/*.py") if (n := p.read_text().count("\n")) > 350}
     assert not long, long
+
+
+def test_the_diagrams_of_the_architecture_page_are_current():
+    done = run(sys.executable, str(ROOT / "docs" / "architecture_diagrams.py"), "--check")
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_package_states_that_it_is_typed():
+    assert (ROOT / "avsreplay" / "py.typed").is_file()
