@@ -64,6 +64,8 @@ class Reason(Enum):
     FEW_INLIERS = "few_inliers"
     FIT_ERROR = "fit_error"  # rms_m >= threshold
     POSE_JUMP = "pose_jump"  # weighted innovation norm >= threshold
+    DOUBTFUL = "doubtful"  # large innovation: not decided yet whether scan, sensor or target is the cause
+    SENSOR_BIAS = "sensor_bias"  # the measured poses have a constant offset that motion does not explain
     CLOCK = "clock"  # the stamp steps back or jumps
 
 

@@ -232,6 +232,7 @@ def cold(seed: int, seconds: float = 100.0):
         yield track, x
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 14])
 def test_cold_start_hands_over_and_stays_honest(seed: int) -> None:
     modes, sizes = [], []
@@ -291,6 +292,7 @@ def test_a_body_at_rest_is_no_trouble() -> None:
     assert np.sqrt(track.belief.P[12, 12]) > 0.2
 
 
+@pytest.mark.slow
 def test_a_nearly_axisymmetric_body_can_be_captured_though_its_parameters_stay_unknown() -> None:
     """A spent stage: where its cross axes lie can hardly be told, where its fixture will be in 30 s can."""
     moments, base = np.array([1.0, 1.003, 0.3]), tumbling.draw(5, seconds=1.0).states[0]

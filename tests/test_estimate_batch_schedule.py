@@ -64,6 +64,7 @@ def test_a_pose_loses_its_say_beyond_the_gate_and_none_before() -> None:
         assert innovation_of(P, H, seen.alpha, R).weight == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_a_frozen_scan_that_passes_leaves_the_estimate_honest(seed: int) -> None:
     """One and the same fault, and the printed filter denies its error."""
@@ -74,6 +75,7 @@ def test_a_frozen_scan_that_passes_leaves_the_estimate_honest(seed: int) -> None
     assert nees(deaf.belief, world.states[-1]) > 3.0 * BAND_20[1]
 
 
+@pytest.mark.slow
 def test_a_right_filter_is_left_alone() -> None:
     """Twenty bodies, three audits each: the fit takes the word from none, and nothing differs in a bit."""
     recalls = 0
@@ -143,6 +145,7 @@ def test_the_memory_is_where_pushes_have_turned_the_body_by_the_stray() -> None:
         assert 3.0 * torque * np.sqrt(memory_s(torque) ** 3 / 3.0) == pytest.approx(0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("start", [Start.NEAR, Start.COLD])
 def test_a_pushed_body_is_told_honestly(start: Start) -> None:
     """Ten times the default torque noise over 100 s; mean NEES of eight bodies, the fit's word or the filter's."""
@@ -173,6 +176,7 @@ def test_the_fit_begins_where_the_belief_came_from() -> None:
     assert np.abs(chart.minus(to_chart(world.states[0]))).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_a_given_start_is_honest_under_precise_poses() -> None:
     """Poses far finer than the start: what the printed filter linearises on the way it takes for knowledge."""
     sizes: dict[Constraint, list[float]] = {constraint: [] for constraint in Constraint}
@@ -202,6 +206,7 @@ def test_a_belief_becomes_a_prior_by_its_draws() -> None:
     assert np.linalg.eigvalsh(drawn[12:17, 12:17])[0] > 3.0 * np.linalg.eigvalsh(straight[12:17, 12:17])[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("constraint", Constraint)
 def test_a_given_start_that_is_wrong_is_left_out(constraint: Constraint) -> None:
     """Ten of its own sigma off: no confident wrong number is made of it, and the row says that it was contradicted."""

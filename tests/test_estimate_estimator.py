@@ -106,6 +106,7 @@ def run(
         yield track, seen
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("constraint", Constraint)
 def test_consistent_from_a_near_start_over_many_runs(constraint: Constraint) -> None:
     """Mean NEES and NIS in their 99.9 % chi-square bands, truth from the full inertia tensor.
@@ -193,6 +194,7 @@ def test_a_wrong_noise_is_found(rule: Adaptation) -> None:
     assert np.sqrt(R[3:].mean()) == pytest.approx(np.radians(0.5), rel=0.12)
 
 
+@pytest.mark.slow
 def test_scale_keeps_nis_honest_where_the_registration_lies() -> None:
     nis = []
     for seed in range(4):
@@ -217,6 +219,7 @@ def burst(level: float, seconds: float = 20.0):
         yield t, track.window.factors[[0, 3]]
 
 
+@pytest.mark.slow
 def test_a_burst_is_followed_within_a_window_and_left_again() -> None:
     """Five times the noise for 20 s, unknown to the registration; a window is 30 scans, 6 s.
 

@@ -59,6 +59,7 @@ def test_knowing_more_never_makes_it_worse() -> None:
         assert len(weakest(fold, 2, parameter_sets.BLOCKS_OF[name])) == 2
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not LOG.exists(), reason="fixtures/tumble.mcap is not here")
 def test_the_command_prints_one_document() -> None:
     from avsreplay.cli.observability import command

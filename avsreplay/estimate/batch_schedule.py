@@ -19,7 +19,7 @@ from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.batch_covariance import memory_s, propagate_chart
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
 from avsreplay.estimate.dynamics import propagate_state
-from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, first_belief, given_prior
+from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, first_belief
 from avsreplay.estimate.measurement import in_fixture, measured_pose
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
 from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
@@ -46,7 +46,6 @@ class BatchSchedule:
     def __init__(self, params: EstimatorParams, noise: Noise, start: Belief | None) -> None:
         self.params, self.noise, self.start = params, noise, start
         self.checked_poses = 0 if params.start is Start.PAPER else params.audit_poses
-        self._prior = None if start is None or params.start is Start.PAPER else given_prior(start)
         self._rules = FitParams(rescale=params.adapt is not Adaptation.OFF)
         self._memory_ns = round(min(memory_s(params.torque_noise_radps15), _LONGEST_S) * 1e9)
 
@@ -62,9 +61,8 @@ class BatchSchedule:
         if last is None or track.since >= max(1.0, self._growth(last) * last.count):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
             start = chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
-            result = batch_estimate(
-                track.fixes, self.params, self._rules, last, start, self._given(track.fixes[0].t_ns)
-            )
+            given = self._given(track)
+            result = batch_estimate(track.fixes, self.params, self._rules, last, start, given)
             rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
             track = replace(track, reinitialised=track.reinitialised + rejected)
             return self._adopted(track, result, result.gaussian and converged)
@@ -92,7 +90,7 @@ class BatchSchedule:
             return track
         epoch_ns = track.fixes[0].t_ns
         rejected = track.batch is not None and track.batch.prior_rejected
-        begin, given = chart_at(track.belief, epoch_ns), None if rejected else self._given(epoch_ns)
+        begin, given = chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
         result = batch_estimate(track.fixes, self.params, self._rules, start=begin, given=given)
         if (result.gaussian or many_outliers) and contradicted(track.belief, result.belief):
             return replace(self._adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
@@ -104,12 +102,13 @@ class BatchSchedule:
             return first_belief(track.fixes, self.params)
         return ekf.chart_update(prediction.belief, prediction.H, innovation, NO_INFLATION)
 
-    def _given(self, t_ns: int) -> Prior | None:
-        """The given start, propagated to the first pose; None where disturbances or time have made it useless."""
-        if self.start is None or self._prior is None or t_ns - self.start.t_ns > _RECENT * self._memory_ns:
+    def _given(self, track: Track) -> Prior | None:
+        """The track's prior, propagated to the first pose; None where disturbances or time have made it useless."""
+        t_ns = track.fixes[0].t_ns
+        if track.prior is None or t_ns - track.prior_ns > _RECENT * self._memory_ns:
             return None
-        x, step = propagate_chart(self._prior.mean, (t_ns - self.start.t_ns) * 1e-9)
-        P = step @ self._prior.P @ step.T
+        x, step = propagate_chart(track.prior.mean, (t_ns - track.prior_ns) * 1e-9)
+        P = step @ track.prior.P @ step.T
         return Prior(to_chart(x), P) if float(np.sqrt(np.trace(P[:3, :3]))) < _GAUSSIAN_HALF_RAD else None
 
     def _adopted(self, track: Track, result: BatchResult, to_filter: bool) -> Track:
@@ -123,9 +122,9 @@ class BatchSchedule:
     def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
         """The poses within the fit's memory, including this one."""
         oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns, key=_instant)
-        return (*track.fixes[oldest:], self._fix(prediction, innovation))
+        return (*track.fixes[oldest:], self.fix(prediction, innovation))
 
-    def _fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
+    def fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
         """The healthy pose at its own instant: a scan deskewed by the prior's motion is moved back by it."""
         x, lag_ns = prediction.belief.x, round(prediction.lag_s * 1e9)
         pose = measured_pose(x, innovation.alpha)

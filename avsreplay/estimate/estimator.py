@@ -13,14 +13,15 @@ import numpy as np
 
 from avsreplay.errors import UsageError
 from avsreplay.estimate import dynamics, ekf
+from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
-from avsreplay.estimate.initialise import guessed_belief
-from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
+from avsreplay.estimate.initialise import given_prior, guessed_belief
+from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import Noise
 from avsreplay.estimate.params import EstimatorParams, Start
-from avsreplay.estimate.track import Prediction, Track
+from avsreplay.estimate.track import Epoch, Prediction, Track
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory
+from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory, Verdict
 
 
 class Estimator:
@@ -43,6 +44,8 @@ class Estimator:
         self.start = start if params.start in (Start.AUTO, Start.NEAR) else None
         self.noise = Noise(self.params, extent_m)
         self.batch = BatchSchedule(self.params, self.noise, self.start)
+        self.anomalies = AnomalyTest(self.params, extent_m, self.batch, self._replayed)
+        self._prior = None if self.start is None else given_prior(self.start)
         self._robust = params.robust and params.start is not Start.PAPER
         self._by_gain = self.params.by_gain
         self._torque, self._force = self.params.torque_noise_radps15, self.params.force
@@ -55,7 +58,7 @@ class Estimator:
             T_ac: pose of {C} in {A}, used where no start is given.
         """
         if self.start is not None:
-            return Track(self.start, "near")
+            return Track(self.start, "near", prior=self._prior, prior_ns=self.start.t_ns)
         mode = "filter" if self.params.start is Start.PAPER else "start"
         return Track(guessed_belief(t_ns, T_ac, self.params), mode)
 
@@ -83,6 +86,38 @@ class Estimator:
         R = self.noise.of(alignment, x, prediction.window)
         alpha, share = innovation_vector(x, alignment.T_ac), self.noise.correlated_share(alignment)
         return ekf.innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
+
+    def step(
+        self, track: Track, prediction: Prediction, innovation: Innovation | None, verdict: Verdict, converged: bool
+    ) -> tuple[Track, Verdict]:
+        """The posterior and the final verdict: a large innovation is decided on over the next scans.
+
+        Args:
+            track: after the last scan.
+            prediction: of this scan.
+            innovation: None where the scan gave no pose.
+            verdict: of the fault rule on this scan alone.
+            converged: t_1 was reached at the last scan.
+
+        Returns:
+            The track, and the verdict with gamma 0 and reason ``doubtful`` while a decision is pending.
+        """
+        if innovation is None:
+            return self.update(track, prediction, None, 0), verdict
+        epoch = Epoch(replace(track, recent=(), doubtful=()), prediction, innovation, converged)
+        return self.anomalies.step(
+            track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged)
+        )
+
+    def _replayed(self, track: Track, epoch: Epoch) -> Track:
+        """A stored scan, predicted and used again from another track."""
+        prediction = self.predict(track, epoch.prediction.belief.t_ns)
+        prediction = replace(prediction, lag_s=epoch.prediction.lag_s, blur=epoch.prediction.blur)
+        pose = measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha)
+        alpha, R = innovation_vector(prediction.belief.x, pose), epoch.innovation.R
+        P, share = prediction.belief.P, epoch.innovation.share
+        innovation = ekf.innovation_of(P, prediction.H, alpha, R, self._robust, share)
+        return self.update(track, prediction, innovation, 1, epoch.converged)
 
     def update(
         self, track: Track, prediction: Prediction, innovation: Innovation | None, gamma: int, converged: bool = True

@@ -109,9 +109,9 @@ def _at_pose(T_ac: Pose, w: Array, v: Array) -> State:
     return State(T_ac.q, w, T_ac.t, v, np.zeros(2), np.zeros(3), geometry.IDENTITY_QUAT)
 
 
-def poses_of(fixes: tuple[PoseFix, ...]) -> Poses:
-    """The fixes as input of the fit, times from the first."""
-    t0 = fixes[0].t_ns
+def poses_of(fixes: tuple[PoseFix, ...], epoch_ns: int | None = None) -> Poses:
+    """The fixes as input of the fit, times from the epoch, by default the first pose."""
+    t0 = fixes[0].t_ns if epoch_ns is None else epoch_ns
     return Poses(
         np.array([(f.t_ns - t0) * 1e-9 for f in fixes]),
         np.array([f.T_ac.q for f in fixes]),

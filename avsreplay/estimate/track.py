@@ -6,12 +6,51 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.noise import NoiseWindow
 from avsreplay.geometry import Array, frozen
-from avsreplay.records import Belief
+from avsreplay.records import Belief, Innovation
 
 _NO_NOISE = frozen(np.zeros((6, 6)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Manoeuvre:
+    """A change of the target's velocity that free motion does not explain.
+
+    Attributes:
+        t_ns: its most likely instant.  t_1s_s: standard deviation of the instant [s].
+        velocity: (3,) change of the velocity of the centre of mass, in {A} [m/s].
+        rate: (3,) change of the angular rate, in {B} [rad/s].
+        P: (6, 6) covariance of (rate, velocity).
+        detected_ns: instant of the scan at which it was decided.
+    """
+
+    t_ns: int
+    t_1s_s: float
+    velocity: Array
+    rate: Array
+    P: Array
+    detected_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SensorBias:
+    """A constant offset (6,) of the measured poses, in {A}: position [m] and half angle; P (6, 6) its covariance."""
+
+    offset: Array
+    P: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Epoch:
+    """A scan as the estimator received it: the track before it (without history), its prediction and innovation."""
+
+    track: Track
+    prediction: Prediction
+    innovation: Innovation
+    converged: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,6 +67,10 @@ class Track:
         batch: the last batch fit whose estimate was adopted.  since: healthy poses since the last fit.
         reinitialised: how often a fit replaced the filter's estimate, or the given start was rejected.
         inflation: (2,) factor on R for errors correlated in time (attitude, position) by the last fit; None before it.
+        prior, prior_ns: Gaussian prior of the fit and its instant: the given start, or that after a manoeuvre.
+        recent: the last accepted scans.  doubtful: the scans not yet decided on.
+        bias: an error of the sensor in effect, None where there is none.
+        manoeuvres: all that were found.
     """
 
     belief: Belief
@@ -41,6 +84,12 @@ class Track:
     since: int = 0
     reinitialised: int = 0
     inflation: Array | None = None
+    prior: Prior | None = None
+    prior_ns: int = 0
+    recent: tuple[Epoch, ...] = ()
+    doubtful: tuple[Epoch, ...] = ()
+    bias: SensorBias | None = None
+    manoeuvres: tuple[Manoeuvre, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

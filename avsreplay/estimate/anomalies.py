@@ -1,0 +1,172 @@
+"""What the estimator does with a large innovation: it defers the scan, decides over the next ones, and acts.
+
+A scan whose NIS is above the 99.99 % point, or whose pose jumps, is doubtful. It does not change the estimate; after three to five of them ``hypotheses`` decides. Free motion: the scans are used after all. Manoeuvre: rate and
+velocity are fitted anew from its instant on, with inertia, axes and centre of mass kept. Sensor bias: the estimate
+coasts while the offset lasts. A jump seen before the estimate has ever converged means that the earlier poses may
+as well be the biased ones: the estimate is initialised anew from the poses that agree with one another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from avsreplay.estimate.batch import FitParams, Prior, fit
+from avsreplay.estimate.batch_covariance import BatchCovariance, belief_at
+from avsreplay.estimate.batch_schedule import BatchSchedule
+from avsreplay.estimate.chart import to_chart, to_errors
+from avsreplay.estimate.dynamics import propagate
+from avsreplay.estimate.error_state import VEL, W
+from avsreplay.estimate.hypotheses import ChangePriors, Explanation, Hypothesis, explain
+from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
+from avsreplay.estimate.noise import GATE
+from avsreplay.estimate.params import EstimatorParams, Start
+from avsreplay.estimate.track import Epoch, Manoeuvre, Prediction, SensorBias, Track
+from avsreplay.records import Belief, Innovation, Reason, Verdict
+
+_FEWEST, _MOST, _RECENT = 3, 5, 3  # doubtful scans before a decision, accepted scans looked back on
+_MARGIN = 6.0  # log odds of the best hypothesis over the next, for a decision before _MOST
+_READY = 8  # poses that the estimate must be based on
+_EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
+_TESTED = (Reason.OK, Reason.POSE_JUMP)
+
+Update = Callable[[Track, Prediction, Innovation, int, bool], Track]
+
+
+class AnomalyTest:
+    """Wraps the filter's update by the test of hypotheses.
+
+    Args:
+        params: settings, auto values filled in.
+        extent_m: the target's bounding diagonal [m].
+        batch: makes the poses that a fit takes.
+        replay: predicts, forms the innovation of a stored scan and updates with it.
+    """
+
+    def __init__(
+        self, params: EstimatorParams, extent_m: float, batch: BatchSchedule, replay: Callable[[Track, Epoch], Track]
+    ) -> None:
+        self.params, self.batch, self._replay = params, batch, replay
+        self.enabled = params.robust and params.start is not Start.PAPER
+        speed = 0.2 * params.length("start_vel_1s_mps")
+        self._priors = ChangePriors(0.1 * params.start_rate_1s_radps, speed, 0.05 * extent_m, 0.05)
+
+    def step(
+        self, track: Track, epoch: Epoch, verdict: Verdict, update: Callable[[Track], Track]
+    ) -> tuple[Track, Verdict]:
+        """The track after a measured scan, and the verdict on it. ``update`` applies the scan to a track."""
+        nis = epoch.innovation.nis
+        suspicious = verdict.reason is Reason.POSE_JUMP or (verdict.gamma == 1 and nis > GATE)
+        if not self.enabled or verdict.reason not in _TESTED or not _ready(track):
+            return update(track), verdict
+        if not suspicious:
+            return self._accepted(track, epoch, update), verdict
+        if track.bias is not None and self._still_biased(track.bias, epoch.innovation):
+            return replace(track, belief=epoch.prediction.belief), Verdict(0, Reason.SENSOR_BIAS)
+        track = replace(track, belief=epoch.prediction.belief, doubtful=(*track.doubtful, epoch), bias=None)
+        if len(track.doubtful) < _FEWEST or not track.recent:
+            return track, Verdict(0, Reason.DOUBTFUL)
+        return self._decided(track)
+
+    def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:
+        """A scan that agrees with the prediction: the doubtful scans before it were bad."""
+        after = update(replace(track, doubtful=(), bias=None))
+        return replace(after, recent=(*track.recent, epoch)[-_RECENT:])
+
+    def _decided(self, track: Track) -> tuple[Track, Verdict]:
+        """The track after a decision, or still in doubt."""
+        window, first = (*track.recent, *track.doubtful), len(track.recent)
+        ranked = explain(window, first, self._priors, self.params.torque_noise_radps15, self.params.force)
+        best, margin = ranked[0], ranked[0].log_evidence - ranked[1].log_evidence
+        last_chance = len(track.doubtful) >= _MOST
+        explained = best.chi2 < _EXPLAINED * best.dof
+        if not last_chance and (margin < _MARGIN or not explained):
+            return track, Verdict(0, Reason.DOUBTFUL)
+        established = track.doubtful[0].converged or (track.batch is not None and track.batch.gaussian)
+        if best.hypothesis is Hypothesis.FREE_MOTION:
+            return self._replayed(track), Verdict(1, Reason.OK)
+        if best.hypothesis is Hypothesis.MANOEUVRE and explained:
+            return self._manoeuvred(track, window, best), Verdict(1, Reason.OK)
+        if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and established:
+            return replace(track, doubtful=(), bias=SensorBias(best.size, best.P)), Verdict(0, Reason.SENSOR_BIAS)
+        if best.hypothesis is not Hypothesis.FROZEN or not explained:
+            anew = self._initialised_anew(track)
+            if anew is not None:
+                return anew, Verdict(1, Reason.OK)
+        return replace(track, doubtful=()), Verdict(0, Reason.POSE_JUMP)
+
+    def _still_biased(self, bias: SensorBias, innovation: Innovation) -> bool:
+        """Does the offset explain this innovation? It is as uncertain as it was estimated, plus the prediction."""
+        left = innovation.alpha - bias.offset
+        return float(left @ np.linalg.solve(innovation.S + bias.P, left)) < GATE
+
+    def _replayed(self, track: Track) -> Track:
+        """All doubtful scans used after all, with their Cauchy weights."""
+        epochs = track.doubtful
+        out = replace(epochs[0].track, recent=track.recent, manoeuvres=track.manoeuvres)
+        for epoch in epochs:
+            out = self._replay(out, epoch)
+        return replace(out, recent=(*track.recent, *epochs)[-_RECENT:], doubtful=())
+
+    def _manoeuvred(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
+        """Rate and velocity fitted anew from the manoeuvre on; everything else is continuous."""
+        before = window[0].track
+        t_ns = before.belief.t_ns + round(best.after_s * 1e9)
+        at, _ = propagate(before.belief, t_ns, self.params.torque_noise_radps15, self.params.force)
+        P = at.P.copy()
+        P[W, W] += self._priors.rate_radps**2 * np.eye(3)
+        P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
+        chart = to_chart(at.x)
+        T = to_errors(chart)
+        half = np.linalg.solve(T, P)
+        prior = Prior(chart, np.linalg.solve(T, half.T))
+        after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
+        fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
+        result = self._fitted(track, fixes, prior, t_ns)
+        now_ns = window[-1].prediction.belief.t_ns
+        found = Manoeuvre(t_ns, best.after_1s_s, best.size[3:], best.size[:3], best.P, now_ns)
+        return replace(
+            track,
+            belief=result.belief,
+            mode="filter" if track.mode == "filter" else "fit",
+            fixes=fixes,
+            batch=result,
+            since=0,
+            prior=prior,
+            prior_ns=t_ns,
+            recent=(),
+            doubtful=(),
+            manoeuvres=(*track.manoeuvres, found),
+        )
+
+    def _fitted(self, track: Track, fixes: tuple[PoseFix, ...], prior: Prior, t_ns: int) -> BatchResult:
+        """Fit of the poses after a manoeuvre with the prior at its instant."""
+        poses = poses_of(fixes, t_ns)
+        inflation = np.ones(2) if track.inflation is None else track.inflation
+        window = track.window.factors
+        factors = np.array([window[3], window[0]]) * np.sqrt(inflation)
+        fitted = fit(poses, prior.mean, prior, FitParams(rescale=False), factors)
+        now_ns = fixes[-1].scan_ns
+        belief = belief_at(BatchCovariance(fitted, ()), now_ns, (now_ns - t_ns) * 1e-9)
+        return BatchResult(t_ns, fitted.chart, len(fixes), np.array([window[3], window[0]]), inflation, belief, True)
+
+    def _initialised_anew(self, track: Track) -> Track | None:
+        """A new track from the doubtful poses alone, if they agree with one another through free motion."""
+        epochs = track.doubtful
+        fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in epochs)
+        poses = poses_of(fixes)
+        fitted = fit(poses, to_chart(rough_state(fixes)), weak_prior(poses, self.params), FitParams(rescale=False))
+        if 2.0 * fitted.half_chi2 > _EXPLAINED * (6 * len(fixes) - 12):
+            return None
+        first = epochs[0].prediction.belief
+        out = Track(Belief(first.t_ns, first.x, first.P), "start", manoeuvres=track.manoeuvres)
+        for epoch in epochs:
+            out = self._replay(out, epoch)
+        return replace(out, reinitialised=track.reinitialised + 1, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
+
+
+def _ready(track: Track) -> bool:
+    """Is the estimate based on enough poses for its prediction to be tested?"""
+    return track.mode == "filter" or (track.mode == "fit" and track.batch is not None and track.batch.count >= _READY)

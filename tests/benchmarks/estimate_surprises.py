@@ -1,0 +1,273 @@
+"""What the estimator does when the model does not hold.
+
+``python tests/benchmarks/estimate_surprises.py [--bodies 20] [--cases name,name] [--without]``.
+
+Each case is a random tumbling body of 4 m extent, seen at 2 Hz from a cold start, with poses simulated by a
+registration-noise model: white noise of 2 mm and 0.1 deg per axis, a tenth of its variance correlated over 0.4 rad of
+rotation. The events: manoeuvres, sensor biases, a constant torque, a noise burst, spins about a principal axis, a body
+at rest. Printed per case: scans from the event to the first flagged one, manoeuvres found, the error of the reported
+size in its own sigma, the scans until the error is below four claimed sigma for good, the scans that claim convergence
+although the error is above four claimed sigma, and the final error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import tumbling
+
+from avsreplay import geometry
+from avsreplay.estimate import Estimator, EstimatorParams, Track
+from avsreplay.estimate.measurement import measurement_jacobian
+from avsreplay.geometry import Array, Pose
+from avsreplay.monitor.consistency import Consistency, ConsistencyParams
+from avsreplay.monitor.convergence import Convergence, ConvergenceParams
+from avsreplay.monitor.faults import FaultDetector, FaultParams
+from avsreplay.records import Alignment, AlignStatus, ScanStatus, State
+
+HEADS = (
+    "case",
+    "scans to the first flag: median, worst (bodies)",
+    "manoeuvres",
+    "size error, time error",
+    "scans to recover: median, worst",
+    "scans converged beyond 4 sigma",
+    "bodies converged ever, at the end",
+    "final error, median",
+    "worst",
+    "reasons",
+    "ms a scan",
+    "worst ms",
+    "grasp 1 sigma, last 10 s [mm]",
+)
+EXTENT, HZ, POS_M, ROT_RAD = 4.0, 2.0, 0.002, np.radians(0.1)
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """An event: when, and what it does to the body or to the sensor."""
+
+    name: str
+    at_s: float = 45.0
+    until_s: float = 1e9
+    seconds: float = 80.0
+    velocity: float = 0.0  # step [m/s]
+    rate: float = 0.0  # step [rad/s]
+    torque: float = 0.0  # constant, per unit inertia [rad/s2]
+    bias: float = 0.0  # along the line of sight [m]
+    noise: float = 1.0  # factor on sigma, not reported by the registration
+    spin: int | None = None  # about this principal axis
+    speed: float = 0.1  # rad/s
+    outlier: float = 0.0  # single scan [m]
+
+
+CASES = (
+    Case("clean"),
+    Case("bias 0.15 m, first 10 s", at_s=0.0, until_s=10.0, bias=0.15),
+    Case("velocity step 1 cm/s", velocity=0.01),
+    Case("rate step 0.01 rad/s", rate=0.01),
+    Case("constant torque 1e-4", torque=1e-4),
+    Case("bias 3 cm to the end", at_s=60.0, bias=0.03),
+    Case("bias 5 cm for 15 s", at_s=60.0, until_s=75.0, bias=0.05, seconds=100.0),
+    Case("bias 5 cm for 15 s, early", at_s=40.0, until_s=55.0, bias=0.05),
+    Case("noise x5 for 20 s", at_s=40.0, until_s=60.0, noise=5.0),
+    Case("single outlier 0.1 m", at_s=45.0, until_s=45.4, bias=0.1),
+    Case("spin about axis x", spin=0, seconds=150.0),
+    Case("spin about axis y", spin=1, seconds=150.0),
+    Case("spin about axis z", spin=2, seconds=150.0),
+    Case("at rest", speed=1e-6),
+)
+
+
+@dataclass(slots=True)
+class Result:
+    """One body: per scan time, gamma, reason, converged, error and claimed sigma; manoeuvres at the end."""
+
+    t: list[float] = field(default_factory=list)
+    gamma: list[int] = field(default_factory=list)
+    reason: list[str] = field(default_factory=list)
+    converged: list[bool] = field(default_factory=list)
+    ratio: list[float] = field(default_factory=list)
+    error: list[tuple[float, float]] = field(default_factory=list)
+    grasp: list[float] = field(default_factory=list)
+    track: Track | None = None
+    seconds: float = 0.0
+    worst_ms: float = 0.0
+    true_velocity: Array = field(default_factory=lambda: np.zeros(3))
+    true_rate: Array = field(default_factory=lambda: np.zeros(3))
+
+
+def world_of(case: Case, seed: int) -> tuple[list[float], list[State], Array, Array]:
+    """Times, true states, true changes of velocity in {A} and of rate in {B}."""
+    rng = np.random.Generator(np.random.PCG64([seed, 5]))
+    world = tumbling.draw(seed, seconds=case.seconds, hz=HZ, rate=case.speed, sigma_max=0.85)
+    x0, dv, dw = world.states[0], np.zeros(3), np.zeros(3)
+    if case.spin is not None:
+        x0 = replace(x0, w_b=case.speed * np.eye(3)[case.spin])
+        return list(world.times), tumbling.follow(world.times, world.moments, x0), dv, dw
+    if case.torque:
+        direction = _direction(rng)
+        states, x, part = [x0], x0, 10
+        for _ in world.times[1:]:
+            for _ in range(part):
+                push = case.torque * direction / (HZ * part)
+                x = tumbling.follow(np.array([0.0, 1.0 / (HZ * part)]), world.moments, replace(x, w_b=x.w_b + push))[-1]
+            states.append(x)
+        return list(world.times), states, dv, dw
+    if not (case.velocity or case.rate):
+        return list(world.times), world.states, dv, dw
+    at = case.at_s + 0.2
+    before = world.times[world.times <= at]
+    dv, dw = case.velocity * _direction(rng), case.rate * _direction(rng)
+    x = tumbling.follow(np.array([0.0, at]), world.moments, x0)[-1]
+    pushed = replace(x, v_a=x.v_a + dv, w_b=x.w_b + dw)
+    rest = world.times[len(before) :]
+    later = tumbling.follow(np.append(0.0, rest - at), world.moments, pushed)[1:]
+    return list(world.times), world.states[: len(before)] + later, dv, dw
+
+
+def measured(case: Case, times: list[float], states: list[State], seed: int) -> list[Alignment]:
+    """Noisy poses: white noise, and a part that stays while the view turns little."""
+    rng = np.random.Generator(np.random.PCG64([seed, 6]))
+    sigma = np.repeat([ROT_RAD, POS_M], 3)
+    C, share, lean, out = np.diag(sigma**2), 0.1, rng.normal(size=6), []
+    for k, (t, x) in enumerate(zip(times, states, strict=True)):
+        turn = float(np.linalg.norm(x.w_b)) / HZ
+        keep = np.exp(-turn / 0.4)
+        lean = keep * lean + np.sqrt(1.0 - keep**2) * rng.normal(size=6) if k else lean
+        event = case.at_s <= t < case.until_s
+        d = sigma * (np.sqrt(1.0 - share) * rng.normal(size=6) + np.sqrt(share) * lean)
+        d *= case.noise if event else 1.0
+        T = x.T_ac @ Pose(geometry.exp(d[:3]), d[3:])
+        if event and case.bias:
+            T = Pose(T.q, T.t + case.bias * T.t / np.linalg.norm(T.t))
+        claimed = C * case.noise**2 if event else C
+        out.append(Alignment(T, 5, True, 4000, 3900, 0.008, np.linalg.inv(claimed), AlignStatus.ALIGNED, claimed))
+    return out
+
+
+def run(case: Case, seed: int, tested: bool = True) -> Result:
+    times, states, dv, dw = world_of(case, seed)
+    estimator = Estimator(EstimatorParams(correlated_share=0.1), None, EXTENT)
+    estimator.anomalies.enabled = tested
+    detector, watch = FaultDetector(FaultParams(), EXTENT), Consistency(ConsistencyParams())
+    test = Convergence(ConvergenceParams(), EXTENT)
+    word, seen_so_far, result = test.initial(), watch.initial(), Result(true_velocity=dv, true_rate=dw)
+    alignments = measured(case, times, states, seed)
+    track = estimator.initial(0, alignments[0].T_ac)
+    for t, x, alignment in zip(times, states, alignments, strict=True):
+        begun = time.process_time()
+        prediction = estimator.predict(track, round(t * 1e9))
+        innovation = estimator.innovate(prediction, alignment)
+        verdict = detector.judge(ScanStatus.OK, alignment, innovation, prediction.belief)
+        track, verdict = estimator.step(track, prediction, innovation, verdict, word.converged)
+        spent = time.process_time() - begun
+        result.seconds, result.worst_ms = result.seconds + spent, max(result.worst_ms, 1e3 * spent)
+        seen_so_far = watch.observe(seen_so_far, innovation, verdict.gamma)
+        honest = watch.judge(seen_so_far).consistent is True and not track.window.many_outliers
+        honest = honest and not track.doubtful
+        forecast = estimator.forecast(track.belief, test.params.times_s)
+        word = test.judge(word, track.belief, forecast, honest)
+        score(result, t, x, track, verdict.gamma, verdict.reason.value, word.converged)
+        result.grasp.append(float(forecast.pos_1s_m.max()))
+    result.track = track
+    return result
+
+
+def score(result: Result, t: float, x: State, track: Track, gamma: int, reason: str, converged: bool) -> None:
+    """The error of the estimated pose, and its size in claimed sigma (position and attitude, whichever is larger)."""
+    pose, truth, H = track.belief.x.T_ac, x.T_ac, measurement_jacobian(track.belief.x)
+    S = H @ track.belief.P @ H.T
+    position = float(np.linalg.norm(pose.t - truth.t))
+    angle = float(geometry.angle(geometry.multiply(geometry.conjugate(truth.q), pose.q)))
+    claimed = np.sqrt(np.trace(S[:3, :3])), 2.0 * np.sqrt(np.trace(S[3:, 3:]))
+    result.t.append(t)
+    result.gamma.append(gamma)
+    result.reason.append(reason)
+    result.converged.append(converged)
+    result.error.append((position, np.degrees(angle)))
+    result.ratio.append(max(position / claimed[0], angle / claimed[1]))
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    v = rng.normal(size=3)
+    return v / np.linalg.norm(v)
+
+
+def line(case: Case, results: list[Result]) -> str:
+    """One row of the table."""
+    after = [
+        next(k for k, t in enumerate(r.t) if t >= case.at_s and (not (case.velocity or case.rate) or t > case.at_s))
+        for r in results
+    ]
+    if case.bias and case.until_s < 1e9 and case.at_s == 0.0:
+        after = [next(k for k, t in enumerate(r.t) if t >= case.until_s) for r in results]
+    delay = [
+        next((k - a for k in range(a, len(r.t)) if not r.gamma[k]), None) for r, a in zip(results, after, strict=True)
+    ]
+    back = []
+    for r, a in zip(results, after, strict=True):
+        bad = [k for k in range(a, len(r.t)) if r.ratio[k] > 4.0]
+        back.append(bad[-1] + 1 - a if bad else 0)
+    wrong = [sum(c and q > 4.0 for c, q in zip(r.converged, r.ratio, strict=True)) for r in results]
+    final = np.array([r.error[-1] for r in results])
+    found = [r.track.manoeuvres if r.track else () for r in results]
+    reasons = Counter(reason for r in results for reason in r.reason if reason != "ok")
+    first = [d for d in delay if d is not None]
+    claim = sum(any(r.converged) for r in results)
+    end = sum(r.converged[-1] for r in results)
+    cells = [
+        case.name,
+        f"{_middle(first)} ({len(first)}/{len(results)})",
+        str(sum(map(len, found))),
+        _sizes(results, found),
+        _middle(back),
+        str(sum(wrong)),
+        f"{claim}, {end}",
+        f"{1e3 * np.median(final[:, 0]):.1f} mm {np.median(final[:, 1]):.2f} deg",
+        f"{1e3 * final[:, 0].max():.0f} mm {final[:, 1].max():.2f} deg",
+        ", ".join(f"{reason} {n}" for reason, n in sorted(reasons.items())),
+        f"{1e3 * sum(r.seconds for r in results) / sum(len(r.t) for r in results):.2f}",
+        f"{max(r.worst_ms for r in results):.0f}",
+        f"{1e3 * np.median([max(r.grasp[-20:]) for r in results]):.0f}",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def _middle(values: list[int]) -> str:
+    return f"{np.median(values):.0f}, {max(values)}" if values else "-"
+
+
+def _sizes(results: list[Result], found: list[tuple]) -> str:
+    """Reported changes against the true ones, in sigma, and the error of the time."""
+    off = []
+    for r, events in zip(results, found, strict=True):
+        if len(events) == 1 and (r.true_velocity.any() or r.true_rate.any()):
+            e = events[0]
+            dv = np.concatenate([np.zeros(3), e.velocity - r.true_velocity])[3:]
+            off.append((float(np.sqrt(dv @ np.linalg.solve(e.P[3:, 3:], dv) / 3.0)), e.t_ns * 1e-9 - 45.2))
+    if not off:
+        return "-"
+    return f"{np.median([o[0] for o in off]):.1f} sigma, {np.median(np.abs([o[1] for o in off])):.2f} s"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--bodies", type=int, default=20)
+    parser.add_argument("--cases", default="", help="only those whose name contains this text, comma separated")
+    parser.add_argument("--without", action="store_true", help="without the test of hypotheses")
+    given = parser.parse_args()
+    print("| " + " | ".join(HEADS) + " |")
+    print("|" + "---|" * len(HEADS))
+    wanted = [w for w in given.cases.split(",") if w]
+    for case in CASES:
+        if not wanted or any(w in case.name for w in wanted):
+            print(line(case, [run(case, seed, not given.without) for seed in range(given.bodies)]), flush=True)
+
+
+if __name__ == "__main__":
+    main()
