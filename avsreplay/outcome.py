@@ -13,7 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import BLOCKS, Alignment, Belief, Forecast, Innovation, Plan, Scan, ScanStatus, Verdict
+from avsreplay.records import BLOCKS, Alignment, Belief, Forecast, Innovation, Manoeuvre, Plan, Scan, ScanStatus, Verdict
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -65,6 +65,7 @@ class Outcome:
         sigma_hits: how often the bounds of the inertia ratios limited the gain so far.
         r_floors: how many eigenvalues of R were raised to their lower limit so far.
         reinitialised: how often the filter or the given start was replaced by a fit so far.
+        manoeuvres: all changes of the target's velocity found so far.
         monitors: observability, consistency and convergence.
         action: command of the supervisor to the robot.
         supervisor_rule: rule of the supervisor that gave it.
@@ -84,6 +85,7 @@ class Outcome:
     sigma_hits: int
     r_floors: int
     reinitialised: int
+    manoeuvres: tuple[Manoeuvre, ...]
     monitors: MonitorReport
     action: str
     supervisor_rule: str
@@ -150,6 +152,11 @@ def if_innovation(get: Callable[[Innovation], float | None]) -> Value[float | No
 def if_planned(get: Callable[[Outcome, Plan], float]) -> Value[float | None]:
     """Take a value of the capture plan in force, None where there is none."""
     return lambda o, s: get(o, o.plan) if o.plan is not None and o.plan.found else None
+
+
+def last_manoeuvre(get: Callable[[Outcome, Manoeuvre], float]) -> Value[float | None]:
+    """Take a value of the last manoeuvre, None before the first."""
+    return lambda o, s: get(o, o.manoeuvres[-1]) if o.manoeuvres else None
 
 
 def if_measured(get: Callable[[Pose], float]) -> Value[float | None]:

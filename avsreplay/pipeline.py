@@ -84,7 +84,7 @@ class Monitors:
         rank = observability.measure(gramian)
         consistency = self.consistency.observe(state.consistency, innovation, gamma)
         window = self.consistency.judge(consistency)
-        consistent = window.consistent and not track.window.many_outliers
+        consistent = window.consistent and not (track.window.many_outliers or track.doubtful)
         forecast = estimator.forecast(track.belief, self.convergence.params.times_s)
         convergence = self.convergence.judge(state.convergence, track.belief, forecast, consistent is True)
         report = MonitorReport(
@@ -161,8 +161,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     if not verdict.gamma and _prediction_lost(stages, scan, predicted):
         measurement = _acquire(stages, scan, _deskewed(stages, state, scan, predicted), "acquired")
         prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
-    gamma, converged = verdict.gamma, state.monitors.convergence.converged
-    track = stages.estimator.update(track, prior, innovation, gamma, converged)
+    converged = state.monitors.convergence.converged
+    track, verdict = stages.estimator.step(track, prior, innovation, verdict, converged)
+    gamma = verdict.gamma
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, innovation, gamma, track)
     seen = _planner_input(stages, track, scan.t_ns, gamma, report.converged)
     guidance = stages.guidance.step(state.guidance or stages.guidance.initial(scan.t_ns), seen)
@@ -180,6 +181,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         sigma_hits=track.sigma_hits,
         r_floors=track.r_floors,
         reinitialised=track.reinitialised,
+        manoeuvres=track.manoeuvres,
         monitors=report,
         action=guidance.decision.action.value,
         supervisor_rule=guidance.decision.rule,

@@ -289,6 +289,26 @@ class Verdict:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Manoeuvre:
+    """A change of the target's velocity that free motion does not explain.
+
+    Attributes:
+        t_ns: its most likely instant.  t_1s_s: standard deviation of the instant [s].
+        velocity: (3,) change of the velocity of the centre of mass, in {A} [m/s].
+        rate: (3,) change of the angular rate, in {B} [rad/s].
+        P: (6, 6) covariance of (rate, velocity).
+        detected_ns: instant of the scan at which it was decided.
+    """
+
+    t_ns: int
+    t_1s_s: float
+    velocity: Array
+    rate: Array
+    P: Array
+    detected_ns: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
     """Predicted standard deviations of the grasp point; each is the root of the trace of its 3x3 covariance.
 

@@ -24,6 +24,7 @@ from avsreplay.outcome import (
     if_measured,
     if_planned,
     if_points,
+    last_manoeuvre,
     pose_error_values,
     position_1s_m,
     since_start_s,
@@ -218,6 +219,20 @@ class Row:
         "How many eigenvalues of R were raised to the lower limit, up to this scan.")
     reinitialised: int | None = _exact(lambda o, s: o.reinitialised,
         "How often the poses contradicted the filter or the given initial state, so that a fit replaced it.")
+    manoeuvres: int | None = _exact(lambda o, s: len(o.manoeuvres),
+        "Number of manoeuvres found so far: changes of the target's velocity that free motion does not explain.")
+    manoeuvre_s: float | None = _seconds(last_manoeuvre(lambda o, m: since_start_s(o, m.t_ns)),
+        "Instant of the last manoeuvre, since the first scan.")
+    manoeuvre_1s_s: float | None = _seconds(last_manoeuvre(lambda o, m: m.t_1s_s),
+        "Standard deviation of manoeuvre_s.")
+    manoeuvre_mps: float | None = _number(last_manoeuvre(lambda o, m: float(np.linalg.norm(m.velocity))),
+        "Change of the velocity of the centre of mass by the last manoeuvre.", "m/s")
+    manoeuvre_1s_mps: float | None = _number(last_manoeuvre(lambda o, m: float(np.sqrt(np.trace(m.P[3:, 3:])))),
+        "Standard deviation of that change (root of the trace).", "m/s")
+    manoeuvre_radps: float | None = _number(last_manoeuvre(lambda o, m: float(np.linalg.norm(m.rate))),
+        "Change of the angular rate by the last manoeuvre.", "rad/s")
+    manoeuvre_1s_radps: float | None = _number(last_manoeuvre(lambda o, m: float(np.sqrt(np.trace(m.P[:3, :3])))),
+        "Standard deviation of that change (root of the trace).", "rad/s")
 
     ogm_log10_cond: float | None = column(lambda o, s: o.monitors.ogm_log10_cond,
         "log10 of the condition number of the observability Gramian; null below full rank.",

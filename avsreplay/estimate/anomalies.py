@@ -1,9 +1,10 @@
 """What the estimator does with a large innovation: it defers the scan, decides over the next ones, and acts.
 
-A scan whose NIS is above the 99.99 % point, or whose pose jumps, is doubtful. It does not change the estimate; after three to five of them ``hypotheses`` decides. Free motion: the scans are used after all. Manoeuvre: rate and
+A scan whose NIS is above the 99.99 % point, or whose pose jumps, is doubtful. It does not change the estimate. After
+three to five doubtful scans ``hypotheses`` decides. Free motion: the scans are used after all. Manoeuvre: rate and
 velocity are fitted anew from its instant on, with inertia, axes and centre of mass kept. Sensor bias: the estimate
-coasts while the offset lasts. A jump seen before the estimate has ever converged means that the earlier poses may
-as well be the biased ones: the estimate is initialised anew from the poses that agree with one another.
+coasts while the offset lasts. Before the estimate has converged, the poses before a jump may as well be the biased
+ones: it is then initialised anew from the later poses, if these agree with one another.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from avsreplay.estimate.hypotheses import ChangePriors, Explanation, Hypothesis,
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.noise import GATE
 from avsreplay.estimate.params import EstimatorParams, Start
-from avsreplay.estimate.track import Epoch, Manoeuvre, Prediction, SensorBias, Track
-from avsreplay.records import Belief, Innovation, Reason, Verdict
+from avsreplay.estimate.track import Epoch, Prediction, SensorBias, Track
+from avsreplay.records import Belief, Innovation, Manoeuvre, Reason, Verdict
 
 _FEWEST, _MOST, _RECENT = 3, 5, 3  # doubtful scans before a decision, accepted scans looked back on
 _MARGIN = 6.0  # log odds of the best hypothesis over the next, for a decision before _MOST

@@ -95,7 +95,8 @@ def explain(
         epochs: consecutive measured scans, ``first_doubtful`` of them accepted, the others in doubt.
         first_doubtful: index of the first doubtful scan, 1 at least.
         priors: 1 sigma of the size of a change.
-        torque, force: root densities of the disturbances [rad/s^1.5], [m/s^1.5].
+        torque: root density of the angular disturbance [rad/s^1.5].
+        force: root density of the linear disturbance [m/s^1.5].
     """
     start = epochs[0].track.belief
     window = _window(epochs, start, torque, force)
@@ -106,9 +107,9 @@ def explain(
     found = [
         Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), 6 * n, n),
         _manoeuvre(window, start, root, white, free, priors, n),
-        _sensor_bias(window, root, white, free, priors, first_doubtful, n),
+        _sensor_bias(window, root, white, free, priors, n),
         _bad_scans(window, priors, first_doubtful, n),
-        _frozen(window, priors, first_doubtful, n),
+        _frozen(window, first_doubtful, n),
     ]
     return sorted(found, key=lambda e: -e.log_evidence)
 
@@ -184,9 +185,7 @@ def _fractions() -> Array:
     return (np.arange(_INSTANTS) + 0.5) / _INSTANTS
 
 
-def _sensor_bias(
-    window: _Window, root: Array, white: Array, free: float, priors: ChangePriors, first: int, n: int
-) -> Explanation:
+def _sensor_bias(window: _Window, root: Array, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
     """A constant offset of the measured pose in {A} from one of the scans on."""
     scale = np.repeat([priors.position_m, priors.half_angle], 3)
     found = []
@@ -215,7 +214,7 @@ def _bad_scans(window: _Window, priors: ChangePriors, first: int, n: int) -> Exp
     return Explanation(Hypothesis.BAD_SCANS, value, chi2, 6 * n, first)
 
 
-def _frozen(window: _Window, priors: ChangePriors, first: int, n: int) -> Explanation:
+def _frozen(window: _Window, first: int, n: int) -> Explanation:
     """The doubtful scans repeat the last accepted one: their poses equal its pose."""
     value, chi2 = _gaussian(window.y[: 6 * first], window.C[: 6 * first, : 6 * first])
     for k in range(first, n):

@@ -10,29 +10,9 @@ from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.noise import NoiseWindow
 from avsreplay.geometry import Array, frozen
-from avsreplay.records import Belief, Innovation
+from avsreplay.records import Belief, Innovation, Manoeuvre
 
 _NO_NOISE = frozen(np.zeros((6, 6)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Manoeuvre:
-    """A change of the target's velocity that free motion does not explain.
-
-    Attributes:
-        t_ns: its most likely instant.  t_1s_s: standard deviation of the instant [s].
-        velocity: (3,) change of the velocity of the centre of mass, in {A} [m/s].
-        rate: (3,) change of the angular rate, in {B} [rad/s].
-        P: (6, 6) covariance of (rate, velocity).
-        detected_ns: instant of the scan at which it was decided.
-    """
-
-    t_ns: int
-    t_1s_s: float
-    velocity: Array
-    rate: Array
-    P: Array
-    detected_ns: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)

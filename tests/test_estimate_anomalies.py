@@ -1,0 +1,90 @@
+"""Large innovations: manoeuvres, sensor biases and bad scans are told apart, and clean logs are left alone."""
+
+from __future__ import annotations
+
+import estimate_surprises as surprises
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from avsreplay.estimate import hypotheses
+
+CLEAN = surprises.Case("clean", seconds=60.0)
+
+
+def test_the_evidence_is_the_marginal_likelihood() -> None:
+    """Woodbury's form against the density of N(0, C + M U M'), evaluated directly."""
+    rng = np.random.Generator(np.random.PCG64(3))
+    A = rng.normal(size=(18, 18))
+    C, M, scale = A @ A.T + np.eye(18), rng.normal(size=(18, 6)), rng.uniform(0.1, 3.0, size=6)
+    y = rng.normal(size=18)
+    root = np.linalg.cholesky(C)
+    white = np.linalg.solve(root, y)
+    free = -0.5 * white @ white - np.log(np.diag(root)).sum()
+    value, u, P = hypotheses._evidence(white, free, np.linalg.solve(root, M), scale)
+    want = multivariate_normal.logpdf(y, np.zeros(18), C + M @ np.diag(scale**2) @ M.T)
+    assert value - 9.0 * np.log(2.0 * np.pi) == pytest.approx(want, rel=1e-10)
+    gain = np.diag(scale**2) @ M.T @ np.linalg.inv(C + M @ np.diag(scale**2) @ M.T)
+    assert u == pytest.approx(gain @ y, rel=1e-8)
+    assert pytest.approx(np.diag(scale**2) - gain @ M @ np.diag(scale**2), abs=1e-9) == P
+
+
+def test_nothing_is_found_on_a_clean_log() -> None:
+    result = surprises.run(CLEAN, 3)
+    assert result.track is not None
+    assert result.track.manoeuvres == ()
+    assert result.track.reinitialised == 0
+    assert all(result.gamma)
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(5, marks=pytest.mark.slow)])
+def test_a_push_is_reported_and_followed(seed: int) -> None:
+    """A velocity step of 1 cm/s at 45.2 s: instant, size and sigma, and no claim of convergence while in doubt."""
+    case = surprises.Case("push", velocity=0.01, seconds=60.0)
+    result = surprises.run(case, seed)
+    assert result.track is not None
+    (found,) = result.track.manoeuvres
+    assert abs(found.t_ns * 1e-9 - 45.2) < max(0.6, 4.0 * found.t_1s_s)
+    off = np.concatenate([found.rate, found.velocity - result.true_velocity])
+    assert off @ np.linalg.solve(found.P, off) < 22.5  # 99.9 % of chi-square with 6 degrees of freedom
+    at = result.t.index(45.5)
+    assert result.reason.index("doubtful") - at <= 3
+    assert max(result.ratio[at + 10 :]) < 4.0
+    doubtful = [k for k, reason in enumerate(result.reason) if reason == "doubtful"]
+    assert not any(result.converged[k] for k in doubtful)
+
+
+@pytest.mark.slow
+def test_a_bias_of_the_sensor_is_no_manoeuvre() -> None:
+    """5 cm along the line of sight from 60 to 70 s: flagged from the first scan, and the estimate is not moved."""
+    case = surprises.Case("bias", at_s=60.0, until_s=70.0, bias=0.05, seconds=75.0)
+    result = surprises.run(case, 1)
+    assert result.track is not None
+    assert result.track.manoeuvres == ()
+    biased = [k for k, t in enumerate(result.t) if 60.0 <= t < 70.0]
+    assert not any(result.gamma[k] for k in biased)
+    assert "sensor_bias" in {result.reason[k] for k in biased}
+    assert all(result.gamma[biased[-1] + 1 :])
+    assert max(error for error, _ in result.error[biased[0] :]) < 0.01
+
+
+def test_a_bias_before_convergence_does_not_stay() -> None:
+    """15 cm over the first 10 s: the estimate starts anew from the later poses, which agree with one another."""
+    case = surprises.Case("early", at_s=0.0, until_s=10.0, bias=0.15, seconds=30.0)
+    result = surprises.run(case, 2)
+    after = result.t.index(10.0)
+    assert max(error for error, _ in result.error[after + 5 :]) < 0.02
+    assert result.track is not None
+    assert result.track.reinitialised == 1
+
+
+@pytest.mark.slow
+def test_a_single_wild_scan_changes_nothing() -> None:
+    case = surprises.Case("outlier", at_s=50.0, until_s=50.4, bias=0.1, seconds=60.0)
+    result, clean = surprises.run(case, 4), surprises.run(CLEAN, 4)
+    wild = result.t.index(50.0)
+    assert [k for k, gamma in enumerate(result.gamma) if not gamma] == [wild]
+    assert result.reason[wild] == "doubtful"
+    assert result.error[-1][0] == pytest.approx(clean.error[-1][0], abs=1e-3)
+    assert result.track is not None
+    assert result.track.manoeuvres == ()
