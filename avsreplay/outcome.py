@@ -13,7 +13,18 @@ from typing import TypeVar
 import numpy as np
 
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import BLOCKS, Alignment, Belief, Forecast, Innovation, Manoeuvre, Plan, Scan, ScanStatus, Verdict
+from avsreplay.records import (
+    BLOCKS,
+    Alignment,
+    Belief,
+    Forecast,
+    Innovation,
+    Manoeuvre,
+    Plan,
+    Scan,
+    ScanStatus,
+    Verdict,
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
