@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import pytest
 
 from avsreplay.report.episodes import Peak
-from avsreplay.sweep.kinds import KindOfFault
+from avsreplay.sweep.fault_kinds import FaultKind
 from avsreplay.sweep.page import build_sweep_page, words
 from avsreplay.sweep.statistics import ScoreHistogram, consistency, quantiles, rate, typical
 from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary
@@ -95,7 +95,7 @@ def _cells(text):
 
 
 def test_faults_by_kind_stand_together_false_alarms_first(summary):
-    frozen = KindOfFault(
+    frozen = FaultKind(
         harmful=True,
         strengths=(),
         lengths_s=(2.0,),
@@ -109,8 +109,8 @@ def test_faults_by_kind_stand_together_false_alarms_first(summary):
         peak_flagged=Peak(0.0123, 0.004),
         peak_used=Peak(1.25, 178.6),
     )
-    clutter = KindOfFault(False, (0.5,), (2.0,), 4, rate(0, 4), 1, rate(0, 1))
-    none = KindOfFault(False, (), (), 200, rate(1, 200))
+    clutter = FaultKind(False, (0.5,), (2.0,), 4, rate(0, 4), 1, rate(0, 1))
+    none = FaultKind(False, (), (), 200, rate(1, 200))
     kinds = {"clutter": clutter, "frozen": frozen, "none": none}
     cells = tuple(dataclasses.replace(cell, kinds=kinds) for cell in summary.cells)
     page = build_sweep_page(dataclasses.replace(summary, cells=cells, detector=None))
@@ -125,7 +125,7 @@ def test_faults_by_kind_stand_together_false_alarms_first(summary):
 
 
 def test_without_faults_there_is_no_table_of_them(summary):
-    none = {"none": KindOfFault(False, (), (), 200, rate(1, 200))}
+    none = {"none": FaultKind(False, (), (), 200, rate(1, 200))}
     cells = tuple(dataclasses.replace(cell, kinds=none) for cell in summary.cells)
     assert "By kind of fault" not in build_sweep_page(dataclasses.replace(summary, cells=cells))
 

@@ -13,9 +13,9 @@ from click.testing import CliRunner
 
 from avsreplay.cli import sweep as command
 from avsreplay.errors import DataLost, MissingBackend, UnreadableInput, UsageError
-from avsreplay.sweep import Journal, execute, expand, load_campaign, write_results
+from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
 from avsreplay.sweep.execute import _crashed
-from avsreplay.sweep.plan import Task
+from avsreplay.sweep.expansion import Task
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed")
 pytest.importorskip("distributed", reason="Dask is not installed")
@@ -66,6 +66,7 @@ def results(output):
     return {name: (output / name).read_bytes() for name in RESULTS}
 
 
+@pytest.mark.slow
 def test_the_results_say_what_was_run(reference, tmp_path):
     import pyarrow.parquet as pq
 
@@ -98,6 +99,7 @@ def test_the_results_say_what_was_run(reference, tmp_path):
         assert empty["peak_used"] == {"pos_err_m": None, "rot_err_deg": None}
 
 
+@pytest.mark.slow
 def test_noise_matters_in_every_repeat(reference, tmp_path):
     """Repeats share their seed across combinations, so the noisier one fits worse each time, not only on average."""
     import pyarrow.parquet as pq
@@ -107,6 +109,7 @@ def test_noise_matters_in_every_repeat(reference, tmp_path):
     assert all(2.0 < noisy / quiet < 6.0 for quiet, noisy in zip(fit[::2], fit[1::2], strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [2])
 def test_any_number_of_workers_gives_the_same_bytes(campaign, reference, tmp_path, workers):
     done = sweep(campaign, tmp_path / "out", "--workers", str(workers))
@@ -115,11 +118,12 @@ def test_any_number_of_workers_gives_the_same_bytes(campaign, reference, tmp_pat
     assert results(tmp_path / "out") == reference
 
 
+@pytest.mark.slow
 def test_faults_by_kind_need_no_lines_a_scan(campaign, reference, tmp_path):
     campaign.write_text(SMALL.replace("repeats = 3", "repeats = 3\nscans = false"))
     done = sweep(campaign, tmp_path / "out", "--workers", "0")
     assert done.exit_code == 0, done.output
-    assert "by kind of fault" in done.output
+    assert "By kind of fault" in done.output
     assert "empty" in done.output
     kinds = [
         [cell["kinds"] for cell in json.loads(text)["cells"]]
@@ -128,6 +132,7 @@ def test_faults_by_kind_need_no_lines_a_scan(campaign, reference, tmp_path):
     assert kinds[0] == kinds[1]
 
 
+@pytest.mark.slow
 def test_a_limit_is_taken_up_where_it_ended(campaign, reference, tmp_path):
     first = sweep(campaign, tmp_path / "out", "--workers", "0", "--limit", "4")
     assert "4 of 6 runs done" in first.output
@@ -140,6 +145,7 @@ def test_a_limit_is_taken_up_where_it_ended(campaign, reference, tmp_path):
     assert (tmp_path / "out" / "journal.txt").read_bytes() == before  # nothing was run again
 
 
+@pytest.mark.slow
 def test_a_killed_campaign_is_taken_up_again(campaign, reference, tmp_path):
     args = [sys.executable, "-m", "avsreplay", "sweep", str(campaign), "-o", str(tmp_path / "out"), "--workers", "0"]
     process = subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -148,11 +154,12 @@ def test_a_killed_campaign_is_taken_up_again(campaign, reference, tmp_path):
         time.sleep(0.005)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    assert 2 <= len(Journal(journal).status) < 6
+    assert 2 <= len(Journal(tmp_path / "out").status) < 6
     assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
     assert results(tmp_path / "out") == reference
 
 
+@pytest.mark.slow
 def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, reference, tmp_path):
     """A cluster of our own, reached by its address as a remote one would be; its first worker is killed mid-run."""
     from distributed import Client, LocalCluster
@@ -161,11 +168,11 @@ def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, refer
     with (
         LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
         Client(cluster) as client,
-        Journal(tmp_path / "out" / "journal.txt") as journal,
+        Journal(tmp_path / "out") as journal,
     ):
         victims = list(client.run(os.getpid).values())
         seen = []
-        for outcome in execute((p.task for p in plan.points()), scheduler=cluster.scheduler_address):
+        for outcome in run_tasks((p.task for p in plan.points()), scheduler=cluster.scheduler_address):
             seen.append(outcome.id)
             journal.add(outcome)
             if len(seen) == 1:
@@ -175,6 +182,7 @@ def test_a_worker_killed_in_the_middle_loses_and_doubles_nothing(campaign, refer
     assert results(tmp_path / "out") == reference
 
 
+@pytest.mark.slow
 def test_a_run_that_fails_is_a_row_and_exit_4(campaign, tmp_path):
     text = SMALL.replace("repeats = 3", "repeats = 1")
     text += '[[case]]\nname = "good"\n[[case]]\nname = "cold"\nset = { "run.init" = "9,9,9,0,0,0,1" }\n'
@@ -182,11 +190,11 @@ def test_a_run_that_fails_is_a_row_and_exit_4(campaign, tmp_path):
     campaign.write_text(text)
     done = sweep(campaign, tmp_path / "out", "--workers", "0")
     assert isinstance(done.exception, DataLost)
-    assert "2 of 6 runs failed" in str(done.exception)
+    assert "2 of 6 runs were not ok (2 failed)" in str(done.exception)
     assert "6 of 6 runs done (2 failed, 4 ok)" in done.output
     again = sweep(campaign, tmp_path / "out", "--workers", "0")
     assert isinstance(again.exception, DataLost)
-    assert len(Journal(tmp_path / "out" / "journal.txt").status) == 6
+    assert len(Journal(tmp_path / "out").status) == 6
     retried = sweep(campaign, tmp_path / "out", "--workers", "0", "--retry-failed", "--limit", "0")
     assert "4 of 6 runs done (4 ok)" in retried.output
 
@@ -197,12 +205,13 @@ def test_a_run_that_breaks_is_a_row_too(monkeypatch):
 
     monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "run_task", broken)
     task = Task("ab", "", "", "", "", (), True)
-    (outcome,) = execute([task])
+    (outcome,) = run_tasks([task])
     assert (outcome.status, outcome.error) == ("crashed", "ZeroDivisionError: by nought")
     killed = type("KilledWorker", (Exception,), {})("tcp://10.0.0.1:5000")
     assert "10.0.0.1" not in _crashed("ab", killed).error
 
 
+@pytest.mark.slow
 def test_recorded_logs_are_swept_as_well(tmp_path):
     path = tmp_path / "logs.toml"
     path.write_text(
@@ -221,6 +230,7 @@ def test_a_plan_is_only_told(campaign, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["small.toml"]
 
 
+@pytest.mark.slow
 def test_bad_input_is_one_line(campaign, tmp_path, monkeypatch):
     assert isinstance(CliRunner().invoke(command.command, [str(campaign)]).exception, UsageError)
     monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "CONNECT_S", 1)
@@ -235,3 +245,93 @@ def test_bad_input_is_one_line(campaign, tmp_path, monkeypatch):
     done = sweep(campaign, tmp_path / "out3", "--workers", "0")
     assert isinstance(done.exception, MissingBackend)
     assert not (tmp_path / "out3").exists()  # said before anything was run
+
+
+def test_a_cut_log_is_lossy_and_exit_4_as_in_run(cli, tmp_path):
+    data = (FIXTURES / "tumble.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    (tmp_path / "c.toml").write_text('logs = ["cut.mcap"]\n')
+    assert cli("run", tmp_path / "cut.mcap", "--json").code == DataLost.exit_code
+    done = sweep(tmp_path / "c.toml", tmp_path / "out", "--workers", "0", "--json")
+    assert isinstance(done.exception, DataLost)
+    assert "1 of 1 runs were not ok (1 lossy)" in str(done.exception)
+    assert "damaged places were left out" in str(done.exception)
+    said = json.loads(done.output)
+    assert said["status"] == {"lossy": 1}
+    (worst,) = said["worst"]
+    assert (worst["status"], worst["seed"]) == ("lossy", None)
+
+
+@pytest.mark.slow
+def test_the_worst_run_is_made_again_by_one_command(campaign, reference, tmp_path):
+    said = json.loads(reference["summary.json"])
+    worst = said["worst"][0]
+    assert len(said["worst"]) == 5
+    (tmp_path / "results.parquet").write_bytes(reference["results.parquet"])
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(tmp_path / "results.parquet").to_pylist()
+    errors = {row["id"]: max(row["pose_healthy.position_m.max"], row["worst_coast.pos_err_m"]) for row in table}
+    assert worst["id"] == max(errors, key=errors.get)
+    row = next(row for row in table if row["id"] == worst["id"])
+    assert row["seed"] == worst["seed"]
+    again = CliRunner().invoke(
+        command.command, [str(campaign), "--run", worst["id"][:10], "-o", str(tmp_path / "again"), "--report"]
+    )
+    assert again.exit_code == 0, again.output
+    assert (tmp_path / "again" / "report.html").exists()
+    rows = [json.loads(line) for line in (tmp_path / "again" / "rows.jsonl").read_text().splitlines()]
+    assert len(rows) == row["scans"]
+    assert max(r["pos_err_m"] for r in rows) == pytest.approx(errors[worst["id"]], rel=1e-12)
+    unknown = CliRunner().invoke(command.command, [str(campaign), "--run", "zz", "-o", str(tmp_path / "x")])
+    assert isinstance(unknown.exception, UsageError)
+
+
+@pytest.mark.slow
+def test_a_damaged_line_costs_its_own_run_only(campaign, reference, tmp_path):
+    """One byte of line 2 of 6 is changed: that run is made again and the results are the same."""
+    assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
+    path = tmp_path / "out" / "journal.txt"
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(lines[0] + lines[1].replace(b"ok", b"oK", 1) + b"".join(lines[2:]))
+    done = sweep(campaign, tmp_path / "out", "--workers", "0")
+    assert done.exit_code == 0, done.output
+    assert "1 damaged lines of the journal were moved" in done.output
+    assert sorted(path.read_bytes().splitlines(keepends=True)) == sorted(lines)
+    assert path.read_bytes().splitlines(keepends=True)[:-1] == [lines[0], *lines[2:]]
+    assert results(tmp_path / "out") == reference
+
+
+def test_two_campaigns_in_one_directory_end_in_one_line(campaign, tmp_path):
+    with Journal(tmp_path / "out"):
+        done = sweep(campaign, tmp_path / "out", "--workers", "0")
+    assert isinstance(done.exception, UsageError)
+    assert "in use by process" in str(done.exception)
+    assert sweep(campaign, tmp_path / "out", "--workers", "0", "--limit", "1").exit_code == 0
+
+
+@pytest.mark.slow
+def test_results_hold_a_few_runs_in_memory(campaign, reference, tmp_path, monkeypatch):
+    """Batches of 2 runs and of 1 scan give the same values."""
+    import pyarrow.parquet as pq
+
+    monkeypatch.setattr(sys.modules["avsreplay.sweep.results"], "BATCH", 2)
+    monkeypatch.setattr(sys.modules["avsreplay.sweep.results"], "SCAN_BATCH", 1)
+    assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
+    for name in ("results.parquet", "scans.parquet"):
+        (tmp_path / name).write_bytes(reference[name])
+        assert pq.read_table(tmp_path / "out" / name).equals(pq.read_table(tmp_path / name))
+    assert (tmp_path / "out" / "summary.json").read_bytes() == reference["summary.json"]
+
+
+@pytest.mark.slow
+def test_dask_listens_on_the_loopback_only():
+    psutil = pytest.importorskip("psutil")
+    from avsreplay.sweep.execute import _client
+
+    with _client(1, None, "127.0.0.1:0") as client:
+        me = psutil.Process()
+        found = [c for p in (me, *me.children(recursive=True)) for c in p.net_connections("inet")]
+        assert client.dashboard_link.startswith("http://127.0.0.1:")
+    listening = {c.laddr.ip for c in found if c.status == psutil.CONN_LISTEN}
+    assert listening == {"127.0.0.1"}

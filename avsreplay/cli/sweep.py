@@ -14,20 +14,21 @@ from avsreplay.cli.options import PATH
 from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
-    from avsreplay.sweep import Journal, Plan
-    from avsreplay.sweep.plan import Task
+    from avsreplay.sweep import Expansion, Journal
+    from avsreplay.sweep.expansion import Task
     from avsreplay.sweep.summary import SweepSummary
-    from avsreplay.sweep.worker import Outcome
+    from avsreplay.sweep.worker import RunResult
 
 EPILOG = """\b
 Examples:
   avsreplay sweep blackouts.toml -o blackouts/ --workers 2
-  avsreplay sweep blackouts.toml -o blackouts/               again: only unfinished runs are executed
+  avsreplay sweep blackouts.toml -o blackouts/               again: only what is not finished is run
   avsreplay sweep blackouts.toml -o blackouts/ --scheduler tcp://head:8786
   avsreplay sweep blackouts.toml --plan                      list the runs
+  avsreplay sweep blackouts.toml --run 3f2a91 -o worst/ --report
 
 \b
-Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished but some runs failed."""
+Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished, but runs failed or data was lost."""
 
 
 @click.command("sweep", epilog=EPILOG)
@@ -38,33 +39,43 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished but some runs failed."
     type=click.IntRange(0),
     default=2,
     show_default=True,
-    help="Number of processes; 0 runs in this process without Dask.",
+    help="Number of processes; 0: this one, without Dask.",
 )
+@click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, as tcp://host:port, in place of --workers.")
 @click.option(
-    "--scheduler", metavar="ADDRESS", help="Address of a Dask scheduler (tcp://host:port) instead of --workers."
+    "--dashboard",
+    metavar="HOST:PORT",
+    default="127.0.0.1:0",
+    show_default=True,
+    help="Address of the Dask dashboard of --workers; port 0: any free port.",
 )
-@click.option("--limit", type=click.IntRange(0), help="Largest number of runs to execute now.")
-@click.option("--retry-failed", is_flag=True, help="Run failed and crashed runs again.")
-@click.option("--plan", "only_plan", is_flag=True, help="List the runs and execute none.")
+@click.option("--limit", type=click.IntRange(0), help="Largest number of runs to make now.")
+@click.option("--retry-failed", is_flag=True, help="Make failed and crashed runs again.")
+@click.option("--plan", "only_plan", is_flag=True, help="List the runs without making them.")
+@click.option("--run", "run_id", metavar="ID", help="Make one run again, by its id or the begin of it, as 'run' does.")
+@click.option("--report", "page", is_flag=True, help="With --run: add the HTML report to the result directory.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
 def command(
     campaign: Path,
     output: Path | None,
     workers: int,
     scheduler: str | None,
+    dashboard: str,
     limit: int | None,
     retry_failed: bool,
     only_plan: bool,
+    run_id: str | None,
+    page: bool,
     as_json: bool,
 ) -> None:
-    """Run a CAMPAIGN (a TOML file): a grid, a list of cases or random draws over scenarios, logs and settings.
+    """Make the runs of a CAMPAIGN (a TOML file): a grid, cases or random draws over scenarios, logs and settings.
 
-    Each finished run is saved at once: the same command continues after an interruption. Results are one row per run
-    (results.parquet), one row per scan (scans.parquet), summary.json and report.html. They do not depend on the number
-    of workers.
+    Each finished run is saved at once: the same command continues after an interruption. Results are one row per
+    run (results.parquet), one row per scan (scans.parquet), summary.json and report.html; they do not depend on the
+    number of workers.
     """
-    from avsreplay.sweep import Journal, execute, expand, load_campaign, write_results
-    from avsreplay.sweep.results import arrow
+    from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
+    from avsreplay.sweep.parquet import arrow
 
     plan = expand(load_campaign(campaign))
     if only_plan:
@@ -72,31 +83,69 @@ def command(
         return
     if output is None:
         raise UsageError("no directory for the results", where="sweep", hint="add -o DIR, or --plan to list the runs")
-    arrow()  # a missing library is reported before the first run
-    journal = Journal(output / "journal.txt")
-    if retry_failed:
-        journal.forget(("failed", "crashed"))
+    if run_id is not None:
+        _make_again(plan, run_id, output, page)
+        return
+    arrow()  # raises before anything runs, not after
+    journal = Journal(output)
     with journal:
+        _report_damage(journal)
+        if retry_failed:
+            journal.forget(("failed", "crashed"))
         waiting = list(islice(_waiting(plan, journal), limit))
-        for outcome in _tracked(execute(waiting, workers, scheduler), len(waiting)):
-            journal.add(outcome)
-    summary = write_results(plan, journal, output)
+        for result in _tracked(run_tasks(waiting, workers, scheduler, dashboard), len(waiting)):
+            journal.add(result)
+        summary = write_results(plan, journal, output)
     if as_json:
         click.echo(json.dumps(summary.document(), indent=1, allow_nan=False))
     else:
-        _print(summary)
+        _print(summary, campaign)
     _report_failures(summary, journal, output)
 
 
+def _report_damage(journal: Journal) -> None:
+    """Say which runs are made again because their results were damaged."""
+    again = journal.check_scans()
+    if journal.damaged:
+        what = f"{len(journal.damaged)} damaged lines of the journal were moved to {journal.folder / 'journal.damaged'}"
+        click.echo(f"avsreplay: {what}; their runs are made again", err=True)
+    if again:
+        click.echo(f"avsreplay: the scans of {again} runs are damaged or missing; these runs are made again", err=True)
+
+
 def _report_failures(summary: SweepSummary, journal: Journal, output: Path) -> None:
-    if failed := summary.done - summary.status.get("ok", 0):
-        first = next(o for o in journal.outcomes() if o.status != "ok")
-        what = f"{failed} of {summary.done} runs failed, for example: {first.error}"
-        raise DataLost(what, where=str(output), hint="see the column 'error' of results.parquet")
+    if bad := summary.done - summary.status.get("ok", 0):
+        worst = next(
+            run_id for status in ("crashed", "failed", "lossy") for run_id, s in journal.status.items() if s == status
+        )
+        parts = [f"{count} {status}" for status, count in summary.status.items() if status != "ok"]
+        what = (
+            f"{bad} of {summary.done} runs were not ok ({', '.join(parts)}), for example: {journal.result(worst).error}"
+        )
+        raise DataLost(what, where=str(output), hint="see the columns 'status' and 'error' of results.parquet")
 
 
-def _waiting(plan: Plan, journal: Journal) -> Iterator[Task]:
-    """The unfinished tasks, each once."""
+def _make_again(plan: Expansion, run_id: str, output: Path, page: bool) -> None:
+    """Make one run as ``avsreplay run`` does, with a result directory."""
+    import tempfile
+
+    from avsreplay.cli.run import command as run_command
+    from avsreplay.sweep.worker import log_of
+
+    found = {point.task.id: point.task for point in plan.points() if point.task.id.startswith(run_id)}
+    if len(found) != 1:
+        what = f"{len(found)} runs of the campaign have an id that begins with '{run_id}'"
+        raise UsageError(what, where="--run", hint="take the id from results.parquet, in full")
+    (task,) = found.values()
+    with tempfile.TemporaryDirectory(prefix="avsreplay-") as folder:
+        arguments = [str(log_of(task, Path(folder))), "-o", str(output), *(["--report"] if page else [])]
+        arguments += ["--model", task.model] if task.log and task.model else []
+        arguments += [word for assignment in task.assignments for word in ("--set", assignment)]
+        run_command.main(arguments, standalone_mode=False)
+
+
+def _waiting(plan: Expansion, journal: Journal) -> Iterator[Task]:
+    """The runs that are not finished, each task once."""
     seen: set[str] = set()
     for point in plan.points():
         if point.task.id not in journal and point.task.id not in seen:
@@ -104,13 +153,13 @@ def _waiting(plan: Plan, journal: Journal) -> Iterator[Task]:
             yield point.task
 
 
-def _tracked(items: Iterator[Outcome], total: int) -> Iterator[Outcome]:
+def _tracked(items: Iterator[RunResult], total: int) -> Iterator[RunResult]:
     from avsreplay.cli.progress import tracked
 
     return tracked(items, total, "runs")
 
 
-def _plan_text(plan: Plan) -> str:
+def _plan_text(plan: Expansion) -> str:
     campaign = plan.loaded.campaign
     from avsreplay.sweep.page import words
 
@@ -120,9 +169,9 @@ def _plan_text(plan: Plan) -> str:
     return "\n".join(lines)
 
 
-def _print(summary: SweepSummary) -> None:
+def _print(summary: SweepSummary, campaign: Path) -> None:
     from avsreplay.report.table import make_console, print_line, print_table
-    from avsreplay.sweep.page import cell_table, detector_table, kinds_table
+    from avsreplay.sweep.page import cell_table, detector_table, kinds_table, worst_table
 
     console = make_console(plain_width=120)
     status = ", ".join(f"{count} {word}" for word, count in summary.status.items())
@@ -133,3 +182,7 @@ def _print(summary: SweepSummary) -> None:
     if summary.detector is not None and summary.detector.harmful:
         print_table(console, detector_table(summary.detector))
     print_table(console, kinds_table(cells), tight=True)
+    if summary.worst:
+        print_table(console, worst_table(summary.worst), tight=True)
+        run = summary.worst[0].id
+        click.echo(f"to make one again: avsreplay sweep {campaign} --run {run} -o worst/ --report")

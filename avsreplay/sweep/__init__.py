@@ -1,11 +1,11 @@
-"""Campaigns: many runs from one file, on one machine or a Dask cluster, resumable, the same results in any order."""
+"""Campaigns: many runs from one file, on one machine or a Dask cluster; they resume and give the same results."""
 
 from __future__ import annotations
 
 from avsreplay.sweep.campaign import Campaign, load_campaign
-from avsreplay.sweep.execute import execute
+from avsreplay.sweep.execute import run_tasks
+from avsreplay.sweep.expansion import Expansion, Point, expand
 from avsreplay.sweep.journal import Journal
-from avsreplay.sweep.plan import Plan, Point, expand
 from avsreplay.sweep.results import write_results
 
-__all__ = ["Campaign", "Journal", "Plan", "Point", "execute", "expand", "load_campaign", "write_results"]
+__all__ = ["Campaign", "Expansion", "Journal", "Point", "expand", "load_campaign", "run_tasks", "write_results"]

@@ -1,4 +1,4 @@
-"""A campaign file: what is varied, how often, and what counts as success. Strict TOML like every other file."""
+"""A campaign file: what is varied, how often, and what counts as a success."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import Any
 
 from avsreplay import toml_document
 from avsreplay.settings import Settings, setting
-
-__all__ = ["Axis", "Campaign", "Case", "Criterion", "Draw", "DrawKind", "LoadedCampaign", "load_campaign"]
 
 MAX_REPEATS = 10_000_000
 PREFIXES = ("scenario.", "run.")
@@ -79,7 +77,7 @@ class Draw(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Criterion(Settings):
+class SuccessCriterion(Settings):
     """One table [[success]]: a run succeeds where the metric has a value and is within the limits."""
 
     name: str = setting(doc="Name of the criterion in tables.")
@@ -105,7 +103,7 @@ class Campaign(Settings):
     grid: tuple[Axis, ...] = setting((), "What is varied.")
     case: tuple[Case, ...] = setting((), "Alternatives.")
     draw: tuple[Draw, ...] = setting((), "What is drawn.")
-    success: tuple[Criterion, ...] = setting((), "What counts as a success.")
+    success: tuple[SuccessCriterion, ...] = setting((), "What counts as a success.")
 
     def check(self) -> None:
         """Raise ValueError where entries exclude each other or a name occurs twice."""
@@ -119,10 +117,10 @@ class Campaign(Settings):
         for kind, entries in (("key", names), ("case", [c.name for c in self.case])):
             double = next((n for n in entries if entries.count(n) > 1), None)
             if double is not None:
-                raise ValueError(f"{kind} '{double}' stands twice")
+                raise ValueError(f"{kind} '{double}' occurs twice")
         wrong = next((n for n in self._keys() if self.logs and n.startswith("scenario.")), None)
         if wrong is not None:
-            raise ValueError(f"'{wrong}' has no place where logs are given")
+            raise ValueError(f"'{wrong}' cannot be set where logs are given")
 
     def _keys(self) -> list[str]:
         cases = [key for case in self.case for key in case.set]
@@ -131,7 +129,7 @@ class Campaign(Settings):
 
 @dataclass(frozen=True, slots=True)
 class LoadedCampaign:
-    """A campaign and where its file names start."""
+    """A campaign, the folder to which its file names are relative, and its own name."""
 
     campaign: Campaign
     folder: Path

@@ -1,4 +1,4 @@
-"""Tasks to outcomes, as they come: in this process, on worker processes of this machine, or on a Dask cluster."""
+"""Runs tasks in this process, on worker processes of this machine, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -9,31 +9,33 @@ from contextlib import contextmanager
 from typing import Any
 
 from avsreplay.errors import MissingBackend, UnreadableInput
-from avsreplay.sweep.plan import Task
-from avsreplay.sweep.worker import Outcome, run_task
+from avsreplay.sweep.expansion import Task
+from avsreplay.sweep.worker import RunResult, run_task
 
-__all__ = ["execute"]
-
-IN_FLIGHT = 4  # tasks a worker thread has in hand or in wait; keeps the scheduler's list short
-CONNECT_S = 10  # how long a scheduler has to answer
-LOOK_EVERY = 64  # completions between looks at how many workers there are
+IN_FLIGHT = 4  # tasks per worker thread that run or wait; limits the tasks at the scheduler
+CONNECT_S = 10  # time limit for the answer of a scheduler [s]
+LOOK_EVERY = 64  # completions between two queries for the number of workers
 
 
-def execute(tasks: Iterable[Task], workers: int = 0, scheduler: str | None = None) -> Iterator[Outcome]:
-    """Run ``tasks``; outcomes come in any order, one for each.
+def run_tasks(
+    tasks: Iterable[Task], workers: int = 0, scheduler: str | None = None, dashboard: str = "127.0.0.1:0"
+) -> Iterator[RunResult]:
+    """Run tasks; yields one result per task, in order of completion.
 
     Args:
-        tasks: what to run.
-        workers: processes of this machine; 0 runs here, one after the other, without Dask.
-        scheduler: address of a Dask scheduler; its workers must see the files that tasks name.
+        tasks: What to run.
+        workers: Processes on this machine; 0 runs the tasks in this process, one after the other, without Dask.
+        scheduler: Address of a Dask scheduler, whose workers must see the files that tasks name.
+        dashboard: Address at which the Dask dashboard of ``workers`` listens.
 
     Raises:
-        MissingBackend: Dask is asked for and not installed.  UnreadableInput: the scheduler does not answer.
+        MissingBackend: Dask is needed and not installed.
+        UnreadableInput: The scheduler does not answer.
     """
     if workers == 0 and scheduler is None:
         yield from _here(tasks)
         return
-    with _client(workers, scheduler) as client:
+    with _client(workers, scheduler, dashboard) as client:
         yield from _on(client, iter(tasks))
 
 
@@ -46,7 +48,7 @@ def _distributed() -> Any:
         raise MissingBackend("Dask (distributed) is not installed", where="sweep", hint=hint) from None
 
 
-def _here(tasks: Iterable[Task]) -> Iterator[Outcome]:
+def _here(tasks: Iterable[Task]) -> Iterator[RunResult]:
     with ThreadPoolExecutor(max_workers=1) as pool:
         for task in tasks:
             future = pool.submit(run_task, task)
@@ -55,7 +57,7 @@ def _here(tasks: Iterable[Task]) -> Iterator[Outcome]:
 
 
 @contextmanager
-def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
+def _client(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any]:
     dask = _distributed()
     if scheduler is not None:
         try:
@@ -65,17 +67,16 @@ def _client(workers: int, scheduler: str | None) -> Iterator[Any]:
             what = f"the scheduler does not answer: {str(error).splitlines()[0]}"
             raise UnreadableInput(what, where=scheduler, hint="check the address") from None
         return
+    options = {"threads_per_worker": 1, "processes": True, "memory_limit": None}
     with (
-        dask.LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, dashboard_address=":0", memory_limit=None
-        ) as cluster,
+        dask.LocalCluster(n_workers=workers, host="127.0.0.1", dashboard_address=dashboard, **options) as cluster,
         dask.Client(cluster) as client,
     ):
         yield client
 
 
-def _on(client: Any, tasks: Iterator[Task]) -> Iterator[Outcome]:
-    """A bounded number in flight; a worker that dies has its tasks run elsewhere by the scheduler."""
+def _on(client: Any, tasks: Iterator[Task]) -> Iterator[RunResult]:
+    """Keep a bounded number of tasks at the scheduler, which runs the tasks of a worker that dies on another."""
     running = _distributed().as_completed()
     held, count, limit = 0, 0, IN_FLIGHT
     while True:
@@ -91,16 +92,16 @@ def _on(client: Any, tasks: Iterator[Task]) -> Iterator[Outcome]:
         yield _collected(future)
 
 
-def _collected(future: Any) -> Outcome:
+def _collected(future: Any) -> RunResult:
     if future.status == "finished":
-        outcome: Outcome = future.result()
+        outcome: RunResult = future.result()
         return outcome
     return _crashed(str(future.key).removeprefix("run-"), future.exception())
 
 
-def _crashed(task_id: str, error: BaseException | None) -> Outcome:
-    """A run that broke: its kind and first line, free of addresses, so that the row is the same everywhere."""
+def _crashed(task_id: str, error: BaseException | None) -> RunResult:
+    """The result of a run that raised: kind and first line of the error, without addresses that differ between runs."""
     if type(error).__name__ == "KilledWorker":
-        return Outcome(task_id, "crashed", "the worker process died on it, again and again")
+        return RunResult(task_id, "crashed", "the worker process died repeatedly")
     first = (str(error).splitlines() or [""])[0]
-    return Outcome(task_id, "crashed", f"{type(error).__name__}: {first}")
+    return RunResult(task_id, "crashed", f"{type(error).__name__}: {first}")

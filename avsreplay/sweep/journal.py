@@ -1,52 +1,64 @@
-"""What is done, one line a run, appended as it comes: the campaign's memory.
+"""The journal of a campaign: one line per finished run, appended as runs finish, and the scans of each run.
 
-A line is ``checksum id status outcome``. A process that is killed leaves at most one torn line, which is cut off when
-the campaign is taken up again. Lines stand in the order of completion; results are sorted elsewhere.
+A line is ``checksum id status values``; the scans of a run are a Parquet file of their own, written before its line. A
+line that is damaged (a changed byte, or the end cut off by a kill) is moved to ``journal.damaged`` and its run is made
+again; all other lines are kept. Lines are in the order of completion; results are sorted elsewhere.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import socket
 import sys
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, TypeVar
 
-from avsreplay.errors import UnreadableInput
-from avsreplay.sweep.worker import Outcome
-
-__all__ = ["Journal"]
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.report.atomic import atomic_path
+from avsreplay.sweep.parquet import read_scans, write_scans
+from avsreplay.sweep.worker import RunResult
 
 T = TypeVar("T")
 
 
 class Journal:
-    """The file of outcomes; a context manager while it is appended to.
+    """The finished runs of a campaign in one folder; a context manager while runs are added.
+
+    Opening it to add runs locks the folder, so that two campaigns cannot write to it at once.
 
     Attributes:
-        status: of every run that is done, by its id.
+        status: Status of every finished run, by its id.
+        damaged: Lines that were set aside, without a last line cut off by a kill.
 
     Raises:
-        UnreadableInput: the file cannot be read or written.
+        UnreadableInput: A file cannot be read or written.
+        UsageError: On entering, where another process uses the folder; it is named.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._stream: BinaryIO | None = None
-        self._places: dict[str, tuple[int, int]] = {}
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.path = folder / "journal.txt"
         self.status: dict[str, str] = {}
+        self.damaged: list[bytes] = []
+        self._places: dict[str, tuple[int, int]] = {}
         self._end = 0
-        if path.exists():
+        self._torn = b""
+        self._stream: BinaryIO | None = None
+        self._lock: BinaryIO | None = None
+        if self.path.exists():
             self._guarded(self._index)
 
     def __enter__(self) -> Journal:
         def begin() -> BinaryIO:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            stream = self._path.open("ab")
-            stream.truncate(self._end)  # a torn line of a run that was cut short
-            return stream
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(self.folder / "lock")
+            if self.damaged or self._torn:
+                self._set_aside()
+            return self.path.open("ab")
 
         self._stream = self._guarded(begin)
         return self
@@ -54,69 +66,117 @@ class Journal:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if self._stream is not None:
-            self._stream.close()
-            self._stream = None
+        for stream in (self._stream, self._lock):
+            if stream is not None:
+                stream.close()
+        self._stream = self._lock = None
 
     def __contains__(self, run_id: str) -> bool:
         return run_id in self.status
 
-    def add(self, outcome: Outcome) -> None:
-        """Append an outcome and hand it to the system at once; one that is there already is left out."""
+    def add(self, result: RunResult) -> None:
+        """Append a result and flush it; a run that is there already is left out."""
         stream = self._stream
         if stream is None:
             raise RuntimeError("the journal is not open")
-        if outcome.id in self.status:
+        if result.id in self.status:
             return
-        line = _line(outcome)
+        if result.scans:
+            write_scans(self._part(result.id), result.scans)
+        line = _line(result)
 
         def append() -> None:
             stream.write(line)
             stream.flush()
 
         self._guarded(append)
-        self._note(outcome.id, outcome.status, len(line))
+        self._note(result.id, result.status, len(line))
 
-    def outcome(self, run_id: str) -> Outcome:
-        """What the run came to. Raises KeyError for one that is not done."""
+    def result(self, run_id: str) -> RunResult:
+        """The result of a run without its scans. Raises KeyError for one that is not finished."""
         start, size = self._places[run_id]
 
         def read() -> bytes:
-            with self._path.open("rb") as stream:
+            with self.path.open("rb") as stream:
                 stream.seek(start)
                 return stream.read(size)
 
-        return _outcome(self._guarded(read))
+        return _result(self._guarded(read))
 
-    def outcomes(self) -> Iterator[Outcome]:
-        """What is done, in the order it was finished."""
-        if not self._path.exists():
-            return
-        with self._guarded(lambda: self._path.open("rb")) as stream:
-            for _, size in self._places.values():
-                yield _outcome(stream.read(size))
+    def scans(self, run_id: str) -> list[tuple[Any, ...]]:
+        """The scans of a run in the order of SCAN_COLUMNS. Raises UnreadableInput where they are damaged."""
+        part = self._part(run_id)
+        return read_scans(part) if part.exists() else []
+
+    def check_scans(self) -> int:
+        """Forget every run whose scans are missing or damaged, so that it is made again; return their number."""
+        bad = []
+        for run_id in self.status:
+            count = self.result(run_id).scan_count
+            try:
+                if count and len(self.scans(run_id)) != count:
+                    bad.append(run_id)
+            except UnreadableInput:
+                bad.append(run_id)
+        if bad:
+            self._keep([run_id for run_id in self.status if run_id not in set(bad)])
+        return len(bad)
 
     def forget(self, statuses: tuple[str, ...]) -> None:
-        """Drop the runs that ended so, to have them run again."""
-        kept = [self.outcome(run_id) for run_id, status in self.status.items() if status not in statuses]
-        partial = self._path.with_suffix(".partial")
+        """Drop the runs that ended with one of these statuses, so that they are made again."""
+        self._keep([run_id for run_id, status in self.status.items() if status not in statuses])
 
-        def rewrite() -> None:
-            partial.write_bytes(b"".join(_line(outcome) for outcome in kept))
-            partial.replace(self._path)
+    def _part(self, run_id: str) -> Path:
+        return self.folder / "scans" / run_id[:2] / f"{run_id}.parquet"
 
-        self._guarded(rewrite)
+    def _keep(self, run_ids: Sequence[str]) -> None:
+        if len(run_ids) == len(self.status):
+            return
+
+        kept = [self._places[run_id] for run_id in run_ids]
+        writing = self._stream is not None
+        if self._stream is not None:
+            self._stream.close()
+        self._copy(kept)
         self._places, self.status, self._end = {}, {}, 0
         self._guarded(self._index)
+        if writing:
+            self._stream = self._guarded(lambda: self.path.open("ab"))
+
+    def _copy(self, places: Sequence[tuple[int, int]]) -> None:
+        """Replace the journal by these of its lines."""
+        with self.path.open("rb") as source, atomic_path(self.path) as part:
+            with part.open("wb") as target:
+                for start, size in places:
+                    source.seek(start)
+                    target.write(source.read(size))
+            source.close()  # Windows does not replace an open file
 
     def _index(self) -> None:
-        """Place and status of every whole line; stops at the first that is torn."""
-        with self._path.open("rb") as stream:
+        """Place and status of every line that is whole; the others are kept apart."""
+        place = 0
+        with self.path.open("rb") as stream:
             for line in stream:
-                if not line.endswith(b"\n") or line[:9] != b"%08x " % zlib.crc32(line[9:-1]):
-                    return
-                run_id, status, _ = line[9:].split(b" ", 2)
-                self._note(run_id.decode(), status.decode(), len(line))
+                parts = line[9:-1].split(b" ", 2)
+                if line[-1:] == b"\n" and line[:9] == b"%08x " % zlib.crc32(line[9:-1]) and len(parts) == 3:
+                    self._end = place
+                    self._note(parts[0].decode(), parts[1].decode(), len(line))
+                elif line[-1:] == b"\n":
+                    self.damaged.append(line)
+                else:
+                    self._torn = line
+                place += len(line)
+
+    def _set_aside(self) -> None:
+        """Move lines that are not whole out of the journal."""
+        if self.damaged:
+            with (self.folder / "journal.damaged").open("ab") as stream:
+                stream.write(b"".join(self.damaged))
+        places = self._places
+        self._copy(list(places.values()))
+        self._end, self._torn, self._places = 0, b"", {}
+        for run_id, (_, size) in places.items():
+            self._note(run_id, self.status[run_id], size)
 
     def _note(self, run_id: str, status: str, size: int) -> None:
         self._places[run_id] = (self._end, size)
@@ -128,19 +188,53 @@ class Journal:
             return act()
         except OSError as error:
             what = error.strerror or "cannot be used"
-            raise UnreadableInput(what, where=str(self._path), hint="check the folder, then run it again") from None
+            raise UnreadableInput(what, where=str(self.path), hint="check the folder, then run it again") from None
 
 
-def _line(outcome: Outcome) -> bytes:
-    values = {"error": outcome.error, "metrics": outcome.metrics, "episodes": outcome.episodes}
-    values["scans"] = outcome.scans
-    rest = f"{outcome.id} {outcome.status} {json.dumps(values, separators=(',', ':'))}".encode()
+def _locked(path: Path) -> BinaryIO:
+    """The open lock file of a folder; the system releases it when the process ends, however it ends."""
+    stream = path.open("a+b")
+    try:
+        _lock(stream)
+    except OSError:
+        stream.seek(0)
+        owner = stream.read(200).decode("utf-8", "replace").strip() or "another process"
+        stream.close()
+        hint = "wait for it, or give another directory with -o"
+        raise UsageError(f"the directory is in use by {owner}", where=str(path.parent), hint=hint) from None
+    stream.seek(0)
+    stream.truncate()
+    stream.write(f"process {os.getpid()} on {socket.gethostname()}\n".encode())
+    stream.flush()
+    return stream
+
+
+def _lock(stream: BinaryIO) -> None:
+    if sys.platform == "win32":
+        import msvcrt
+
+        stream.seek(1 << 20)  # beyond the text, which another process must be able to read
+        msvcrt.locking(stream.fileno(), msvcrt.LK_NBLCK, 1)
+    else:
+        import fcntl
+
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _line(result: RunResult) -> bytes:
+    values = {
+        "error": result.error,
+        "metrics": result.metrics,
+        "episodes": result.episodes,
+        "scans": len(result.scans) or result.scan_count,
+    }
+    rest = f"{result.id} {result.status} {json.dumps(values, separators=(',', ':'))}".encode()
     return b"%08x %s\n" % (zlib.crc32(rest), rest)
 
 
-def _outcome(line: bytes) -> Outcome:
+def _result(line: bytes) -> RunResult:
     run_id, status, body = line[9:-1].split(b" ", 2)
     values: dict[str, Any] = json.loads(body)
     metrics = values["metrics"] and {sys.intern(name): value for name, value in values["metrics"].items()}
-    scans, episodes = (tuple(map(tuple, values.get(name, ()))) for name in ("scans", "episodes"))
-    return Outcome(run_id.decode(), status.decode(), values["error"], metrics, scans, episodes)
+    episodes = tuple(map(tuple, values["episodes"]))
+    return RunResult(run_id.decode(), status.decode(), values["error"], metrics, (), episodes, values["scans"])

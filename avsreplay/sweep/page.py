@@ -11,9 +11,9 @@ from markupsafe import Markup
 from avsreplay.report.episodes import Peak
 from avsreplay.report.page import Part, Section, build, render
 from avsreplay.report.table import Table
-from avsreplay.sweep.kinds import NONE, KindOfFault
+from avsreplay.sweep.fault_kinds import NONE, FaultKind
 from avsreplay.sweep.statistics import Quantiles, Rate, Roc, Typical
-from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary
+from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary, WorstRun
 
 # Okabe and Ito's colours, distinguishable without colour vision, each with a dash pattern of its own
 _STYLES = (("#0072B2", ""), ("#D55E00", "7 3"), ("#009E73", "2 3"), ("#CC79A7", "8 3 2 3"))
@@ -31,6 +31,9 @@ scan to its first flagged one [s], median and worst. Recovery: from the first sc
 estimate [mm, deg] over the window's flagged scans, over its used ones, and over the used ones after it up to the next
 window."""
 
+_WORST_TEXT = """A run is made again, with its own report, by:
+avsreplay sweep CAMPAIGN.toml --run ID -o DIR --report"""
+
 
 def build_sweep_page(summary: SweepSummary) -> str:
     """The page of a campaign's summary; the same summary gives the same bytes."""
@@ -46,7 +49,18 @@ def build_sweep_page(summary: SweepSummary) -> str:
         parts += [Section("Fault tests"), detector_table(summary.detector), _roc(summary.detector)]
     kinds = kinds_table(cells)
     parts += [Section("Faults by kind", _KINDS_TEXT), kinds] if kinds.rows else []
+    if summary.worst:
+        parts += [Section("Worst runs", _WORST_TEXT), worst_table(summary.worst)]
     return build(summary.name, _status_line(summary), parts)
+
+
+def worst_table(worst: Sequence[WorstRun]) -> Table:
+    """A row per run that did not end well or has the largest errors, and how to make it again."""
+    rows = tuple(
+        (run.id, str(run.cell), str(run.repeat), "" if run.seed is None else str(run.seed), run.status, run.reason)
+        for run in worst
+    )
+    return Table("Worst runs", ("run", "combination", "repeat", "seed", "status", "reason"), rows)
 
 
 def words(values: Mapping[str, Any]) -> str:
@@ -85,11 +99,12 @@ def cell_table(number: int, cell: Cell) -> Table:
     for name, found in cell.metrics.items():
         if found is not None:
             points = (f"{v:.4g}" for v in (found.q05, found.median, found.q95))
-            interval = f"{found.median_low:.4g} to {found.median_high:.4g}"
-            rows.append((HEADLINES[name], str(found.count), *points, interval))
+            rows.append(
+                (HEADLINES[name], str(found.count), *points, _interval(found.median_low, found.median_high, ".4g"))
+            )
     for name, share in cell.rates.items():
         if share is not None:
-            span = f"{share.low:.1%} to {share.high:.1%}"
+            span = _interval(share.low, share.high, ".1%")
             rows.append((name, f"{share.successes}/{share.count}", "", f"{share.share:.1%}", "", span))
     if cell.nees is not None:
         nees, band = cell.nees, f"1 expected; {cell.nees.low:.3f} to {cell.nees.high:.3f}"
@@ -115,7 +130,15 @@ def detector_table(detector: Detector) -> Table:
 
 
 def _share(share: Rate | None) -> str:
-    return "" if share is None else f"{share.share:.1%} ({share.low:.1%} to {share.high:.1%})"
+    if share is None:
+        return ""
+    span = _interval(share.low, share.high, ".1%")
+    return f"{share.share:.1%} ({span})" if span else f"{share.share:.1%}"
+
+
+def _interval(low: float | None, high: float | None, style: str) -> str:
+    """An interval in words, "" where there are too few runs for one."""
+    return "" if low is None or high is None else f"{low:{style}} to {high:{style}}"
 
 
 def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Markup | None:
@@ -124,7 +147,7 @@ def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Marku
     if not known:
         return None
     low = min(0.0, *(q.q05 for _, q in known)) if len(known) > 1 else min(0.0, known[0][1].q05)
-    high = max(max(q.q95, q.median_high) for _, q in known)
+    high = max(max(q.q95, q.median_high or q.q95) for _, q in known)
     scale = (_WIDTH - _LEFT - 20) / (high - low or 1.0)
 
     def x(value: float) -> str:
@@ -135,7 +158,11 @@ def _spans(title: str, entries: Sequence[tuple[int, Quantiles | None]]) -> Marku
             "label": number,
             "title": f"{number}: median {q.median:.4g}, 5 % {q.q05:.4g}, 95 % {q.q95:.4g}, {q.count} runs",
             "y": _ROW * (k + 2),
-            "x": {name: x(getattr(q, name)) for name in ("q05", "q95", "median_low", "median_high", "median")},
+            "x": {
+                **{name: x(getattr(q, name)) for name in ("q05", "q95", "median")},
+                "median_low": x(q.median if q.median_low is None else q.median_low),
+                "median_high": x(q.median if q.median_high is None else q.median_high),
+            },
         }
         for k, (number, q) in enumerate(known)
     ]
@@ -194,7 +221,7 @@ def _kind_rows(cells: Sequence[tuple[int, Cell]]) -> Iterator[tuple[str, ...]]:
                 yield _kind_row(name, number, cell.kinds[name])
 
 
-def _kind_row(name: str, number: int, kind: KindOfFault) -> tuple[str, ...]:
+def _kind_row(name: str, number: int, kind: FaultKind) -> tuple[str, ...]:
     harmless = name != NONE and not kind.harmful
     return (
         f"{name} ~" if harmless else name,

@@ -1,128 +1,109 @@
-"""A campaign's result files: one row a run, one row a scan, and the summary. Made from the journal, in plan order.
+"""The result files of a campaign, made from its journal in the order of the plan.
 
-No clock, host, path or order of completion reaches them: 1 worker or 8, taken up again or not, the same bytes.
+No clock, host, path or order of completion reaches them: any number of workers, interrupted or not, gives the same
+bytes. Runs are read one by one, so that the memory needed hardly depends on their number.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
-from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from avsreplay import __version__
-from avsreplay.errors import MissingBackend
+from avsreplay.report.atomic import atomic_text
+from avsreplay.sweep.expansion import Expansion, Point
 from avsreplay.sweep.journal import Journal
 from avsreplay.sweep.page import build_sweep_page
-from avsreplay.sweep.plan import Plan, Point
-from avsreplay.sweep.summary import SweepSummary, summarise
-from avsreplay.sweep.worker import SCAN_COLUMNS, Outcome
+from avsreplay.sweep.parquet import arrow, scan_schema, write_batches
+from avsreplay.sweep.summary import CampaignFold, DetectorFold, SweepSummary
+from avsreplay.sweep.worker import RunResult
 
-__all__ = ["arrow", "write_results"]
+BATCH = 5_000  # runs held in memory while results.parquet is written
+SCAN_BATCH = 200_000  # scans held in memory while scans.parquet is written
+_FIXED = ("index", "cell", "repeat", "seed", "id", "status", "error")
 
-SCAN_BATCH = 200_000
 
+def write_results(plan: Expansion, journal: Journal, folder: Path) -> SweepSummary:
+    """Write ``results.parquet``, ``scans.parquet`` (where scans are kept), ``summary.json`` and ``report.html``.
 
-def write_results(plan: Plan, journal: Journal, folder: Path) -> SweepSummary:
-    """Write ``results.parquet``, ``scans.parquet`` (where kept), ``summary.json`` and ``report.html`` into ``folder``.
-
-    Raises MissingBackend where pyarrow is not installed.
+    Raises:
+        MissingBackend: pyarrow is not installed.
+        UnreadableInput: A file cannot be read or written.
     """
     arrow()
-    by_id = {outcome.id: _without_scans(outcome) for outcome in journal.outcomes()}
-    done = [(point, by_id[point.task.id]) for point in plan.points() if point.task.id in by_id]
-    _write(_run_table(done), folder / "results.parquet")
+    fold, kinds, ids = CampaignFold(plan), dict[str, set[str]](), set[str]()
+    for point, result in _finished(plan, journal):
+        fold.add(point, result)
+        ids.add(result.id)
+        for name, value in _values(point, result).items():
+            kinds.setdefault(name, set()).add(_kind(value))
+    _write_runs(plan, journal, kinds, folder / "results.parquet")
+    detector = None
     if plan.loaded.campaign.scans:
-        _write_scans(done, journal, folder / "scans.parquet")
-    summary = summarise(plan, done, journal.outcomes())
+        detector = DetectorFold()
+        write_batches(folder / "scans.parquet", scan_schema(), _scan_batches(sorted(ids), journal, detector))
+    summary = fold.result(detector.result() if detector else None)
     text = json.dumps({"version": __version__, **summary.document()}, indent=1, allow_nan=False)
-    _replace(folder / "summary.json", text.encode() + b"\n")
-    _replace(folder / "report.html", build_sweep_page(summary).encode())
+    for name, content in (("summary.json", text + "\n"), ("report.html", build_sweep_page(summary))):
+        with atomic_text(folder / name) as stream:
+            stream.write(content)
     return summary
 
 
-def arrow() -> tuple[Any, Any]:
-    """The modules pyarrow and its Parquet part, which ship no types. Raises MissingBackend without them."""
-    try:
-        return importlib.import_module("pyarrow"), importlib.import_module("pyarrow.parquet")
-    except ImportError:
-        hint = "pip install 'avsreplay[sweep]'"
-        raise MissingBackend("pyarrow is not installed", where="sweep", hint=hint) from None
+def _finished(plan: Expansion, journal: Journal) -> Iterator[tuple[Point, RunResult]]:
+    return ((point, journal.result(point.task.id)) for point in plan.points() if point.task.id in journal)
 
 
-def _without_scans(outcome: Outcome) -> Outcome:
-    return replace(outcome, scans=())
+def _values(point: Point, result: RunResult) -> dict[str, Any]:
+    """The columns of a run that depend on the campaign: what was set, and its metrics."""
+    return {**{f"set:{key}": value for key, value in point.values.items()}, **(result.metrics or {})}
 
 
-def _run_table(done: Sequence[tuple[Point, Outcome]]) -> Any:
+def _kind(value: Any) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "bool"
+    return "number" if isinstance(value, (int, float)) else "text" if isinstance(value, str) else "mixed"
+
+
+def _write_runs(plan: Expansion, journal: Journal, kinds: Mapping[str, set[str]], path: Path) -> None:
+    """One row per run; a column is of truth values, float64 or text, anything mixed or nested as JSON text."""
     pa, _ = arrow()
+    types = {"bool": pa.bool_(), "number": pa.float64(), "text": pa.string()}
+    columns = [*sorted(name for name in kinds if name.startswith("set:"))]
+    columns += sorted(name for name in kinds if not name.startswith("set:"))
+    only = {name: "".join(kinds[name] - {"none"}) for name in columns}
+    integers = {"index", "cell", "repeat", "seed"}
+    fixed = [(name, pa.int64() if name in integers else pa.string()) for name in _FIXED]
+    schema = pa.schema([*fixed, *((name, types.get(only[name] or "number", pa.string())) for name in columns)])
 
-    keys = sorted({key for point, _ in done for key in point.values})
-    names = sorted({name for _, outcome in done for name in (outcome.metrics or {})})
-    columns: dict[str, Any] = {
-        "index": pa.array([p.index for p, _ in done], pa.int64()),
-        "cell": pa.array([p.cell for p, _ in done], pa.int64()),
-        "repeat": pa.array([p.repeat for p, _ in done], pa.int64()),
-        "id": pa.array([o.id for _, o in done], pa.string()),
-        "status": pa.array([o.status for _, o in done], pa.string()),
-        "error": pa.array([o.error for _, o in done], pa.string()),
-    }
-    columns |= {f"set:{key}": _column([p.values.get(key) for p, _ in done]) for key in keys}
-    columns |= {name: _column([(o.metrics or {}).get(name) for _, o in done]) for name in names}
-    return pa.table(columns)
+    def row(point: Point, result: RunResult) -> tuple[Any, ...]:
+        found = _values(point, result)
+        place = (point.index, point.cell, point.repeat, point.seed, result.id, result.status, result.error)
+        return (*place, *(_plain(found.get(name), only[name]) for name in columns))
 
-
-def _column(values: Sequence[Any]) -> Any:
-    """Truth values, numbers (float64) or words; anything mixed or nested as JSON text."""
-    pa, _ = arrow()
-
-    given = [v for v in values if v is not None]
-    if given and all(isinstance(v, bool) for v in given):
-        return pa.array(values, pa.bool_())
-    if all(isinstance(v, (int, float)) and not isinstance(v, bool) for v in given):
-        return pa.array([None if v is None else float(v) for v in values], pa.float64())
-    if all(isinstance(v, str) for v in given):
-        return pa.array(values, pa.string())
-    return pa.array([None if v is None else json.dumps(v) for v in values], pa.string())
+    runs = (row(*found) for found in _finished(plan, journal))
+    write_batches(path, schema, iter(lambda: list(islice(runs, BATCH)), []))
 
 
-def _write_scans(done: Sequence[tuple[Point, Outcome]], journal: Journal, path: Path) -> None:
-    """Scans in the order of the runs' names, one batch in memory."""
-    pa, pq = arrow()
-
-    types = {"seq": pa.int64(), "fault": pa.string(), "harmful": pa.bool_(), "gamma": pa.int64()}
-    schema = pa.schema([("id", pa.string()), *((name, types.get(name, pa.float64())) for name in SCAN_COLUMNS)])
-    partial = path.with_name(path.name + ".partial")
-    with pq.ParquetWriter(partial, schema, compression="zstd") as writer:
-        for outcomes in _batches({o.id for _, o in done}, journal):
-            rows = [(o.id, *line) for o in outcomes for line in o.scans]
-            columns = zip(*rows, strict=True) if rows else ([] for _ in schema)
-            writer.write_table(pa.table([pa.array(c, f.type) for c, f in zip(columns, schema, strict=True)], schema))
-    partial.replace(path)
+def _plain(value: Any, kind: str) -> Any:
+    if value is None or kind in ("bool", "text"):
+        return value
+    return float(value) if kind == "number" else json.dumps(value)
 
 
-def _batches(wanted: set[str], journal: Journal) -> Iterator[list[Outcome]]:
-    batch: list[Outcome] = []
-    for run_id in sorted(wanted):
-        batch.append(journal.outcome(run_id))
-        if sum(len(outcome.scans) for outcome in batch) >= SCAN_BATCH:
+def _scan_batches(ids: list[str], journal: Journal, detector: DetectorFold) -> Iterator[list[tuple[Any, ...]]]:
+    """The scans in the order of the runs' ids; each run counts once for the fault tests."""
+    batch: list[tuple[Any, ...]] = []
+    for run_id in ids:
+        scans = journal.scans(run_id)
+        detector.add(scans)
+        batch += [(run_id, *line) for line in scans]
+        if len(batch) >= SCAN_BATCH:
             yield batch
             batch = []
-    if batch:
-        yield batch
-
-
-def _write(table: Any, path: Path) -> None:
-    _, pq = arrow()
-
-    partial = path.with_name(path.name + ".partial")
-    pq.write_table(table, partial, compression="zstd")
-    partial.replace(path)
-
-
-def _replace(path: Path, data: bytes) -> None:
-    partial = path.with_name(path.name + ".partial")
-    partial.write_bytes(data)
-    partial.replace(path)
+    yield batch

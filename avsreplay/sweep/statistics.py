@@ -1,60 +1,50 @@
-"""What many runs say: quantiles, success rates with their intervals, consistency, and the detector's curves."""
+"""Statistics over many runs: quantiles, success rates, consistency, and ROC curves of the fault tests."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = [
-    "Consistency",
-    "Quantiles",
-    "Rate",
-    "Roc",
-    "ScoreHistogram",
-    "Typical",
-    "consistency",
-    "quantiles",
-    "rate",
-    "typical",
-]
-
-Z95 = 1.959963984540054  # two-sided 95 % point of the normal distribution
+LEVEL = 0.95  # of every interval
 
 
 @dataclass(frozen=True, slots=True)
 class Quantiles:
-    """Of the runs that have the metric: 5 %, 50 % and 95 % points, and a 95 % interval of the median."""
+    """5 %, 50 % and 95 % quantiles over the runs that have the metric, and a 95 % interval of the median.
+
+    The interval is None where there are too few runs for one with this coverage (fewer than 6).
+    """
 
     count: int
     q05: float
     median: float
     q95: float
-    median_low: float
-    median_high: float
+    median_low: float | None
+    median_high: float | None
 
 
 def quantiles(values: Sequence[float]) -> Quantiles | None:
-    """Quantiles by linear interpolation; the median's interval by order statistics (binomial, normal ranks).
-
-    None where there is no value.
-    """
+    """Quantiles by linear interpolation, the interval of the median by order statistics; None without a value."""
     if not len(values):
         return None
+    from scipy.stats import quantile_test
+
     ordered = np.sort(np.asarray(values, dtype=np.float64))
-    n = len(ordered)
-    reach = 0.5 * Z95 * math.sqrt(n)
-    low, high = math.floor(0.5 * n - reach), math.ceil(0.5 * n + reach)
     q05, median, q95 = (float(np.quantile(ordered, q)) for q in (0.05, 0.5, 0.95))
-    return Quantiles(n, q05, median, q95, float(ordered[max(low, 0)]), float(ordered[min(high, n - 1)]))
+    interval: Any = quantile_test(ordered, p=0.5).confidence_interval(confidence_level=LEVEL)
+    low, high = (float(b) if math.isfinite(b) else None for b in (interval.low, interval.high))
+    whole = low is not None and high is not None
+    return Quantiles(len(values), q05, median, q95, low if whole else None, high if whole else None)
 
 
 @dataclass(frozen=True, slots=True)
 class Typical:
-    """Of the windows that have the figure: how many, the median and the largest."""
+    """Number, median and largest of the values that exist."""
 
     count: int
     median: float
@@ -62,38 +52,36 @@ class Typical:
 
 
 def typical(values: Sequence[float]) -> Typical | None:
-    """Median (the mean of the middle two of an even count) and worst. None where there is no value."""
-    if not len(values):
-        return None
-    return Typical(len(values), float(np.median(values)), float(max(values)))
+    """Median and largest value; None without a value."""
+    return Typical(len(values), float(np.median(values)), float(max(values))) if len(values) else None
 
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """A share with its 95 % interval."""
+    """A share and its 95 % interval, which is None for a single run."""
 
     successes: int
     count: int
     share: float
-    low: float
-    high: float
+    low: float | None
+    high: float | None
 
 
 def rate(successes: int, count: int) -> Rate | None:
-    """Wilson's score interval: right for few runs and for shares of 0 and 1. None for no run."""
+    """The share of successes with Wilson's score interval; None for no run."""
     if count == 0:
         return None
-    share, z2 = successes / count, Z95 * Z95
-    centre = (share + z2 / (2 * count)) / (1 + z2 / count)
-    half = Z95 / (1 + z2 / count) * math.sqrt(share * (1 - share) / count + z2 / (4 * count * count))
-    low = 0.0 if successes == 0 else max(0.0, centre - half)
-    high = 1.0 if successes == count else min(1.0, centre + half)
-    return Rate(successes, count, share, low, high)
+    if count == 1:
+        return Rate(successes, 1, float(successes), None, None)
+    from scipy.stats import binomtest
+
+    interval = binomtest(successes, count).proportion_ci(LEVEL, method="wilson")
+    return Rate(successes, count, successes / count, float(interval.low), float(interval.high))
 
 
 @dataclass(frozen=True, slots=True)
-class Consistency:
-    """Mean normalised error squared per degree of freedom over independent runs, and the 95 % band of a right one."""
+class RunConsistency:
+    """Mean NEES per state over independent runs, and the 95 % band of a consistent estimator."""
 
     count: int
     mean_per_dof: float
@@ -102,24 +90,27 @@ class Consistency:
     median_per_dof: float
 
 
-def consistency(nees: Sequence[float], dof: int) -> Consistency | None:
-    """From one NEES a run. None without any."""
+def consistency(nees: Sequence[float], dof: int) -> RunConsistency | None:
+    """The consistency of one NEES of ``dof`` states per run; None without a value."""
     if not len(nees):
         return None
     from scipy.stats import chi2
 
     n = len(nees)
-    low, high = (float(chi2.ppf(share, dof * n)) / (dof * n) for share in (0.025, 0.975))
-    return Consistency(n, math.fsum(nees) / (dof * n), low, high, float(np.median(nees)) / dof)
+    low, high = (float(bound) / (dof * n) for bound in chi2.interval(LEVEL, dof * n))
+    return RunConsistency(n, math.fsum(nees) / (dof * n), low, high, float(np.median(nees)) / dof)
 
 
 @dataclass(frozen=True, slots=True)
 class Roc:
-    """A curve of one score as the only test.
+    """The receiver operating characteristic of one score as the only fault test.
 
     Attributes:
-        thresholds, detected, false: at each threshold, shares of the harmful and of the other scans flagged by it.
-        area: under the curve.  at_one_percent: threshold and detected share where at most 1 % is falsely flagged.
+        thresholds: Thresholds from strict to lenient.
+        detected: Share of the harmful scans that each flags.
+        false: Share of the other scans that each flags.
+        area: Area under the curve.
+        at_one_percent: Threshold at which at most 1 % of the other scans are flagged, and the share it detects.
     """
 
     thresholds: tuple[float, ...]
@@ -130,10 +121,10 @@ class Roc:
 
 
 class ScoreHistogram:
-    """Scores of harmful and of other scans in fixed bins, so that any number of scans takes the same room.
+    """Histogram of the scores of harmful and of other scans; its size does not depend on the number of scans.
 
-    Bins are even in the logarithm of the score, 100 a decade from 1e-9 to 1e6: thresholds are known to 2.4 %. A scan
-    without a score (nothing measured) counts as flagged at every threshold.
+    Bins are uniform in the logarithm of the score, 100 per decade from 1e-9 to 1e6, so that thresholds are known to
+    2.4 %. A scan without a score (nothing measured) counts as flagged at every threshold.
     """
 
     EDGES: NDArray[np.float64] = np.logspace(-9.0, 6.0, 1501)
@@ -142,7 +133,7 @@ class ScoreHistogram:
         self._counts = np.zeros((2, len(self.EDGES) + 1), dtype=np.int64)
 
     def add(self, score: float | None, harmful: bool) -> None:
-        """One scan; a larger score is a worse one."""
+        """Count one scan; a larger score is worse."""
         place = (
             len(self.EDGES) if score is None or math.isnan(score) else int(np.searchsorted(self.EDGES, score, "right"))
         )
@@ -150,12 +141,12 @@ class ScoreHistogram:
 
     @property
     def totals(self) -> tuple[int, int]:
-        """Other scans, harmful scans."""
+        """Number of other and of harmful scans."""
         other, harmful = self._counts.sum(axis=1)
         return int(other), int(harmful)
 
     def roc(self) -> Roc | None:
-        """The curve over thresholds at which something changes, lenient to strict. None where one kind is missing."""
+        """The curve over the thresholds at which it changes; None without harmful or without other scans."""
         other, harmful = self.totals
         if not other or not harmful:
             return None

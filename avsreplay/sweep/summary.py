@@ -1,7 +1,8 @@
-"""A campaign in a few tables: a line a combination, and the detector's curves over all scans."""
+"""The summary of a campaign: one entry per combination, the fault tests over all scans, and the worst runs."""
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -9,22 +10,20 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from avsreplay import settings
-from avsreplay.sweep.campaign import Criterion
-from avsreplay.sweep.kinds import KindOfFault, kinds_of_fault
-from avsreplay.sweep.plan import Plan, Point
+from avsreplay.sweep.campaign import SuccessCriterion
+from avsreplay.sweep.expansion import Expansion, Point
+from avsreplay.sweep.fault_kinds import FaultKind, FaultKinds
 from avsreplay.sweep.statistics import (
-    Consistency,
     Quantiles,
     Rate,
     Roc,
+    RunConsistency,
     ScoreHistogram,
     consistency,
     quantiles,
     rate,
 )
-from avsreplay.sweep.worker import SCAN_COLUMNS, Outcome
-
-__all__ = ["HEADLINES", "Cell", "Detector", "SweepSummary", "summarise"]
+from avsreplay.sweep.worker import SCAN_COLUMNS, RunResult
 
 HEADLINES = {
     "pose_healthy.position_m.rmse": "position error, healthy scans [m]",
@@ -36,13 +35,16 @@ HEADLINES = {
     "faults.false_alarms": "false alarms",
 }
 CRITERIA = (
-    Criterion("converged", "convergence.t1_s"),
-    Criterion("capture planned", "capture.last_s"),
-    Criterion("no fault missed", "faults.missed", max=0),
-    Criterion("no false alarm", "faults.false_alarms", max=0),
+    SuccessCriterion("converged", "convergence.t1_s"),
+    SuccessCriterion("capture planned", "capture.last_s"),
+    SuccessCriterion("no fault missed", "faults.missed", max=0),
+    SuccessCriterion("no false alarm", "faults.false_alarms", max=0),
 )
 SCORES = {"rms_m": "rms_m", "alpha_m": "alpha_m", "outlier_ratio": "inlier_ratio", "nis": "nis"}  # score: its column
 STATES = 20
+WORST = 5  # runs that are listed
+_ERRORS = {"pose_healthy.position_m.max": "healthy scan", "worst_coast.pos_err_m": "coasting"}
+_BAD = ("crashed", "failed", "lossy")  # worst status first
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +52,13 @@ class Cell:
     """One combination.
 
     Attributes:
-        values: what was set.  runs: done.  status: how many ended how.  metrics: HEADLINES' quantiles.
-        rates: of the runs done, by criterion.  nees: at the last scan of each run.
-        kinds: the fault rule by kind of fault, "none" for the scans outside every window.
+        values: What was set, by key.
+        runs: Number of finished runs.
+        status: Number of runs by status.
+        metrics: Quantiles of HEADLINES.
+        rates: Share of the finished runs that meet each criterion.
+        nees: NEES at the last scan of each run.
+        kinds: Fault detection by kind of fault; "none" for the scans outside every window.
     """
 
     values: Mapping[str, Any]
@@ -60,16 +66,20 @@ class Cell:
     status: Mapping[str, int]
     metrics: Mapping[str, Quantiles | None]
     rates: Mapping[str, Rate | None]
-    nees: Consistency | None
-    kinds: Mapping[str, KindOfFault] = field(default_factory=dict)
+    nees: RunConsistency | None
+    kinds: Mapping[str, FaultKind] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Detector:
-    """The fault rule over all scans of all runs.
+    """Fault detection over all scans of all runs.
 
     Attributes:
-        harmful, other: scans.  detected, false: shares flagged by the rule in force.  curves: each score by itself.
+        harmful: Number of harmful scans.
+        other: Number of other scans.
+        detected: Share of the harmful scans that were flagged.
+        false: Share of the other scans that were flagged.
+        curves: ROC curve of each score alone.
     """
 
     harmful: int
@@ -80,8 +90,20 @@ class Detector:
 
 
 @dataclass(frozen=True, slots=True)
+class WorstRun:
+    """A run to look at: its id, combination, repeat, seed, status, and the reason why it is listed."""
+
+    id: str
+    cell: int
+    repeat: int
+    seed: int | None
+    status: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
 class SweepSummary:
-    """The whole campaign: planned and done runs, how they ended, a Cell each combination, the detector."""
+    """A campaign: planned and finished runs, number of runs by status, combinations, fault tests, worst runs."""
 
     name: str
     planned: int
@@ -89,59 +111,93 @@ class SweepSummary:
     status: Mapping[str, int]
     cells: tuple[Cell, ...]
     detector: Detector | None
+    worst: tuple[WorstRun, ...] = ()
 
     def document(self) -> dict[str, Any]:
-        """Plain values for JSON; what is not finite is null."""
+        """Plain values for JSON; a number that is not finite is null."""
         plain: dict[str, Any] = _finite(settings.dump(self))
         return plain
 
 
-def summarise(plan: Plan, done: Sequence[tuple[Point, Outcome]], outcomes: Iterable[Outcome]) -> SweepSummary:
-    """Sum up what is ``done``; ``outcomes`` (any order) bring the scans."""
-    campaign = plan.loaded.campaign
-    criteria = (*CRITERIA, *campaign.success)
-    by_cell: dict[int, list[Outcome]] = {k: [] for k in range(len(plan.cells))}
-    for point, outcome in done:
-        by_cell[point.cell].append(outcome)
-    used = {outcome.id for _, outcome in done}
-    return SweepSummary(
-        name=campaign.name,
-        planned=len(plan),
-        done=len(done),
-        status=_status([outcome for _, outcome in done]),
-        cells=tuple(_cell(plan.cells[k], found, criteria) for k, found in by_cell.items()),
-        detector=_detector(o for o in outcomes if o.id in used) if campaign.scans else None,
-    )
+class CampaignFold:
+    """Adds up the runs of a campaign one by one; it keeps a few numbers per run."""
+
+    def __init__(self, plan: Expansion) -> None:
+        self._plan = plan
+        self._criteria = (*CRITERIA, *plan.loaded.campaign.success)
+        self._cells = [_CellFold() for _ in plan.cells]
+        self._worst: list[tuple[tuple[float, ...], WorstRun]] = []
+
+    def add(self, point: Point, result: RunResult) -> None:
+        """Add one finished run."""
+        self._cells[point.cell].add(result, self._criteria)
+        badness, reason = _badness(result)
+        run = WorstRun(result.id, point.cell, point.repeat, point.seed, result.status, reason)
+        if reason:
+            heapq.heappush(self._worst, ((*badness, -point.index), run))
+            if len(self._worst) > WORST:
+                heapq.heappop(self._worst)
+
+    def result(self, detector: Detector | None) -> SweepSummary:
+        """The summary of the runs added."""
+        status = sum((cell.status for cell in self._cells), Counter[str]())
+        return SweepSummary(
+            name=self._plan.loaded.campaign.name,
+            planned=len(self._plan),
+            done=status.total(),
+            status=dict(sorted(status.items())),
+            cells=tuple(c.result(v, self._criteria) for c, v in zip(self._cells, self._plan.cells, strict=True)),
+            detector=detector,
+            worst=tuple(run for _, run in sorted(self._worst, reverse=True, key=lambda entry: entry[0])),
+        )
 
 
-def _cell(values: Mapping[str, Any], found: Sequence[Outcome], criteria: Sequence[Criterion]) -> Cell:
-    return Cell(
-        values=values,
-        runs=len(found),
-        status=_status(found),
-        metrics={name: quantiles(_numbers(found, name)) for name in HEADLINES},
-        rates={c.name: rate(sum(_meets(c, o) for o in found), len(found)) for c in criteria},
-        nees=consistency(_numbers(found, "end.nees"), STATES),
-        kinds=kinds_of_fault((line for o in found for line in o.episodes), [o.metrics for o in found if o.metrics]),
-    )
+class _CellFold:
+    def __init__(self) -> None:
+        self.status: Counter[str] = Counter()
+        self._numbers: dict[str, list[float]] = {name: [] for name in (*HEADLINES, "end.nees")}
+        self._met: Counter[str] = Counter()
+        self._kinds = FaultKinds()
+
+    def add(self, result: RunResult, criteria: Sequence[SuccessCriterion]) -> None:
+        self.status[result.status] += 1
+        metrics = result.metrics or {}
+        for name, values in self._numbers.items():
+            value = metrics.get(name)
+            values += [float(value)] if value is not None and math.isfinite(value) else []
+        self._met.update(c.name for c in criteria if _meets(c, metrics))
+        self._kinds.add(result.episodes, metrics)
+
+    def result(self, values: Mapping[str, Any], criteria: Sequence[SuccessCriterion]) -> Cell:
+        runs = self.status.total()
+        return Cell(
+            values=values,
+            runs=runs,
+            status=dict(sorted(self.status.items())),
+            metrics={name: quantiles(self._numbers[name]) for name in HEADLINES},
+            rates={c.name: rate(self._met[c.name], runs) for c in criteria},
+            nees=consistency(self._numbers["end.nees"], STATES),
+            kinds=self._kinds.result(),
+        )
 
 
-def _status(found: Sequence[Outcome]) -> dict[str, int]:
-    return dict(sorted(Counter(outcome.status for outcome in found).items()))
-
-
-def _numbers(found: Sequence[Outcome], name: str) -> list[float]:
-    values = ((outcome.metrics or {}).get(name) for outcome in found)
-    return [float(v) for v in values if v is not None and math.isfinite(v)]
-
-
-def _meets(criterion: Criterion, outcome: Outcome) -> bool:
-    value = (outcome.metrics or {}).get(criterion.metric)
+def _meets(criterion: SuccessCriterion, metrics: Mapping[str, Any]) -> bool:
+    value = metrics.get(criterion.metric)
     return isinstance(value, (int, float)) and criterion.min <= value <= criterion.max
 
 
-class _DetectorFold:
-    """Counts over scans, in any order."""
+def _badness(result: RunResult) -> tuple[tuple[float, float], str]:
+    """Sort key, larger for a worse run, and the reason in words."""
+    metrics = result.metrics or {}
+    known = [(metrics[name], what) for name, what in _ERRORS.items() if metrics.get(name) is not None]
+    error, what = max(known, default=(0.0, ""))
+    rank = len(_BAD) - _BAD.index(result.status) if result.status in _BAD else 0
+    reason = result.error or (f"position error {error:.4g} m ({what})" if what else "")
+    return (float(rank), error), reason
+
+
+class DetectorFold:
+    """Adds up the scans of all runs, in any order."""
 
     PLACE: ClassVar[dict[str, int]] = {name: place for place, name in enumerate(SCAN_COLUMNS)}
 
@@ -149,13 +205,16 @@ class _DetectorFold:
         self._curves = {name: ScoreHistogram() for name in SCORES}
         self._flagged: Counter[tuple[bool, bool]] = Counter()
 
-    def add(self, line: Sequence[Any]) -> None:
-        harmful, flagged = bool(line[self.PLACE["harmful"]]), line[self.PLACE["gamma"]] == 0
-        self._flagged[harmful, flagged] += 1
-        for name, column in SCORES.items():
-            self._curves[name].add(_score(name, line[self.PLACE[column]]), harmful)
+    def add(self, scans: Iterable[Sequence[Any]]) -> None:
+        """Add the scans of one run, in the order of SCAN_COLUMNS."""
+        for line in scans:
+            harmful, flagged = bool(line[self.PLACE["harmful"]]), line[self.PLACE["gamma"]] == 0
+            self._flagged[harmful, flagged] += 1
+            for name, column in SCORES.items():
+                self._curves[name].add(_score(name, line[self.PLACE[column]]), harmful)
 
     def result(self) -> Detector:
+        """Fault detection over the scans added."""
         counts = {kind: self._flagged[kind, True] + self._flagged[kind, False] for kind in (True, False)}
         return Detector(
             harmful=counts[True],
@@ -166,17 +225,8 @@ class _DetectorFold:
         )
 
 
-def _detector(outcomes: Iterable[Outcome]) -> Detector:
-    """The fault rule over all scans; a run that stands twice in the plan counts once."""
-    fold = _DetectorFold()
-    for outcome in outcomes:
-        for line in outcome.scans:
-            fold.add(line)
-    return fold.result()
-
-
 def _score(name: str, value: float | None) -> float | None:
-    """Larger is worse: the share of inliers counts by what it lacks to 1."""
+    """The score of a test, larger for a worse scan: the share of inliers is replaced by that of outliers."""
     return 1.0 - value if value is not None and name == "outlier_ratio" else value
 
 

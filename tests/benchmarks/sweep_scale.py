@@ -26,7 +26,7 @@ from sweep_speed import CAMPAIGN
 
 from avsreplay.sweep import Journal, expand, load_campaign
 from avsreplay.sweep.execute import IN_FLIGHT
-from avsreplay.sweep.worker import Outcome, run_task
+from avsreplay.sweep.worker import RunResult, run_task
 
 SCANS = 600
 
@@ -64,12 +64,12 @@ def client_cost() -> tuple[float, int, int]:
         (folder / "c.toml").write_text(CAMPAIGN.format(runs=1))
         like = run_task(next(expand(load_campaign(folder / "c.toml")).points()).task)
         many = json.loads(json.dumps(like.scans * (SCANS // len(like.scans))))  # no number shared, as in a true run
-        data = pickle.dumps(Outcome(like.id, like.status, None, like.metrics, tuple(tuple(scan) for scan in many)))
-        with Journal(folder / "journal.txt") as journal:
+        data = pickle.dumps(RunResult(like.id, like.status, None, like.metrics, tuple(tuple(scan) for scan in many)))
+        with Journal(folder) as journal:
             start = time.process_time()
             for k in range(200):
                 outcome = pickle.loads(data)
-                journal.add(Outcome(f"{k:024x}", outcome.status, outcome.error, outcome.metrics, outcome.scans))
+                journal.add(RunResult(f"{k:024x}", outcome.status, outcome.error, outcome.metrics, outcome.scans))
             took = (time.process_time() - start) / 200
         return took, (folder / "journal.txt").stat().st_size // 200, len(data)
 
@@ -159,7 +159,7 @@ class State:
         self.scheduler.transitions({task.key: "waiting"}, "submit")
 
     def finish(self, address: str, key: str, start: float, stop: float) -> None:
-        done = {"nbytes": 46_000, "type": b"", "typename": "Outcome", "worker": address}
+        done = {"nbytes": 46_000, "type": b"", "typename": "RunResult", "worker": address}
         spans = [{"action": "compute", "start": start, "stop": stop}]
         next_, _, messages = self.scheduler._transition(key, "memory", "finish", startstops=spans, **done)
         self._keep(messages)

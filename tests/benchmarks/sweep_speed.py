@@ -14,8 +14,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from avsreplay.sweep import Journal, execute, expand, load_campaign, write_results
-from avsreplay.sweep.worker import Outcome, run_task
+from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
+from avsreplay.sweep.worker import RunResult, run_task
 
 CAMPAIGN = """
 name = "speed"
@@ -60,7 +60,7 @@ def _waiting(seconds: float, plan):
 
     def act(task):
         time.sleep(seconds)
-        return Outcome(task.id, like.status, like.error, like.metrics, like.scans)
+        return RunResult(task.id, like.status, like.error, like.metrics, like.scans)
 
     return act
 
@@ -78,8 +78,8 @@ def _swept(plan, workers: int, folder: Path) -> tuple[float, float, float]:
     """Seconds to the first outcome, from it to the last, and for the result files."""
     start = time.perf_counter()
     first = 0.0
-    with Journal(folder / "journal.txt") as journal:
-        for outcome in execute((p.task for p in plan.points()), workers):
+    with Journal(folder) as journal:
+        for outcome in run_tasks((p.task for p in plan.points()), workers):
             first = first or time.perf_counter()
             journal.add(outcome)
         last = time.perf_counter()

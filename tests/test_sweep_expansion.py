@@ -1,23 +1,16 @@
-"""Campaign files, their unrolling, TOML text, the journal and the statistics: no run is made here."""
+"""Campaign files and the runs that they stand for; no run is made here."""
 
-import json
-import math
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 from scipy import stats
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.simulate import load_scenario
-from avsreplay.sweep import Journal, expand, load_campaign
-from avsreplay.sweep.statistics import ScoreHistogram, consistency, quantiles, rate
-from avsreplay.sweep.toml_text import toml_text, toml_value
-from avsreplay.sweep.worker import Outcome
+from avsreplay.sweep import expand, load_campaign
 
 BASE = """
 name = "test"
@@ -51,6 +44,7 @@ def test_a_grid_is_every_combination_and_every_repeat(tmp_path):
     assert [p.index for p in points] == list(range(12))
     assert {(p.cell, p.repeat) for p in points} == {(c, r) for c in range(4) for r in range(3)}
     assert len({p.task.id for p in points}) == 12
+    assert [p.seed for p in points] == [table["seed"] for table in tables(plan)]
     assert {p.task.assignments for p in points} == {('faults.policy="any"',), ('faults.policy="all"',)}
     for point, table in zip(points, tables(plan), strict=True):
         assert table["scanner"]["noise_m"] == point.values["scenario.scanner.noise_m"]
@@ -166,12 +160,12 @@ def test_logs_are_an_axis(tmp_path):
         ('[[grid]]\nkey = "run.faults.polcy"\nvalues = ["any"]\n', "policy"),
         ('[[grid]]\nkey = "faults.policy"\nvalues = ["any"]\n', "must begin with"),
         ('[[grid]]\nkey = "scenario.seed"\nvalues = []\n', "not empty"),
-        ('[set]\n"scenario.fault.9.start_s" = 1.0\n', "does not lead to a place"),
-        ('[set]\n"scenario.name.x" = 1.0\n', "does not lead to a place"),
+        ('[set]\n"scenario.fault.9.start_s" = 1.0\n', "names no setting"),
+        ('[set]\n"scenario.name.x" = 1.0\n', "names no setting"),
         ("repeats = 0\n", "repeats"),
         ("repets = 1\n", "repeats"),
         ('logs = ["none.mcap"]\n', "No such file"),
-        ('logs = ["x"]\n[set]\n"scenario.seed" = 1\n', "no place where logs"),
+        ('logs = ["x"]\n[set]\n"scenario.seed" = 1\n', "cannot be set where logs"),
         ('[[draw]]\nkey = "scenario.seed"\nkind = "choice"\n', "needs values"),
         ('[[grid]]\nkey = "run.init"\nvalues = ["log"]\n[[draw]]\nkey = "run.init"\nkind = "attitude"\n', "twice"),
     ],
@@ -183,157 +177,7 @@ def test_wrong_campaigns_are_one_line(tmp_path, text, words):
     assert str(caught.value).count(":") >= 1
 
 
-plain = st.recursive(
-    st.booleans()
-    | st.integers(-(2**62), 2**62)
-    | st.floats(allow_nan=False)
-    | st.text(st.characters(exclude_categories=["Cs"])),
-    lambda inner: (
-        st.lists(inner, max_size=4)
-        | st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])), inner, max_size=4)
-    ),
-    max_leaves=12,
-)
-
-
-@given(st.dictionaries(st.text(st.characters(exclude_categories=["Cs"])), plain, max_size=5))
-def test_toml_text_reads_back(table):
-    assert tomllib.loads(toml_text(table)) == table
-
-
-def test_toml_refuses_what_it_cannot_say():
-    with pytest.raises(ValueError, match="object"):
-        toml_value(object())
-
-
-def outcome(k, status="ok"):
-    return Outcome(
-        f"{k:024x}", status, None, {"a.b_m": 0.1 * k, "none": None, "nan": math.inf}, ((0, None, True, 1, 0.5),)
-    )
-
-
-def test_the_journal_remembers(tmp_path):
-    with Journal(tmp_path / "d" / "journal.txt") as journal:
-        for k in (3, 1, 2, 1):
-            journal.add(outcome(k))
-    again = Journal(tmp_path / "d" / "journal.txt")
-    assert [o.id[-1] for o in again.outcomes()] == ["3", "1", "2"]
-    assert again.outcome(outcome(2).id) == outcome(2)
-    assert outcome(1).id in again
-
-
-def test_a_torn_line_is_cut_off_wherever_it_is_torn(tmp_path):
-    path = tmp_path / "journal.txt"
-    with Journal(path) as journal:
-        for k in range(3):
-            journal.add(outcome(k))
-    whole = path.read_bytes()
-    lines = whole.splitlines(keepends=True)
-    second_end = len(lines[0]) + len(lines[1])
-    for cut in range(second_end, len(whole)):
-        path.write_bytes(whole[:cut])
-        with Journal(path) as journal:
-            assert len(journal.status) == 2
-            journal.add(outcome(2))
-        assert path.read_bytes() == whole
-
-
-def test_a_damaged_line_ends_what_is_trusted(tmp_path):
-    path = tmp_path / "journal.txt"
-    with Journal(path) as journal:
-        for k in range(3):
-            journal.add(outcome(k))
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
-    path.write_bytes(bytes(data))
-    assert list(Journal(path).status) == [outcome(0).id]
-
-
-def test_failed_runs_can_be_forgotten(tmp_path):
-    with Journal(tmp_path / "journal.txt") as journal:
-        journal.add(outcome(1))
-        journal.add(outcome(2, "failed"))
-        journal.add(outcome(3))
-    journal = Journal(tmp_path / "journal.txt")
-    journal.forget(("failed",))
-    assert [o.id[-1] for o in journal.outcomes()] == ["1", "3"]
-    assert len(Journal(tmp_path / "journal.txt").status) == 2
-
-
-def test_a_journal_that_cannot_be_written_is_one_line(tmp_path):
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(UnreadableInput), Journal(tmp_path / "file" / "journal.txt"):
-        pass
-
-
-def test_wilson_intervals_cover_as_they_promise():
-    """Exact coverage over all outcomes of 50 runs at several true shares: near 95 % on average, never far below."""
-    covered = []
-    for p in (0.02, 0.1, 0.5, 0.9, 0.98):
-        inside = [rate(k, 50).low <= p <= rate(k, 50).high for k in range(51)]
-        covered.append(np.sum(stats.binom(50, p).pmf(np.arange(51)) * inside))
-    assert min(covered) > 0.9
-    assert 0.93 < np.mean(covered) < 0.98
-    assert rate(0, 0) is None
-    assert (rate(0, 3).low, rate(3, 3).high) == (0.0, 1.0)
-    assert_allclose([rate(3, 3).low], [3 / (3 + 1.959963984540054**2)], rtol=1e-12)
-
-
-def test_quantiles_and_the_median_interval():
-    rng = np.random.Generator(np.random.PCG64(1))
-    found = quantiles(list(range(101)))
-    assert (found.q05, found.median, found.q95) == (5.0, 50.0, 95.0)
-    covered = 0
-    for _ in range(400):
-        q = quantiles(rng.normal(size=40))
-        covered += q.median_low <= 0.0 <= q.median_high
-    assert stats.binomtest(covered, 400, 0.96).pvalue > 1e-3
-    assert quantiles([]) is None
-
-
-def test_consistency_band_holds_right_runs():
-    rng = np.random.Generator(np.random.PCG64(2))
-    inside = 0
-    for _ in range(200):
-        c = consistency(list(rng.chisquare(20, size=30)), 20)
-        inside += c.low < c.mean_per_dof < c.high
-    assert stats.binomtest(inside, 200, 0.95).pvalue > 1e-3
-
-
-def test_a_roc_is_that_of_its_scores():
-    """Against the exact area (Mann and Whitney) and exact shares, to the width of a bin."""
-    rng = np.random.Generator(np.random.PCG64(3))
-    good, bad = np.exp(rng.normal(-4, 0.7, 3000)), np.exp(rng.normal(-2.5, 0.7, 800))
-    histogram = ScoreHistogram()
-    for score in good:
-        histogram.add(float(score), False)
-    for score in bad:
-        histogram.add(float(score), True)
-    roc = histogram.roc()
-    exact = stats.mannwhitneyu(bad, good).statistic / (len(bad) * len(good))
-    assert abs(roc.area - exact) < 2e-3
-    threshold, detected = roc.at_one_percent
-    assert np.mean(good >= threshold) <= 0.01
-    assert abs(np.mean(bad >= threshold) - detected) < 1e-12
-    assert np.mean(good >= threshold / 1.05) > 0.008  # and it is the lowest such threshold
-    assert np.all(np.diff(roc.thresholds) < 0)
-    assert np.all(np.diff(roc.detected) >= 0)
-
-
-def test_scans_without_a_measurement_are_flagged_at_every_threshold():
-    histogram = ScoreHistogram()
-    for _ in range(10):
-        histogram.add(None, True)
-        histogram.add(0.01, False)
-    roc = histogram.roc()
-    assert roc.area == 1.0
-    assert roc.at_one_percent[1] == 1.0
-    histogram.add(None, False)
-    assert histogram.roc().false[0] == 1 / 11
-    assert ScoreHistogram().roc() is None
-
-
-def test_a_summary_holds_no_number_that_json_cannot_say():
-    from avsreplay.sweep.summary import _finite
-
-    assert json.dumps(_finite({"a": [math.inf, math.nan, 1.0], "b": {"c": -math.inf}}), allow_nan=False)
+def test_settings_given_as_a_table_reach_the_run(tmp_path):
+    text = '[[case]]\nname = "a"\nset = { "run.register" = { n_max = 7, backend = "kiss" }, "run.init" = "auto" }\n'
+    (point,) = plan_of(tmp_path, text).points()
+    assert set(point.task.assignments) == {"register.n_max=7", 'register.backend="kiss"', 'init="auto"'}

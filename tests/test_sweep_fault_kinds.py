@@ -12,11 +12,20 @@ from avsreplay.report.episodes import Episode, Peak
 from avsreplay.simulate import load_scenario
 from avsreplay.simulate.faults import Kind
 from avsreplay.sweep import Journal, expand, load_campaign
-from avsreplay.sweep.kinds import EPISODE_COLUMNS, episode_lines, kinds_of_fault
+from avsreplay.sweep.fault_kinds import EPISODE_COLUMNS, FaultKinds, episode_lines
 from avsreplay.sweep.statistics import Typical, typical
-from avsreplay.sweep.worker import Outcome
+from avsreplay.sweep.worker import RunResult
 
 CAMPAIGN = Path(__file__).parent.parent / "docs" / "campaigns" / "faults.toml"
+
+
+def kinds_of_fault(lines, metrics):
+    """The windows as one run's, then the metrics as those of runs without a window."""
+    kinds = FaultKinds()
+    kinds.add(lines, {})
+    for each in metrics:
+        kinds.add([], each)
+    return kinds.result()
 
 
 def episode(kind="frozen", **changes):
@@ -91,9 +100,9 @@ def test_the_median_of_an_even_count_lies_between():
 def test_windows_survive_the_journal(tmp_path):
     lines = episode_lines(EPISODES)
     assert {len(line) for line in lines} == {len(EPISODE_COLUMNS)}
-    with Journal(tmp_path / "journal.txt") as journal:
-        journal.add(Outcome("ab", "ok", None, {}, (), lines))
-    assert Journal(tmp_path / "journal.txt").outcome("ab").episodes == lines
+    with Journal(tmp_path) as journal:
+        journal.add(RunResult("ab", "ok", None, {}, (), lines))
+    assert Journal(tmp_path).result("ab").episodes == lines
 
 
 def test_the_campaign_of_faults_has_every_kind_at_three_strengths():

@@ -1,8 +1,8 @@
-"""A campaign unrolled into runs. Each is a task that holds all it needs and a name made of just that.
+"""The runs of a campaign. Each is a task that contains everything a worker needs.
 
-A task's name is the hash of its scenario, settings and inputs: a run that is done stays done whatever is added to the
-campaign, and two equal runs are one. Seeds belong to the repeat, so all combinations of one repeat meet the same
-noise and the same draws: differences between combinations are not differences of luck.
+The id of a task is the hash of its scenario, settings and inputs: a finished run stays finished when the campaign is
+extended, and two equal runs are made once. The seed depends on the repeat only, so that all combinations of one repeat
+have the same noise and the same draws and differences between combinations are not due to chance.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 import avsreplay
 from avsreplay import geometry, toml_document
@@ -25,21 +26,23 @@ from avsreplay.config import RunConfig
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.simulate import load_scenario, scenario_of
 from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
-from avsreplay.sweep.toml_text import toml_text, toml_value
 
-__all__ = ["Plan", "Point", "Task", "expand"]
-
-FORMAT = 2  # of what a run leaves behind: an older one is run again
-_NAMED = ("scenario", "log", "case")  # axes that choose a file or a case, not a key
+FORMAT = 3  # of a run's result: one of an older format is made again
+_NAMED = ("scenario", "log", "case")  # axes that select a file or a case, not a key
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """What a worker needs for one run; ``id`` is the hash of all else but the folder names.
+    """What a worker needs for one run.
 
     Attributes:
-        scenario: TOML text, empty where a log is replayed.  folder: where its relative names start.
-        log, model: files, or empty.  assignments: ``a.b=c`` of the replay.  scans: keep a line a scan.
+        id: Hash of everything below except folder names.
+        scenario: TOML text, "" where a log is replayed.
+        folder: Folder to which file names in the scenario are relative.
+        log: Log file, or "".
+        model: Model file, or "".
+        assignments: Settings ``a.b=value`` of the replay.
+        scans: Whether one row per scan is kept.
     """
 
     id: str
@@ -53,26 +56,19 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One run of the plan.
-
-    Attributes:
-        index: its row.  cell: which combination.  repeat: which repeat of it.  values: what was set, by key.
-    """
+    """One run: row number, number of the combination, repeat, seed (None for a log), values by key, and task."""
 
     index: int
     cell: int
     repeat: int
+    seed: int | None
     values: Mapping[str, Any]
     task: Task
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """All runs of a campaign, made one by one.
-
-    Attributes:
-        cells: the combinations, each by key; what is drawn is not among them.
-    """
+class Expansion:
+    """All runs of a campaign, made one by one. ``cells`` are the combinations by key, without what is drawn."""
 
     loaded: LoadedCampaign
     cells: tuple[Mapping[str, Any], ...]
@@ -84,22 +80,24 @@ class Plan:
         return len(self.cells) * self.loaded.campaign.repeats
 
     def points(self) -> Iterator[Point]:
-        """The runs in the order of their rows: repeat by repeat, so that an early stop leaves whole repeats."""
+        """The runs in the order of their rows: repeat by repeat, so that a stop leaves complete repeats."""
         campaign = self.loaded.campaign
         for repeat in range(campaign.repeats):
             drawn = _draws(campaign, repeat)
+            seed = None if campaign.logs else _seed(campaign, repeat)
             for cell, chosen in enumerate(self.cells):
-                index = repeat * len(self.cells) + cell
-                yield Point(index, cell, repeat, {**chosen, **drawn}, self._task({**chosen, **drawn}, repeat))
+                index, values = repeat * len(self.cells) + cell, {**chosen, **drawn}
+                yield Point(index, cell, repeat, seed, values, self.task(values, repeat))
 
-    def _task(self, values: Mapping[str, Any], repeat: int) -> Task:
+    def task(self, values: Mapping[str, Any], repeat: int) -> Task:
+        """The task of a combination, drawn values included, in a repeat."""
         campaign, folder = self.loaded.campaign, self.loaded.folder
         of_case: Mapping[str, Any] = next((case.set for case in campaign.case if case.name == values.get("case")), {})
         every = {**campaign.set, **of_case, **{k: v for k, v in values.items() if k not in _NAMED}}
         name = values.get("scenario", campaign.scenario)
         home = (folder / name).parent
         scenario = "" if campaign.logs else self._scenario(name, every, repeat)
-        run = (f"{k[4:]}={toml_value(v)}" for k, v in every.items() if k.startswith("run."))
+        run = _assignments({k[4:]: v for k, v in every.items() if k.startswith("run.")})
         log = str(folder / values["log"]) if campaign.logs else ""
         model = str(folder / campaign.model) if campaign.model else ""
         assignments = (*self._run, *run)
@@ -114,13 +112,15 @@ class Plan:
         for key, value in every.items():
             if key.startswith("scenario."):
                 table = _placed(table, key.split(".")[1:], value, key, self.loaded.name)
-        return toml_text(table)
+        return tomli_w.dumps(table)
 
 
-def expand(loaded: LoadedCampaign) -> Plan:
-    """The plan of a campaign; every value of every axis is tried for its key and kind before anything runs.
+def expand(loaded: LoadedCampaign) -> Expansion:
+    """The runs of a campaign; every value of every axis is checked before anything runs.
 
-    Raises UsageError naming the campaign's key, UnreadableInput for a file that is not there.
+    Raises:
+        UsageError: A wrong key or value; the message names it.
+        UnreadableInput: A file cannot be read.
     """
     campaign = loaded.campaign
     axes: list[list[tuple[str, Any]]] = [[(axis.key, value) for value in axis.values] for axis in campaign.grid]
@@ -131,13 +131,13 @@ def expand(loaded: LoadedCampaign) -> Plan:
             axes.insert(0, [(name, file) for file in files])
     cells = tuple(dict(chosen) for chosen in itertools.product(*axes))
     bases = _base_tables(loaded)
-    plan = Plan(loaded, cells, bases, _base_run(loaded), _inputs(loaded, bases))
+    plan = Expansion(loaded, cells, bases, _base_run(loaded), _inputs(loaded, bases))
     _try_all(plan, axes)
     return plan
 
 
 def _base_tables(loaded: LoadedCampaign) -> dict[str, Mapping[str, Any]]:
-    """The scenarios' tables by their names in the campaign; the built-in one's name is empty."""
+    """The scenarios by their names in the campaign; the name of the built-in one is ""."""
     campaign = loaded.campaign
     names = () if campaign.logs else campaign.scenarios or (campaign.scenario,)
     return {name: _table(loaded.folder / name if name else None) for name in names}
@@ -152,20 +152,20 @@ def _base_run(loaded: LoadedCampaign) -> tuple[str, ...]:
         return ()
     document = toml_document.load(loaded.folder / loaded.campaign.config)
     toml_document.build(RunConfig, document)
-    return tuple(f"{key}={toml_value(value)}" for key, value in _leaves(document.table))
+    return tuple(_assignments(document.table))
 
 
 def _inputs(loaded: LoadedCampaign, bases: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
     """Hashes of the files that runs read, by path."""
     campaign = loaded.campaign
     paths = {str(loaded.folder / name) for name in (*campaign.logs, campaign.model) if name}
-    texts = {name: toml_text(table) for name, table in bases.items()}
+    texts = {name: tomli_w.dumps(table) for name, table in bases.items()}
     paths |= {_model_of(text, (loaded.folder / name).parent) for name, text in texts.items()}
     return {path: _sha256(Path(path)) for path in sorted(paths - {""})}
 
 
 def _model_of(scenario: str, folder: Path) -> str:
-    """Path of the model that a scenario's text names, empty where it names none."""
+    """Path of the model that a scenario names, "" where it names none."""
     model = toml_document.parse(scenario, "scenario").table.get("target", {}).get("model") if scenario else None
     return str(folder / model) if model else ""
 
@@ -178,13 +178,13 @@ def _sha256(path: Path) -> str:
         raise UnreadableInput(error.strerror or "cannot be read", where=str(path), hint="check the path") from None
 
 
-def _try_all(plan: Plan, axes: list[list[tuple[str, Any]]]) -> None:
-    """Build the scenario and the settings once for every value of every axis, the others at their first."""
+def _try_all(plan: Expansion, axes: list[list[tuple[str, Any]]]) -> None:
+    """Build scenario and settings once for every value of every axis, the other axes at their first value."""
     first = {axis[0][0]: axis[0][1] for axis in axes}
     drawn = _draws(plan.loaded.campaign, 0)
     for key, value in [(None, None), *(pair for axis in axes for pair in axis)]:
         chosen = {**first, **({key: value} if key else {}), **drawn}
-        task = plan._task(chosen, 0)
+        task = plan.task(chosen, 0)
         try:
             if task.scenario:
                 scenario_of(toml_document.parse(task.scenario, plan.loaded.name))
@@ -200,7 +200,7 @@ def _seed(campaign: Campaign, repeat: int) -> int:
 
 
 def _draws(campaign: Campaign, repeat: int) -> dict[str, Any]:
-    """What is drawn for a repeat: each key from a stream of its own, so that adding a draw changes no other."""
+    """The values drawn for a repeat, each from its own random stream, so that adding a draw changes no other."""
     drawn = {}
     for draw in campaign.draw:
         stream = np.random.SeedSequence(campaign.seed, spawn_key=(1, repeat, zlib.crc32(draw.key.encode())))
@@ -229,22 +229,23 @@ def _drawn(draw: Draw, rng: np.random.Generator) -> Any:
 
 
 def _placed(node: Any, path: list[str], value: Any, key: str, where: str) -> Any:
-    """``node`` with ``value`` at ``path``; what lies beside it is shared, not copied."""
+    """A copy of ``node`` with ``value`` at ``path``; everything else is shared."""
     head, rest = path[0], path[1:]
     if isinstance(node, list):
         if not head.isdigit() or int(head) >= len(node):
-            raise UsageError(f"'{key}' does not lead to a place", where=where, hint=f"the list has {len(node)} entries")
+            raise UsageError(f"'{key}' names no setting", where=where, hint=f"the list has {len(node)} entries")
         changed = list(node)
         changed[int(head)] = _placed(node[int(head)], rest, value, key, where) if rest else value
         return changed
     if not isinstance(node, Mapping):
-        raise UsageError(f"'{key}' does not lead to a place", where=where, hint="check the key")
+        raise UsageError(f"'{key}' names no setting", where=where, hint="check the key")
     return {**node, head: _placed(node.get(head, {}), rest, value, key, where) if rest else value}
 
 
-def _leaves(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _assignments(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """``a.b=value`` of every value in a table of tables."""
     for key, value in table.items():
         if isinstance(value, Mapping):
-            yield from _leaves(value, f"{prefix}{key}.")
+            yield from _assignments(value, f"{prefix}{key}.")
         else:
-            yield f"{prefix}{key}", value
+            yield f"{prefix}{key}={toml_document.toml_value(value)}"
