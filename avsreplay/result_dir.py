@@ -181,8 +181,8 @@ class ResultDirectory:
         """
         self.path = path
         self._part = path.with_name(f".{path.name}.{os.getpid()}.part")
-        if path.exists() and not overwrite:
-            raise UsageError("is already there", where=str(path), hint="name another, or add --overwrite")
+        if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+            raise UsageError("already exists", where=str(path), hint="choose another name, or add --overwrite")
         if path.exists() and not _replaceable(path):
             raise UsageError("is not a result directory", where=str(path), hint="name another; it is left alone")
 

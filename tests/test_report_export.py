@@ -133,7 +133,7 @@ def test_stamps_are_exact(t_ns):
 def test_tum_and_kitti_give_the_poses_back(tmp_path, make_rows):
     poses = [(5 + k, Pose(exp([0.1 * k, -0.2, 0.3]), [k / 3, 2.0, 3.0])) for k in range(5)]
     assert write_tum(tmp_path / "a.tum", poses) == 5
-    assert write_kitti(tmp_path / "a.kitti", poses) == 5
+    assert write_kitti(tmp_path / "a.kitti", [pose for _, pose in poses]) == 5
     tum, kitti = np.loadtxt(tmp_path / "a.tum"), np.loadtxt(tmp_path / "a.kitti")
     for k, (_, pose) in enumerate(poses):
         np.testing.assert_array_equal(tum[k, 1:], [*pose.t, *pose.q])
@@ -179,7 +179,7 @@ def test_the_document_is_strict_json(make_rows):
     text = dump_document(rows, summary, {"seed": 7, "empty": {}})
     whole = json.loads(text, parse_constant=pytest.fail)
     assert whole == document(rows, summary, {"seed": 7, "empty": {}})
-    assert list(whole) == ["format", "header", "summary", "rows"]
+    assert list(whole) == ["format", "verdict", "header", "summary", "rows"]
     assert [parse_row(r, "x") for r in whole["rows"]] == [dataclasses.replace(r, rms_m=None) for r in rows]
 
 

@@ -97,7 +97,7 @@ def test_start_takes_a_time_too(cli, fixtures_folder):
 
 def test_off_a_terminal_nothing_but_results_is_printed(cli, fixtures_folder):
     done = cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 4)
-    assert done.err == ""
+    assert [line.split(" ")[0] for line in done.err.splitlines()] == ["verdict"]
     assert "\x1b" not in done.out
     assert max(map(len, done.out.splitlines())) <= 80
 

@@ -42,7 +42,8 @@ Examples:
 
 \b
 Exit codes: 0 ok, 1 a requested check failed, 2 usage,
-            3 unreadable input, 4 finished but data was lost."""
+            3 unreadable input, 4 finished but data was lost,
+            130 interrupted, 141 the reader of the output stopped reading."""
 
 
 class _Commands(click.Group):
@@ -128,9 +129,8 @@ def main() -> None:
         code = error.exit_code
     except (click.Abort, KeyboardInterrupt):
         code = _fail("interrupted", 130)
-    except BrokenPipeError:
-        sys.stderr.close()
-        code = 0
+    except SystemExit:  # click exits only where the reader of stdout has closed the pipe: 128 + SIGPIPE
+        code = 141
     sys.exit(code if isinstance(code, int) else 0)
 
 

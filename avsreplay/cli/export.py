@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from avsreplay.cli.options import PATH
+from avsreplay.cli.options import PATH, output_is_free
 from avsreplay.errors import UsageError
 from avsreplay.report import export
 from avsreplay.report.result import load_result
@@ -37,20 +37,25 @@ def command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) 
 
     CSV and Parquet hold every column of every scan with units in the headings; TUM and KITTI hold poses of {C} in {A}.
     """
-    if output.exists() and not overwrite:
-        raise UsageError("already exists", where=str(output), hint="choose another name, or add --overwrite")
+    output_is_free(output, overwrite=overwrite)
     found = load_result(result)
-    if kind == "csv":
-        export.write_csv(output, found.rows)
+    if kind in ("csv", "parquet"):
+        (export.write_csv if kind == "csv" else export.write_parquet)(output, found.rows)
         click.echo(f"{output}: {len(found.rows)} rows")
         return
-    if kind == "parquet":
-        export.write_parquet(output, found.rows)
-        click.echo(f"{output}: {len(found.rows)} rows")
-        return
-    trajectory = found.poses if poses == "truth" else export.row_poses(found.rows, poses)  # type: ignore[arg-type]
-    count = (export.write_tum if kind == "tum" else export.write_kitti)(output, trajectory)
+    truth = dict(found.poses)
+    by_row = [
+        truth.get(row.t_ns) if poses == "truth" else export.row_pose(row, poses)  # type: ignore[arg-type]
+        for row in found.rows
+    ]
+    count = sum(pose is not None for pose in by_row)
     if not count:
-        output.unlink()
         raise UsageError(f"the result has no {poses} poses", where=str(result), hint="choose others with --poses")
-    click.echo(f"{output}: {count} poses")
+    if kind == "tum":
+        stamped = found.poses if poses == "truth" else export.row_poses(found.rows, poses)  # type: ignore[arg-type]
+        click.echo(f"{output}: {export.write_tum(output, stamped)} poses")
+        return
+    export.write_kitti(output, by_row)
+    missing = len(by_row) - count
+    note = f"; {missing} scans without a pose are lines of nan" if missing else ""
+    click.echo(f"{output}: {len(by_row)} lines, one per scan{note}")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import click
 
-from avsreplay.cli.options import PATH
-from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.cli.options import PATH, output_is_free
+from avsreplay.errors import UnreadableInput
 
 EPILOG = """\b
 Examples:
@@ -31,8 +31,7 @@ def command(result: Path, output: Path | None, title: str | None, overwrite: boo
     the effective configuration.
     """
     page = output or (result if result.is_dir() else result.parent) / "report.html"
-    if page.exists() and not overwrite:
-        raise UsageError("already exists", where=str(page), hint="choose another name, or add --overwrite")
+    output_is_free(page, overwrite=overwrite)
     click.echo(write_page(result, page, title))
 
 

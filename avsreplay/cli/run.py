@@ -13,13 +13,14 @@ import click
 
 from avsreplay.cli.options import PATH, read_options, source_options
 from avsreplay.cli.setting_options import run_settings, take_run_settings
-from avsreplay.errors import DataLost, UsageError
+from avsreplay.errors import CheckFailed, DataLost, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from avsreplay.report.golden import GoldenResult
     from avsreplay.report.summary import Summary
+    from avsreplay.report.verdict import Verdict
     from avsreplay.result_dir import ResultDirectory
     from avsreplay.rows import Row
     from avsreplay.run import Job, Listener, Run
@@ -68,6 +69,12 @@ class _Start(click.ParamType[str | float]):
 @click.option("--report", "page", is_flag=True, help="Add the HTML page, report.html, to the result directory.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+@click.option(
+    "--require",
+    "least",
+    type=click.Choice(["pass", "check"]),
+    help="Exit with code 1 if the verdict is worse than this.",
+)
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
 @click.option("--plain", is_flag=True, help="Print no curves of error and gamma.")
@@ -84,11 +91,12 @@ def command(log: Path, **flags: Any) -> None:
     wanted.check()
     target = ResultDirectory(wanted.output, overwrite=wanted.overwrite) if wanted.output else None
     with Run(_job(log, flags)) as run:
-        rows, summary, record, scans_per_s = _replayed(run, target, wanted.to_rerun)
-        _print(wanted, rows, summary, record, scans_per_s)
+        done = _replayed(run, target, wanted.to_rerun)
+        _print(wanted, done)
         if wanted.page and wanted.output:
             _page(wanted.output)
-        _gate(wanted, rows)
+        click.echo(f"verdict {done.verdict.line}", err=True)
+        _gate(wanted, done)
         _report_losses(run)
 
 
@@ -106,6 +114,7 @@ class Wanted:
     table_all: bool
     plain: bool
     to_rerun: bool
+    least: str | None
 
     def check(self) -> None:
         """Raise UsageError if two options contradict each other."""
@@ -125,11 +134,21 @@ def _job(log: Path, flags: dict[str, Any]) -> Job:
     return Job(source=log, options=read_options(flags), config_file=config_file, assignments=assignments)
 
 
-def _replayed(
-    run: Run, target: ResultDirectory | None, to_rerun: bool
-) -> tuple[list[Row], Summary, dict[str, Any], float]:
-    """Replay, and return rows, summary, run record and scans per second; ``target`` receives all results."""
+@dataclass(frozen=True, slots=True)
+class _Finished:
+    """What a replay gave; ``record`` is ``run.json``."""
+
+    rows: Sequence[Row]
+    summary: Summary
+    record: dict[str, Any]
+    verdict: Verdict
+    scans_per_s: float
+
+
+def _replayed(run: Run, target: ResultDirectory | None, to_rerun: bool) -> _Finished:
+    """Replay the log; ``target`` receives all results. An interrupt ends the replay and keeps what there is."""
     from avsreplay.cli.progress import tracked
+    from avsreplay.report.verdict import verdict_of
     from avsreplay.result_dir import RerunStream, ResultWriter
 
     keeper = ResultWriter(target, run.surface, run.registrar) if target else None
@@ -140,15 +159,30 @@ def _replayed(
         listeners += keeper.listeners if keeper else ()
         if run.config.reference.value == "fit":
             run.fit_reference(tracked)
-        rows = list(run.rows(listeners, tracked))
+        rows: list[Row] = []
+        interrupted = _collect(run.rows(listeners, tracked), rows)
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
             viewer.close()
         summary = run.summary()
         record = _record(run, summary)
+        if interrupted:
+            record["interrupted_after"] = len(rows)
+            click.echo(f"avsreplay: interrupted; the results of {len(rows)} of {len(run)} scans are kept", err=True)
         if keeper:
             keeper.finish(rows, record)
-    return rows, summary, record, len(rows) / seconds
+    return _Finished(rows, summary, record, verdict_of(rows, summary, record), len(rows) / seconds)
+
+
+def _collect(found: Iterator[Row], rows: list[Row]) -> bool:
+    """Take all rows; True if the user interrupted the replay after at least one row."""
+    try:
+        rows.extend(found)
+    except KeyboardInterrupt:
+        if not rows:
+            raise
+        return True
+    return False
 
 
 def _page(result: Path) -> None:
@@ -159,46 +193,66 @@ def _page(result: Path) -> None:
 
 def _record(run: Run, summary: Summary) -> dict[str, Any]:
     from avsreplay.cli.version import versions
+    from avsreplay.report.compare import changed_settings
     from avsreplay.report.result import facts_record
+    from avsreplay.settings import dump
 
     header = run.source.header
     labels = header.labels if header.labels or header.seed is not None else None
     facts = facts_record(labels=labels, truth=run.truth, counts=dict(summary.counts))
-    return {**run.facts(), "facts": facts, "versions": versions()}
+    changed = changed_settings(dump(run.config), dump(type(run.config)()))
+    return {**run.facts(), "changed_settings": changed, "facts": facts, "versions": versions()}
 
 
-def _print(wanted: Wanted, rows: Sequence[Row], summary: Summary, record: dict[str, Any], scans_per_s: float) -> None:
+def _print(wanted: Wanted, done: _Finished) -> None:
     if wanted.as_json:
         from avsreplay.report.export import dump_document
 
-        click.echo(dump_document(rows, summary, record), nl=False)
+        click.echo(dump_document(done.rows, done.summary, done.record), nl=False)
         return
     from avsreplay.report.summary_tables import print_tables
     from avsreplay.report.table import make_console
 
-    choice = {"every": wanted.table_every, "show_all": wanted.table_all, "plain": wanted.plain}
-    print_tables(make_console(), rows, summary, scans_per_s=scans_per_s, **choice)  # type: ignore[arg-type]
+    print_tables(
+        make_console(),
+        done.rows,
+        done.summary,
+        done.verdict,
+        every=wanted.table_every,
+        show_all=wanted.table_all,
+        plain=wanted.plain,
+        scans_per_s=done.scans_per_s,
+    )
 
 
-def _gate(wanted: Wanted, rows: Sequence[Row]) -> None:
+def _gate(wanted: Wanted, done: _Finished) -> None:
+    """Golden file and verdict: raise CheckFailed if a requested check fails."""
     from avsreplay.report.golden import compare_golden, update_golden
 
+    rows = done.rows
     if wanted.update_golden:
         update_golden(wanted.update_golden, rows)
         click.echo(f"golden rows written: {wanted.update_golden} ({len(rows)} scans)", err=True)
     if wanted.golden:
         result = compare_golden(wanted.golden, rows)
         if not result.ok:
-            _print_differences(result, to_stderr=wanted.as_json)
+            _print_differences(result, done.verdict, to_stderr=wanted.as_json)
         result.check(str(wanted.golden))
         click.echo(f"golden rows agree: {wanted.golden} ({result.rows} scans)", err=True)
+    order = ["pass", "check", "fail"]
+    if wanted.least and order.index(done.verdict.grade.value.lower()) > order.index(wanted.least):
+        raise CheckFailed(f"the verdict is {done.verdict.line}", where=f"--require {wanted.least}")
+    if "interrupted_after" in done.record:
+        raise KeyboardInterrupt
 
 
-def _print_differences(result: GoldenResult, *, to_stderr: bool) -> None:
+def _print_differences(result: GoldenResult, verdict: Verdict, *, to_stderr: bool) -> None:
     from avsreplay.report.comparison_tables import golden_table
-    from avsreplay.report.table import make_console, print_table
+    from avsreplay.report.table import make_console, print_line, print_table
 
-    print_table(make_console(sys.stderr if to_stderr else sys.stdout), golden_table(result))
+    console = make_console(sys.stderr if to_stderr else sys.stdout)
+    print_line(console, "settings that differ from their defaults: " + ("; ".join(verdict.changed) or "none"))
+    print_table(console, golden_table(result))
 
 
 def _report_losses(run: Run) -> None:

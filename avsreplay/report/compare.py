@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from avsreplay.report.golden import GoldenResult, compare_records
 from avsreplay.report.jsonl import plain
@@ -146,3 +148,22 @@ def first_divergence(baseline: Sequence[Row], other: Sequence[Row], *, first: in
 def _records(rows: Sequence[Row]) -> Mapping[int, Mapping[str, object]]:
     names = [c.name for c in columns()]
     return {row.seq: {name: plain(getattr(row, name)) for name in names} for row in rows}
+
+
+def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """A nested table of settings as dotted keys."""
+    out: dict[str, Any] = {}
+    for key, value in table.items():
+        out |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
+    return out
+
+
+def changed_settings(config: Mapping[str, Any], base: Mapping[str, Any], word: str = "default") -> list[str]:
+    """Settings of ``config`` that differ from those of ``base``, each as ``key = value (default ...)``."""
+    ours, theirs = flat(config), flat(base)
+    keys = [key for key in dict.fromkeys((*ours, *theirs)) if ours.get(key) != theirs.get(key)]
+    return [f"{key} = {_value(ours.get(key))} ({word} {_value(theirs.get(key))})" for key in keys]
+
+
+def _value(value: Any) -> str:
+    return "auto" if value is None else json.dumps(value)

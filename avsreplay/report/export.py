@@ -20,6 +20,7 @@ from avsreplay.geometry import Pose
 from avsreplay.report.atomic import atomic_path, atomic_text
 from avsreplay.report.jsonl import field_types, plain
 from avsreplay.report.summary import Summary
+from avsreplay.report.verdict import verdict_of
 from avsreplay.rows import Row, columns
 from avsreplay.settings import dump
 
@@ -34,13 +35,16 @@ _COLUMNS = {
 }
 
 
+def row_pose(row: Row, which: Literal["estimate", "registration"]) -> Pose | None:
+    """The estimated or the registered pose of a row, None where there is none."""
+    attitude, position = _COLUMNS[which]
+    q, t = [getattr(row, n) for n in attitude], [getattr(row, n) for n in position]
+    return None if None in (*q, *t) else Pose(q, t)  # type: ignore[arg-type]
+
+
 def row_poses(rows: Iterable[Row], which: Literal["estimate", "registration"]) -> Iterator[StampedPose]:
     """The estimated or the registered pose of every row that has one."""
-    attitude, position = _COLUMNS[which]
-    for row in rows:
-        q, t = [getattr(row, n) for n in attitude], [getattr(row, n) for n in position]
-        if None not in (*q, *t):
-            yield row.t_ns, Pose(q, t)  # type: ignore[arg-type]
+    return ((row.t_ns, pose) for row in rows if (pose := row_pose(row, which)) is not None)
 
 
 def stamp_text(t_ns: int) -> str:
@@ -54,9 +58,15 @@ def write_tum(path: str | Path, poses: Iterable[StampedPose]) -> int:
     return _write_lines(path, (f"{stamp_text(t_ns)} {_text((*pose.t, *pose.q))}" for t_ns, pose in poses))
 
 
-def write_kitti(path: str | Path, poses: Iterable[StampedPose]) -> int:
-    """Write a KITTI trajectory: the upper 3x4 of T_ac row by row on a line, without stamps [m]; returns the number."""
-    return _write_lines(path, (_text(pose.matrix[:3].reshape(-1)) for _, pose in poses))
+def write_kitti(path: str | Path, poses: Iterable[Pose | None]) -> int:
+    """Write a KITTI trajectory: the upper 3x4 of T_ac row by row on a line per scan [m]; return the number of poses.
+
+    KITTI has no time stamps, so that a line number must be a scan number: a scan without a pose is a line of ``nan``.
+    """
+    listed = list(poses)
+    nothing = " ".join(["nan"] * 12)
+    _write_lines(path, (nothing if pose is None else _text(pose.matrix[:3].reshape(-1)) for pose in listed))
+    return sum(pose is not None for pose in listed)
 
 
 def _text(values: Iterable[Any]) -> str:
@@ -108,11 +118,12 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
         pq.write_table(pa.table(table, schema=schema), part)
 
 
-def document(rows: Iterable[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    """Return ``{"format", "header", "summary", "rows"}`` as plain JSON values (NaN is null)."""
+def document(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """Return ``{"format", "verdict", "header", "summary", "rows"}`` as plain JSON values (NaN is null)."""
     names = [f.name for f in dataclasses.fields(Row)]
     return {
         "format": FORMAT,
+        "verdict": verdict_of(rows, summary, header).record(),
         "header": _strict(dump(dict(header or {}))),
         "summary": summary_record(summary),
         "rows": [{name: plain(getattr(row, name)) for name in names} for row in rows],
@@ -127,7 +138,7 @@ def summary_record(summary: Summary) -> dict[str, Any]:
     return record
 
 
-def dump_document(rows: Iterable[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> str:
+def dump_document(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> str:
     """The document as text with one line per row, ending in a line end."""
     whole = document(rows, summary, header)
     lines = ",\n".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in whole.pop("rows"))

@@ -25,6 +25,7 @@ from avsreplay.report.gate import RuleOutcome
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import fact_lines, in_one_line, summary_tables
 from avsreplay.report.table import Table, as_cell, facts_table
+from avsreplay.report.verdict import moments_table, verdict_of, verdict_table
 from avsreplay.report.view import View, scene
 from avsreplay.rows import Row
 
@@ -85,25 +86,38 @@ def render(template: str, **context: Any) -> Markup:
     return Markup(_environment().get_template(template).render(**context))
 
 
-def build(title: str, verdict: str, parts: Iterable[Part], data: Mapping[str, Any] | None = None) -> str:
+def build(
+    title: str,
+    lines: Sequence[str],
+    parts: Iterable[Part],
+    data: Mapping[str, Any] | None = None,
+    lead: Iterable[Part] = (),
+) -> str:
     """Build a page.
 
     Args:
         title: of the page and its first heading.
-        verdict: the line under it.
+        lines: under the title, the verdict first.
         parts: tables, headings, figures and folded text, in order; a table without rows is left out.
         data: charts and 3D view for the scripts; without it the page has no script.
+        lead: parts above the charts.
 
     Returns:
         The page as text; the same arguments give the same bytes.
     """
-    listed = [(_kind(part), part) for part in parts if not isinstance(part, Table) or part.rows]
+    listed, first = _listed(parts), _listed(lead)
     style = Markup(_asset("uPlot.min.css") if data else "") + render("page.css")
     script = Markup("\n".join(map(_asset, _SCRIPTS))) if data else ""
     embedded = Markup(embed(data)) if data else ""
     return str(
-        render("page.html", title=title, verdict=verdict, parts=listed, style=style, script=script, data=embedded)
+        render(
+            "page.html", title=title, lines=lines, lead=first, parts=listed, style=style, script=script, data=embedded
+        )
     )
+
+
+def _listed(parts: Iterable[Part]) -> list[tuple[str, Part]]:
+    return [(_kind(part), part) for part in parts if not isinstance(part, Table) or part.rows]
 
 
 def _kind(part: Part) -> str:
@@ -149,11 +163,14 @@ def build_page(
         "scans": [row.seq for row in rows],
         "scene": scene(rows, dict(poses), view),
     }
-    parts: list[Part] = [*summary_tables(summary, rows), facts_table("Run", fact_lines(summary))]
+    verdict = verdict_of(rows, summary, header)
+    errors, faults, *others = summary_tables(summary, rows)
+    parts: list[Part] = [errors, *others, facts_table("Run", fact_lines(summary))]
     if header:
         text = json.dumps(header, indent=2, ensure_ascii=False, default=str)
         parts.append(Folded("Configuration and versions", text))
-    return build(title, in_one_line(summary), parts, data)
+    lead = [verdict_table(verdict), moments_table(verdict), faults]
+    return build(title, [verdict.line, in_one_line(summary)], parts, data, lead)
 
 
 def _packed(columns: Columns) -> dict[str, Any]:
@@ -185,7 +202,7 @@ def build_comparison(runs: Sequence[SavedRun], outcomes: Sequence[RuleOutcome] =
     figures = [(run.name, metrics(run.summary)) for run in runs]
     names = ", ".join(run.name for run in runs)
     line = f"{len(runs)} runs: {names}.{_gate_sentence(outcomes)}"
-    return build("Comparison", line, [comparison_table(figures, meaning=True), gate_table(outcomes)], data)
+    return build("Comparison", [line], [comparison_table(figures, meaning=True), gate_table(outcomes)], data)
 
 
 def _gate_sentence(outcomes: Sequence[RuleOutcome]) -> str:

@@ -66,7 +66,7 @@ class Summary:
     """Everything that is said of a run as a whole.
 
     Attributes:
-        pose_healthy, pose_coasting: errors of the estimate.
+        pose_all, pose_healthy, pose_coasting: errors of the estimate.
         registration_healthy, registration_flagged: errors of the measured poses.
         reasons: why scans were flagged.  status: scans by the status of their registration.
         counts: losses and clock problems, given by the caller.
@@ -83,6 +83,7 @@ class Summary:
     gaps: int
     status: Mapping[str, int]
     reasons: Mapping[str, int]
+    pose_all: Errors
     pose_healthy: Errors
     pose_coasting: Errors
     registration_healthy: Errors
@@ -204,6 +205,7 @@ class SummaryFold:
             gaps=len(gaps(stamps)),
             status=dict(sorted(self._status.items())),
             reasons=dict(sorted(self._reasons.items())),
+            pose_all=self._errors("", "healthy", "coasting"),
             pose_healthy=self._errors("", "healthy"),
             pose_coasting=self._errors("", "coasting"),
             registration_healthy=self._errors("reg_", "healthy"),
@@ -238,9 +240,12 @@ class SummaryFold:
                 out[name] = share
         return out
 
-    def _errors(self, prefix: str, state: str) -> Errors:
-        position = self._values.get(f"{prefix}pos_err_m/{state}", [])
-        return Errors(Statistics.of(position), Statistics.of(self._values.get(f"{prefix}rot_err_deg/{state}", [])))
+    def _errors(self, prefix: str, *states: str) -> Errors:
+        position, rotation = (
+            [v for state in states for v in self._values.get(f"{prefix}{name}/{state}", [])]
+            for name in ("pos_err_m", "rot_err_deg")
+        )
+        return Errors(Statistics.of(position), Statistics.of(rotation))
 
     def _observability(self) -> Observability:
         row = self._last

@@ -8,9 +8,10 @@ from rich.console import Console
 
 from avsreplay.report.episodes import Episode
 from avsreplay.report.scan_table import print_sparks, scan_table
-from avsreplay.report.summary import Summary
+from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Capture, Parameter, Statistics
-from avsreplay.report.table import Table, TableCell, decimals, facts_table, number, print_table
+from avsreplay.report.table import Table, TableCell, decimals, facts_table, number, print_line, print_table
+from avsreplay.report.verdict import Verdict, moments_table, verdict_table
 from avsreplay.rows import Row
 
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
@@ -20,23 +21,30 @@ def print_tables(
     console: Console,
     rows: Sequence[Row],
     summary: Summary,
+    verdict: Verdict | None = None,
     *,
     every: int | None = None,
     show_all: bool = False,
     scans_per_s: float | None = None,
     plain: bool = False,
 ) -> None:
-    """Print the per-scan table, curves on a wide terminal, and the summary.
+    """Print the verdict, the per-scan table, curves on a wide terminal, and the summary.
 
     Args:
         console: where to print.
         rows: one per scan.
         summary: of the same rows.
+        verdict: on the run; None leaves it out.
         every: print every N-th scan.
         show_all: print all scans.
         scans_per_s: measured speed; it is printed and never written to a file.
         plain: leave the curves out.
     """
+    if verdict is not None:
+        print_line(console, verdict.line)
+        console.print()
+        print_table(console, verdict_table(verdict))
+        print_table(console, moments_table(verdict))
     if rows:
         print_table(console, scan_table(console, rows, every=every, show_all=show_all), tight=True)
         if not plain:
@@ -54,6 +62,7 @@ def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, .
 def error_table(summary: Summary) -> Table:
     """Statistics of the pose and registration errors, in mm (m from 1 m on) and degrees."""
     groups = (
+        ("pose, all scans", summary.pose_all if summary.coasting else Errors(None, None)),
         ("pose, healthy", summary.pose_healthy),
         ("pose, coasting", summary.pose_coasting),
         ("registration", summary.registration_healthy),
@@ -155,10 +164,12 @@ def _fault_words(summary: Summary) -> list[str]:
 
 
 def _error_words(summary: Summary) -> list[str]:
-    position, rotation = summary.pose_healthy.position_m, summary.pose_healthy.rotation_deg
-    if position is None or rotation is None:
-        return ["no truth to compare with"]
-    return [f"pose error {1000 * position.rmse:.3g} mm and {rotation.rmse:.3g} deg rms in healthy scans"]
+    """Errors against the truth in healthy scans; without a healthy scan, while coasting."""
+    for errors, scans in ((summary.pose_healthy, "healthy scans"), (summary.pose_coasting, "coasting scans")):
+        if errors.position_m is not None and errors.rotation_deg is not None:
+            rms = f"{1000 * errors.position_m.rmse:.3g} mm and {errors.rotation_deg.rmse:.3g} deg rms in {scans}"
+            return [f"pose error {rms}"]
+    return ["no truth to compare with"]
 
 
 def fact_lines(summary: Summary, *, scans_per_s: float | None = None) -> list[tuple[str, str]]:

@@ -51,7 +51,7 @@ def build_sweep_page(summary: SweepSummary) -> str:
     parts += [Section("Faults by kind", _KINDS_TEXT), kinds] if kinds.rows else []
     if summary.worst:
         parts += [Section("Worst runs", _WORST_TEXT), worst_table(summary.worst)]
-    return build(summary.name, _status_line(summary), parts)
+    return build(summary.name, [_status_line(summary)], parts)
 
 
 def worst_table(worst: Sequence[WorstRun]) -> Table:

@@ -1,0 +1,326 @@
+"""The verdict on a run: PASS, CHECK or FAIL with its reasons, the origin of the first pose, and the worst moments.
+
+FAIL: the result must not be used, for example because most scans were not used. CHECK: a person should look at the
+named part. The limits below are stated in docs/report.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from itertools import chain, groupby
+from typing import Any
+
+from avsreplay.report.summary import Summary
+from avsreplay.report.table import Table, TableCell
+from avsreplay.rows import Row
+
+USED_FAIL, USED_CHECK = 0.5, 0.9  # share of the scans without an injected harmful fault that updated the filter
+INSIDE_LEAST = 0.8  # share of NIS or NEES inside the 95 % band
+FALSE_ALARMS = 0.05  # share of the scans without a fault
+ERROR_FAIL, ERROR_CHECK = 0.05, 0.02  # median position error over the model's extent, all scans
+TURN_FAIL, TURN_CHECK = 15.0, 5.0  # median attitude error, all scans [deg]
+FIT_CHECK = 0.02  # median rms distance of the inliers over the model's extent
+MOMENTS = 5
+
+
+class Grade(Enum):
+    """Grades from best to worst."""
+
+    PASS = "PASS"
+    CHECK = "CHECK"
+    FAIL = "FAIL"
+
+
+@dataclass(frozen=True, slots=True)
+class Reason:
+    """One reason against PASS: what, when and how bad, in a sentence."""
+
+    grade: Grade
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """An interval that deserves a look.
+
+    Attributes:
+        row: index of its worst row.  start_s, end_s: since the first scan.
+        what: what happened, with its size.  cause: injected fault or reason of the detector, "" if unknown.
+    """
+
+    row: int
+    start_s: float
+    end_s: float
+    what: str
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """The verdict on one run.
+
+    Attributes:
+        grade: the worst grade of all reasons.
+        reasons: worst first.
+        first_pose: where the first pose came from.
+        robot: the robot that the planner assumed, "" without configuration.
+        changed: settings that differ from their defaults, as ``key = value (default ...)``.
+        moments: at most five, worst first.
+    """
+
+    grade: Grade
+    reasons: tuple[Reason, ...]
+    first_pose: str
+    robot: str
+    changed: tuple[str, ...]
+    moments: tuple[Moment, ...]
+
+    @property
+    def line(self) -> str:
+        """Grade and at most three reasons in one line."""
+        if not self.reasons:
+            return f"{self.grade.value}: no reason for concern was found."
+        more = len(self.reasons) - 3
+        texts = [reason.text for reason in self.reasons[:3]] + ([f"{more} more reasons"] if more > 0 else [])
+        return f"{self.grade.value}: {'; '.join(texts)}."
+
+    def record(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        return {
+            "grade": self.grade.value,
+            "reasons": [{"grade": r.grade.value, "text": r.text} for r in self.reasons],
+            "first_pose": self.first_pose,
+            "robot": self.robot,
+            "changed_settings": list(self.changed),
+            "worst_moments": [
+                {"t_s": m.start_s, "end_s": m.end_s, "what": m.what, "cause": m.cause} for m in self.moments
+            ],
+        }
+
+
+def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> Verdict:
+    """Judge a run.
+
+    Args:
+        rows: one per scan.
+        summary: of the same rows.
+        header: ``run.json``; without it nothing is said of the robot and the settings.
+
+    Returns:
+        The verdict.
+    """
+    header = header or {}
+    extent_m = (header.get("model") or {}).get("extent_m")
+    stopped = header.get("interrupted_after")
+    broken_off = [Reason(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
+    found = (_use(rows, summary), _errors(rows, extent_m), _faults(summary), _filter(rows, summary), _data(summary))
+    reasons = sorted((*broken_off, *chain.from_iterable(found)), key=lambda reason: reason.grade is not Grade.FAIL)
+    return Verdict(
+        grade=reasons[0].grade if reasons else Grade.PASS,
+        reasons=tuple(reasons),
+        first_pose=first_pose(rows, header),
+        robot=_robot(header),
+        changed=tuple(header.get("changed_settings") or ()),
+        moments=tuple(worst_moments(rows)),
+    )
+
+
+def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Reason]:
+    """Scans that updated the filter; those with a harmful fault are not expected to."""
+    if not summary.healthy:
+        common = max(summary.reasons, key=lambda name: summary.reasons[name], default="no scan")
+        yield Reason(Grade.FAIL, f"none of the {summary.scans} scans was used (mostly {_plain(common)})")
+        return
+    expected = summary.scans - (summary.faults.harmful_scans if summary.faults.known else 0)
+    share = min(summary.healthy / expected, 1.0) if expected else 1.0
+    if share < USED_CHECK:
+        common = max(summary.reasons, key=lambda name: summary.reasons[name])
+        grade = Grade.FAIL if share < USED_FAIL else Grade.CHECK
+        text = f"only {summary.healthy} of {summary.scans} scans were used (mostly {_plain(common)})"
+        yield Reason(grade, text)
+    last = next((k for k in range(len(rows) - 1, -1, -1) if rows[k].gamma == 1), 0)
+    if rows[-1].t_s - rows[last].t_s > 0.1 * (rows[-1].t_s - rows[0].t_s) and len(rows) - last > 3:
+        yield Reason(Grade.FAIL, f"no scan after {rows[last].t_s:.1f} s was used, the estimate is only a prediction")
+
+
+def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Reason]:
+    """Errors over all scans, coasting included, and the fit to the model."""
+    position, turn = _median(rows, "pos_err_m"), _median(rows, "rot_err_deg")
+    if position is not None and extent_m and position > ERROR_CHECK * extent_m:
+        grade = Grade.FAIL if position > ERROR_FAIL * extent_m else Grade.CHECK
+        share = 100 * position / extent_m
+        yield Reason(grade, f"the median position error of all scans is {position:.3g} m, {share:.1f} % of the model")
+    if turn is not None and turn > TURN_CHECK:
+        grade = Grade.FAIL if turn > TURN_FAIL else Grade.CHECK
+        yield Reason(grade, f"the median attitude error of all scans is {turn:.3g} deg")
+    fit = _median([row for row in rows if row.gamma == 1], "rms_m")
+    if fit is not None and extent_m and fit > FIT_CHECK * extent_m:
+        share = 100 * fit / extent_m
+        text = f"the scans fit the model badly: median rms {1000 * fit:.3g} mm, {share:.1f} % of its extent"
+        yield Reason(Grade.CHECK, f"{text}; check unit, scale and model")
+
+
+def _faults(summary: Summary) -> Iterator[Reason]:
+    faults = summary.faults
+    missed = [e for e in faults.episodes if e.harmful and not e.detected]
+    if missed:
+        first = f"{_plain(missed[0].kind)} at {missed[0].start_s:.1f} s"
+        text = f"{len(missed)} of {faults.injected} harmful faults were not detected, the first: {first}"
+        yield Reason(Grade.FAIL, text)
+    lost = next((e for e in faults.episodes if e.lost), None)
+    if lost is not None:
+        yield Reason(Grade.FAIL, f"the estimate did not recover from {_plain(lost.kind)} at {lost.start_s:.1f} s")
+    if faults.known and faults.false_alarm_rate > FALSE_ALARMS:
+        share = 100 * faults.false_alarm_rate
+        yield Reason(Grade.CHECK, f"{faults.false_alarms} scans without a fault were rejected ({share:.1f} %)")
+
+
+def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Reason]:
+    """Consistency, reinitialisation and convergence."""
+    for name, share in (("NEES", summary.nees), ("NIS", summary.nis)):
+        if share is not None and share.count >= 10 and share.inside < INSIDE_LEAST:
+            low = "too small (overconfident)" if share.median > share.high else "too large"
+            where = f"the covariance is {low}, " if not share.low <= share.median <= share.high else ""
+            yield Reason(Grade.CHECK, f"{where}only {100 * share.inside:.0f} % of {name} inside the 95 % band")
+    inconsistent = [row for row in rows if row.consistent is False]
+    if len(inconsistent) > 0.1 * len(rows):
+        begin = inconsistent[0].t_s
+        text = f"the innovations are inconsistent in {len(inconsistent)} of {len(rows)} scans, first at {begin:.1f} s"
+        yield Reason(Grade.CHECK, text)
+    if summary.reinitialised:
+        when = next(row.t_s for row in rows if row.reinitialised)
+        text = f"the estimate was reinitialised {_times(summary.reinitialised)}, first at {when:.1f} s"
+        yield Reason(Grade.CHECK, f"{text}, because the poses contradicted it")
+    searches = [row for row in rows[1:] if row.guess == "acquired" and row.gamma == 1]
+    if searches and rows[0].gamma == 1:
+        text = f"the pose was searched again {_times(len(searches))}, first at {searches[0].t_s:.1f} s"
+        yield Reason(Grade.CHECK, text)
+    t1 = summary.convergence
+    if rows and t1.t1_s is None:
+        blocks = f" (not converged: {rows[-1].unconverged_blocks})" if rows[-1].unconverged_blocks else ""
+        yield Reason(Grade.CHECK, f"the estimate did not converge, so no capture is planned{blocks}")
+    elif rows and not t1.at_end:
+        yield Reason(Grade.CHECK, f"convergence, reached at {t1.t1_s:.1f} s, does not hold at the end")
+
+
+def _data(summary: Summary) -> Iterator[Reason]:
+    """Losses and clock problems of the log."""
+    for name, text in (
+        ("losses", "damaged places of the log were left out"),
+        ("stamps_unset", "scans have no time stamp"),
+        ("stamps_back", "time stamps go backwards"),
+        ("stamps_jumped", "time stamps jump"),
+    ):
+        if summary.counts.get(name):
+            yield Reason(Grade.CHECK, f"{summary.counts[name]} {text}")
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
+def _plain(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _median(rows: Sequence[Row], column: str) -> float | None:
+    values = sorted(v for row in rows if (v := getattr(row, column)) is not None)
+    return values[len(values) // 2] if values else None
+
+
+def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
+    """Where the first pose came from, in words."""
+    if not rows:
+        return "no scan"
+    config = header.get("config") or {}
+    mode = (config.get("estimator") or {}).get("start")
+    said = {
+        "start": "the log's initial state",
+        "truth": "the ground truth of the log",
+        "given": f"the option --init {config.get('init', '')}".rstrip(),
+        "acquired": "a global search without any prior knowledge",
+    }.get(rows[0].guess, _plain(rows[0].guess))
+    return said + (f"; initialisation '{mode}'" if mode else "")
+
+
+def _robot(header: Mapping[str, Any]) -> str:
+    """The robot that the planner assumed."""
+    plan = (header.get("config") or {}).get("plan") or {}
+    if not plan:
+        return ""
+    name = header.get("robot") or "default robot"
+    facts = [f"a_max {plan['a_max_mps2']:g} m/s2"] if isinstance(plan.get("a_max_mps2"), (int, float)) else []
+    facts += [f"latency {plan['latency_s']:g} s"] if isinstance(plan.get("latency_s"), (int, float)) else []
+    return ", ".join([name, *facts])
+
+
+def worst_moments(rows: Sequence[Row]) -> list[Moment]:
+    """The five intervals with the largest attitude error, NIS or duration without a used scan; no two overlap."""
+    found = [moment for _, moment in sorted(_moments(rows), key=lambda item: -item[0])]
+    kept: list[Moment] = []
+    for moment in found:
+        if all(moment.end_s < other.start_s or other.end_s < moment.start_s for other in kept):
+            kept.append(moment)
+    return kept[:MOMENTS]
+
+
+def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
+    """Candidates with a weight: flagged intervals and single scans whose error or NIS stands out."""
+    for flagged, group in groupby(enumerate(rows), key=lambda item: item[1].gamma == 0):
+        listed = list(group)
+        if flagged:
+            yield _flagged_moment(listed)
+    for column, unit, factor, name in (
+        ("pos_err_m", "mm", 1000.0, "position error"),
+        ("rot_err_deg", "deg", 1.0, "attitude error"),
+        ("nis", "", 1.0, "NIS"),
+    ):
+        typical = _median(rows, column)
+        places = [(getattr(row, column), k) for k, row in enumerate(rows) if getattr(row, column) is not None]
+        for value, k in sorted(places, reverse=True)[:MOMENTS]:
+            if typical and value > 3.0 * typical:
+                text = f"{name} {factor * value:.3g} {unit}".rstrip()
+                row = rows[k]
+                yield value / typical, Moment(k, row.t_s, row.t_s, text, _cause(row))
+
+
+def _flagged_moment(listed: Sequence[tuple[int, Row]]) -> tuple[float, Moment]:
+    worst, row = max(listed, key=lambda item: item[1].pos_err_m or 0.0)
+    error = "" if row.pos_err_m is None else f", error up to {1000 * row.pos_err_m:.3g} mm"
+    first, last = listed[0][1], listed[-1][1]
+    count = "1 scan" if len(listed) == 1 else f"{len(listed)} scans"
+    return 3.0 * len(listed), Moment(worst, first.t_s, last.t_s, f"{count} not used{error}", _cause(first))
+
+
+def _cause(row: Row) -> str:
+    if row.fault:
+        return f"injected: {_plain(row.fault)}"
+    return _plain(row.reason) if row.gamma == 0 else ""
+
+
+def verdict_table(verdict: Verdict) -> Table:
+    """Reasons, first pose, robot and changed settings, as on terminal and page."""
+    marks = {Grade.FAIL: "bad", Grade.CHECK: "warn", Grade.PASS: "good"}
+    rows: list[tuple[str | TableCell, ...]] = [
+        ("reason", TableCell(f"{r.grade.value}: {r.text}", marks[r.grade])) for r in verdict.reasons
+    ]
+    rows.append(("first pose from", verdict.first_pose))
+    if verdict.robot:
+        rows.append(("robot", verdict.robot))
+    rows += [("changed setting", text) for text in verdict.changed] or [("settings", "all at their defaults")]
+    return Table("Verdict", ("what", "value"), tuple(rows), align="l")
+
+
+def moments_table(verdict: Verdict) -> Table:
+    """The worst moments; a click leads to the scan."""
+    rows = tuple(
+        (
+            TableCell(f"{m.start_s:.1f}" if m.start_s == m.end_s else f"{m.start_s:.1f} to {m.end_s:.1f}", scan=m.row),
+            m.what,
+            m.cause,
+        )
+        for m in verdict.moments
+    )
+    return Table("Worst moments", ("t\n[s]", "what", "cause"), rows, align="l")

@@ -1,0 +1,51 @@
+"""Progress off a terminal, an interrupted replay, and a reader that stops reading."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from avsreplay.cli import progress
+from avsreplay.cli.run import _collect
+
+
+def test_off_a_terminal_a_line_appears_every_period(monkeypatch, capsys):
+    clock = iter(range(0, 1000, 20))
+    monkeypatch.setattr(progress.time, "monotonic", lambda: float(next(clock)))
+    assert list(progress.tracked(range(6), 6, "replaying")) == list(range(6))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "avsreplay: replaying: 2 of 6 after 40 s, about 80 s left"
+    assert len(lines) == 3
+
+
+def test_a_quick_run_prints_no_progress(capsys):
+    assert list(progress.tracked(range(3), 0, "x")) == [0, 1, 2]
+    assert capsys.readouterr().err == ""
+
+
+def _interrupted(rows):
+    yield from rows
+    raise KeyboardInterrupt
+
+
+def test_an_interrupt_keeps_the_rows_so_far(make_rows):
+    kept = []
+    assert _collect(_interrupted(make_rows(3)), kept)
+    assert [row.seq for row in kept] == [0, 1, 2]
+    assert not _collect(iter(make_rows(2)), [])
+
+
+def test_an_interrupt_before_the_first_row_ends_the_run():
+    with pytest.raises(KeyboardInterrupt):
+        _collect(_interrupted([]), [])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
+def test_a_closed_pipe_is_not_a_failed_check(fixtures_folder):
+    shell = "{} -m avsreplay run {} --json | true; exit ${{PIPESTATUS[0]}}"
+    command = shell.format(sys.executable, fixtures_folder / "tumble.mcap")
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    assert done.returncode == 141, done.stderr
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,152 @@
+"""The verdict: no run with a serious problem passes, and every reason says what, when and how bad."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import re
+
+import numpy as np
+import pytest
+
+from avsreplay.records import Label
+from avsreplay.report.export import dump_document
+from avsreplay.report.page import build_page
+from avsreplay.report.summary import Summary
+from avsreplay.report.verdict import Grade, first_pose, verdict_of, worst_moments
+
+HEADER = {"model": {"extent_m": 8.0}, "config": {"init": "log", "estimator": {"start": "auto"}, "plan": {}}}
+
+
+def _labels(rows):
+    return [Label("full_occlusion", rows[20].t_ns, rows[25].t_ns)]
+
+
+def _judged(rows, *, header=HEADER, **facts):
+    facts.setdefault("labels", _labels(rows) if len(rows) > 25 else None)
+    return verdict_of(rows, Summary.fold(rows, **facts), header)
+
+
+def _good(make_rows, n=100, **changes):
+    """Rows of a consistent run: the statistics are those of the expected distributions."""
+    return make_rows(n, seed=3, **changes)
+
+
+def test_a_good_run_passes(make_rows):
+    found = _judged(_good(make_rows))
+    assert (found.grade, found.reasons) == (Grade.PASS, ())
+    assert found.line == "PASS: no reason for concern was found."
+
+
+def test_no_healthy_scan_fails(make_rows):
+    rows = _good(make_rows, gamma=0, reason="not_aligned", nis=None, converged=False)
+    found = _judged(rows)
+    assert found.grade is Grade.FAIL
+    assert "none of the 100 scans was used (mostly not aligned)" in found.line
+
+
+def test_one_used_scan_of_35_fails(make_rows):
+    rows = [dataclasses.replace(r, gamma=int(r.seq == 0), reason="fit_error") for r in make_rows(35, fault=None)]
+    assert _judged(rows, labels=None).grade is Grade.FAIL
+
+
+def test_an_injected_blackout_is_no_reason(make_rows):
+    rows = make_rows(100, seed=3, blackout=range(20, 80))
+    labels = [Label("full_occlusion", rows[20].t_ns, rows[79].t_ns)]
+    assert not any("were used" in reason.text for reason in _judged(rows, labels=labels).reasons)
+
+
+def test_a_missed_fault_fails_and_is_named(make_rows):
+    rows = _good(make_rows)
+    missed = Label("range_bias", rows[50].t_ns, rows[55].t_ns)
+    rows = [dataclasses.replace(r, fault="range_bias") if 50 <= r.seq <= 55 else r for r in rows]
+    found = _judged(rows, labels=[*_labels(rows), missed])
+    assert found.grade is Grade.FAIL
+    assert "1 of 2 harmful faults were not detected, the first: range bias at 10.0 s" in found.line
+
+
+def test_the_end_of_the_log_without_a_used_scan_fails(make_rows):
+    rows = [dataclasses.replace(r, gamma=0, reason="pose_jump") if r.seq >= 85 else r for r in _good(make_rows)]
+    assert "no scan after 16.8 s was used" in _judged(rows).line
+
+
+@pytest.mark.parametrize(
+    ("changes", "grade", "text"),
+    [
+        ({"pos_err_m": 0.51}, Grade.FAIL, "median position error of all scans is 0.51 m, 6.4 % of the model"),
+        ({"pos_err_m": 0.2}, Grade.CHECK, "2.5 % of the model"),
+        ({"rot_err_deg": 178.0}, Grade.FAIL, "median attitude error of all scans is 178 deg"),
+        ({"rms_m": 0.3}, Grade.CHECK, "check unit, scale and model"),
+        ({"nees": 100.0}, Grade.CHECK, "the covariance is too small (overconfident), only 0 % of NEES inside"),
+        ({"nees": 1.0}, Grade.CHECK, "the covariance is too large"),
+        ({"nis": 40.0}, Grade.CHECK, "only 0 % of NIS inside the 95 % band"),
+        ({"consistent": False}, Grade.CHECK, "the innovations are inconsistent in 100 of 100 scans, first at 0.0 s"),
+        ({"reinitialised": 2}, Grade.CHECK, "the estimate was reinitialised 2 times, first at 0.0 s"),
+        ({"converged": False}, Grade.CHECK, "did not converge"),
+    ],
+)
+def test_each_problem_is_a_reason(make_rows, changes, grade, text):
+    found = _judged(_good(make_rows, **changes))
+    assert found.grade is grade
+    assert any(text in reason.text for reason in found.reasons), found.reasons
+
+
+def test_losses_and_an_interruption_are_reasons(make_rows):
+    rows = _good(make_rows)
+    found = _judged(rows, counts={"losses": 2}, header={**HEADER, "interrupted_after": 100})
+    assert found.line == (
+        "CHECK: the replay was interrupted after 100 scans; 2 damaged places of the log were left out."
+    )
+
+
+def test_the_worst_reason_is_first_and_at_most_three_are_in_the_line(make_rows):
+    found = _judged(_good(make_rows, rms_m=0.3, nees=100.0, nis=40.0, reinitialised=1, pos_err_m=1.0))
+    assert found.line.startswith("FAIL: the median position error")
+    assert found.line.count(";") == 4  # three reasons, one of them with a semicolon, and the count of the others
+    assert re.search(r"\d more reasons\.$", found.line)
+
+
+@pytest.mark.parametrize(
+    ("guess", "words"),
+    [
+        ("truth", "the ground truth of the log"),
+        ("acquired", "a global search"),
+        ("start", "the log's initial state"),
+        ("given", "the option --init log"),
+    ],
+)
+def test_the_origin_of_the_first_pose_is_stated(make_rows, guess, words):
+    assert words in first_pose(make_rows(3, guess=guess), HEADER)
+
+
+def test_the_worst_moments_do_not_overlap_and_state_their_cause(make_rows):
+    rows = [dataclasses.replace(r, pos_err_m=0.5) if r.seq == 70 else r for r in _good(make_rows)]
+    found = worst_moments(rows)
+    assert 1 <= len(found) <= 5
+    spans = sorted((m.start_s, m.end_s) for m in found)
+    assert all(a[1] < b[0] for a, b in itertools.pairwise(spans))
+    assert any(m.what == "position error 500 mm" and rows[m.row].seq == 70 for m in found)
+    assert any(m.what.startswith("6 scans not used") and m.cause == "injected: full occlusion" for m in found)
+
+
+def test_json_and_page_carry_the_verdict_first(make_rows):
+    rows = _good(make_rows, reinitialised=1)
+    summary = Summary.fold(rows, labels=_labels(rows))
+    header = {**HEADER, "changed_settings": ['faults.policy = "all" (default "any")']}
+    document = json.loads(dump_document(rows, summary, header))
+    assert list(document)[:2] == ["format", "verdict"]
+    assert document["verdict"]["grade"] == "CHECK"
+    assert document["verdict"]["changed_settings"] == header["changed_settings"]
+    page = build_page(rows, summary, header)
+    assert (
+        page.index("CHECK: ") < page.index("Worst moments") < page.index("Injected faults") < page.index('id="charts"')
+    )
+    assert "faults.policy = &#34;all&#34;" in page
+
+
+def test_any_rows_get_a_verdict(make_rows):
+    rng = np.random.default_rng(1)
+    for n in (0, 1, 2, 7):
+        rows = [dataclasses.replace(r, gamma=int(rng.integers(2)), fault=None) for r in make_rows(n)]
+        assert _judged(rows, labels=None, header=None).line
