@@ -142,7 +142,7 @@ def account(marks: Sequence[Mark], labels: Sequence[Label] | None) -> FaultAccou
     """Set rows against labels; without labels they are read off the rows' own ``fault`` column."""
     known = labels is not None or any(m.fault is not None for m in marks)
     labels = _labels_of(marks) if labels is None else labels
-    members = _members(marks, labels)
+    labels, members = _replayed(marks, labels, _members(marks, labels))
     holes = gaps([m.t_ns for m in marks])
     t0 = marks[0].t_ns if marks else 0
     nexts = _nexts(labels)
@@ -164,6 +164,16 @@ def account(marks: Sequence[Mark], labels: Sequence[Label] | None) -> FaultAccou
         peak_flagged=Peak.of(m for m in free if m.gamma == 0),
         peak_used=Peak.of(m for m in free if m.gamma == 1),
     )
+
+
+def _replayed(
+    marks: Sequence[Mark], labels: Sequence[Label], members: list[list[int]]
+) -> tuple[list[Label], list[list[int]]]:
+    """The labels that have scans or lie within the replayed time, so that others do not count as missed."""
+    stamps = [m.t_ns for m in marks if m.fault is None] or [m.t_ns for m in marks]
+    first, last = min(stamps, default=0), max(stamps, default=-1)
+    kept = [i for i, label in enumerate(labels) if members[i] or (label.start_ns <= last and label.end_ns > first)]
+    return [labels[i] for i in kept], [members[i] for i in kept]
 
 
 def _labels_of(marks: Sequence[Mark]) -> list[Label]:
