@@ -11,13 +11,15 @@ from scipy import stats
 from avsreplay import geometry
 from avsreplay.errors import MissingBackend
 from avsreplay.records import Surface
-from avsreplay.simulate import Shape, builtin_surface, caster
-from avsreplay.simulate.caster import Caster, Engine
+from avsreplay.simulate import Shape, builtin_surface, ray_casting
 from avsreplay.simulate.motion import Motion, MotionParams
-from avsreplay.simulate.scanner import Pattern, Scanner, ScannerParams, View
+from avsreplay.simulate.ray_casting import Engine, RayCaster
+from avsreplay.simulate.scanner import FieldOfView, Pattern, Scanner, ScannerParams
 from avsreplay.simulate.target import TargetParams, body
 
-needs_embree = pytest.mark.skipif(not caster.importlib.util.find_spec("embreex"), reason="embreex is not installed")
+needs_embree = pytest.mark.skipif(
+    not ray_casting.importlib.util.find_spec("embreex"), reason="embreex is not installed"
+)
 SURFACE = builtin_surface()
 MESH = trimesh.Trimesh(SURFACE.vertices, SURFACE.faces, process=False)
 CLEAN = ScannerParams(rays=(40, 40), noise_m=0.0, outlier_ratio=0.0)
@@ -74,26 +76,26 @@ def test_a_wall_is_seen_at_its_distance():
     wall = Surface(np.array([[-9.0, -9, 0], [9, -9, 0], [0, 18, 0]]), np.array([[0, 1, 2]], np.int32), "wall", "")
     for engine in (Engine.EXACT, Engine.AUTO):
         towards = geometry.normalise(np.array([[0.0, 0, 0, 1]]))[:, [0, 1, 3]]
-        ranges, cosine = Caster(wall, engine).ranges(np.array([[0.1, 0.2, -3.0]]), towards)
+        ranges, cosine = RayCaster(wall, engine).ranges(np.array([[0.1, 0.2, -3.0]]), towards)
         assert_allclose(ranges, 3.0, atol=1e-12)
         assert_allclose(cosine, 1.0)
-        missed, _ = Caster(wall, engine).ranges(np.array([[0.1, 0.2, -3.0]]), -towards)
+        missed, _ = RayCaster(wall, engine).ranges(np.array([[0.1, 0.2, -3.0]]), -towards)
         assert np.isinf(missed).all()
 
 
 def test_a_triangle_without_area_is_never_hit():
     vertices = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 2, 0], [0, 0, -1], [0, 0, -1]])
     faces = np.array([[3, 4, 3], [0, 1, 2]], np.int32)
-    ranges, _ = Caster(Surface(vertices, faces, "x", "")).ranges(np.array([[0.0, 0, -3]]), np.array([[0.0, 0, 1]]))
+    ranges, _ = RayCaster(Surface(vertices, faces, "x", "")).ranges(np.array([[0.0, 0, -3]]), np.array([[0.0, 0, 1]]))
     assert_allclose(ranges, 3.0)
 
 
 @needs_embree
 def test_without_embree_the_exact_engine_takes_over(monkeypatch):
-    monkeypatch.setattr(caster.importlib.util, "find_spec", lambda name: None)
-    assert Caster(SURFACE).engine is Engine.EXACT
+    monkeypatch.setattr(ray_casting.importlib.util, "find_spec", lambda name: None)
+    assert RayCaster(SURFACE).engine is Engine.EXACT
     with pytest.raises(MissingBackend, match=r"embreex is not installed.*exact"):
-        Caster(SURFACE, Engine.EMBREE)
+        RayCaster(SURFACE, Engine.EMBREE)
 
 
 def test_range_noise_is_white_and_of_its_level():
@@ -151,7 +153,7 @@ def test_a_raster_of_a_still_target_is_a_flash_of_the_same_rays():
     assert_allclose(raster.cast(0.0).ranges, flash.cast(0.0).ranges, atol=1e-9)
 
 
-@pytest.mark.parametrize("view", list(View))
+@pytest.mark.parametrize("view", list(FieldOfView))
 @pytest.mark.parametrize("pattern", list(Pattern))
 def test_the_field_of_view_bounds_every_ray(view, pattern):
     params = replace(CLEAN, fov_deg=(20.0, 10.0), view=view, pattern=pattern, scan_s=float(pattern is Pattern.RASTER))
@@ -161,7 +163,7 @@ def test_the_field_of_view_bounds_every_ray(view, pattern):
     assert np.abs(down).max() < 5
     assert np.abs(across).max() > 9.5
     assert np.abs(down).max() > 4.7
-    if view is View.CONE:
+    if view is FieldOfView.CONE:
         assert np.all(np.hypot(across / 10, down / 5) < 1.01)
     assert_allclose(np.linalg.norm(d, axis=1), 1.0, atol=1e-15)
 

@@ -15,7 +15,7 @@ from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.records import ScanStatus
 from avsreplay.simulate import EPOCH_NS, builtin_surface, load_scenario, scenario_of, simulate
-from avsreplay.simulate.faults import FaultParams, Kind, active, label
+from avsreplay.simulate.faults import InjectedFault, Kind, active, label
 from avsreplay.simulate.scenario import StartParams, belief
 
 SURFACE = builtin_surface()
@@ -195,14 +195,14 @@ def test_labels_are_half_open_windows_on_the_log_clock():
 
 
 def test_a_label_says_harmful_by_kind_unless_the_scenario_says_otherwise():
-    said = {kind: label(FaultParams(kind, 0.0, 1.0), 0).harmful for kind in Kind}
+    said = {kind: label(InjectedFault(kind, 0.0, 1.0), 0).harmful for kind in Kind}
     harmless = {Kind.PARTIAL_OCCLUSION, Kind.CLUTTER, Kind.NOISE_BURST}
     assert {kind for kind, harmful in said.items() if not harmful} == harmless
-    assert label(FaultParams(Kind.CLUTTER, 0.0, 1.0, harmful=True), 0).harmful
+    assert label(InjectedFault(Kind.CLUTTER, 0.0, 1.0, harmful=True), 0).harmful
 
 
 def test_faults_may_overlap():
-    both = [FaultParams(Kind.CLUTTER, 0.0, 2.0), FaultParams(Kind.NOISE_BURST, 1.0, 2.0)]
+    both = [InjectedFault(Kind.CLUTTER, 0.0, 2.0), InjectedFault(Kind.NOISE_BURST, 1.0, 2.0)]
     assert list(active(both, 0, 1_500_000_000)) == [Kind.CLUTTER, Kind.NOISE_BURST]
     run = scans(fault("range_bias", 2.0, 1.0) + fault("stamp_jump", 2.5, 1.0))
     assert [s.fault for s in run[3:8]] == [None, "range_bias", "range_bias", "stamp_jump", None]

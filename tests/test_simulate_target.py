@@ -12,8 +12,7 @@ from avsreplay.errors import UsageError
 from avsreplay.records import Surface
 from avsreplay.simulate import Shape, builtin_surface
 from avsreplay.simulate.inertia import body_of, is_closed, principal
-from avsreplay.simulate.shapes import box, extrusion, frustum, join, shell
-from avsreplay.simulate.target import TargetParams, body
+from avsreplay.simulate.target import TargetParams, body, box, extrusion, frustum, join, shell
 
 RNG = np.random.Generator(np.random.PCG64(5))
 CUBE_TURNS = [  # all 24, some more than once, by another hand

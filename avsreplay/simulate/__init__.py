@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from avsreplay.simulate.caster import Engine
+from avsreplay.simulate.ray_casting import Engine
 from avsreplay.simulate.scenario import Scenario, load_scenario, scenario_of
 from avsreplay.simulate.simulation import EPOCH_NS, Simulation, simulate
 from avsreplay.simulate.target import Shape, builtin_surface

@@ -1,4 +1,4 @@
-"""Faults put into a simulated log on purpose, each over a window of the log clock and labelled there.
+"""Faults injected into a simulated log, each over a window of the log clock and labelled in the log.
 
 =================  ===========================================  =======  ========================================
 kind               strength (default)                           harmful  what happens
@@ -14,8 +14,8 @@ frozen             none                                         yes      the las
 stamp_jump         added to the stamps [s] (30.0)               yes      log time stays true
 =================  ===========================================  =======  ========================================
 
-``harmful`` is what the label says of the scan: by design it cannot give a good pose at its stamp. Harmless kinds are
-meant to be lived through; a scenario may state either for itself.
+``harmful`` is part of the label: the scan cannot give a correct pose at its stamp. The estimate should survive a fault
+that is not harmful. A scenario may set it for each fault.
 """
 
 from __future__ import annotations
@@ -32,17 +32,15 @@ from avsreplay.records import Label
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.scanner import Returns
 
-__all__ = ["FaultParams", "Kind", "active", "clutter", "label", "occlude", "strength"]
-
 NS = 1_000_000_000
-PLATE_RETURN_RATIO = 0.05  # a dark plate: this part of the rays it stops comes back
+PLATE_RETURN_RATIO = 0.05  # a dark plate: share of the rays it blocks that give a return
 PLATE_DEPTH_RATIO = 0.4  # of the target's median range
 PLATE_TILT = math.tan(math.radians(15.0))
 CLUTTER_RADIUS_RATIO = 1.2  # of the target's bounding sphere
 
 
 class Kind(Enum):
-    """What goes wrong."""
+    """The kinds of fault."""
 
     OCCLUSION = "occlusion"
     PARTIAL_OCCLUSION = "partial_occlusion"
@@ -69,7 +67,7 @@ _DEFAULTS: dict[Kind, tuple[float | None, bool]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class FaultParams(Settings):
+class InjectedFault(Settings):
     """One table [[fault]]: a kind of fault over [start_s, start_s + duration_s)."""
 
     kind: Kind = setting(doc="What goes wrong.")
@@ -97,13 +95,13 @@ def _fits(kind: Kind, value: float) -> bool:
     return math.isfinite(value) and (value > 0.0 or kind in (Kind.RANGE_BIAS, Kind.STAMP_JUMP))
 
 
-def strength(fault: FaultParams) -> float:
-    """Its strength, the kind's default where none is given (0 for a kind that has none)."""
+def strength(fault: InjectedFault) -> float:
+    """The strength of a fault, the default of its kind where none is given (0 for a kind without strength)."""
     return fault.strength if fault.strength is not None else _DEFAULTS[fault.kind][0] or 0.0
 
 
-def label(fault: FaultParams, epoch_ns: int) -> Label:
-    """The fault's window on the log clock, half-open."""
+def label(fault: InjectedFault, epoch_ns: int) -> Label:
+    """The label of a fault: a half-open window on the log clock that begins at ``epoch_ns``."""
     default, harmful = _DEFAULTS[fault.kind]
     return Label(
         kind=fault.kind.value,
@@ -114,9 +112,9 @@ def label(fault: FaultParams, epoch_ns: int) -> Label:
     )
 
 
-def active(faults: Sequence[FaultParams], epoch_ns: int, log_ns: int) -> dict[Kind, FaultParams]:
-    """The faults whose window holds ``log_ns``, the first of each kind, in the scenario's order."""
-    found: dict[Kind, FaultParams] = {}
+def active(faults: Sequence[InjectedFault], epoch_ns: int, log_ns: int) -> dict[Kind, InjectedFault]:
+    """The faults whose window contains ``log_ns``, the first of each kind, in the order of the scenario."""
+    found: dict[Kind, InjectedFault] = {}
     for fault in faults:
         window = label(fault, epoch_ns)
         if window.start_ns <= log_ns < window.end_ns:
@@ -125,9 +123,13 @@ def active(faults: Sequence[FaultParams], epoch_ns: int, log_ns: int) -> dict[Ki
 
 
 def occlude(returns: Returns, covered: float, side_rad: float, rng: np.random.Generator) -> Returns:
-    """A plate from one side of the image hides ``covered`` of the returns; a few plate points come back.
+    """Hide a share of the returns behind a plate; a few returns come from the plate.
 
-    ``side_rad``: the side it comes from, 0 the left, a quarter turn the top of the image (x right, y down).
+    Args:
+        returns: The returns of the scan.
+        covered: Share that is hidden.
+        side_rad: Direction in the image from which the plate enters: 0 from the left, pi / 2 from the top.
+        rng: For the returns of the plate.
     """
     draw = rng.random(len(returns.ranges))
     if not len(returns.ranges):
@@ -146,7 +148,15 @@ def occlude(returns: Returns, covered: float, side_rad: float, rng: np.random.Ge
 
 
 def clutter(returns: Returns, ratio: float, centre_a: ArrayLike, radius_m: float, rng: np.random.Generator) -> Returns:
-    """``ratio`` times as many points again, even over a ball about the target (centre (3,) in {A} [m])."""
+    """Add ``ratio`` times as many points, uniform over a ball about the target.
+
+    Args:
+        returns: The returns of the scan.
+        ratio: Number of points to add over the number of returns.
+        centre_a: (3,) centre of the target in {A} [m].
+        radius_m: Radius of its bounding sphere [m].
+        rng: For the points.
+    """
     n = round(ratio * len(returns.ranges))
     towards = rng.standard_normal((n, 3))
     radii = CLUTTER_RADIUS_RATIO * radius_m * np.cbrt(rng.random(n)) / np.sqrt(np.sum(towards * towards, axis=1))

@@ -1,7 +1,7 @@
 """Mass properties of a triangle model, and its principal axes {B}.
 
-Density is uniform: over the volume of a closed mesh, over the area of an open one (a thin shell). Only ratios of
-inertia reach the motion, so moments are per unit mass [m2]. Sums are exact (fsum): the order of faces is no matter.
+Density is uniform over the volume of a closed mesh, or over the area of an open one (a thin shell). Moments are per
+unit mass [m2], since only their ratios affect the motion. Sums are exact (fsum): the order of faces does not matter.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from avsreplay.errors import UsageError
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import Surface
 
-__all__ = ["Body", "body_of", "is_closed", "principal", "with_axes"]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Body:
-    """What moves: inertia about the mass centre, and the principal axes that the state speaks of.
+    """Mass properties of a rigid body.
 
     Attributes:
-        inertia_c: (3, 3) in {C}'s axes about the mass centre, per unit mass [m2].  centre_c: (3,) mass centre [m].
-        moments: (3,) principal moments Ixx, Iyy, Izz of {B} [m2].  q_bc: (4,) mu, {C} to {B}.
+        inertia_c: (3, 3) inertia about the mass centre in the axes of {C}, per unit mass [m2].
+        centre_c: (3,) mass centre in {C} [m].
+        moments: (3,) principal moments Ixx, Iyy, Izz of {B} per unit mass [m2].
+        q_bc: (4,) mu, {C} to {B}, scalar last.
     """
 
     inertia_c: Array
@@ -37,20 +37,21 @@ class Body:
 
     @property
     def c_b(self) -> Array:
-        """(3,) fixture in {B}, varrho [m]: p_b = A(mu) p_c + varrho puts the mass centre at zero."""
+        """(3,) varrho, the fixture in {B} [m]: p_b = A(mu) p_c + varrho is zero at the mass centre."""
         return -geometry.rotate(geometry.matrix(self.q_bc), self.centre_c)
 
     @property
     def sigma(self) -> Array:
-        """(2,) ((Iyy - Izz) / Ixx, (Izz - Ixx) / Iyy)."""
+        """(2,) inertia ratios ((Iyy - Izz) / Ixx, (Izz - Ixx) / Iyy)."""
         xx, yy, zz = self.moments
         return np.array([(yy - zz) / xx, (zz - xx) / yy])
 
 
 def body_of(surface: Surface) -> Body:
-    """The body whose shape is ``surface``.
+    """The body of uniform density with this surface.
 
-    Raises UsageError for a model without faces or without volume.
+    Raises:
+        UsageError: The model has no faces, or encloses no volume.
     """
     if not len(surface.faces):
         hint = "name a mesh, or give moments_m2, axes_xyzw and mass_centre_m under [target]"
@@ -64,7 +65,7 @@ def body_of(surface: Surface) -> Body:
 
 
 def is_closed(faces: NDArray[np.int32], vertices: Array) -> bool:
-    """Is every edge met by its reverse exactly once, equal corners taken as one (STL repeats them)?"""
+    """Whether every edge occurs exactly once in each direction; equal vertices are merged, since STL repeats them."""
     _, corner = np.unique(vertices, axis=0, return_inverse=True)
     loops = corner.reshape(-1)[faces].astype(np.int64)
     edges = np.concatenate([loops[:, [0, 1]], loops[:, [1, 2]], loops[:, [2, 0]]])
@@ -75,13 +76,13 @@ def is_closed(faces: NDArray[np.int32], vertices: Array) -> bool:
 
 
 def principal(inertia_c: ArrayLike, centre_c: ArrayLike) -> Body:
-    """Principal axes of ``inertia_c`` (3, 3) [m2] about ``centre_c`` (3,), labelled so that {B} lies nearest {C}.
+    """The body with inertia ``inertia_c`` (3, 3) [m2] about its mass centre ``centre_c`` (3,) [m] in {C}.
 
-    Of the 24 right-handed labellings the one with the largest trace of A(mu), which is the smallest turn.
+    Of the 24 right-handed orders and signs of its principal axes, {B} has those with the smallest rotation from {C}.
     """
     inertia = np.asarray(inertia_c, dtype=np.float64)
     moments, axes = _jacobi(inertia)
-    best = max(_labellings(axes), key=lambda option: (round(float(np.trace(option[0])), 12), option[1]))
+    best = max(_axis_permutations(axes), key=lambda option: (round(float(np.trace(option[0])), 12), option[1]))
     R_cb, order = best
     q_bc = geometry.conjugate(geometry.quaternion(R_cb))
     return Body(frozen(inertia), frozen(centre_c), frozen(moments[list(order)]), frozen(geometry.normalise(q_bc)))
@@ -110,7 +111,7 @@ def _moments(surface: Surface) -> tuple[float, Array, Array]:
     return math.fsum(weight), np.array(first), second
 
 
-def _labellings(axes: Array) -> list[tuple[Array, tuple[int, ...]]]:
+def _axis_permutations(axes: Array) -> list[tuple[Array, tuple[int, ...]]]:
     found = []
     for order in itertools.permutations(range(3)):
         R_cb = axes[:, order] * np.where(np.diagonal(axes[:, order]) < 0.0, -1.0, 1.0)
@@ -121,15 +122,15 @@ def _labellings(axes: Array) -> list[tuple[Array, tuple[int, ...]]]:
 
 
 def _jacobi(matrix: Array) -> tuple[Array, Array]:
-    """Eigenvalues (3,) and vectors (columns) of a symmetric matrix by Jacobi turns: the same bits on any machine."""
+    """Eigenvalues (3,) and vectors (columns) of a symmetric matrix by Jacobi rotations, with reproducible bits."""
     a, v = [[float(x) for x in row] for row in matrix], [[float(i == j) for j in range(3)] for i in range(3)]
     for _sweep in range(12):
         for p, q in ((0, 1), (0, 2), (1, 2)):
-            _turn(a, v, p, q)
+            _rotate(a, v, p, q)
     return np.array([a[i][i] for i in range(3)]), np.array(v)
 
 
-def _turn(a: list[list[float]], v: list[list[float]], p: int, q: int) -> None:
+def _rotate(a: list[list[float]], v: list[list[float]], p: int, q: int) -> None:
     if abs(a[p][q]) <= 1e-300 or abs(a[p][q]) < 1e-18 * (abs(a[p][p]) + abs(a[q][q])):
         return
     theta = (a[q][q] - a[p][p]) / (2.0 * a[p][q])

@@ -1,10 +1,10 @@
-"""The true motion: a rigid body by its full inertia tensor in {C}'s axes, never by sigma.
+"""The true motion of a rigid body, integrated with its full inertia tensor in the axes of {C} (not with sigma).
 
-    I dw/dt = -w x (I w) + torque,   dq/dt = 1/2 q o [w; 0]   (Hamilton, w in the body's axes)
+    I dw/dt = -w x (I w) + torque,   dq/dt = 1/2 q o [w; 0]   (Hamilton product, w in body axes)
 
-The right-hand sides are quadratic, so the Taylor coefficients of the solution follow by recurrence. A step spans at
-most a quarter of a radian and takes 22 terms (truncation under 1e-13); between steps the polynomial itself is the
-dense output. Plain float arithmetic: the same bits on any machine.
+The right-hand sides are quadratic, so the Taylor coefficients of the solution follow by recurrence. A step covers at
+most 0.25 rad with 22 terms (truncation error below 1e-13); the polynomial is also the dense output. The arithmetic uses
+Python floats only, so the result has the same bits on any machine.
 """
 
 from __future__ import annotations
@@ -21,8 +21,6 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.inertia import Body
-
-__all__ = ["Motion", "MotionParams"]
 
 ORDER = 22
 STEP_RAD = 0.25
@@ -64,14 +62,21 @@ class MotionParams(Settings):
 
 
 class Motion:
-    """The motion of ``body`` over [0, span_s], from ``params``; disturbances drawn from ``rng`` where asked for."""
+    """The motion of a body over [0, span_s].
+
+    Args:
+        body: Its mass properties.
+        params: Initial state and disturbances.
+        span_s: Length [s].
+        rng: For the disturbances.
+    """
 
     def __init__(self, body: Body, params: MotionParams, span_s: float, rng: np.random.Generator) -> None:
         self._body = body
         self._starts, self._coefficients = _integrate(body, params, span_s, rng)
 
     def states(self, times_s: ArrayLike) -> tuple[Array, Array, Array, Array]:
-        """At times (n,) [s]: q_ac (n, 4), rate in {C} (n, 3), mass centre (n, 3) and its velocity (n, 3) in {A}."""
+        """At times (n,) [s]: q_ac (n, 4), rate in {C} (n, 3) [rad/s], mass centre (n, 3) and velocity (n, 3) in {A}."""
         times = np.asarray(times_s, dtype=np.float64)
         step = np.clip(np.searchsorted(self._starts, times, side="right") - 1, 0, len(self._starts) - 1)
         tau = (times - self._starts[step])[:, None]
@@ -107,7 +112,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class _Instant:
-    """Where a step begins: q_ac, w_c, r_a, v_a."""
+    """State at the begin of a step: q_ac, w_c, r_a, v_a."""
 
     q: Vector
     w: Vector
@@ -157,7 +162,7 @@ def _terms(now: _Instant, inertia: Rows, torque: Vector, force: Vector) -> list[
 
 
 def _turning(now: _Instant, inertia: Rows, inverse: Rows, torque: Vector) -> list[tuple[Vector, Vector]]:
-    """Coefficients of attitude and rate: products of series are sums over i of term i with term k - i."""
+    """Taylor coefficients of attitude and rate; a product of series is a sum over i of terms i and k - i."""
     qs, ws, hs = [now.q], [now.w], [_times(inertia, now.w)]
     for k in range(ORDER):
         load = [torque[i] if k == 0 else 0.0 for i in range(3)]

@@ -1,7 +1,7 @@
-"""The scanner: a fixed grid of rays from the camera, cast on the moving target, with its noise.
+"""The scanner: a fixed grid of rays from the camera, cast on the moving target, with noise.
 
-A flash scanner takes the whole grid at once; a raster scanner takes it point by point, row after row, while the
-target moves: every ray then meets the target where it truly is at that ray's instant.
+A flash scanner measures all rays at once. A raster scanner measures them point by point and row by row while the target
+moves: each ray is cast on the target at its pose at the time of that ray.
 """
 
 from __future__ import annotations
@@ -16,20 +16,18 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array, frozen, rotate
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, setting
-from avsreplay.simulate.caster import Caster, Engine
 from avsreplay.simulate.motion import Motion
-
-__all__ = ["Pattern", "Returns", "Scanner", "ScannerParams", "View"]
+from avsreplay.simulate.ray_casting import Engine, RayCaster
 
 
 class Pattern(Enum):
-    """How the grid is taken."""
+    """Order in which the rays are measured."""
 
     FLASH = "flash"  # all rays at the stamp
     RASTER = "raster"  # row after row over ``scan_s``, each point with its own time
 
 
-class View(Enum):
+class FieldOfView(Enum):
     """Outline of the field of view."""
 
     RECTANGLE = "rectangle"
@@ -44,7 +42,9 @@ class ScannerParams(Settings):
     fov_deg: tuple[float, float] = setting(
         (44.0, 44.0), "Full angles of the field of view, horizontal and vertical.", unit="deg", above=0.0, below=170.0
     )
-    view: View = setting(View.RECTANGLE, "Outline of the field of view: the rectangle, or the cone inscribed in it.")
+    view: FieldOfView = setting(
+        FieldOfView.RECTANGLE, "Outline of the field of view: the rectangle, or the cone inscribed in it."
+    )
     rays: tuple[int, int] = setting((128, 128), "Rays horizontally and vertically.", low=1, high=4096)
     scan_s: float = setting(0.0, "Duration of a raster scan, which begins at its stamp.", unit="s", low=0.0)
     noise_m: float = setting(0.008, "1 sigma of the range, along the ray.", unit="m", low=0.0)
@@ -73,10 +73,12 @@ class ScannerParams(Settings):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Returns:
-    """What came back, ray by ray.
+    """The returns of a scan.
 
     Attributes:
-        directions: (n, 3) unit, in {A}.  ranges: (n,) [m].  times_s: (n,) after the stamp [s].
+        directions: (n, 3) unit vectors in {A}.
+        ranges: (n,) [m].
+        times_s: (n,) after the stamp [s].
     """
 
     directions: Array
@@ -84,11 +86,11 @@ class Returns:
     times_s: Array
 
     def keep(self, mask: NDArray[np.bool_]) -> Returns:
-        """Those of the mask (n,)."""
+        """The returns selected by a mask (n,)."""
         return Returns(self.directions[mask], self.ranges[mask], self.times_s[mask])
 
     def joined(self, other: Returns) -> Returns:
-        """These, then those of ``other``."""
+        """These returns, then the others."""
         return Returns(
             np.concatenate([self.directions, other.directions]),
             np.concatenate([self.ranges, other.ranges]),
@@ -96,7 +98,7 @@ class Returns:
         )
 
     def in_order(self) -> Returns:
-        """The same by time, equal times left in place."""
+        """The returns by time; the order of equal times is kept."""
         order = np.argsort(self.times_s, kind="stable")
         return Returns(self.directions[order], self.ranges[order], self.times_s[order])
 
@@ -107,16 +109,18 @@ class Returns:
 
 
 class Scanner:
-    """A scanner in front of one target in one motion.
+    """A scanner that observes one target.
 
     Attributes:
-        params: as given.  centre_c: (3,), radius_m: the target's bounding sphere in {C} [m].
+        params: Its parameters.
+        centre_c: (3,) centre of the target's bounding sphere in {C} [m].
+        radius_m: Its radius [m].
     """
 
     def __init__(self, params: ScannerParams, surface: Surface, motion: Motion) -> None:
         self.params = params
         self._motion = motion
-        self._caster = Caster(surface, params.engine)
+        self._caster = RayCaster(surface, params.engine)
         self._directions, self._times = _grid(params)
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         self.centre_c = frozen(0.5 * (low + high))
@@ -124,11 +128,11 @@ class Scanner:
 
     @property
     def engine(self) -> Engine:
-        """Who casts the rays."""
+        """The engine that casts the rays."""
         return self._caster.engine
 
     def cast(self, t_s: float) -> Returns:
-        """Noise-free first returns of a scan stamped ``t_s`` [s], the lost ones left out."""
+        """The first returns of a scan at ``t_s`` [s] without noise; rays without a return are left out."""
         R_ac, t_ac = self._poses(t_s)
         near = self._may_hit(R_ac, t_ac)
         R_ca = np.swapaxes(R_ac[near] if len(R_ac) > 1 else R_ac, -1, -2)
@@ -141,7 +145,7 @@ class Scanner:
         return Returns(self._directions[near], ranges, self._times[near]).keep(seen)
 
     def disturb(self, returns: Returns, rng: np.random.Generator, noise_factor: float = 1.0) -> Returns:
-        """Range noise, outliers and dropouts upon noise-free returns."""
+        """Add range noise and outliers, and remove dropouts."""
         p, n = self.params, len(returns.ranges)
         ranges = returns.ranges + noise_factor * p.noise_m * rng.standard_normal(n)
         wrong = rng.random(n) < p.outlier_ratio
@@ -150,13 +154,13 @@ class Scanner:
         return Returns(returns.directions, ranges, returns.times_s).keep(kept & (ranges > 0.0))
 
     def _poses(self, t_s: float) -> tuple[Array, Array]:
-        """Poses of the target at every ray's instant: (n, 3, 3) and (n, 3), n = 1 for a flash."""
+        """Rotations (n, 3, 3) and positions (n, 3) of the target at the time of each ray; n = 1 for a flash."""
         if self.params.pattern is Pattern.FLASH:
             return self._motion.poses([t_s])
         return self._motion.poses(t_s + self._times)
 
     def _may_hit(self, R_ac: Array, t_ac: Array) -> NDArray[np.intp]:
-        """Rays that pass through the target's bounding sphere."""
+        """The rays that pass through the bounding sphere of the target."""
         centre = rotate(R_ac, self.centre_c) + t_ac
         along = np.sum(self._directions * centre, axis=1)
         aside = np.sum(centre * centre, axis=1) - along * along
@@ -164,9 +168,9 @@ class Scanner:
 
 
 def _grid(params: ScannerParams) -> tuple[Array, Array]:
-    """Unit directions (n, 3) in {A}, row after row from the top left, and times (n,) [s] after the stamp.
+    """Unit directions (n, 3) in {A}, row by row from the top left, and times (n,) [s] after the stamp.
 
-    A flash images on a plane (even steps in tangent), a raster turns a mirror (even steps in angle).
+    The rays of a flash are uniform on the image plane, those of a raster in the angle of its mirror.
     """
     (across, down), (columns, rows) = params.fov_deg, params.rays
     u, v = _steps(columns), _steps(rows)
@@ -178,12 +182,12 @@ def _grid(params: ScannerParams) -> tuple[Array, Array]:
     grid = np.array([(a, b, 1.0) for b in y for a in x])
     grid /= np.sqrt(np.sum(grid * grid, axis=1))[:, None]
     times = np.arange(len(grid)) * (params.scan_s / len(grid))
-    if params.view is View.CONE:
+    if params.view is FieldOfView.CONE:
         inside = np.array([a * a + b * b <= 1.0 for b in v for a in u])
         grid, times = grid[inside], times[inside]
     return frozen(grid), frozen(times)
 
 
 def _steps(n: int) -> list[float]:
-    """N cell centres over (-1, 1)."""
+    """The centres of n equal cells over (-1, 1)."""
     return [(2 * k + 1) / n - 1.0 for k in range(n)]

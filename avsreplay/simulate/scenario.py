@@ -1,4 +1,4 @@
-"""A scenario: one TOML file, strict. Each table's parameters stand beside what they set."""
+"""A scenario: one TOML file, one table per part of the simulation."""
 
 from __future__ import annotations
 
@@ -15,12 +15,10 @@ from avsreplay.errors import UsageError
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 from avsreplay.settings import Settings, setting
-from avsreplay.simulate.faults import FaultParams
+from avsreplay.simulate.faults import InjectedFault
 from avsreplay.simulate.motion import MotionParams
 from avsreplay.simulate.scanner import ScannerParams
 from avsreplay.simulate.target import TargetParams
-
-__all__ = ["Scenario", "ScenarioParams", "StartParams", "belief", "load_scenario", "scenario_of"]
 
 MAX_SCANS = 10_000_000
 DRAWN = "drawn from its 1 sigma"
@@ -65,7 +63,7 @@ class ScenarioParams(Settings):
     target: TargetParams = setting(TargetParams, "The target.")
     motion: MotionParams = setting(MotionParams, "The target's motion.")
     scanner: ScannerParams = setting(ScannerParams, "The scanner.")
-    fault: tuple[FaultParams, ...] = setting((), "The injected faults, one table [[fault]] each.")
+    fault: tuple[InjectedFault, ...] = setting((), "The injected faults, one table [[fault]] each.")
     start: StartParams | None = setting(
         None, "The initial belief.", unset="the log has none, and the estimator starts cold"
     )
@@ -84,8 +82,9 @@ class Scenario:
     """A scenario as read.
 
     Attributes:
-        params: what it says, the seed in force included.  text: its TOML text, for the log.
-        folder: where its relative file names start.
+        params: Its parameters, with the seed that is used.
+        text: Its TOML text, which is stored in the log.
+        folder: Folder to which its file names are relative.
     """
 
     params: ScenarioParams
@@ -94,16 +93,22 @@ class Scenario:
 
     @property
     def model(self) -> Path | None:
-        """The model it names, None for a built-in shape."""
+        """The model file, None for a built-in shape."""
         if not self.params.target.model:
             return None
         return (self.folder or Path()) / self.params.target.model
 
 
 def load_scenario(path: Path | None = None, seed: int | None = None) -> Scenario:
-    """The scenario in ``path``, or the built-in one; ``seed`` overrides its own.
+    """Load a scenario.
 
-    Raises UnreadableInput or UsageError with file and line.
+    Args:
+        path: Its file; None for the built-in scenario.
+        seed: Replaces its own seed.
+
+    Raises:
+        UnreadableInput: The file cannot be read.
+        UsageError: A key or value is wrong; the message names file and line.
     """
     if path is None:
         text = resources.files("avsreplay.simulate").joinpath("builtin.toml").read_text(encoding="utf-8")
@@ -122,7 +127,7 @@ def scenario_of(document: toml_document.Document, seed: int | None = None, folde
 
 
 def belief(start: StartParams, truth: State, t_ns: int, rng: np.random.Generator) -> Belief:
-    """The first belief about ``truth``: offsets given or drawn, and the covariance of the 20 error states."""
+    """The initial belief: the true state plus offsets, given or drawn, and the covariance of the 20 error states."""
     rate = _offset(start.rate_offset_radps, start.rate_std_radps, 3, rng)
     sigma = _offset(start.sigma_offset, start.sigma_std, 2, rng)
     varrho = _offset(start.varrho_offset_m, start.varrho_std_m, 3, rng)

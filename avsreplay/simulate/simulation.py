@@ -1,7 +1,6 @@
-"""Scenario and surface to scans with truth, one by one. Same seed, same scans, to the bit.
+"""Simulated scans of a scenario, one by one. The same seed gives the same bits.
 
-Every scan draws from its own streams, named by purpose and place, so that a fault added to a scenario leaves all
-other scans as they were.
+Every scan has its own random streams, one per purpose, so that a fault added to a scenario does not change other scans.
 """
 
 from __future__ import annotations
@@ -14,26 +13,27 @@ import numpy as np
 
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.simulate import faults
-from avsreplay.simulate.caster import Engine
-from avsreplay.simulate.faults import FaultParams, Kind
+from avsreplay.simulate.faults import InjectedFault, Kind
 from avsreplay.simulate.motion import Motion
+from avsreplay.simulate.ray_casting import Engine
 from avsreplay.simulate.scanner import Pattern, Returns, Scanner
 from avsreplay.simulate.scenario import Scenario, belief
 from avsreplay.simulate.target import body
 
-__all__ = ["EPOCH_NS", "Simulation", "simulate"]
-
-EPOCH_NS = 1_700_000_000_000_000_000  # the first instant of every simulated log: a fixed date, so that bytes repeat
+EPOCH_NS = (
+    1_700_000_000_000_000_000  # time of the first scan of every simulated log, fixed so that logs are reproducible
+)
 NS = 1_000_000_000
 _STREAMS = {"motion": 0, "start": 1, "noise": 2, "fault": 3, "plate": 4}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation:
-    """A scenario ready to be recorded or replayed.
+    """A simulated log.
 
     Attributes:
-        header: what the log says of itself.  count: instants at which a scan is due (dropped ones included).
+        header: Header of the log.
+        count: Number of scans, dropped ones included.
     """
 
     header: LogHeader
@@ -44,11 +44,11 @@ class Simulation:
 
     @property
     def engine(self) -> Engine:
-        """Who casts the rays."""
+        """The engine that casts the rays."""
         return self._scanner.engine
 
     def truth(self, log_ns: int) -> State:
-        """The full true state at an instant of the log clock."""
+        """The true state at an instant of the log clock [ns]."""
         return self._motion.state((log_ns - EPOCH_NS) / NS)
 
     def truth_of(self, scan: Scan) -> Truth:
@@ -56,11 +56,11 @@ class Simulation:
         state = self.truth(scan.log_ns)
         return Truth(state.T_ac, state, next((kind.value for kind in self._faults(scan.log_ns)), None))
 
-    def _faults(self, log_ns: int) -> dict[Kind, FaultParams]:
+    def _faults(self, log_ns: int) -> dict[Kind, InjectedFault]:
         return faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
 
     def scans(self) -> Iterator[Scan]:
-        """The scans in the recorder's order; a dropped one leaves a gap in ``seq``."""
+        """The scans in the order of recording; a dropped one leaves a gap in ``seq``."""
         last: Scan | None = None
         for k in range(self.count):
             scan = self._scan(k, last)
@@ -90,8 +90,8 @@ class Simulation:
             scan = replace(scan, points=last.points, times_s=last.times_s, status=last.status)
         return scan
 
-    def _returns(self, k: int, log_ns: int, now: dict[Kind, FaultParams], state: State) -> Returns:
-        """Cast, cover, disturb, bias, clutter: in the order light meets them."""
+    def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault], state: State) -> Returns:
+        """Ray casting, occlusion, noise, bias, clutter: in the order in which they act on the light."""
         noise, wrong = self._rng("noise", k), self._rng("fault", k)
         returns = self._scanner.cast((log_ns - EPOCH_NS) / NS)
         for kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
@@ -106,8 +106,8 @@ class Simulation:
             returns = faults.clutter(returns, ratio, centre, self._scanner.radius_m, wrong)
         return returns.keep(np.zeros(len(returns.ranges), dtype=bool)) if Kind.EMPTY in now else returns.in_order()
 
-    def _side(self, fault: FaultParams) -> float:
-        """The side one plate comes from, the same for all its scans [rad]."""
+    def _side(self, fault: InjectedFault) -> float:
+        """Direction in the image from which the plate of a fault enters, the same for all its scans [rad]."""
         return float(self._rng("plate", self._scenario.params.fault.index(fault)).uniform(0.0, 2.0 * math.pi))
 
     def _rng(self, stream: str, k: int) -> np.random.Generator:
@@ -115,9 +115,15 @@ class Simulation:
 
 
 def simulate(scenario: Scenario, surface: Surface) -> Simulation:
-    """The simulation of ``scenario`` with the model ``surface`` (in {C}).
+    """The simulation of a scenario.
 
-    Raises UsageError for a model without mass, MissingBackend for a ray engine that is not installed.
+    Args:
+        scenario: The scenario.
+        surface: The model in {C}.
+
+    Raises:
+        UsageError: The model has no mass properties.
+        MissingBackend: The ray engine is not installed.
     """
     params = scenario.params
     span_s = params.duration_s + params.scanner.scan_s

@@ -1,36 +1,34 @@
-"""Built-in targets, made in code. {C} is on the face of the grapple fixture, its +x outward: the approach axis.
+"""Built-in targets, made of closed solids. {C} is on the face of the grapple fixture, +x outward: the approach axis.
 
-The model is written as binary PLY with float32 corners and read back by the same rounding, so the surface here and
-the one in a log's attachment are equal to the bit.
+Vertices are rounded to float32 as in the binary PLY file, so that this surface and the one in a log are identical.
+Faces are counter-clockwise seen from outside.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.inertia import Body, body_of, with_axes
-from avsreplay.simulate.shapes import Solid, box, extrusion, frustum, join, moved, shell
-
-__all__ = ["Shape", "TargetParams", "body", "builtin_surface", "ply_bytes"]
 
 
 class Shape(Enum):
-    """The targets that need no file."""
+    """The built-in targets."""
 
     SATELLITE = "satellite"  # bus, two unequal panels, nozzle, fixture, small parts: no symmetry
     BRACKET = "bracket"  # an L-shaped bracket with a tapered pin
     STAGE = "stage"  # a spent rocket stage: nearly a body of revolution, marked by a raceway and a box
-    CUBE = "cube"  # fully symmetric: the pose has 24 equals
+    CUBE = "cube"  # fully symmetric: 24 equivalent poses
 
 
 FROM_MESH = "from the mesh, of uniform density"
@@ -65,7 +63,7 @@ class TargetParams(Settings):
 
 
 def builtin_surface(shape: Shape = Shape.SATELLITE) -> Surface:
-    """The mesh of a built-in target in {C}, closed and outward, with its PLY bytes."""
+    """The mesh of a built-in target in {C}, with its PLY bytes. Parts that touch keep their own faces."""
     parts = {
         Shape.SATELLITE: _satellite,
         Shape.BRACKET: _bracket,
@@ -79,7 +77,11 @@ def builtin_surface(shape: Shape = Shape.SATELLITE) -> Surface:
 
 
 def body(params: TargetParams, surface: Surface) -> Body:
-    """Mass properties of the target: the scenario's where given, else the mesh's. Raises UsageError (inertia)."""
+    """Mass properties of the target: those of the scenario where given, else those of the mesh.
+
+    Raises:
+        UsageError: They are needed from a mesh that has none (see ``body_of``).
+    """
     given = params.moments_m2 is not None and params.axes_xyzw is not None
     if given and params.mass_centre_m is not None:
         return with_axes(params.moments_m2 or (), params.axes_xyzw or (), params.mass_centre_m)
@@ -91,7 +93,7 @@ def body(params: TargetParams, surface: Surface) -> Body:
 
 
 def ply_bytes(vertices: NDArray[np.float32] | Array, faces: NDArray[np.int32]) -> bytes:
-    """A triangle mesh as binary little-endian PLY; the same mesh gives the same bytes."""
+    """A triangle mesh as binary little-endian PLY: vertices (n, 3) [m], faces (m, 3)."""
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
@@ -108,9 +110,82 @@ def _triangle(moments: tuple[float, float, float]) -> bool:
 
 
 def _at(x: float, y: float, z: float, roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Pose:
-    """T_cs from a place [m] and turns about x, then y, then z [deg]."""
+    """T_cs from a position [m] and rotations about x, then y, then z [deg]."""
     turns = [geometry.exp(np.radians(angle) * axis) for angle, axis in zip((roll, pitch, yaw), np.eye(3), strict=True)]
     return Pose(geometry.multiply(turns[2], geometry.multiply(turns[1], turns[0])), np.array([x, y, z]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solid:
+    """A closed triangle surface.
+
+    Attributes:
+        vertices: (n, 3) [m].  faces: (m, 3) vertex indices, outward by the right hand.
+    """
+
+    vertices: Array
+    faces: NDArray[np.int32]
+
+
+def join(solids: Iterable[Solid]) -> Solid:
+    """Several solids as one list of triangles."""
+    parts = list(solids)
+    shifts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
+    faces = np.concatenate([p.faces + s for p, s in zip(parts, shifts, strict=True)]).astype(np.int32)
+    return Solid(np.concatenate([p.vertices for p in parts]), faces)
+
+
+def moved(solid: Solid, pose: Pose) -> Solid:
+    """The solid in {C}, given its pose T_cs."""
+    return Solid(pose.apply(solid.vertices), solid.faces)
+
+
+def extrusion(outline: Sequence[tuple[float, float]], x0: float, x1: float) -> Solid:
+    """An outline in (y, z), counter-clockwise about +x, star-shaped from its mean point, from x0 to x1 [m]."""
+    centre = tuple(sum(c) / len(outline) for c in zip(*outline, strict=True))
+    return _tube([[(x0, *centre)], [(x0, *p) for p in outline], [(x1, *p) for p in outline], [(x1, *centre)]])
+
+
+def box(low: ArrayLike, high: ArrayLike) -> Solid:
+    """The box between two corners (3,) [m], two triangles a side."""
+    (x0, y0, z0), (x1, y1, z1) = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    corners = [(x, y, z) for x in (x0, x1) for y in (y0, y1) for z in (z0, z1)]
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return Solid(np.array(corners), np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], np.int32))
+
+
+def frustum(x0: float, r0: float, x1: float, r1: float, sides: int = 24) -> Solid:
+    """A closed cone frustum about x from radius r0 at x0 to r1 at x1 > x0 [m]."""
+    return _tube([[(x0, 0.0, 0.0)], _ring(x0, r0, sides), _ring(x1, r1, sides), [(x1, 0.0, 0.0)]])
+
+
+def shell(x0: float, r0: float, x1: float, r1: float, wall: float, floor: float, sides: int = 24) -> Solid:
+    """An open cup about x: radius r0 at x0 and r1 at its opening x1, thickness ``wall``, bottom at x0 + floor [m]."""
+    outer0, outer1 = _ring(x0, r0, sides), _ring(x1, r1, sides)
+    inner1, inner0 = _ring(x1, r1 - wall, sides), _ring(x0 + floor, r0 - wall, sides)
+    return _tube([[(x0, 0.0, 0.0)], outer0, outer1, inner1, inner0, [(x0 + floor, 0.0, 0.0)]])
+
+
+def _ring(x: float, radius: float, sides: int) -> list[tuple[float, float, float]]:
+    angles = [2.0 * math.pi * k / sides for k in range(sides)]
+    return [(x, radius * math.cos(a), radius * math.sin(a)) for a in angles]
+
+
+def _tube(rings: Sequence[Sequence[tuple[float, float, float]]]) -> Solid:
+    """The surface through rings about x, from a single point to a single point."""
+    vertices = np.array([p for ring in rings for p in ring], dtype=np.float64)
+    starts = np.cumsum([0, *(len(r) for r in rings)])
+    faces: list[tuple[int, int, int]] = []
+    for a, b, low, high in zip(starts[:-2], starts[1:-1], rings[:-1], rings[1:], strict=True):
+        n = max(len(low), len(high))
+        for k in range(n):
+            i, j = k % len(low), (k + 1) % len(low)
+            p, q = k % len(high), (k + 1) % len(high)
+            if i != j:
+                faces.append((a + i, a + j, b + p))
+            if p != q:
+                faces.append((a + j, b + q, b + p))
+    return Solid(vertices, np.array(faces, np.int32))
 
 
 def _fixture() -> list[Solid]:

@@ -30,8 +30,7 @@ from avsreplay.log import parse_surface, read_surface
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
-from avsreplay.simulate.shapes import box, frustum, join
-from avsreplay.simulate.target import Shape, ply_bytes
+from avsreplay.simulate.target import Shape, box, frustum, join, ply_bytes
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 TURN_RAD, FARTHEST_RAD, NEAR_RAD = 0.02, 0.6, 0.06

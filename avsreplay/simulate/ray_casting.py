@@ -1,6 +1,6 @@
-"""First hits of rays on a triangle mesh: embreex where it is installed, an exact search of our own elsewhere.
+"""First intersection of rays with a triangle mesh: by embreex where it is installed, by an exhaustive search elsewhere.
 
-Either engine only says which triangle; the range is then the ray's own with that triangle's plane, in float64.
+Either engine only finds the triangle; the range is computed from the plane of that triangle in float64.
 """
 
 from __future__ import annotations
@@ -16,25 +16,28 @@ from avsreplay.errors import MissingBackend
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
 
-__all__ = ["Caster", "Engine"]
-
 CHUNK = 1 << 20  # ray-triangle pairs held at once by the exact search
 Hits = NDArray[np.int64]
 Search = Callable[[Array, Array], Hits]
 
 
 class Engine(Enum):
-    """Who looks for the triangle."""
+    """The search for the triangle."""
 
-    AUTO = "auto"  # embreex where installed, else exact
-    EMBREE = "embree"  # float32, fast; an edge may fall to either side on another processor
-    EXACT = "exact"  # every triangle tried in float64: slow, the same bits on any machine
+    AUTO = "auto"  # embree where embreex is installed, else exact
+    EMBREE = "embree"  # float32, fast; hits on an edge may differ between processors
+    EXACT = "exact"  # every triangle in float64: slow, the same bits on any machine
 
 
-class Caster:
-    """Rays against one mesh.
+class RayCaster:
+    """Casts rays on one mesh.
 
-    Raises MissingBackend where embree is asked for and not installed.
+    Args:
+        surface: The mesh.
+        engine: The search for the triangle.
+
+    Raises:
+        MissingBackend: embree is requested and embreex is not installed.
     """
 
     def __init__(self, surface: Surface, engine: Engine = Engine.AUTO) -> None:
@@ -48,9 +51,11 @@ class Caster:
         self._search = build(self._corners)
 
     def ranges(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Range (n,) [m] to the first hit (inf: none) and cosine (n,) of its incidence.
+        """Range (n,) [m] to the first intersection (inf: none) and cosine (n,) of the angle of incidence there.
 
-        ``directions`` (n, 3) unit; ``origins`` (n, 3), or (1, 3) where all rays start at one point.
+        Args:
+            origins: (n, 3), or (1, 3) where all rays have one origin [m].
+            directions: (n, 3) unit vectors.
         """
         face = self._search(origins, directions)
         origins = np.broadcast_to(origins, directions.shape)
@@ -111,7 +116,7 @@ def _exact(corners: Array) -> Search:
 def _nearest(origins: Array, directions: Array, a: Array, e1: Array, e2: Array) -> Hits:
     """Index of the nearest triangle (m, corner a, edges e1, e2) hit by each ray, -1 where none.
 
-    Moeller and Trumbore's test with its triple products turned so that all but the direction is known beforehand
+    Moeller and Trumbore's test, its triple products permuted so that all but the direction is computed once
     where the rays share an origin: origins (n or 1, 1, 3), directions (n, 3).
     """
     s = origins - a
