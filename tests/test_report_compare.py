@@ -96,6 +96,23 @@ def test_a_missing_figure_breaks_the_rule_unless_optional():
     assert not judge([Rule("t1_s", max_ratio=2)], [("a", BASE), ("b", BASE | {"t1_s": 3.0})])[0].ok
 
 
+def test_an_optional_rule_does_not_skip_a_lost_value():
+    rules = [Rule("t1_s", max_increase=2.0, optional=True), Rule("capture_s", max=40.0, optional=True)]
+    base = BASE | {"t1_s": 8.0, "capture_s": 29.0}
+    outcomes = judge(rules, [("base", base), ("new", base | {"t1_s": None, "capture_s": None})])
+    assert [o.ok for o in outcomes] == [False, False]
+    assert outcomes[0].why == "the run has lost the value (baseline 8)"
+
+
+def test_a_run_that_used_no_scan_cannot_pass(make_rows):
+    rows = make_rows(30, gamma=0, reason="not_aligned", nis=None)
+    figures = metrics(Summary.fold(rows))
+    outcomes = judge([Rule("false_alarms", max=1000.0, optional=True)], [("run", figures)], baseline=False)
+    assert outcomes[-1].why == "the run used no scan"
+    with pytest.raises(CheckFailed):
+        check_gate(outcomes)
+
+
 def test_one_run_is_judged_by_absolute_rules_only():
     assert judge([Rule("healthy", min=90)], [("a", BASE)])[0].ok
     with pytest.raises(UsageError, match="needs a baseline"):
@@ -178,6 +195,8 @@ def test_the_table_shows_changes_and_the_first_divergence(runs):
     done = _run(runs / "base", runs / "same", runs / "worse")
     assert done.exit_code == 0, done.output
     assert "+100.0 %" in done.output
+    assert "worse: worse in all_pos_rmse_m" in done.output
+    assert "same: no difference; all 40 rows agree" in done.output
     assert "same: all 40 rows agree with base" in done.output
     assert "worse: 40 cells differ from base, first at scan 0, column pos_err_m" in done.output
     assert max(len(line) for line in done.output.splitlines() if "cells" not in line and "agree" not in line) <= 80
@@ -197,9 +216,10 @@ def test_the_gate_fails_with_its_own_code_and_writes_for_ci(runs):
 def test_json_is_all_there_is_on_stdout(runs):
     done = _run(runs / "base", runs / "worse", "--gate", runs / "rules.toml", "--json", "--github")
     whole = json.loads(done.stdout)
-    assert [r["name"] for r in whole["runs"]] == ["base", "worse"]
-    assert whole["runs"][1]["divergence"]["by_column"] == {"pos_err_m": 40}
-    assert whole["runs"][1]["divergence"]["first"]["seq"] == 0
+    assert [r["name"] for r in whole["results"]] == ["base", "worse"]
+    assert whole["results"][1]["conclusion"]["word"] == "worse"
+    assert whole["results"][1]["divergence"]["by_column"] == {"pos_err_m": 40}
+    assert whole["results"][1]["divergence"]["first"]["seq"] == 0
     assert [o["ok"] for o in whole["gate"]] == [False]
 
 
@@ -208,7 +228,7 @@ def test_runs_of_one_name_are_told_apart(runs):
     other.mkdir()
     shutil.copytree(runs / "worse", other / "base")
     whole = json.loads(_run(runs / "base", other / "base", "--json").stdout)
-    assert [r["name"] for r in whole["runs"]] == ["base#1", "base#2"]
+    assert [r["name"] for r in whole["results"]] == ["base#1", "base#2"]
 
 
 def test_a_single_run_can_be_gated(runs):
@@ -245,8 +265,8 @@ def test_the_page_overlays_the_runs_and_keeps_what_is_there(runs):
 
 def test_the_page_says_what_the_gate_said(runs):
     results = [load_result(runs / name) for name in ("base", "worse")]
-    assert "1 of 2 rules broken" in build_comparison(results, _outcomes())
-    assert "All 1 rules hold" in build_comparison(results, _outcomes()[:1])
+    assert "1 of 2 rules broken" in build_comparison(results, [], _outcomes())
+    assert "All 1 rules hold" in build_comparison(results, [], _outcomes()[:1])
 
 
 # ---- sparklines

@@ -509,7 +509,7 @@ def test_a_comparison_overlays_and_reads_runs_of_different_rates(browser, tmp_pa
         write_rows(tmp_path / name / "rows.jsonl", rows)
     results = [load_result(tmp_path / name) for name in ("one", "two")]
     path = tmp_path / "c.html"
-    path.write_text(build_comparison(results), encoding="utf-8")
+    path.write_text(build_comparison(results, []), encoding="utf-8")
     browser.get(path.as_uri())
     assert browser.get_log("browser") == []
     outputs = "return [...document.querySelectorAll('#chart-sigma1 output')].map((o) => o.textContent)"

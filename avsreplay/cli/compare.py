@@ -5,24 +5,30 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH
+from avsreplay.cli.options import PATH, output_is_free
 from avsreplay.errors import UsageError
 from avsreplay.report import gate as gates
 from avsreplay.report.atomic import atomic_text
 from avsreplay.report.compare import METRICS, first_divergence, metrics
+from avsreplay.report.conclusion import Conclusion, conclude
 from avsreplay.report.result import Result, load_result
 from avsreplay.settings import dump
+
+if TYPE_CHECKING:
+    from avsreplay.report.table import Table
 
 EPILOG = """\b
 Examples:
   avsreplay compare baseline/ candidate/
   avsreplay compare baseline/ a/ b/ -o compare.html
   avsreplay compare baseline/ candidate/ --gate rules.toml --junit gate.xml --github
+  avsreplay compare baseline/ candidate/ --markdown >> "$GITHUB_STEP_SUMMARY"
   avsreplay compare candidate/ --gate rules.toml          a single run: absolute rules only
 
 \b
@@ -62,6 +68,8 @@ def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> 
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing page.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+@click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for the summary of a CI job.")
+@click.option("--all", "show_all", is_flag=True, help="Print the equal metrics too.")
 @click.option(
     "--metrics",
     is_flag=True,
@@ -78,64 +86,31 @@ def command(
     output: Path | None,
     overwrite: bool,
     as_json: bool,
+    as_markdown: bool,
+    show_all: bool,
 ) -> None:
-    """Compare saved RESULTS: metrics, changes, and the first scan and column at which they differ.
+    """Compare saved RESULTS: a conclusion, the settings that differ, and every metric.
 
-    RESULTS are directories written by 'avsreplay run -o' or their rows.jsonl; the first is the baseline.
+    RESULTS are directories written by 'avsreplay run -o' or their rows.jsonl; the first is the baseline. A folder of
+    several results (one per seed) is compared run by run with the baseline's runs of the same names.
+
+    Errors cover all scans, coasting included; a value that a run has lost is worse. Intervals are 95 % bootstrap
+    intervals of the paired difference. The conclusion on a metric without one needs a change above 10 %.
     """
     if (junit or github) and not gate:
         raise UsageError("--junit and --github need --gate", hint="name the rules with --gate rules.toml")
-    if output and output.exists() and not overwrite:
-        raise UsageError("already exists", where=str(output), hint="name another with -o, or add --overwrite")
-    runs = _with_distinct_names([load_result(path) for path in results])
-    figures = [(run.name, metrics(run.summary)) for run in runs]
-    outcomes = gates.judge(gates.load_rules(gate), figures) if gate else []
+    output_is_free(output, overwrite=overwrite)
+    groups = _with_distinct_names([_group(path) for path in results])
+    rules = gates.load_rules(gate) if gate else ()
+    pairs = [(other, _paired(groups[0], other)) for other in groups[1:]]
+    conclusions = [conclude(other.name, listed) for other, listed in pairs]
+    outcomes = _outcomes(rules, groups[0], pairs)
     if as_json:
-        click.echo(_document(runs, outcomes))
+        click.echo(_document(groups, conclusions, outcomes))
+    elif as_markdown:
+        click.echo("\n".join(_markdown(groups, conclusions, outcomes)))
     else:
-        _print(runs, outcomes)
-    _write(runs, outcomes, junit, output)
-    for line in gates.github_lines(outcomes) if github else ():
-        click.echo(line, err=as_json)
-    gates.check_gate(outcomes)
-
-
-def _with_distinct_names(runs: list[Result]) -> list[Result]:
-    """Runs of the same name get a number."""
-    names = [run.name for run in runs]
-    so_far: Counter[str] = Counter()
-    out = []
-    for run in runs:
-        so_far[run.name] += 1
-        out.append(replace(run, name=f"{run.name}#{so_far[run.name]}") if names.count(run.name) > 1 else run)
-    return out
-
-
-def _print(runs: Sequence[Result], outcomes: Sequence[gates.RuleOutcome]) -> None:
-    from avsreplay.report.comparison_tables import comparison_tables, divergence_line, gate_table
-    from avsreplay.report.table import make_console, print_line, print_table
-
-    console, base = make_console(), runs[0]
-    for table in comparison_tables([(run.name, metrics(run.summary)) for run in runs]):
-        print_table(console, table)
-    for other in runs[1:]:
-        print_line(console, divergence_line(base.name, other.name, first_divergence(base.rows, other.rows)))
-    print_table(console, gate_table(outcomes))
-
-
-def _document(runs: Sequence[Result], outcomes: Sequence[gates.RuleOutcome]) -> str:
-    records = [{"name": run.name, "metrics": metrics(run.summary)} for run in runs]
-    for record, run in zip(records[1:], runs[1:], strict=True):
-        found = first_divergence(runs[0].rows, run.rows, first=1)
-        first = dump(found.differences[0]) if found.differences else None
-        record["divergence"] = {"cells": found.count, "by_column": dict(found.by_column), "first": first}
-    whole = {"format": "avsreplay-compare/1", "runs": records, "gate": dump(list(outcomes))}
-    return json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
-
-
-def _write(
-    runs: Sequence[Result], outcomes: Sequence[gates.RuleOutcome], junit: Path | None, output: Path | None
-) -> None:
+        _print(groups, conclusions, outcomes, show_all=show_all)
     if junit:
         with atomic_text(junit) as stream:
             stream.write(gates.junit(outcomes))
@@ -143,4 +118,138 @@ def _write(
         from avsreplay.report.page import build_comparison
 
         with atomic_text(output) as stream:
-            stream.write(build_comparison(runs, outcomes))
+            stream.write(build_comparison([group.runs[0] for group in groups], conclusions, outcomes))
+    for line in gates.github_lines(outcomes) if github else ():
+        click.echo(line, err=as_json or as_markdown)
+    gates.check_gate(outcomes)
+
+
+@dataclass(frozen=True, slots=True)
+class _Group:
+    """A result, or several (one per seed or log) in a folder."""
+
+    name: str
+    runs: tuple[Result, ...]
+
+
+def _group(path: Path) -> _Group:
+    """The result at ``path``, or all results in its subfolders."""
+    inside = sorted(found.parent for found in path.glob("*/rows.jsonl")) if not (path / "rows.jsonl").is_file() else []
+    runs = tuple(load_result(folder) for folder in inside or [path])
+    return _Group(path.resolve().name if inside else runs[0].name, runs)
+
+
+def _with_distinct_names(groups: list[_Group]) -> list[_Group]:
+    """Runs or groups of the same name get a number."""
+    names = [group.name for group in groups]
+    so_far: Counter[str] = Counter()
+    out = []
+    for group in groups:
+        so_far[group.name] += 1
+        if names.count(group.name) == 1:
+            out.append(group)
+            continue
+        name = f"{group.name}#{so_far[group.name]}"
+        out.append(_Group(name, group.runs if len(group.runs) > 1 else (replace(group.runs[0], name=name),)))
+    return out
+
+
+def _paired(base: _Group, other: _Group) -> list[tuple[Result, Result]]:
+    """Runs of two groups by name. Raises UsageError if a run has no partner."""
+    if len(base.runs) == len(other.runs) == 1:
+        return [(base.runs[0], other.runs[0])]
+    ours, theirs = ({run.name: run for run in group.runs} for group in (other, base))
+    alone = sorted(ours.keys() ^ theirs.keys())
+    if alone:
+        what = f"the runs cannot be paired by name: {', '.join(alone[:3])} without a partner"
+        raise UsageError(what, where=f"{base.name}, {other.name}", hint="give both folders the same subfolders")
+    return [(theirs[name], ours[name]) for name in sorted(ours)]
+
+
+def _outcomes(
+    rules: Sequence[gates.Rule], base: _Group, pairs: Sequence[tuple[_Group, list[tuple[Result, Result]]]]
+) -> list[gates.RuleOutcome]:
+    """The rules on every run against its own baseline; on the runs themselves where there is only one group."""
+    if not rules:
+        return []
+    if not pairs:
+        return gates.judge(rules, [(run.name, metrics(run.summary)) for run in base.runs], baseline=False)
+    out = []
+    for group, listed in pairs:
+        for left, right in listed:
+            name = group.name if len(listed) == 1 else f"{group.name}/{right.name}"
+            out += gates.judge(rules, [(base.name, metrics(left.summary)), (name, metrics(right.summary))])
+    return out
+
+
+def _tables(
+    groups: Sequence[_Group],
+    conclusions: Sequence[Conclusion],
+    outcomes: Sequence[gates.RuleOutcome],
+    *,
+    show_all: bool = False,
+) -> list[Table]:
+    from avsreplay.report import comparison_tables as tables
+
+    found = [tables.settings_table(c) for c in conclusions]
+    found += [tables.changes_table(groups[0].name, c, show_all=show_all) for c in conclusions]
+    if not conclusions:
+        found += [tables.metrics_table(run.name, list(metrics(run.summary).items())) for run in groups[0].runs]
+    return [*found, tables.gate_table(outcomes)]
+
+
+def _divergences(groups: Sequence[_Group]) -> list[str]:
+    from avsreplay.report.comparison_tables import divergence_line
+
+    base, others = groups[0], [group for group in groups[1:] if len(group.runs) == 1]
+    return [
+        divergence_line(base.name, other.name, first_divergence(base.runs[0].rows, other.runs[0].rows))
+        for other in others
+        if len(base.runs) == 1
+    ]
+
+
+def _print(
+    groups: Sequence[_Group],
+    conclusions: Sequence[Conclusion],
+    outcomes: Sequence[gates.RuleOutcome],
+    *,
+    show_all: bool,
+) -> None:
+    from avsreplay.report.table import make_console, print_line, print_table
+
+    console = make_console()
+    for conclusion in conclusions:
+        print_line(console, conclusion.sentence)
+    console.print()
+    for table in _tables(groups, conclusions, outcomes, show_all=show_all):
+        print_table(console, table)
+    for line in _divergences(groups):
+        print_line(console, line)
+
+
+def _markdown(
+    groups: Sequence[_Group], conclusions: Sequence[Conclusion], outcomes: Sequence[gates.RuleOutcome]
+) -> list[str]:
+    from avsreplay.report.table import escaped, markdown
+
+    signs = {"better": "✅", "same": "✅", "worse": "❌", "mixed": "⚠️", "no evidence": "❔"}
+    lines = [f"### {signs[c.word]} {escaped(c.sentence)}\n" for c in conclusions]
+    return lines + [markdown(table) for table in _tables(groups, conclusions, outcomes) if table.rows]
+
+
+def _document(
+    groups: Sequence[_Group], conclusions: Sequence[Conclusion], outcomes: Sequence[gates.RuleOutcome]
+) -> str:
+    records: list[dict[str, Any]] = [
+        {"name": group.name, "runs": [{"name": run.name, "metrics": metrics(run.summary)} for run in group.runs]}
+        for group in groups
+    ]
+    for record, group, conclusion in zip(records[1:], groups[1:], conclusions, strict=True):
+        record["conclusion"] = dump(conclusion)
+        if len(group.runs) == len(groups[0].runs) == 1:
+            found = first_divergence(groups[0].runs[0].rows, group.runs[0].rows, first=1)
+            first = dump(found.differences[0]) if found.differences else None
+            record["divergence"] = {"cells": found.count, "by_column": dict(found.by_column), "first": first}
+    whole = {"format": "avsreplay-compare/2", "results": records, "gate": dump(list(outcomes))}
+    return json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)

@@ -78,6 +78,7 @@ METRICS: tuple[Metric, ...] = (
     Metric("scans", "", "scans replayed", lambda s: s.scans),
     Metric("healthy", "", "scans used by the filter", lambda s: s.healthy),
     Metric("healthy_ratio", "", "scans used over scans replayed", lambda s: s.healthy / s.scans if s.scans else None),
+    *_errors("all", "all scans, coasting included", lambda s: s.pose_all),
     *_errors("pose", "healthy scans", lambda s: s.pose_healthy),
     *_errors("coast", "coasting scans", lambda s: s.pose_coasting),
     *_errors("reg", "of the registration, healthy scans", lambda s: s.registration_healthy),

@@ -1,42 +1,63 @@
-"""Tables of several runs: their figures, a gate's outcomes, differences from a golden file."""
+"""Tables of several runs: their conclusion and metrics, a gate's outcomes, differences from a golden file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from avsreplay.report.compare import METRICS
+from avsreplay.report.conclusion import HEADLINES, Change, Conclusion
 from avsreplay.report.gate import RuleOutcome
 from avsreplay.report.golden import GoldenResult
-from avsreplay.report.table import Table, TableCell, number
+from avsreplay.report.table import Table, TableCell, facts_table, number
 
-_ABREAST = 3
-Figures = tuple[str, Mapping[str, float | None]]
-"""A run's name and its metrics by name."""
+_MARKS = {"better": "good", "worse": "bad"}
 
 
-def comparison_tables(runs: Sequence[Figures]) -> list[Table]:
-    """Metrics of the baseline (the first run) and of the others with their change, at most three runs per table."""
-    base, others = runs[0], runs[1:]
-    starts = range(0, max(len(others), 1), _ABREAST - 1)
-    return [comparison_table([base, *others[k : k + _ABREAST - 1]]) for k in starts]
+def settings_table(conclusion: Conclusion) -> Table:
+    """The settings in which a run differs from the baseline."""
+    texts = conclusion.settings or ("none",)
+    return facts_table(f"Settings of {conclusion.name} that differ", [("setting", text) for text in texts])
 
 
-def comparison_table(runs: Sequence[Figures], *, meaning: bool = False) -> Table:
-    """One table of all ``runs``; with ``meaning`` a column says what each metric is."""
-    base, others = runs[0], runs[1:]
-    heads = ["metric", *(["meaning"] if meaning else []), base[0]]
-    heads += [head for name, _ in others for head in (name, "change")]
-    rows = []
-    for metric in METRICS:
-        values = [figures.get(metric.name) for _, figures in runs]
-        if any(v is not None for v in values):
-            cells = [cell for v in values[1:] for cell in (number(v), _change(values[0], v))]
-            rows.append((metric.name, *([metric.doc] if meaning else []), number(values[0]), *cells))
-    title = "Runs, change against the first" if others else "Runs"
-    return Table(title, tuple(heads), tuple(rows), align="llr" if meaning else "lr")
+def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = False) -> Table:
+    """The metrics of a run against those of the baseline, with a word on each.
+
+    Without ``show_all`` the table has the main metrics and those that changed.
+    """
+    shown = [c for c in conclusion.changes if show_all or c.metric in HEADLINES or c.word != "equal"]
+    meaning = {m.name: m.doc for m in METRICS}
+    rows = tuple(
+        (
+            change.metric,
+            *((meaning[change.metric],) if show_all else ()),
+            number(change.base, ".4g"),
+            number(change.other, ".4g"),
+            change.note or _relative(change),
+            "" if change.low is None else f"{change.low:+.2g} to {change.high:+.2g}",
+            TableCell(change.word, _MARKS.get(change.word, "")),
+        )
+        for change in shown
+    )
+    runs = f", means of {conclusion.pairs} pairs" if conclusion.pairs > 1 else ""
+    left_out = len(conclusion.changes) - len(shown)
+    return Table(
+        f"{conclusion.name} against {baseline}{runs}",
+        ("metric", *(("meaning",) if show_all else ()), "baseline", "this", "change", "95 % interval", "conclusion"),
+        rows,
+        align="llrrrrl" if show_all else "lrrrrl",
+        note=f"{left_out} equal metrics are not shown" if left_out else "",
+    )
 
 
-def _change(base: float | None, value: float | None) -> str:
+def metrics_table(name: str, figures: Sequence[tuple[str, float | None]]) -> Table:
+    """The metrics of a single run."""
+    meaning = {m.name: m.doc for m in METRICS}
+    rows = tuple((metric, meaning[metric], number(value)) for metric, value in figures if value is not None)
+    return Table(name, ("metric", "meaning", "value"), rows, align="llr")
+
+
+def _relative(change: Change) -> str:
+    base, value = change.base, change.other
     if base is None or value is None or base == value:
         return ""
     if base == 0:
@@ -58,7 +79,13 @@ def divergence_line(baseline: str, other: str, found: GoldenResult) -> str:
 def gate_table(outcomes: Sequence[RuleOutcome]) -> Table:
     """Every rule and its outcome."""
     rows = tuple(
-        (TableCell("holds", "good") if o.ok else TableCell("broken", "bad"), o.run, o.rule.text, number(o.value), o.why)
+        (
+            TableCell("holds", "good") if o.ok else TableCell("broken", "bad"),
+            o.run,
+            o.rule.text,
+            number(o.value),
+            o.why,
+        )
         for o in outcomes
     )
     return Table("Gate", ("outcome", "run", "rule", "value", "why"), rows, align="lllrl")

@@ -20,7 +20,7 @@ _RELATIVE = _LIMITS[2:]
 class Rule(Settings):
     """One rule on one metric; all given limits must hold.
 
-    A run without a value for the metric breaks the rule, unless ``optional``.
+    A run without a value breaks the rule, unless it is ``optional`` and the baseline has no value either.
     """
 
     metric: str = setting(doc="The metric that is limited.")
@@ -30,7 +30,7 @@ class Rule(Settings):
     max_ratio: float | None = setting(None, "Largest multiple of the baseline's value.")
     max_increase: float | None = setting(None, "Largest increase over the baseline's value.")
     max_decrease: float | None = setting(None, "Largest decrease below the baseline's value.")
-    optional: bool = setting(False, "Whether a run without the metric passes.")
+    optional: bool = setting(False, "Whether a run without a value passes, if the baseline has none either.")
     note: str = setting("", "The reason, printed with the outcome.")
 
     def check(self) -> None:
@@ -93,7 +93,7 @@ def load_rules(path: str | Path) -> tuple[Rule, ...]:
 def judge(
     rules: Sequence[Rule], runs: Sequence[tuple[str, Mapping[str, float | None]]], *, baseline: bool = True
 ) -> list[RuleOutcome]:
-    """Apply every rule to every run but the baseline, which is the first.
+    """Apply every rule to every run but the baseline, which is the first; a run that used no scan always fails.
 
     Args:
         rules: to apply.
@@ -107,18 +107,29 @@ def judge(
         needy = next((rule for rule in rules if rule.relative), None)
         if needy is not None:
             raise UsageError(f"'{needy.text}' needs a baseline", where="--gate", hint="name the baseline first")
-        return [_outcome(rule, name, figures, {}) for name, figures in runs for rule in rules]
+        return [outcome for name, figures in runs for outcome in _outcomes(rules, name, figures, {})]
     base = runs[0][1]
-    return [_outcome(rule, name, figures, base) for name, figures in runs[1:] for rule in rules]
+    return [outcome for name, figures in runs[1:] for outcome in _outcomes(rules, name, figures, base)]
+
+
+def _outcomes(
+    rules: Sequence[Rule], run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]
+) -> list[RuleOutcome]:
+    """The outcome of every rule, and a broken rule on the healthy scans where the run has none."""
+    outcomes = [_outcome(rule, run, figures, base) for rule in rules]
+    if not figures.get("healthy"):
+        outcomes.append(RuleOutcome(run, Rule("healthy", min=1.0), 0.0, False, "the run used no scan"))
+    return outcomes
 
 
 def _outcome(
     rule: Rule, run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]
 ) -> RuleOutcome:
-    value = figures.get(rule.metric)
+    value, reference = figures.get(rule.metric), base.get(rule.metric)
+    if value is None and reference is not None:
+        return RuleOutcome(run, rule, None, False, f"the run has lost the value (baseline {reference:.6g})")
     if value is None:
         return RuleOutcome(run, rule, None, rule.optional, "" if rule.optional else "the run has no value")
-    reference = base.get(rule.metric)
     if rule.relative and reference is None:
         return RuleOutcome(run, rule, value, rule.optional, "" if rule.optional else "the baseline has no value")
     for name, limit in rule.limits.items():

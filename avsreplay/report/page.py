@@ -11,15 +11,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import Any, Protocol
+from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from avsreplay.records import State
 from avsreplay.report.charts import Chart, Columns, charts, derived, embed, pack, spans, values
-from avsreplay.report.compare import metrics
-from avsreplay.report.comparison_tables import comparison_table, gate_table
+from avsreplay.report.comparison_tables import changes_table, gate_table, settings_table
+from avsreplay.report.conclusion import ComparedRun, Conclusion
 from avsreplay.report.export import StampedPose
 from avsreplay.report.gate import RuleOutcome
 from avsreplay.report.summary import Summary
@@ -50,22 +50,6 @@ class Folded:
 
 Part = Table | Section | Folded | Markup
 """What stands under the charts, in order; Markup is a figure made by ``render``."""
-
-
-class SavedRun(Protocol):
-    """What a page needs of a saved result."""
-
-    @property
-    def name(self) -> str:
-        """What the run is called."""
-
-    @property
-    def rows(self) -> Sequence[Row]:
-        """One per scan."""
-
-    @property
-    def summary(self) -> Summary:
-        """Of the same rows."""
 
 
 @cache
@@ -177,11 +161,14 @@ def _packed(columns: Columns) -> dict[str, Any]:
     return {name: pack(column, "f4") for name, column in columns.items()}
 
 
-def build_comparison(runs: Sequence[SavedRun], outcomes: Sequence[RuleOutcome] = ()) -> str:
-    """The page of several runs: their metrics in a table, their charts over each other.
+def build_comparison(
+    runs: Sequence[ComparedRun], conclusions: Sequence[Conclusion], outcomes: Sequence[RuleOutcome] = ()
+) -> str:
+    """The page of several runs: conclusions, metrics in tables, charts over each other.
 
     Args:
         runs: the first is the baseline, whose flagged scans are shaded.
+        conclusions: one for each of the other runs.
         outcomes: of a gate.
 
     Returns:
@@ -199,10 +186,11 @@ def build_comparison(runs: Sequence[SavedRun], outcomes: Sequence[RuleOutcome] =
         "states": None,
         "scene": None,
     }
-    figures = [(run.name, metrics(run.summary)) for run in runs]
+    lines = [c.sentence for c in conclusions] or [runs[0].name]
+    lead = [*(settings_table(c) for c in conclusions), gate_table(outcomes)]
+    parts = [changes_table(runs[0].name, c, show_all=True) for c in conclusions]
     names = ", ".join(run.name for run in runs)
-    line = f"{len(runs)} runs: {names}.{_gate_sentence(outcomes)}"
-    return build("Comparison", [line], [comparison_table(figures, meaning=True), gate_table(outcomes)], data)
+    return build("Comparison", [*lines, f"{len(runs)} runs: {names}.{_gate_sentence(outcomes)}"], parts, data, lead)
 
 
 def _gate_sentence(outcomes: Sequence[RuleOutcome]) -> str:
@@ -212,7 +200,7 @@ def _gate_sentence(outcomes: Sequence[RuleOutcome]) -> str:
     return f" {broken} of {len(outcomes)} rules broken." if broken else f" All {len(outcomes)} rules hold."
 
 
-def _overlaid(runs: Sequence[SavedRun], columns: Sequence[Columns]) -> list[Chart]:
+def _overlaid(runs: Sequence[ComparedRun], columns: Sequence[Columns]) -> list[Chart]:
     """One chart for each line of the single-run charts, with a line per run."""
     everything: Columns = {name: column for own in reversed(columns) for name, column in own.items()}
     out = []

@@ -130,15 +130,15 @@ def markdown(table: Table) -> str:
     """The table in GitHub's Markdown; "" for a table without rows."""
     if not table.rows:
         return ""
-    heads = [_escaped(head.replace("\n", " ")) for head in table.heads]
+    heads = [escaped(head.replace("\n", " ")) for head in table.heads]
     rules = ["---:" if table.right(k) else "---" for k in range(len(heads))]
-    rows = [[_escaped(as_cell(cell).signed()) for cell in row] for row in table.rows]
+    rows = [[escaped(as_cell(cell).signed()) for cell in row] for row in table.rows]
     lines = [f"| {' | '.join(cells)} |" for cells in (heads, rules, *rows)]
-    note = ["", _escaped(table.note)] if table.note else []
-    return "\n".join([f"**{_escaped(table.title)}**", "", *lines, *note]) + "\n"
+    note = ["", escaped(table.note)] if table.note else []
+    return "\n".join([f"**{escaped(table.title)}**", "", *lines, *note]) + "\n"
 
 
-def _escaped(text: str) -> str:
+def escaped(text: str) -> str:
     """Text that Markdown shows as it is, on one line."""
     for sign in "\\`*_[]<>|#":
         text = text.replace(sign, "\\" + sign)

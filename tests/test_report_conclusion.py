@@ -1,0 +1,163 @@
+"""The conclusion of a comparison: directions, lost values, intervals, settings, pairs."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from avsreplay.cli.compare import command
+from avsreplay.errors import UsageError
+from avsreplay.report.compare import METRICS
+from avsreplay.report.conclusion import HEADLINES, conclude
+from avsreplay.report.jsonl import write_rows
+from avsreplay.report.summary import Summary
+
+
+@dataclass
+class Saved:
+    name: str
+    rows: list
+    header: dict = field(default_factory=dict)
+
+    @property
+    def summary(self):
+        return Summary.fold(self.rows)
+
+
+def _noisy(rows, factor, seed=5):
+    """Errors drawn anew around ``factor`` times 10 mm: independent from scan to scan."""
+    rng = np.random.default_rng(seed)
+    return [dataclasses.replace(r, pos_err_m=float(factor * 0.01 * abs(1 + 0.3 * rng.normal()))) for r in rows]
+
+
+def _changes(found):
+    return {change.metric: change for change in found.changes}
+
+
+def test_the_same_rows_are_the_same(make_rows):
+    found = conclude("b", [(Saved("a", make_rows(60)), Saved("b", make_rows(60)))])
+    assert found.word == "same"
+    assert {change.word for change in found.changes} == {"equal"}
+
+
+def test_larger_errors_are_worse_and_smaller_ones_better(make_rows):
+    base, other = Saved("a", _noisy(make_rows(200), 1.0)), Saved("b", _noisy(make_rows(200), 1.5, seed=6))
+    worse, better = (_changes(conclude("x", [pair]))["all_pos_rmse_m"] for pair in ((base, other), (other, base)))
+    assert (worse.word, better.word) == ("worse", "better")
+    assert worse.low < worse.other - worse.base < worse.high
+    assert worse.low == pytest.approx(-better.high)
+
+
+def test_errors_that_differ_by_chance_are_no_evidence(make_rows):
+    words = [
+        _changes(
+            conclude(
+                "b", [(Saved("a", _noisy(make_rows(200), 1.0, k)), Saved("b", _noisy(make_rows(200), 1.0, 100 + k)))]
+            )
+        )["all_pos_rmse_m"].word
+        for k in range(20)
+    ]
+    assert words.count("no evidence") >= 16  # 95 % intervals: one in twenty is expected to exclude 0
+
+
+def test_errors_of_coasting_scans_count(make_rows):
+    base = make_rows(100)
+    other = [dataclasses.replace(r, pos_err_m=1.0) if r.gamma == 0 else r for r in base]
+    found = _changes(conclude("b", [(Saved("a", base), Saved("b", other))]))
+    assert found["pose_pos_rmse_m"].word == "equal"
+    assert found["all_pos_rmse_m"].other > 0.2
+
+
+def test_one_used_scan_of_35_is_worse_not_better(make_rows):
+    """Errors of healthy scans alone would call this an improvement."""
+    base = make_rows(35)
+    other = [
+        dataclasses.replace(
+            r, gamma=int(k == 0), reason="fit_error", pos_err_m=0.0005 if k == 0 else 0.5, converged=False
+        )
+        for k, r in enumerate(base)
+    ]
+    found = conclude("b", [(Saved("a", base), Saved("b", other))])
+    changes = _changes(found)
+    assert changes["pose_pos_rmse_m"].other < changes["pose_pos_rmse_m"].base
+    assert found.word == "worse"
+    for name in ("healthy_ratio", "all_pos_rmse_m", "t1_s"):
+        assert changes[name].word == "worse", name
+    assert changes["t1_s"].note == "lost"
+    assert "t1_s (lost)" in found.sentence
+
+
+def test_what_goes_wrong_no_more_is_not_lost(make_rows):
+    found = _changes(conclude("b", [(Saved("a", make_rows(60)), Saved("b", make_rows(60, blackout=range(0))))]))
+    assert found["coast_pos_rmse_m"].word == "changed"
+
+
+def test_headlines_are_metrics():
+    assert set(HEADLINES) <= {m.name for m in METRICS}
+
+
+def test_settings_that_differ_are_named(make_rows):
+    config = {"faults": {"policy": "any"}, "plan": {"a_max_mps2": 0.05}}
+    other = {"faults": {"policy": "all"}, "plan": {"a_max_mps2": 0.05}}
+    left = Saved("a", make_rows(9), {"config": config, "log": {"name": "x.mcap", "sha256": "1"}})
+    right = Saved("b", make_rows(9), {"config": other, "log": {"name": "y.mcap", "sha256": "2"}})
+    assert conclude("b", [(left, right)]).settings == (
+        "log = y.mcap (baseline x.mcap)",
+        'faults.policy = "all" (baseline "any")',
+    )
+
+
+def test_groups_of_seeds_get_intervals_and_few_do_not(make_rows):
+    def pairs(n, factor):
+        return [
+            (Saved(str(k), _noisy(make_rows(30), 1.0, k)), Saved(str(k), _noisy(make_rows(30), factor, 50 + k)))
+            for k in range(n)
+        ]
+
+    many = _changes(conclude("g", pairs(8, 1.4)))["pose_pos_rmse_m"]
+    assert (many.word, many.low > 0.0) == ("worse", True)
+    few = _changes(conclude("g", pairs(3, 1.4)))["pose_pos_rmse_m"]
+    assert (few.word, few.low) == ("no evidence", None)
+
+
+def test_no_runs_of_rows_have_a_conclusion(make_rows):
+    assert conclude("b", [(Saved("a", make_rows(3)), Saved("b", []))]).word == "worse"
+    assert conclude("b", [(Saved("a", []), Saved("b", []))]).word == "same"
+
+
+@pytest.fixture
+def seeds(tmp_path, make_rows):
+    for group, factor in (("base", 1.0), ("other", 1.5)):
+        for k in range(6):
+            folder = tmp_path / group / f"seed-{k}"
+            folder.mkdir(parents=True)
+            write_rows(folder / "rows.jsonl", _noisy(make_rows(30), factor, k + 10 * (group == "other")))
+    return tmp_path
+
+
+def test_folders_of_runs_are_paired_by_name(seeds):
+    done = CliRunner().invoke(command, [str(seeds / "base"), str(seeds / "other"), "--json"])
+    assert done.exit_code == 0, done.output
+    conclusion = json.loads(done.stdout)["results"][1]["conclusion"]
+    assert (conclusion["pairs"], conclusion["word"]) == (6, "worse")
+
+
+def test_a_run_without_a_partner_is_a_usage_error(seeds):
+    (seeds / "other" / "seed-5").rename(seeds / "other" / "seed-9")
+    done = CliRunner().invoke(command, [str(seeds / "base"), str(seeds / "other")])
+    assert isinstance(done.exception, UsageError)
+    assert "seed-5, seed-9 without a partner" in str(done.exception)
+
+
+def test_markdown_is_a_heading_and_tables(seeds):
+    done = CliRunner().invoke(command, [str(seeds / "base" / "seed-0"), str(seeds / "other" / "seed-0"), "--markdown"])
+    lines = done.stdout.splitlines()
+    assert lines[0].startswith("### ")
+    table = [line for line in lines if line.startswith("|")]
+    assert all(line.count("|") - line.count("\\|") >= 3 for line in table)
+    assert any("all\\_pos\\_rmse\\_m" in line for line in table)
