@@ -85,7 +85,7 @@ class Monitors:
         consistency = self.consistency.observe(state.consistency, innovation, gamma)
         window = self.consistency.judge(consistency)
         consistent = window.consistent and not (track.window.many_outliers or track.doubtful)
-        forecast = estimator.forecast(track.belief, self.convergence.params.times_s)
+        forecast = estimator.track_forecast(track, self.convergence.params.times_s)
         convergence = self.convergence.judge(state.convergence, track.belief, forecast, consistent is True)
         report = MonitorReport(
             ogm_rank=rank.rank,
@@ -285,6 +285,6 @@ def _planner_input(stages: Stages, track: Track, t_ns: int, gamma: int, converge
         gamma=gamma,
         converged=converged,
         goal=estimator.motion(belief),
-        forecast=lambda times_s: estimator.forecast(belief, times_s),
+        forecast=lambda times_s: estimator.track_forecast(track, times_s),
         standoff=lambda times_s: standoff()(times_s),
     )

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.batch import FitParams, fit
-from avsreplay.estimate.batch_covariance import covariance_of, memory_s, process_noise_pass
+from avsreplay.estimate.batch_covariance import memory_s, process_noise_pass
 from avsreplay.estimate.batch_schedule import chart_at, contradicted
 from avsreplay.estimate.chart import nees, to_chart, to_errors
 from avsreplay.estimate.ekf import innovation_of
@@ -127,14 +127,12 @@ def test_without_pushes_the_pass_is_the_fit_and_with_them_it_knows_less() -> Non
     poses, params = poses_of(found), WHITE.resolved(2.0)
     prior = weak_prior(poses, params)
     fitted = fit(poses, to_chart(rough_state(found)), prior, FitParams())
-    plain = covariance_of(poses, fitted, prior, FitParams())
-    calm = process_noise_pass(plain, poses, prior, FitParams(), 0.0, 0.0).fitted
+    y, calm = process_noise_pass(fitted.chart, None, poses, prior, FitParams(), fitted.effective, (0.0, 0.0))
     scale = np.sqrt(np.outer(np.diag(fitted.P_chart), np.diag(fitted.P_chart)))
-    assert np.abs((calm.P_chart - fitted.P_chart) / scale).max() < 1e-4
-    y = calm.chart.minus(fitted.chart)
+    assert np.abs((calm - fitted.P_chart) / scale).max() < 1e-4
     assert y @ np.linalg.solve(fitted.P_chart, y) < 0.01
     for torque, force in ((1e-6, 0.0), (1e-5, 0.0), (0.0, 1e-4)):
-        wide = process_noise_pass(plain, poses, prior, FitParams(), torque, force).fitted.P_chart
+        _, wide = process_noise_pass(fitted.chart, None, poses, prior, FitParams(), fitted.effective, (torque, force))
         least = np.linalg.eigvalsh((wide - fitted.P_chart) / scale)
         assert least[0] > -1e-4
         assert least[-1] > 1e-3

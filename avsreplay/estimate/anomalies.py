@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from avsreplay.estimate.batch import FitParams, Prior, fit
-from avsreplay.estimate.batch_covariance import BatchCovariance, belief_at
+from avsreplay.estimate.batch_covariance import BatchCovariance, final_mixture, moments
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.dynamics import propagate
@@ -148,10 +148,13 @@ class AnomalyTest:
         inflation = np.ones(2) if track.inflation is None else track.inflation
         window = track.window.factors
         factors = np.array([window[3], window[0]]) * np.sqrt(inflation)
-        fitted = fit(poses, prior.mean, prior, FitParams(rescale=False), factors)
-        now_ns = fixes[-1].scan_ns
-        belief = belief_at(BatchCovariance(fitted, ()), now_ns, (now_ns - t_ns) * 1e-9)
-        return BatchResult(t_ns, fitted.chart, len(fixes), np.array([window[3], window[0]]), inflation, belief, True)
+        rules = FitParams(rescale=False)
+        fitted = fit(poses, prior.mean, prior, rules, factors)
+        now_ns, noise = fixes[-1].scan_ns, (self.params.torque_noise_radps15, self.params.force)
+        found = BatchCovariance(fitted, ())
+        components = final_mixture(found, poses, prior, rules, noise, now_ns, (now_ns - t_ns) * 1e-9)
+        plain = np.array([window[3], window[0]])
+        return BatchResult(t_ns, fitted.chart, len(fixes), plain, inflation, moments(components), True, components)
 
     def _initialised_anew(self, track: Track) -> Track | None:
         """A new track from the doubtful poses alone, if they agree with one another through free motion."""

@@ -79,6 +79,10 @@ class Poses:
         """The first ``count`` poses."""
         return Poses(self.times_s[:count], self.q[:count], self.t[:count], self.C[:count])
 
+    def latest(self, count: int, epoch_s: float) -> Poses:
+        """The last ``count`` poses, with times from ``epoch_s``."""
+        return Poses(self.times_s[-count:] - epoch_s, self.q[-count:], self.t[-count:], self.C[-count:])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:

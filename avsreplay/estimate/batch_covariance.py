@@ -14,33 +14,53 @@ errors are propagated back to the epoch, where the transition is the identity, a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
+from avsreplay import geometry
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Prior, cost, linearised, pinned
 from avsreplay.estimate.chart import Chart, to_chart, to_errors, to_state
-from avsreplay.estimate.dynamics import propagate_state, ratios, torque_density
+from avsreplay.estimate.dynamics import (
+    grasp_forecast,
+    grasp_trajectory,
+    propagate,
+    propagate_state,
+    ratios,
+    rotation_path,
+    torque_density,
+)
 from avsreplay.estimate.error_state import DIM, RHO, VEL
 from avsreplay.geometry import Array
-from avsreplay.records import Belief, State
+from avsreplay.records import Belief, Forecast, State
 
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
 _TRIAL = 2.0  # sigma
 _RISE, _TRIES = 0.5 * _NODE**2, 4
 _PIN_1S = 0.02  # of the direction's sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
+_NEGLIGIBLE = 0.1  # sigma: a correction below this is always applied
+_LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
 _DISTURBED = 12  # error states that a disturbance reaches: attitude, rate, position, velocity
 _SPHERE = 3.0  # tr I / I
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProfilePoint:
-    """A fit with one direction fixed, and its remaining covariance P (20, 20)."""
+    """A fit with one direction fixed by ``pin``, and its remaining covariance P (20, 20)."""
 
     chart: Chart
     P: Array
+    pin: Pin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Component:
+    """One Gaussian of a mixture: its weight, and mean and covariance at the last pose."""
+
+    weight: float
+    belief: Belief
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,28 +113,115 @@ def _profile(
     """The fit with the direction fixed at ``side`` sigma, adjusted at most ``_TRIES`` times until the cost fits."""
     there, P = fitted.chart.moved(side * axis), fitted.P_chart
     for _ in range(_TRIES):
-        there, P = pinned(poses, there, prior, params, fitted.effective, Pin(fitted.chart, row, side, _PIN_1S))
+        pin = Pin(fitted.chart, row, side, _PIN_1S)
+        there, P = pinned(poses, there, prior, params, fitted.effective, pin)
         rise = cost(poses, there, prior, params, fitted.effective) - fitted.half_chi2
         if abs(rise - _RISE) < 0.2 * _RISE:
             break
         side *= float(np.clip(np.sqrt(_RISE / max(rise, 1e-9)), 0.4, 2.5))
-    return ProfilePoint(there, P)
+    return ProfilePoint(there, P, pin)
 
 
-def belief_at(found: BatchCovariance, t_ns: int, after_s: float) -> Belief:
-    """Mean of the fit and its corrected covariance, ``after_s`` after the epoch; ``t_ns`` is that instant."""
-    fitted = found.fitted
-    x, step = propagate_chart(fitted.chart, after_s)
-    here = to_chart(x)
-    P0 = fitted.P_chart - sum((np.outer(d.axis, d.axis) for d in found.directions), np.zeros((DIM, DIM)))
-    P = (1.0 - 2.0 * _WEIGHT * len(found.directions)) * step @ P0 @ step.T
-    for point in (point for direction in found.directions for point in direction.points):
-        there, step = propagate_chart(point.chart, after_s)
-        y = to_chart(there).minus(here)
-        P += _WEIGHT * (np.outer(y, y) + step @ point.P @ step.T)
+def final_mixture(
+    found: BatchCovariance,
+    poses: Poses,
+    prior: Prior,
+    rules: FitParams,
+    noise: tuple[float, float],
+    t_ns: int,
+    after_s: float,
+) -> tuple[Component, ...]:
+    """The fit with process noise as a Gaussian mixture at the last pose; the first component has the published mean.
+
+    Args:
+        found: the fit and its non-Gaussian directions.
+        poses: that it was made of.
+        prior: of the fit.
+        rules: of the fit.
+        noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
+        t_ns: the instant of the last scan [ns].
+        after_s: that instant after the epoch [s].
+    """
+    fitted, n = found.fitted, len(found.directions)
+    axes = sum((np.outer(d.axis, d.axis) for d in found.directions), np.zeros((DIM, DIM)))
+    bases: list[tuple[float, Chart, Pin | None, Array]] = [(1.0 - 2.0 * _WEIGHT * n, fitted.chart, None, axes)]
+    bases += [(_WEIGHT, p.chart, p.pin, np.zeros((DIM, DIM))) for d in found.directions for p in d.points]
+    out = []
+    for weight, chart, pin, without in bases:
+        y, P = process_noise_pass(chart, pin, poses, prior, rules, fitted.effective, noise)
+        x, step = propagate_chart(chart, after_s)
+        base, move = to_chart(x), step @ y
+        share = 1.0
+        if float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
+            share = _accepted_share(base, move, poses.latest(_LATEST, after_s), prior, rules, fitted.effective)
+        there = base.moved(share * move)
+        P = step @ (P - without) @ step.T + (1.0 - share) ** 2 * np.outer(move, move)
+        T = to_errors(there)
+        P = T @ P @ T.T
+        out.append(Component(weight, Belief(t_ns, to_state(there), 0.5 * (P + P.T))))
+    return tuple(out)
+
+
+def _accepted_share(base: Chart, move: Array, latest: Poses, prior: Prior, rules: FitParams, factors: Array) -> float:
+    """The part of the linear correction by process noise that lowers the cost of the latest poses most, 0 if none does.
+
+    The correction is a Gauss-Newton step of a linearised problem; along a strongly curved direction a full step can
+    be worse than none.
+    """
+    charts = [base.moved(share * move) for share in _SHARES]
+    costs = [cost(latest, chart, Prior(chart, prior.P), rules, factors) for chart in charts]
+    return _SHARES[int(np.argmin(costs))]
+
+
+def moments(components: tuple[Component, ...]) -> Belief:
+    """Mean of the first component and the second moments of all about it."""
+    first = components[0].belief
+    if len(components) == 1:
+        return first
+    here = to_chart(first.x)
     T = to_errors(here)
-    P = T @ P @ T.T
-    return Belief(t_ns, x, 0.5 * (P + P.T))
+    P = np.zeros((DIM, DIM))
+    for component in components:
+        there = to_chart(component.belief.x)
+        back = T @ np.linalg.inv(to_errors(there))  # the component's error states about the mean
+        y = T @ there.minus(here)
+        P += component.weight * (np.outer(y, y) + back @ component.belief.P @ back.T)
+    return Belief(first.t_ns, first.x, 0.5 * (P + P.T))
+
+
+def mixture_forecast(
+    components: tuple[Component, ...], t_ns: int, times_s: Array, torque: float, force: float
+) -> Forecast:
+    """Predicted 1 sigma of the grasp point, each component propagated about its own trajectory.
+
+    About the mean alone the propagation would be wrong by orders of magnitude where the components differ in inertia:
+    a spin that is stable for one of them is unstable for another.
+
+    Args:
+        components: at the last fit, the first with the mean that is published.
+        t_ns: the present instant [ns].
+        times_s: (n,) >= 0, ascending [s after the present].
+        torque: root density of the angular disturbance [rad/s^1.5].
+        force: root density of the linear disturbance [m/s^1.5].
+    """
+    total, centre = np.zeros((3, len(times_s))), None
+    for component in components:
+        now, _ = propagate(component.belief, t_ns, torque, force)
+        found = grasp_forecast(now, times_s, torque, force)
+        motion = _grasp_motion(now.x, times_s)
+        centre = motion if centre is None else centre
+        own = np.array([found.pos_1s_m, found.vel_1s_mps, found.rot_1s_rad]) ** 2
+        turn = geometry.angle(geometry.multiply(geometry.conjugate(centre[2]), motion[2])) ** 2
+        off = [((motion[k] - centre[k]) ** 2).sum(axis=1) for k in (0, 1)]
+        total += component.weight * (own + np.array([*off, turn]))
+    return Forecast(np.asarray(times_s, dtype=np.float64), *np.sqrt(np.maximum(total, 0.0)))
+
+
+def _grasp_motion(x: State, times_s: Array) -> tuple[Array, Array, Array]:
+    """Position, velocity and attitude q_ac of the grasp point at ``times_s``."""
+    position, velocity = grasp_trajectory(x)(times_s)
+    q_ab, _ = rotation_path(x).at(np.asarray(times_s, dtype=np.float64))
+    return position, velocity, geometry.multiply(q_ab, x.q_bc)
 
 
 def propagate_chart(chart: Chart, h: float) -> tuple[State, Array]:
@@ -129,20 +236,26 @@ def memory_s(torque: float) -> float:
 
 
 def process_noise_pass(
-    found: BatchCovariance, poses: Poses, prior: Prior, rules: FitParams, torque: float, force: float
-) -> BatchCovariance:
-    """The fit with process noise, valid at the last pose; ``torque``, ``force``: root densities as in the filter."""
-    fitted = found.fitted
-    rows, J = linearised(poses, fitted.chart, prior, rules, fitted.effective)
-    into = np.linalg.inv(to_errors(fitted.chart))[:, :_DISTURBED]
-    Q = into @ _noise_increments(fitted.x, poses.times_s, torque, force) @ into.T
-    y, P = _motion.filter(-fitted.chart.minus(prior.mean), prior.P, rows, J, Q)
-    more = P - fitted.P_chart
-    moved = [[ProfilePoint(p.chart.moved(y), p.P + more) for p in d.points] for d in found.directions]
-    directions = tuple(
-        NonGaussianDirection(d.axis, (low, high)) for d, (low, high) in zip(found.directions, moved, strict=True)
-    )
-    return BatchCovariance(replace(fitted, chart=fitted.chart.moved(y), P_chart=P), directions)
+    chart: Chart,
+    pin: Pin | None,
+    poses: Poses,
+    prior: Prior,
+    rules: FitParams,
+    factors: Array,
+    noise: tuple[float, float],
+) -> tuple[Array, Array]:
+    """Correction y (20,) of a trajectory at the epoch by process noise, and its covariance P, valid at the last pose.
+
+    ``pin`` fixes a direction as in the profile fit; ``noise``: root densities of torque and force as in the filter.
+    """
+    rows, J = linearised(poses, chart, prior, rules, factors)
+    into = np.linalg.inv(to_errors(chart))[:, :_DISTURBED]
+    Q = into @ _noise_increments(to_state(chart), poses.times_s, *noise) @ into.T
+    y, P = -chart.minus(prior.mean), prior.P
+    if pin is not None:
+        k = P @ pin.row / float(pin.row @ P @ pin.row + pin.one_sigma**2)
+        y, P = y - k * (pin.error(chart) * pin.one_sigma + float(pin.row @ y)), P - np.outer(k, pin.row @ P)
+    return _motion.filter(y, np.ascontiguousarray(0.5 * (P + P.T)), rows, J, Q)
 
 
 def _noise_increments(x: State, times_s: Array, torque: float, force: float) -> Array:

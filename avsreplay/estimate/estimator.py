@@ -14,6 +14,7 @@ import numpy as np
 from avsreplay.errors import UsageError
 from avsreplay.estimate import dynamics, ekf
 from avsreplay.estimate.anomalies import AnomalyTest
+from avsreplay.estimate.batch_covariance import mixture_forecast
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.initialise import given_prior, guessed_belief
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
@@ -108,6 +109,17 @@ class Estimator:
         return self.anomalies.step(
             track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged)
         )
+
+    def track_forecast(self, track: Track, times_s: Array) -> Forecast:
+        """Predicted 1 sigma of the grasp point after a scan, by components where the likelihood is not Gaussian.
+
+        Args:
+            track: after the scan.
+            times_s: (n,) >= 0, ascending [s after the scan].
+        """
+        if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
+            return self.forecast(track.belief, times_s)
+        return mixture_forecast(track.batch.components, track.belief.t_ns, times_s, self._torque, self._force)
 
     def _replayed(self, track: Track, epoch: Epoch) -> Track:
         """A stored scan, predicted and used again from another track."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, cost, fit
-from avsreplay.estimate.batch_covariance import BatchCovariance, belief_at, covariance_of, process_noise_pass
+from avsreplay.estimate.batch_covariance import BatchCovariance, Component, covariance_of, final_mixture, moments
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.error_state import DIM, boxplus, hamilton
@@ -64,6 +64,7 @@ class BatchResult:
         epoch_ns: instant of the first pose.  chart: values there, where the next fit starts.  count: poses.
         factors, inflation: (2,) noise factors and correlation inflation, of attitude and position.
         belief: at the last pose.  gaussian: the filter may start from it.
+        components: the Gaussian mixture that ``belief`` has the moments of.
         prior_rejected: the poses contradict the given start, and it was left out.
     """
 
@@ -74,6 +75,7 @@ class BatchResult:
     inflation: Array
     belief: Belief
     gaussian: bool
+    components: tuple[Component, ...] = ()
     prior_rejected: bool = False
 
 
@@ -190,12 +192,20 @@ def batch_estimate(
         rejected = _contradicts(poses, fitted, weak, joint, given, rules)
         fitted, prior = (fitted, weak) if rejected else (joint, given)
     found = covariance_of(poses, fitted, prior, rules)
-    found = process_noise_pass(found, poses, prior, rules, params.torque_noise_radps15, params.force)
-    now_ns = fixes[-1].scan_ns
-    belief = belief_at(found, now_ns, (now_ns - fixes[0].t_ns) * 1e-9)
+    now_ns, noise = fixes[-1].scan_ns, (params.torque_noise_radps15, params.force)
+    components = final_mixture(found, poses, prior, rules, noise, now_ns, (now_ns - fixes[0].t_ns) * 1e-9)
     gaussian = _determined(found, weak)
-    chart = fitted.chart
-    return BatchResult(fixes[0].t_ns, chart, len(poses), fitted.factors, fitted.inflation, belief, gaussian, rejected)
+    return BatchResult(
+        epoch_ns=fixes[0].t_ns,
+        chart=fitted.chart,
+        count=len(poses),
+        factors=fitted.factors,
+        inflation=fitted.inflation,
+        belief=moments(components),
+        gaussian=gaussian,
+        components=components,
+        prior_rejected=rejected,
+    )
 
 
 def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior, rules: FitParams) -> bool:

@@ -170,7 +170,7 @@ def run(case: Case, seed: int, tested: bool = True) -> Result:
         seen_so_far = watch.observe(seen_so_far, innovation, verdict.gamma)
         honest = watch.judge(seen_so_far).consistent is True and not track.window.many_outliers
         honest = honest and not track.doubtful
-        forecast = estimator.forecast(track.belief, test.params.times_s)
+        forecast = estimator.track_forecast(track, test.params.times_s)
         word = test.judge(word, track.belief, forecast, honest)
         score(result, t, x, track, verdict.gamma, verdict.reason.value, word.converged)
         result.grasp.append(float(forecast.pos_1s_m.max()))

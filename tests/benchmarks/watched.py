@@ -30,6 +30,6 @@ def fold(
         track = estimator.update(track, prediction, seen, 1, words[0].converged)
         seen_so_far = watch.observe(seen_so_far, seen, 1)
         honest = watch.judge(seen_so_far).consistent is True and not track.window.many_outliers
-        forecast = estimator.forecast(track.belief, tests[0].params.times_s)
+        forecast = estimator.track_forecast(track, tests[0].params.times_s)
         words = [test.judge(word, track.belief, forecast, honest) for test, word in zip(tests, words, strict=True)]
         yield t, x, track, words
