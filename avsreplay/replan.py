@@ -46,6 +46,7 @@ class Saved:
         rows, beliefs: one each a scan.  truth: the recorded true motion, None where there is none.
         estimator: with the run's own settings.  plan, supervisor: the run's settings.
         axis_c: (3,) outward axis of the fixture in {C}.  extent_m: bounding diagonal of the target.
+        warnings: what is known against the result: not verified, or made from a damaged log.
     """
 
     name: str
@@ -57,6 +58,7 @@ class Saved:
     supervisor: SupervisorParams
     axis_c: Array
     extent_m: float
+    warnings: Sequence[str] = ()
 
     @property
     def since_ns(self) -> int:
@@ -88,7 +90,6 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
     if not result.rows or len(beliefs) != len(result.rows):
         what = f"{len(result.rows)} rows and {len(beliefs)} beliefs"
         raise UnreadableInput(what, where=str(path), hint="run again")
-    _check_beliefs(beliefs, path)
     config = result.header.get("config", {})
     extent = extent_m or _extent(result, path)
     since_ns = result.rows[0].t_ns
@@ -106,22 +107,8 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
         supervisor=_table(SupervisorParams, config, "supervisor").resolved(extent),
         axis_c=np.asarray(config.get("fixture_axis_c", (1.0, 0.0, 0.0)), dtype=np.float64),
         extent_m=extent,
+        warnings=result.warnings,
     )
-
-
-def _check_beliefs(beliefs: Sequence[Belief], path: Path) -> None:
-    """Every mean finite, every covariance finite and not negative along its diagonal."""
-    for k, belief in enumerate(beliefs):
-        x = belief.x
-        finite = all(
-            np.isfinite(part).all() for part in (x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, belief.P)
-        )
-        if not finite:
-            raise UnreadableInput(f"the belief after scan {k} is not finite", where=str(path), hint="run again")
-        least = float(np.diagonal(belief.P).min())
-        if least < 0.0:
-            what = f"the covariance after scan {k} is not positive (a variance of {least:.3g})"
-            raise UnreadableInput(what, where=str(path), hint="run again")
 
 
 def _table(cls: Any, config: Mapping[str, Any], name: str) -> Any:

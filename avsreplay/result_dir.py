@@ -6,10 +6,8 @@ depend on the input alone, byte for byte; ``run.json`` also names the versions.
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
@@ -21,6 +19,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.estimate.measurement import measurement_jacobian
+from avsreplay.files import check_output, output_folder, read_npz
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.result_log import ResultFrame, ResultLog
 from avsreplay.pipeline import PipelineState, planned_segment
@@ -29,11 +28,13 @@ from avsreplay.records import Belief, State, Surface
 from avsreplay.register import Registrar
 from avsreplay.report.export import row_poses, write_layout, write_tum
 from avsreplay.report.jsonl import write_rows
+from avsreplay.report.result import write_manifest
 from avsreplay.report.view import CloudView, PathView, View, thin_cloud, thin_surface, write_view
 from avsreplay.rows import Row
 from avsreplay.run import Listener, ReplayedScan
 
 PATH_POINTS = 41
+_MOST_BELIEF_BYTES, _LARGEST = 1 << 30, 1e15
 VIEW_REACH = 0.05  # of the model's extent: residuals in the view are cut off there
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 _STREAMED_COLUMNS = ("pos_err_m", "rot_err_deg", "rms_m", "nis", "sigma1", "sigma2", "t_go_s", "gamma")
@@ -61,18 +62,36 @@ def read_beliefs(path: Path) -> list[Belief]:
     Raises:
         UnreadableInput: it is missing or not as a run writes it.
     """
+    shapes = {"t_ns": ("i", (None,)), "x": ("f", (None, len(MEAN_COLUMNS))), "P": ("f", (None, 20, 20))}
+    hint = "name a directory written by run -o"
+    data = read_npz(path, shapes, limit=_MOST_BELIEF_BYTES, hint=hint)
+    ends = np.cumsum([0, *(size for _, size in _BLOCKS)])
     try:
-        with np.load(path, allow_pickle=False) as data:
-            stamps, means, covariances = data["t_ns"], data["x"], data["P"]
-        ends = np.cumsum([0, *(size for _, size in _BLOCKS)])
-        return [
+        beliefs = [
             Belief(int(t), State(*(x[a:b] for a, b in pairwise(ends))), P)
-            for t, x, P in zip(stamps, means, covariances, strict=True)
+            for t, x, P in zip(data["t_ns"], data["x"], data["P"], strict=True)
         ]
-    except FileNotFoundError:
-        raise UnreadableInput("no such file", where=str(path), hint="name a directory written by run -o") from None
-    except (OSError, ValueError, KeyError, EOFError):
-        raise UnreadableInput("not beliefs as a run writes them", where=str(path), hint="run again") from None
+    except ValueError:
+        raise UnreadableInput("its arrays differ in length", where=str(path), hint=hint) from None
+    for k, belief in enumerate(beliefs):
+        if defect := _defect(belief):
+            raise UnreadableInput(f"the belief after scan {k} {defect}", where=str(path), hint=hint)
+    return beliefs
+
+
+def _defect(belief: Belief) -> str:
+    """Return what is wrong with a belief, an empty string if nothing is."""
+    x, P = belief.x, belief.P
+    numbers = np.concatenate([mean_vector(x), P.ravel()])
+    if not (np.isfinite(numbers).all() and np.abs(numbers).max() < _LARGEST):
+        return "is not finite"
+    if any(abs(np.linalg.norm(q) - 1.0) > 1e-6 for q in (x.q_ab, x.q_bc)):
+        return "has a quaternion that is not of unit length"
+    if np.abs(x.sigma).max() >= 1.0:
+        return "has an inertia ratio that is not below 1"
+    if P.diagonal().min() < 0.0:
+        return f"has a covariance that is not positive (a variance of {P.diagonal().min():.3g})"
+    return "has a covariance that is not symmetric" if np.abs(P - P.T).max() > 1e-9 * np.abs(P).max() else ""
 
 
 class Beliefs:
@@ -171,49 +190,41 @@ class ViewWriter:
 
 
 class ResultDirectory:
-    """A directory that appears when the ``with`` block ends without an error, and not otherwise."""
+    """The folder of a result; it appears when the ``with`` block ends without an error, and not otherwise.
+
+    Args:
+        path: the folder.
+        overwrite: whether an existing result may be replaced.
+
+    Raises:
+        UsageError: the folder exists, is not a result, or its name cannot be used.
+    """
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
-        """Check that it may be written.
-
-        Raises:
-            UsageError: something is there and ``overwrite`` is False, or it is no result directory.
-        """
-        self.path = path
-        self._part = path.with_name(f".{path.name}.{os.getpid()}.part")
-        if path.exists() and not overwrite and not (path.is_dir() and not any(path.iterdir())):
+        self.path, self._stack = path, ExitStack()
+        check_output(path, folder=True)
+        if path.exists() and not overwrite and any(path.iterdir()):
             raise UsageError("already exists", where=str(path), hint="choose another name, or add --overwrite")
         if path.exists() and not _replaceable(path):
             raise UsageError("is not a result directory", where=str(path), hint="name another; it is left alone")
 
     def __enter__(self) -> ResultDirectory:
-        try:
-            self._part.mkdir(parents=True)
-        except OSError as error:
-            what = error.strerror or "cannot be written"
-            raise UnreadableInput(what, where=str(self.path), hint="check the folder and its rights") from None
+        self._part = self._stack.enter_context(output_folder(self.path))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        if kind is not None:
-            shutil.rmtree(self._part, ignore_errors=True)
-            return
-        if self.path.exists():
-            shutil.rmtree(self.path)
-        self._part.rename(self.path)
+        self._stack.__exit__(kind, error, traceback)
 
-    def write(self, rows: Sequence[Row], beliefs: Beliefs, record: Mapping[str, Any]) -> None:
-        """Write rows, trajectories, beliefs and ``run.json`` (``record``)."""
+    def write(self, rows: Sequence[Row], beliefs: Beliefs) -> None:
+        """Write rows, trajectories and beliefs."""
         write_rows(self._part / "rows.jsonl", rows)
         write_tum(self._part / "estimate.tum", row_poses(rows, "estimate"))
         write_tum(self._part / "registration.tum", row_poses(rows, "registration"))
         if beliefs.truth:
             write_tum(self._part / "truth.tum", beliefs.truth)
         beliefs.write(self._part / "beliefs.npz")
-        text = json.dumps(record, indent=1, ensure_ascii=False, allow_nan=False)
-        (self._part / "run.json").write_text(text + "\n", encoding="utf-8")
 
     def file(self, name: str) -> Path:
         """Return where a further file of the result is to be written, inside the ``with`` block."""
@@ -242,7 +253,8 @@ class ResultWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        self._log.close()
+        with suppress(OSError):  # reported by ``finish``; after an error the folder is removed
+            self._log.close()
         self._directory.__exit__(kind, error, traceback)
 
     @property
@@ -252,9 +264,11 @@ class ResultWriter:
 
     def finish(self, rows: Sequence[Row], record: Mapping[str, Any]) -> None:
         """Write what needs the whole run; ``record`` is ``run.json``."""
-        self._directory.write(rows, self._beliefs, record)
+        self._log.close()
+        self._directory.write(rows, self._beliefs)
         write_view(self._directory.file("view.npz"), self._view.view())
         write_layout(self._directory.file("result.layout.json"))
+        write_manifest(self._directory.file("run.json").parent, record, len(rows))
 
 
 class RerunStream:

@@ -28,6 +28,8 @@ from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
 from avsreplay.score import Scorer, matched_truth
 
+MOST_LOSSES = 100  # listed one by one in run.json
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ReplayedScan:
@@ -194,11 +196,12 @@ class Run:
 
     def facts(self) -> dict[str, Any]:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""
-        surface = self.surface
+        surface, losses = self.surface, self.source.losses
         return {
             "log": {"name": self.job.source.name, "sha256": self.source.sha256, "scans": len(self.source)},
             "model": {"name": Path(surface.name).name, "sha256": surface.sha256, "extent_m": surface.extent},
             "clock": settings.dump(self.source.clock),
+            "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
             "selection": settings.dump(self.job.options),
             "config": settings.dump(self.config),
         }

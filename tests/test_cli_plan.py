@@ -149,7 +149,8 @@ def test_what_cannot_be_is_one_line(result, args, says):
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "says"), [("P", -1e-6, "scan 7 is not positive"), ("x", np.nan, "scan 7 is not finite")]
+    ("name", "value", "says"),
+    [("P", -1e-6, "scan 7 has a covariance that is not positive"), ("x", np.nan, "scan 7 is not finite")],
 )
 def test_a_belief_that_cannot_be_is_named(result, tmp_path, name, value, says):
     for file in result.iterdir():

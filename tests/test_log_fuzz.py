@@ -16,7 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_cases import scans
 
-from avsreplay.log.bytes_io import BadFile, BadMessage
+from avsreplay.files import BadFile
+from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import point_cloud2
 from avsreplay.log.pcd import read_pcd, unpack_lzf
 from avsreplay.log.ply import read_ply

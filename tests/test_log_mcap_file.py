@@ -204,6 +204,29 @@ def test_a_decompression_bomb_is_rejected(tmp_path: Path, compression: str) -> N
         assert losses[0].chunks == 1
 
 
+def test_millions_of_records_of_length_zero_take_little_memory(tmp_path: Path) -> None:
+    """A chunk of 32 MiB of zeros is 3.7 million records; compressed it takes 1 kB of the file."""
+    import tracemalloc
+
+    import zstandard
+
+    size = 32 << 20
+    packed = zstandard.compress(bytes(size))
+    chunk = struct.pack("<QQQII", 0, 1, size, 0, 4) + b"zstd" + struct.pack("<Q", len(packed)) + packed
+    record = struct.pack("<BQ", mcap.CHUNK, len(chunk)) + chunk
+    intact = tmp_path / "good.mcap"
+    write(intact, LogHeader(), CLOUDS[:4])
+    data, first = intact.read_bytes(), chunks(intact)[0][0]
+    (tmp_path / "zeros.mcap").write_bytes(data[:first] + record + data[first:])
+    tracemalloc.start()
+    found, losses = read(tmp_path / "zeros.mcap")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(found) == 4
+    assert [loss.what for loss in losses] == ["records of unknown kinds"]
+    assert peak < 3 * size
+
+
 def test_a_file_without_chunks_is_read_beyond_damage(tmp_path: Path) -> None:
     from mcap.writer import CompressionType, Writer
 

@@ -14,9 +14,9 @@ from true_scans import true_scans
 
 from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.files import BadFile
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source, parse_surface, read_surface
-from avsreplay.log.bytes_io import BadFile
 from avsreplay.log.pcd import read_pcd, unpack_lzf
 from avsreplay.log.ply import read_ply
 from avsreplay.log.surface import surface_bytes

@@ -19,7 +19,7 @@ from avsreplay.report.compare import METRICS, first_divergence, metrics
 from avsreplay.report.gate import Rule, RuleOutcome, check_gate, github_lines, judge, junit, load_rules
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import build_comparison
-from avsreplay.report.result import load_result
+from avsreplay.report.result import load_result, write_manifest
 from avsreplay.report.scan_table import print_sparks, spark
 from avsreplay.report.summary import Summary
 
@@ -183,6 +183,7 @@ def runs(tmp_path, make_rows):
     for name, rows in (("base", make_rows(40)), ("same", make_rows(40)), ("worse", worse)):
         (tmp_path / name).mkdir()
         write_rows(tmp_path / name / "rows.jsonl", rows)
+        write_manifest(tmp_path / name, {}, len(rows))
     (tmp_path / "rules.toml").write_text('[[rule]]\nmetric = "pose_pos_rmse_m"\nmax_ratio = 1.5\nnote = "no regress"\n')
     return tmp_path
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from avsreplay.errors import MissingBackend, UnreadableInput
+from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Pose, exp
 from avsreplay.report.columns_page import columns_page, row_schema, schema_text
 from avsreplay.report.export import (
@@ -90,7 +90,7 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, make_rows):
 
 
 def test_a_folder_that_is_not_there_is_one_line(tmp_path, make_rows):
-    with pytest.raises(UnreadableInput, match="No such file"):
+    with pytest.raises(UsageError, match="no such folder"):
         write_rows(tmp_path / "no" / "a.jsonl", make_rows(1))
 
 

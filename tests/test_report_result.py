@@ -58,9 +58,9 @@ def test_the_summary_comes_back_as_it_was(folder):
     np.testing.assert_allclose(result.poses[3][1].q, exp([0, 0, 0.3]), atol=1e-15)
 
 
-def test_lone_rows_are_a_result(folder):
+def test_a_single_file_of_rows_is_a_result(folder):
     result = load_result(folder[0] / "rows.jsonl")
-    assert (result.view, result.header, len(result.rows)) == (None, {}, 40)
+    assert (result.view, result.header["seed"], len(result.rows)) == (None, 7, 40)
 
 
 def test_the_view_comes_back_and_its_bytes_are_stable(folder, tmp_path):
@@ -125,7 +125,7 @@ def test_no_rows_is_one_line(tmp_path):
         ("run.json", '{"facts": [1]}', "not as written"),
         ("truth.tum", "1 2 3", r"truth\.tum:1: not 'stamp"),
         ("truth.tum", "x 0 0 0 0 0 0 1", "not 'stamp"),
-        ("view.npz", "nothing", "not a view file"),
+        ("view.npz", "nothing", "not a valid npz"),
     ],
 )
 def test_a_damaged_file_is_one_line(folder, name, text, match):

@@ -6,10 +6,16 @@ A command is the object ``command`` in ``avsreplay/cli/<name>.py``; it is import
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import importlib
 import os
 import sys
+import tempfile
+import traceback
+import warnings
 from collections.abc import Iterator
+from pathlib import Path
 
 import click
 
@@ -41,9 +47,9 @@ Examples:
   avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
 
 \b
-Exit codes: 0 ok, 1 a requested check failed, 2 usage,
-            3 unreadable input, 4 finished but data was lost,
-            130 interrupted, 141 the reader of the output stopped reading."""
+Exit codes: 0 ok, 1 the requested check failed, 2 usage, 3 a file cannot
+            be read or written, 4 finished but data was lost, 70 internal
+            error, 130 interrupted, 141 standard output was closed."""
 
 
 class _Commands(click.Group):
@@ -62,7 +68,14 @@ class _Commands(click.Group):
             near = difflib.get_close_matches(unknown[0], known, 1)
             hint = f"did you mean {near[0]}?" if near else "unset it, or see 'avsreplay COMMAND --help'"
             raise UsageError("no command has an option of this name", where=f"environment {unknown[0]}", hint=hint)
-        return super().invoke(ctx)
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:
+            raise StdoutClosed from None
+        except SystemExit as leaving:
+            if isinstance(leaving.__context__, BrokenPipeError):  # rich exits with 1
+                raise StdoutClosed from None
+            raise
 
     def _variables(self, ctx: click.Context) -> Iterator[str]:
         """Every environment variable that stands for an option."""
@@ -118,23 +131,64 @@ def group() -> None:
     """
 
 
+class StdoutClosed(BaseException):
+    """The reader of standard output closed it; not an OSError, which click and rich turn into exit code 1."""
+
+
 def main() -> None:
-    """Entry point: an AvsError becomes one line on stderr and its exit code, without a traceback."""
+    """Entry point: run a command and exit with its code; every error is one line on stderr."""
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal
     try:
         code = group.main(standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY")
     except AvsError as error:
         code = _fail(str(error), error.exit_code)
     except click.ClickException as error:
-        error.show()
-        code = error.exit_code
+        code = _fail(error.format_message(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         code = _fail("interrupted", 130)
-    except SystemExit:  # click exits only where the reader of stdout has closed the pipe: 128 + SIGPIPE
-        code = 141
-    sys.exit(code if isinstance(code, int) else 0)
+    except StdoutClosed:
+        code = _silence(141)
+    except OSError as error:
+        code = _fail(f"{error.filename or 'standard output'}: {error.strerror or error}", 3)
+    except Exception as error:
+        code = _crash(error)
+    sys.exit(_flushed(code if isinstance(code, int) else 0))
+
+
+def _flushed(code: int) -> int:
+    """Flush standard output; return ``code``, or 3 if the output cannot be written."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:  # the command was finished
+        return _silence(code)
+    except OSError as error:
+        return _silence(_fail(f"standard output: {error.strerror or error}", 3))
+    return code
+
+
+def _silence(code: int) -> int:
+    """Discard what is still buffered for standard output, so that the interpreter does not report it at its end."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return code
+
+
+def _crash(error: Exception) -> int:
+    """Report an unexpected error in one line and write its traceback to a file; return exit code 70."""
+    text = "".join(traceback.format_exception(error))
+    name = f"avsreplay-crash-{hashlib.sha256(text.encode('utf-8', 'replace')).hexdigest()[:12]}.txt"
+    report, where = Path(tempfile.gettempdir()) / name, "no report could be written"
+    with contextlib.suppress(OSError):
+        arguments = " ".join(map(ascii, sys.argv[1:]))
+        report.write_text(f"avsreplay {arguments}\n{sys.version}\n{text}", encoding="utf-8", errors="backslashreplace")
+        where = f"please report it with {report}"
+    reason = str(error) or "no message"
+    return _fail(f"internal error: {type(error).__name__}: {reason[:200]}; {where}", 70)
 
 
 def _fail(message: str, code: int) -> int:
-    printable = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message)
-    click.echo(f"avsreplay: {printable}", err=True)
+    printable = "".join(c if c.isprintable() else c.encode("unicode_escape", "surrogatepass").decode() for c in message)
+    with contextlib.suppress(OSError):
+        click.echo(f"avsreplay: {printable}", err=True)
     return code

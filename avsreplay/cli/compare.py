@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, output_is_free
-from avsreplay.errors import UsageError
+from avsreplay.cli.options import PATH, load
+from avsreplay.errors import DataLost, UsageError
+from avsreplay.files import check_output, output_text
 from avsreplay.report import gate as gates
-from avsreplay.report.atomic import atomic_text
 from avsreplay.report.compare import METRICS, first_divergence, metrics
 from avsreplay.report.conclusion import Conclusion, conclude
-from avsreplay.report.result import Result, load_result
+from avsreplay.report.result import Result
 from avsreplay.settings import dump
 
 if TYPE_CHECKING:
@@ -40,7 +40,8 @@ A rule:
 'avsreplay compare --metrics' lists the metrics.
 
 \b
-Exit codes: 0 ok, 1 a rule was broken, 2 usage, 3 unreadable input."""
+Exit codes: 0 ok, 1 a rule was broken, 2 usage, 3 unreadable input,
+            4 the rules hold, but a result cannot be verified or its log was damaged."""
 
 
 def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
@@ -99,7 +100,10 @@ def command(
     """
     if (junit or github) and not gate:
         raise UsageError("--junit and --github need --gate", hint="name the rules with --gate rules.toml")
-    output_is_free(output, overwrite=overwrite)
+    if output:
+        check_output(output, overwrite=overwrite)
+    if junit:
+        check_output(junit)
     groups = _with_distinct_names([_group(path) for path in results])
     rules = gates.load_rules(gate) if gate else ()
     pairs = [(other, _paired(groups[0], other)) for other in groups[1:]]
@@ -112,16 +116,31 @@ def command(
     else:
         _print(groups, conclusions, outcomes, show_all=show_all)
     if junit:
-        with atomic_text(junit) as stream:
+        with output_text(junit) as stream:
             stream.write(gates.junit(outcomes))
     if output:
         from avsreplay.report.page import build_comparison
 
-        with atomic_text(output) as stream:
+        with output_text(output) as stream:
             stream.write(build_comparison([group.runs[0] for group in groups], conclusions, outcomes))
     for line in gates.github_lines(outcomes) if github else ():
         click.echo(line, err=as_json or as_markdown)
     gates.check_gate(outcomes)
+    if gate:
+        _check_sources([run for group in groups for run in group.runs])
+
+
+def _check_sources(runs: Sequence[Result]) -> None:
+    """Raise DataLost if a run whose rules hold cannot be verified, was interrupted, or rests on a damaged log."""
+    for run in runs:
+        if run.losses:
+            what = f"the rules hold, but the log of {run.name} was damaged at {run.losses} places"
+            raise DataLost(what, where="--gate", hint="record it again, or repair it with 'avsreplay doctor'")
+        if "interrupted_after" in run.header:
+            raise DataLost(f"the rules hold, but {run.name} was interrupted", where="--gate", hint="run again")
+        if run.unverified and run.whole:
+            what = f"the rules hold, but {run.name} cannot be verified: {run.unverified}"
+            raise DataLost(what, where="--gate", hint="run again")
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +154,7 @@ class _Group:
 def _group(path: Path) -> _Group:
     """The result at ``path``, or all results in its subfolders."""
     inside = sorted(found.parent for found in path.glob("*/rows.jsonl")) if not (path / "rows.jsonl").is_file() else []
-    runs = tuple(load_result(folder) for folder in inside or [path])
+    runs = tuple(load(folder) for folder in inside or [path])
     return _Group(path.resolve().name if inside else runs[0].name, runs)
 
 

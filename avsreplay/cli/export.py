@@ -6,10 +6,10 @@ from pathlib import Path
 
 import click
 
-from avsreplay.cli.options import PATH, output_is_free
+from avsreplay.cli.options import PATH, load
 from avsreplay.errors import UsageError
+from avsreplay.files import STDOUT, check_output
 from avsreplay.report import export
-from avsreplay.report.result import load_result
 
 EPILOG = """\b
 Examples:
@@ -37,11 +37,11 @@ def command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) 
 
     CSV and Parquet hold every column of every scan with units in the headings; TUM and KITTI hold poses of {C} in {A}.
     """
-    output_is_free(output, overwrite=overwrite)
-    found = load_result(result)
+    check_output(output, overwrite=overwrite)
+    found, quiet = load(result), output == STDOUT
     if kind in ("csv", "parquet"):
         (export.write_csv if kind == "csv" else export.write_parquet)(output, found.rows)
-        click.echo(f"{output}: {len(found.rows)} rows")
+        click.echo(f"{output}: {len(found.rows)} rows", err=quiet)
         return
     truth = dict(found.poses)
     by_row = [
@@ -53,9 +53,9 @@ def command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) 
         raise UsageError(f"the result has no {poses} poses", where=str(result), hint="choose others with --poses")
     if kind == "tum":
         stamped = found.poses if poses == "truth" else export.row_poses(found.rows, poses)  # type: ignore[arg-type]
-        click.echo(f"{output}: {export.write_tum(output, stamped)} poses")
+        click.echo(f"{output}: {export.write_tum(output, stamped)} poses", err=quiet)
         return
     export.write_kitti(output, by_row)
     missing = len(by_row) - count
     note = f"; {missing} scans without a pose are lines of nan" if missing else ""
-    click.echo(f"{output}: {len(by_row)} lines, one per scan{note}")
+    click.echo(f"{output}: {len(by_row)} lines, one per scan{note}", err=quiet)

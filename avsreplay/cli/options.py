@@ -13,6 +13,7 @@ from avsreplay.errors import UsageError
 
 if TYPE_CHECKING:
     from avsreplay.log import SourceOptions
+    from avsreplay.report.result import Result
 
 F = TypeVar("F", bound=Callable[..., Any])
 PATH = click.Path(path_type=Path)
@@ -92,7 +93,11 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
         raise UsageError(str(error), hint="correct the option") from None
 
 
-def output_is_free(output: Path | None, *, overwrite: bool) -> None:
-    """Raise UsageError if ``output`` exists and must not be replaced."""
-    if output and output.exists() and not overwrite:
-        raise UsageError("already exists", where=str(output), hint="choose another name with -o, or add --overwrite")
+def load(path: Path) -> Result:
+    """Read and verify a saved result; warn on stderr if it could not be verified or its log was damaged."""
+    from avsreplay.report.result import load_result
+
+    result = load_result(path)
+    for line in result.warnings:
+        click.echo(f"avsreplay: warning: {line}", err=True)
+    return result

@@ -71,14 +71,17 @@ def command(
     log has the truth, what each plan would have missed by and how a flight under the supervisor would have ended.
     """
     from avsreplay.errors import UsageError
+    from avsreplay.files import check_output
     from avsreplay.replan import load_saved
 
     for name, value in (("--every", every_s), ("--extent", extent_m)):
         if value is not None and not 0.0 < value < float("inf"):
             raise UsageError(f"{value} is not above 0", where=name, hint="give a finite number above 0")
-    if export and export.exists() and not overwrite:
-        raise UsageError("is already there", where=str(export), hint="name another, or add --overwrite")
+    if export:
+        check_output(export, overwrite=overwrite)
     saved = load_saved(result, extent_m)
+    for line in saved.warnings:
+        click.echo(f"avsreplay: warning: {line}", err=True)
     planning = _planning(saved, flags)
     index = saved.index_at(at_s)
     made = _usable(lambda: planning.plan_at(index))
@@ -290,7 +293,7 @@ def _export(planning: Replanning, made: Plan, path: Path) -> None:
     import numpy as np
 
     from avsreplay.errors import UsageError
-    from avsreplay.report.atomic import atomic_path
+    from avsreplay.files import output_text
 
     if not made.found:
         raise UsageError("there is no plan to export", where=str(path), hint=f"its status is {made.status.value}")
@@ -298,6 +301,6 @@ def _export(planning: Replanning, made: Plan, path: Path) -> None:
     times = np.append(np.arange(0.0, made.t_go_s, 0.1), made.t_go_s)
     values = np.column_stack([times, *flown.at(times), flown.thrust(times)])
     names = ["t_s", *(f"{q}{c}_{u}" for q, u in (("r", "m"), ("v", "mps"), ("u", "mps2")) for c in "xyz")]
-    with atomic_path(path) as part:
+    with output_text(path) as stream:
         lines = [",".join(names), *(",".join(repr(float(v)) for v in row) for row in values)]
-        part.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        stream.write("\n".join(lines) + "\n")

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import click
 
-from avsreplay.cli.options import PATH, output_is_free
+from avsreplay.cli.options import PATH, load
 from avsreplay.errors import UnreadableInput
+from avsreplay.files import STDOUT, check_output
 
 EPILOG = """\b
 Examples:
@@ -31,17 +32,16 @@ def command(result: Path, output: Path | None, title: str | None, overwrite: boo
     the effective configuration.
     """
     page = output or (result if result.is_dir() else result.parent) / "report.html"
-    output_is_free(page, overwrite=overwrite)
-    click.echo(write_page(result, page, title))
+    check_output(page, overwrite=overwrite)
+    click.echo(write_page(result, page, title), err=page == STDOUT)
 
 
 def write_page(result: Path, target: Path, title: str | None = None) -> str:
     """Write the page of ``result`` to ``target`` and return one line about it."""
-    from avsreplay.report.atomic import atomic_text
+    from avsreplay.files import output_text
     from avsreplay.report.page import build_page
-    from avsreplay.report.result import load_result
 
-    found = load_result(result)
+    found = load(result)
     if not found.rows:
         raise UnreadableInput("holds no row", where=str(result), hint="name the result of a run with at least one scan")
     page = build_page(
@@ -53,6 +53,6 @@ def write_page(result: Path, target: Path, title: str | None = None) -> str:
         poses=found.poses,
         view=found.view,
     )
-    with atomic_text(target) as stream:
+    with output_text(target) as stream:
         stream.write(page)
     return f"{target} ({len(page) / 1e6:.2f} MB)"

@@ -14,6 +14,7 @@ import click
 from avsreplay.cli.options import PATH, read_options, source_options
 from avsreplay.cli.setting_options import run_settings, take_run_settings
 from avsreplay.errors import CheckFailed, DataLost, UsageError
+from avsreplay.files import check_output
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -122,6 +123,8 @@ class Wanted:
             raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
         if self.page and self.output is None:
             raise UsageError("--report needs a result directory", hint="add -o DIR")
+        if self.update_golden:
+            check_output(self.update_golden)
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Job:

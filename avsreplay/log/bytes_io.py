@@ -19,10 +19,6 @@ class BadMessage(ValueError):
     """A message or record whose bytes do not match its type."""
 
 
-class BadFile(ValueError):
-    """A file whose bytes do not match its header or its name."""
-
-
 def shown(text: object) -> str:
     r"""Return ``str(text)`` with every control character replaced by an escape (``\x1b``, ``\u202e``)."""
     return _UNSAFE.sub(lambda m: m[0].encode("unicode_escape", "surrogatepass").decode("ascii"), str(text))

@@ -10,7 +10,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from avsreplay.log.bytes_io import BadFile, BadMessage, shown
+from avsreplay.files import BadFile
+from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.index import Recording
 from avsreplay.log.options import Loss, TopicInfo
 from avsreplay.log.point_cloud2 import Cloud, decode_cloud

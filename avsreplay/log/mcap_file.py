@@ -24,7 +24,7 @@ from avsreplay.log.surface import MODEL_ENDINGS
 
 _TIMES = struct.Struct("<QQ")
 _BLOCK = 1 << 20
-_LEAST_CHUNK = 49
+_LEAST_CHUNK, _LEAST_MESSAGE = 49, 22
 _MAX_LOSSES = 10_000
 
 
@@ -208,7 +208,9 @@ class McapFile(Recording):
         head = mcap.chunk_head(self._file.read_at_most(at, min(mcap.CHUNK_PREFIX, end - at)), end - at)
         try:
             data = self._chunks.check(at, head)
-            walked = [(op, b, e) for op, b, e in mcap.records(memoryview(data))]
+            for opcode, begin, stop in mcap.records(memoryview(data)):  # checked before any of it is used
+                if opcode == mcap.MESSAGE and stop - begin < _LEAST_MESSAGE:
+                    raise BadMessage("a message shorter than its fixed fields")
         except BadMessage as error:
             start_ns, end_ns = (min(t, MAX_NS) for t in (head.start_ns, head.end_ns))
             self._resume = self._swallowed(at, end)
@@ -217,7 +219,7 @@ class McapFile(Recording):
         number, self._trusted = self._chunks.add(at, head), end
         self.unchecked += head.crc == 0
         view = memoryview(data)
-        for opcode, begin, stop in walked:
+        for opcode, begin, stop in mcap.records(view):
             if opcode == mcap.MESSAGE:
                 self._message(view, begin, stop, number, begin)
             elif opcode == mcap.SCHEMA:

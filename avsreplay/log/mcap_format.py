@@ -19,6 +19,7 @@ ATTACHMENT, STATISTICS, METADATA, DATA_END = 9, 11, 12, 15
 CHUNK_PREFIX = 9 + 8 + 8 + 8 + 4 + 4 + 4 + 8  # opcode and length, then the longest head of a chunk
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")
+_KNOWN, _MOST_FOREIGN = frozenset(range(1, 16)), 10_000  # a chunk of zeros is millions of records of length 0
 _SIGNATURE = re.compile(rb"(?=\x06[\s\S]{36}(?:\x00{4}|\x03\x00{3}lz4|\x04\x00{3}zstd))")
 
 
@@ -87,11 +88,14 @@ class Fields:
 
 def records(view: memoryview) -> Iterator[tuple[int, int, int]]:
     """Yield (opcode, begin, end) of the content of each record. Raises BadMessage if the last one is cut."""
-    at, size = 0, len(view)
+    at, size, foreign = 0, len(view), 0
     while at + 9 <= size:
         opcode, length = _HEAD.unpack_from(view, at)
         if length > size - at - 9:
             raise BadMessage("a record ends past its container")
+        foreign += opcode not in _KNOWN
+        if opcode == 0 or foreign > _MOST_FOREIGN:
+            raise BadMessage("records of unknown kinds")
         yield opcode, at + 9, at + 9 + length
         at += 9 + length
     if at != size:

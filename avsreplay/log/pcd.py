@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.log.bytes_io import BadFile
+from avsreplay.files import BadFile
 
 _KINDS = {"F": "f", "I": "i", "U": "u"}
 _MAX_HEADER = 1 << 16

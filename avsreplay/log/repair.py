@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.files import check_output, output_path
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.header import HEADER_RECORD, decode_header
 from avsreplay.log.index import CLOUD_TYPES, MAX_NS
@@ -109,31 +110,21 @@ def repair(path: Path, output: Path, *, overwrite: bool = False, max_message_mib
         UnreadableInput: the input cannot be opened, or the output cannot be written.
     """
     _check(path, output, overwrite)
-    partial = output.with_name(output.name + ".partial")
     probe = McapFile(path, max_message_mib << 20)
     probe.close()
-    try:
-        with partial.open("wb") as stream:
-            copier = _Copier(stream, probe.profile)
-            McapFile(path, max_message_mib << 20, copy_to=copier).close()
-            copier.finish()
-        partial.replace(output)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        what = f"cannot be written: {error.strerror}"
-        raise UnreadableInput(what, where=shown(output), hint="name another output") from None
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
+    with output_path(output, overwrite=overwrite) as part, part.open("wb") as stream:
+        copier = _Copier(stream, probe.profile)
+        McapFile(path, max_message_mib << 20, copy_to=copier).close()
+        copier.finish()
     return copier.done
 
 
 def _check(path: Path, output: Path, overwrite: bool) -> None:
     if not path.exists():
         raise UnreadableInput("no such file", where=shown(path), hint="check the path")
-    if output.exists() and (output.samefile(path) or not overwrite):
-        hint = "name another output" if output.samefile(path) else "name another output or add --overwrite"
-        raise UsageError("exists already", where=shown(output), hint=hint)
+    if output.exists() and output.samefile(path):
+        raise UsageError("is the input", where=shown(output), hint="name another output")
+    check_output(output, overwrite=overwrite)
     if not is_mcap(path):
         hint = "convert it with 'avsreplay record' instead"
         raise UsageError("only MCAP files are repaired", where=shown(path), hint=hint)

@@ -90,9 +90,13 @@ class ResultLog:
         self._channels: dict[str, int] = {}
 
     def close(self) -> None:
-        """Finish the file."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._stream.close()
+        """Finish the file; a second call does nothing."""
+        if self._stream.closed:
+            return
+        try:
+            self._writer.finish()  # type: ignore[no-untyped-call]
+        finally:
+            self._stream.close()
 
     def write(self, frame: ResultFrame) -> None:
         """Append the messages of one scan."""

@@ -20,7 +20,7 @@ ROS1_MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 _CHUNK_OP = re.compile(rb"\x04\x00\x00\x00op=\x05")
 _WINDOW, _MARGIN = 1 << 20, 128
-_MAX_HEAD = 1 << 16
+_MAX_HEAD, _MOST_FOREIGN = 1 << 16, 10_000
 _MAX_CANDIDATES, _MAX_LOSSES = 20_000, 10_000
 _COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
 
@@ -146,12 +146,13 @@ class Ros1Bag(Recording):
         head = ChunkHead(0, 0, record.number("size"), 0, _COMPRESSIONS[name], record.data_at - at, record.data_size)
         try:
             data = memoryview(self._chunks.check(at, head))
-            inner = list(_records(data))
+            for _ in _records(data):  # checked before any of it is used
+                pass
         except BadMessage as error:
             self._bad_chunk = Loss(str(error), at, record.end - at, 1)
             return
         number = self._chunks.add(at, head)
-        for found in inner:
+        for found in _records(data):
             body = data[found.data_at : found.end]
             if found.op == _CONNECTION:
                 self._connection(found, body)
@@ -225,11 +226,15 @@ class Ros1Bag(Recording):
 
 def _records(view: memoryview) -> Iterator[_Record]:
     """Yield the records of a chunk. Raises BadMessage if the last one is cut."""
-    walk = Fields(view)
+    walk, foreign = Fields(view), 0
     while walk.at < len(view):
         head = walk.take(walk.number(4))
         size = walk.number(4)
-        yield _parsed(head, walk.at, size)
+        record = _parsed(head, walk.at, size)
+        foreign += record.op not in (_MESSAGE, _CONNECTION)
+        if foreign > _MOST_FOREIGN:
+            raise BadMessage("records of unknown kinds")
+        yield record
         walk.take(size)
 
 

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import io
-import math
 import re
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,16 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import MissingBackend, UnreadableInput
-from avsreplay.log.bytes_io import BadFile, shown
+from avsreplay.files import BadFile, parse_npy, read_members
+from avsreplay.log.bytes_io import shown
 from avsreplay.log.pcd import read_pcd
 from avsreplay.log.ply import read_ply
-
-_MAX_NPY_HEADER = 4096
-_NPY_HEADER = re.compile(
-    r"\{\s*'descr':\s*'(?P<descr>[^']{1,8})',\s*'fortran_order':\s*(?P<fortran>True|False),"
-    r"\s*'shape':\s*\((?P<shape>(?:\s*\d{1,18}\s*,?){0,8})\s*\),?\s*\}"
-)
-_NPY_KIND = re.compile(r"[<>|=]?(?:f[248]|[iu][1248])")
 
 
 def read_points(path: Path, limit: int) -> NDArray[Any]:
@@ -61,22 +52,7 @@ def _kitti(data: bytes, _limit: int) -> NDArray[Any]:
 
 
 def _npy(data: bytes, _limit: int) -> NDArray[Any]:
-    """Parse the npy format; numpy's own reader allocates the sizes in the header and may unpickle."""
-    wide = data[6:7] in (b"\x02", b"\x03")
-    start = 12 if wide else 10
-    size = int.from_bytes(data[8:start], "little")
-    if data[:6] != b"\x93NUMPY" or size > _MAX_NPY_HEADER or len(data) < start + size:
-        raise BadFile("not a valid npy file")
-    header = _NPY_HEADER.fullmatch(data[start : start + size].decode("latin-1").strip())
-    if header is None or not _NPY_KIND.fullmatch(header["descr"]):
-        raise BadFile("an npy file that is not an array of numbers")
-    shape = tuple(int(n) for n in header["shape"].split(",") if n.strip())
-    descr, fortran = header["descr"], header["fortran"] == "True"
-    dtype, count = np.dtype(descr), math.prod(shape)
-    if count * dtype.itemsize > len(data) - start - size:
-        raise BadFile(f"an array of shape {str(shape)[:60]}, which its bytes do not hold")
-    array = np.frombuffer(data, dtype, count, start + size)
-    return _columns(array.reshape(shape, order="F" if fortran else "C"))
+    return _columns(parse_npy(data))
 
 
 def _columns(array: NDArray[Any]) -> NDArray[Any]:
@@ -88,19 +64,11 @@ def _columns(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _npz(data: bytes, limit: int) -> NDArray[Any]:
-    try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            members = [m for m in archive.infolist() if m.filename.endswith(".npy")]
-            named = [m for m in members if m.filename in ("points.npy", "xyz.npy")] or members
-            if len(named) != 1:
-                raise BadFile(f"{len(members)} arrays; name one of them 'points'")
-            with archive.open(named[0]) as member:
-                inner = member.read(limit + 1)
-    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError) as error:
-        raise BadFile(f"not a readable npz: {str(error)[:80]}") from None
-    if len(inner) > limit:
-        raise BadFile(f"an array over the limit of {limit} bytes")
-    return _npy(inner, limit)
+    members = {name: member for name, member in read_members(data, limit).items() if name.endswith(".npy")}
+    named = [name for name in members if name in ("points.npy", "xyz.npy")] or list(members)
+    if len(named) != 1:
+        raise BadFile(f"{len(members)} arrays; name one of them 'points'")
+    return _npy(members[named[0]], limit)
 
 
 def _las(data: bytes, limit: int) -> NDArray[Any]:

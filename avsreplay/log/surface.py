@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput
+from avsreplay.files import BadFile
 from avsreplay.geometry import Array, frozen
-from avsreplay.log.bytes_io import BadFile, shown
+from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
 from avsreplay.records import Surface
 

@@ -14,6 +14,7 @@ from types import TracebackType
 from typing import Any, BinaryIO
 
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.files import STDOUT, check_output, is_stream
 from avsreplay.geometry import Pose
 from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.header import HEADER_RECORD, encode_header
@@ -74,8 +75,12 @@ class LogWriter:
             raise ValueError(f"compression is {compression!r}, not zstd, lz4 or none")
         if chunk_bytes < 1 or chunk_s <= 0.0:
             raise ValueError(f"chunk_bytes {chunk_bytes} and chunk_s {chunk_s} must be positive")
-        self._path, self._overwrite = Path(path), overwrite
-        self._partial = self._path if streaming else self._path.with_name(self._path.name + ".partial")
+        check_output(Path(path), overwrite=overwrite)
+        if Path(path) == STDOUT:
+            raise UsageError("a log cannot be written to standard output", where="-", hint="name a file")
+        self._path, self._overwrite = Path(path).resolve(), overwrite  # a symbolic link is followed, never replaced
+        self._direct = streaming or is_stream(self._path)
+        self._partial = self._path if self._direct else self._path.with_name(self._path.name + ".partial")
         self._point_type, self._chunk_bytes, self._chunk_ns = point_type, chunk_bytes, round(chunk_s * 1e9)
         self._labels = sorted(_edges(header.labels), key=lambda edge: (edge[0], edge[1]))
         self._channels: dict[str, int] = {}
@@ -137,13 +142,10 @@ class LogWriter:
             self._partial.replace(self._path)
 
     def _create(self) -> BinaryIO:
-        for path in dict.fromkeys((self._path, self._partial)):
-            if path.exists() and not self._overwrite:
-                raise UsageError("exists already", where=str(path), hint="name another output or add --overwrite")
+        if not self._direct and self._partial.exists() and not self._overwrite:
+            raise UsageError("already exists", where=str(self._partial), hint="choose another name, or add --overwrite")
         try:
             return self._partial.open("wb")
-        except FileNotFoundError:
-            raise UsageError("no such folder", where=str(self._path.parent), hint="make it first") from None
         except OSError as error:
             raise UnreadableInput(
                 f"cannot be written: {error.strerror}", where=str(self._path), hint="name another output"
@@ -217,7 +219,8 @@ class LogWriter:
     def _finish(self) -> None:
         self._writer.finish()
         self._stream.flush()
-        os.fsync(self._stream.fileno())
+        if self._path.is_file() or not self._direct:
+            os.fsync(self._stream.fileno())
         self._stream.close()
 
     def _guarded(self, action: Callable[[], None]) -> None:
@@ -234,11 +237,13 @@ class LogWriter:
             OSError
         ):  # the buffered bytes cannot be written either; the file is closed nevertheless
             self._stream.close()
-        os.truncate(self._partial, min(self._complete, self._partial.stat().st_size))
+        if self._partial.is_file():
+            os.truncate(self._partial, min(self._complete, self._partial.stat().st_size))
 
     def _discard(self) -> None:
         self._stream.close()
-        self._partial.unlink(missing_ok=True)
+        if self._partial.is_file():
+            self._partial.unlink()
 
 
 def _edges(labels: tuple[Label, ...]) -> list[tuple[int, int, Label]]:

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from avsreplay.errors import MissingBackend
+from avsreplay.files import output_path, output_text
 from avsreplay.geometry import Pose
-from avsreplay.report.atomic import atomic_path, atomic_text
 from avsreplay.report.jsonl import field_types, plain
 from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import verdict_of
@@ -29,6 +29,7 @@ FORMAT = "avsreplay-run/1"
 StampedPose = tuple[int, Pose]
 """(t_ns, T_ac): a time and the pose of {C} in {A} at that time."""
 
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a spreadsheet evaluates text that begins so
 _COLUMNS = {
     "estimate": (("qx", "qy", "qz", "qw"), ("x_m", "y_m", "z_m")),
     "registration": (("reg_qx", "reg_qy", "reg_qz", "reg_qw"), ("reg_x_m", "reg_y_m", "reg_z_m")),
@@ -75,7 +76,7 @@ def _text(values: Iterable[Any]) -> str:
 
 def _write_lines(path: str | Path, lines: Iterable[str]) -> int:
     count = 0
-    with atomic_text(path) as stream:
+    with output_text(path) as stream:
         for line in lines:
             stream.write(line + "\n")
             count += 1
@@ -85,7 +86,7 @@ def _write_lines(path: str | Path, lines: Iterable[str]) -> int:
 def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
     """Write all columns; their names (with units as suffixes) stand in the first line, null is an empty cell."""
     names = [c.name for c in columns()]
-    with atomic_text(path) as stream:
+    with output_text(path) as stream:
         writer = csv.writer(stream, lineterminator="\n")
         writer.writerow(names)
         writer.writerows([_cell(plain(getattr(row, name))) for name in names] for row in rows)
@@ -94,6 +95,8 @@ def write_csv(path: str | Path, rows: Iterable[Row]) -> None:
 def _cell(value: Any) -> str:
     if value is None:
         return ""
+    if isinstance(value, str):
+        return f"'{value}" if value.startswith(_FORMULA) else value
     return str(value).lower() if isinstance(value, bool) else str(value)
 
 
@@ -114,7 +117,7 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
         [pa.field(c.name, kinds[types[c.name][0]], types[c.name][1], {"unit": c.unit, "doc": c.doc}) for c in columns()]
     )
     table = {f.name: [plain(getattr(row, f.name)) for row in rows] for f in dataclasses.fields(Row)}
-    with atomic_path(path) as part:
+    with output_path(path) as part:
         pq.write_table(pa.table(table, schema=schema), part)
 
 
@@ -156,5 +159,5 @@ def _strict(value: Any) -> Any:
 
 def write_layout(path: str | Path) -> None:
     """Write the layout with which Foxglove and Lichtblick show ``result.mcap``: 3D view, plots, diagnostics."""
-    with atomic_text(path) as stream:
+    with output_text(path) as stream:
         stream.write((files("avsreplay.report") / "assets" / "layout.json").read_text(encoding="utf-8"))

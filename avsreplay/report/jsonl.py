@@ -17,11 +17,12 @@ from types import TracebackType
 from typing import Any
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.report.atomic import atomic_text
+from avsreplay.files import output_text, parse_json
 from avsreplay.rows import Row
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
-_MAX_LINE = 1 << 20
+_MAX_LINE, _MAX_FILE, _MAX_NAME, _MAX_TEXT = 1 << 20, 2 << 30, 100, 10_000
+_LARGEST = 1e100  # sums of squares of larger values are not finite
 
 
 def field_types() -> dict[str, tuple[type, bool]]:
@@ -57,7 +58,7 @@ class RowWriter:
         self.count = 0
 
     def __enter__(self) -> RowWriter:
-        self._stream = self._stack.enter_context(atomic_text(self._path))
+        self._stream = self._stack.enter_context(output_text(self._path))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
@@ -82,38 +83,48 @@ def write_rows(path: str | Path, rows: Iterable[Row]) -> int:
 
 
 def read_records(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield each line as (``file:line``, object) without checking the columns.
+    """Yield each line as (``file:line``, object of columns).
+
+    The columns are not checked, but every name is printable text and every value is null, a bool, a number of 64 bits
+    or printable text.
 
     Raises:
-        UnreadableInput: the file is missing or is not UTF-8, or a line is not a JSON object.
+        UnreadableInput: the file is missing or larger than 2 GiB, or a line is not such an object.
     """
     path = Path(path)
     try:
-        with path.open(encoding="utf-8") as stream:
-            for number, line in enumerate(stream, 1):
+        if path.stat().st_size > _MAX_FILE or not path.is_file():
+            raise UnreadableInput("not a rows.jsonl file", where=str(path), hint="name a rows.jsonl file")
+        with path.open("rb") as stream:
+            for number, line in enumerate(iter(lambda: stream.readline(_MAX_LINE + 1), b""), 1):
                 if line.strip():
                     yield f"{path}:{number}", _parse(line, f"{path}:{number}")
-    except UnicodeDecodeError:
-        raise UnreadableInput("not UTF-8 text", where=str(path), hint="name a rows.jsonl file") from None
     except OSError as error:
         what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
         raise UnreadableInput(what, where=str(path), hint="check the path") from None
 
 
-def _parse(line: str, where: str) -> dict[str, Any]:
+def _parse(line: bytes, where: str) -> dict[str, Any]:
+    hint = "name a rows.jsonl file"
     if len(line) > _MAX_LINE:
-        raise UnreadableInput("a line longer than 1 MiB, not a row", where=where, hint="name a rows.jsonl file")
-    try:
-        record = json.loads(line, parse_constant=_refuse)
-    except (ValueError, RecursionError):
-        raise UnreadableInput("not valid JSON", where=where, hint="name a rows.jsonl file") from None
+        raise UnreadableInput("a line longer than 1 MiB, not a row", where=where, hint=hint)
+    record = parse_json(line, where=where, hint=hint)
     if not isinstance(record, dict):
-        raise UnreadableInput("not a JSON object", where=where, hint="name a rows.jsonl file")
+        raise UnreadableInput("not a JSON object", where=where, hint=hint)
+    for name, value in record.items():
+        if not name.isprintable() or len(name) > _MAX_NAME:
+            raise UnreadableInput(f"a column with the name {ascii(name)[:40]}", where=where, hint=hint)
+        if not _is_cell(value):
+            raise UnreadableInput(f"column '{name}' is {ascii(value)[:40]}", where=where, hint=hint)
     return record
 
 
-def _refuse(constant: str) -> Any:
-    raise ValueError(f"{constant} is not JSON")
+def _is_cell(value: Any) -> bool:
+    if isinstance(value, str):
+        return value.isprintable() and len(value) <= _MAX_TEXT
+    if isinstance(value, float):
+        return abs(value) <= _LARGEST
+    return value is None or (isinstance(value, int) and -(2**63) <= value < 2**63)
 
 
 def parse_row(record: Mapping[str, Any], where: str) -> Row:
@@ -143,5 +154,12 @@ def _checked(value: Any, name: str, kind: type, nullable: bool, where: str) -> A
 
 
 def read_rows(path: str | Path) -> list[Row]:
-    """All rows of a file; raises UnreadableInput as ``read_records`` and ``parse_row`` do."""
-    return [parse_row(record, where) for where, record in read_records(path)]
+    """Return all rows of a file. Raises UnreadableInput, also if the scans are not in ascending order."""
+    rows: list[Row] = []
+    for where, record in read_records(path):
+        row = parse_row(record, where)
+        if rows and row.seq <= rows[-1].seq:
+            what = f"scan {row.seq} after scan {rows[-1].seq}"
+            raise UnreadableInput(what, where=where, hint="the file is not as a run wrote it: run again")
+        rows.append(row)
+    return rows

@@ -6,13 +6,17 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from avsreplay.errors import UnreadableInput
+from avsreplay.files import read_json, read_limited, sha256
 from avsreplay.geometry import Pose
 from avsreplay.records import Label, State
 from avsreplay.report.export import StampedPose
@@ -21,7 +25,10 @@ from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, read_view
 from avsreplay.rows import Row
 
-_STATE = ("q_ab", "w_b", "r_a", "v_a", "sigma", "c_b", "q_bc")
+_STATE = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}
+_TABLES = ("log", "model", "clock", "losses", "selection", "config", "versions", "files")
+_RUN_AGAIN = "the result is not as a run wrote it: run again"
+_MAX_TUM, _LARGEST, _UNIT, _LONGEST_S = 512 << 20, 1e15, 1e-3, 9_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,6 +38,8 @@ class Result:
     Attributes:
         name: of its folder.  header: ``run.json`` as it stands, empty where there is none.
         truth: the true state at the last scan, its axes named as the estimate's.  poses: true poses of {C} in {A}.
+        unverified: why the files could not be compared with run.json; empty if they are as the run wrote them.
+        whole: whether it is a result directory, not a single file of rows.
     """
 
     name: str
@@ -40,6 +49,21 @@ class Result:
     truth: State | None = None
     poses: Sequence[StampedPose] = ()
     view: View | None = None
+    unverified: str = ""
+    whole: bool = False
+
+    @property
+    def losses(self) -> int:
+        """Return the number of damaged places in the log of the run."""
+        found = self.header.get("losses")
+        return int(found["count"]) if isinstance(found, dict) and isinstance(found.get("count"), int) else 0
+
+    @property
+    def warnings(self) -> list[str]:
+        """Return what a reader of figures from this result must know."""
+        out = [f"{self.name}: not verified, {self.unverified}"] if self.unverified else []
+        out += [f"{self.name}: its log was damaged at {self.losses} places"] if self.losses else []
+        return out + ([f"{self.name}: the run was interrupted"] if "interrupted_after" in self.header else [])
 
 
 def facts_record(
@@ -58,56 +82,114 @@ def _label_record(label: Label) -> dict[str, Any]:
     return {name: getattr(label, name) for name in names}
 
 
-def load_result(path: str | Path) -> Result:
-    """Read a result directory, or a lone ``rows.jsonl``.
+def write_manifest(folder: Path, record: Mapping[str, Any], rows: int) -> None:
+    """Write ``run.json``: ``record``, the number of rows, and size and SHA-256 of every file in the folder."""
+    files = {path.name: {"bytes": path.stat().st_size, "sha256": sha256(path)} for path in sorted(folder.iterdir())}
+    text = json.dumps({**record, "rows": rows, "files": files}, indent=1, allow_nan=False)
+    (folder / "run.json").write_text(text + "\n", encoding="utf-8")
 
-    Raises UnreadableInput where there are no rows, or where a file that is there is not what it says.
+
+def load_result(path: str | Path) -> Result:
+    """Read a result directory, or a single ``rows.jsonl``, and verify its files against ``run.json``.
+
+    Args:
+        path: the directory or the rows.
+
+    Returns:
+        The result. ``unverified`` states why it could not be verified; it is empty if all files are as the run wrote
+        them.
+
+    Raises:
+        UnreadableInput: a file is missing, damaged, or differs from the size, SHA-256 or number of rows in run.json.
     """
     path = Path(path)
     folder, rows_path = (path, path / "rows.jsonl") if path.is_dir() else (None, path)
+    whole = folder or (path.parent if path.name == "rows.jsonl" and (path.parent / "run.json").is_file() else None)
+    header, unverified = _header(whole / "run.json") if whole else {}, "it is a single file of rows without run.json"
+    if whole:
+        unverified = _verify(whole, header, None if folder else ("rows.jsonl",))
     rows = read_rows(rows_path)
-    header = _header(folder / "run.json") if folder else {}
+    if not unverified and len(rows) != header.get("rows"):
+        what = f"{len(rows)} rows, run.json states {header.get('rows')}"
+        raise UnreadableInput(what, where=str(rows_path), hint=_RUN_AGAIN)
     labels, truth, counts = _facts(header.get("facts") or {}, str(path))
     summary = Summary.fold(rows, labels=labels, truth=truth, counts=counts)
     poses = read_tum(folder / "truth.tum") if folder and (folder / "truth.tum").is_file() else []
     view = read_view(folder / "view.npz") if folder and (folder / "view.npz").is_file() else None
     name = path.resolve().name if folder else path.name.removesuffix(".jsonl").removesuffix(".rows")
-    return Result(name, rows, summary, header, truth, poses, view)
+    return Result(name, rows, summary, header, truth, poses, view, unverified, whole is not None)
 
 
 def _header(path: Path) -> dict[str, Any]:
     if not path.is_file():
         return {}
-    try:
-        header = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        raise UnreadableInput("not valid JSON", where=str(path), hint="run again") from None
+    header = read_json(path, hint=_RUN_AGAIN)
     if not isinstance(header, dict):
-        raise UnreadableInput("not a JSON object", where=str(path), hint="run again")
+        raise UnreadableInput("not a JSON object", where=str(path), hint=_RUN_AGAIN)
+    for key in _TABLES:
+        if not isinstance(header.get(key, {}), dict):
+            raise UnreadableInput(f"'{key}' is not a JSON object", where=str(path), hint=_RUN_AGAIN)
     return header
 
 
-def _facts(record: Mapping[str, Any], where: str) -> tuple[list[Label] | None, State | None, dict[str, int]]:
+def _verify(folder: Path, header: Mapping[str, Any], names: Sequence[str] | None) -> str:
+    """Compare files with size and SHA-256 in run.json; return why this is not possible, or an empty string."""
+    files = header.get("files")
+    if not isinstance(files, dict) or "rows.jsonl" not in files:
+        return "run.json lists no files" if header else "there is no run.json"
+    for name, entry in files.items():
+        if names is not None and name not in names:
+            continue
+        path, entry = folder / name, entry if isinstance(entry, dict) else {}
+        if Path(name).name != name or not path.is_file():
+            raise UnreadableInput(f"'{name}' is missing", where=str(folder), hint=_RUN_AGAIN)
+        try:
+            same = path.stat().st_size == entry.get("bytes") and sha256(path) == entry.get("sha256")
+        except OSError as error:
+            raise UnreadableInput(error.strerror or "cannot be read", where=str(path), hint=_RUN_AGAIN) from None
+        if not same:
+            raise UnreadableInput("differs from its SHA-256 in run.json", where=str(path), hint=_RUN_AGAIN)
+    return ""
+
+
+def _facts(record: Any, where: str) -> tuple[list[Label] | None, State | None, dict[str, int]]:
     try:
-        labels = record.get("labels")
-        truth = record.get("truth")
+        labels, truth = record.get("labels"), record.get("truth")
         counts = {str(k): int(v) for k, v in (record.get("counts") or {}).items()}
-        known = None if labels is None else [Label(**label) for label in labels]
-        return known, None if truth is None else State(**truth), counts
-    except (TypeError, ValueError, AttributeError):
-        raise UnreadableInput(
-            "'facts' in run.json are not as written by a run", where=where, hint="run again"
-        ) from None
+        known = None if labels is None else [_label(label) for label in labels]
+        return known, None if truth is None else _state(truth), counts
+    except (TypeError, ValueError, AttributeError, KeyError):
+        raise UnreadableInput("'facts' in run.json are not as written by a run", where=where, hint=_RUN_AGAIN) from None
+
+
+def _label(values: Mapping[str, Any]) -> Label:
+    label = Label(**values)
+    times = (label.start_ns, label.end_ns)
+    if not all(type(t) is int and -(2**63) <= t < 2**63 for t in times) or type(label.harmful) is not bool:
+        raise ValueError("a label of the wrong type")
+    if not isinstance(label.kind, str) or not label.kind.isprintable():
+        raise ValueError("a label without a name")
+    if not isinstance(label.strength, (int, float, type(None))):
+        raise ValueError("a label without a strength")
+    return label
+
+
+def _state(values: Mapping[str, Any]) -> State:
+    arrays = {name: np.array(values[name], dtype=np.float64) for name in _STATE}
+    sizes_match = all(arrays[name].shape == (size,) for name, size in _STATE.items())
+    if not sizes_match or not all((np.abs(a) < _LARGEST).all() for a in arrays.values()):
+        raise ValueError("a state of another shape")
+    if any(abs(np.linalg.norm(arrays[name]) - 1.0) > _UNIT for name in ("q_ab", "q_bc")):
+        raise ValueError("a quaternion that is not of unit length")
+    return State(**arrays)
 
 
 def read_tum(path: str | Path) -> list[StampedPose]:
-    """Poses of a TUM file, stamps to the nanosecond. Raises UnreadableInput with the line."""
+    """Read a TUM file: (t_ns, pose) with times exact to the nanosecond. Raises UnreadableInput with the line."""
+    hint = "name a TUM trajectory"
+    text = read_limited(Path(path), _MAX_TUM, hint).decode("utf-8", "backslashreplace")
     out: list[StampedPose] = []
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        raise UnreadableInput("cannot be read", where=str(path), hint="name a TUM trajectory") from None
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(text.splitlines(), 1):
         if line.strip() and not line.startswith("#"):
             out.append(_stamped(line, f"{path}:{number}"))
     return out
@@ -115,8 +197,14 @@ def read_tum(path: str | Path) -> list[StampedPose]:
 
 def _stamped(line: str, where: str) -> StampedPose:
     try:
-        stamp, *values = line.split()
-        x, y, z, *q = (float(v) for v in values)
-        return int((Decimal(stamp) * 1_000_000_000).to_integral_value(ROUND_DOWN)), Pose(q, [x, y, z])  # type: ignore[arg-type]
+        stamp, *words = line.split()
+        x, y, z, *q = values = [float(v) for v in words]
+        seconds = Decimal(stamp)
+        if not abs(seconds) < _LONGEST_S or len(q) != 4 or not max(map(abs, values)) < _LARGEST:
+            raise ValueError("a pose out of range")
+        t_ns = int((seconds * 1_000_000_000).to_integral_value(ROUND_DOWN))
+        if abs(math.hypot(*q) - 1.0) > _UNIT:
+            raise ValueError("not a unit quaternion")
+        return t_ns, Pose(q, [x, y, z])  # type: ignore[arg-type]
     except (ValueError, ArithmeticError):
         raise UnreadableInput("not 'stamp x y z qx qy qz qw'", where=where, hint="name a TUM trajectory") from None

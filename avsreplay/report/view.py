@@ -5,7 +5,6 @@ Decimation is deterministic: clouds by an even stride, the model by clustering i
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +14,22 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from avsreplay.errors import UnreadableInput
+from avsreplay.files import output_path, read_npz
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
-from avsreplay.report.atomic import atomic_path
 from avsreplay.report.charts import pack, values
 from avsreplay.rows import Row
 
 CLOUD_POINTS = 300
 MOST_FACES = 4000
-_MOST_BYTES = 1 << 30
+_MOST_BYTES, _LARGEST = 1 << 30, 1e15
+_ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    **dict.fromkeys(("vertices", "cloud_points", "path_points"), ("f", (None, 3))),
+    **dict.fromkeys(("cloud_seq", "cloud_size", "path_t_ns", "path_size"), ("i", (None,))),
+    **dict.fromkeys(("cloud_residual", "path_miss"), ("f", (None,))),
+    "faces": ("i", (None, 3)),
+}
+_SINGLE = ("vertices", "cloud_points", "path_points", "cloud_residual")
 
 Floats = NDArray[np.float32]
 Faces = NDArray[np.int32]
@@ -105,7 +111,7 @@ def write_view(path: str | Path, view: View) -> None:
         "path_points": _joined([p.points for p in view.paths]),
         "path_miss": np.array([np.nan if p.miss_m is None else p.miss_m for p in view.paths], dtype=np.float64),
     }
-    with atomic_path(path) as part, part.open("wb") as stream:
+    with output_path(path) as part, part.open("wb") as stream:
         np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
 
 
@@ -123,16 +129,12 @@ def read_view(path: str | Path) -> View:
     Raises:
         UnreadableInput: the file is missing or is not a view.
     """
+    path, hint = Path(path), "run again with -o"
+    arrays = read_npz(path, _ARRAYS, limit=_MOST_BYTES, hint=hint)
     try:
-        with np.load(path, allow_pickle=False) as data:
-            if sum(info.file_size for info in data.zip.infolist()) > _MOST_BYTES:
-                raise ValueError("too large")
-            arrays = {name: data[name] for name in data.files}
-        return _view(arrays)
-    except FileNotFoundError:
-        raise UnreadableInput("no such file", where=str(path), hint="check the path") from None
-    except (OSError, ValueError, KeyError, IndexError, AttributeError, EOFError, zipfile.BadZipFile):
-        raise UnreadableInput("not a view file", where=str(path), hint="run again with --report") from None
+        return _view({name: a.astype(np.float32) if name in _SINGLE else a for name, a in arrays.items()})
+    except ValueError as error:
+        raise UnreadableInput(f"not a view file: {error}", where=str(path), hint=hint) from None
 
 
 def _view(arrays: dict[str, NDArray[np.float32]]) -> View:
@@ -147,14 +149,17 @@ def _view(arrays: dict[str, NDArray[np.float32]]) -> View:
         PathView(int(t), p, None if np.isnan(miss) else float(miss))
         for t, p, miss in zip(arrays["path_t_ns"], lines, arrays["path_miss"], strict=True)
     )
-    faces = arrays["faces"].astype(np.int32).reshape(-1, 3)
-    vertices = arrays["vertices"].reshape(-1, 3)
+    vertices, faces = arrays["vertices"], arrays["faces"]
+    if not all((np.abs(arrays[name]) < _LARGEST).all() for name in ("vertices", "cloud_points", "path_points")):
+        raise ValueError("points that are not finite or too far away")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError("faces refer to vertices that do not exist")
-    return View(vertices, faces, clouds, paths)
+    return View(vertices, faces.astype(np.int32), clouds, paths)
 
 
 def _split(joined: NDArray[np.float32], sizes: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+    if (sizes < 0).any() or (sizes > len(joined)).any():
+        raise ValueError("sizes out of range")
     ends = np.cumsum(sizes.astype(np.int64))
     if (ends[-1] if len(ends) else 0) != len(joined):
         raise ValueError("sizes do not add up")

@@ -18,7 +18,7 @@ from types import TracebackType
 from typing import Any, BinaryIO, TypeVar
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.report.atomic import atomic_path
+from avsreplay.files import output_path
 from avsreplay.sweep.parquet import read_scans, write_scans
 from avsreplay.sweep.worker import RunResult
 
@@ -145,7 +145,7 @@ class Journal:
 
     def _copy(self, places: Sequence[tuple[int, int]]) -> None:
         """Replace the journal by these of its lines."""
-        with self.path.open("rb") as source, atomic_path(self.path) as part:
+        with self.path.open("rb") as source, output_path(self.path) as part:
             with part.open("wb") as target:
                 for start, size in places:
                     source.seek(start)

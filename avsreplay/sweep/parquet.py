@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from avsreplay.errors import MissingBackend, UnreadableInput
-from avsreplay.report.atomic import atomic_path
+from avsreplay.files import output_path
 from avsreplay.sweep.worker import SCAN_COLUMNS
 
 
@@ -42,7 +42,7 @@ def write_batches(path: Path, schema: Any, batches: Iterable[Sequence[tuple[Any,
     """Write rows in batches to a file that appears once it is complete."""
     pa, pq = arrow()
     with (
-        atomic_path(path) as part,
+        output_path(path) as part,
         pq.ParquetWriter(part, schema, compression="zstd", write_page_checksum=True) as writer,
     ):
         for rows in batches:

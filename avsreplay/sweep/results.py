@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from avsreplay import __version__
-from avsreplay.report.atomic import atomic_text
+from avsreplay.files import output_text
 from avsreplay.sweep.expansion import Expansion, Point
 from avsreplay.sweep.journal import Journal
 from avsreplay.sweep.page import build_sweep_page
@@ -48,7 +48,7 @@ def write_results(plan: Expansion, journal: Journal, folder: Path) -> SweepSumma
     summary = fold.result(detector.result() if detector else None)
     text = json.dumps({"version": __version__, **summary.document()}, indent=1, allow_nan=False)
     for name, content in (("summary.json", text + "\n"), ("report.html", build_sweep_page(summary))):
-        with atomic_text(folder / name) as stream:
+        with output_text(folder / name) as stream:
             stream.write(content)
     return summary
 

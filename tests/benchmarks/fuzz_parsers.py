@@ -16,7 +16,8 @@ import atheris
 with atheris.instrument_imports(include=["avsreplay.log"]):
     from fuzz_inputs import seeds
 
-    from avsreplay.log.bytes_io import BadFile, BadMessage
+    from avsreplay.files import BadFile
+    from avsreplay.log.bytes_io import BadMessage
     from avsreplay.log.pcd import read_pcd, unpack_lzf
     from avsreplay.log.ply import read_ply
     from avsreplay.log.point_cloud2 import decode_cloud

@@ -1,0 +1,422 @@
+"""Files at the boundary of the program: outputs that are complete or absent, and numpy archives checked on reading.
+
+An output that is a regular file is written beside its place and renamed when it is complete. A symbolic link is
+followed and never replaced. A device, a FIFO and ``-`` (standard output) are written directly. Names that cannot be
+written are refused by ``check_output`` before any work is done.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import itertools
+import json
+import math
+import os
+import re
+import shutil
+import stat
+import sys
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.errors import UnreadableInput, UsageError
+
+STDOUT = Path("-")
+_NAME_BYTES = 255
+_PART = re.compile(r"\..+\.\d+\.\d+\.part", re.DOTALL)
+_CLEANED: set[Path] = set()
+_COUNTER = itertools.count()
+_BLOCK = 1 << 20
+_MAX_NPY_HEADER = 4096
+_LEAST_ARRAYS, _MAX_RATIO = 96 << 20, 8  # arrays may take 96 MiB, or eight times the size of their archive
+_NPY_HEADER = re.compile(
+    r"\{\s*'descr':\s*'(?P<descr>[^']{1,8})',\s*'fortran_order':\s*(?P<fortran>True|False),"
+    r"\s*'shape':\s*\((?P<shape>(?:\s*\d{1,18}\s*,?){0,8})\s*\),?\s*\}"
+)
+_NPY_TYPE = re.compile(r"[<>|=]?(?:f[248]|[iu][1248])")
+_ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError)
+
+
+class BadFile(ValueError):
+    """A file whose bytes do not match its header or its name."""
+
+
+def is_stream(path: Path) -> bool:
+    """Return whether an output is written directly: ``-``, a device or a FIFO, also behind a symbolic link."""
+    if path == STDOUT:
+        return True
+    try:
+        mode = path.stat().st_mode
+    except OSError:
+        return False
+    return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode) or stat.S_ISBLK(mode)
+
+
+def check_output(path: Path, *, overwrite: bool = True, folder: bool = False) -> None:
+    """Refuse an output that cannot be written, before any work is done.
+
+    Args:
+        path: the output.
+        overwrite: whether an existing file or folder may be replaced.
+        folder: whether the output is a folder; its parents are created.
+
+    Raises:
+        UsageError: the name is unusable, the output exists, or its folder does not.
+        UnreadableInput: its folder cannot be written.
+    """
+    name = os.fsencode(path)
+    if not path.name or path.name == ".." or b"\0" in name:
+        raise UsageError("is not the name of an output", where=repr(str(path)), hint="name a file")
+    if not _is_text(str(path)):
+        raise UsageError("is not a UTF-8 name", where=ascii(str(path)), hint="name another output")
+    if len(os.fsencode(path.name)) > _NAME_BYTES:
+        where = f"{path.name[:40]}..."
+        raise UsageError(f"the name is longer than {_NAME_BYTES} bytes", where=where, hint="name another output")
+    try:
+        _check_place(path, overwrite, folder)
+    except (OSError, RuntimeError) as error:  # RuntimeError: a loop of symbolic links
+        what = f"cannot be written: {getattr(error, 'strerror', None) or 'a loop of symbolic links'}"
+        raise UsageError(what, where=str(path)[:200], hint="name another output") from None
+
+
+def _is_text(text: str) -> bool:
+    try:
+        text.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _check_place(path: Path, overwrite: bool, folder: bool) -> None:
+    if path == STDOUT:
+        if folder:
+            raise UsageError("a folder cannot be written to standard output", where="-", hint="name a folder")
+        return
+    place = path.resolve()
+    there = place.stat().st_mode if place.exists() else None
+    if there is not None and not folder and is_stream(place):
+        return
+    if there is not None and stat.S_ISDIR(there) != folder:
+        what = "is not a folder" if folder else "is a folder"
+        raise UsageError(what, where=str(path), hint="name another output")
+    if there is not None and not folder and not stat.S_ISREG(there):
+        raise UsageError("is not a regular file", where=str(path), hint="name another output")
+    if there is not None and not overwrite:
+        raise UsageError("already exists", where=str(path), hint="choose another name, or add --overwrite")
+    parent = place.parent
+    while folder and not parent.exists():
+        parent = parent.parent
+    if not parent.is_dir():
+        raise UsageError("no such folder", where=str(path.parent), hint="create it first")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise UnreadableInput("cannot be written: Permission denied", where=str(path), hint="check the folder's rights")
+
+
+@contextmanager
+def output_path(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]:
+    """Give a path to write to; on success its content becomes ``path``, on failure nothing is changed.
+
+    Args:
+        path: the output.
+        overwrite: whether a file that appears meanwhile may be replaced.
+
+    Yields:
+        A temporary path beside the output, or the output itself if it is a device or a FIFO.
+
+    Raises:
+        UsageError: the output cannot be written (see ``check_output``).
+        UnreadableInput: writing failed; the text states why.
+    """
+    path = Path(path)
+    check_output(path, overwrite=overwrite)
+    if path == STDOUT:
+        raise UsageError("this output needs a file", where="-", hint="name a file")
+    place = path.resolve()
+    try:
+        if is_stream(place):
+            yield place
+            return
+        with _part(place) as part:
+            yield part
+            _publish(part, place, overwrite)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+@contextmanager
+def output_text(path: str | Path, *, overwrite: bool = True) -> Iterator[IO[str]]:
+    """Open an output as UTF-8 text with Unix line ends; see ``output_path``. ``-`` is standard output."""
+    if Path(path) == STDOUT:
+        yield sys.stdout
+        sys.stdout.flush()
+        return
+    with (
+        output_path(path, overwrite=overwrite) as part,
+        part.open("w", encoding="utf-8", newline="\n", errors="backslashreplace") as stream,
+    ):
+        yield stream
+
+
+@contextmanager
+def output_folder(path: Path) -> Iterator[Path]:
+    """Give a temporary folder; on success it replaces the folder ``path``, on failure nothing is changed.
+
+    Raises:
+        UsageError: the folder cannot be written (see ``check_output``).
+        UnreadableInput: writing failed; the text states why.
+    """
+    check_output(path, folder=True)
+    place = path.resolve()
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with _part(place, folder=True) as part:
+            yield part
+            _swap(part, place)
+    except OSError as error:
+        raise _unwritable(path, error) from None
+
+
+def _swap(part: Path, place: Path) -> None:
+    """Put ``part`` in the place of an existing folder, which is kept until the new one is there."""
+    old = _beside(place)
+    if place.exists():
+        place.rename(old)
+    try:
+        part.rename(place)
+    except OSError:
+        if old.exists():
+            old.rename(place)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def _publish(part: Path, place: Path, overwrite: bool) -> None:
+    if place.exists():
+        with contextlib.suppress(OSError):
+            shutil.copymode(place, part)
+    if overwrite:
+        part.replace(place)
+        return
+    try:
+        os.link(part, place)  # fails if another process has created the file meanwhile
+    except FileExistsError:
+        raise UsageError("appeared while it was written", where=str(place), hint="add --overwrite") from None
+    except OSError:  # a file system without hard links
+        part.replace(place)
+
+
+def _unwritable(path: Path, error: OSError) -> UnreadableInput:
+    what = f"cannot be written: {error.strerror or error}"
+    return UnreadableInput(
+        what, where=str(path), hint="nothing was changed; check the folder, its rights and its space"
+    )
+
+
+def _beside(place: Path) -> Path:
+    """Return a name beside ``place`` that no other process or thread uses."""
+    stem = os.fsdecode(os.fsencode(place.name)[:200])
+    return place.with_name(f".{stem}.{os.getpid()}.{next(_COUNTER)}.part")
+
+
+@contextmanager
+def _part(place: Path, *, folder: bool = False) -> Iterator[Path]:
+    """Create a locked temporary file or folder beside ``place`` and remove it at the end if it is still there."""
+    _remove_stale(place.parent)
+    part = _beside(place)
+    if folder:
+        part.mkdir()
+    else:
+        part.touch(exist_ok=False)
+    lock = _lock(part)
+    try:
+        yield part
+    finally:
+        if lock is not None:
+            os.close(lock)
+        _remove(part)
+
+
+def _lock(part: Path) -> int | None:
+    """Lock a temporary file as long as this process lives; None if the system or file system cannot."""
+    try:
+        import fcntl
+    except ModuleNotFoundError:  # Windows: an open file cannot be removed there
+        return None
+    handle = os.open(part, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(handle)
+        return None
+    return handle
+
+
+def _remove_stale(folder: Path) -> None:
+    """Remove the temporary files in a folder whose process has ended (their lock is free), once in this process."""
+    if folder in _CLEANED:
+        return
+    _CLEANED.add(folder)
+    with contextlib.suppress(OSError):
+        for entry in folder.iterdir():
+            if _PART.fullmatch(entry.name):
+                lock = _lock(entry)
+                if lock is not None or os.name == "nt":
+                    _remove(entry)
+                if lock is not None:
+                    os.close(lock)
+
+
+def _remove(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file. Raises OSError if it cannot be read."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(_BLOCK):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def read_limited(path: Path, limit: int, hint: str) -> bytes:
+    """Return the bytes of a regular file of at most ``limit`` bytes. Raises UnreadableInput otherwise."""
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise UnreadableInput("is not a regular file", where=str(path), hint=hint)
+        if found.st_size > limit:
+            raise UnreadableInput(f"larger than {limit >> 20} MiB", where=str(path), hint=hint)
+        return path.read_bytes()
+    except OSError as error:
+        what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
+        raise UnreadableInput(what, where=str(path), hint=hint) from None
+
+
+def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
+    """Return the value of a JSON text, with finite floats, integers of at most 64 bits and valid Unicode only.
+
+    Raises UnreadableInput otherwise.
+    """
+    try:
+        value = json.loads(text, parse_constant=_reject_constant)
+        _check_json(value)
+    except (ValueError, RecursionError) as error:
+        reason = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else "not valid JSON"
+        raise UnreadableInput(reason, where=where, hint=hint) from None
+    return value
+
+
+def read_json(path: Path, *, limit: int = 64 << 20, hint: str) -> Any:
+    """Return the value of a JSON file; see ``parse_json``. Raises UnreadableInput."""
+    return parse_json(read_limited(path, limit, hint), where=str(path), hint=hint)
+
+
+def _reject_constant(name: str) -> None:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _check_json(value: Any) -> None:
+    """Raise ValueError for a number or a string that JSON permits and this program cannot use."""
+    if isinstance(value, str):
+        value.encode("utf-8")  # a lone surrogate is a UnicodeEncodeError, which is a ValueError
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("a number that is too large")
+    elif isinstance(value, int) and abs(value) >= 1 << 64:
+        raise ValueError("an integer that is too large")
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            _check_json(key)
+            _check_json(item)
+    elif isinstance(value, list):
+        for item in value:
+            _check_json(item)
+
+
+def parse_npy(data: bytes) -> NDArray[Any]:
+    """Return the array of numbers in a npy file.
+
+    numpy's own reader allocates the sizes in the header, evaluates the header and may unpickle.
+
+    Raises:
+        BadFile: the file is malformed, or is not an array of integers or floats.
+    """
+    start = 12 if data[6:7] in (b"\x02", b"\x03") else 10
+    size = int.from_bytes(data[8:start], "little")
+    if data[:6] != b"\x93NUMPY" or size > _MAX_NPY_HEADER or len(data) < start + size:
+        raise BadFile("not a valid npy file")
+    header = _NPY_HEADER.fullmatch(data[start : start + size].decode("latin-1").strip())
+    if header is None or not _NPY_TYPE.fullmatch(header["descr"]):
+        raise BadFile("an npy file that is not an array of numbers")
+    shape = tuple(int(n) for n in header["shape"].split(",") if n.strip())
+    dtype, count = np.dtype(header["descr"]), math.prod(shape)
+    if count * dtype.itemsize > len(data) - start - size:
+        raise BadFile(f"an array of shape {str(shape)[:60]}, which its bytes do not contain")
+    array = np.frombuffer(data, dtype, count, start + size)
+    return array.reshape(shape, order="F" if header["fortran"] == "True" else "C")
+
+
+def read_members(data: bytes, limit: int) -> dict[str, bytes]:
+    """Return the members of a zip archive by name. Raises BadFile if it is malformed or larger than ``limit``."""
+    out: dict[str, bytes] = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            for info in archive.infolist():
+                with archive.open(info) as member:
+                    out[info.filename] = member.read(limit + 1)
+                limit -= len(out[info.filename])
+                if limit < 0:
+                    raise BadFile("its arrays are over the size limit")
+    except BadFile:
+        raise
+    except _ZIP_ERRORS as error:
+        raise BadFile(f"not a valid npz file: {str(error)[:80]}") from None
+    return out
+
+
+def read_npz(
+    path: Path, shapes: Mapping[str, tuple[str, tuple[int | None, ...]]], *, limit: int, hint: str
+) -> dict[str, NDArray[Any]]:
+    """Read a numpy archive of declared content.
+
+    Args:
+        path: the file.
+        shapes: for each array the kind of its numbers ("f" or "i") and its shape; None is any length.
+        limit: largest size of the file [bytes].
+        hint: what to do about an unusable file.
+
+    Returns:
+        The arrays by name, as float64 or int64.
+
+    Raises:
+        UnreadableInput: the file is missing, damaged, too large, or an array has another type or shape.
+    """
+    data = read_limited(path, limit, hint)
+    try:
+        members = read_members(data, max(_LEAST_ARRAYS, _MAX_RATIO * len(data)))
+        return {name: _declared(members, name, *shapes[name]) for name in shapes}
+    except BadFile as error:
+        raise UnreadableInput(str(error), where=str(path), hint=hint) from None
+
+
+def _declared(members: Mapping[str, bytes], name: str, kind: str, shape: tuple[int | None, ...]) -> NDArray[Any]:
+    if f"{name}.npy" not in members:
+        raise BadFile(f"the array '{name}' is missing")
+    array = parse_npy(members[f"{name}.npy"])
+    fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
+    if array.dtype.kind != kind or not fits:
+        raise BadFile(f"the array '{name}' has the type {array.dtype} and the shape {array.shape}")
+    return array.astype(np.int64 if kind == "i" else np.float64)

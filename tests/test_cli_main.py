@@ -1,0 +1,76 @@
+"""The last handler of the command line: closed pipes, a full standard output, unexpected errors."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from avsreplay import cli
+
+posix = pytest.mark.skipif(os.name != "posix", reason="devices and pipes of POSIX")
+AVSREPLAY = [sys.executable, "-m", "avsreplay"]
+
+
+def with_stdout(handle: int, *args: object) -> tuple[int, str]:
+    done = subprocess.run([*AVSREPLAY, *map(str, args)], stdout=handle, stderr=subprocess.PIPE, text=True, check=False)
+    return done.returncode, done.stderr
+
+
+@posix
+@pytest.mark.parametrize(
+    "args",
+    [("run", "tumble.mcap", "--n-scans", 3), ("run", "tumble.mcap", "--n-scans", 3, "--json"), ("info", "tumble.mcap")],
+)
+def test_a_closed_pipe_is_not_a_failed_check(args: tuple[object, ...], fixtures_folder: Path) -> None:
+    reader, writer = os.pipe()
+    os.close(reader)
+    code, err = with_stdout(writer, args[0], fixtures_folder / str(args[1]), *args[2:])
+    os.close(writer)
+    assert code in (0, 141)
+    assert "Traceback" not in err
+    assert "Exception ignored" not in err
+
+
+@posix
+def test_a_full_standard_output_is_one_line(fixtures_folder: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        code, err = with_stdout(full.fileno(), "info", fixtures_folder / "tumble.mcap")
+    assert code == 3
+    assert err.strip() == "avsreplay: standard output: No space left on device"
+
+
+def test_an_unexpected_error_is_one_line_and_a_report(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    def broken(**_: object) -> None:
+        raise ZeroDivisionError("a \x1b[31mdefect\udcff")
+
+    monkeypatch.setattr(cli.group, "main", broken)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    assert left.value.code == 70
+    err = capsys.readouterr().err
+    assert len(err.strip().splitlines()) == 1
+    assert "\x1b" not in err
+    (report,) = tmp_path.iterdir()
+    assert str(report) in err
+    assert "ZeroDivisionError" in report.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RecursionError("deep"), OSError(28, "No space left on device", "x")])
+def test_no_error_exits_with_the_code_of_a_failed_check(
+    error: Exception, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def broken(**_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(cli.group, "main", broken)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with pytest.raises(SystemExit) as left:
+        cli.main()
+    assert left.value.code in (3, 70)

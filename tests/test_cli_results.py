@@ -1,0 +1,215 @@
+"""Saved results through the commands that read them: verified, and never an internal error or a silent pass."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from avsreplay.cli import group
+from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
+
+READERS = {
+    "report": ("report", "RESULT", "-o", "OUT"),
+    "export": ("export", "RESULT", "--to", "csv", "-o", "OUT"),
+    "compare": ("compare", "RESULT", "--gate", "GATE"),
+    "plan": ("plan", "RESULT", "--at", "1", "--samples", "1", "--every", "1"),
+}
+
+
+@pytest.fixture(scope="module")
+def saved(fixtures_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("saved") / "result"
+    run("run", fixtures_folder / "tumble.mcap", "--n-scans", 12, "-o", path)
+    return path
+
+
+@pytest.fixture
+def result(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "result"))
+
+
+def run(*args: object) -> Result:
+    return CliRunner().invoke(group, [str(a) for a in args])
+
+
+def read(command: str, result: Path) -> Result:
+    gate = result.parent / "gate.toml"
+    gate.write_text('[[rule]]\nmetric = "healthy"\nmin = 0.0\noptional = true\n')
+    words = {"RESULT": result, "OUT": result.parent / "out", "GATE": gate}
+    return run(*(words.get(word, word) for word in READERS[command]))
+
+
+def rewrite_manifest(result: Path, **changes: object) -> None:
+    path = result / "run.json"
+    path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **changes}), encoding="utf-8")
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_an_intact_result_is_read_without_a_warning(command: str, result: Path) -> None:
+    done = read(command, result)
+    assert done.exception is None, done.exception
+    assert "warning" not in done.stderr
+
+
+def test_the_manifest_lists_every_file_with_its_sum(result: Path) -> None:
+    header = json.loads((result / "run.json").read_text(encoding="utf-8"))
+    assert set(header["files"]) == {p.name for p in result.iterdir()} - {"run.json"}
+    assert header["rows"] == 12
+    assert header["losses"] == {"count": 0, "first": []}
+
+
+@pytest.mark.parametrize("command", READERS)
+def test_cut_rows_cannot_pass(command: str, result: Path) -> None:
+    path = result / "rows.jsonl"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:6]))
+    assert isinstance(read(command, result).exception, UnreadableInput)
+    done = run("compare", path, "--gate", result.parent / "gate.toml")
+    assert isinstance(done.exception, (UnreadableInput, UsageError))
+
+
+@pytest.mark.parametrize("command", READERS)
+@pytest.mark.parametrize("name", ["beliefs.npz", "view.npz", "truth.tum", "result.mcap"])
+def test_a_changed_or_missing_file_is_found(command: str, name: str, result: Path) -> None:
+    path = result / name
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    assert isinstance(read(command, result).exception, UnreadableInput)
+    path.unlink()
+    assert isinstance(read(command, result).exception, UnreadableInput)
+
+
+def test_a_result_without_a_manifest_passes_no_gate_in_silence(result: Path) -> None:
+    (result / "run.json").unlink()
+    done = read("compare", result)
+    assert isinstance(done.exception, DataLost)
+    assert "cannot be verified" in str(done.exception)
+    done = read("export", result)
+    assert done.exception is None
+    assert "not verified" in done.stderr
+
+
+def test_a_result_of_a_damaged_log_passes_no_gate_in_silence(fixtures_folder: Path, tmp_path: Path) -> None:
+    log = tmp_path / "cut.mcap"
+    log.write_bytes((fixtures_folder / "tumble.mcap").read_bytes()[:200_000])
+    assert isinstance(run("run", log, "-o", tmp_path / "result").exception, DataLost)
+    done = read("compare", tmp_path / "result")
+    assert isinstance(done.exception, DataLost)
+    assert "damaged" in str(done.exception)
+    assert "its log was damaged" in read("export", tmp_path / "result").stderr
+
+
+BAD_JSON = ["", "{", "[]", '"a"', "NaN", "9" * 400, '{"facts": 1e999}', '{"facts": {"labels": [1]}}', '{"config": 3}']
+
+
+@pytest.mark.parametrize("command", READERS)
+@pytest.mark.parametrize("text", BAD_JSON)
+def test_a_malformed_run_json_is_one_line(command: str, text: str, result: Path) -> None:
+    (result / "run.json").write_text(text)
+    done = read(command, result)
+    assert done.exception is None or isinstance(done.exception, AvsError), repr(done.exception)
+
+
+BAD_ROWS = [
+    ("x_m", "1e999"),
+    ("x_m", "9" * 400),
+    ("x_m", "1e200"),
+    ("seq", "9" * 30),
+    ("status", '"\\ud800"'),
+    ("status", '"\\u001b[31m"'),
+    ("reason", "[1]"),
+    ("gamma", "null"),
+]
+
+
+@pytest.mark.parametrize(("column", "value"), BAD_ROWS)
+def test_a_value_that_no_run_writes_is_one_line(column: str, value: str, result: Path, fixtures_folder: Path) -> None:
+    lines = (result / "rows.jsonl").read_text().splitlines()
+    row = json.loads(lines[3])
+    row[column] = "HERE"
+    lines[3] = json.dumps(row).replace('"HERE"', value)
+    (result / "rows.jsonl").write_text("\n".join(lines) + "\n")
+    (result / "run.json").unlink()
+    for command in ("report", "export", "compare"):
+        done = read(command, result)
+        assert isinstance(done.exception, UnreadableInput), repr(done.exception)
+    done = run("run", fixtures_folder / "tumble.mcap", "--n-scans", 5, "--golden", result / "rows.jsonl")
+    assert isinstance(done.exception, AvsError), repr(done.exception)
+    assert "\x1b" not in done.output
+
+
+def test_escape_codes_in_a_golden_file_do_not_reach_the_terminal(fixtures_folder: Path, tmp_path: Path) -> None:
+    golden = tmp_path / "golden.jsonl"
+    row = json.loads((fixtures_folder / "tumble.rows.jsonl").read_text().splitlines()[0])
+    golden.write_text(json.dumps({**row, "\x1b]0;title\x07": 1}) + "\n")
+    done = run("run", fixtures_folder / "tumble.mcap", "--n-scans", 1, "--golden", golden)
+    assert isinstance(done.exception, UnreadableInput)
+    assert "\x1b" not in done.output + str(done.exception)
+
+
+def test_an_export_of_nothing_keeps_the_old_file(result: Path, tmp_path: Path) -> None:
+    (result / "run.json").unlink()
+    (result / "truth.tum").unlink()
+    old = tmp_path / "poses.tum"
+    old.write_text("precious")
+    done = run("export", result, "--to", "tum", "--poses", "truth", "-o", old, "--overwrite")
+    assert isinstance(done.exception, UsageError)
+    assert old.read_text() == "precious"
+
+
+def test_cells_that_a_spreadsheet_would_evaluate_are_quoted(result: Path, tmp_path: Path) -> None:
+    lines = [json.loads(line) for line in (result / "rows.jsonl").read_text().splitlines()]
+    lines[0]["fault"] = "=HYPERLINK(1)"
+    (result / "rows.jsonl").write_text("".join(json.dumps(row) + "\n" for row in lines))
+    (result / "run.json").unlink()
+    run("export", result, "--to", "csv", "-o", tmp_path / "rows.csv")
+    text = (tmp_path / "rows.csv").read_text()
+    assert "'=HYPERLINK(1)" in text
+    assert ",=" not in text
+
+
+def test_devices_as_outputs_stay_devices(result: Path, fixtures_folder: Path, tmp_path: Path) -> None:
+    null, link = Path("/dev/null"), tmp_path / "link"
+    link.symlink_to(null)
+    log = fixtures_folder / "tumble.mcap"
+    read("compare", result)  # writes the gate file
+    commands = [
+        ("export", result, "--to", "csv", "-o", "OUT"),
+        ("export", result, "--to", "tum", "-o", "OUT", "--overwrite"),
+        ("report", result, "-o", "OUT"),
+        ("compare", result, "--gate", result.parent / "gate.toml", "--junit", "OUT"),
+        ("compare", result, result, "-o", "OUT"),
+        ("plan", result, "--at", "1", "--samples", "1", "--every", "1", "--export", "OUT"),
+        ("doctor", log, "--repair", "OUT"),
+        ("run", log, "--n-scans", 2, "--update-golden", "OUT"),
+        ("record", "--seed", 1, log, "-o", "OUT"),
+    ]
+    for command in commands:
+        for output in (null, link):
+            done = run(*(output if word == "OUT" else word for word in command))
+            assert done.exception is None or isinstance(done.exception, AvsError), (command, done.exception)
+            assert stat.S_ISCHR(null.stat().st_mode), command
+            assert link.is_symlink(), command
+
+
+@pytest.mark.parametrize("name", ["", ".", "/", "x" * 300, "file", "a\udcff"])
+def test_an_unusable_result_directory_is_refused_before_the_replay(
+    name: str, fixtures_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    done = run("run", fixtures_folder / "tumble.mcap", "-o", name, "--overwrite")
+    assert isinstance(done.exception, UsageError)
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_belief_of_another_size_is_one_line(result: Path) -> None:
+    (result / "run.json").unlink()
+    np.savez(result / "beliefs.npz", t_ns=np.arange(3), x=np.zeros((3, 22)), P=np.zeros((3, 20, 21)))
+    assert isinstance(read("plan", result).exception, UnreadableInput)
