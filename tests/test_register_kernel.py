@@ -161,6 +161,73 @@ def test_kernel_and_oracle_find_the_same_closest_points_on_the_built_in_like_mes
     assert np.median(np.abs(np.sqrt(ours.d2[near]) - np.sqrt(plain.d2[near]))) < 1e-15
 
 
+def hard_meshes() -> dict[str, Surface]:
+    """Meshes that are not closed, single and outer: what a display model of a spacecraft is made of."""
+    trimesh = pytest.importorskip("trimesh")
+    r = rng(20)
+    ball = trimesh.creation.icosphere(3, 1.0)
+    box = trimesh.creation.box((0.9, 0.7, 0.5))
+    panel = trimesh.creation.box((2.5, 0.8, 0.004))
+    inside = trimesh.util.concatenate([ball, box, panel])  # parts that intersect: interior faces
+    half = ball.triangles_center[:, 2] < 0.3
+    twice = np.concatenate([box.faces, box.faces, box.faces[::2, [1, 2, 0]], box.faces[:3, ::-1]])
+    fine = trimesh.creation.torus(0.7, 0.3, major_sections=60, minor_sections=32)
+    return {
+        "interior faces": surface(inside.vertices, inside.faces),
+        "open": surface(ball.vertices, ball.faces[half]),
+        "duplicated, some turned over": surface(box.vertices, twice),
+        "fine": surface(fine.vertices, fine.faces),
+        "single faces in any order": soup(600, seed=21, size=0.2),
+        "one face of a large model": surface(100.0 * r.standard_normal((3, 3)), [[0, 1, 2]]),
+    }
+
+
+@pytest.mark.parametrize("name", hard_meshes())
+def test_nearest_face_that_faces_the_camera_is_that_of_a_full_search(name: str) -> None:
+    mesh = hard_meshes()[name]
+    corners = mesh.vertices[mesh.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    model = SurfaceIndex.build(mesh, 0.3 * mesh.extent)
+    r = rng(22)
+    on = np.einsum("nk,nki->ni", r.dirichlet(np.ones(3), 120), corners[r.integers(len(corners), size=120)])
+    away = 10 ** r.uniform(-6, -0.5, (120, 1)) * mesh.extent * r.standard_normal((120, 3))
+    q = np.concatenate([on + 0.01 * away, on + away, adversarial(mesh.vertices, 23, 12)])
+    for eye in (np.array([0.3, 5.0, 2.0]) * mesh.extent, np.array([-0.02, 0.05, 0.1]) * mesh.extent):
+        faces = np.sum((eye - corners[:, 0]) * normals, axis=1) > 0.0
+        found = model.closest(q, camera_c=eye)
+        assert faces[found.id[found.id >= 0]].all()
+        least = np.array([distances(query, corners[faces]).min(initial=np.inf) for query in q])
+        sure = np.abs(least - model.reach_m) > 1e-9 * mesh.extent
+        assert np.array_equal((found.id >= 0)[sure], (least < model.reach_m)[sure])
+        near = found.id >= 0
+        assert np.abs(np.sqrt(found.d2[near]) - least[near]).max(initial=0.0) < 1e-9 * mesh.extent
+
+
+@pytest.mark.parametrize("name", ["interior faces", "open", "fine"])
+@pytest.mark.parametrize("facing", [True, False])
+def test_neighbours_kept_over_many_passes_are_those_of_a_search(name: str, facing: bool) -> None:
+    """The camera passes over many faces' edges while the pose settles, so faces begin and cease to face it."""
+    mesh = hard_meshes()[name]
+    model = SurfaceIndex.build(mesh, 0.3 * mesh.extent)
+    corners = mesh.vertices[mesh.faces]
+    r = rng(24)
+    eye = np.array([0.5, 6.0, 2.0])
+    seen = corners[
+        np.sum((eye - corners[:, 0]) * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        > 0
+    ]
+    p = np.einsum("nk,nki->ni", r.dirichlet(np.ones(3), 3000), seen[r.integers(len(seen), size=3000)])
+    start = Pose(exp([0.06, -0.04, 0.05]), eye)
+    scan = start.inverse().apply(p + 0.002 * r.standard_normal(p.shape))
+    for n in (3, 8, 30):
+        rule = IcpParams(n_max=n, n_plane=2, eps_rad=0.0, eps_m=0.0, facing=facing)
+        guess = Pose(exp([0.02, 0.03, -0.02]), np.array([0.01, -0.01, 0.02])) @ start
+        kept, plain = (model.icp(scan, guess, replace(rule, keep=keep)) for keep in (True, False))
+        assert kept.T_ca.tobytes() == plain.T_ca.tobytes()
+        assert kept.rms_m == plain.rms_m < 0.1
+    assert kept.searched < plain.searched
+
+
 def scan_of(mesh: Surface, n: int, seed: int, noise: float = 0.003) -> Array:
     r = rng(seed)
     corners = mesh.vertices[mesh.faces][r.integers(len(mesh.faces), size=n)]

@@ -106,6 +106,7 @@ class Index {
     const Cloud cloud(points);
     const View v = cloud.view();
     const Vec3 eye = camera ? Vec3{(*camera)[0], (*camera)[1], (*camera)[2]} : Vec3{0, 0, 0};
+    const bool sided = camera.has_value();
     Feet out;
     auto foot = array<double>({(size_t)v.n, 3}, &out.foot), normal = array<double>({(size_t)v.n, 3}, &out.normal);
     auto d2 = array<double>({(size_t)v.n}, &out.d2);
@@ -114,8 +115,10 @@ class Index {
       nb::gil_scoped_release release;
       Team team(threads);
       const Code& code = this->code();
+      Facing facing;
+      code.face(store_, sided ? &eye : nullptr, 0, facing);
       team.each((v.n + CHUNK - 1) / CHUNK, [&](int64_t k) {
-        code.closest(store_, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), camera ? &eye : nullptr, out);
+        code.closest(store_, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), facing, sided, out);
       });
     }
     return nb::make_tuple(foot, d2, id, normal);
@@ -145,7 +148,10 @@ class Index {
     {
       nb::gil_scoped_release release;
       Team team(threads);
-      s = run_pass(store_, code(), v, {T.v, gate * gate, Pass::plane, facing}, nullptr, team);
+      Facing sides;
+      const Vec3 eye{T.v[3], T.v[7], T.v[11]};
+      code().face(store_, facing ? &eye : nullptr, 0, sides);
+      s = run_pass(store_, code(), v, {T.v, gate, 0.f, Pass::plane, facing, &sides}, nullptr, team);
     }
     double *H, *b;
     auto info = array<double>({6, 6}, &H), gradient = array<double>({6}, &b);
@@ -159,10 +165,11 @@ class Index {
 
   nb::dict shape() const {
     nb::dict d;
-    d["cell_m"] = store_.cell;
     d["blocks"] = store_.blocks;
-    d["top"] = store_.top.size();
-    d["bricks"] = store_.bricks.size() / 64;
+    d["nodes"] = store_.nodes.size();
+    d["grain_m"] = store_.grain;
+    d["cell_m"] = store_.cell;
+    d["bricks"] = store_.bricks.size() / WORDS;
     d["lists"] = store_.lists.size();
     return d;
   }

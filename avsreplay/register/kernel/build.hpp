@@ -13,9 +13,7 @@ struct Surface {
   int64_t n_kept;          // 0: a cloud
 };
 
+void build_cells(Store& store, const Code& code, Team& team);
 void build(Store& store, const Surface& surface, double reach, const Code& code, Team& team);
-void build_blocks(Store& store, const Surface& surface);             // primitives, blocks, tree
-void build_normals(Store& store, const Code& code, Team& team);      // a cloud's, from each point's neighbours
-void build_cells(Store& store, const Code& code, Team& team);        // the grid of lists
 
 }  // namespace avs

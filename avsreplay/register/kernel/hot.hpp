@@ -18,9 +18,11 @@ enum class Pass { point, plane };
 // What one pass does.
 struct Look {
   const double* T;  // rows of [R t], scan into {C}; t is also where the camera is
-  double gate2;
+  double gate;      // [m]
+  float lead;       // [m], see Scope; 0: no neighbour is kept for later passes
   Pass kind;
-  bool facing;  // only primitives that face the camera count
+  bool sided;       // only primitives that face the camera count
+  const Facing* facing;
 };
 
 // Sums over a chunk or a scan; p, foot relative to the model's centre, e = n . (foot - p), J = [p x n, n].
@@ -35,7 +37,7 @@ struct Sums {
 // Where a point was at its last search, and what was found.
 struct Kept {
   double x, y, z;
-  float radius2;   // the neighbour is the same nearer than this to (x, y, z)
+  float radius2;   // the neighbour is the same nearer than this to (x, y, z); negative: nowhere
   int32_t lane;    // 8 block + lane, -1: none
 };
 
@@ -46,27 +48,20 @@ struct Feet {
   double* normal;   // (n, 3)
 };
 
-// A question to `filter`: which of the blocks `in` can hold the nearest primitive of some place in a box?
-struct Filter {
-  double centre[3];
-  double half;
-  const uint32_t* in;
-  uint32_t n;
-  uint32_t* out;      // room for n
-  float* scratch;     // room for 8 n
-};
-
-struct Filtered {
-  uint32_t n;
-  double distance;  // of the centre to the nearest primitive [m]
+// A cell near a block: the cell's number, the block, their distance in steps.
+struct Near {
+  uint64_t cell;
+  uint32_t block, steps;
 };
 
 constexpr int NEIGHBOURS = 10;  // of a cloud's point, itself among them, that give its normal
 
 struct Code {
   const char* name;
-  Filtered (*filter)(const Store&, const Filter&);
-  void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Vec3* eye, const Feet&);
+  // Appends the cells nearer than `band` to a block; false once there are more than `most`.
+  bool (*cells)(const Store&, uint32_t block, float band, size_t most, std::vector<Near>&);
+  void (*face)(const Store&, const Vec3* eye, double margin, Facing&);
+  void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Facing&, bool sided, const Feet&);
   void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
   void (*pass)(const Store&, const View&, int64_t first, int64_t last, const Look&, Kept*, Sums&);
 };

@@ -1,4 +1,5 @@
 // The whole hot code of one instruction set. AVS_ISA names it and AVS_CODE its door.
+#include <algorithm>
 #include <cmath>
 #include <cstring>
 #include <limits>
@@ -15,18 +16,22 @@ namespace AVS_ISA {
 
 #include "search.hpp"
 
-#include "filter.hpp"
+#include "facing.hpp"
 
 #include "neighbours.hpp"
 
+#include "cells.hpp"
+
 #include "pass.hpp"
 
-static Filtered filter(const Store& s, const Filter& f) {
-  return s.mesh ? filter_kind<Triangles, TrianglePivots>(s, f) : filter_kind<Points, PointPivots>(s, f);
+static void closest(const Store& s, const View& v, int64_t first, int64_t last, const Facing& facing, bool sided,
+                    const Feet& out) {
+  s.mesh ? closest_kind<Triangles>(s, v, first, last, facing, sided, out)
+         : closest_kind<Points>(s, v, first, last, facing, sided, out);
 }
 
-static void closest(const Store& s, const View& v, int64_t first, int64_t last, const Vec3* eye, const Feet& out) {
-  s.mesh ? closest_kind<Triangles>(s, v, first, last, eye, out) : closest_kind<Points>(s, v, first, last, eye, out);
+static bool cells(const Store& s, uint32_t block, float band, size_t most, std::vector<Near>& out) {
+  return s.mesh ? cells_kind<Triangles>(s, block, band, most, out) : cells_kind<Points>(s, block, band, most, out);
 }
 
 static void normals(const Store& s, int64_t first, int64_t last, Vec3* out) {
@@ -40,7 +45,7 @@ static void pass(const Store& s, const View& v, int64_t first, int64_t last, con
 }  // namespace AVS_ISA
 
 const Code& AVS_CODE() {
-  static const Code code{AVS_NAME, AVS_ISA::filter, AVS_ISA::closest, AVS_ISA::normals, AVS_ISA::pass};
+  static const Code code{AVS_NAME, AVS_ISA::cells, AVS_ISA::face, AVS_ISA::closest, AVS_ISA::normals, AVS_ISA::pass};
   return code;
 }
 }  // namespace avs

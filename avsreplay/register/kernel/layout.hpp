@@ -1,7 +1,8 @@
-// What the index is made of: plain data, read by the code of every instruction set.
+// The index as plain data, shared by the code of every instruction set.
 //
 // Primitives (points or triangles) are split at medians into compact blocks of eight. A block holds single-precision
-// copies relative to the model's centre, which only pre-select; the answer comes from the double-precision records.
+// copies relative to the model's centre, which only pre-select; results come from the double-precision records.
+// A tree with eight children a node bounds the blocks by axis-aligned boxes.
 #pragma once
 #include <cstddef>
 #include <cstdint>
@@ -35,37 +36,80 @@ struct Box {
   float lo[3], hi[3];
 };
 
-// A cell's word: 0 no primitive within reach of any place in it; top bit: number of a brick of 4 x 4 x 4 words;
-// else where its list starts: a count, then blocks. A count of TOO_MANY sends the query to the tree.
-constexpr uint32_t EMPTY = 0;
-constexpr uint32_t IS_BRICK = 0x80000000u;
-constexpr uint32_t TOO_MANY = 0xffffffffu;
-constexpr int LEVELS = 2;            // bricks below the top grid
-constexpr int FINE = 1 << 2 * LEVELS;  // finest cells along a top cell's side
-constexpr int LONGEST_LIST = 48;
+// A node covers a contiguous range of blocks. Its children cover consecutive parts of that range, in order.
+constexpr uint32_t IS_BLOCK = 0x80000000u;  // set in a child that is one block instead of a node
+constexpr uint32_t NO_CHILD = 0xffffffffu;
+struct Node {
+  float lo[3][LANES], hi[3][LANES];  // boxes of the children; an absent child has lo = inf
+  uint32_t child[LANES];
+};
+
+// Bounds over the faces below each child: of the unit normals n and of the plane offsets h = n . (a - centre).
+struct NodeSides {
+  float n_lo[3][LANES], n_hi[3][LANES], h_lo[LANES], h_hi[LANES];
+};
+
+// The grid near the surface. A cell's word is 0 (not near, or nothing there) or where its list starts: a header with
+// the number of entries and a distance, then the blocks by their distance from the cell's centre. All blocks within the
+// header's distance of the centre are listed. Distances are in units of `Store::step`, rounded down.
+constexpr int BRICK = 4, WORDS = BRICK * BRICK * BRICK;  // cells along a brick's side, and in a brick
+constexpr int DISTANCE_BITS = 10, LONGEST_LIST = 24;
+constexpr uint32_t STEPS = (1u << DISTANCE_BITS) - 1;
+constexpr uint32_t MOST_BLOCKS = 1u << (32 - DISTANCE_BITS);  // larger models have no grid
 
 struct Store {
   bool mesh = false;
   double reach = 0, extent = 0;
   Vec3 centre{};
-  float slack = 0;  // bound of the error of any single-precision distance here [m]
+  float slack = 0;  // bound of the error of any single-precision distance [m]
   double tie = 0, tie2 = 0;  // distances nearer each other than this are equal [m], and its square
+  double grain = 0;  // median diagonal of a block [m]
 
   uint32_t blocks = 0;
+  uint8_t last_valid = 0xff;        // lanes of the last block that are not padding
   std::vector<int32_t> id;          // of the caller's faces or points, LANES a block
   std::vector<Vec3> points;         // LANES a block, a cloud's
   std::vector<Triangle> triangles;  // LANES a block, a mesh's
   std::vector<Vec3> normals;        // LANES a block
   std::vector<PointBlock> point_blocks;
   std::vector<TriangleBlock> triangle_blocks;
-  std::vector<Box> nodes;  // preorder; a node of k blocks has its right child 2 ceil(k / 2) further on
+  std::vector<Box> boxes;        // of each block, relative to the centre
+  std::vector<Node> nodes;       // preorder
+  std::vector<NodeSides> sides;  // of each node, a mesh's
 
   Vec3 low{};       // corner of the grid
-  double cell = 0;  // side of a finest cell [m]
-  int32_t size[3]{};  // top cells
-  std::vector<uint32_t> top, bricks, lists;
+  double cell = 0;  // side of a cell [m]; 0: no grid
+  float step = 0;   // unit of distances in the lists [m]
+  int32_t size[3]{};             // bricks along each axis
+  std::vector<uint32_t> top;     // a word a brick: 0 or 1 + its number
+  std::vector<uint32_t> bricks;  // WORDS a brick
+  std::vector<uint32_t> lists;
 
   std::size_t bytes() const;
+};
+
+// Size of the left part where a node's range of n > 1 blocks is halved. Parts are multiples of a power of eight, so
+// that all nodes but the last of each level are full.
+inline uint32_t child_capacity(uint32_t n) {
+  uint32_t c = 1;
+  while ((uint64_t)c * 8 < n) c *= 8;
+  return c;
+}
+inline uint32_t left_part(uint32_t n) {
+  const uint32_t c = child_capacity(n), parts = (n + c - 1) / c;
+  return c * ((parts + 1) / 2);
+}
+
+// Half a cell's diagonal, rounded up.
+inline float cell_radius(const Store& s) { return (float)(0.8660255 * s.cell) + s.slack; }
+
+// Which lanes of the blocks face an eye that is within `margin` of `eye`. `may`: the lane faces at least one such
+// place, or rounding cannot tell; `sure`: it faces all of them. A child without any `may` lane is not `alive`.
+struct Facing {
+  Vec3 eye{};
+  double margin = 0;
+  std::vector<uint8_t> may, sure;  // a bit a lane, a byte a block
+  std::vector<uint8_t> alive;      // a bit a child, a byte a node
 };
 
 }  // namespace avs

@@ -12,36 +12,58 @@ namespace {
 
 constexpr int64_t MIN_INLIERS = 6;
 
-// Decides pass by pass whether neighbours are remembered; it shows in the time, never in the result. They are once a
-// step moves no point by more than a part of a cell, and no longer where most were searched for all the same, until
-// the steps are half as long.
+// Where each point was and what was nearest to it: where its next search begins, or, while it provably cannot have
+// changed, its neighbour. This shows in the time, never in the result.
 class Memory {
  public:
-  Memory(const Store& s, int64_t n, bool allowed) : extent_(s.extent), longest_(allowed ? (s.mesh ? MESH_UNDER : CLOUD_UNDER) * s.cell : 0), n_(n) {}
+  Memory(const Store& s, int64_t n, bool allowed)
+      : extent_(s.extent), longest_(allowed ? MOST_OF_GRAIN * s.grain : 0), kept_((size_t)n, Kept{0, 0, 0, -1.f, -1}) {}
 
-  Kept* for_step(double turn, double move) {
-    length_ = move + 0.5 * turn * extent_;
-    judged_ = filled_;
-    filled_ = length_ < longest_;
-    if (!filled_) return nullptr;
-    if (kept_.empty()) kept_.assign((size_t)n_, Kept{0, 0, 0, -1.f, -1});
-    return kept_.data();
+  Kept* data() { return kept_.data(); }
+
+  // How much farther than the nearest primitive the others must be known for the neighbours to outlast the next steps.
+  float lead(double turn, double move) const {
+    const double wanted = STEPS * (move + 0.5 * turn * extent_);
+    return wanted < longest_ ? (float)wanted : 0.f;
   }
 
-  void was_searched(int64_t searched) {
-    if (judged_ && searched > (int64_t)(TOO_OFTEN * (double)n_)) longest_ = 0.5 * length_;
+  void forget_radii() {
+    for (Kept& k : kept_) k.radius2 = -1.f;
   }
 
  private:
-  static constexpr double MESH_UNDER = 0.3, CLOUD_UNDER = 0.04, TOO_OFTEN = 0.6;
-  double extent_, longest_, length_ = 0;
-  int64_t n_;
-  bool filled_ = false, judged_ = false;  // this pass fills the memory; the one before did, so this one can use it
+  static constexpr double MOST_OF_GRAIN = 0.2, STEPS = 4.0;
+  double extent_, longest_;
   std::vector<Kept> kept_;
 };
 
-double worst() { return std::numeric_limits<double>::infinity(); }
+// Which faces count. Decided anew where the eye has left the margin of the last decision.
+class Sides {
+ public:
+  Sides(const Store& s, const Code& code, bool sided) : s_(s), code_(code), sided_(sided && s.mesh) {
+    if (!sided_) code_.face(s_, nullptr, 0, facing_);
+  }
 
+  // Returns whether it was decided anew.
+  bool look_from(const double* T) {
+    if (!sided_) return false;
+    const Vec3 eye{T[3], T[7], T[11]}, d{eye.x - facing_.eye.x, eye.y - facing_.eye.y, eye.z - facing_.eye.z};
+    const double moved = std::sqrt(d.x * d.x + d.y * d.y + d.z * d.z);
+    if (known_ && moved <= facing_.margin) return false;
+    code_.face(s_, &eye, known_ ? 2.0 * moved : 0.0, facing_);
+    return known_ = true;
+  }
+
+  const Facing& facing() const { return facing_; }
+
+ private:
+  const Store& s_;
+  const Code& code_;
+  bool sided_, known_ = false;
+  Facing facing_;
+};
+
+double worst() { return std::numeric_limits<double>::infinity(); }
 
 // The pose about the model's centre, where the sums live.
 void recentre(double* T, const Vec3& by) { T[3] += by.x, T[7] += by.y, T[11] += by.z; }
@@ -76,15 +98,16 @@ Sums run_pass(const Store& s, const Code& code, const View& v, const Look& look,
 
 Outcome icp(const Store& s, const Code& code, const View& v, const double* T, const Rule& rule, Team& team) {
   Memory memory(s, v.n, rule.keep);
+  Sides sides(s, code, rule.facing);
   Outcome o{};
   std::memcpy(o.T, T, sizeof o.T);
   o.gate = rule.gate, o.turn = o.move = worst(), o.rms = std::numeric_limits<double>::quiet_NaN();
   bool plane = rule.n_plane > 0;
   while (o.passes < rule.n_max && !o.converged) {
-    Kept* kept = memory.for_step(o.turn, o.move);
-    const Look look{o.T, o.gate * o.gate, plane ? Pass::plane : Pass::point, rule.facing};
-    const Sums sums = run_pass(s, code, v, look, kept, team);
-    if (kept) memory.was_searched((int64_t)sums.v[3]);
+    if (sides.look_from(o.T)) memory.forget_radii();
+    const Pass kind = plane ? Pass::plane : Pass::point;
+    const Look look{o.T, o.gate, memory.lead(o.turn, o.move), kind, rule.facing, &sides.facing()};
+    const Sums sums = run_pass(s, code, v, look, memory.data(), team);
     ++o.passes;
     o.inliers = (int64_t)sums.v[0], o.ignored = (int64_t)sums.v[2], o.searched += (int64_t)sums.v[3];
     o.rms = o.inliers ? std::sqrt(sums.v[1] / sums.v[0]) : std::numeric_limits<double>::quiet_NaN();

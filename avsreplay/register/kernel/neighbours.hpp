@@ -21,34 +21,44 @@ struct Patch {
 static inline bool is_copy(const Store& s, uint32_t lane) { return lane % LANES > 0 && s.id[lane] == s.id[lane - 1]; }
 
 static void visit(const Store& s, const Query& q, uint32_t block, Patch& patch) {
-  const float limit = patch.n < NEIGHBOURS ? 3e38f : lenient(s, (float)patch.worst());
+  const float limit = patch.n < NEIGHBOURS ? 3e38f : lenient(s, std::sqrt((float)patch.worst()), 0.f);
   for (unsigned lanes = bits(Points::distance2(s, block, q) < f8(limit)); lanes; lanes &= lanes - 1) {
     const uint32_t lane = LANES * block + (uint32_t)lowest_bit(lanes);
     if (!is_copy(s, lane)) patch.add(s, Points::foot(s, lane, q).d2, lane);
   }
 }
 
-static Patch patch_at(const Store& s, const Query& q) {
+static Patch patch_at(const Store& s, const Query& q, uint32_t own) {
   struct Todo {
-    uint32_t node, first, last;
+    uint32_t child;
     float d2;
-  } stack[64];
-  const float p[3] = {(float)(q.x - s.centre.x), (float)(q.y - s.centre.y), (float)(q.z - s.centre.z)};
+  } stack[STACK];
   Patch patch;
+  visit(s, q, own, patch);
   int depth = 0;
-  stack[depth++] = {0, 0, s.blocks, 0.f};
+  stack[depth++] = {0, 0.f};
   while (depth) {
     const Todo t = stack[--depth];
-    if (patch.n == NEIGHBOURS && t.d2 > lenient(s, (float)patch.worst())) continue;
-    if (t.last - t.first == 1) {
-      visit(s, q, t.first, patch);
+    const float limit = patch.n < NEIGHBOURS ? 3e38f : lenient(s, std::sqrt((float)patch.worst()), 0.f);
+    if (!(t.d2 < limit)) continue;
+    if (t.child & IS_BLOCK) {
+      if ((t.child & ~IS_BLOCK) != own) visit(s, q, t.child & ~IS_BLOCK, patch);
       continue;
     }
-    const uint32_t left = (t.last - t.first + 1) / 2, mid = t.first + left;
-    const Todo a{t.node + 1, t.first, mid, box_distance2(s.nodes[t.node + 1], p)};
-    const Todo b{t.node + 2 * left, mid, t.last, box_distance2(s.nodes[t.node + 2 * left], p)};
-    stack[depth++] = a.d2 < b.d2 ? b : a;
-    stack[depth++] = a.d2 < b.d2 ? a : b;
+    const F8 d = box_distance2(s.nodes[t.child], q);
+    alignas(32) float d2[LANES];
+    store8(d2, d);
+    int nearest = depth;
+    for (unsigned open = bits(d < f8(limit)); open; open &= open - 1) {
+      const int k = lowest_bit(open);
+      stack[depth] = {s.nodes[t.child].child[k], d2[k]};
+      if (d2[k] < stack[nearest].d2) nearest = depth;
+      ++depth;
+    }
+    if (depth > nearest) {
+      const Todo last = stack[depth - 1];
+      stack[depth - 1] = stack[nearest], stack[nearest] = last;
+    }
   }
   return patch;
 }
@@ -81,7 +91,7 @@ static Vec3 least_direction(double (&A)[3][3]) {
 
 static Vec3 normal_at(const Store& s, uint32_t lane) {
   const Vec3& p = s.points[lane];
-  const Patch patch = patch_at(s, query(s, p.x, p.y, p.z));
+  const Patch patch = patch_at(s, query(s, p.x, p.y, p.z), lane / LANES);
   double mean[3] = {0, 0, 0}, A[3][3] = {};
   double at[NEIGHBOURS][3];
   for (int k = 0; k < patch.n; ++k) {

@@ -1,7 +1,7 @@
 // One chunk of a pass: move, search, sum. Included inside a namespace named after the instruction set.
 //
 // The chunk is taken in sweeps so that the cache misses of many points overlap: moved points and their cells first, then
-// the words, then the lists, then the blocks a few points ahead of the search.
+// the lists, then the blocks a few points ahead of the search.
 static_assert(CHUNK % 4 == 0, "sums run over four points at a time");
 
 enum Treat : uint8_t { IGNORED, SEARCHED, KEPT };
@@ -13,9 +13,7 @@ struct Chunk {
   alignas(32) double d2[CHUNK];
   alignas(32) double take[CHUNK];   // 1: an inlier, 0: not
   double c[3][CHUNK];               // moved, in {C}
-  Place cell[CHUNK];
-  uint32_t word[CHUNK];
-  uint8_t level[CHUNK];  // of the word
+  const uint32_t* list[CHUNK];      // of the cell of a point that is searched for, or null
   Treat search[CHUNK];
 };
 
@@ -46,8 +44,8 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
   for (int i = 0; i < n; ++i) {
     double p[3], q[3];
     read(v, first + i, p);
-    c.cell[i].inside = false;
     c.search[i] = finite(p) ? SEARCHED : IGNORED;
+    c.list[i] = nullptr;
     if (c.search[i] == IGNORED) {
       out.v[2] += 1;
       continue;
@@ -56,40 +54,15 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
     for (int k = 0; k < 3; ++k) c.c[k][i] = q[k];
     if (kept && still_near(kept[first + i], q)) {
       c.search[i] = KEPT;
-      continue;
+    } else if (const uint32_t* word = word_at(s, q[0], q[1], q[2])) {
+      c.list[i] = word;
+      fetch(word);
     }
-    c.cell[i] = place(s, q[0], q[1], q[2]);
-    if (c.cell[i].inside) fetch(&s.top[top_slot(s, c.cell[i])]);
   }
-}
-
-static void look_up(const Store& s, int n, Chunk& c) {
   for (int i = 0; i < n; ++i) {
-    c.word[i] = c.cell[i].inside ? s.top[top_slot(s, c.cell[i])] : EMPTY;
-    c.level[i] = 0;
-    if (c.word[i] & IS_BRICK) fetch(&s.bricks[brick_slot(c.word[i], c.cell[i], 0)]);
+    c.list[i] = list_of(s, c.list[i]);
+    if (c.list[i]) fetch(c.list[i]);
   }
-  for (int level = 0; level < LEVELS; ++level)
-    for (int i = 0; i < n; ++i) {
-      if (c.word[i] & IS_BRICK) {
-        c.word[i] = s.bricks[brick_slot(c.word[i], c.cell[i], level)];
-        ++c.level[i];
-      }
-      if (c.word[i] & IS_BRICK)
-        fetch(&s.bricks[brick_slot(c.word[i], c.cell[i], level + 1)]);
-      else if (c.word[i])
-        fetch(&s.lists[c.word[i]]);
-    }
-}
-
-constexpr int AHEAD = 4;
-
-template <class Kind>
-static inline void fetch_blocks(const Store& s, uint32_t word) {
-  if (word == EMPTY) return;
-  const uint32_t* list = s.lists.data() + word;
-  if (*list == TOO_MANY) return;
-  for (uint32_t k = 1; k <= *list && k <= 4; ++k) Kind::prefetch(s, list[k]);
 }
 
 static inline void enter(const Store& s, Chunk& c, int i, const Foot& f, int32_t lane, bool inlier, bool normals) {
@@ -104,39 +77,60 @@ static inline void enter(const Store& s, Chunk& c, int i, const Foot& f, int32_t
 }
 
 template <class Kind>
-static inline Best search_one(const Store& s, const Query& q, const Chunk& c, int i, Kept* kept, float* scratch) {
-  if (!kept) return nearest<Kind>(s, q, c.word[i], scratch, nullptr);
-  float room = 0;
-  const Best best = nearest<Kind>(s, q, c.word[i], scratch, &room);
-  const float wall = c.cell[i].inside ? to_wall(s, q, c.cell[i], c.level[i]) : 0.f;
-  room = wall < room ? wall : room;
-  *kept = {q.x, q.y, q.z, room > 0 ? room * room * 0.9999f : 0.f, best.lane};
-  return best;
+static inline Best keep_one(const Scope& o, const Query& q, const Kept& kept) {
+  if (kept.lane < 0) return {{0, 0, 0, 0, 0}, -1};
+  return {Kind::foot(o.s, (uint32_t)kept.lane, q), kept.lane};
 }
 
 template <class Kind>
-static inline Best keep_one(const Store& s, const Query& q, const Kept& kept) {
-  if (kept.lane < 0) return nothing(0);
-  return {Kind::foot(s, (uint32_t)kept.lane, q), kept.lane};
+static inline Best search_one(const Scope& o, const Query& q, const uint32_t* list, int32_t seed, Kept* kept) {
+  Search<Kind> search(o, q);
+  search.run(list, seed);
+  if (kept) {
+    const float room = o.lead > 0.f ? search.room() : 0.f;
+    *kept = {q.x, q.y, q.z, room > 0 ? room * room * 0.9999f : -1.f, search.best().lane};
+  }
+  return search.best();
+}
+
+// A kept neighbour that no longer faces the eye is searched for again.
+template <class Kind>
+static inline bool is_kept(const Scope& o, Treat treat, const Kept* kept) {
+  return treat == KEPT && (!o.eye || kept->lane < 0 || Kind::faces(o.s, (uint32_t)kept->lane, *o.eye));
+}
+
+constexpr int AHEAD = 4;
+
+// What the search of a point will read first.
+template <class Kind>
+static inline void fetch_ahead(const Store& s, const uint32_t* list, const Kept* kept) {
+  if (kept && kept->lane >= 0) Kind::prefetch(s, (uint32_t)kept->lane);
+  if (!list) return;
+  const uint32_t n = *list & (MOST_BLOCKS - 1);
+  for (uint32_t k = 1; k <= n && k <= 2; ++k) Kind::prefetch(s, (list[k] & (MOST_BLOCKS - 1)) * LANES);
 }
 
 template <class Kind>
-static void search(const Store& s, int64_t first, int n, const Look& look, Kept* kept, Chunk& c, Sums& out) {
-  alignas(32) float scratch[LANES * LONGEST_LIST];
-  const Vec3 eye{look.T[3], look.T[7], look.T[11]};
-  const bool normals = look.kind == Pass::plane;
+static void search(const Scope& o, int64_t first, int n, bool normals, Kept* kept, Chunk& c, Sums& out) {
+  int32_t last = -1;
   for (int i = 0; i < n; ++i) {
-    if (i + AHEAD < n && c.search[i + AHEAD] == SEARCHED) fetch_blocks<Kind>(s, c.word[i + AHEAD]);
+    if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.list[i + AHEAD], kept ? kept + first + i + AHEAD : nullptr);
     if (c.search[i] == IGNORED) {
-      enter(s, c, i, {}, -1, false, normals);
+      enter(o.s, c, i, {}, -1, false, normals);
       continue;
     }
-    const Query q = query(s, c.c[0][i], c.c[1][i], c.c[2][i]);
+    const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
     Kept* memory = kept ? kept + first + i : nullptr;
-    Best best = c.search[i] == KEPT ? keep_one<Kind>(s, q, *memory) : search_one<Kind>(s, q, c, i, memory, scratch);
-    if (look.facing) best = nearest_facing<Kind>(s, q, best, look.gate2, eye);
-    out.v[3] += c.search[i] == SEARCHED ? 1 : 0;
-    enter(s, c, i, best.foot, best.lane, best.lane >= 0 && best.foot.d2 < look.gate2, normals);
+    Best best;
+    if (is_kept<Kind>(o, c.search[i], memory)) {
+      best = keep_one<Kind>(o, q, *memory);
+    } else {
+      const int32_t own = memory ? memory->lane : -1;
+      best = search_one<Kind>(o, q, c.list[i], own < 0 && !c.list[i] ? last : own, memory);
+      out.v[3] += 1;
+    }
+    last = best.lane;
+    enter(o.s, c, i, best.foot, best.lane, best.lane >= 0 && best.foot.d2 < o.bound2, normals);
   }
 }
 
@@ -179,6 +173,10 @@ static void sum_plane(int n, const Chunk& c, Sums& out) {
   for (int k = 0; k < 31; ++k) out.v[4 + k] = sum_in_order(a[2 + k]);
 }
 
+static inline Scope scope_of(const Store& s, const Facing& facing, bool sided, double bound, float lead) {
+  return {s, facing, sided && s.mesh ? &facing.eye : nullptr, bound * bound, (float)bound, lead};
+}
+
 template <class Kind>
 static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, Kept* kept,
                       Sums& out) {
@@ -186,26 +184,30 @@ static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last
   const int n = (int)(last - first);
   for (double& x : out.v) x = 0;
   gather(s, v, first, n, look.T, kept, c, out);
-  look_up(s, n, c);
-  search<Kind>(s, first, n, look, kept, c, out);
+  const Vec3 eye{look.T[3], look.T[7], look.T[11]};
+  Scope o = scope_of(s, *look.facing, false, look.gate, look.lead);
+  if (look.sided && s.mesh) o.eye = &eye;
+  search<Kind>(o, first, n, look.kind == Pass::plane, kept, c, out);
   clear_tail(n, c);
   look.kind == Pass::plane ? sum_plane(n, c, out) : sum_point(n, c, out);
 }
 
 template <class Kind>
-static void closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const Vec3* eye, const Feet& out) {
-  alignas(32) float scratch[LANES * LONGEST_LIST];
+static void closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const Facing& facing, bool sided,
+                         const Feet& out) {
   const double nan = std::numeric_limits<double>::quiet_NaN();
+  const Scope o = scope_of(s, facing, sided, s.reach, 0.f);
+  int32_t seed = -1;
   for (int64_t i = first; i < last; ++i) {
     double p[3];
     read(v, i, p);
-    const Place at = place(s, p[0], p[1], p[2]);
-    Best best = nothing(0);
-    if (at.inside) {
+    Best best{{0, 0, 0, 0, 0}, -1};
+    if (finite(p)) {
       const Query q = query(s, p[0], p[1], p[2]);
-      best = nearest<Kind>(s, q, word_at(s, at).word, scratch, nullptr);
-      if (eye) best = nearest_facing<Kind>(s, q, best, s.reach * s.reach, *eye);
+      const uint32_t* list = list_of(s, word_at(s, q.x, q.y, q.z));
+      best = search_one<Kind>(o, q, list, list ? -1 : seed, nullptr);
     }
+    seed = best.lane;
     const bool found = best.lane >= 0;
     const Vec3 n = found ? s.normals[(size_t)best.lane] : Vec3{nan, nan, nan};
     const Vec3 f = found ? Vec3{best.foot.x, best.foot.y, best.foot.z} : Vec3{nan, nan, nan};

@@ -32,10 +32,12 @@ struct Points {
 
   static bool faces(const Store&, uint32_t, const Vec3&) { return true; }  // a cloud has no sides
 
-  static void prefetch(const Store& s, uint32_t block) {
-    const char* p = reinterpret_cast<const char*>(s.point_blocks.data() + block);
+  // The lane's block and its exact record.
+  static void prefetch(const Store& s, uint32_t lane) {
+    const char* p = reinterpret_cast<const char*>(s.point_blocks.data() + lane / LANES);
     fetch(p);
     fetch(p + 64);
+    fetch(s.points.data() + lane);
   }
 };
 
@@ -113,8 +115,10 @@ struct Triangles {
     return e;
   }
 
-  static void prefetch(const Store& s, uint32_t block) {
-    const char* p = reinterpret_cast<const char*>(s.triangle_blocks.data() + block);
+  static void prefetch(const Store& s, uint32_t lane) {
+    const char* p = reinterpret_cast<const char*>(s.triangle_blocks.data() + lane / LANES);
     for (size_t k = 0; k < sizeof(TriangleBlock); k += 64) fetch(p + k);
+    p = reinterpret_cast<const char*>(s.triangles.data() + lane);
+    for (size_t k = 0; k < sizeof(Triangle); k += 64) fetch(p + k);
   }
 };

@@ -1,11 +1,19 @@
-// The nearest primitive of a query: through its cell's list, or down the tree where there is none.
+// The nearest primitive of a query by branch and bound over the tree, begun at a guess.
 // Included inside a namespace named after the instruction set.
 struct Best {
   Foot foot;
   int32_t lane;  // 8 block + lane, -1: none within the bound
 };
 
-static inline Best nothing(double bound2) { return {{bound2, 0, 0, 0, 0}, -1}; }
+// What all queries of a pass have in common.
+struct Scope {
+  const Store& s;
+  const Facing& facing;
+  const Vec3* eye;  // only primitives that face it count; null: all
+  double bound2;    // feet at this squared distance or farther do not count [m^2]
+  float bound;      // its root [m]
+  float lead;       // other primitives are found up to this much beyond the nearest [m]; 0: only the nearest
+};
 
 // Of two at the same distance the one that faces the query more squarely wins, then the lower id.
 static inline bool wins_tie(const Store& s, const Foot& f, uint32_t lane, const Best& best) {
@@ -20,172 +28,175 @@ static inline bool nearer(const Store& s, const Foot& f, uint32_t lane, const Be
   return f.d2 <= best.foot.d2 + tie && wins_tie(s, f, lane, best);
 }
 
-// `eye`: only primitives that face it count; null: all.
+// Square of a distance and a lead, with room for the rounding of single precision.
+static inline float lenient(const Store& s, float d, float lead) {
+  const float r = d + 2.f * s.slack + lead;
+  return r * r * 1.00001f;
+}
+
+static inline F8 box_distance2(const Node& n, const Query& q) {
+  const F8 zero = f8(0.f);
+  const F8 x = max8(max8(load8(n.lo[0]) - q.qx, q.qx - load8(n.hi[0])), zero);
+  const F8 y = max8(max8(load8(n.lo[1]) - q.qy, q.qy - load8(n.hi[1])), zero);
+  const F8 z = max8(max8(load8(n.lo[2]) - q.qz, q.qz - load8(n.hi[2])), zero);
+  return x * x + y * y + z * z;
+}
+
+// Where the grid keeps the list of the cell that a place is in, or null.
+static inline const uint32_t* word_at(const Store& s, double x, double y, double z) {
+  if (!(s.cell > 0)) return nullptr;
+  const double inv = 1.0 / s.cell, f[3] = {(x - s.low.x) * inv, (y - s.low.y) * inv, (z - s.low.z) * inv};
+  int32_t c[3];
+  for (int k = 0; k < 3; ++k) {
+    if (!(f[k] >= 0 && f[k] < (double)s.size[k] * BRICK)) return nullptr;
+    c[k] = (int32_t)f[k];
+  }
+  const uint32_t brick = s.top[((size_t)(c[0] / BRICK) * s.size[1] + c[1] / BRICK) * s.size[2] + c[2] / BRICK];
+  if (!brick) return nullptr;
+  return s.bricks.data() + (size_t)(brick - 1) * WORDS + (size_t)((c[0] % BRICK * BRICK + c[1] % BRICK) * BRICK + c[2] % BRICK);
+}
+
+static inline const uint32_t* list_of(const Store& s, const uint32_t* word) {
+  return word && *word ? s.lists.data() + *word : nullptr;
+}
+
+constexpr int STACK = 96;  // at most 10 levels of 8 children
+
+// One search.
 template <class Kind>
-static inline void consider(const Store& s, const Query& q, uint32_t block, unsigned lanes, const Vec3* eye, Best& best) {
-  for (; lanes; lanes &= lanes - 1) {
-    const uint32_t lane = LANES * block + (uint32_t)lowest_bit(lanes);
-    if (eye && !Kind::faces(s, lane, *eye)) continue;
-    const Foot f = Kind::foot(s, lane, q);
-    if (best.lane < 0 ? f.d2 < best.foot.d2 : nearer<Kind>(s, f, lane, best)) best = {f, (int32_t)lane};
-  }
-}
+class Search {
+ public:
+  Search(const Scope& scope, const Query& q)
+      : o_(scope), s_(scope.s), q_(q), best_{{scope.bound2, 0, 0, 0, 0}, -1},
+        p_{(float)(q.x - s_.centre.x), (float)(q.y - s_.centre.y), (float)(q.z - s_.centre.z)},
+        exact_(lenient(s_, scope.bound, 0.f)), limit_(lenient(s_, scope.bound, scope.lead)) {}
 
-// Largest single-precision square that a primitive as near as `d2` can show.
-static inline float lenient(const Store& s, float d2) {
-  const float d = std::sqrt(d2) + 2.f * s.slack;
-  return d * d * 1.00001f;
-}
-
-// The least and the second least of all the lanes seen.
-struct TwoLeast {
-  F8 first = f8(3e38f), second = f8(3e38f);
-
-  void add(F8 d) {
-    second = min8(second, max8(first, d));
-    first = min8(first, d);
+  // `list`: of the query's cell, or null. `seed`: a lane to begin with, -1 for none; it shows in the time, never in the
+  // result.
+  void run(const uint32_t* list, int32_t seed) {
+    if (!is_near()) return;
+    const uint32_t first = seed < 0 ? NO_CHILD : (uint32_t)seed / LANES;
+    if (seed >= 0) visit(first);
+    if (list && in_list(list, first)) return;
+    first_ = second_ = 3e38f;  // the tree comes to the same blocks again
+    in_tree();
   }
 
-  float runner_up() const {
-    float a[8], b[8];
-    store8(a, first), store8(b, second);
-    float m = 3e38f, n = 3e38f;
-    for (int k = 0; k < 8; ++k) {
-      const float larger = a[k] < m ? m : a[k];
-      n = larger < n ? larger : n;
-      n = b[k] < n ? b[k] : n;
-      m = a[k] < m ? a[k] : m;
+  const Best& best() const { return best_; }
+
+  // How far the query may move before another primitive can be the nearest, or one come within the bound. An eye that
+  // stays within the margin of `Facing` makes no difference.
+  float room() const {
+    if (best_.lane >= 0 && first_ < least_) return 0.f;  // a lane that may come to face the eye is nearer
+    const float first = std::sqrt(first_), second = std::sqrt(second_), known = std::sqrt(limit_);
+    const float next = best_.lane < 0 ? first : second;
+    const float gap = (next < known ? next : known) - (best_.lane < 0 ? o_.bound : first);
+    return (best_.lane < 0 ? gap : 0.5f * gap) - 3.f * s_.slack;
+  }
+
+ private:
+  // False for every query that is farther than the bound from the model's box, or not finite.
+  bool is_near() const {
+    const Vec3& c = s_.centre;
+    const double sum = std::fabs(q_.x - c.x) + std::fabs(q_.y - c.y) + std::fabs(q_.z - c.z);
+    return sum <= 2.0 * (s_.extent + (double)o_.bound + (double)o_.lead);
+  }
+
+  // Visits the blocks of the list. False where others may be nearer.
+  bool in_list(const uint32_t* list, uint32_t seed) {
+    constexpr int shift = 32 - DISTANCE_BITS;
+    const uint32_t n = *list & (MOST_BLOCKS - 1);
+    const float radius = cell_radius(s_);
+    for (uint32_t k = 1; k <= n; ++k) {
+      const float d = (float)(list[k] >> shift) * s_.step - radius;
+      if (d > 0.f && !(d * d < limit_)) break;
+      const uint32_t block = list[k] & (MOST_BLOCKS - 1);
+      if (block != seed && o_.facing.may[block] && to_box2(s_.boxes[block]) < limit_) visit(block);
     }
-    return n;
+    const float known = (float)(*list >> shift) * s_.step - radius;
+    return known > 0.f && limit_ <= known * known;
   }
-};
 
-// `room`: how far the query may move before another primitive can be the nearest, or any come within reach.
-template <class Kind>
-static inline Best in_list(const Store& s, const Query& q, const uint32_t* list, float* d2, float* room) {
-  const uint32_t n = *list++;
-  TwoLeast two;
-  for (uint32_t k = 0; k < n; ++k) {
-    const F8 d = Kind::distance2(s, list[k], q);
-    store8(d2 + LANES * k, d);
-    two.add(d);
-  }
-  const float m = least(two.first);
-  const F8 limit = f8(lenient(s, m));
-  Best best = nothing(s.reach * s.reach);
-  for (uint32_t k = 0; k < n; ++k) {
-    const unsigned lanes = bits(load8(d2 + LANES * k) < limit);
-    if (lanes) consider<Kind>(s, q, list[k], lanes, nullptr, best);
-  }
-  if (room) {
-    const float d = std::sqrt(m);
-    *room = best.lane < 0 ? d - (float)s.reach : 0.5f * (std::sqrt(two.runner_up()) - d);
-    *room -= 2.f * s.slack;
-  }
-  return best;
-}
-
-static inline float box_distance2(const Box& b, const float* q) {
-  float sum = 0;
-  for (int k = 0; k < 3; ++k) {
-    const float under = b.lo[k] - q[k], over = q[k] - b.hi[k];
-    const float d = under > over ? under : over;
-    if (d > 0) sum += d * d;
-  }
-  return sum;
-}
-
-// Branch and bound over the tree; boxes are in single precision, so the bound is lenient.
-template <class Kind>
-static Best in_tree(const Store& s, const Query& q, double bound2, const Vec3* eye) {
-  struct Todo {
-    uint32_t node, first, last;
-    float d2;
-  } stack[64];
-  const float p[3] = {(float)(q.x - s.centre.x), (float)(q.y - s.centre.y), (float)(q.z - s.centre.z)};
-  Best best = nothing(bound2);
-  int depth = 0;
-  stack[depth++] = {0, 0, s.blocks, box_distance2(s.nodes[0], p)};
-  while (depth) {
-    const Todo t = stack[--depth];
-    const float limit = lenient(s, (float)best.foot.d2);
-    if (t.d2 > limit) continue;
-    if (t.last - t.first == 1) {
-      consider<Kind>(s, q, t.first, bits(Kind::distance2(s, t.first, q) < f8(limit)), eye, best);
-      continue;
+  float to_box2(const Box& b) const {
+    float sum = 0;
+    for (int k = 0; k < 3; ++k) {
+      const float under = b.lo[k] - p_[k], over = p_[k] - b.hi[k], d = under > over ? under : over, out = d > 0.f ? d : 0.f;
+      sum += out * out;
     }
-    const uint32_t left = (t.last - t.first + 1) / 2, mid = t.first + left;
-    const Todo a{t.node + 1, t.first, mid, box_distance2(s.nodes[t.node + 1], p)};
-    const Todo b{t.node + 2 * left, mid, t.last, box_distance2(s.nodes[t.node + 2 * left], p)};
-    stack[depth++] = a.d2 < b.d2 ? b : a;
-    stack[depth++] = a.d2 < b.d2 ? a : b;
+    return sum;
   }
-  return best;
-}
 
-struct Place {
-  bool inside;
-  int32_t cell[3];  // of the finest cells
+  void in_tree() {
+    struct Todo {
+      uint32_t child;
+      float d2;
+    } stack[STACK];
+    int depth = 0;
+    stack[depth++] = {0, 0.f};
+    while (depth) {
+      const Todo t = stack[--depth];
+      if (!(t.d2 < limit_)) continue;
+      if (t.child & IS_BLOCK) {
+        visit(t.child & ~IS_BLOCK);
+        continue;
+      }
+      const Node& n = s_.nodes[t.child];
+      const F8 d = box_distance2(n, q_);
+      unsigned open = bits(d < f8(limit_)) & o_.facing.alive[t.child];
+      if (!open) continue;
+      alignas(32) float d2[LANES];
+      store8(d2, d);
+      int nearest = depth;
+      for (; open; open &= open - 1) {
+        const int k = lowest_bit(open);
+        stack[depth] = {n.child[k], d2[k]};
+        if (d2[k] < stack[nearest].d2) nearest = depth;
+        ++depth;
+      }
+      const Todo last = stack[depth - 1];
+      stack[depth - 1] = stack[nearest], stack[nearest] = last;
+    }
+  }
+
+  void visit(uint32_t block) {
+    const F8 d = Kind::distance2(s_, block, q_);
+    unsigned lanes = bits(d < f8(limit_)) & o_.facing.may[block];
+    if (!lanes) return;
+    alignas(32) float d2[LANES];
+    store8(d2, d);
+    const unsigned sure = o_.facing.sure[block];
+    float least = least_;
+    for (unsigned m = lanes; m; m &= m - 1) {
+      const int k = lowest_bit(m);
+      second_ = d2[k] < first_ ? first_ : d2[k] < second_ ? d2[k] : second_;
+      first_ = d2[k] < first_ ? d2[k] : first_;
+      if ((sure >> k & 1) && d2[k] < least) least = d2[k];
+    }
+    tighten(least);
+    for (; lanes; lanes &= lanes - 1) {
+      const int k = lowest_bit(lanes);
+      if (!(d2[k] < exact_)) continue;
+      const uint32_t lane = LANES * block + (uint32_t)k;
+      if (!(sure >> k & 1) && !Kind::faces(s_, lane, *o_.eye)) continue;
+      const Foot f = Kind::foot(s_, lane, q_);
+      if (best_.lane < 0 ? f.d2 < best_.foot.d2 : nearer<Kind>(s_, f, lane, best_)) best_ = {f, (int32_t)lane};
+      tighten(d2[k]);
+    }
+  }
+
+  void tighten(float d2) {
+    if (!(d2 < least_)) return;
+    least_ = d2;
+    const float d = std::sqrt(d2), exact = lenient(s_, d, 0.f), limit = lenient(s_, d, o_.lead);
+    exact_ = exact < exact_ ? exact : exact_, limit_ = limit < limit_ ? limit : limit_;
+  }
+
+  const Scope& o_;
+  const Store& s_;
+  const Query& q_;
+  Best best_;
+  float p_[3];  // the query relative to the model's centre
+  float exact_, limit_;  // squared distances under which lanes are measured exactly, and looked at
+  float least_ = 3e38f;  // least squared distance of a lane that counts
+  float first_ = 3e38f, second_ = 3e38f;  // least two of the lanes that may count
 };
-
-static inline Place place(const Store& s, double x, double y, double z) {
-  const double inv = 1.0 / s.cell;
-  const double f[3] = {(x - s.low.x) * inv, (y - s.low.y) * inv, (z - s.low.z) * inv};
-  Place p{true, {0, 0, 0}};
-  for (int k = 0; k < 3; ++k) {
-    if (!(f[k] >= 0 && f[k] < (double)s.size[k] * FINE)) return {false, {0, 0, 0}};
-    p.cell[k] = (int32_t)f[k];
-  }
-  return p;
-}
-
-static inline size_t top_slot(const Store& s, const Place& p) {
-  constexpr int shift = 2 * LEVELS;
-  return ((size_t)(p.cell[0] >> shift) * s.size[1] + (p.cell[1] >> shift)) * s.size[2] + (p.cell[2] >> shift);
-}
-
-static inline size_t brick_slot(uint32_t word, const Place& p, int level) {
-  const int shift = 2 * (LEVELS - 1 - level);
-  const auto part = [&](int k) { return (size_t)(p.cell[k] >> shift & 3); };
-  return (size_t)(word & ~IS_BRICK) * 64 + (part(0) * 4 + part(1)) * 4 + part(2);
-}
-
-struct Found {
-  uint32_t word;
-  int level;  // bricks passed on the way: the word's cell has the side cell * 4^(LEVELS - level)
-};
-
-static inline Found word_at(const Store& s, const Place& p) {
-  Found f{s.top[top_slot(s, p)], 0};
-  for (; f.word & IS_BRICK; ++f.level) f.word = s.bricks[brick_slot(f.word, p, f.level)];
-  return f;
-}
-
-// Distance from a place to the walls of its word's cell.
-static inline float to_wall(const Store& s, const Query& q, const Place& p, int level) {
-  const int shift = 2 * (LEVELS - level);
-  const double side = s.cell * (double)(1 << shift), at[3] = {q.x - s.low.x, q.y - s.low.y, q.z - s.low.z};
-  double least = side;
-  for (int k = 0; k < 3; ++k) {
-    const double into = at[k] - (double)(p.cell[k] >> shift) * side, left = side - into;
-    least = into < least ? into : least;
-    least = left < least ? left : least;
-  }
-  return (float)least - s.slack;
-}
-
-template <class Kind>
-static inline Best nearest(const Store& s, const Query& q, uint32_t word, float* scratch, float* room) {
-  const double reach2 = s.reach * s.reach;
-  if (room) *room = word == EMPTY ? 3e38f : 0.f;
-  if (word == EMPTY) return nothing(reach2);
-  const uint32_t* list = s.lists.data() + word;
-  return *list == TOO_MANY ? in_tree<Kind>(s, q, reach2, nullptr) : in_list<Kind>(s, q, list, scratch, room);
-}
-
-// The nearest of the primitives that face the eye, given the nearest of all; within the bound.
-template <class Kind>
-static inline Best nearest_facing(const Store& s, const Query& q, const Best& best, double bound2, const Vec3& eye) {
-  if (best.lane < 0 || best.foot.d2 >= bound2) return nothing(bound2);
-  return Kind::faces(s, (uint32_t)best.lane, eye) ? best : in_tree<Kind>(s, q, bound2, &eye);
-}

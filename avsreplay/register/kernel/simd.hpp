@@ -83,8 +83,21 @@ static inline D4 load4(const double* p) {
   std::memcpy(&r, p, sizeof r);
   return r;
 }
-static inline F8 min8(F8 a, F8 b) { return select(a < b, a, b); }
-static inline F8 max8(F8 a, F8 b) { return select(b < a, a, b); }
+// The second operand where they are equal or one is not a number, as minps and maxps do.
+static inline F8 min8(F8 a, F8 b) {
+#if AVS_VECTORS && defined(__AVX__)
+  return {(F8::Raw)_mm256_min_ps((__m256)a.v, (__m256)b.v)};
+#else
+  return select(a < b, a, b);
+#endif
+}
+static inline F8 max8(F8 a, F8 b) {
+#if AVS_VECTORS && defined(__AVX__)
+  return {(F8::Raw)_mm256_max_ps((__m256)a.v, (__m256)b.v)};
+#else
+  return select(b < a, a, b);
+#endif
+}
 static inline F8 clamp8(F8 x, F8 lo, F8 hi) { return min8(max8(x, lo), hi); }
 
 static inline F8 sqrt8(F8 a) {

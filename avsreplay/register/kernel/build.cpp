@@ -1,4 +1,4 @@
-// Primitives split at medians into blocks of eight, and the tree of boxes over them.
+// Primitives split at medians into blocks of eight, and the tree of bounds over them.
 #include <algorithm>
 #include <cmath>
 #include <limits>
@@ -65,7 +65,7 @@ void split(std::vector<int32_t>& order, const std::vector<Vec3>& at, size_t firs
   int axis = 0;
   for (int k = 1; k < 3; ++k)
     if (hi[k] - lo[k] > hi[axis] - lo[axis]) axis = k;
-  const size_t blocks = (n + LANES - 1) / LANES, mid = first + LANES * ((blocks + 1) / 2);
+  const size_t mid = first + (size_t)LANES * left_part((uint32_t)((n + LANES - 1) / LANES));
   const auto less = [&](int32_t a, int32_t b) {
     const double x = axis_of(at[a], axis), y = axis_of(at[b], axis);
     return x < y || (x == y && a < b);
@@ -127,17 +127,97 @@ Box box_of(const Store& s, uint32_t block) {
   return b;
 }
 
-Box make_nodes(Store& s, uint32_t node, uint32_t first, uint32_t last) {
-  Box b = no_box();
-  if (last - first == 1) {
-    b = box_of(s, first);
-  } else {
-    const uint32_t left = (last - first + 1) / 2;
-    const Box l = make_nodes(s, node + 1, first, first + left), r = make_nodes(s, node + 2 * left, first + left, last);
-    for (int k = 0; k < 3; ++k) b.lo[k] = std::min(l.lo[k], r.lo[k]), b.hi[k] = std::max(l.hi[k], r.hi[k]);
+// What a node's parent knows of it.
+struct Bounds {
+  Box box = no_box();
+  float n_lo[3], n_hi[3], h_lo, h_hi;
+
+  Bounds() {
+    constexpr float inf = std::numeric_limits<float>::infinity();
+    for (int k = 0; k < 3; ++k) n_lo[k] = inf, n_hi[k] = -inf;
+    h_lo = inf, h_hi = -inf;
   }
-  s.nodes[node] = b;
+
+  void add(const Bounds& b) {
+    for (int k = 0; k < 3; ++k) {
+      box.lo[k] = std::min(box.lo[k], b.box.lo[k]), box.hi[k] = std::max(box.hi[k], b.box.hi[k]);
+      n_lo[k] = std::min(n_lo[k], b.n_lo[k]), n_hi[k] = std::max(n_hi[k], b.n_hi[k]);
+    }
+    h_lo = std::min(h_lo, b.h_lo), h_hi = std::max(h_hi, b.h_hi);
+  }
+};
+
+Bounds bounds_of(const Store& s, uint32_t block) {
+  Bounds b;
+  b.box = s.boxes[block];
+  if (!s.mesh) return b;
+  for (size_t lane = (size_t)LANES * block; lane < (size_t)LANES * (block + 1); ++lane) {
+    const Triangle& t = s.triangles[lane];
+    for (int k = 0; k < 3; ++k) {
+      const float n = (float)axis_of(t.n, k);
+      b.n_lo[k] = std::min(b.n_lo[k], n), b.n_hi[k] = std::max(b.n_hi[k], n);
+    }
+    const float h = (float)dot(t.n, t.a - s.centre);
+    b.h_lo = std::min(b.h_lo, h), b.h_hi = std::max(b.h_hi, h);
+  }
   return b;
+}
+
+void set_child(Store& s, uint32_t node, int k, uint32_t child, const Bounds& b) {
+  Node& n = s.nodes[node];
+  n.child[k] = child;
+  for (int a = 0; a < 3; ++a) n.lo[a][k] = b.box.lo[a], n.hi[a][k] = b.box.hi[a];
+  if (!s.mesh) return;
+  NodeSides& f = s.sides[node];
+  for (int a = 0; a < 3; ++a) f.n_lo[a][k] = b.n_lo[a], f.n_hi[a][k] = b.n_hi[a];
+  f.h_lo[k] = b.h_lo, f.h_hi[k] = b.h_hi;
+}
+
+// The part of a node's range that is one child's.
+struct Part {
+  uint32_t first, last;
+};
+
+void collect(uint32_t first, uint32_t last, uint32_t capacity, std::vector<Part>& parts) {
+  if (last - first <= capacity) {
+    parts.push_back({first, last});
+    return;
+  }
+  const uint32_t mid = first + capacity * (((last - first + capacity - 1) / capacity + 1) / 2);
+  collect(first, mid, capacity, parts), collect(mid, last, capacity, parts);
+}
+
+Bounds make_node(Store& s, uint32_t first, uint32_t last) {
+  const uint32_t node = (uint32_t)s.nodes.size();
+  s.nodes.emplace_back();
+  if (s.mesh) s.sides.emplace_back();
+  std::vector<Part> parts;
+  collect(first, last, child_capacity(last - first), parts);
+  Bounds all;
+  for (int k = 0; k < LANES; ++k) {
+    if (k >= (int)parts.size()) {
+      set_child(s, node, k, NO_CHILD, Bounds());
+      continue;
+    }
+    const Part p = parts[(size_t)k];
+    const uint32_t child = p.last - p.first == 1 ? p.first | IS_BLOCK : (uint32_t)s.nodes.size();
+    const Bounds b = p.last - p.first == 1 ? bounds_of(s, p.first) : make_node(s, p.first, p.last);
+    set_child(s, node, k, child, b);
+    all.add(b);
+  }
+  return all;
+}
+
+double median_diagonal(const Store& s) {
+  std::vector<double> d(s.blocks);
+  for (uint32_t k = 0; k < s.blocks; ++k) {
+    const Box& b = s.boxes[k];
+    double sum = 0;
+    for (int a = 0; a < 3; ++a) sum += ((double)b.hi[a] - b.lo[a]) * ((double)b.hi[a] - b.lo[a]);
+    d[k] = std::sqrt(sum);
+  }
+  std::nth_element(d.begin(), d.begin() + d.size() / 2, d.end());
+  return d[d.size() / 2];
 }
 
 void set_frame(Store& s, const Surface& from) {
@@ -152,11 +232,7 @@ void set_frame(Store& s, const Surface& from) {
   // About 20 roundings of 6e-8 of the largest coordinate, doubled.
   s.slack = (float)(2e-6 * (s.extent + s.reach));
   s.tie = 1e-10 * (s.extent + s.reach), s.tie2 = s.tie * s.tie;
-  const double grown = s.reach + 4.0 * s.slack;
-  s.low = {lo.x - grown, lo.y - grown, lo.z - grown};
 }
-
-}  // namespace
 
 void build_blocks(Store& s, const Surface& from) {
   s.mesh = from.n_kept > 0;
@@ -180,8 +256,36 @@ void build_blocks(Store& s, const Surface& from) {
     const int32_t k = order[std::min(i, n - 1)];  // the last block is filled up with the last primitive
     s.mesh ? add_triangle(s, from, i / LANES, (int)(i % LANES), k) : add_point(s, from, i / LANES, (int)(i % LANES), k);
   }
-  s.nodes.resize(2 * (size_t)s.blocks - 1);
-  make_nodes(s, 0, 0, s.blocks);
+  s.last_valid = (uint8_t)(0xff >> ((size_t)LANES * s.blocks - n));
+  s.boxes.resize(s.blocks);
+  for (uint32_t k = 0; k < s.blocks; ++k) s.boxes[k] = box_of(s, k);
+  make_node(s, 0, s.blocks);
+  s.grain = median_diagonal(s);
+}
+
+// A cloud's, each from the point's neighbours.
+void build_normals(Store& s, const Code& code, Team& team) {
+  const int64_t lanes = (int64_t)s.points.size();
+  team.each((lanes + CHUNK - 1) / CHUNK, [&](int64_t k) {
+    code.normals(s, k * CHUNK, std::min(lanes, (k + 1) * CHUNK), s.normals.data());
+  });
+}
+
+}  // namespace
+
+std::size_t Store::bytes() const {
+  return id.size() * sizeof id[0] + points.size() * sizeof(Vec3) + triangles.size() * sizeof(Triangle) +
+         normals.size() * sizeof(Vec3) + point_blocks.size() * sizeof(PointBlock) +
+         triangle_blocks.size() * sizeof(TriangleBlock) + boxes.size() * sizeof(Box) + 
+         nodes.size() * sizeof(Node) + sides.size() * sizeof(NodeSides) +
+         (top.size() + bricks.size() + lists.size()) * sizeof(uint32_t);
+}
+
+void build(Store& s, const Surface& surface, double reach, const Code& code, Team& team) {
+  s.reach = reach;
+  build_blocks(s, surface);
+  if (!s.mesh) build_normals(s, code, team);
+  build_cells(s, code, team);
 }
 
 }  // namespace avs
