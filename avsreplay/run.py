@@ -20,6 +20,7 @@ from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
 from avsreplay.log import Source, SourceOptions, open_source
+from avsreplay.log.cloud_stream import ahead
 from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
 from avsreplay.records import Belief, Scan, ScanStatus, State, Surface, Truth
@@ -148,7 +149,7 @@ class Run:
         """
         ready = self._new_stages()
         poses, instants = HealthyPoses(ready.estimator.params), set[int]()
-        for state, outcome in pipeline.fold(ready, first_state(ready), self._scans(progress, "fitting")):
+        for state, outcome in self._outcomes(ready, progress, "fitting"):
             poses.add(state, outcome)
             if outcome.scan.status is not ScanStatus.CLOCK:
                 instants.add(outcome.scan.t_ns)
@@ -168,9 +169,11 @@ class Run:
             raise UnreadableInput("no scan to replay", where=str(self.job.source), hint=hint)
         if self.config.reference is Against.FIT and self._reference is None:
             self.fit_reference(progress)
-        listeners, ready = tuple(listeners), self._stages
-        scorer = self._scorer()
-        for state, outcome in pipeline.fold(ready, first_state(ready), self._scans(progress, "replaying")):
+        listeners, scorer = tuple(listeners), self._scorer()
+        outcomes = self._outcomes(self._stages, progress, "replaying")
+        if self.job.prefetch:  # the pipeline runs on a second thread; scoring and writing stay in this one
+            outcomes = ahead(outcomes, self.job.prefetch)
+        for state, outcome in outcomes:
             truth = self._truth_of(outcome.scan)
             row = Row.of(outcome, scorer.score(state, outcome, truth))
             self._fold.add(row)
@@ -209,9 +212,14 @@ class Run:
     def _new_stages(self) -> Stages:
         return stages(self.config, self.source.header, self.surface, self.registrar, self.source.truth_of)
 
-    def _scans(self, progress: Progress | None, what: str) -> Iterable[Scan]:
+    def _outcomes(self, ready: Stages, progress: Progress | None, what: str) -> Iterator[tuple[PipelineState, Outcome]]:
+        """The pipeline over the scans, which are decoded ahead on a thread that ends with this generator."""
         scans = self.source.scans(self.job.prefetch)
-        return progress(scans, len(self.source), what) if progress else scans
+        try:
+            shown = progress(scans, len(self.source), what) if progress else scans
+            yield from pipeline.fold(ready, first_state(ready), shown)
+        finally:
+            scans.close()
 
     def _scorer(self) -> Scorer:
         """Against the truth of the log, or against the reference within its span."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import TypeVar
@@ -111,7 +111,7 @@ class FolderClouds:
 CloudStream = MessageClouds | FolderClouds
 
 
-def ahead(items: Iterator[T], count: int) -> Iterator[T]:
+def ahead(items: Iterator[T], count: int) -> Generator[T]:
     """Yield the same items in the same order, at most ``count`` of them computed ahead on a second thread.
 
     An exception of ``items`` is raised in the calling thread.
@@ -136,6 +136,9 @@ def ahead(items: Iterator[T], count: int) -> Iterator[T]:
             put((False, None))
         except BaseException as error:  # raised again in the consumer's thread
             put((False, error))
+        finally:
+            if isinstance(items, Generator):
+                items.close()
 
     thread = threading.Thread(target=produce, name="avsreplay-read-ahead", daemon=True)
     thread.start()

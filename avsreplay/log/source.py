@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
@@ -93,7 +93,7 @@ class Source:
                     digest.update(block)
         return digest.hexdigest()
 
-    def scans(self, prefetch: int = 0) -> Iterator[Scan]:
+    def scans(self, prefetch: int = 0) -> Generator[Scan]:
         """Yield the selected scans.
 
         Args:

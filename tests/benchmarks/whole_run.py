@@ -1,8 +1,12 @@
-"""How much of a whole replay is registration: process time of a run over that of its registrations, in one process.
+"""What a whole run costs beside its registrations: processor time and elapsed time, on one thread and on several.
 
-python tests/benchmarks/whole_run.py LOG [--repeats N] [--quick]
+python tests/benchmarks/whole_run.py LOG [LOG ...] [--repeats N] [--n-scans N]
 
-A log of 600 scans with 10,000 points each is the built-in scenario with more rays:
+Each repeat replays every log twice into a result directory, on one thread and with decoding, pipeline and writing on
+threads of their own, in turn; medians of the ratios are printed. "Registrations" is the processor time inside
+``Registrar.register`` and ``Registrar.acquire`` of the one-thread run. With threads the elapsed time approaches that of
+``pipeline.step``, because decoding, scoring and writing are done meanwhile: step/registrations is the bound. Elapsed
+times mean something on an idle machine only. A log of 600 scans with 10,000 points each is the built-in scenario with more rays:
 sed 's/^rays.*/rays = [235, 235]/' avsreplay/simulate/builtin.toml > dense.toml
 avsreplay record dense.toml -o dense.mcap
 """
@@ -10,49 +14,82 @@ avsreplay record dense.toml -o dense.mcap
 from __future__ import annotations
 
 import argparse
-import statistics
+import tempfile
 import time
 from pathlib import Path
+from statistics import median
 
+from avsreplay import pipeline
+from avsreplay.log import SourceOptions
 from avsreplay.register import Registrar
+from avsreplay.result_dir import ResultDirectory, ResultWriter
 from avsreplay.run import Job, Run
 
 
-def timed(log: Path, n_scans: int | None) -> tuple[int, float, float]:
-    """Scans, process time of the whole replay [s], of its registrations [s]."""
-    from avsreplay.log import SourceOptions
+def timed(log: Path, n_scans: int | None, prefetch: int) -> tuple[int, float, float, float, float]:
+    """Scans; processor and elapsed time of the run [s]; processor time of its registrations and of ``step`` [s]."""
+    spent, originals = [0.0], {name: getattr(Registrar, name) for name in ("register", "acquire")}
+    depth, chain, step = [0], [0.0], pipeline.step
 
-    spent = [0.0]
-    register = Registrar.register
-
-    def counted(self, *args):
-        begun = time.process_time()
-        found = register(self, *args)
-        spent[0] += time.process_time() - begun
+    def timed_step(*args):
+        begun = time.thread_time()
+        found = step(*args)
+        chain[0] += time.thread_time() - begun
         return found
 
-    Registrar.register = counted
+    def counting(original):
+        def counted(self, *args):
+            begun = time.thread_time()
+            depth[0] += 1
+            try:
+                return original(self, *args)
+            finally:
+                depth[0] -= 1
+                spent[0] += 0.0 if depth[0] else time.thread_time() - begun
+
+        return counted
+
+    for name, original in originals.items():
+        setattr(Registrar, name, counting(original))
+    pipeline.step = timed_step
     try:
-        with Run(Job(source=log, options=SourceOptions(n_scans=n_scans), prefetch=0)) as run:
-            begun = time.process_time()
-            count = sum(1 for _ in run.rows())
-            return count, time.process_time() - begun, spent[0]
+        job = Job(source=log, options=SourceOptions(n_scans=n_scans), prefetch=prefetch)
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            Run(job) as run,
+            ResultWriter(ResultDirectory(Path(folder) / "result"), run.surface, run.registrar) as writer,
+        ):
+            begun, elapsed = time.process_time(), time.perf_counter()
+            rows = list(run.rows(writer.listeners))
+            writer.finish(rows, {})
+            return len(rows), time.process_time() - begun, time.perf_counter() - elapsed, spent[0], chain[0]
     finally:
-        Registrar.register = register
+        pipeline.step = step
+        for name, original in originals.items():
+            setattr(Registrar, name, original)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("log", type=Path)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("logs", type=Path, nargs="+", metavar="LOG")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--quick", action="store_true", help="100 scans, once")
+    parser.add_argument("--n-scans", type=int)
     args = parser.parse_args()
-    runs = [timed(args.log, 100 if args.quick else None) for _ in range(1 if args.quick else args.repeats)]
-    count = runs[0][0]
-    whole, registration = (statistics.median(run[k] for run in runs) for k in (1, 2))
-    ratio = statistics.median(run[1] / run[2] for run in runs)
-    print(f"{count} scans: {1e3 * whole / count:.2f} ms a scan, {1e3 * registration / count:.2f} of it registration")
-    print(f"whole run over its registrations: {ratio:.2f}")
+    print(
+        "scans  ms/scan  registration  whole/registrations  step/registrations  elapsed threads/one  elapsed/registrations  log"
+    )
+    for log in args.logs:
+        timed(log, 3, 0)  # imports
+        runs = [(timed(log, args.n_scans, 0), timed(log, args.n_scans, 2)) for _ in range(args.repeats)]
+        count = runs[0][0][0]
+        whole, spent = (1e3 * median(one[k] for one, _ in runs) / count for k in (1, 3))
+        ratio = median(one[1] / one[3] for one, _ in runs)
+        bound = median(one[4] / one[3] for one, _ in runs)
+        threads = median(several[2] / one[2] for one, several in runs)
+        elapsed = median(several[2] / one[3] for one, several in runs)
+        print(
+            f"{count:5d} {whole:8.2f} {spent:13.2f} {ratio:20.2f} {bound:19.2f} {threads:20.2f} {elapsed:22.2f}  {log.name}"
+        )
 
 
 if __name__ == "__main__":
