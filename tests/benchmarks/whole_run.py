@@ -6,7 +6,9 @@ Each repeat replays every log twice into a result directory, on one thread and w
 threads of their own, in turn; medians of the ratios are printed. "Registrations" is the processor time inside
 ``Registrar.register`` and ``Registrar.acquire`` of the one-thread run. With threads the elapsed time approaches that of
 ``pipeline.step``, because decoding, scoring and writing are done meanwhile: step/registrations is the bound. Elapsed
-times mean something on an idle machine only. A log of 600 scans with 10,000 points each is the built-in scenario with more rays:
+times mean something on an idle machine only.
+
+A log of 600 scans with 10,000 points each is the built-in scenario with more rays:
 sed 's/^rays.*/rays = [235, 235]/' avsreplay/simulate/builtin.toml > dense.toml
 avsreplay record dense.toml -o dense.mcap
 """
@@ -88,7 +90,7 @@ def main() -> None:
         threads = median(several[2] / one[2] for one, several in runs)
         elapsed = median(several[2] / one[3] for one, several in runs)
         print(
-            f"{count:5d} {whole:8.2f} {spent:13.2f} {ratio:20.2f} {bound:19.2f} {threads:20.2f} {elapsed:22.2f}  {log.name}"
+            f"{count:5d} {whole:8.2f} {spent:13.2f} {ratio:12.2f} {bound:9.2f} {threads:20.2f} {elapsed:12.2f}  {log.name}"
         )
 
 
