@@ -77,9 +77,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--n-scans", type=int)
     args = parser.parse_args()
-    print(
-        "scans  ms/scan  registration  whole/registrations  step/registrations  elapsed threads/one  elapsed/registrations  log"
-    )
+    print("scans  ms/scan  registration  whole/reg  step/reg  threads/one  elapsed/reg  log")
     for log in args.logs:
         timed(log, 3, 0)  # imports
         runs = [(timed(log, args.n_scans, 0), timed(log, args.n_scans, 2)) for _ in range(args.repeats)]
@@ -89,9 +87,8 @@ def main() -> None:
         bound = median(one[4] / one[3] for one, _ in runs)
         threads = median(several[2] / one[2] for one, several in runs)
         elapsed = median(several[2] / one[3] for one, several in runs)
-        print(
-            f"{count:5d} {whole:8.2f} {spent:13.2f} {ratio:12.2f} {bound:9.2f} {threads:20.2f} {elapsed:12.2f}  {log.name}"
-        )
+        figures = f"{count:5d} {whole:8.2f} {spent:13.2f} {ratio:10.2f} {bound:9.2f} {threads:12.2f} {elapsed:12.2f}"
+        print(f"{figures}  {log.name}")
 
 
 if __name__ == "__main__":
