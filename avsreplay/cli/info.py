@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.setting_options import source_setting
+from avsreplay.cli.options import read_options, source_options
 
 if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss
+    from avsreplay.preflight import Advice
     from avsreplay.report.table import Table
 
 WIDTH = 120  # fixed if the output is not a terminal, so that the text is always the same
@@ -21,32 +23,34 @@ WIDTH = 120  # fixed if the output is not a terminal, so that the text is always
 EPILOG = """\b
 Examples:
   avsreplay info tumble.mcap
+  avsreplay info drive.bag --model target.stl
   avsreplay info drive.bag --json"""
 
 
 @click.command(name="info", epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
-@source_setting("--topic")
+@source_options
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
-@source_setting("--max-message-mib", type=int, default=128, show_default=True)
-def command(source: Path, topic: str | None, as_json: bool, max_message_mib: int) -> None:
+def command(source: Path, as_json: bool, **reading: Any) -> None:
     """Show topics, types, counts, rates, time span, model, scenario and injected faults of SOURCE.
+
+    With a model (in the log or --model) it also checks what a run needs: unit of the model, background points, truth,
+    transforms and time stamps; each finding names the option to add.
 
     The exit code is 4 if a part of SOURCE could not be read.
     """
-    from avsreplay.errors import DataLost, UsageError
-    from avsreplay.log import SourceOptions, open_source
+    from avsreplay.errors import DataLost
+    from avsreplay.log import open_source
+    from avsreplay.preflight import preflight
 
-    try:
-        options = SourceOptions(topic=topic, max_message_mib=max_message_mib)
-    except ValueError as error:
-        raise UsageError(str(error), where="--max-message-mib", hint="give a whole number of MiB") from None
-    with open_source(source, options, inspect=True) as opened:
+    with open_source(source, read_options(reading), inspect=True) as opened:
         info = opened.info()
+        advice = preflight(opened, opened.header.surface) if info.cloud_topic or info.scans else []
     if as_json:
-        click.echo(json.dumps(document(info), indent=2))
+        checks = [dataclasses.asdict(a) for a in advice]
+        click.echo(json.dumps({**document(info), "checks": checks}, indent=2))
     else:
-        _print(info)
+        _print(info, advice)
     if info.losses:
         what = f"{len(info.losses)} part(s) could not be read"
         raise DataLost(what, where=info.path, hint="run avsreplay doctor for details")
@@ -54,8 +58,6 @@ def command(source: Path, topic: str | None, as_json: bool, max_message_mib: int
 
 def document(info: LogInfo) -> dict[str, Any]:
     """Return the JSON document: the fields of ``LogInfo`` and the rate of each topic."""
-    import dataclasses
-
     out = dataclasses.asdict(info)
     for table, topic in zip(out["topics"], info.topics, strict=True):
         table["rate_hz"] = topic.rate_hz
@@ -79,14 +81,16 @@ def loss_line(loss: Loss) -> str:
     return shown("".join([*parts, ")"]))
 
 
-def _print(info: LogInfo) -> None:
+def _print(info: LogInfo, advice: list[Advice]) -> None:
     from avsreplay.log.bytes_io import shown
+    from avsreplay.preflight import advice_table
     from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
     console = make_console(plain_width=WIDTH)
     print_table(console, facts_table("Log", [(name, shown(value)) for name, value in _facts(info)]))
     print_table(console, _topics(info))
     print_table(console, _faults(info))
+    print_table(console, advice_table(advice))
     for loss in info.losses:
         print_line(console, "lost: " + loss_line(loss))
 

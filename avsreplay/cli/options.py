@@ -54,6 +54,7 @@ def added(*options: Callable[[F], F]) -> Callable[[F], F]:
 source_options = added(
     source_setting("--model", type=PATH),
     source_setting("--cloud-model", is_flag=True),
+    source_setting("--model-scale", type=float),
     source_setting("--topic"),
     source_setting("--truth-topic"),
     source_setting("--truth", "truth_file", type=PATH),

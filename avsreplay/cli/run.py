@@ -92,7 +92,8 @@ def command(log: Path, **flags: Any) -> None:
     wanted.check()
     target = ResultDirectory(wanted.output, overwrite=wanted.overwrite) if wanted.output else None
     with Run(_job(log, flags)) as run:
-        done = _replayed(run, target, wanted.to_rerun)
+        advice = _checked(run)
+        done = _replayed(run, advice, target, wanted.to_rerun)
         _print(wanted, done)
         if wanted.page and wanted.output:
             _page(wanted.output)
@@ -137,6 +138,16 @@ def _job(log: Path, flags: dict[str, Any]) -> Job:
     return Job(source=log, options=read_options(flags), config_file=config_file, assignments=assignments)
 
 
+def _checked(run: Run) -> list[str]:
+    """Check the log before the replay: findings are printed on stderr, and are reasons of the verdict."""
+    from avsreplay.preflight import preflight
+
+    found = [advice for advice in preflight(run.source, run.surface, run.registrar) if advice.grade != "ok"]
+    for advice in found:
+        click.echo(f"avsreplay: {advice.about}: {advice.sentence}", err=True)
+    return [advice.sentence for advice in found]
+
+
 @dataclass(frozen=True, slots=True)
 class _Finished:
     """What a replay gave; ``record`` is ``run.json``."""
@@ -148,7 +159,7 @@ class _Finished:
     scans_per_s: float
 
 
-def _replayed(run: Run, target: ResultDirectory | None, to_rerun: bool) -> _Finished:
+def _replayed(run: Run, advice: list[str], target: ResultDirectory | None, to_rerun: bool) -> _Finished:
     """Replay the log; ``target`` receives all results. An interrupt ends the replay and keeps what there is."""
     from avsreplay.cli.progress import tracked
     from avsreplay.report.verdict import verdict_of
@@ -169,6 +180,7 @@ def _replayed(run: Run, target: ResultDirectory | None, to_rerun: bool) -> _Fini
             viewer.close()
         summary = run.summary()
         record = _record(run, summary)
+        record["preflight"] = advice
         if interrupted:
             record["interrupted_after"] = len(rows)
             click.echo(f"avsreplay: interrupted; the results of {len(rows)} of {len(run)} scans are kept", err=True)

@@ -22,7 +22,7 @@ from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_tim
 from avsreplay.log.ros1_bag import ROS1_MAGIC, Ros1Bag
 from avsreplay.log.scan_files import by_number, scan_files
 from avsreplay.log.source import Source, refuse_losses
-from avsreplay.log.surface import parse_surface, read_surface
+from avsreplay.log.surface import parse_surface, read_surface, scaled
 from avsreplay.records import LogHeader, Surface
 
 
@@ -133,7 +133,7 @@ def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tu
     if surface is None:
         surface, trouble = _carried(recording)
         lost += trouble
-    return replace(header, surface=surface), tuple(lost)
+    return replace(header, surface=surface and scaled(surface, options.model_scale)), tuple(lost)
 
 
 def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
@@ -242,6 +242,7 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     times = _times(path, files, found)
     clouds = FolderClouds(files, options.rate_hz, options.max_message_mib << 20, times)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
+    surface = surface and scaled(surface, options.model_scale)
     notes = {"source": "folder", "times": "given" if times else f"steady at {options.rate_hz!r} Hz"}
     ground_truth = _ground_truth(files, clouds.header_ns, by_name, found, options)
     besides = [p for p in (pose_file, path / _TIME_FILE) if p is not None and p.is_file() and p.is_relative_to(path)]

@@ -36,6 +36,9 @@ class SourceOptions(Settings):
     )
     model: Path | None = setting(None, "Model file.", unset="the log's own model")
     cloud_model: bool = setting(False, "The model may be a point cloud without faces.")
+    model_scale: float = setting(
+        1.0, "Factor from the unit of the model to metres: 0.001 for a model in millimetres.", above=0.0
+    )
     clock: ClockChoice = setting(ClockChoice.HEADER, "Clock of the scans' times.")
     start_s: float | None = setting(None, "Begin, after the first scan.", unit="s")
     start_offset_s: float | None = setting(None, "The same as start_s.", unit="s")

@@ -105,6 +105,10 @@ class Source:
         scans = (self._scan(seq, i) for seq, i in enumerate(self._selected))
         return ahead(scans, prefetch) if prefetch else scans
 
+    def scan_at(self, seq: int) -> Scan:
+        """Return the selected scan with this index. Raises IndexError where there is none."""
+        return self._scan(seq, self._selected[seq])
+
     def truth_of(self, scan: Scan) -> Truth:
         """Return the ground truth at one of this source's scans: pose, full state and injected fault, where known."""
         lookup, place = self._ground_truth.truth, self._selected[scan.seq]

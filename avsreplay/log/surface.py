@@ -7,6 +7,7 @@ import io
 import logging
 import struct
 import zlib
+from dataclasses import replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -72,6 +73,15 @@ def parse_surface(data: bytes, name: str, cloud_ok: bool = True) -> Surface:
         UnreadableInput: as for ``read_surface``.
     """
     return _parsed(data, PurePath(name).name, shown(name), cloud_ok)
+
+
+def scaled(surface: Surface, scale: float) -> Surface:
+    """Return the model with its coordinates multiplied by ``scale``; its bytes and SHA-256 are those of the result."""
+    if scale == 1.0:
+        return surface
+    bare = Surface(frozen(scale * surface.vertices, -1, 3), surface.faces, surface.name, "")
+    data = surface_bytes(bare)
+    return replace(bare, data=data, sha256=hashlib.sha256(data).hexdigest())
 
 
 def surface_bytes(surface: Surface) -> bytes:

@@ -114,9 +114,10 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     header = header or {}
     extent_m = (header.get("model") or {}).get("extent_m")
     stopped = header.get("interrupted_after")
-    broken_off = [Reason(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
+    outside = [Reason(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
+    outside += [Reason(Grade.CHECK, text) for text in header.get("preflight") or ()]
     found = (_use(rows, summary), _errors(rows, extent_m), _faults(summary), _filter(rows, summary), _data(summary))
-    reasons = sorted((*broken_off, *chain.from_iterable(found)), key=lambda reason: reason.grade is not Grade.FAIL)
+    reasons = sorted((*outside, *chain.from_iterable(found)), key=lambda reason: reason.grade is not Grade.FAIL)
     return Verdict(
         grade=reasons[0].grade if reasons else Grade.PASS,
         reasons=tuple(reasons),

@@ -1,0 +1,213 @@
+"""Checks before a run: unit of the model, background, truth, transforms and time stamps, each with the option to add.
+
+Sizes are compared as diameters (largest distance between two points), which do not depend on the attitude. A scan sees
+one side of the target, so that its diameter is between about 0.4 and 1.1 of the model's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Array
+from avsreplay.log import LogInfo, Source
+from avsreplay.records import Surface
+from avsreplay.register import Registrar
+from avsreplay.report.table import Table, TableCell
+
+SCANS = 5
+_LEAST, _MOST = 0.25, 1.3  # diameter of a scan over that of the model outside which something is wrong
+_ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
+_UNITS = {
+    0.001: "millimetres",
+    1000.0: "kilometres, or the scans are in millimetres",
+    0.01: "centimetres",
+    100.0: "units of 100 m, or the scans are in centimetres",
+    0.0254: "inches",
+    39.3701: "units of 39.37 m, or the scans are in inches",
+    0.3048: "feet",
+    3.28084: "units of 3.28 m, or the scans are in feet",
+}
+_POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
+_SAMPLED = 3000  # points of a scan that are grouped
+_MARGIN = 0.25  # of the model's diameter around the target in a suggested crop
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """One finding.
+
+    Attributes:
+        grade: "ok", "check" or "fail".
+        about: what was checked.
+        text: what was found.
+        option: the exact option to add, "" if there is none.
+    """
+
+    grade: str
+    about: str
+    text: str
+    option: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """The finding with its option."""
+        return f"{self.text}; add {self.option}" if self.option else self.text
+
+
+def preflight(source: Source, surface: Surface | None, registrar: Registrar | None = None) -> list[Advice]:
+    """Check a log and a model before a run.
+
+    Args:
+        source: open log; at most five scans spread over it are read.
+        surface: model of the target, None if there is none.
+        registrar: of the model; with it the share of points on the model is measured where the first pose is known.
+
+    Returns:
+        The findings in the order of the checks.
+    """
+    info = source.info()
+    clouds = _sampled_clouds(source)
+    found = [*_sizes(clouds, surface), *_transforms(info), *_truth(info), *_clock(info)]
+    share = None if registrar is None else _share_on_model(source, registrar)
+    if share is not None:
+        text = f"{100 * share:.0f} % of the points of the first scan are on the model at the first pose"
+        found.insert(1, Advice("ok" if share >= 0.5 else "check", "points on the model", text))
+    return found
+
+
+def _sampled_clouds(source: Source) -> list[NDArray[Any]]:
+    """Finite points of a few scans, spread evenly over the log; scans with fewer than ten points are left out."""
+    wanted = np.unique(np.linspace(0, len(source) - 1, SCANS).astype(int)).tolist() if len(source) else []
+    clouds = [source.scan_at(seq).points for seq in wanted]
+    return [cloud[np.isfinite(cloud).all(axis=1)] for cloud in clouds if len(cloud) >= 10]
+
+
+def _share_on_model(source: Source, registrar: Registrar) -> float | None:
+    """Share of the first scan's points on the model, registered from its known pose; None without either."""
+    if not len(source) or len((scan := source.scan_at(0)).points) < 10:
+        return None
+    start, truth = source.header.start, source.truth_of(scan).pose
+    pose = start.x.T_ac if start is not None else truth
+    return None if pose is None else registrar.register(scan.points, pose).inlier_ratio
+
+
+def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
+    """Largest distance between two points (n, 3) [m], by two sweeps; ``trimmed`` leaves out the outermost 2 %."""
+    points = np.asarray(points, dtype=np.float64)
+    if not len(points):
+        return 0.0
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    if trimmed:
+        points = points[away <= np.quantile(away, 0.98)]
+        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    first = points[np.argmax(away)]
+    second = points[np.argmax(np.linalg.norm(points - first, axis=1))]
+    return float(np.linalg.norm(points - second, axis=1).max())
+
+
+def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None) -> list[Advice]:
+    if not clouds:
+        return [Advice("check", "scans", "the examined scans hold no points")]
+    scan_m = float(np.median([diameter(cloud) for cloud in clouds]))
+    if surface is None:
+        return [Advice("fail", "model", f"there is no model; the scans measure {scan_m:.3g} m", "--model FILE")]
+    model_m = diameter(surface.vertices, trimmed=False)
+    ratio = scan_m / model_m if model_m else np.inf
+    said = f"the scans measure {scan_m:.3g} m, the model {model_m:.3g} m"
+    if _LEAST <= ratio <= _MOST:
+        return [Advice("ok", "size", said)]
+    targets = [_target(cloud, model_m) for cloud in clouds] if ratio > _MOST else []
+    inside = [points for points in targets if points is not None]
+    if len(inside) * 2 > len(clouds):
+        return [_crop_advice(clouds, inside, model_m)]
+    scale = _unit(ratio)
+    if scale is None:
+        return [Advice("fail", "size", f"{said}; no common unit explains the difference")]
+    text = f"{said}: the model seems to be in {_UNITS[scale]}"
+    return [Advice("fail", "unit", text, f"--model-scale {scale:g}")]
+
+
+def _unit(ratio: float) -> float | None:
+    """The factor of a unit that makes the sizes agree best, None if none does."""
+    low, high = _ONE_SIDE
+    fitting = [scale for scale in _UNITS if low <= ratio / scale <= high]
+    return min(fitting, key=lambda scale: abs(np.log(ratio / scale / 0.9)), default=None)
+
+
+def _target(cloud: NDArray[Any], model_m: float) -> Array | None:
+    """The largest connected group of points with the size of the model, None if there is none."""
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    points = np.asarray(cloud[:: max(len(cloud) // _SAMPLED, 1)], dtype=np.float64)
+    edges = cKDTree(points).query_pairs(0.1 * model_m, output_type="ndarray")
+    ones = np.ones(len(edges))
+    graph = csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(len(points), len(points)))
+    _, member = connected_components(graph, directed=False)
+    groups = [points[member == k] for k in np.flatnonzero(np.bincount(member) >= max(10, len(points) // 100))]
+    fitting = [g for g in groups if _ONE_SIDE[0] <= diameter(g, trimmed=False) / model_m <= _ONE_SIDE[1]]
+    return max(fitting, key=len, default=None)
+
+
+def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], model_m: float) -> Advice:
+    """Most points are background: the crop that keeps the target in all examined scans."""
+    margin = _MARGIN * model_m
+    ranges = [np.linalg.norm(points, axis=1) for points in targets]
+    low, high = max(min(r.min() for r in ranges) - margin, 0.0), max(r.max() for r in ranges) + margin
+    everything = np.concatenate([np.asarray(cloud, dtype=np.float64) for cloud in clouds])
+    away = np.linalg.norm(everything, axis=1)
+    by_range = (away >= low) & (away <= high)
+    corner = np.min([points.min(axis=0) for points in targets], axis=0) - margin
+    other = np.max([points.max(axis=0) for points in targets], axis=0) + margin
+    by_box = ((everything >= corner) & (everything <= other)).all(axis=1)
+    box = ",".join(f"{v:.2f}" for v in (*corner, *other))
+    use_range = by_range.mean() <= 1.2 * by_box.mean()
+    option = f"--crop-range {low:.2f},{high:.2f}" if use_range else f"--crop-box {box}"
+    share = 100 * (1.0 - (by_range if use_range else by_box).mean())
+    text = f"{share:.0f} % of the points are background; a group of points has the size of the model ({model_m:.3g} m)"
+    return Advice("check", "background", text, option)
+
+
+def _transforms(info: LogInfo) -> list[Advice]:
+    found = [topic for topic in info.topics if topic.type.endswith("TFMessage") and topic.count]
+    if not found:
+        return []
+    names = ", ".join(f"{topic.name} ({topic.count} messages)" for topic in found)
+    return [Advice("ok", "transforms", f"{names}; for a moving sensor use --fixed-frame FRAME")]
+
+
+def _truth(info: LogInfo) -> list[Advice]:
+    if info.truth:
+        return [Advice("ok", "truth", "the log states true poses; they are used for scoring")]
+    names = [t.name for t in info.topics if t.type.rsplit("/", 1)[-1] in _POSE_TYPES and t.count]
+    if names:
+        others = f" (or {', '.join(names[1:3])})" if names[1:] else ""
+        text = f"no truth is selected, but the log has poses{others}"
+        return [Advice("ok", "truth", text, f"--truth-topic {names[0]}")]
+    return [Advice("ok", "truth", "the log has no true poses; errors are unknown", "--reference fit")]
+
+
+def _clock(info: LogInfo) -> list[Advice]:
+    clock = info.clock
+    if clock is None:
+        return []
+    problems = [
+        f"{getattr(clock, name)} {name}" for name in ("unset", "jumps", "back", "equal") if getattr(clock, name)
+    ]
+    if not problems:
+        return [Advice("ok", "time stamps", f"median period {clock.period_s:.4g} s")]
+    option = "--clock log" if clock.clock == "header" else ""
+    return [Advice("check", "time stamps", f"time stamps of scans: {', '.join(problems)}", option)]
+
+
+def advice_table(found: Sequence[Advice]) -> Table:
+    """The findings with the option to add."""
+    marks = {"ok": "good", "check": "warn", "fail": "bad"}
+    rows = tuple((TableCell(a.about, marks[a.grade]), a.text, a.option) for a in found)
+    return Table("Checks before a run", ("check", "finding", "option to add"), rows, align="l")

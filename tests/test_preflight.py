@@ -1,0 +1,166 @@
+"""Checks before a run: unit, background, truth and clock, each with the option to add."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from avsreplay.geometry import Pose, exp
+from avsreplay.log import open_source
+from avsreplay.log.options import LogInfo, TopicInfo
+from avsreplay.log.surface import parse_surface, scaled, surface_bytes
+from avsreplay.preflight import diameter, preflight
+from avsreplay.records import Scan, ScanStatus
+from avsreplay.register.contract import boxes
+
+
+@dataclasses.dataclass
+class Log:
+    """A source with given clouds."""
+
+    clouds: list
+    topics: tuple = ()
+    truth: bool = False
+
+    def __len__(self):
+        return len(self.clouds)
+
+    def info(self):
+        return LogInfo("x", "mcap", 1, self.topics, 0, 1, truth=self.truth)
+
+    def scan_at(self, seq):
+        return Scan(seq, seq * 100_000_000, np.asarray(self.clouds[seq], np.float64), ScanStatus.OK)
+
+
+@pytest.fixture(scope="module")
+def surface():
+    return boxes()
+
+
+def _seen(surface, n=6, wall=False, seed=1):
+    """Points of the half that faces the sensor while the target turns and moves, some with a wall behind."""
+    rng = np.random.default_rng(seed)
+    corners = surface.vertices[surface.faces]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    clouds = []
+    for k in range(n):
+        pick = rng.choice(len(corners), 4000, p=area / area.sum())
+        u = np.sort(rng.uniform(size=(2, len(pick))), axis=0)
+        weights = np.stack([u[0], u[1] - u[0], 1 - u[1]], axis=1)
+        points = Pose(exp([0.3 * k, 0.2, 0.1]), [0.3 * k, 0.0, 12.0]).apply(
+            np.einsum("ij,ijk->ik", weights, corners[pick])
+        )
+        points = points[points[:, 2] < np.median(points[:, 2])]
+        if wall:
+            flat = rng.uniform([-15, -10, 25.0], [15, 10, 25.1], (9000, 3))
+            points = np.concatenate([points, flat])
+        clouds.append(points)
+    return clouds
+
+
+def _found(found, about):
+    return next(advice for advice in found if advice.about == about)
+
+
+def test_a_fitting_model_is_ok(surface):
+    found = preflight(Log(_seen(surface)), surface)
+    assert _found(found, "size").grade == "ok"
+    assert not any(advice.grade == "fail" for advice in found)
+
+
+@pytest.mark.parametrize(
+    ("factor", "option", "unit"),
+    [
+        (1000.0, "--model-scale 0.001", "millimetres"),
+        (100.0, "--model-scale 0.01", "centimetres"),
+        (39.37, "--model-scale 0.0254", "inches"),
+        (0.001, "--model-scale 1000", "scans are in millimetres"),
+    ],
+)
+def test_a_wrong_unit_is_named_with_the_factor(surface, factor, option, unit):
+    found = _found(preflight(Log(_seen(surface)), scaled(surface, factor)), "unit")
+    assert (found.grade, found.option) == ("fail", option)
+    assert unit in found.text
+
+
+def test_the_suggested_factor_makes_the_sizes_agree(surface):
+    log, wrong = Log(_seen(surface)), scaled(surface, 1000.0)
+    factor = float(_found(preflight(log, wrong), "unit").option.split()[1])
+    assert _found(preflight(log, scaled(wrong, factor)), "size").grade == "ok"
+
+
+def test_a_wall_is_background_and_the_crop_keeps_the_target(surface):
+    clouds = _seen(surface, wall=True)
+    found = _found(preflight(Log(clouds), surface), "background")
+    flag, values = found.option.split()
+    numbers = [float(v) for v in values.split(",")]
+    for cloud in clouds:
+        away = np.linalg.norm(cloud, axis=1)
+        kept = (
+            (away >= numbers[0]) & (away <= numbers[1])
+            if flag == "--crop-range"
+            else ((cloud >= numbers[:3]) & (cloud <= numbers[3:])).all(axis=1)
+        )
+        target = cloud[:, 2] < 20.0
+        assert kept[target].mean() > 0.99
+        assert kept[~target].mean() < 0.05
+
+
+def test_no_unit_is_guessed_where_none_fits(surface):
+    found = preflight(Log([7000.0 * cloud for cloud in _seen(surface)]), surface)
+    assert "no common unit" in _found(found, "size").text
+
+
+def test_no_model_asks_for_one(surface):
+    assert _found(preflight(Log(_seen(surface)), None), "model").option == "--model FILE"
+
+
+def test_empty_scans_are_said():
+    assert _found(preflight(Log([np.zeros((0, 3))] * 3), None), "scans").grade == "check"
+
+
+def test_a_pose_topic_is_offered_as_truth(surface):
+    topics = (TopicInfo("/mocap/pose", "geometry_msgs/msg/PoseStamped", "cdr", 9, 0, 1),)
+    assert _found(preflight(Log(_seen(surface), topics), surface), "truth").option == "--truth-topic /mocap/pose"
+    assert _found(preflight(Log(_seen(surface)), surface), "truth").option == "--reference fit"
+
+
+def test_the_diameter_does_not_depend_on_the_attitude_or_a_stray_point():
+    rng = np.random.default_rng(2)
+    points = rng.uniform([-1, -0.5, -0.2], [1, 0.5, 0.2], (4000, 3))
+    turned = Pose(exp([0.4, 1.0, -2.0]), [5.0, 6.0, 7.0]).apply(points)
+    assert diameter(turned) == pytest.approx(diameter(points), rel=0.02)
+    assert diameter(np.vstack([points, [[900.0, 0, 0]]])) == pytest.approx(diameter(points), rel=0.05)
+    assert diameter(np.zeros((0, 3))) == 0.0
+
+
+def test_a_scaled_model_keeps_its_shape_and_can_be_written(surface):
+    half = scaled(surface, 0.5)
+    assert half.extent == pytest.approx(0.5 * surface.extent)
+    assert half.sha256 != surface.sha256
+    again = parse_surface(surface_bytes(half), "m.ply")
+    np.testing.assert_array_equal(again.vertices, half.vertices)
+    assert scaled(surface, 1.0) is surface
+
+
+@pytest.fixture(scope="module")
+def model_in_mm(tmp_path_factory, fixtures_folder):
+    with open_source(fixtures_folder / "tumble.mcap") as source:
+        path = tmp_path_factory.mktemp("model") / "target.ply"
+        path.write_bytes(surface_bytes(scaled(source.header.surface, 1000.0)))
+    return path
+
+
+def test_a_model_in_millimetres_is_said_before_any_table(cli, fixtures_folder, model_in_mm):
+    log = fixtures_folder / "tumble.mcap"
+    info = json.loads(cli("info", log, "--model", model_in_mm, "--json").out)
+    assert [c["option"] for c in info["checks"] if c["grade"] == "fail"] == ["--model-scale 0.001"]
+    done = cli("run", log, "--model", model_in_mm, "--n-scans", 5)
+    assert "--model-scale 0.001" in done.err.splitlines()[0]
+    assert "--model-scale 0.001" in done.out.split("Scans:")[0]
+    right = cli("run", log, "--model", model_in_mm, "--model-scale", "0.001", "--n-scans", 5)
+    assert "model-scale 0.001" not in right.err.splitlines()[0]
+    assert "5 healthy" in right.out
