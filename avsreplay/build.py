@@ -11,8 +11,7 @@ from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.params import Start
 from avsreplay.geometry import Pose
-from avsreplay.monitor.consistency import Consistency
-from avsreplay.monitor.convergence import Convergence
+from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.faults import FaultDetector
 from avsreplay.pipeline import Monitors, PipelineState, Stages
 from avsreplay.plan import Guidance, Supervisor

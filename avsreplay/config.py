@@ -15,8 +15,7 @@ from typing import Any
 
 from avsreplay.estimate import EstimatorParams
 from avsreplay.geometry import Pose
-from avsreplay.monitor.consistency import ConsistencyParams
-from avsreplay.monitor.convergence import ConvergenceParams
+from avsreplay.monitor.convergence import ConsistencyParams, ConvergenceParams
 from avsreplay.monitor.faults import FaultParams
 from avsreplay.plan import PlanParams, SupervisorParams
 from avsreplay.register import RegisterParams

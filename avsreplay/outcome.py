@@ -36,6 +36,7 @@ class MonitorReport:
         ogm_log10_cond: log10 of its condition number, None below full rank.
         ogm_log10_cond_scaled: the same after scaling by the prior standard deviations.
         consistent: the innovations agree with their covariance; None before there are enough of them.
+        violations: consistency checks that the estimate has failed so far.
         nis_mean: mean NIS over the consistency window.
         autocorrelation: lag-1 autocorrelation of the whitened innovations in that window.
         converged: the planner may rely on the estimate.
@@ -49,6 +50,7 @@ class MonitorReport:
     ogm_log10_cond: float | None
     ogm_log10_cond_scaled: float | None
     consistent: bool | None
+    violations: int
     nis_mean: float | None
     autocorrelation: float | None
     converged: bool

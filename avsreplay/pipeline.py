@@ -21,8 +21,7 @@ from avsreplay.estimate import Estimator, Prediction, Track
 from avsreplay.estimate.deskew import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor import observability
-from avsreplay.monitor.consistency import Consistency, ConsistencyTrack
-from avsreplay.monitor.convergence import Convergence, ConvergenceTrack
+from avsreplay.monitor.convergence import Consistency, ConsistencyTrack, Convergence, ConvergenceTrack, violations
 from avsreplay.monitor.faults import FaultDetector
 from avsreplay.monitor.observability import Gramian
 from avsreplay.outcome import MonitorReport, Outcome
@@ -57,6 +56,7 @@ class MonitorState:
     gramian: Gramian
     consistency: ConsistencyTrack
     convergence: ConvergenceTrack
+    violations: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,11 +80,12 @@ class Monitors:
         track: Track,
     ) -> tuple[MonitorState, MonitorReport]:
         """Take one scan: its prior, innovation and gamma, and the estimate after it."""
-        gramian = observability.observe(state.gramian, prior.Phi, prior.H, gamma)
+        gramian = self._gramian(state.gramian, estimator, prior, innovation if gamma else None, track)
         rank = observability.measure(gramian)
         consistency = self.consistency.observe(state.consistency, innovation, gamma)
         window = self.consistency.judge(consistency)
-        consistent = window.consistent and not (track.window.many_outliers or track.doubtful)
+        failed = self._violations(estimator, prior, innovation if gamma else None, track)
+        consistent = window.consistent and not (track.window.many_outliers or track.doubtful or failed)
         forecast = estimator.track_forecast(track, self.convergence.params.times_s)
         convergence = self.convergence.judge(state.convergence, track.belief, forecast, consistent is True)
         report = MonitorReport(
@@ -92,6 +93,7 @@ class Monitors:
             ogm_log10_cond=rank.log10_cond,
             ogm_log10_cond_scaled=rank.log10_cond_scaled,
             consistent=consistent,
+            violations=state.violations + len(failed),
             nis_mean=window.nis_mean,
             autocorrelation=window.autocorrelation,
             converged=convergence.converged,
@@ -100,7 +102,25 @@ class Monitors:
             unconverged=convergence.unknown,
             forecast=forecast,
         )
-        return MonitorState(gramian, consistency, convergence), report
+        return MonitorState(gramian, consistency, convergence, state.violations + len(failed)), report
+
+    def _gramian(
+        self, gramian: Gramian, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track
+    ) -> Gramian:
+        """The Gramian with one more scan, along the trajectory of the new fit where there is one."""
+        refitted = estimator.refitted_rows(track)
+        if refitted is not None:
+            return observability.from_trajectory(gramian.scale, *refitted)
+        return observability.observe(gramian, prior.Phi, prior.H, None if healthy is None else healthy.R)
+
+    def _violations(
+        self, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track
+    ) -> tuple[str, ...]:
+        """The consistency checks that the estimate fails after a healthy scan."""
+        found = None if healthy is None else estimator.residual_after(track, prior, healthy)
+        if healthy is None or found is None:
+            return ()
+        return violations(track.belief, estimator.pose_covariance(track.belief), found[0], healthy.R, found[1])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -247,6 +247,8 @@ class Row:
         "Lag-1 autocorrelation of the whitened innovations over that window; 0 is expected.", atol=1e-4)
     consistent: bool | None = _exact(lambda o, s: o.monitors.consistent,
         "The mean NIS is below the upper limit of its chi-square interval and few poses have a reduced weight.")
+    violations: int | None = _exact(lambda o, s: o.monitors.violations,
+        "Consistency checks that the estimate has failed so far; a failed check withdraws converged.")
     converged: bool = _exact(lambda o, s: o.monitors.converged, "The planner may rely on the estimate.", table=True)
     covariance_converged: bool | None = _exact(lambda o, s: o.monitors.covariance_converged,
         "The covariance of every block of states is below its limit (the paper's criterion).")

@@ -14,7 +14,7 @@ from avsreplay.estimate import Estimator
 from avsreplay.estimate.chart import nearest_permutation, nees
 from avsreplay.estimate.error_state import boxminus
 from avsreplay.geometry import Pose
-from avsreplay.monitor.consistency import block_nees
+from avsreplay.monitor.convergence import block_nees
 from avsreplay.outcome import CaptureError, Outcome, PoseError, Score
 from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan import Motion, interpolated, miss

@@ -115,6 +115,7 @@ def _row(k: int, rng: np.random.Generator, blind: bool, changes: dict[str, objec
         "r_floors": 0,
         "reinitialised": 0,
         "manoeuvres": 0,
+        "violations": 0,
         "ogm_rank": min(k, 20),
         "ogm_log10_cond": None if k < 20 else 9.0,
         "ogm_log10_cond_scaled": None if k < 20 else 4.0,

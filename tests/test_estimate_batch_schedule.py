@@ -19,7 +19,7 @@ from avsreplay.estimate.ekf import innovation_of
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.initialise import PoseFix, batch_estimate, given_prior, poses_of, rough_state, weak_prior
 from avsreplay.estimate.params import Constraint, Start
-from avsreplay.monitor.consistency import Consistency, ConsistencyParams
+from avsreplay.monitor.convergence import Consistency, ConsistencyParams
 from avsreplay.records import Belief, State
 
 POS_M, ROT_RAD = 0.005, np.radians(0.3)

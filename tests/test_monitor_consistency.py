@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from avsreplay.monitor.consistency import Consistency, ConsistencyParams, block_nees, mean_band
-from avsreplay.records import BLOCKS, Innovation
+from avsreplay.monitor.convergence import Consistency, ConsistencyParams, block_nees, mean_band, violations
+from avsreplay.records import BLOCKS, Belief, Innovation, State
 
 STRICT = ConsistencyParams(slack=1.0)
 
@@ -83,3 +83,20 @@ def test_params_refuse() -> None:
         ConsistencyParams(window=5, least=9)
     with pytest.raises(ValueError, match="slack"):
         ConsistencyParams(slack=0.5)
+
+
+def belief_of(P: np.ndarray, sigma: tuple[float, float] = (0.1, 0.2)) -> Belief:
+    return Belief(0, State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, sigma, np.zeros(3), [0, 0, 0, 1.0]), P)
+
+
+def test_each_check_of_the_estimate_fails_where_it_should() -> None:
+    R, good, none = 1e-4 * np.eye(6), 1e-4 * np.eye(20), np.ones(2)
+    pose = 0.5 * R
+    assert violations(belief_of(good), pose, np.zeros(6), R, none) == ()
+    bad = good.copy()
+    bad[0, 0] = -1e-4
+    assert "covariance" in violations(belief_of(bad), pose, np.zeros(6), R, none)
+    assert violations(belief_of(good, (1.2, 0.0)), pose, np.zeros(6), R, none) == ("sigma",)
+    assert violations(belief_of(good), 1.3 * R, np.zeros(6), R, none) == ("worse_than_measured",)
+    assert violations(belief_of(good), 1.3 * R, np.zeros(6), R, 2.0 * none) == ()
+    assert violations(belief_of(good), pose, np.full(6, 0.1), R, none) == ("outside_gate",)

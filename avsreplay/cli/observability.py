@@ -12,6 +12,7 @@ from avsreplay.cli.options import PATH, read_options, source_options
 
 if TYPE_CHECKING:
     from avsreplay.estimate.reference import Reference
+    from avsreplay.geometry import Array
     from avsreplay.monitor.observability import Gramian
     from avsreplay.rows import Row
     from avsreplay.run import Run
@@ -97,7 +98,7 @@ def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[
         t_ns = row.t_ns
         line: dict[str, Any] = {"t_s": row.t_s, "gamma": row.gamma}
         for name, (Phi, H) in steps.items():
-            folds[name] = observe(folds[name], Phi, H, row.gamma)
+            folds[name] = observe(folds[name], Phi, H, _noise(row))
             found = measure(folds[name])
             line[name] = {
                 "rank": found.rank,
@@ -107,6 +108,15 @@ def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[
             }
         lines.append(line)
     return lines, folds
+
+
+def _noise(row: Row) -> Array | None:
+    """R (6, 6) [m, half-angle] of a healthy scan, isotropic in position and in attitude."""
+    if not row.gamma or row.r_pos_m is None or row.r_rot_deg is None:
+        return None
+    import numpy as np
+
+    return np.diag(np.repeat([row.r_pos_m, 0.5 * np.radians(row.r_rot_deg)], 3) ** 2)
 
 
 def _print(found: dict[str, Any]) -> None:

@@ -227,6 +227,16 @@ def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) 
     return Forecast(times, position, velocity, 2.0 * half_angle)
 
 
+def pose_rows(x: State, times_s: Array) -> Array:
+    """H Phi (n, 6, 20) of a pose measured at each of ``times_s`` (n,) [s], with respect to the error states at 0."""
+    path = rotation_history(x, times_s)
+    J = grasp_jacobian(geometry.matrix(path.q), path.w, x.c_b)[:, [0, 1, 2, 6, 7, 8]]
+    rows, rotational = J.copy(), J[:, :, :6]
+    rows[:, :, :6], rows[:, :, SIGMA] = rotational @ path.S[:, :, :6], rotational @ path.S[:, :, 6:]
+    rows[:, :, VEL] += np.asarray(times_s)[:, None, None] * J[:, :, RHO]
+    return rows
+
+
 def grasp_jacobian(A_ab: Array, w_b: Array, c_b: Array) -> Array:
     """Jacobian (n, 9, 20) of the grasp point's position [m], velocity [m/s] and half-angle attitude (section 8).
 

@@ -16,9 +16,16 @@ from avsreplay.estimate import dynamics, ekf
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_covariance import mixture_forecast
 from avsreplay.estimate.batch_schedule import BatchSchedule
+from avsreplay.estimate.chart import to_state
 from avsreplay.estimate.initialise import given_prior, guessed_belief
-from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
-from avsreplay.estimate.noise import Noise
+from avsreplay.estimate.measurement import (
+    in_camera,
+    innovation_vector,
+    measured_pose,
+    measurement_jacobian,
+    residual,
+)
+from avsreplay.estimate.noise import NO_INFLATION, Noise
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import Epoch, Prediction, Track
 from avsreplay.geometry import Array, Pose
@@ -120,6 +127,43 @@ class Estimator:
         if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
             return self.forecast(track.belief, times_s)
         return mixture_forecast(track.batch.components, track.belief.t_ns, times_s, self._torque, self._force)
+
+    def refitted_rows(self, track: Track) -> tuple[Array, Array, Array] | None:
+        """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no new fit.
+
+        Args:
+            track: after a scan.
+
+        Returns:
+            H Phi (n, 6, 20) from the first pose on, R (n, 6, 6) and the transition (20, 20) from there to the scan.
+        """
+        if track.mode != "fit" or track.batch is None or track.since or track.batch.count != len(track.fixes):
+            return None
+        start, fixes = track.batch, track.fixes
+        x = to_state(start.chart)
+        times = np.array([(fix.t_ns - start.epoch_ns) * 1e-9 for fix in fixes])
+        R = np.array([in_camera(fix.C, fix.T_ac.q, x.q_bc) for fix in fixes])
+        _, Phi = dynamics.propagate_state(x, (track.belief.t_ns - start.epoch_ns) * 1e-9)
+        return dynamics.pose_rows(x, times), R, Phi
+
+    def residual_after(
+        self, track: Track, prediction: Prediction, innovation: Innovation
+    ) -> tuple[Array, Array] | None:
+        """Residual (6,) of the measured pose after the update, and the inflation (2,) that the update allowed for.
+
+        None where the scan did not change the estimate: before the first fit, and between two fits with a
+        non-Gaussian likelihood.
+
+        Args:
+            track: after a healthy scan.
+            prediction: of that scan.
+            innovation: of that scan.
+        """
+        between = track.mode == "fit" and track.since > 0 and not (track.batch is not None and track.batch.gaussian)
+        if between or track.mode not in ("fit", "filter"):
+            return None
+        left = residual(track.belief.x, prediction.belief.x, innovation.alpha)
+        return left, NO_INFLATION if track.inflation is None else track.inflation
 
     def _replayed(self, track: Track, epoch: Epoch) -> Track:
         """A stored scan, predicted and used again from another track."""

@@ -1,9 +1,10 @@
-"""When the estimate may be relied on: t_1, by the covariance's blocks or by the grasp point's predicted 1 sigma.
+"""Whether the covariance of the estimate can be trusted, and from when on the estimate may be used (t_1).
 
-``covariance`` is the paper's test: every parameter and motion block below its limit. ``predictive`` asks for
-what the capture needs: position, velocity and attitude of the grasp point over the planner's horizon; a body whose
-parameters can never be told apart may still pass. Either must hold for the dwell, and only while the
-innovations are consistent.
+Consistency: NIS of the innovations inside its chi-square band, and checks that hold for every correct estimate. They
+need no ground truth. Convergence: ``covariance`` is the paper's test, every parameter and motion block below its limit;
+``predictive`` tests what the capture needs, position, velocity and attitude of the grasp point over the planner's
+horizon, so that a body with unobservable parameters may pass. Either must hold for the dwell time, and only while the
+estimate is consistent.
 """
 
 from __future__ import annotations
@@ -14,11 +15,36 @@ from enum import Enum
 
 import numpy as np
 
-from avsreplay.geometry import Array
-from avsreplay.records import BLOCKS, Belief, Forecast
+from avsreplay.geometry import Array, frozen
+from avsreplay.records import BLOCKS, Belief, Forecast, Innovation
 from avsreplay.settings import Settings, given, setting
 
-__all__ = ["Convergence", "ConvergenceParams", "ConvergenceTrack", "Criterion", "block_1s"]
+_GATE = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom
+_NOT_WORSE = 1.05  # a posterior 1 sigma may exceed that of the measurement by this factor
+
+
+@dataclass(frozen=True, slots=True)
+class ConsistencyParams(Settings):
+    """The innovation test that may withdraw ``converged``."""
+
+    window: int = setting(50, "Healthy scans in the window of the test.", low=2)
+    least: int = setting(15, "Healthy scans from which the test is made.", low=2)
+    level: float = setting(
+        0.9999,
+        "Probability of the two-sided band in which the mean NIS of a correct filter lies.",
+        above=0.0,
+        below=1.0,
+    )
+    slack: float = setting(
+        2.0,
+        "Factor by which the mean NIS may exceed the band, because registration errors are not quite white.",
+        low=1.0,
+    )
+
+    def check(self) -> None:
+        """Raise ValueError where the test needs more scans than its window holds."""
+        if self.least > self.window:
+            raise ValueError(f"least is {self.least}, must not exceed window = {self.window}")
 
 
 class Criterion(Enum):
@@ -81,18 +107,140 @@ class ConvergenceParams(Settings):
         }
 
 
+def mean_band(dof: int, count: int, level: float) -> tuple[float, float]:
+    """Two-sided band of the mean of ``count`` chi-square values of ``dof`` degrees of freedom each."""
+    from scipy.special import gammaincinv
+
+    n = 0.5 * dof * count
+    tail = 0.5 * (1.0 - level)
+    return float(2.0 * gammaincinv(n, tail)) / count, float(2.0 * gammaincinv(n, 1.0 - tail)) / count
+
+
+def block_nees(error: Array, P: Array) -> dict[str, float]:
+    """NEES e' P^-1 e of each block by itself, and of all 20 as 'all'. error (20,), P (20, 20)."""
+    out = {name: float(error[b] @ np.linalg.solve(P[b, b], error[b])) for name, b in BLOCKS.items()}
+    out["all"] = float(error @ np.linalg.solve(P, error))
+    return out
+
+
 def block_1s(P: Array) -> dict[str, float]:
     """Root of the trace of each block of P (20, 20), in its own units (half angles)."""
     variances = np.diagonal(P)
     return {name: float(np.sqrt(np.maximum(variances[where].sum(), 0.0))) for name, where in BLOCKS.items()}
 
 
+def violations(belief: Belief, pose_covariance: Array, residual: Array, R: Array, inflation: Array) -> tuple[str, ...]:
+    """The checks that an estimate after a healthy scan fails; a correct one passes all.
+
+    Args:
+        belief: after the update.
+        pose_covariance: (6, 6) of its pose, metres in {A} and half angles in {B}.
+        residual: (6,) measured minus estimated pose, in the same units.
+        R: (6, 6) noise of the measured pose.
+        inflation: (2,) factor on R, attitude and position, by which the update allowed for correlated errors.
+
+    Returns:
+        Names of the failed checks: ``covariance`` (not positive semidefinite, or not finite), ``sigma`` (an inertia
+        ratio outside its physical range), ``worse_than_measured`` (1 sigma of position or attitude above that of the
+        measurement), ``outside_gate`` (the measurement is an outlier for the estimate).
+    """
+    found = []
+    P = belief.P
+    scale = np.sqrt(np.maximum(np.diagonal(P), 1e-300))
+    if not np.all(np.isfinite(P)) or float(np.linalg.eigvalsh(P / np.outer(scale, scale))[0]) < -1e-6:
+        found.append("covariance")
+    if not np.all(np.abs(belief.x.sigma) < 1.0):
+        found.append("sigma")
+    for block, factor in ((slice(0, 3), inflation[1]), (slice(3, 6), inflation[0])):
+        limit = max(float(factor), 1.0) * _NOT_WORSE**2 * float(np.trace(R[block, block]))
+        if not float(np.trace(pose_covariance[block, block])) <= limit:
+            found.append("worse_than_measured")
+            break
+    if not float(residual @ np.linalg.solve(R + pose_covariance, residual)) <= _GATE:
+        found.append("outside_gate")
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConsistencyTrack:
+    """Whitened innovations L^-1 alpha of the last healthy epochs, (n, 6), oldest first, each with its Cauchy weight."""
+
+    white: Array
+
+
 @dataclass(frozen=True, slots=True)
-class ConvergenceTrack:
-    """The fold's state.
+class ConsistencyReport:
+    """The window in numbers, None before there are enough scans.
 
     Attributes:
-        converged: may the planner rely on the estimate now.  t1_ns: the epoch from which it first held, None before.
+        consistent: the mean NIS is not above its band.  nis_mean: mean NIS.  band: its two-sided chi-square band.
+        autocorrelation: of the whitened innovations one healthy epoch apart, 0 where white.
+        autocorrelation_band: half width of the band that it stays in where white.
+    """
+
+    consistent: bool | None
+    nis_mean: float | None = None
+    band: tuple[float, float] | None = None
+    autocorrelation: float | None = None
+    autocorrelation_band: float | None = None
+
+
+class Consistency:
+    """Tests the innovations of healthy scans.
+
+    Args:
+        params: window, level and slack of the test.
+    """
+
+    def __init__(self, params: ConsistencyParams) -> None:
+        self.params = params
+        self._bands: dict[int, tuple[float, float]] = {}
+
+    def initial(self) -> ConsistencyTrack:
+        """Return an empty window."""
+        return ConsistencyTrack(frozen(np.zeros((0, 6))))
+
+    def observe(self, track: ConsistencyTrack, innovation: Innovation | None, gamma: int) -> ConsistencyTrack:
+        """Return the window with one more scan; faulty scans are left out.
+
+        Args:
+            track: the window so far.
+            innovation: None where nothing was measured.
+            gamma: 1 for a healthy scan.
+        """
+        if innovation is None or gamma == 0:
+            return track
+        white = np.sqrt(innovation.weight) * np.linalg.solve(np.linalg.cholesky(innovation.S), innovation.alpha)
+        kept = track.white[max(0, len(track.white) + 1 - self.params.window) :]
+        return ConsistencyTrack(frozen(np.vstack([kept, white])))
+
+    def judge(self, track: ConsistencyTrack) -> ConsistencyReport:
+        """Test the window. Only a mean NIS above its band (times the slack) is inconsistent: caution is safe."""
+        n = len(track.white)
+        if n < self.params.least:
+            return ConsistencyReport(None)
+        band = self._band(n)
+        mean = float(np.einsum("ij,ij->", track.white, track.white)) / n
+        lag = float(np.einsum("ij,ij->", track.white[1:], track.white[:-1]) / (mean * (n - 1)))
+        return ConsistencyReport(mean <= self.params.slack * band[1], mean, band, lag, self._autocorrelation_band(n))
+
+    def _band(self, n: int) -> tuple[float, float]:
+        if n not in self._bands:
+            self._bands[n] = mean_band(6, n, self.params.level)
+        return self._bands[n]
+
+    def _autocorrelation_band(self, n: int) -> float:
+        from scipy.special import ndtri
+
+        return float(ndtri(0.5 * (1.0 + self.params.level))) / math.sqrt(6.0 * (n - 1))
+
+
+@dataclass(frozen=True, slots=True)
+class ConvergenceTrack:
+    """The state of the test.
+
+    Attributes:
+        converged: the planner may use the estimate now.  t1_ns: the epoch from which it first held, None before.
         since_ns: start of the present unbroken stretch, None outside one.
         covariance_converged, predictive_converged: the two tests at this epoch, before the dwell.
         unknown: blocks above their covariance limit.
@@ -107,7 +255,7 @@ class ConvergenceTrack:
 
 
 class Convergence:
-    """Decides t_1.
+    """Determines t_1.
 
     Args:
         params: limits; those left out are taken from ``extent_m``, the target's bounding diagonal [m].
@@ -118,15 +266,22 @@ class Convergence:
         self._limits = self.params.block_limits
 
     def initial(self) -> ConvergenceTrack:
-        """Nothing has held yet."""
+        """Return the state before the first scan."""
         return ConvergenceTrack()
 
     def judge(
         self, track: ConvergenceTrack, belief: Belief, forecast: Forecast | None = None, consistent: bool = True
     ) -> ConvergenceTrack:
-        """One epoch on. A belief that is not ``consistent`` is not converged, however small its covariance."""
-        spread = block_1s(belief.P)
-        unknown = tuple(name for name, limit in self._limits.items() if not spread[name] <= limit)
+        """Return the state after one more scan. An inconsistent estimate is not converged.
+
+        Args:
+            track: the state so far.
+            belief: the estimate after the scan.
+            forecast: predicted 1 sigma of the grasp point; needed by the predictive criterion.
+            consistent: of the consistency tests.
+        """
+        one_sigma = block_1s(belief.P)
+        unknown = tuple(name for name, limit in self._limits.items() if not one_sigma[name] <= limit)
         predictive = forecast is not None and self._predicted(forecast)
         holds = predictive if self.params.criterion is Criterion.PREDICTIVE else not unknown
         if not (holds and consistent):
@@ -139,5 +294,5 @@ class Convergence:
     def _predicted(self, forecast: Forecast) -> bool:
         p = self.params
         limits = (given(p.grasp_pos_m), given(p.grasp_vel_mps), math.radians(p.grasp_rot_deg))
-        seen = (forecast.pos_1s_m, forecast.vel_1s_mps, forecast.rot_1s_rad)
-        return all(bool(np.all(values <= limit)) for values, limit in zip(seen, limits, strict=True))
+        predicted = (forecast.pos_1s_m, forecast.vel_1s_mps, forecast.rot_1s_rad)
+        return all(bool(np.all(values <= limit)) for values, limit in zip(predicted, limits, strict=True))

@@ -1,8 +1,9 @@
-"""The observability Gramian (eq after [eq:S_recursive]) as a fold over scans.
+"""The observability Gramian (eq after [eq:S_recursive]), updated scan by scan.
 
-W_o = sum of (H Phi)' (H Phi). What is folded is its triangular root, [root; H Phi] re-triangularised: the condition
-of W_o is the square of the root's, so 10^30 is still told from 10^16, which the sum itself cannot. Scaled by the prior
-standard deviations it has no units. A rank below full is said as such, not as a huge number.
+W_o = sum of (H Phi)' (H Phi). Its triangular root is stored, [root; H Phi] re-triangularised: the condition number of
+W_o is the square of the root's, so that 10^30 is still told from 10^16, which the sum itself cannot do. Scaled by the
+prior standard deviations it has no units. The rank is relative to the measurement noise: it counts the directions
+about which the poses, weighted by R^-1, say more than the prior does.
 """
 
 from __future__ import annotations
@@ -18,9 +19,6 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import BLOCKS
 
-__all__ = ["Gramian", "Observability", "gramian", "measure", "observe", "weakest"]
-
-RANK_TOL = 1e-11
 _WORDS: Mapping[str, str] = {
     "attitude": "attitude of the principal axes",
     "rate": "angular rate",
@@ -34,9 +32,15 @@ _WORDS: Mapping[str, str] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Gramian:
-    """The fold's state: root (n, n) with W_o = root' root, Phi_k0 (n, n), and the prior 1 sigma (n,) that scales it."""
+    """The Gramian so far.
+
+    Attributes:
+        root: (n, n) with W_o = root' root.  white: (n, n) the same root with rows weighted by R^-1/2.
+        Phi_k0: (n, n) transition from the first scan to the last.  scale: (n,) prior 1 sigma.
+    """
 
     root: Array
+    white: Array
     Phi_k0: Array
     scale: Array
 
@@ -46,8 +50,8 @@ class Observability:
     """The Gramian in numbers.
 
     Attributes:
-        rank: of the scaled Gramian.  size: number of states.
-        log10_cond, log10_cond_scaled: log10 of the condition, None below full rank.
+        rank: directions that the poses determine better than the prior.  size: number of states.
+        log10_cond, log10_cond_scaled: log10 of the condition number of W_o, None below full rank.
     """
 
     rank: int
@@ -57,30 +61,65 @@ class Observability:
 
 
 def gramian(prior_1s: Array) -> Gramian:
-    """Nothing seen yet; ``prior_1s`` (n,) are the prior standard deviations in the states' units."""
+    """Return the Gramian before the first scan.
+
+    Args:
+        prior_1s: (n,) prior standard deviations in the states' units.
+
+    Raises:
+        ValueError: one of them is not positive and finite.
+    """
     scale = frozen(prior_1s, -1)
     if not np.all(np.isfinite(scale)) or np.any(scale <= 0.0):
         raise ValueError("prior standard deviations must be positive and finite")
-    return Gramian(np.zeros((scale.size, scale.size)), np.eye(scale.size), scale)
+    zero = np.zeros((scale.size, scale.size))
+    return Gramian(zero, zero, np.eye(scale.size), scale)
 
 
-def observe(state: Gramian, Phi: Array, H: Array, gamma: int) -> Gramian:
-    """One scan on: Phi_k0 = Phi Phi_k-1,0 always, H Phi_k0 added where the scan is healthy. Phi (n, n), H (m, n)."""
+def observe(state: Gramian, Phi: Array, H: Array, R: Array | None) -> Gramian:
+    """Return the Gramian after one more scan: Phi_k0 = Phi Phi_k-1,0, and H Phi_k0 is added for a healthy scan.
+
+    Args:
+        state: so far.
+        Phi: (n, n) transition from the last scan.
+        H: (m, n) measurement Jacobian.
+        R: (m, m) measurement noise, None for a faulty scan.
+    """
     Phi_k0 = Phi @ state.Phi_k0
-    if gamma == 0:
-        return Gramian(state.root, Phi_k0, state.scale)
-    root: Array = np.asarray(np.linalg.qr(np.vstack([state.root, H @ Phi_k0]), mode="r"))
-    return Gramian(root, Phi_k0, state.scale)
+    if R is None:
+        return Gramian(state.root, state.white, Phi_k0, state.scale)
+    return _added(state, (H @ Phi_k0)[None], R[None], Phi_k0)
+
+
+def from_trajectory(scale: Array, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
+    """Return the Gramian of many healthy scans along one trajectory.
+
+    Args:
+        scale: (n,) prior standard deviations.
+        rows: (k, m, n) H Phi from the first scan.
+        R: (k, m, m) measurement noise.
+        Phi_k0: (n, n) transition from the first scan to the last.
+    """
+    return _added(gramian(scale), rows, R, Phi_k0)
+
+
+def _added(state: Gramian, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
+    white = np.linalg.solve(np.linalg.cholesky(R), rows)
+    roots = [
+        np.asarray(np.linalg.qr(np.vstack([old, new.reshape(-1, state.scale.size)]), mode="r"))
+        for old, new in ((state.root, rows), (state.white, white))
+    ]
+    return Gramian(roots[0], roots[1], Phi_k0, state.scale)
 
 
 def measure(state: Gramian) -> Observability:
-    """Rank and conditions."""
-    scaled = np.linalg.svd(state.root * state.scale, compute_uv=False)
-    rank = int(np.sum(scaled > RANK_TOL * scaled[0])) if scaled[0] > 0.0 else 0
-    n = scaled.size
+    """Return the rank and the condition numbers."""
+    told = np.linalg.svd(state.white * state.scale, compute_uv=False)
+    rank, n = int(np.sum(told > 1.0)), state.scale.size
     if rank < n:
         return Observability(rank, n, None, None)
     raw = np.linalg.svd(state.root, compute_uv=False)
+    scaled = np.linalg.svd(state.root * state.scale, compute_uv=False)
     return Observability(rank, n, _log10_cond(raw), _log10_cond(scaled))
 
 
@@ -89,7 +128,13 @@ def _log10_cond(singular: NDArray[Any]) -> float | None:
 
 
 def weakest(state: Gramian, count: int = 3, blocks: Mapping[str, slice] = BLOCKS) -> tuple[str, ...]:
-    """The least observed directions of the scaled Gramian in words, weakest first."""
+    """Return the least observed directions of the scaled Gramian in words, weakest first.
+
+    Args:
+        state: the Gramian.
+        count: number of directions.
+        blocks: names of the states.
+    """
     _, _, rows = np.linalg.svd(state.root * state.scale)
     return tuple(_in_words(row, blocks) for row in rows[::-1][:count])
 

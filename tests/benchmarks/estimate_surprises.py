@@ -24,8 +24,7 @@ from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor.consistency import Consistency, ConsistencyParams
-from avsreplay.monitor.convergence import Convergence, ConvergenceParams
+from avsreplay.monitor.convergence import Consistency, ConsistencyParams, Convergence, ConvergenceParams, violations
 from avsreplay.monitor.faults import FaultDetector, FaultParams
 from avsreplay.records import Alignment, AlignStatus, ScanStatus, State
 
@@ -40,6 +39,7 @@ HEADS = (
     "final error, median",
     "worst",
     "reasons",
+    "failed checks",
     "ms a scan",
     "worst ms",
     "grasp 1 sigma, last 10 s [mm]",
@@ -94,6 +94,7 @@ class Result:
     ratio: list[float] = field(default_factory=list)
     error: list[tuple[float, float]] = field(default_factory=list)
     grasp: list[float] = field(default_factory=list)
+    violations: list[str] = field(default_factory=list)
     track: Track | None = None
     seconds: float = 0.0
     worst_ms: float = 0.0
@@ -169,7 +170,13 @@ def run(case: Case, seed: int, tested: bool = True) -> Result:
         result.seconds, result.worst_ms = result.seconds + spent, max(result.worst_ms, 1e3 * spent)
         seen_so_far = watch.observe(seen_so_far, innovation, verdict.gamma)
         honest = watch.judge(seen_so_far).consistent is True and not track.window.many_outliers
-        honest = honest and not track.doubtful
+        failed = ()
+        found = estimator.residual_after(track, prediction, innovation) if verdict.gamma else None
+        if found is not None:
+            covariance = estimator.pose_covariance(track.belief)
+            failed = violations(track.belief, covariance, found[0], innovation.R, found[1])
+        result.violations += list(failed)
+        honest = honest and not track.doubtful and not failed
         forecast = estimator.track_forecast(track, test.params.times_s)
         word = test.judge(word, track.belief, forecast, honest)
         score(result, t, x, track, verdict.gamma, verdict.reason.value, word.converged)
@@ -231,6 +238,7 @@ def line(case: Case, results: list[Result]) -> str:
         f"{1e3 * np.median(final[:, 0]):.1f} mm {np.median(final[:, 1]):.2f} deg",
         f"{1e3 * final[:, 0].max():.0f} mm {final[:, 1].max():.2f} deg",
         ", ".join(f"{reason} {n}" for reason, n in sorted(reasons.items())),
+        ", ".join(f"{n} {k}" for k, n in sorted(Counter(v for r in results for v in r.violations).items())) or "0",
         f"{1e3 * sum(r.seconds for r in results) / sum(len(r.t) for r in results):.2f}",
         f"{max(r.worst_ms for r in results):.0f}",
         f"{1e3 * np.median([max(r.grasp[-20:]) for r in results]):.0f}",

@@ -8,8 +8,7 @@ import numpy as np
 import tumbling
 
 from avsreplay.estimate import Estimator, Track
-from avsreplay.monitor.consistency import Consistency, ConsistencyParams
-from avsreplay.monitor.convergence import Convergence, ConvergenceTrack
+from avsreplay.monitor.convergence import Consistency, ConsistencyParams, Convergence, ConvergenceTrack
 from avsreplay.records import State
 
 
