@@ -52,6 +52,8 @@ class AlignStatus(Enum):
     NO_POINTS = "no_points"
     AMBIGUOUS = "ambiguous"  # global search: a second pose fits as well
     FAILED = "failed"  # the back end raised an error or its pose is not finite
+    IMPLAUSIBLE = "implausible"  # the scan contradicts the pose (register.plausibility)
+    BUDGET_EXHAUSTED = "budget_exhausted"  # implausible, and the work allowed for one scan was spent
 
 
 class Reason(Enum):
@@ -234,7 +236,12 @@ class Alignment:
     @property
     def measured(self) -> bool:
         """Return whether ``T_ac`` is a measurement and not only the initial guess."""
-        return self.status not in (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED)
+        return self.status in (
+            AlignStatus.ALIGNED,
+            AlignStatus.NOT_CONVERGED,
+            AlignStatus.DEGENERATE,
+            AlignStatus.AMBIGUOUS,
+        )
 
     @property
     def inlier_ratio(self) -> float:

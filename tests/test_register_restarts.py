@@ -43,10 +43,10 @@ def test_no_far_guess_ends_beside_the_truth(scans):
     assert np.max(left, axis=0)[1] < 0.01
 
 
-def test_a_close_guess_is_looked_at_once(scans, monkeypatch):
+def test_a_close_guess_is_registered_once(scans, monkeypatch):
     registrar, calls = Registrar(builtin_surface()), []
     graded = registrar._graded
-    monkeypatch.setattr(registrar, "_graded", lambda scan, guess: calls.append(1) or graded(scan, guess))
+    monkeypatch.setattr(registrar, "_graded", lambda *args: calls.append(1) or graded(*args))
     for scan in scans:
         registrar.register(scan.points, scan.truth)
     assert len(calls) == len(scans)

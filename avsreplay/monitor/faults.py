@@ -98,8 +98,8 @@ class FaultDetector:
             alignment and alignment.status is AlignStatus.NO_POINTS
         ):
             return Reason.NO_SCAN
-        lost = (AlignStatus.NO_OVERLAP, AlignStatus.FAILED, AlignStatus.AMBIGUOUS)
-        if alignment is None or seen is None or alignment.status in lost or not np.isfinite(seen.nis):
+        lost = alignment is None or not alignment.measured or alignment.status is AlignStatus.AMBIGUOUS
+        if lost or seen is None or not np.isfinite(seen.nis):
             return Reason.NOT_ALIGNED
         return None if np.all(np.isfinite(prior.P)) else Reason.NOT_ALIGNED
 

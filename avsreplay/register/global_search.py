@@ -34,6 +34,7 @@ FINE_PASSES = 40  # ICP from a wrong pose can take hundreds
 PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
 CELL_OF_EXTENT = 0.02
 LEAST_COSINE = 0.05
+SHIFT_OF_EXTENT = 0.25
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -93,29 +94,47 @@ class GlobalSearch:
         self._refine = HornBackend(replace(target, limits=brief))
         self._settle = HornBackend(target)
 
-    def search(self, points: NDArray[Any]) -> SearchResult:
-        """Return the best poses for a scan (n, 3) in {A} [m], finite, n >= 1."""
+    def search(self, points: NDArray[Any], first_round: int = 0, last_round: int = 2) -> SearchResult:
+        """Return the best poses for a scan (n, 3) in {A} [m], finite, n >= 1.
+
+        Round 0 assumes that the whole visible side is in the scan. Round 1 shifts the starts, for a target that is
+        partly outside the scan or hidden. Round 2 does not assume the camera position. The first round that explains
+        the scan ends the search.
+        """
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
         p = self._params
         few, some, fine = (thin_to(scan, count) for count in (p.coarse_points, p.middle_points, p.fine_points))
         sight = self._target.visibility.direction_to_camera(scan)
         finals: list[Candidate] = []
         tried = 0
-        for sights, sided in (([sight], sight is not None), ([sight, *_axes(few)], False)):
-            starts = list(self._starts(few.mean(axis=0), sights))
+        for sights, shifts, sided in self._rounds(few, sight)[first_round : last_round + 1]:
+            starts = list(self._starts(few.mean(axis=0), sights, shifts))
             finals += self._refined(fine, self._selected(few, some, starts, sided))
             tried += len(starts)
             if max((final.inlier_ratio for final in finals), default=0.0) >= p.enough_ratio:
                 break
         return self._verdict(fine, finals, tried)
 
-    def _starts(self, centroid_a: Array, sights: Sequence[Array | None]) -> Iterator[Pose]:
-        """Every attitude with every camera direction: centroid of the scan on the centroid of the visible surface."""
+    def _rounds(self, few: Array, sight: Array | None) -> list[tuple[Sequence[Array | None], Array, bool]]:
+        """Camera directions, shifts of the scan (k, 3) in {A} [m], and whether the directions can be relied on."""
+        none = np.zeros((1, 3))
+        axes = np.linalg.svd((few - few.mean(axis=0)) if sight is None else sight[None])[2]
+        across = SHIFT_OF_EXTENT * self._extent * (axes[:2] if sight is None else axes[1:])
+        known = sight is not None
+        return [
+            ([sight], none, known),
+            ([sight], np.vstack([across, -across]), known),
+            ([sight, *_axes(few)], none, False),
+        ]
+
+    def _starts(self, centroid_a: Array, sights: Sequence[Array | None], shifts: Array) -> Iterator[Pose]:
+        """Every attitude with every camera direction and shift: centroid of the scan on that of the visible surface."""
         quaternions = attitudes(self._params.starts)
         for q, R_ca in zip(quaternions, geometry.matrix(quaternions), strict=True):
             for sight in sights:
                 middle = self._middle if sight is None else self._centroids.of(R_ca @ sight)
-                yield Pose(q, middle - R_ca @ centroid_a)
+                for shift in shifts:
+                    yield Pose(q, middle - R_ca @ (centroid_a + shift))
 
     def _selected(self, few: Array, some: Array, starts: list[Pose], sided: bool) -> list[Pose]:
         """The best starts after passes with few points, then the best of these, all different, with more points."""

@@ -44,6 +44,13 @@ class HornBackend:
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
+        return self._run(points, guess, self._rule)
+
+    def align_within(self, points: NDArray[Any], guess: Pose, gate_m: float) -> Fit:
+        """Return T_ca with correspondences nearer than ``gate_m`` [m] from the first pass to the last."""
+        return self._run(points, guess, replace(self._rule, gate_m=gate_m, floor_m=gate_m, tighten=0.0))
+
+    def _run(self, points: NDArray[Any], guess: Pose, rule: IcpParams) -> Fit:
         facing = self._visibility.camera_c(self._index, points, guess) is not None
-        found = self._index.icp(points, guess, replace(self._rule, facing=facing))
+        found = self._index.icp(points, guess, replace(rule, facing=facing))
         return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged)

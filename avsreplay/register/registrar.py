@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
+from itertools import chain, islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register import quality
 from avsreplay.register.backend import Target, build, load
 from avsreplay.register.global_search import GlobalSearch, SearchResult
+from avsreplay.register.horn import HornBackend
 from avsreplay.register.params import RegisterParams
-from avsreplay.register.restarts import restart_if_doubtful
+from avsreplay.register.plausibility import PlausibilityTest
+from avsreplay.register.restarts import Budget, Restarter
 from avsreplay.register.sampling import thin
+from avsreplay.register.segments import segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
+
+LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in units of the gate) a fit is close
+FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
+SEARCH_WORK = 2_000_000  # point searches of the first round of the global search, about
+MOST_SEGMENTS = 3
 
 
 class Registrar:
@@ -46,7 +57,8 @@ class Registrar:
         self._visibility = Visibility(surface, self.params.camera)
         self._target = Target(surface, self._index, self.limits, self._visibility)
         self._backend = build(self.params.backend, factory, self._target)
-        self._search: GlobalSearch | None = None
+        self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
+        self._restarter = Restarter(self._target, self._test)
 
     def register(self, points: NDArray[Any], guess: Pose) -> Alignment:
         """Register a scan from a guess (eq:ICP).
@@ -63,7 +75,8 @@ class Registrar:
         if len(scan) == 0:
             return quality.not_measured(len(points), AlignStatus.NO_POINTS, guess)
         first = self._graded(scan, guess)
-        return restart_if_doubtful(first, guess, scan, self.limits.gate_m, lambda other: self._graded(scan, other))
+        found = first if self._healthy(first) else self._recovered(scan, guess, first)
+        return self._searched(scan, found) if self._far(guess, found) else found
 
     def acquire(self, points: NDArray[Any]) -> Alignment:
         """Find the pose without a guess: the best of a search over all attitudes, then registered as any other.
@@ -79,10 +92,28 @@ class Registrar:
         scan = self._scan(points)
         if len(scan) == 0:
             return quality.not_measured(len(points), AlignStatus.NO_POINTS)
-        search = self.search(scan)
-        found = self.register(scan, search.best.T_ca.inverse())
-        if not search.found:
+        target = without_scattered_points(np.asarray(scan, dtype=np.float64))
+        attempts = chain(
+            [(target, 0, 0)],
+            ((part, 0, 0) for part in islice(segments(target, self._target.surface.extent), MOST_SEGMENTS)),
+            [(target, 1, 2)],
+        )
+        results: list[Alignment] = []
+        for part, first, last in attempts:
+            results.append(self._acquired(scan, part, self._global.search(part, first, last)))
+            if results[-1].measured:
+                return results[-1]
+        return results[0]
+
+    def _acquired(self, scan: NDArray[Any], part: Array, search: SearchResult) -> Alignment:
+        """Register the result of a search of part of the scan on the whole scan, and test it."""
+        T_ca, few = search.best.T_ca, self._restarter.part(part)
+        width = max(self.limits.gate_m, 3.0 * self._restarter.measure(few, T_ca).noise_m)
+        found = self._graded(scan, T_ca.inverse(), width)
+        if not search.found or not found.measured:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None)
+        if self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan)).reason:
+            return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None)
         if search.ambiguous and search.second is not None:
             words = quality.turn_words(search.best.T_ca @ search.second.T_ca.inverse())
             return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
@@ -105,25 +136,71 @@ class Registrar:
 
     def search(self, points: NDArray[Any]) -> SearchResult:
         """Return the best and second best pose of a scan (n, 3) in {A} [m], finite, n >= 1."""
-        if self._search is None:
-            self._search = GlobalSearch(self._target, self.params.acquire)
-        return self._search.search(points)
+        return self._global.search(points)
+
+    @cached_property
+    def _global(self) -> GlobalSearch:
+        return GlobalSearch(self._target, self.params.acquire)
 
     def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
         finite = np.isfinite(points).all(axis=1)
         scan = points if finite.all() else points[finite]
         return thin(scan, self.params.subsample_m) if self.params.subsample_m > 0.0 else scan
 
-    def _graded(self, scan: NDArray[Any], guess: Pose) -> Alignment:
-        fit = self._align(scan, guess.inverse())
+    def _healthy(self, found: Alignment) -> bool:
+        """A close fit of nearly all points needs no further test."""
+        return found.inlier_ratio >= LEAST_RATIO and found.rms_m <= POOR_OF_GATE * self.limits.gate_m
+
+    def _far(self, guess: Pose, found: Alignment) -> bool:
+        """A measured pose so far from the guess that another local minimum may be better."""
+        angle = float(geometry.angle((guess.inverse() @ found.T_ac).q))
+        return found.measured and found.status is not AlignStatus.DEGENERATE and angle > FAR_RAD
+
+    def _searched(self, scan: NDArray[Any], found: Alignment) -> Alignment:
+        """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
+        if Budget(len(scan), found.iterations * len(scan)).allows(SEARCH_WORK):
+            return self.acquire(scan)
+        return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None)
+
+    def _doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment) -> bool:
+        """A failure, or a poor fit away from the guess: possibly a local minimum next to the true pose."""
+        if found.status is AlignStatus.FAILED or not found.inliers:
+            return True
+        moved = found.T_ac.inverse().apply(points) - guess.inverse().apply(points)
+        far = float(np.linalg.norm(moved, axis=1).mean()) > self.limits.gate_m
+        return far and found.rms_m > POOR_OF_GATE * self.limits.gate_m
+
+    def _recovered(self, scan: NDArray[Any], guess: Pose, first: Alignment) -> Alignment:
+        """Test a pose with a poor fit; restart if it is implausible, and report what remains implausible."""
+        few = self._restarter.part(scan)
+        budget = Budget(len(scan), spent=first.iterations * len(scan))
+        kept = self._restarter.measure(few, first.T_ac.inverse())
+        suspect = self._doubtful(few, guess, first) or bool(self._test.check(few, kept.T_ca).reason)
+        if suspect:
+            kept = self._restarter.best(few, guess.inverse(), first.T_ac.inverse(), budget)
+        width = max(self.limits.gate_m, 3.0 * kept.noise_m)
+        unchanged = kept.T_ca.t.tobytes() == first.T_ac.inverse().t.tobytes() and width == self.limits.gate_m
+        final = first if unchanged else self._graded(scan, kept.T_ca.inverse(), width)
+        if not final.measured or not self._test.check(few, final.T_ac.inverse()).reason:
+            return final
+        status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
+        return replace(final, status=status, covariance=None, free_directions="")
+
+    def _graded(self, scan: NDArray[Any], guess: Pose, width_m: float | None = None) -> Alignment:
+        """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
+        fit = self._align(scan, guess.inverse(), width_m)
         if fit is None:
             return quality.not_measured(len(scan), AlignStatus.FAILED, guess)
-        return quality.grade(self._index, self._visibility, scan, fit, self.limits, self.params)
+        limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
+        return quality.grade(self._index, self._visibility, scan, fit, limits, self.params)
 
-    def _align(self, scan: NDArray[Any], guess: Pose) -> Fit | None:
+    def _align(self, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | None:
         """Run the back end; whatever it raises becomes the status FAILED."""
         try:
-            fit = self._backend.align(scan, guess)
+            if width_m is not None and isinstance(self._backend, HornBackend):
+                fit = self._backend.align_within(scan, guess, width_m)
+            else:
+                fit = self._backend.align(scan, guess)
             finite = bool(np.isfinite(fit.T_ca.matrix).all())
         except Exception:  # an error of a library is a status of this scan, not the end of a replay
             return None

@@ -1,12 +1,15 @@
-"""Restarts of a registration that may have ended in a local minimum: far from its guess, with a poor fit.
+"""Restarts of a registration whose fit is poor or whose pose is implausible, within a budget of point searches.
 
-On the built-in target started 4 deg and 12 cm off, 3 of 100 registrations end 2 deg beside the true pose with three
-times the residuals of the others; after restarts from six rotations about the guess and six about the result, none.
+A restart is a graduated registration of part of the scan: point-to-plane passes while the rejection distance falls
+geometrically from ``START_OF_EXTENT`` (or the reach) to ``STOP_OF_EXTENT`` of the extent. The falling distance rejects
+outliers, which the rms rule of the normal loop cannot do if they are the majority. Starts: the guess and the first
+result, then rotations about them. The best pose is found by truncated squared distances at a common width.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,58 +17,137 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, AlignStatus
+from avsreplay.register.backend import Target
+from avsreplay.register.plausibility import PlausibilityTest, robust_noise
+from avsreplay.register.surface_index import IcpParams
 
+POINTS = 1500  # of the scan, used by restarts
+START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
+FALL, PASSES = 0.6, 4  # of the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
-POOR_OF_GATE = 0.3  # an rms above this share of the gate is a poor fit
-BETTER_THAN = 0.9  # a restart replaces the first pose only if its cost is below this share of the first cost
+BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
+HEALTHY_PASSES = 12  # passes of an ordinary registration, over all points of the scan
+HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
 
-def restart_if_doubtful(
-    first: Alignment,
-    guess: Pose,
-    points: NDArray[Any],
-    gate_m: float,
-    register: Callable[[Pose], Alignment],
-) -> Alignment:
-    """Return the better of ``first`` and the restarts; ``first`` unchanged if its fit is good.
+class Budget:
+    """Point searches left for one scan: counted work, so that results do not depend on the machine.
 
     Args:
-        first: the alignment from ``guess`` (T_ac).
-        guess: initial pose of ``first``.
-        points: (n, 3) in {A} [m].
-        gate_m: distance beyond which a point is not an inlier.
-        register: aligns the scan from another guess T_ac.
-
-    Returns:
-        The alignment with the least truncated squared distance to the model.
+        points: points of the scan.
+        spent: point searches made so far.
     """
-    if not _doubtful(first, guess, points, gate_m):
-        return first
-    found = [register(start) for start in _starts(guess, first.T_ac, points.mean(axis=0))]
-    best = min(found, key=lambda other: _cost(other, gate_m))
-    return best if _cost(best, gate_m) < BETTER_THAN * _cost(first, gate_m) else first
+
+    def __init__(self, points: int, spent: int = 0) -> None:
+        self._left = HEALTHY_SCANS * HEALTHY_PASSES * points - spent
+        self.exhausted = False
+
+    def spend(self, searches: int) -> None:
+        """Subtract work that was done."""
+        self._left -= searches
+
+    def allows(self, searches: int) -> bool:
+        """Return whether this much work is left; if not, the budget is exhausted."""
+        self.exhausted = self.exhausted or searches > self._left
+        return not self.exhausted
 
 
-def _doubtful(first: Alignment, guess: Pose, points: NDArray[Any], gate_m: float) -> bool:
-    if first.status in (AlignStatus.FAILED, AlignStatus.NO_POINTS) or not first.inliers:
-        return False
-    if first.rms_m <= POOR_OF_GATE * gate_m:
-        return False
-    moved = first.T_ac.inverse().apply(points) - guess.inverse().apply(points)
-    return float(np.linalg.norm(moved, axis=1).mean()) > gate_m
+@dataclass(frozen=True, slots=True, eq=False)
+class Restart:
+    """A pose T_ca, the distances (k,) [m] of the points used, and their robust noise [m]."""
+
+    T_ca: Pose
+    distance: Array
+    noise_m: float
+
+    def cost(self, width_m: float) -> float:
+        """Return the mean of min(1, squared distance in units of the width)."""
+        return float(np.mean(np.minimum(self.distance / width_m, 1.0) ** 2))
 
 
-def _cost(found: Alignment, gate_m: float) -> float:
-    """Mean of min(1, squared distance in units of the gate) over the scan."""
-    return 1.0 - found.inlier_ratio * (1.0 - (found.rms_m / gate_m) ** 2) if found.inliers else 1.0
+class Restarter:
+    """Restarts for one target."""
 
+    def __init__(self, target: Target, test: PlausibilityTest) -> None:
+        self._target, self._test = target, test
+        self._extent = target.surface.extent
 
-def _starts(guess: Pose, result: Pose, centre_a: Array) -> Iterator[Pose]:
-    """Rotations by +-TURN_RAD about each axis of {C} through the centroid of the scan."""
-    for base in (guess, result):
-        centre = base.inverse().apply(centre_a)
-        for axis in np.eye(3):
-            for sign in (1.0, -1.0):
-                turn = geometry.exp(sign * TURN_RAD * axis)
-                yield base @ Pose(turn, centre - geometry.matrix(turn) @ centre)
+    def part(self, points: NDArray[Any]) -> NDArray[Any]:
+        """Return about ``POINTS`` points of the scan (n, 3), evenly over its order."""
+        return points[np.linspace(0, len(points) - 1, POINTS).astype(np.intp)] if len(points) > POINTS else points
+
+    def measure(self, points: NDArray[Any], T_ca: Pose) -> Restart:
+        """Return the distances of ``points`` (n, 3) in {A} at a pose."""
+        camera_c = self._target.visibility.camera_c(self._target.index, points, T_ca)
+        distance = self._test.distances(self._target.index.closest(T_ca.apply(points), camera_c=camera_c))
+        return Restart(T_ca, distance, robust_noise(distance))
+
+    def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
+        """Return the pose after passes with a falling rejection distance, from ``start_m`` [m] on."""
+        index, gate = self._target.index, start_m
+        while gate > STOP_OF_EXTENT * self._extent:
+            facing = self._target.visibility.camera_c(index, points, T_ca) is not None
+            rule = IcpParams(
+                n_max=PASSES,
+                n_plane=PASSES,
+                gate_m=gate,
+                tighten=0.0,
+                eps_rad=1e-4,
+                eps_m=1e-4 * self._extent,
+                facing=facing,
+            )
+            found = index.icp(points, T_ca, rule)
+            T_ca = Pose.from_matrix(found.T_ca)
+            budget.spend(found.iterations * len(points))
+            gate *= FALL
+        return self.measure(points, T_ca)
+
+    def best(self, points: NDArray[Any], guess: Pose, result: Pose, budget: Budget) -> Restart:
+        """Return the best of the first result and the restarts, all T_ca; ends at the first plausible pose.
+
+        Args:
+            points: the part of the scan in {A} [m].
+            guess: initial pose of the first registration.
+            result: its result.
+            budget: work that is left.
+        """
+        found = [self.measure(points, result)]
+        for T_ca, start in self._starts(guess, result, points.mean(axis=0)):
+            if not budget.allows(self.work(start) * len(points)):
+                break
+            found.append(self.graduated(points, T_ca, start, budget))
+            if self._convincing(points, found):
+                break
+        return self._least(found)
+
+    def work(self, start_m: float) -> int:
+        """Return the passes of one graduated registration, at most."""
+        return PASSES * int(np.ceil(np.log(start_m / (STOP_OF_EXTENT * self._extent)) / -np.log(FALL)))
+
+    def _convincing(self, points: NDArray[Any], found: list[Restart]) -> bool:
+        """Two starts led to the best pose and it is plausible."""
+        best = self._least(found)
+        same = sum(self._same(best.T_ca, other.T_ca) for other in found)
+        return same >= 2 and not self._test.check(points, best.T_ca).reason
+
+    def _least(self, found: list[Restart]) -> Restart:
+        width = max(self._target.limits.gate_m, 3.0 * min(each.noise_m for each in found))
+        least = min(found, key=lambda each: each.cost(width))
+        return least if least.cost(width) < BETTER_THAN * found[0].cost(width) else found[0]
+
+    def _same(self, T_a: Pose, T_b: Pose) -> bool:
+        step = T_a @ T_b.inverse()  # in {C}
+        middle = 0.5 * (self._target.surface.vertices.min(axis=0) + self._target.surface.vertices.max(axis=0))
+        shift = float(np.linalg.norm(step.apply(middle) - middle))
+        return float(geometry.angle(step.q)) < np.radians(1.0) and shift < 0.01 * self._extent
+
+    def _starts(self, guess: Pose, result: Pose, centre_a: Array) -> Iterator[tuple[Pose, float]]:
+        """Guess and result with a narrow and a wide start, then both rotated by TURN_RAD about each axis of {C}."""
+        narrow, wide = START_OF_EXTENT * self._extent, self._target.limits.reach_m
+        yield from ((guess, narrow), (result, narrow), (guess, max(wide, narrow)))
+        for base in (guess, result):
+            centre = base.apply(centre_a)
+            for axis in np.eye(3):
+                for sign in (1.0, -1.0):
+                    turn = geometry.exp(sign * TURN_RAD * axis)
+                    yield Pose(turn, centre - geometry.matrix(turn) @ centre) @ base, narrow

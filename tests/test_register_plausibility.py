@@ -1,0 +1,127 @@
+"""Wrong poses are rejected, correct ones are not: noise, contrast, free space, and the work that a scan may cost."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose, exp
+from avsreplay.records import AlignStatus, Surface
+from avsreplay.register import Registrar
+from avsreplay.register.contract import boxes, example_pose, view
+from avsreplay.register.plausibility import PlausibilityTest, robust_noise
+from avsreplay.register.restarts import HEALTHY_PASSES, HEALTHY_SCANS, Budget
+from avsreplay.register.segments import segments, without_scattered_points
+from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.visibility import Visibility
+
+SEED = 7
+
+
+@pytest.fixture(scope="module")
+def surface() -> Surface:
+    return boxes()
+
+
+@pytest.fixture(scope="module")
+def registrar(surface: Surface) -> Registrar:
+    return Registrar(surface)
+
+
+def hidden_view(surface: Surface, T_ac: Pose, count: int, rng: np.random.Generator, sigma: float = 0.01) -> Array:
+    """Points of the visible surface only: of all facing points in a direction, the nearest."""
+    points = T_ac.apply(view(surface, 12 * count, T_ac.inverse().t))
+    cell = np.floor(points[:, :2] / points[:, 2:] / 0.012).astype(int)
+    order = np.lexsort((points[:, 2], cell[:, 1], cell[:, 0]))
+    _, first = np.unique(cell[order], axis=0, return_index=True)
+    seen = points[order[first]]
+    return seen * (1.0 + sigma * rng.standard_normal((len(seen), 1)) / np.linalg.norm(seen, axis=1, keepdims=True))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.6])
+def test_the_noise_is_found_among_outliers(share: float) -> None:
+    rng = np.random.default_rng(SEED)
+    distance = np.abs(rng.normal(0.0, 0.02, 20000))
+    distance[: int(share * 20000)] = rng.uniform(0.0, 2.0, int(share * 20000))
+    assert 0.018 < robust_noise(distance) < 0.026
+    assert robust_noise(7.0 * distance) == pytest.approx(7.0 * robust_noise(distance))
+
+
+def test_the_true_pose_is_plausible_and_others_are_not(surface: Surface) -> None:
+    index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
+    test, T_ac, rng = PlausibilityTest(surface, index, visibility, 0.065), example_pose(), np.random.default_rng(SEED)
+    scan = hidden_view(surface, T_ac, 3000, rng)
+    assert test.check(scan, T_ac.inverse()).reason == ""
+    for _ in range(10):
+        axis = rng.standard_normal(3)
+        wrong = T_ac @ Pose(exp(0.7 * axis / np.linalg.norm(axis)), np.zeros(3))
+        assert test.check(scan, wrong.inverse()).reason != ""
+
+
+def test_a_model_in_front_of_the_measured_surface_is_in_free_space(surface: Surface) -> None:
+    """The camera looks through the model at a wall: the distances of the part on the model alone do not show it."""
+    index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
+    test, T_ac, rng = PlausibilityTest(surface, index, visibility, 0.065), example_pose(), np.random.default_rng(SEED)
+    scan = hidden_view(surface, T_ac, 3000, rng)
+    part = scan[scan[:, 0] < np.quantile(scan[:, 0], 0.4)]
+    others = scan[scan[:, 0] >= np.quantile(scan[:, 0], 0.4)]
+    assert test.check(part, T_ac.inverse(), scan).violated < 0.1
+    behind = np.vstack([part, others * 1.6])
+    assert test.check(part, T_ac.inverse(), behind).violated > 0.3
+    assert "free space" in test.check(part, T_ac.inverse(), behind).reason
+
+
+@pytest.mark.parametrize("guess_deg", [0.1, 3.0])
+def test_most_points_outliers(registrar: Registrar, surface: Surface, guess_deg: float) -> None:
+    rng, T_ac = np.random.default_rng(SEED), example_pose()
+    scan = hidden_view(surface, T_ac, 3000, rng)
+    wrong = rng.random(len(scan)) < 0.6
+    scan[wrong] = rng.uniform(scan.min(0) - 0.5, scan.max(0) + 0.5, (wrong.sum(), 3))
+    found = registrar.register(scan, T_ac @ Pose(exp(np.radians(guess_deg) * np.array([0.6, 0.0, 0.8])), np.zeros(3)))
+    step = T_ac.inverse() @ found.T_ac
+    assert found.status is AlignStatus.ALIGNED
+    assert np.degrees(geometry.angle(step.q)) < 0.5
+
+
+@pytest.mark.parametrize("guess_deg", [20.0, 60.0, 120.0, 180.0])
+def test_what_is_called_aligned_is_right(registrar: Registrar, surface: Surface, guess_deg: float) -> None:
+    rng, T_ac = np.random.default_rng(SEED), example_pose()
+    scan = hidden_view(surface, T_ac, 3000, rng)
+    for axis in np.vstack([np.eye(3), rng.standard_normal((3, 3))]):
+        turn = exp(np.radians(guess_deg) * axis / np.linalg.norm(axis))
+        found = registrar.register(scan, T_ac @ Pose(turn, np.zeros(3)))
+        right = np.degrees(geometry.angle((T_ac.inverse() @ found.T_ac).q)) < 0.5
+        assert right or found.status is not AlignStatus.ALIGNED
+
+
+def test_the_budget_counts_work() -> None:
+    budget = Budget(1000, spent=HEALTHY_PASSES * 1000)
+    left = (HEALTHY_SCANS - 1) * HEALTHY_PASSES * 1000
+    budget.spend(left - 500)
+    assert budget.allows(500)
+    assert not budget.exhausted
+    assert not budget.allows(501)
+    assert budget.exhausted
+
+
+def test_scattered_points_are_left_out_and_a_clean_scan_is_not_changed() -> None:
+    rng = np.random.default_rng(SEED)
+    plane = np.column_stack([rng.uniform(-1, 1, (1000, 2)), np.zeros(1000)])
+    scattered = rng.uniform(-1.5, 1.5, (1500, 3))
+    kept = without_scattered_points(np.vstack([plane, scattered]))
+    near = np.abs(kept[:, 2]) < 0.1
+    assert near.mean() > 0.9
+    assert near.sum() > 800
+    assert len(without_scattered_points(plane)) == len(plane)
+
+
+def test_a_body_is_separated_from_the_wall_behind_it(surface: Surface) -> None:
+    rng, T_ac = np.random.default_rng(SEED), example_pose()
+    body = hidden_view(surface, T_ac, 3000, rng)
+    u = rng.uniform(-8.0, 8.0, (4000, 2))
+    wall = np.column_stack([u, np.full(4000, float(body[:, 2].max()) + 0.3)])
+    parts = list(segments(np.vstack([body, wall]), surface.extent))
+    assert len(parts[0]) == pytest.approx(len(body), rel=0.15)
+    assert parts[0][:, 2].max() <= body[:, 2].max() + 1e-9
+    assert list(segments(body, surface.extent)) == []
