@@ -76,18 +76,23 @@ def test_a_wall_is_seen_at_its_distance():
     wall = Surface(np.array([[-9.0, -9, 0], [9, -9, 0], [0, 18, 0]]), np.array([[0, 1, 2]], np.int32), "wall", "")
     for engine in (Engine.EXACT, Engine.AUTO):
         towards = geometry.normalise(np.array([[0.0, 0, 0, 1]]))[:, [0, 1, 3]]
-        ranges, cosine = RayCaster(wall, engine).ranges(np.array([[0.1, 0.2, -3.0]]), towards)
+        ranges, cosine, faces = RayCaster(wall, engine).ranges(np.array([[0.1, 0.2, -3.0]]), towards)
         assert_allclose(ranges, 3.0, atol=1e-12)
         assert_allclose(cosine, 1.0)
-        missed, _ = RayCaster(wall, engine).ranges(np.array([[0.1, 0.2, -3.0]]), -towards)
+        assert (faces >= 0).all()
+        missed, _, none = RayCaster(wall, engine).ranges(np.array([[0.1, 0.2, -3.0]]), -towards)
         assert np.isinf(missed).all()
+        assert (none == -1).all()
 
 
 def test_a_triangle_without_area_is_never_hit():
     vertices = np.array([[-1.0, -1, 0], [1, -1, 0], [0, 2, 0], [0, 0, -1], [0, 0, -1]])
     faces = np.array([[3, 4, 3], [0, 1, 2]], np.int32)
-    ranges, _ = RayCaster(Surface(vertices, faces, "x", "")).ranges(np.array([[0.0, 0, -3]]), np.array([[0.0, 0, 1]]))
+    ranges, _, face = RayCaster(Surface(vertices, faces, "x", "")).ranges(
+        np.array([[0.0, 0, -3]]), np.array([[0.0, 0, 1]])
+    )
     assert_allclose(ranges, 3.0)
+    assert face.tolist() == [1]  # the index in the mesh, the degenerate triangle counted
 
 
 @needs_embree
@@ -149,15 +154,17 @@ def test_a_raster_of_a_still_target_is_a_flash_of_the_same_rays():
     still = MotionParams(attitude_xyzw=SPIN.attitude_xyzw, rate_radps=(0, 0, 0))
     raster = scanner(replace(CLEAN, pattern=Pattern.RASTER, scan_s=1.0), still)
     flash = scanner(CLEAN, still)
-    flash._directions = raster._directions
+    flash._rays = raster._rays
     assert_allclose(raster.cast(0.0).ranges, flash.cast(0.0).ranges, atol=1e-9)
 
 
 @pytest.mark.parametrize("view", list(FieldOfView))
 @pytest.mark.parametrize("pattern", list(Pattern))
 def test_the_field_of_view_bounds_every_ray(view, pattern):
-    params = replace(CLEAN, fov_deg=(20.0, 10.0), view=view, pattern=pattern, scan_s=float(pattern is Pattern.RASTER))
-    d = scanner(params)._directions
+    params = replace(
+        CLEAN, fov_deg=(20.0, 10.0), view=view, pattern=pattern, scan_s=float(pattern is not Pattern.FLASH)
+    )
+    d = scanner(params)._rays[0]
     across, down = np.degrees(np.arctan2(d[:, 0], d[:, 2])), np.degrees(np.arctan2(d[:, 1], d[:, 2]))
     assert np.abs(across).max() < 10
     assert np.abs(down).max() < 5

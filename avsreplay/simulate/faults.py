@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -144,7 +144,7 @@ def occlude(returns: Returns, covered: float, side_rad: float, rng: np.random.Ge
         returns.directions[:, 2] + PLATE_TILT * returns.directions[:, 0]
     )  # plane z + tan(tilt) x = depth
     back = hidden & (draw < PLATE_RETURN_RATIO) & (on_plate > 0.0)
-    return Returns(returns.directions, np.where(hidden, on_plate, returns.ranges), returns.times_s).keep(~hidden | back)
+    return replace(returns, ranges=np.where(hidden, on_plate, returns.ranges)).keep(~hidden | back)
 
 
 def clutter(returns: Returns, ratio: float, centre_a: ArrayLike, radius_m: float, rng: np.random.Generator) -> Returns:
@@ -164,5 +164,6 @@ def clutter(returns: Returns, ratio: float, centre_a: ArrayLike, radius_m: float
     times = rng.choice(returns.times_s, n) if n else np.empty(0)
     ranges = np.sqrt(np.sum(points * points, axis=1))
     ahead = points[:, 2] > 0.0
-    added = Returns(points[ahead] / ranges[ahead, None], ranges[ahead], times[ahead])
+    one, zero = np.ones(int(ahead.sum())), np.zeros(int(ahead.sum()))
+    added = Returns(points[ahead] / ranges[ahead, None], ranges[ahead], times[ahead], one, zero, zero)
     return returns.joined(added)

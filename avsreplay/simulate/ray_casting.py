@@ -44,30 +44,35 @@ class RayCaster:
         corners = surface.vertices[surface.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         keep = np.linalg.norm(normals, axis=1) > 0.0  # a zero-area triangle cannot be hit
+        self._index = np.flatnonzero(keep)
         self._corners = np.ascontiguousarray(corners[keep])
         self._normals = normals[keep] / np.linalg.norm(normals[keep], axis=1, keepdims=True)
         self.engine = _resolve(engine)
         build = _embree if self.engine is Engine.EMBREE else _exact
         self._search = build(self._corners)
 
-    def ranges(self, origins: Array, directions: Array) -> tuple[Array, Array]:
-        """Range (n,) [m] to the first intersection (inf: none) and cosine (n,) of the angle of incidence there.
+    def ranges(self, origins: Array, directions: Array) -> tuple[Array, Array, Hits]:
+        """First intersections of rays.
 
         Args:
             origins: (n, 3), or (1, 3) where all rays have one origin [m].
             directions: (n, 3) unit vectors.
+
+        Returns:
+            Range (n,) [m] (inf: none), cosine (n,) of the angle of incidence, and face (n,) of the mesh (-1: none).
         """
         face = self._search(origins, directions)
         origins = np.broadcast_to(origins, directions.shape)
         hit = np.flatnonzero(face >= 0)
         normal = self._normals[face[hit]]
         cosine = _dot(normal, directions[hit])
-        ranges, cosines = np.full(len(face), np.inf), np.zeros(len(face))
+        ranges, cosines, faces = np.full(len(face), np.inf), np.zeros(len(face)), np.full(len(face), -1)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = _dot(normal, self._corners[face[hit], 0] - origins[hit]) / cosine
         good = np.isfinite(depth) & (depth > 0.0)
         ranges[hit[good]], cosines[hit[good]] = depth[good], np.abs(cosine[good])
-        return ranges, cosines
+        faces[hit[good]] = self._index[face[hit[good]]]
+        return ranges, cosines, faces
 
 
 def _resolve(engine: Engine) -> Engine:

@@ -1,14 +1,16 @@
-"""The scanner: a fixed grid of rays from the camera, cast on the moving target, with noise.
+"""The scanner: beams from the camera, cast on the moving target, with noise.
 
-A flash scanner measures all rays at once. A raster scanner measures them point by point and row by row while the target
-moves: each ray is cast on the target at its pose at the time of that ray.
+A flash scanner measures all beams at once. Any other scanner measures them one after the other, or column by column,
+while the target moves: each beam is cast on the target at its pose at the time of that beam.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,19 @@ from avsreplay.geometry import Array, frozen, rotate
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.motion import Motion
+from avsreplay.simulate.optics import Material, beam, face_optics, merged
 from avsreplay.simulate.ray_casting import Engine, RayCaster
+
+
+class Preset(Enum):
+    """Classes of instruments; their figures and sources are in presets.toml."""
+
+    NONE = "none"
+    FLASH_TOF = "flash_tof"
+    FLASH_TOF_SMALL = "flash_tof_small"
+    RASTER_TRIANGULATION = "raster_triangulation"
+    LISSAJOUS_LIDAR = "lissajous_lidar"
+    SPINNING_LIDAR = "spinning_lidar"
 
 
 class Pattern(Enum):
@@ -25,6 +39,8 @@ class Pattern(Enum):
 
     FLASH = "flash"  # all rays at the stamp
     RASTER = "raster"  # row after row over ``scan_s``, each point with its own time
+    LISSAJOUS = "lissajous"  # two sinusoidal mirrors over ``scan_s``
+    SPINNING = "spinning"  # a column of beams that rotates about the vertical axis over ``scan_s``
 
 
 class FieldOfView(Enum):
@@ -38,7 +54,14 @@ class FieldOfView(Enum):
 class ScannerParams(Settings):
     """The table [scanner]: rays, field of view and noise. The camera looks along +z of {A}, x to the right."""
 
-    pattern: Pattern = setting(Pattern.FLASH, "All rays at the stamp (flash), or row by row over scan_s (raster).")
+    preset: Preset = setting(
+        Preset.NONE, "Class of instrument, which sets the defaults of this table (docs/scenario.md, Scanner)."
+    )
+    pattern: Pattern = setting(
+        Pattern.FLASH,
+        "All rays at the stamp (flash), row by row (raster), along a Lissajous figure (lissajous), or column by column"
+        " with all rays of a column at once (spinning); the last three over scan_s.",
+    )
     fov_deg: tuple[float, float] = setting(
         (44.0, 44.0), "Full angles of the field of view, horizontal and vertical.", unit="deg", above=0.0, below=170.0
     )
@@ -46,8 +69,40 @@ class ScannerParams(Settings):
         FieldOfView.RECTANGLE, "Outline of the field of view: the rectangle, or the cone inscribed in it."
     )
     rays: tuple[int, int] = setting((128, 128), "Rays horizontally and vertically.", low=1, high=4096)
-    scan_s: float = setting(0.0, "Duration of a raster scan, which begins at its stamp.", unit="s", low=0.0)
-    noise_m: float = setting(0.008, "1 sigma of the range, along the ray.", unit="m", low=0.0)
+    lissajous: tuple[int, int] = setting(
+        (73, 101), "Periods of the two mirrors in a Lissajous scan, horizontal and vertical.", low=1, high=4096
+    )
+    scan_s: float = setting(0.0, "Duration of a scan that is not a flash; it begins at its stamp.", unit="s", low=0.0)
+    divergence_mrad: float = setting(
+        0.0,
+        "Full angle of the beam; on an edge the returns of one beam merge into a mixed pixel.",
+        unit="mrad",
+        low=0.0,
+        below=100.0,
+    )
+    merge_m: float = setting(
+        math.inf,
+        "Returns of one beam that differ by less in range merge, weighted by intensity; else the strongest counts.",
+        unit="m",
+        low=0.0,
+        infinite=True,
+    )
+    noise_m: float = setting(
+        0.008, "1 sigma of the range, along the ray, at the reference range and normal incidence.", unit="m", low=0.0
+    )
+    noise_growth: float = setting(
+        0.0, "The 1 sigma of the range is proportional to the range to this power.", low=0.0, high=4.0
+    )
+    noise_incidence: float = setting(
+        0.0, "The 1 sigma of the range is proportional to 1 / cos(incidence) to this power.", low=0.0, high=4.0
+    )
+    reference_m: float = setting(1.0, "Reference range of noise and intensity.", unit="m", above=0.0)
+    quantisation_m: float = setting(0.0, "Ranges are rounded to multiples of this; 0: not rounded.", unit="m", low=0.0)
+    intensity_min: float = setting(
+        0.0,
+        "Smallest intensity of a return, over that of a white diffuse surface at normal incidence and reference range.",
+        low=0.0,
+    )
     outlier_ratio: float = setting(
         0.02, "Share of the returns with a range anywhere between range_min_m and range_max_m.", low=0.0, high=1.0
     )
@@ -67,8 +122,8 @@ class ScannerParams(Settings):
         """Raise ValueError where the ranges, or pattern and duration, do not go together."""
         if self.range_min_m >= self.range_max_m:
             raise ValueError(f"range_min_m = {self.range_min_m} must be below range_max_m = {self.range_max_m}")
-        if (self.pattern is Pattern.RASTER) != (self.scan_s > 0.0):
-            raise ValueError(f"scan_s = {self.scan_s}: positive for a raster scan, 0 for a flash")
+        if (self.pattern is not Pattern.FLASH) != (self.scan_s > 0.0):
+            raise ValueError(f"scan_s = {self.scan_s}: 0 for a flash, positive for any other pattern")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,28 +134,30 @@ class Returns:
         directions: (n, 3) unit vectors in {A}.
         ranges: (n,) [m].
         times_s: (n,) after the stamp [s].
+        cosines: (n,) cosine of the angle of incidence.
+        intensities: (n,) intensity, 1 for a white diffuse surface at normal incidence and reference range.
+        dropouts: (n,) probability that the return is lost.
     """
 
     directions: Array
     ranges: Array
     times_s: Array
+    cosines: Array
+    intensities: Array
+    dropouts: Array
 
-    def keep(self, mask: NDArray[np.bool_]) -> Returns:
-        """The returns selected by a mask (n,)."""
-        return Returns(self.directions[mask], self.ranges[mask], self.times_s[mask])
+    def keep(self, chosen: NDArray[Any]) -> Returns:
+        """The returns selected by a mask (n,) or by indices."""
+        return Returns(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
     def joined(self, other: Returns) -> Returns:
         """These returns, then the others."""
-        return Returns(
-            np.concatenate([self.directions, other.directions]),
-            np.concatenate([self.ranges, other.ranges]),
-            np.concatenate([self.times_s, other.times_s]),
-        )
+        names = [field.name for field in fields(self)]
+        return Returns(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
 
     def in_order(self) -> Returns:
         """The returns by time; the order of equal times is kept."""
-        order = np.argsort(self.times_s, kind="stable")
-        return Returns(self.directions[order], self.ranges[order], self.times_s[order])
+        return self.keep(np.argsort(self.times_s, kind="stable"))
 
     @property
     def points(self) -> NDArray[np.float32]:
@@ -117,11 +174,15 @@ class Scanner:
         radius_m: Its radius [m].
     """
 
-    def __init__(self, params: ScannerParams, surface: Surface, motion: Motion) -> None:
+    def __init__(
+        self, params: ScannerParams, surface: Surface, motion: Motion, materials: Sequence[Material] = ()
+    ) -> None:
         self.params = params
         self._motion = motion
         self._caster = RayCaster(surface, params.engine)
-        self._directions, self._times = _grid(params)
+        self._optics = face_optics(surface, materials)
+        directions, self._times = _grid(params)
+        self._rays = beam(directions, 1e-3 * params.divergence_mrad)
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         self.centre_c = frozen(0.5 * (low + high))
         self.radius_m = float(np.max(np.linalg.norm(surface.vertices - self.centre_c, axis=1)))
@@ -132,26 +193,51 @@ class Scanner:
         return self._caster.engine
 
     def cast(self, t_s: float) -> Returns:
-        """The first returns of a scan at ``t_s`` [s] without noise; rays without a return are left out."""
+        """The returns of a scan at ``t_s`` [s] without noise; beams without a return are left out."""
         R_ac, t_ac = self._poses(t_s)
         near = self._may_hit(R_ac, t_ac)
         R_ca = np.swapaxes(R_ac[near] if len(R_ac) > 1 else R_ac, -1, -2)
         origins = rotate(R_ca, -(t_ac[near] if len(t_ac) > 1 else t_ac))
-        directions = rotate(R_ca, self._directions[near])
-        ranges, cosine = self._caster.ranges(origins, directions)
+        found = [self._traced(origins, rotate(R_ca, rays[near])) for rays in self._rays]
+        ranges, cosines, intensities, dropouts = (np.stack(part) for part in zip(*found, strict=True))
+        directions, times = self._rays[0][near], self._times[near]
+        if len(found) == 1:
+            returns = Returns(directions, ranges[0], times, cosines[0], intensities[0], dropouts[0])
+        else:
+            mean, intensity, weights = merged(ranges, intensities, self.params.merge_m)
+            cosine, lost = (weights * cosines).sum(axis=0), (weights * dropouts).sum(axis=0)
+            returns = Returns(directions, mean, times, cosine, intensity, lost)
+        return returns.keep(np.isfinite(returns.ranges) & (returns.intensities >= self.params.intensity_min))
+
+    def _traced(self, origins: Array, directions: Array) -> tuple[Array, Array, Array, Array]:
+        """Range (inf: no return), cosine of incidence, intensity and probability of a dropout of each ray in {C}."""
         p = self.params
+        ranges, cosines, faces = self._caster.ranges(origins, directions)
         seen = (ranges >= p.range_min_m) & (ranges <= p.range_max_m)
-        seen &= cosine >= math.cos(math.radians(p.max_incidence_deg))
-        return Returns(self._directions[near], ranges, self._times[near]).keep(seen)
+        seen &= cosines >= math.cos(math.radians(p.max_incidence_deg))
+        intensities, dropouts = np.zeros(len(ranges)), np.zeros(len(ranges))
+        intensities[seen] = self._optics.intensity(faces[seen], cosines[seen], ranges[seen], p.reference_m)
+        dropouts[seen] = self._optics.dropouts[faces[seen]]
+        return np.where(seen, ranges, np.inf), cosines, intensities, dropouts
 
     def disturb(self, returns: Returns, rng: np.random.Generator, noise_factor: float = 1.0) -> Returns:
-        """Add range noise and outliers, and remove dropouts."""
+        """Add range noise and outliers, remove dropouts, and quantise the ranges."""
         p, n = self.params, len(returns.ranges)
-        ranges = returns.ranges + noise_factor * p.noise_m * rng.standard_normal(n)
+        noise_m = noise_factor * p.noise_m * np.ones(n)
+        if p.noise_growth > 0.0:
+            noise_m *= (returns.ranges / p.reference_m) ** p.noise_growth
+        if p.noise_incidence > 0.0:
+            noise_m /= np.maximum(returns.cosines, 0.01) ** p.noise_incidence
+        ranges = returns.ranges + noise_m * rng.standard_normal(n)
         wrong = rng.random(n) < p.outlier_ratio
         ranges = np.where(wrong, rng.uniform(p.range_min_m, p.range_max_m, n), ranges)
-        kept = rng.random(n) >= p.dropout_ratio
-        return Returns(returns.directions, ranges, returns.times_s).keep(kept & (ranges > 0.0))
+        lost = np.where(
+            returns.dropouts > 0.0, 1.0 - (1.0 - p.dropout_ratio) * (1.0 - returns.dropouts), p.dropout_ratio
+        )
+        kept = rng.random(n) >= lost
+        if p.quantisation_m > 0.0:
+            ranges = np.round(ranges / p.quantisation_m) * p.quantisation_m
+        return replace(returns, ranges=ranges).keep(kept & (ranges > 0.0))
 
     def _poses(self, t_s: float) -> tuple[Array, Array]:
         """Rotations (n, 3, 3) and positions (n, 3) of the target at the time of each ray; n = 1 for a flash."""
@@ -162,30 +248,48 @@ class Scanner:
     def _may_hit(self, R_ac: Array, t_ac: Array) -> NDArray[np.intp]:
         """The rays that pass through the bounding sphere of the target."""
         centre = rotate(R_ac, self.centre_c) + t_ac
-        along = np.sum(self._directions * centre, axis=1)
+        directions = self._rays[0]
+        along = np.sum(directions * centre, axis=1)
         aside = np.sum(centre * centre, axis=1) - along * along
-        return np.flatnonzero(aside <= (1.001 * self.radius_m) ** 2)
+        spread = 1e-3 * self.params.divergence_mrad * np.maximum(along, 0.0)
+        return np.flatnonzero(aside <= (1.001 * self.radius_m + spread) ** 2)
 
 
 def _grid(params: ScannerParams) -> tuple[Array, Array]:
-    """Unit directions (n, 3) in {A}, row by row from the top left, and times (n,) [s] after the stamp.
+    """Unit directions (n, 3) in {A} in the order of measurement, and times (n,) [s] after the stamp.
 
-    The rays of a flash are uniform on the image plane, those of a raster in the angle of its mirror.
+    The rays of a flash are uniform on the image plane, those of a raster in the angle of its mirrors, row by row from
+    the top left. A Lissajous figure has as many rays as columns times rows. A spinning scanner measures column by
+    column from the left; its rays are uniform in azimuth and elevation.
     """
     (across, down), (columns, rows) = params.fov_deg, params.rays
-    u, v = _steps(columns), _steps(rows)
     halves = [math.radians(0.5 * across), math.radians(0.5 * down)]
-    if params.pattern is Pattern.FLASH:
-        x, y = [math.tan(halves[0]) * s for s in u], [math.tan(halves[1]) * s for s in v]
+    if params.pattern is Pattern.LISSAJOUS:
+        count = columns * rows
+        phases = [2.0 * math.pi * (k + 0.5) / count for k in range(count)]
+        a, b = params.lissajous
+        image = [(math.sin(a * phase), math.sin(b * phase + 0.25 * math.pi)) for phase in phases]
+    elif params.pattern is Pattern.SPINNING:
+        image = [(u, v) for u in _steps(columns) for v in _steps(rows)]
     else:
-        x, y = [math.tan(halves[0] * s) for s in u], [math.tan(halves[1] * s) for s in v]
-    grid = np.array([(a, b, 1.0) for b in y for a in x])
+        image = [(u, v) for v in _steps(rows) for u in _steps(columns)]
+    grid = np.array([_direction(params.pattern, halves, u, v) for u, v in image])
     grid /= np.sqrt(np.sum(grid * grid, axis=1))[:, None]
-    times = np.arange(len(grid)) * (params.scan_s / len(grid))
+    group = rows if params.pattern is Pattern.SPINNING else 1  # rays that are measured at once
+    times = (np.arange(len(grid)) // group * group) * (params.scan_s / len(grid))
     if params.view is FieldOfView.CONE:
-        inside = np.array([a * a + b * b <= 1.0 for b in v for a in u])
+        inside = np.array([u * u + v * v <= 1.0 for u, v in image])
         grid, times = grid[inside], times[inside]
     return frozen(grid), frozen(times)
+
+
+def _direction(pattern: Pattern, halves: list[float], u: float, v: float) -> tuple[float, float, float]:
+    """The direction of a ray at (u, v) in (-1, 1) of the field of view with these half angles; not of unit length."""
+    if pattern is Pattern.FLASH:
+        return math.tan(halves[0]) * u, math.tan(halves[1]) * v, 1.0
+    if pattern is Pattern.SPINNING:
+        return math.sin(halves[0] * u), math.tan(halves[1] * v), math.cos(halves[0] * u)
+    return math.tan(halves[0] * u), math.tan(halves[1] * v), 1.0
 
 
 def _steps(n: int) -> list[float]:

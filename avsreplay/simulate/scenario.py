@@ -17,7 +17,8 @@ from avsreplay.records import Belief, State
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.faults import InjectedFault
 from avsreplay.simulate.motion import MotionParams
-from avsreplay.simulate.scanner import ScannerParams
+from avsreplay.simulate.optics import Material
+from avsreplay.simulate.scanner import Preset, ScannerParams
 from avsreplay.simulate.target import TargetParams
 
 MAX_SCANS = 10_000_000
@@ -63,6 +64,7 @@ class ScenarioParams(Settings):
     target: TargetParams = setting(TargetParams, "The target.")
     motion: MotionParams = setting(MotionParams, "The target's motion.")
     scanner: ScannerParams = setting(ScannerParams, "The scanner.")
+    material: tuple[Material, ...] = setting((), "Optical properties of parts of the target, one table each.")
     fault: tuple[InjectedFault, ...] = setting((), "The injected faults, one table [[fault]] each.")
     start: StartParams | None = setting(
         None, "The initial belief.", unset="the log has none, and the estimator starts cold"
@@ -118,12 +120,23 @@ def load_scenario(path: Path | None = None, seed: int | None = None) -> Scenario
 
 def scenario_of(document: toml_document.Document, seed: int | None = None, folder: Path | None = None) -> Scenario:
     """The scenario of a parsed document."""
-    params = toml_document.build(ScenarioParams, document)
+    params = toml_document.build(ScenarioParams, _with_preset(document))
     if not isinstance(params.run, dict):
         raise UsageError("'run' must be a table", where=document.where(("run",)), hint="write it as [run]")
     if seed is not None:
         params = replace(params, seed=seed)
     return Scenario(params, document.text, folder)
+
+
+def _with_preset(document: toml_document.Document) -> toml_document.Document:
+    """The document with the figures of the scanner's preset where it does not give them itself."""
+    scanner = document.table.get("scanner", {})
+    name = scanner.get("preset", "none") if isinstance(scanner, dict) else "none"
+    if name not in [preset.value for preset in Preset if preset is not Preset.NONE]:
+        return document  # none, or an error that ``build`` reports
+    text = resources.files("avsreplay.simulate").joinpath("presets.toml").read_text(encoding="utf-8")
+    figures = toml_document.parse(text, "presets.toml").table[name]
+    return replace(document, table={**document.table, "scanner": {**figures, **scanner}})
 
 
 def belief(start: StartParams, truth: State, t_ns: int, rng: np.random.Generator) -> Belief:

@@ -76,7 +76,7 @@ class Simulation:
             return None
         body_now = self.truth(log_ns)
         returns = self._returns(k, log_ns, now, body_now)
-        timed = self._scenario.params.scanner.pattern is Pattern.RASTER
+        timed = self._scenario.params.scanner.pattern is not Pattern.FLASH
         jump = faults.strength(now[Kind.STAMP_JUMP]) if Kind.STAMP_JUMP in now else 0.0
         scan = Scan(
             seq=k,
@@ -128,7 +128,7 @@ def simulate(scenario: Scenario, surface: Surface) -> Simulation:
     params = scenario.params
     span_s = params.duration_s + params.scanner.scan_s
     motion = Motion(body(params.target, surface), params.motion, span_s, _generator(params.seed, "motion", 0))
-    scanner = Scanner(params.scanner, surface, motion)
+    scanner = Scanner(params.scanner, surface, motion, params.material)
     first = motion.state(0.0)
     start = None
     if params.start is not None:

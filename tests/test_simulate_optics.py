@@ -1,0 +1,201 @@
+"""Beams, mixed pixels, intensity, range noise and patterns of a scanner, against closed forms."""
+
+import math
+import tomllib
+from dataclasses import replace
+from importlib import resources
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy import stats
+
+from avsreplay import settings, toml_document
+from avsreplay.records import Surface
+from avsreplay.simulate import builtin_surface, scenario_of, simulate
+from avsreplay.simulate.inertia import principal
+from avsreplay.simulate.motion import Motion, MotionParams
+from avsreplay.simulate.optics import Material, beam, face_optics, merged
+from avsreplay.simulate.scanner import Pattern, Preset, Scanner, ScannerParams
+
+BODY = principal(np.diag([1.0, 1.1, 1.2]), np.zeros(3))
+CLEAN = ScannerParams(rays=(33, 33), fov_deg=(40.0, 40.0), noise_m=0.0, outlier_ratio=0.0)
+
+
+def rng(seed=0):
+    return np.random.Generator(np.random.PCG64(seed))
+
+
+def plate(z=0.0, x=(-1.0, 1.0), y=(-1.0, 1.0)):
+    """Corners and faces of a rectangle at z that faces the camera."""
+    corners = np.array([[x[0], y[0], z], [x[1], y[0], z], [x[1], y[1], z], [x[0], y[1], z]], dtype=np.float64)
+    return corners, np.array([[0, 2, 1], [0, 3, 2]], np.int32)
+
+
+def scanner(params, *plates, at=3.0, tilt_rad=0.0, materials=()):
+    """A scanner in front of plates, which are ``at`` metres away and tilted about x."""
+    corners = np.concatenate([p[0] for p in plates])
+    shifts = np.cumsum([0, *(len(p[0]) for p in plates[:-1])])
+    faces = np.concatenate([p[1] + s for p, s in zip(plates, shifts, strict=True)]).astype(np.int32)
+    attitude = (math.sin(tilt_rad / 2), 0.0, 0.0, math.cos(tilt_rad / 2))
+    motion = MotionParams(attitude_xyzw=attitude, rate_radps=(0.0, 0.0, 0.0), position_m=(0.0, 0.0, at))
+    surface = Surface(corners, faces, "plates", "")
+    return Scanner(params, surface, Motion(BODY, motion, 10.0, rng()), materials)
+
+
+def test_a_beam_has_the_second_moments_of_a_uniform_cone():
+    for direction in ([0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [-0.3, 0.5, np.sqrt(1 - 0.34)]):
+        axis = np.array([direction])
+        rays = beam(axis, 0.02)[:, 0]
+        assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=1e-15)
+        off = rays - axis * (rays @ axis[0])[:, None]
+        assert_allclose(off.mean(axis=0), 0.0, atol=1e-15)
+        values = np.linalg.eigvalsh(off.T @ off / len(rays))
+        assert_allclose(values[1:], 0.01**2 / 4, rtol=1e-3)  # a disc of radius R: R^2 / 4
+    assert beam(axis, 0.0).shape == (1, 1, 3)
+
+
+def test_a_beam_on_a_plane_returns_the_range_of_its_centre():
+    narrow, wide = (scanner(replace(CLEAN, divergence_mrad=d), plate()).cast(0.0) for d in (0.0, 5.0))
+    at_centre = np.abs(narrow.directions[:, :2]).max(axis=1) < 0.2
+    found = {tuple(d): r for d, r in zip(wide.directions, wide.ranges, strict=True)}
+    gap = [
+        abs(found[tuple(d)] - r) for d, r in zip(narrow.directions[at_centre], narrow.ranges[at_centre], strict=True)
+    ]
+    assert max(gap) < 3.0 * 0.005**2
+
+
+@pytest.mark.parametrize("merge_m", [math.inf, 0.1])
+def test_an_edge_gives_mixed_pixels_only_where_returns_merge(merge_m):
+    """Two plates 0.5 m apart with a common edge at x = 0."""
+    params = replace(CLEAN, rays=(301, 5), fov_deg=(4.0, 1.0), divergence_mrad=3.0, merge_m=merge_m)
+    returns = scanner(params, plate(0.0, x=(-1.0, 0.0)), plate(0.5, x=(0.0, 1.2))).cast(0.0)
+    depth = returns.directions[:, 2] * returns.ranges
+    between = (depth > 3.02) & (depth < 3.48)
+    across = returns.directions[:, 0] / returns.directions[:, 2]
+    if merge_m == math.inf:
+        assert between.sum() >= 10
+        assert np.abs(across[between]).max() < 0.003  # within one beam of the edge
+    else:
+        assert between.sum() == 0
+    assert ((depth < 3.02) & (across < -0.004)).sum() > 100
+    assert ((depth > 3.48) & (across > 0.004)).sum() > 100
+
+
+def test_merged_ranges_are_means_weighted_by_intensity():
+    ranges = np.array([[1.0, 1.0, np.inf], [2.0, 1.05, np.inf], [np.inf, 3.0, np.inf]])
+    power = np.array([[3.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 1.5, 0.0]])
+    mean, intensity, weights = merged(ranges, power, math.inf)
+    assert_allclose(mean, [1.25, (1.0 + 2.1 + 4.5) / 4.5, np.inf])
+    assert_allclose(intensity, [4.0 / 3.0, 1.5, 0.0])
+    assert_allclose(weights.sum(axis=0), [1.0, 1.0, 0.0])
+    mean, intensity, _ = merged(ranges, power, 0.1)
+    assert_allclose(mean, [1.0, 3.1 / 3.0, np.inf])
+    assert_allclose(intensity, [1.0, 1.0, 0.0])
+
+
+@pytest.mark.parametrize("tilt_deg", [0.0, 30.0, 60.0])
+def test_intensity_follows_lambert_and_the_square_of_the_range(tilt_deg):
+    material = Material("grey", reflectance=0.4)
+    params = replace(CLEAN, rays=(1, 1), fov_deg=(0.1, 0.1), reference_m=2.0)
+    near, far = (
+        scanner(params, plate(), at=d, tilt_rad=math.radians(tilt_deg), materials=[material]).cast(0.0).intensities
+        for d in (2.0, 6.0)
+    )
+    assert_allclose(near, 0.4 * math.cos(math.radians(tilt_deg)), rtol=1e-9)
+    assert_allclose(near / far, 9.0, rtol=1e-9)
+
+
+def test_a_specular_surface_is_lost_except_near_its_normal():
+    foil = Material("foil", reflectance=0.01, specular=20.0, specular_width_deg=3.0)
+    params = replace(CLEAN, intensity_min=0.05, reference_m=3.0)
+    seen = scanner(params, plate(x=(-2, 2), y=(-2, 2)), materials=[foil]).cast(0.0)
+    angle = np.degrees(np.arccos(seen.cosines))
+    limit = 3.0 * math.sqrt(math.log(20.0 / 0.04))  # where the lobe has fallen to 0.04 = 0.05 - 0.01
+    assert len(angle) > 0
+    assert angle.max() < limit
+    white = scanner(params, plate(x=(-2, 2), y=(-2, 2)), materials=[Material("white", reflectance=1.0)]).cast(0.0)
+    assert len(white.ranges) == 33 * 33 > 2 * len(seen.ranges)
+
+
+def test_materials_apply_to_the_faces_in_their_box_the_last_one_first():
+    corners, faces = plate()
+    other, more = plate(x=(2.0, 3.0))
+    surface = Surface(np.concatenate([corners, other]), np.concatenate([faces, more + 4]).astype(np.int32), "two", "")
+    right = (1.5, -9.0, -9.0, 9.0, 9.0, 9.0)
+    optics = face_optics(surface, [Material("all", reflectance=0.2), Material("r", box_m=right, dropout_ratio=0.9)])
+    assert optics.diffuse.tolist() == [0.2, 0.2, 0.5, 0.5]
+    assert optics.dropouts.tolist() == [0.0, 0.0, 0.9, 0.9]
+
+
+def test_dropouts_of_a_material_come_at_their_rate():
+    params = replace(CLEAN, rays=(100, 100), dropout_ratio=0.2)
+    scan = scanner(params, plate(x=(-2, 2), y=(-2, 2)), materials=[Material("m", dropout_ratio=0.5)])
+    clean = scan.cast(0.0)
+    kept = len(scan.disturb(clean, rng(1)).ranges)
+    assert stats.binomtest(kept, len(clean.ranges), 0.8 * 0.5).pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("growth", "incidence"), [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (0.0, 1.0), (2.0, 0.5)])
+def test_noise_grows_with_range_and_incidence(growth, incidence):
+    params = replace(CLEAN, rays=(80, 80), fov_deg=(3.0, 3.0), noise_m=0.01, reference_m=2.0)
+    params = replace(params, noise_growth=growth, noise_incidence=incidence)
+    tilt = math.radians(50.0)
+    scan = scanner(params, plate(), at=6.0, tilt_rad=tilt)
+    clean = scan.cast(0.0)
+    error = scan.disturb(clean, rng(2)).ranges - clean.ranges
+    expected = 0.01 * (clean.ranges / 2.0) ** growth / clean.cosines**incidence
+    assert stats.kstest(error / expected, "norm").pvalue > 1e-3
+    assert 0.95 < np.std(error) / (0.01 * 3.0**growth / math.cos(tilt) ** incidence) < 1.05
+
+
+def test_ranges_are_quantised():
+    params = replace(CLEAN, noise_m=0.01, quantisation_m=0.004)
+    scan = scanner(params, plate())
+    steps = scan.disturb(scan.cast(0.0), rng(3)).ranges / 0.004
+    assert_allclose(steps, np.round(steps), atol=1e-9)
+    assert len(np.unique(np.round(steps))) > 5
+
+
+def test_a_spinning_scanner_measures_a_column_at_once():
+    params = replace(CLEAN, rays=(20, 16), fov_deg=(60.0, 30.0), pattern=Pattern.SPINNING, scan_s=0.1)
+    scan = scanner(params, plate(x=(-9, 9), y=(-9, 9)))
+    d, t = scan._rays[0], scan._times
+    azimuth = np.degrees(np.arctan2(d[:, 0], d[:, 2]))
+    elevation = np.degrees(np.arctan2(d[:, 1], np.hypot(d[:, 0], d[:, 2])))
+    assert len(np.unique(t)) == 20
+    for each in np.unique(t):
+        assert np.ptp(azimuth[t == each]) < 1e-9
+    assert_allclose(np.unique(np.round(np.diff(np.unique(np.round(azimuth, 9))), 9)), 3.0)
+    assert_allclose(np.unique(np.round(elevation, 9)), np.arange(-15 + 0.9375, 15, 1.875), atol=1e-8)
+
+
+def test_a_lissajous_figure_closes_and_covers_the_field_of_view():
+    params = replace(CLEAN, rays=(60, 60), pattern=Pattern.LISSAJOUS, lissajous=(11, 13), scan_s=1.0)
+    d = scanner(params, plate())._rays[0]
+    u, v = (np.degrees(np.arctan2(d[:, k], d[:, 2])) / 20.0 for k in (0, 1))
+    assert_allclose(np.abs([u, v]).max(axis=1), 1.0, atol=1e-3)
+    crossings = [int((np.diff(np.sign(each)) != 0).sum()) for each in (u, v)]
+    assert abs(crossings[0] - 22) <= 1
+    assert abs(crossings[1] - 26) <= 1
+    cells, _, _ = np.histogram2d(u, v, bins=10, range=[(-1, 1), (-1, 1)])
+    assert (cells > 0).all()
+
+
+@pytest.mark.parametrize("preset", [p.value for p in Preset if p is not Preset.NONE])
+def test_a_preset_gives_scans_and_its_figures_are_defaults_only(preset):
+    figures = tomllib.loads(resources.files("avsreplay.simulate").joinpath("presets.toml").read_text("utf-8"))[preset]
+    text = "duration_s = 3.0\nrate_hz = 0.35\n[motion]\nposition_m = [0.0, 0.0, 2.2]\n[target]\nshape = 'bracket'\n"
+    text += f"[scanner]\npreset = '{preset}'\nnoise_m = 0.0123\n"
+    scenario = scenario_of(toml_document.parse(text, "s.toml"))
+    assert scenario.params.scanner.noise_m == 0.0123
+    plain = settings.dump(scenario.params.scanner)
+    assert {k: plain[k] for k in figures if k != "noise_m"} == {k: v for k, v in figures.items() if k != "noise_m"}
+    scan = next(iter(simulate(scenario, builtin_surface(scenario.params.target.shape)).scans()))
+    assert len(scan.points) > 100
+    assert (scan.times_s is not None) == (figures["pattern"] != "flash")
+
+
+def test_presets_are_exactly_the_classes():
+    text = resources.files("avsreplay.simulate").joinpath("presets.toml").read_text("utf-8")
+    assert set(tomllib.loads(text)) == {preset.value for preset in Preset if preset is not Preset.NONE}
