@@ -90,6 +90,16 @@ def test_points_that_are_not_finite_are_left_out_and_counted() -> None:
     np.testing.assert_array_equal(cloud.times_s, kept)
 
 
+@pytest.mark.parametrize("kind", ["float32", "float64"])
+def test_points_that_are_too_far_away_are_left_out_and_counted(kind: str) -> None:
+    points = np.arange(30, dtype=kind).reshape(10, 3)
+    points[3, 1], points[5, 2], points[7, 0] = 1.1e6, -1e20, 1e38
+    points[8] = 9.9e5
+    cloud = decode_cloud(point_cloud2(5, "c", points, None, kind))
+    assert cloud.dropped == 3
+    np.testing.assert_array_equal(cloud.points, np.delete(points, [3, 5, 7], axis=0))
+
+
 def test_time_fields_in_all_their_forms() -> None:
     stamp = 1_600_000_000_500_000_000
     base = np.zeros(4, dtype=[("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("t", "<u8")])  # room for any

@@ -225,6 +225,14 @@ def test_invalid_models_are_rejected(tmp_path: Path, name: str, content: bytes, 
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("value", ["1e20", "-1e7", "1e100"])
+def test_a_model_with_a_vertex_that_is_too_far_away_is_rejected(tmp_path: Path, value: str) -> None:
+    text = f"v 0 0 0\nv 1 0 0\nv 0 {value} 0\nf 1 2 3\n"
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(UnreadableInput, match="a vertex is at"):
+        read_surface(tmp_path / "a.obj")
+
+
 def test_a_cloud_is_accepted_as_a_model_if_requested(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(SEEDS["ascii.ply"])
     with pytest.raises(UnreadableInput, match="--cloud-model"):

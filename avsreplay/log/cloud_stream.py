@@ -8,13 +8,11 @@ from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import TypeVar
 
-import numpy as np
-
 from avsreplay.files import BadFile
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.index import Recording
 from avsreplay.log.options import Loss, TopicInfo
-from avsreplay.log.point_cloud2 import Cloud, decode_cloud
+from avsreplay.log.point_cloud2 import Cloud, decode_cloud, usable
 from avsreplay.log.scan_files import read_points
 
 T = TypeVar("T")
@@ -93,8 +91,8 @@ class FolderClouds:
             raise BadMessage(f"{shown(path.name)}: {error.strerror}") from None
         except ValueError as error:
             raise BadMessage(f"{shown(path.name)}: {error}") from None
-        finite = np.isfinite(points).all(axis=1)
-        kept = points if finite.all() else points[finite]
+        chosen = usable(points)
+        kept = points if chosen is None else points[chosen]
         return Cloud(self.header_ns[place], "", kept, None, len(points) - len(kept))
 
     def payload(self, place: int) -> None:

@@ -14,6 +14,7 @@ from avsreplay.log.cdr import Cursor
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MAX_FIELDS = 256
+MAX_COORDINATE_M = 1e6  # a larger coordinate is a sensor error; squares and grid cells stay in range
 _TIME_NAMES = ("t", "time", "timestamp", "time_offset", "offset_time")
 
 
@@ -71,7 +72,7 @@ class Cloud:
 
 
 def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
-    """Decode a cloud without its non-finite points.
+    """Decode a cloud without the points that are not finite or not within ``MAX_COORDINATE_M``.
 
     Args:
         payload: the serialised message.
@@ -84,19 +85,20 @@ def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
     if 0 in layout.shape:
         return Cloud(layout.stamp_ns, layout.frame, np.zeros((0, 3), np.float32), None, 0)
     points, times = _points(layout), _times(layout)
-    dropped = 0
-    if not _surely_finite(points):
-        finite = np.isfinite(points).all(axis=1)
-        dropped = len(points) - int(np.count_nonzero(finite))
-        if dropped:
-            points, times = points[finite], None if times is None else times[finite]
+    kept = usable(points)
+    dropped = 0 if kept is None else len(points) - int(np.count_nonzero(kept))
+    if kept is not None and dropped:
+        points, times = points[kept], None if times is None else times[kept]
     return Cloud(layout.stamp_ns, layout.frame, points, times, dropped)
 
 
-def _surely_finite(points: NDArray[Any]) -> bool:
-    """Return True if the sum of the coordinates is finite; this is three times faster than testing each of them."""
+def usable(points: NDArray[Any]) -> NDArray[np.bool_] | None:
+    """Return which of the points (n, 3) are finite and within ``MAX_COORDINATE_M``; None if all are."""
     with np.errstate(invalid="ignore", over="ignore"):
-        return bool(np.isfinite(points.sum(dtype=np.float64)))
+        if np.einsum("ij,ij->", points, points) < MAX_COORDINATE_M**2:  # fast: no point can be outside
+            return None
+        kept: NDArray[np.bool_] = (np.abs(points) <= MAX_COORDINATE_M).all(axis=1)
+    return kept
 
 
 def read_layout(payload: bytes | memoryview, encoding: str = "cdr") -> Layout:

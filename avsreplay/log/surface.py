@@ -19,6 +19,7 @@ from avsreplay.files import BadFile
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
+from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
 from avsreplay.records import Surface
 
 MAX_BYTES = 512 << 20
@@ -163,6 +164,9 @@ def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> 
     if bad:
         hint = "remove them in a mesh editor"
         raise UnreadableInput(f"{bad} of {len(vertices)} vertices are not finite", where=where, hint=hint)
+    if np.abs(vertices).max() > MAX_COORDINATE_M:
+        what = f"a vertex is at {np.abs(vertices).max():.3g} m; the largest coordinate is {MAX_COORDINATE_M:.0g} m"
+        raise UnreadableInput(what, where=where, hint="check the units of the model")
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UnreadableInput("a face refers to a vertex that does not exist", where=where, hint="check the file")
     if not len(faces) and not cloud_ok:

@@ -1,0 +1,325 @@
+"""Fuzz campaign on every input of every command: ``python tests/benchmarks/fuzz_commands.py [--quick] [--inputs N]``.
+
+The inputs are listed from the options and arguments of the commands: a new one without a seed here ends the campaign.
+One input of a command is mutated and the command is run. It must succeed or end in one error line: an internal error,
+a warning on the terminal, more than 20 s, more than 512 MiB, a crash of the interpreter or a file outside the requested
+output is a finding. Mutation i depends only on (campaign, i): ``--campaign S --only i`` repeats it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import multiprocessing
+import os
+import resource
+import shutil
+import signal
+import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+import click
+import numpy as np
+from fuzz_inputs import mutate
+
+from avsreplay.cli import SUMMARIES, group
+from avsreplay.errors import AvsError
+from avsreplay.report.result import write_manifest
+
+LIMIT_S, LIMIT_MIB = 20, 512
+ROOT = Path(__file__).resolve().parents[2]
+OUTPUTS = {"output", "update_golden", "junit", "export"}
+NUMBERS = (b"0", b"-1", b"1e999", b"-1e308", b"1e20", b"1e-320", b"9" * 400, b"9223372036854775807", b"nan", b"inf",
+           b"true", b"null", b'"x"', b'"\\ud800"', b'"\\u001b[31m"', b"[]", b"{}", b"")  # fmt: skip
+SCENARIO = """name = "tiny"
+seed = 1
+duration_s = 0.5
+rate_hz = 4.0
+[target]
+shape = "cube"
+[motion]
+position_m = [0.1, 0.0, 5.0]
+rate_radps = [0.06, 0.064, -0.048]
+[scanner]
+fov_deg = [48.0, 48.0]
+rays = [16, 16]
+noise_m = 0.008
+[[fault]]
+kind = "occlusion"
+start_s = 0.2
+duration_s = 0.2
+"""
+CAMPAIGN = """name = "tiny"
+scenario = "scenario.toml"
+[[grid]]
+key = "scenario.scanner.noise_m"
+values = [0.004, 0.008]
+[[draw]]
+key = "scenario.motion.attitude_xyzw"
+kind = "attitude"
+"""
+RULES = '[[rule]]\nmetric = "pose_pos_rmse_m"\nmax = 0.5\nmax_ratio = 1.5\noptional = true\n'
+RUN = ("--init", "truth", "--n-scans", "2")
+# (command, input) -> arguments; IN is the mutated input, the other words name intact seeds or outputs.
+CASES: dict[tuple[str, str], tuple[str, ...]] = {
+    ("record", "source"): ("IN", "-o", "OUT.mcap"),
+    ("record", "model"): ("scans", "--model", "IN", "-o", "OUT.mcap"),
+    ("record", "truth_file"): ("scans", "--truth", "IN", "-o", "OUT.mcap"),
+    ("run", "log"): ("IN", *RUN),
+    ("run", "config_file"): ("log.mcap", "--config", "IN", *RUN),
+    ("run", "model"): ("log.mcap", "--model", "IN", *RUN),
+    ("run", "truth_file"): ("log.mcap", "--truth", "IN", *RUN),
+    ("run", "golden"): ("log.mcap", "--golden", "IN", *RUN),
+    ("info", "source"): ("IN",),
+    ("doctor", "source"): ("IN", "--repair", "OUT.mcap"),
+    ("bench", "log"): ("IN", "--scans", "1"),
+    ("bench", "model"): ("log.mcap", "--model", "IN", "--scans", "1"),
+    ("observability", "log"): ("IN", "--n-scans", "2"),
+    ("observability", "model"): ("log.mcap", "--model", "IN", "--n-scans", "2"),
+    ("observability", "truth_file"): ("log.mcap", "--truth", "IN", "--n-scans", "2"),
+    ("plan", "result"): ("IN", "--at", "0", "--samples", "2", "--every", "1"),
+    ("report", "result"): ("IN", "-o", "OUT.html"),
+    ("export", "result"): ("IN", "--to", "csv", "-o", "OUT.csv"),
+    ("compare", "results"): ("result", "IN", "-o", "OUT.html"),
+    ("compare", "gate"): ("result", "result", "--gate", "IN", "--junit", "OUT.xml"),
+    ("sweep", "campaign"): ("IN", "--plan"),
+    ("sweep", "output"): ("campaign.toml", "-o", "IN", "--limit", "0", "--workers", "0"),
+    ("config", "log"): ("IN",),
+    ("config", "config_file"): ("--config", "IN"),
+}
+SEEDS: dict[str, tuple[str, ...]] = {
+    "source": ("log.mcap", "log.mcap", "scenario.toml", "scans"), "log": ("log.mcap",),
+    "model": ("model.ply", "model.obj"),
+    "truth_file": ("result/truth.tum",), "config_file": ("config.toml",), "golden": ("result/rows.jsonl",),
+    "result": ("result",), "results": ("result",), "gate": ("rules.toml",), "campaign": ("campaign.toml",),
+    "output": ("sweep",),
+}  # fmt: skip
+
+
+class Hang(BaseException):
+    """Raised by the alarm: no handler of the package may catch it."""
+
+
+def listed() -> list[tuple[str, str]]:
+    """Every input of every command. Raises SystemExit if one has no case here."""
+    found = [("sweep", "output")]
+    for name in SUMMARIES:
+        command = group.get_command(click.Context(group), name)
+        for param in command.params if command else ():
+            if isinstance(param.type, click.Path) and param.name not in OUTPUTS:
+                found.append((name, str(param.name)))
+    missing = [case for case in found if case not in CASES]
+    if missing:
+        raise SystemExit(f"no seed for {missing}: add it to CASES")
+    return found
+
+
+def call(*args: object) -> None:
+    group.main([str(a) for a in args], standalone_mode=False, prog_name="avsreplay")
+
+
+def build(folder: Path) -> None:
+    """The intact seeds."""
+    from avsreplay.log import open_source
+    from avsreplay.log.surface import surface_bytes
+
+    texts = {"scenario.toml": SCENARIO, "campaign.toml": CAMPAIGN, "rules.toml": RULES}
+    for name, text in texts.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()):
+        call("config")
+        (folder / "config.toml").write_text(out.getvalue(), encoding="utf-8")
+        call("record", folder / "scenario.toml", "-o", folder / "log.mcap", "--compression", "none")
+        call("run", folder / "log.mcap", "--init", "truth", "-o", folder / "result")
+        call("sweep", folder / "campaign.toml", "-o", folder / "sweep", "--workers", "0")
+    with open_source(folder / "log.mcap") as source:
+        assert source.header.surface is not None
+        vertices, faces = source.header.surface.vertices, source.header.surface.faces
+        (folder / "model.ply").write_bytes(surface_bytes(source.header.surface))
+        (folder / "scans").mkdir()
+        for scan in source.scans():
+            np.save(folder / "scans" / f"s_{scan.seq}.npy", scan.points)
+    lines = [f"v {x} {y} {z}" for x, y, z in vertices] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in faces]
+    (folder / "model.obj").write_text("\n".join(lines) + "\n")
+
+
+def number_changed(data: bytes, rng: np.random.Generator) -> bytes:
+    """Replace one number of a text by an extreme one."""
+    import re
+
+    places = list(re.finditer(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?", data[: 1 << 18]))
+    if not places:
+        return data
+    place = places[int(rng.integers(len(places)))]
+    return data[: place.start()] + NUMBERS[int(rng.integers(len(NUMBERS)))] + data[place.end() :]
+
+
+def damaged(data: bytes, name: str, rng: np.random.Generator) -> bytes:
+    """One mutated file."""
+    if name.endswith((".toml", ".jsonl", ".json", ".tum", ".obj")) and rng.random() < 0.6:
+        for _ in range(int(rng.integers(1, 4))):
+            data = number_changed(data, rng)
+        return data
+    return mutate(data, rng, [data])
+
+
+def prepare(seed: str, seeds: Path, place: Path, rng: np.random.Generator) -> Path:
+    """Copy a seed to ``place`` and damage it, or one of its files; the manifest of a result is renewed mostly."""
+    path = place / f"in-{Path(seed).name}"
+    if (seeds / seed).is_file():
+        path.write_bytes(damaged((seeds / seed).read_bytes(), seed, rng))
+        return path
+    shutil.copytree(seeds / seed, path)
+    files = sorted(p for p in path.rglob("*") if p.is_file() and p.suffix not in (".html", ".mcap"))
+    chosen = files[int(rng.integers(len(files)))]
+    chosen.write_bytes(damaged(chosen.read_bytes(), chosen.name, rng))
+    if seed == "result" and chosen.name != "run.json" and rng.random() < 0.8:
+        record = json.loads((path / "run.json").read_text(encoding="utf-8"))
+        (path / "run.json").unlink()
+        count = len([line for line in (path / "rows.jsonl").read_bytes().splitlines() if line.strip()])
+        write_manifest(path, record, count)
+    return path
+
+
+def check(case: tuple[str, str], seeds: Path, place: Path, rng: np.random.Generator) -> str:
+    """Run one command on one damaged input; one word about the outcome. Raises on a finding."""
+    command, param = case
+    choices = SEEDS[param]
+    seed = choices[int(rng.integers(len(choices)))]
+    damaged_input = prepare(seed, seeds, place, rng)
+    before = {p for p in place.rglob("*")}
+    args = [damaged_input if w == "IN" else place / w if w.startswith("OUT") else w for w in CASES[case]]
+    args = [seeds / a if isinstance(a, str) and (seeds / a).exists() and a not in ("0", "1", "2") else a for a in args]
+    outcome, err = _run(command, args)
+    left = {p for p in place.rglob("*")} - before - {place / str(w) for w in CASES[case] if w.startswith("OUT")}
+    left = {p for p in left if damaged_input not in p.parents}
+    if left:
+        raise AssertionError(f"files outside the output: {sorted(left)}")
+    for line in err.splitlines():
+        if "Warning" in line or "Traceback" in line or "\x1b" in line:
+            raise AssertionError(f"on the terminal: {line!r}")
+    return outcome
+
+
+def _run(command: str, args: list[object]) -> tuple[str, str]:
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # as main does
+        try:
+            call(command, *args)
+        except AvsError as error:
+            return f"exit {error.exit_code}", _line(str(error)) + err.getvalue()
+        except click.ClickException as error:
+            return f"exit {error.exit_code}", err.getvalue()
+    return "exit 0", err.getvalue()
+
+
+def _line(text: str) -> str:
+    if "\n" in text or "\x1b" in text:
+        raise AssertionError(f"an error of more than one line, or with control characters: {text!r}")
+    return text + "\n"
+
+
+def work(campaign: int, numbers: list[int], pipe: Connection, seeds: Path, cases: list[tuple[str, str]]) -> None:
+    """A worker process: announces each mutation and its outcome."""
+    os.environ["OMP_NUM_THREADS"] = "1"
+    signal.signal(signal.SIGALRM, _alarm)
+    for number in numbers:
+        rng = np.random.default_rng([campaign, number])
+        case = cases[number % len(cases)]
+        pipe.send(("begin", number, " ".join(case)))
+        with tempfile.TemporaryDirectory() as root:
+            place = Path(root) / "work"
+            place.mkdir()
+            os.chdir(place)
+            signal.alarm(LIMIT_S)
+            try:
+                found = check(case, seeds, place, rng)
+            except (Exception, Hang):
+                found = "FINDING\n" + traceback.format_exc()
+            signal.alarm(0)
+            if [p.name for p in Path(root).iterdir()] != ["work"]:
+                found = "FINDING a file was written outside"
+            os.chdir("/")
+        pipe.send(("end", number, found))
+    pipe.send(("peak", 0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024))
+    pipe.close()
+
+
+def _alarm(_signal: int, _frame: object) -> None:
+    raise Hang
+
+
+def campaign(
+    number: int, inputs: list[int], seeds: Path, cases: list[tuple[str, str]], batch: int = 200
+) -> tuple[Counter[str], list[dict[str, object]], int]:
+    """Run the mutations in batches, each in its own process; outcomes, findings and the largest process in MiB."""
+    tally: Counter[str] = Counter()
+    findings: list[dict[str, object]] = []
+    peak, queue = 0, [inputs[i : i + batch] for i in range(0, len(inputs), batch)]
+    while queue:
+        todo = queue.pop(0)
+        here, there = multiprocessing.Pipe(False)
+        process = multiprocessing.get_context("fork").Process(target=work, args=(number, todo, there, seeds, cases))
+        process.start()
+        there.close()
+        last: tuple[int, str] | None = None
+        while True:
+            try:
+                what, at, value = here.recv()
+            except EOFError:
+                break
+            if what == "begin":
+                last = (at, str(value))
+            elif what == "peak":
+                peak = max(peak, int(value))
+            else:
+                bad = str(value).startswith("FINDING")
+                tally["finding" if bad else str(value)] += 1
+                findings += [{"input": at, "case": last[1] if last else "", "what": value}] if bad else []
+                last = None
+        process.join()
+        if last is not None:
+            tally["finding"] += 1
+            findings.append({"input": last[0], "case": last[1], "what": f"crash, exit code {process.exitcode}"})
+            queue.insert(0, todo[todo.index(last[0]) + 1 :])
+    return tally, findings, peak
+
+
+def main() -> int:
+    """Run and print one JSON document; exit 1 on any finding."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--inputs", type=int, default=100_000)
+    parser.add_argument("--campaign", type=int, default=1)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--only", type=int)
+    parser.add_argument("--commands", nargs="*", default=list(SUMMARIES), help="only these commands")
+    parser.add_argument("--quick", action="store_true", help="500 mutations")
+    asked = parser.parse_args()
+    cases = [case for case in listed() if case[0] in asked.commands]
+    count = 500 if asked.quick else asked.inputs
+    inputs = [asked.only] if asked.only is not None else list(range(asked.first, asked.first + count))
+    start = time.process_time()
+    with tempfile.TemporaryDirectory() as folder:
+        build(Path(folder))
+        tally, findings, peak = campaign(asked.campaign, inputs, Path(folder), cases)
+    if peak > LIMIT_MIB:
+        findings.append({"what": f"a process of {peak} MiB, over {LIMIT_MIB}"})
+    spent = time.process_time() - start + resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    result = {"campaign": asked.campaign, "inputs": len(inputs), "cases": len(cases),
+              "outcomes": dict(sorted(tally.items())),
+              "largest_process_mib": peak, "processor_s": round(spent, 1), "findings": findings[:40],
+              "count_of_findings": len(findings)}  # fmt: skip
+    print(json.dumps(result, indent=1))
+    return 1 if findings else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
