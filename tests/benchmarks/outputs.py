@@ -1,0 +1,199 @@
+"""Outputs of every command: every kind of file node, and kill -9 at random moments.
+
+``python tests/benchmarks/outputs.py [--quick] [--kills N] [--seed S]``. The outputs are listed from the options of the
+commands: a new one without a case here ends the campaign. A node must keep its kind, an output must be complete, old or
+absent, nothing else may be left behind, and the same command must succeed afterwards.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import click
+import numpy as np
+from fuzz_commands import OUTPUTS, build
+
+from avsreplay.cli import SUMMARIES, group
+from avsreplay.errors import AvsError
+from avsreplay.log import open_source
+from avsreplay.report.result import load_result
+
+RUN = ("log.mcap", "--init", "truth", "--n-scans", "2")
+# (command, output) -> arguments; OUT is the output, the other words name intact inputs.
+CASES: dict[tuple[str, str], tuple[str, ...]] = {
+    ("record", "output"): ("scenario.toml", "-o", "OUT", "--overwrite"),
+    ("run", "output"): (*RUN, "-o", "OUT", "--overwrite"),
+    ("run", "update_golden"): (*RUN, "--update-golden", "OUT"),
+    ("doctor", "output"): ("log.mcap", "--repair", "OUT", "--overwrite"),
+    ("plan", "export"): ("result", "--at", "0", "--samples", "1", "--every", "1", "--export", "OUT", "--overwrite"),
+    ("report", "output"): ("result", "-o", "OUT", "--overwrite"),
+    ("export", "output"): ("result", "--to", "csv", "-o", "OUT", "--overwrite"),
+    ("compare", "output"): ("result", "result", "-o", "OUT", "--overwrite"),
+    ("compare", "junit"): ("result", "result", "--gate", "rules.toml", "--junit", "OUT"),
+    ("sweep", "output"): ("campaign.toml", "-o", "OUT", "--workers", "0"),
+}
+FOLDERS = {("run", "output"), ("sweep", "output")}
+NODES = ("file", "null", "full", "fifo", "socket", "folder", "link to a file", "link to null", "link to a folder",
+         "dangling link", "loop of links", "missing folder", "long name", "empty name", "dot", "root")  # fmt: skip
+
+
+def listed() -> list[tuple[str, str]]:
+    """Every output of every command. Raises SystemExit if one has no case here."""
+    found = []
+    for name in SUMMARIES:
+        command = group.get_command(click.Context(group), name)
+        for param in command.params if command else ():
+            if isinstance(param.type, click.Path) and param.name in OUTPUTS:
+                found.append((name, str(param.name)))
+    missing = [case for case in found if case not in CASES]
+    if missing:
+        raise SystemExit(f"no case for {missing}: add it to CASES")
+    return found
+
+
+def command_line(case: tuple[str, str], seeds: Path, output: str) -> list[str]:
+    """The arguments of a case."""
+    words = (output if w == "OUT" else str(seeds / w) if (seeds / w).exists() else w for w in CASES[case])
+    return [sys.executable, "-m", "avsreplay", case[0], *words]
+
+
+def node(kind: str, place: Path) -> str:
+    """Create a file node in an empty folder; the output to name."""
+    path, other = place / "out", place / "other"
+    if kind == "file":
+        path.write_text("old")
+    elif kind in ("null", "full"):
+        return f"/dev/{kind}"
+    elif kind == "fifo":
+        os.mkfifo(path)
+        threading.Thread(target=path.read_bytes, daemon=True).start()
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as bound:
+            bound.bind(str(path))
+    elif kind == "folder":
+        path.mkdir()
+        (path / "mine").touch()
+    elif kind.startswith(("link", "dangling", "loop")):
+        other.write_text("old") if kind == "link to a file" else None
+        other.mkdir() if kind == "link to a folder" else None
+        path.symlink_to({"link to null": Path("/dev/null"), "loop of links": path}.get(kind, other))
+    names = {"missing folder": "missing/out", "long name": "x" * 300, "empty name": "", "dot": ".", "root": "/"}
+    if kind in ("empty name", "dot", "root"):
+        return names[kind]
+    return str(place / names.get(kind, "out"))
+
+
+def kinds(place: Path) -> dict[str, int]:
+    """The kind of every node in a folder, without following links."""
+    return {str(p.relative_to(place)): stat.S_IFMT(p.lstat().st_mode) for p in place.rglob("*")}
+
+
+def try_node(case: tuple[str, str], kind: str, seeds: Path, root: Path) -> str:
+    """Write one output to one node; a finding, or the exit code."""
+    place = Path(tempfile.mkdtemp(dir=root))
+    output = node(kind, place)
+    before = kinds(place)
+    done = subprocess.run(
+        command_line(case, seeds, output), cwd=place, capture_output=True, text=True, timeout=120, check=False
+    )
+    after = kinds(place)
+    lines = [line for line in done.stderr.splitlines() if line.startswith("avsreplay: ") and "warning" not in line]
+    if "Traceback" in done.stderr or done.returncode in (1, 70) or (done.returncode and len(lines) != 1):
+        return f"FINDING {case} {kind}: exit {done.returncode}: {done.stderr[-300:]}"
+    changed = [name for name, what in before.items() if after.get(name) != what]
+    allowed = ("out", "other", "report.html")
+    extra = [name for name in after.keys() - before.keys() if not name.startswith(allowed)]
+    if changed or extra or any(".part" in name for name in after):
+        return f"FINDING {case} {kind}: changed {changed}, left {extra}"
+    if not all(stat.S_ISCHR(Path(f"/dev/{name}").stat().st_mode) for name in ("null", "full")):
+        return f"FINDING {case} {kind}: a device was replaced"
+    return f"exit {done.returncode}"
+
+
+def is_complete(case: tuple[str, str], path: Path) -> bool:
+    """Whether an output is what its command writes when it is not disturbed."""
+    try:
+        if case == ("run", "output"):
+            return not load_result(path).unverified
+        if path.suffix == ".mcap":
+            with open_source(path) as source:
+                return not source.losses
+    except AvsError:
+        return False
+    text = path.read_text(encoding="utf-8")
+    ends = {".html": "</html>", ".xml": "</testsuites>", ".csv": "\n", ".jsonl": "\n"}
+    return text.rstrip(" ").endswith(ends[path.suffix]) or text.rstrip().endswith(ends[path.suffix])
+
+
+SUFFIX = {"record": ".mcap", "doctor": ".mcap", "report": ".html", "export": ".csv", "plan": ".csv"}
+
+
+def kill_one(case: tuple[str, str], seeds: Path, root: Path, fraction: float, seconds: float) -> str:
+    """Write an output twice and kill the second writer; then write it again."""
+    place = Path(tempfile.mkdtemp(dir=root))
+    suffixes = {("compare", "output"): ".html", ("compare", "junit"): ".xml", ("run", "update_golden"): ".jsonl"}
+    path = place / f"out{'' if case in FOLDERS else suffixes.get(case) or SUFFIX[case[0]]}"
+    line = command_line(case, seeds, str(path))
+    subprocess.run(line, cwd=place, capture_output=True, timeout=120, check=False)
+    writer = subprocess.Popen(line, cwd=place, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    time.sleep(fraction * seconds)
+    writer.send_signal(signal.SIGKILL)
+    writer.wait()
+    killed = writer.returncode == -signal.SIGKILL
+    if case != ("sweep", "output") and not is_complete(case, path):
+        return f"FINDING {case}: after kill -9 the output is neither the old nor the new one"
+    left = sorted(p.name for p in place.iterdir())
+    again = subprocess.run(line, cwd=place, capture_output=True, text=True, timeout=120, check=False)
+    if again.returncode:
+        return f"FINDING {case}: after kill -9 the command fails: {again.stderr[-200:]}"
+    if sorted(p.name for p in place.iterdir()) != [path.name]:
+        return f"FINDING {case}: left behind: {left}"
+    return "killed" if killed else "finished before"
+
+
+def main() -> int:
+    """Run and print one JSON document; exit 1 on any finding."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=200, help="per output")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--quick", action="store_true", help="no kills, and only the first node of each output")
+    parser.add_argument("--only", help="one command")
+    asked = parser.parse_args()
+    rng = np.random.Generator(np.random.PCG64(asked.seed))
+    cases = [case for case in listed() if asked.only in (None, case[0])]
+    found: list[str] = []
+    killed: list[str] = []
+    with tempfile.TemporaryDirectory() as seeds, tempfile.TemporaryDirectory() as root:
+        build(Path(seeds))
+        for case in cases:
+            for kind in NODES[:2] if asked.quick else NODES:
+                found.append(try_node(case, kind, Path(seeds), Path(root)))
+            start = time.monotonic()
+            subprocess.run(command_line(case, Path(seeds), str(Path(root) / f"first-{case}")), capture_output=True,
+                           timeout=120, check=False)  # fmt: skip
+            seconds = time.monotonic() - start
+            for _ in range(0 if asked.quick else asked.kills):
+                killed.append(kill_one(case, Path(seeds), Path(root), float(rng.uniform(0.5, 1.05)), seconds))
+    findings = [text for text in (*found, *killed) if text.startswith("FINDING")]
+    outcomes = {
+        "nodes": dict(Counter(t.split(":")[0][:7] for t in found)),
+        "kills": dict(Counter(t[:15] for t in killed)),
+    }
+    print(json.dumps({"outputs": len(cases), **outcomes, "findings": findings}, indent=1))
+    return 1 if findings else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
