@@ -64,22 +64,20 @@ def first_state(ready: Stages) -> PipelineState:
 def _initialise(
     config: RunConfig, header: LogHeader, truth_of: Callable[[Scan], Truth]
 ) -> Callable[[Scan], tuple[Pose | None, str]]:
-    """Where the first pose comes from; "log" is the log's first belief, else its truth, else acquisition."""
-    if config.init == "auto":
+    """Where the first pose comes from: first scan -> T_ac (None: search without a guess) and the name of its source."""
+    start = header.start
+    if config.init == "truth":
+        return lambda scan: (_true_pose(truth_of(scan)), "truth")
+    if config.init == "log" and start is not None:
+        return lambda _scan: (start.x.T_ac, "start")
+    if config.init in ("log", "auto"):
         return lambda _scan: (None, "acquired")
-    if config.init in ("truth", "log"):
-        start = header.start
-        if config.init == "log" and start is not None:
-            return lambda _scan: (start.x.T_ac, "start")
-        return lambda scan: _true_pose(truth_of(scan), required=config.init == "truth")
     pose = parse_pose(config.init)
     return lambda _scan: (pose, "given")
 
 
-def _true_pose(truth: Truth, required: bool) -> tuple[Pose | None, str]:
-    if truth.pose is not None:
-        return truth.pose, "truth"
-    if not required:
-        return None, "acquired"
-    hint = "name its truth with --truth-topic, or give --init auto"
-    raise UsageError("the log has no true pose at its first scan", where="--init truth", hint=hint)
+def _true_pose(truth: Truth) -> Pose:
+    if truth.pose is None:
+        hint = "name its truth with --truth-topic or --truth, or use --init auto"
+        raise UsageError("the log has no true pose at its first scan", where="--init truth", hint=hint)
+    return truth.pose

@@ -47,8 +47,8 @@ class RunConfig(Settings):
     )
     init: str = setting(
         "log",
-        "Initial pose: from the log (log), the true pose (truth), a global search (auto), or the pose of {C} in {A}"
-        " as x,y,z,qx,qy,qz,qw.",
+        "Initial pose: the initial state in the log, else a global search (log); the true pose (truth); a global search"
+        " (auto); or the pose of {C} in {A} as x,y,z,qx,qy,qz,qw.",
     )
     deskew: bool = setting(
         True, "Move points that have their own times to the scan's instant, along the predicted motion."
