@@ -219,6 +219,7 @@ class Alignment:
         info: (6, 6) information of the error d = [theta; v], both in {C} [rad, m], where
             T_ac_true = T_ac @ Exp(d); singular in directions that are not determined.
         covariance: (6, 6) calibrated covariance of the same d, None if the view is degenerate.
+        message: why the back end failed, empty if it did not.
         free_directions: directions that the view does not determine ("slides along x"), empty if none.
     """
 
@@ -232,6 +233,7 @@ class Alignment:
     status: AlignStatus
     covariance: Array | None = None
     free_directions: str = ""
+    message: str = ""
 
     @property
     def measured(self) -> bool:

@@ -123,6 +123,8 @@ class Row:
         " (healthy pose), acquired (search without a guess); until the first healthy scan the source of the first"
         " pose: start (in the log), truth, given (on the command line) or acquired.")
     fault: str | None = _exact(lambda o, s: s.fault, "Label of the fault that was injected into this scan.", table=True)
+    message: str | None = _exact(lambda o, s: o.alignment.message or o.scan.note or None,
+        "Error of the back end, or what was wrong with the recorded message or its stamp.")
 
     points: int = _exact(lambda o, s: len(o.scan.points), "Number of finite points in the scan.")
     iterations: int | None = _exact(if_points(lambda o: o.alignment.iterations), "Iterations of the registration.",

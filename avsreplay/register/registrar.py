@@ -29,6 +29,7 @@ LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in 
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
 SEARCH_WORK = 2_000_000  # point searches of the first round of the global search, about
 MOST_SEGMENTS = 3
+MESSAGE_LENGTH = 200  # characters of an error message that are kept
 
 
 class Registrar:
@@ -189,19 +190,22 @@ class Registrar:
     def _graded(self, scan: NDArray[Any], guess: Pose, width_m: float | None = None) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
         fit = self._align(scan, guess.inverse(), width_m)
-        if fit is None:
-            return quality.not_measured(len(scan), AlignStatus.FAILED, guess)
+        if isinstance(fit, str):
+            return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
         return quality.grade(self._index, self._visibility, scan, fit, limits, self.params)
 
-    def _align(self, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | None:
-        """Run the back end; whatever it raises becomes the status FAILED."""
+    def _align(self, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | str:
+        """Run the back end; what it raises, or a result of another type, becomes the status FAILED with this text."""
+        name = f"back end '{self.params.backend}'"
         try:
             if width_m is not None and isinstance(self._backend, HornBackend):
                 fit = self._backend.align_within(scan, guess, width_m)
             else:
                 fit = self._backend.align(scan, guess)
+            if not isinstance(fit, Fit):
+                return f"{name} returned {type(fit).__name__}, not Fit"
             finite = bool(np.isfinite(fit.T_ca.matrix).all())
-        except Exception:  # an error of a library is a status of this scan, not the end of a replay
-            return None
-        return fit if finite else None
+        except Exception as error:  # an error of a library is a status of this scan, not the end of a replay
+            return f"{name} failed: {type(error).__name__}: {error}".splitlines()[0][:MESSAGE_LENGTH]
+        return fit if finite else f"{name} returned a pose that is not finite"

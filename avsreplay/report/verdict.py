@@ -116,7 +116,13 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     stopped = header.get("interrupted_after")
     outside = [Reason(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
     outside += [Reason(Grade.CHECK, text) for text in header.get("preflight") or ()]
-    found = (_use(rows, summary), _errors(rows, extent_m), _faults(summary), _filter(rows, summary), _data(summary))
+    found = (
+        _use(rows, summary),
+        _errors(rows, extent_m),
+        _faults(summary),
+        _filter(rows, summary),
+        _data(rows, summary),
+    )
     reasons = sorted((*outside, *chain.from_iterable(found)), key=lambda reason: reason.grade is not Grade.FAIL)
     return Verdict(
         grade=reasons[0].grade if reasons else Grade.PASS,
@@ -206,8 +212,12 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Reason]:
         yield Reason(Grade.CHECK, f"convergence, reached at {t1.t1_s:.1f} s, does not hold at the end")
 
 
-def _data(summary: Summary) -> Iterator[Reason]:
-    """Losses and clock problems of the log."""
+def _data(rows: Sequence[Row], summary: Summary) -> Iterator[Reason]:
+    """Errors of the back end, losses and clock problems of the log."""
+    failed = [row for row in rows if row.status == "failed"]
+    if failed:
+        grade = Grade.FAIL if len(failed) > 0.5 * len(rows) else Grade.CHECK
+        yield Reason(grade, f"{len(failed)} of {len(rows)} registrations failed, the first: {failed[0].message}")
     for name, text in (
         ("losses", "damaged places of the log were left out"),
         ("stamps_unset", "scans have no time stamp"),

@@ -1,0 +1,51 @@
+"""A back end that fails: every scan has a row, the row says what happened, and the verdict repeats it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avsreplay.geometry import IDENTITY_QUAT, Pose
+from avsreplay.log import SourceOptions
+from avsreplay.records import Fit
+from avsreplay.report.summary import Summary
+from avsreplay.report.verdict import Grade, verdict_of
+from avsreplay.run import Job, Run
+
+LOG = Path(__file__).parents[1] / "fixtures" / "tumble.mcap"
+
+
+def _raises(points, guess):
+    raise RuntimeError("no licence\nsecond line")
+
+
+def _not_finite(points, guess):
+    fit = Fit(Pose(IDENTITY_QUAT, np.zeros(3)), 1, True)
+    object.__setattr__(fit.T_ca, "t", np.full(3, np.nan))
+    return fit
+
+
+CASES = {
+    "back end 'horn' failed: RuntimeError: no licence": _raises,
+    "back end 'horn' returned tuple, not Fit": lambda points, guess: (guess, 3, True),
+    "back end 'horn' returned NoneType, not Fit": lambda points, guess: None,
+    "back end 'horn' returned a pose that is not finite": _not_finite,
+}
+
+
+@pytest.mark.parametrize("message", CASES)
+def test_a_back_end_that_fails_is_named_in_every_row_and_in_the_verdict(message):
+    with Run(Job(source=LOG, options=SourceOptions(n_scans=3))) as run:
+        run.registrar._backend = type("Broken", (), {"align": staticmethod(CASES[message])})()
+        rows = list(run.rows())
+    assert [(row.status, row.gamma, row.message) for row in rows] == [("failed", 0, message)] * 3
+    verdict = verdict_of(rows, Summary.fold(rows))
+    assert verdict.grade is Grade.FAIL
+    assert any(message in reason.text for reason in verdict.reasons)
+
+
+def test_a_healthy_scan_has_no_message():
+    with Run(Job(source=LOG, options=SourceOptions(n_scans=3))) as run:
+        assert [row.message for row in run.rows()] == [None] * 3
