@@ -26,7 +26,7 @@ def rms(values):
 
 
 def test_every_scan_of_the_turn_is_healthy_and_close(dragon, cli):
-    rows = rows_of(cli("run", dragon, "--json"))
+    rows = rows_of(cli("run", dragon, "--init", "truth", "--json"))
     assert len(rows) == 15
     assert [r["gamma"] for r in rows] == [1] * 15
     for error, limit in (("pos_err_m", 0.5e-3), ("rot_err_deg", 0.5)):
@@ -35,8 +35,8 @@ def test_every_scan_of_the_turn_is_healthy_and_close(dragon, cli):
 
 def test_closed_loop_keeps_the_track_at_48_degrees_where_open_loop_loses_scans(dragon, cli):
     flags = ("--json", "--every-scan", 2, "--set", "reacquire=false")
-    closed = rows_of(cli("run", dragon, *flags))
-    opened = rows_of(cli("run", dragon, *flags, "--guess", "last"))
+    closed = rows_of(cli("run", dragon, "--init", "truth", *flags))
+    opened = rows_of(cli("run", dragon, "--init", "truth", *flags, "--guess", "last"))
     assert [r["gamma"] for r in closed] == [1] * 8
     assert rms([r["rot_err_deg"] for r in closed[1:]]) < 0.5
     assert sum(r["gamma"] for r in opened) < 8
@@ -45,8 +45,8 @@ def test_closed_loop_keeps_the_track_at_48_degrees_where_open_loop_loses_scans(d
 
 
 def test_72_degree_steps_are_kept_once_the_second_scan_is_acquired(dragon, cli):
-    kept = rows_of(cli("run", dragon, "--json", "--every-scan", 3))
-    lost = rows_of(cli("run", dragon, "--json", "--every-scan", 3, "--set", "reacquire=false"))
+    kept = rows_of(cli("run", dragon, "--init", "truth", "--json", "--every-scan", 3))
+    lost = rows_of(cli("run", dragon, "--init", "truth", "--json", "--every-scan", 3, "--set", "reacquire=false"))
     assert [r["gamma"] for r in kept] == [1] * 5
     assert [r["guess"] for r in kept] == ["truth", "acquired", "predicted", "predicted", "predicted"]
     assert sum(r["gamma"] for r in lost) < 5
@@ -54,7 +54,7 @@ def test_72_degree_steps_are_kept_once_the_second_scan_is_acquired(dragon, cli):
 
 def test_the_folder_itself_runs_without_recording_first(cli, shared_data):
     folder = shared_data / "stanford-dragon"
-    rows = rows_of(cli("run", folder, "--model", folder / "dragon_vrip_res3.ply", "--n-scans", 2, "--json"))
+    rows = rows_of(cli("run", folder, "--init", "truth", "--model", folder / "dragon_vrip_res3.ply", "--n-scans", 2, "--json"))
     assert [r["gamma"] for r in rows] == [1, 1]
 
 
