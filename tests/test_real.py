@@ -54,7 +54,9 @@ def test_72_degree_steps_are_kept_once_the_second_scan_is_acquired(dragon, cli):
 
 def test_the_folder_itself_runs_without_recording_first(cli, shared_data):
     folder = shared_data / "stanford-dragon"
-    rows = rows_of(cli("run", folder, "--init", "truth", "--model", folder / "dragon_vrip_res3.ply", "--n-scans", 2, "--json"))
+    rows = rows_of(
+        cli("run", folder, "--init", "truth", "--model", folder / "dragon_vrip_res3.ply", "--n-scans", 2, "--json")
+    )
     assert [r["gamma"] for r in rows] == [1, 1]
 
 
