@@ -10,13 +10,14 @@ from avsreplay.config import RunConfig, parse_pose
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.params import Start
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.faults import FaultDetector
 from avsreplay.pipeline import Monitors, PipelineState, Stages
-from avsreplay.plan import Guidance, Supervisor
+from avsreplay.plan import Guidance, Supervisor, TargetGeometry, hull_vertices
 from avsreplay.records import LogHeader, Scan, Surface, Truth
 from avsreplay.register import Registrar
+from avsreplay.register.surface_index import SurfaceIndex
 
 
 def stages(
@@ -39,19 +40,37 @@ def stages(
         UsageError: a near start is asked for and the log gives none.
     """
     start = header.start if config.init == "log" or config.estimator.start is Start.NEAR else None
+    limits = config.limits.widened(config.robot.radius_m)
     supervision = config.supervisor.resolved(surface.extent)
     return Stages(
         registrar=registrar,
         estimator=Estimator(config.estimator, start, surface.extent),
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
-        guidance=Guidance(config.plan, Supervisor(supervision)),
-        standoff_c=(supervision.standoff_m or 0.0) * np.array(config.fixture_axis_c),
+        guidance=Guidance(config.robot.applied(config.plan), Supervisor(supervision), limits, surface.extent),
+        target=target_geometry(surface, config.fixture_axis_c, limits.clearance_m is not None),
         guess=config.guess,
         deskew=config.deskew,
         reacquire=config.reacquire,
         initialise=_initialise(config, header, truth_of),
     )
+
+
+def target_geometry(surface: Surface, axis_c: tuple[float, float, float], clearance: bool) -> TargetGeometry:
+    """Return the geometry of the target for guidance; the surface is indexed only where a clearance is asked for."""
+    axis, hull = np.array(axis_c), hull_vertices(surface.vertices)
+    if not clearance:
+        return TargetGeometry(axis, hull)
+    index = SurfaceIndex.build(surface, surface.extent)
+    oriented = len(surface.faces) > 0
+
+    def closest(y: Array) -> tuple[Array, Array]:
+        found = index.closest(y)
+        distance = np.sqrt(found.d2)
+        inside = oriented & (np.sum((y - found.foot) * found.normal, axis=1) < 0.0)
+        return found.foot, np.where(inside, -distance, distance)
+
+    return TargetGeometry(axis, hull, closest)
 
 
 def first_state(ready: Stages) -> PipelineState:

@@ -17,7 +17,7 @@ from avsreplay.estimate import EstimatorParams
 from avsreplay.geometry import Pose
 from avsreplay.monitor.convergence import ConsistencyParams, ConvergenceParams
 from avsreplay.monitor.faults import FaultParams
-from avsreplay.plan import PlanParams, SupervisorParams
+from avsreplay.plan import Limits, PlanParams, RobotParams, SupervisorParams
 from avsreplay.register import RegisterParams
 from avsreplay.settings import Settings, setting
 from avsreplay.toml_document import Document, build, load, override
@@ -67,6 +67,8 @@ class RunConfig(Settings):
     consistency: ConsistencyParams = setting(ConsistencyParams, "Consistency of the innovations.")
     convergence: ConvergenceParams = setting(ConvergenceParams, "Convergence.")
     plan: PlanParams = setting(PlanParams, "Planning.")
+    robot: RobotParams = setting(RobotParams, "The robot.")
+    limits: Limits = setting(Limits, "Constraints of every capture plan.")
     supervisor: SupervisorParams = setting(SupervisorParams, "Supervision.")
     fixture_axis_c: tuple[float, float, float] = setting(
         (1.0, 0.0, 0.0), "Unit vector of the fixture's outward axis in {C}, along which the robot approaches."

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,9 +25,9 @@ from avsreplay.monitor.convergence import Consistency, ConsistencyTrack, Converg
 from avsreplay.monitor.faults import FaultDetector
 from avsreplay.monitor.observability import Gramian
 from avsreplay.outcome import MonitorReport, Outcome
-from avsreplay.plan import Guidance, GuidanceState, PlannerInput
+from avsreplay.plan import Guidance, GuidanceState, PlannerInput, Scene, TargetGeometry
 from avsreplay.plan.guidance import Segment
-from avsreplay.records import Alignment, Innovation, Scan, Trajectory, Verdict
+from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
 from avsreplay.register import Registrar
 
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
@@ -128,7 +128,7 @@ class Stages:
     """The stages of the chain, configured for one log.
 
     Attributes:
-        standoff_c: (3,) approach point in {C} [m].
+        target: geometry of the target for guidance.
         deskew: move points with times of their own to the scan's instant by the predicted motion.
         reacquire: register without a guess where the prediction is too uncertain to be one.
         initialise: first scan -> T_ac to begin with (None: acquire it), and where it comes from.
@@ -139,7 +139,7 @@ class Stages:
     faults: FaultDetector
     monitors: Monitors
     guidance: Guidance
-    standoff_c: Array
+    target: TargetGeometry
     guess: Guess
     deskew: bool
     reacquire: bool
@@ -185,8 +185,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     track, verdict = stages.estimator.step(track, prior, innovation, verdict, converged)
     gamma = verdict.gamma
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, innovation, gamma, track)
-    seen = _planner_input(stages, track, scan.t_ns, gamma, report.converged)
-    guidance = stages.guidance.step(state.guidance or stages.guidance.initial(scan.t_ns), seen)
+    forecast = partial(stages.estimator.track_forecast, track)
+    known = planner_input(stages.estimator, track.belief, stages.target, gamma, report.converged, forecast)
+    guidance = stages.guidance.step(state.guidance or stages.guidance.initial(scan.t_ns), known)
     outcome = Outcome(
         scan=scan,
         start_ns=state.start_ns,
@@ -290,21 +291,32 @@ def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
     return deskew(scan.points, scan.times_s, predicted)
 
 
-def _planner_input(stages: Stages, track: Track, t_ns: int, gamma: int, converged: bool) -> PlannerInput:
-    """What guidance may know after a scan: estimate and forecast, never the truth."""
-    estimator, belief = stages.estimator, track.belief
+Forecaster = Callable[[Array], Forecast]
+"""Times (n,) ascending [s after a belief] -> predicted standard deviations of the grasp point without measurements."""
 
-    @cache
-    def standoff() -> Trajectory:
-        x = belief.x
-        away = replace(x, c_b=x.c_b + geometry.matrix(x.q_bc) @ stages.standoff_c)
-        return estimator.motion(replace(belief, x=away))
 
-    return PlannerInput(
-        t_ns=t_ns,
-        gamma=gamma,
-        converged=converged,
+def target_scene(estimator: Estimator, belief: Belief, target: TargetGeometry, forecast: Forecaster) -> Scene:
+    """Return the predicted target after a belief, as the planner uses it: estimate and forecast, never the truth."""
+    centre_c = -geometry.matrix(belief.x.q_bc).T @ belief.x.c_b
+
+    def sigma(times_s: Array) -> tuple[Array, Array]:
+        predicted = forecast(times_s)
+        return predicted.pos_1s_m, predicted.rot_1s_rad
+
+    return Scene(
         goal=estimator.motion(belief),
-        forecast=lambda times_s: estimator.track_forecast(track, times_s),
-        standoff=lambda times_s: standoff()(times_s),
+        attitude=estimator.attitude(belief),
+        axis_c=target.axis_c,
+        centre_c=centre_c,
+        surface=target.surface,
+        sigma=sigma,
+        radius_m=target.radius(centre_c),
     )
+
+
+def planner_input(
+    estimator: Estimator, belief: Belief, target: TargetGeometry, gamma: int, converged: bool, forecast: Forecaster
+) -> PlannerInput:
+    """Return what guidance may know after a scan."""
+    scene = target_scene(estimator, belief, target, forecast)
+    return PlannerInput(belief.t_ns, gamma, converged, scene, forecast)

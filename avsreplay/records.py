@@ -76,7 +76,8 @@ class PlanStatus(Enum):
 
     OPTIMAL = "optimal"  # first feasible time, certified to the stated gap
     FEASIBLE = "feasible"  # satisfies all constraints; no claim of least time
-    INFEASIBLE = "infeasible_within_horizon"
+    NOT_FOUND = "none_found"  # the search found no plan; there may be one
+    INFEASIBLE = "infeasible_within_horizon"  # certified: there is no plan within the horizon
     NO_CONVERGENCE = "no_convergence"
 
 
@@ -350,7 +351,11 @@ class Plan:
         u_max: Largest |u| found along the propagated plan [m/s2].
         latency_s: Coasting time before the thrust [s].
         thrust: (n, 3) acceleration in {A} over n equal intervals [m/s2]; None where the costate defines the thrust.
-        violation_m: Largest excess over the constraints between the nodes [m]; NaN without constraints.
+        violation_m: Largest excess over the geometric constraints along the plan [m]; NaN without constraints.
+        margin_m: Smallest margin of the geometric constraints along the plan [m]; NaN without constraints.
+        binding: Name of the constraint with this margin, "" without constraints.
+        abort_margin_m: Smallest margin of the clearance if the robot aborts at any instant before the corridor [m]; NaN
+            without a clearance.
         steps: Number of steps of the search.
     """
 
@@ -366,6 +371,9 @@ class Plan:
     latency_s: float = 0.0
     thrust: Array | None = None
     violation_m: float = math.nan
+    margin_m: float = math.nan
+    binding: str = ""
+    abort_margin_m: float = math.nan
     steps: int = 0
 
     @property

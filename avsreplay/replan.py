@@ -1,52 +1,68 @@
-"""Planning from a saved result, without replaying it: one plan, its spread, its hindsight, and the flight."""
+"""Planning from the saved beliefs of a result: one plan, its distribution over the belief, its errors, the approach."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avsreplay import geometry, plan, toml_document
+from avsreplay import plan, settings, toml_document
+from avsreplay.build import target_geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.dynamics import grasp_trajectory, propagate
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.geometry import Array
+from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan import (
     Execution,
     Limits,
     Miss,
     Motion,
-    PlannerInput,
     PlanParams,
+    RobotParams,
     Scene,
     Spread,
     SupervisorParams,
+    TargetGeometry,
     Tolerance,
 )
-from avsreplay.plan.limits import margin
-from avsreplay.records import Belief, Plan, State
+from avsreplay.records import Belief, Plan, State, Surface
 from avsreplay.report.result import Result, load_result
 from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
+from avsreplay.settings import Settings, setting
 
-__all__ = ["Replanning", "Saved", "load_saved"]
+SIGMA_BOUND = 0.99  # inertia ratios of the draws are limited to the physical range
 
-SIGMA_BOUND = 0.99  # draws of the inertia ratios stay inside what a body can have
+
+@dataclass(frozen=True, slots=True)
+class PlanningConfig(Settings):
+    """The settings of a run that planning from its result may change."""
+
+    plan: PlanParams = setting(PlanParams, "Planning.")
+    robot: RobotParams = setting(RobotParams, "The robot.")
+    limits: Limits = setting(Limits, "Constraints of every capture plan.")
+    supervisor: SupervisorParams = setting(SupervisorParams, "Supervision.")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Saved:
-    """A result directory as the planner needs it.
+    """The part of a result directory that planning uses.
 
     Attributes:
-        rows, beliefs: one each a scan.  truth: the recorded true motion, None where there is none.
-        estimator: with the run's own settings.  plan, supervisor: the run's settings.
-        axis_c: (3,) outward axis of the fixture in {C}.  extent_m: bounding diagonal of the target.
-        warnings: what is known against the result: not verified, or made from a damaged log.
+        name: Name of the directory, for messages.
+        rows, beliefs: One per scan.
+        truth: Recorded true motion, None where there is none.
+        estimator: Estimator with the settings of the run.
+        plan, supervisor, limits, robot: Settings of the run.
+        axis_c: Outward axis of the fixture in {C}.
+        extent_m: Diagonal of the target's bounding box [m].
+        surface: Thinned model of the target, None where the result has none.
+        warnings: Known defects of the result: not verified, or made from a damaged log.
     """
 
     name: str
@@ -56,8 +72,11 @@ class Saved:
     estimator: Estimator
     plan: PlanParams
     supervisor: SupervisorParams
-    axis_c: Array
+    limits: Limits
+    robot: RobotParams
+    axis_c: tuple[float, float, float]
     extent_m: float
+    surface: Surface | None
     warnings: Sequence[str] = ()
 
     @property
@@ -105,8 +124,11 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
         estimator=Estimator(_table(EstimatorParams, config, "estimator"), None, extent),
         plan=_table(PlanParams, config, "plan"),
         supervisor=_table(SupervisorParams, config, "supervisor").resolved(extent),
-        axis_c=np.asarray(config.get("fixture_axis_c", (1.0, 0.0, 0.0)), dtype=np.float64),
+        limits=_table(Limits, config, "limits"),
+        robot=_table(RobotParams, config, "robot"),
+        axis_c=tuple(config.get("fixture_axis_c", (1.0, 0.0, 0.0))),
         extent_m=extent,
+        surface=_surface(result),
         warnings=result.warnings,
     )
 
@@ -114,6 +136,34 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
 def _table(cls: Any, config: Mapping[str, Any], name: str) -> Any:
     known = {k: v for k, v in config.get(name, {}).items() if v is not None}
     return toml_document.build(cls, toml_document.Document("run.json", {name: known}), (name,))
+
+
+def with_settings(saved: Saved, assignments: Sequence[str]) -> Saved:
+    """Return the saved result with settings of the planner changed by assignments such as ``supervisor.sigmas=2``.
+
+    Raises:
+        UsageError: An assignment has no such form, an unknown key or a wrong value.
+    """
+    tables: dict[str, Any] = {}
+    for name, values in (("plan", saved.plan), ("limits", saved.limits), ("robot", saved.robot)):
+        tables[name] = {k: v for k, v in settings.dump(values).items() if v is not None}
+    tables["supervisor"] = {k: v for k, v in settings.dump(saved.supervisor).items() if v is not None}
+    changed = toml_document.override(toml_document.Document("run.json", tables), assignments)
+    made = toml_document.build(PlanningConfig, changed)
+    return replace(
+        saved,
+        plan=made.plan,
+        limits=made.limits,
+        robot=made.robot,
+        supervisor=made.supervisor.resolved(saved.extent_m),
+    )
+
+
+def _surface(result: Result) -> Surface | None:
+    if result.view is None or not len(result.view.vertices):
+        return None
+    vertices = np.asarray(result.view.vertices, dtype=np.float64)
+    return Surface(vertices, np.asarray(result.view.faces, dtype=np.int32), "view.npz", "")
 
 
 def _extent(result: Result, path: Path) -> float:
@@ -125,14 +175,40 @@ def _extent(result: Result, path: Path) -> float:
     return float(np.linalg.norm(np.ptp(result.view.vertices, axis=0)))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Replanning:
-    """Plans from a saved result under settings of one's own."""
+    """Plans from a saved result with other settings."""
 
-    saved: Saved
-    params: PlanParams
-    limits: Limits
-    supervisor: SupervisorParams
+    def __init__(
+        self,
+        saved: Saved,
+        params: PlanParams,
+        limits: Limits,
+        supervisor: SupervisorParams,
+        robot: RobotParams | None = None,
+    ) -> None:
+        """Create the planning.
+
+        Args:
+            saved: The saved result.
+            params: Parameters of robot and planner.
+            limits: Constraints of every capture plan.
+            supervisor: Resolved parameters of the supervisor.
+            robot: The robot; that of the run where None.
+
+        Raises:
+            UsageError: A clearance is asked for and the result contains no model.
+        """
+        self.saved, self.supervisor, self.robot = saved, supervisor, robot or saved.robot
+        self.params = self.robot.applied(params)
+        self._radius = self.robot.radius_m
+        limits = limits.widened(self.robot.radius_m)
+        self.limits = limits.resolved(saved.extent_m)
+        if saved.surface is not None:
+            self._target = target_geometry(saved.surface, saved.axis_c, limits.clearance_m is not None)
+        elif limits.clearance_m is None:
+            self._target = TargetGeometry(np.array(saved.axis_c), np.zeros((1, 3)))
+        else:
+            raise UsageError("the result contains no model", where=saved.name, hint="plan without a clearance")
 
     @property
     def start(self) -> tuple[Array, Array]:
@@ -141,46 +217,55 @@ class Replanning:
 
     @property
     def tolerance(self) -> Tolerance:
-        """What counts as a capture: the supervisor's tolerances."""
+        """Largest errors of a capture: the supervisor's tolerances."""
         s = self.supervisor
         return Tolerance(s.capture_pos_m or 0.0, s.capture_speed_mps or 0.0, s.capture_angle_deg)
 
-    def scene(self, x: State) -> Scene:
-        """The target after a belief's instant: grasp point, fixture axis and mass centre."""
-        goal = grasp_trajectory(x)
-        tip = grasp_trajectory(_moved(x, self.saved.axis_c))
-        return Scene(
-            goal,
-            lambda t: tip(t)[0] - goal(t)[0],
-            lambda t: x.r_a + np.asarray(t)[:, None] * x.v_a,  # rigid: unit long
-        )
-
     def plan_at(self, index: int) -> Plan:
-        """Plan from the belief after a scan, under the limits where there are any."""
+        """Plan from the belief after a scan, under the limits."""
         belief = self.saved.beliefs[index]
-        scene = self.scene(belief.x)
+        return self._planned(self._scene(belief), belief.t_ns)
+
+    def _forecast(self, belief: Belief) -> Forecaster:
+        return partial(self.saved.estimator.forecast, belief)
+
+    def _scene(self, belief: Belief) -> Scene:
+        return target_scene(self.saved.estimator, belief, self._target, self._forecast(belief))
+
+    def _planned(self, scene: Scene, t_ns: int, warm: plan.RobotPath | None = None) -> Plan:
         if not self.limits.any:
-            return plan.rendezvous(scene.goal, *self.start, self.params, belief.t_ns)
-        return plan.constrained(scene, *self.start, self.params, self.limits, belief.t_ns, self.saved.extent_m)
+            return plan.rendezvous(scene.goal, *self.start, self.params, t_ns)
+        start = None if warm is None else (warm, 0.0)
+        return plan.constrained(scene, *self.start, self.params, self.limits, t_ns, self.saved.extent_m, warm=start)
 
     def path(self, made: Plan) -> plan.RobotPath:
-        """What a plan flies from the start."""
+        """Return the path of a plan from the start."""
         return plan.path_of(made, *self.start)
 
     def attitude(self, belief: Belief, after_s: float) -> Array:
-        """(4,) predicted q_ac a time after a belief."""
-        return _attitude(belief, after_s)
+        """Return the predicted q_ac (4,) a time after a belief."""
+        return np.asarray(self.saved.estimator.attitude(belief)(np.array([after_s]))[0])
 
     def spread_at(self, index: int, made: Plan, count: int, seed: int) -> Spread:
-        """The plan over draws from the belief it was made from."""
+        """Return the distribution of a plan over draws from the belief from which it was made."""
         belief = self.saved.beliefs[index]
         offsets = plan.draws(belief.P, count, np.random.Generator(np.random.PCG64(seed)))
-        futures = [_future(_bounded(boxplus(belief.x, d)), belief) for d in offsets]
-        aimed = self.attitude(belief, made.t_go_s)
-        return plan.spread(self.path(made), futures, self.start, self.params, self.tolerance, aimed)
+        drawn = [replace(belief, x=_bounded(boxplus(belief.x, d))) for d in offsets]
+        scenes = [self._scene(b) for b in drawn]
+        path, aimed = self.path(made), self.attitude(belief, made.t_go_s)
+
+        def planner(scene: Scene) -> Plan:
+            return self._planned(scene, belief.t_ns, path)
+
+        futures = [plan.Future(scene) for scene in scenes]
+        noise = self.robot.thrust_noise * self.params.a_max_mps2
+        disturbance = plan.Disturbance(noise, np.random.Generator(np.random.PCG64([seed, 1])))
+        # contact is measured with the end-effector itself, without the margin of the plan
+        body = None if self.limits.clearance_m is None else replace(self.limits, clearance_m=max(self._radius, 1e-9))
+        return plan.spread(path, futures, planner, self.tolerance, aimed, disturbance, body)
 
     def miss_at(self, index: int, made: Plan) -> Miss | None:
-        """The plan against the truth at its end; None without truth, or where it ends after the log."""
+        """Return the error of a plan against ground truth; None without truth, or where it ends after the log."""
         if self.saved.truth is None or not made.found:
             return None
         belief = self.saved.beliefs[index]
@@ -189,7 +274,7 @@ class Replanning:
         return found if np.isfinite(found.distance_m) else None
 
     def hindsight(self, period_s: float) -> list[tuple[float, Plan, Miss | None]]:
-        """A plan every ``period_s`` from convergence on, each from the start: (made at [s], plan, miss)."""
+        """Plan every ``period_s`` from convergence on, each time from the start: (made at [s], plan, error)."""
         out: list[tuple[float, Plan, Miss | None]] = []
         due_s = 0.0
         for k, row in enumerate(self.saved.rows):
@@ -200,57 +285,17 @@ class Replanning:
         return out
 
     def execute(self) -> Execution | None:
-        """Fly the log under the supervisor; None without truth."""
+        """Simulate the approach over the whole log under the supervisor; None without truth."""
         if self.saved.truth is None:
             return None
-        guidance = plan.Guidance(self.params, plan.Supervisor(self.supervisor), self._planner)
+        guidance = plan.Guidance(self.params, plan.Supervisor(self.supervisor), self.limits, self.saved.extent_m)
         beliefs = {belief.t_ns: belief for belief in self.saved.beliefs}
-        sights = (self.sight(k) for k in range(len(self.saved.rows)))
-        turned = lambda sight, after_s: self.attitude(beliefs[sight.t_ns], after_s)  # noqa: E731
-        return plan.execute(guidance, sights, self.saved.truth, turned, self.saved.since_ns)
-
-    def _planner(self, goal: Any, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
-        if not self.limits.any:
-            return plan.rendezvous(goal, r0, v0, params, t_ns)
-        index = int(np.searchsorted([b.t_ns for b in self.saved.beliefs], t_ns))
-        scene = self.scene(self.saved.beliefs[index].x)
-        wait = self.params.latency_s
-        axis, centre = scene.axis, scene.centre
-        shifted = Scene(goal, axis and (lambda t: axis(t + wait)), centre and (lambda t: centre(t + wait)))
-        return plan.constrained(shifted, r0, v0, params, self.limits, t_ns, self.saved.extent_m)
-
-    def sight(self, index: int) -> PlannerInput:
-        """What the pilot may know after a scan."""
-        belief, row = self.saved.beliefs[index], self.saved.rows[index]
-        away = _moved(belief.x, (self.supervisor.standoff_m or 0.0) * self.saved.axis_c)
-        return PlannerInput(
-            t_ns=belief.t_ns,
-            gamma=row.gamma,
-            converged=row.converged,
-            goal=grasp_trajectory(belief.x),
-            forecast=lambda times: self.saved.estimator.forecast(belief, times),
-            standoff=grasp_trajectory(away),
-            margin=self._margin(belief.x) if self.limits.any else None,
+        inputs = (
+            planner_input(self.saved.estimator, belief, self._target, row.gamma, row.converged, self._forecast(belief))
+            for belief, row in zip(self.saved.beliefs, self.saved.rows, strict=True)
         )
-
-    def _margin(self, x: State) -> Callable[[Array, Array], float]:
-        scene, limits = self.scene(x), self.limits.resolved(self.saved.extent_m)
-        return lambda r, v: margin(scene, limits, r, v)
-
-
-def _moved(x: State, by_c: Array) -> State:
-    """The same body with another grasp point, ``by_c`` (3,) away in {C}."""
-    return replace(x, c_b=x.c_b + geometry.matrix(x.q_bc) @ by_c)
-
-
-def _attitude(belief: Belief, after_s: float) -> Array:
-    later, _ = propagate(belief, belief.t_ns + round(after_s * 1e9), 0.0, 0.0)
-    return later.x.T_ac.q
-
-
-def _future(x: State, belief: Belief) -> plan.Future:
-    drawn = Belief(belief.t_ns, x, belief.P)
-    return plan.Future(grasp_trajectory(x), lambda after_s: _attitude(drawn, after_s))
+        turned = lambda known, after_s: self.attitude(beliefs[known.t_ns], after_s)  # noqa: E731
+        return plan.execute(guidance, inputs, self.saved.truth, turned, self.saved.since_ns)
 
 
 def _bounded(x: State) -> State:

@@ -274,6 +274,13 @@ class Row:
     earliest_capture_s: float | None = _seconds(
         lambda o, s: None if o.plan is None else since_start_s(o, o.plan.t_ns) + o.plan.lower_bound_s,
         "Certified lower bound of the time of capture, from the first scan.")
+    plan_margin_m: float | None = column(lambda o, s: None if o.plan is None else finite(o.plan.margin_m),
+        "Smallest margin of the geometric limits along the plan.", "m", ".4f", 0.0, 0.01)
+    plan_limit: str | None = _exact(lambda o, s: None if o.plan is None else o.plan.binding or None,
+        "Limit that has the smallest margin: cone, corridor, sphere or body.")
+    abort_margin_m: float | None = column(lambda o, s: None if o.plan is None else finite(o.plan.abort_margin_m),
+        "Smallest margin of the clearance if the robot aborts at any instant of the plan before the corridor.",
+        "m", ".4f", 0.0, 0.01)
     plan_miss_m: float | None = _error_m(_PLANNED[0],
         "Distance of gripper and true grasp point at the end of the plan that was made at this scan.")
     plan_miss_mps: float | None = _error_m(_PLANNED[1], "Their relative speed at that time.", "m/s")

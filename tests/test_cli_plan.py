@@ -54,7 +54,7 @@ def result(tmp_path_factory):
     stamps = [1_700_000_000_000_000_000 + round(k * STEP_S * 1e9) for k in range(SCANS)]
     rows = [
         Row(seq=k, t_ns=t, t_s=k * STEP_S, status="aligned", gamma=1, reason="ok", guess="predicted", points=1,
-            estimator="filter", converged=k >= 10, action="stand_still", rule="not_converged")
+            estimator="filter", converged=k >= 10, action="stand_still", supervisor_rule="not_converged")
         for k, t in enumerate(stamps)
     ]  # fmt: skip
     write_rows(folder / "rows.jsonl", rows)
@@ -99,7 +99,13 @@ def test_same_input_same_bytes(result):
 
 def test_tables_name_what_they_show(result):
     text = run(result, "--samples", 4, "--every", 20, "--at", 12).stdout
-    for words in ("Plan made at 12.00 s", "optimal", "capture probability", "Hindsight", "outcome: captured"):
+    for words in (
+        "Plan made at 12.00 s",
+        "optimal within",
+        "capture probability",
+        "Plans against ground truth",
+        "outcome: captured",
+    ):
         assert words in text
 
 
@@ -112,6 +118,20 @@ def test_flags_override_the_run(result):
     assert slow["plan"]["capture_time_s"] > free["plan"]["capture_time_s"]
     assert limited["plan"]["status"] == "feasible"
     assert limited["plan"]["capture_time_s"] > free["plan"]["capture_time_s"]
+
+
+def test_settings_of_supervisor_and_robot_can_be_changed(result):
+    args = (result, "--json", "--samples", 4, "--every", 99, "--at", 6)
+    robot = ("--set", "robot.mass_kg=100", "--set", "robot.thrust_max_n=3", "--set", "robot.thrust_noise=0.5")
+    free, heavy = (json.loads(run(*args, *more).stdout) for more in ((), robot))
+    assert heavy["plan"]["a_max_mps2"] == pytest.approx(0.03)
+    assert heavy["robot"]["mass_kg"] == 100
+    assert heavy["spread"]["miss_m"]["mean"] > 10 * free["spread"]["miss_m"]["mean"]
+    assert heavy["spread"]["probability"] < free["spread"]["probability"]
+    assert "100 kg, at most 0.03 m/s2" in run(*args[:1], *args[2:], *robot).stdout
+    strict = json.loads(run(*args, "--set", "supervisor.capture_pos_m=0.0001").stdout)
+    assert strict["tolerance"]["position_m"] == 0.0001
+    assert strict["execution"]["outcome"] != "captured"
 
 
 def test_export_is_the_plan(result, tmp_path):
@@ -139,6 +159,9 @@ def test_export_is_the_plan(result, tmp_path):
         (("--from", "1,2"), "not three numbers"),
         (("--every", 0), "not above 0"),
         (("--keepout", 3.0), "keepout_m is 3.0"),
+        (("--clearance", 0.1), "contains no model"),
+        (("--set", "robot.mass_kg=3"), "must be given together"),
+        (("--set", "supervisor.sigma=3"), "sigma"),
     ],
 )
 def test_what_cannot_be_is_one_line(result, args, says):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import exp, multiply
-from avsreplay.plan import Future, PlanParams, Tolerance, draws, path_of, rendezvous, spread
+from avsreplay.plan import Future, PlanParams, Scene, Tolerance, draws, path_of, rendezvous, spread
 
 ORIGIN = np.zeros(3)
 PARAMS = PlanParams()
@@ -14,6 +14,14 @@ PARAMS = PlanParams()
 
 def fixed(point):
     return lambda t: (np.tile(point, (len(t), 1)), np.zeros((len(t), 3)))
+
+
+def scene(point, q=None):
+    return Scene(fixed(point), (q is not None and (lambda t: np.tile(q, (len(t), 1)))) or None)
+
+
+def planner(params):
+    return lambda scene: rendezvous(scene.goal, ORIGIN, ORIGIN, params)
 
 
 def plan():
@@ -48,7 +56,7 @@ def test_a_singular_covariance_is_accepted_and_a_negative_one_refused():
 
 
 def test_a_certain_future_gives_no_spread():
-    found = spread(plan(), [Future(fixed([4.0, 0, 0]))] * 5, (ORIGIN, ORIGIN), PARAMS, Tolerance())
+    found = spread(plan(), [Future(scene([4.0, 0, 0]))] * 5, planner(PARAMS), Tolerance())
     assert found.probability == 1.0
     assert found.miss_m.p95 < 1e-9
     assert found.t_go_s.std == pytest.approx(0.0, abs=1e-12)
@@ -59,9 +67,9 @@ def test_a_certain_future_gives_no_spread():
 def test_miss_and_probability_follow_the_rayleigh_distribution():
     rng = np.random.default_rng(3)
     sigma, count = 0.01, 1000
-    futures = [Future(fixed([4.0, *(sigma * z)])) for z in rng.standard_normal((count, 2))]
+    futures = [Future(scene([4.0, *(sigma * z)])) for z in rng.standard_normal((count, 2))]
     quick = PlanParams(grid_s=5.0)
-    found = spread(plan(), futures, (ORIGIN, ORIGIN), quick, Tolerance(position_m=0.02))
+    found = spread(plan(), futures, planner(quick), Tolerance(position_m=0.02))
     expected = 1.0 - math.exp(-0.5 * 2.0**2)  # Rayleigh
     assert found.probability == pytest.approx(expected, abs=4 * math.sqrt(expected * (1 - expected) / count))
     assert found.miss_m.mean == pytest.approx(sigma * math.sqrt(math.pi / 2), rel=0.05)
@@ -70,8 +78,8 @@ def test_miss_and_probability_follow_the_rayleigh_distribution():
 
 def test_end_time_spreads_as_its_slope_says():
     base, slope = 4.0, 1.0 / math.sqrt(4.0 * 0.05)  # t = 2 sqrt(x/a), dt/dx
-    futures = [Future(fixed([base + d, 0, 0])) for d in (-0.05, 0.05)]
-    found = spread(plan(), futures, (ORIGIN, ORIGIN), PARAMS, Tolerance())
+    futures = [Future(scene([base + d, 0, 0])) for d in (-0.05, 0.05)]
+    found = spread(plan(), futures, planner(PARAMS), Tolerance())
     assert found.t_go_s.std == pytest.approx(0.05 * slope, rel=1e-3)
     assert found.probability == 0.0
 
@@ -79,16 +87,16 @@ def test_end_time_spreads_as_its_slope_says():
 def test_the_attitude_error_counts():
     q = exp([0.1, 0.2, 0.3])
     off = multiply(q, exp([0.0, math.radians(3.0), 0.0]))
-    futures = [Future(fixed([4.0, 0, 0]), lambda t: q), Future(fixed([4.0, 0, 0]), lambda t: off)]
-    found = spread(plan(), futures, (ORIGIN, ORIGIN), PARAMS, Tolerance(angle_deg=2.0), q)
+    futures = [Future(scene([4.0, 0, 0], q)), Future(scene([4.0, 0, 0], off))]
+    found = spread(plan(), futures, planner(PARAMS), Tolerance(angle_deg=2.0), q)
     assert found.probability == 0.5
     assert found.angle_deg.mean == pytest.approx(1.5, abs=1e-6)
 
 
 def test_a_future_out_of_reach_is_counted():
-    away = Future(lambda t: (np.tile([900.0, 0, 0], (len(t), 1)), np.zeros((len(t), 3))))
-    found = spread(plan(), [away, Future(fixed([4.0, 0, 0]))], (ORIGIN, ORIGIN), PARAMS, Tolerance())
+    away = Future(scene([900.0, 0, 0]))
+    found = spread(plan(), [away, Future(scene([4.0, 0, 0]))], planner(PARAMS), Tolerance())
     assert found.infeasible == 1
     assert found.probability == 0.5
     with pytest.raises(ValueError, match="no future"):
-        spread(plan(), [], (ORIGIN, ORIGIN), PARAMS, Tolerance())
+        spread(plan(), [], planner(PARAMS), Tolerance())

@@ -1,4 +1,4 @@
-"""``avsreplay plan``: replan the capture from a saved result."""
+"""``avsreplay plan``: plan the capture from the saved beliefs of a result."""
 
 from __future__ import annotations
 
@@ -21,10 +21,11 @@ Examples:
   avsreplay plan results/                          from t_1 on, with the run's settings
   avsreplay plan results/ --at 40 --a-max 0.02
   avsreplay plan results/ --cone-deg 30 --final-deg 8 --speed-max 0.4
+  avsreplay plan results/ --final-deg 15 --clearance 0.1 --set supervisor.sigmas=2 --set robot.thrust_noise=0.02
   avsreplay plan results/ --export plan.csv --json
 
 \b
-Exit codes: 0 ok (also where no capture lies within the horizon: the status says so),
+Exit codes: 0 ok (also where no plan was found; the status says so),
             2 usage, 3 unreadable input."""
 
 
@@ -44,11 +45,23 @@ Exit codes: 0 ok (also where no capture lies within the horizon: the status says
 @setting("--contact-accel", "contact_accel_mps2", type=float, owner=LIMITS)
 @setting("--keepout", "keepout_m", type=float, owner=LIMITS)
 @setting("--keepout-release", "keepout_release_m", type=float, owner=LIMITS)
+@setting("--clearance", "clearance_m", type=float, owner=LIMITS)
+@click.option(
+    "--set",
+    "assignments",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change a setting of plan, limits, robot or supervisor.",
+)
 @click.option("--samples", type=click.IntRange(1), default=64, show_default=True, help="Draws from the belief.")
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the draws.")
-@click.option("--every", "every_s", type=float, help="Hindsight: a plan so often [s]; 2, or 20 under limits.")
-@click.option("--fly", is_flag=True, help="Fly the log under limits too: a constrained plan a second, minutes in all.")
-@click.option("--extent", "extent_m", type=float, help="Target's size [m], where the result does not tell.")
+@click.option(
+    "--every",
+    "every_s",
+    type=float,
+    help="Interval of the plans compared with ground truth [s]; default: 2, with limits 10.",
+)
+@click.option("--extent", "extent_m", type=float, help="Extent of the target [m], if the result does not contain it.")
 @click.option("--export", type=click.Path(path_type=Path), help="Write t, r, v, u of the plan as CSV.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing CSV.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
@@ -58,28 +71,28 @@ def command(
     samples: int,
     seed: int,
     every_s: float | None,
-    fly: bool,
+    assignments: tuple[str, ...],
     extent_m: float | None,
     export: Path | None,
     overwrite: bool,
     as_json: bool,
     **flags: Any,
 ) -> None:
-    """Plan the capture anew from RESULT, a directory written by 'avsreplay run -o'.
+    """Plan the capture from RESULT, a directory written by 'avsreplay run -o'.
 
-    Nothing is replayed: the saved beliefs are enough. Shown are the plan, its spread over the belief, and, where the
-    log has the truth, what each plan would have missed by and how a flight under the supervisor would have ended.
+    The saved beliefs are used and nothing is replayed. The output contains the plan, its distribution over the belief
+    and, if the log has ground truth, the errors of plans made at regular intervals and a simulated approach.
     """
     from avsreplay.errors import UsageError
     from avsreplay.files import check_output
-    from avsreplay.replan import load_saved
+    from avsreplay.replan import load_saved, with_settings
 
     for name, value in (("--every", every_s), ("--extent", extent_m)):
         if value is not None and not 0.0 < value < float("inf"):
             raise UsageError(f"{value} is not above 0", where=name, hint="give a finite number above 0")
     if export:
         check_output(export, overwrite=overwrite)
-    saved = load_saved(result, extent_m)
+    saved = with_settings(load_saved(result, extent_m), assignments)
     for line in saved.warnings:
         click.echo(f"avsreplay: warning: {line}", err=True)
     planning = _planning(saved, flags)
@@ -87,13 +100,11 @@ def command(
     made = _usable(lambda: planning.plan_at(index))
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
     limited = planning.limits.any
-    period_s = every_s or (20.0 if limited else 2.0)
+    period_s = every_s or (10.0 if limited else 2.0)
     hindsight = _usable(lambda: planning.hindsight(period_s))
-    execution = _usable(planning.execute) if fly or not limited else None
+    execution = _usable(planning.execute)
     if export:
         _export(planning, made, export)
-    if limited and not fly:
-        click.echo("not flown: under limits every replan is costly; --fly does it all the same", err=True)
     if as_json:
         click.echo(_document(planning, index, made, spread, hindsight, execution), nl=False)
     else:
@@ -101,19 +112,19 @@ def command(
 
 
 def _usable(action: Any) -> Any:
-    """A value the planner refuses is the user's."""
+    """Return the result of an action; a value that the planner refuses is an error of the user."""
     from avsreplay.errors import UsageError
 
     try:
         return action()
     except ValueError as error:
-        raise UsageError(str(error), hint="correct the flag, or the setting in run.json") from None
+        raise UsageError(str(error), hint="correct the option, or the setting in run.json") from None
 
 
 def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
     from dataclasses import fields, replace
 
-    from avsreplay.plan import Limits, PlanParams
+    from avsreplay.plan import PlanParams
     from avsreplay.replan import Replanning
 
     given = {name: value for name, value in flags.items() if value is not None}
@@ -121,7 +132,8 @@ def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
         given["robot_position_m"] = _point(given["robot_position_m"])
     of_plan = {f.name for f in fields(PlanParams)}
     params: PlanParams = _usable(lambda: replace(saved.plan, **{k: v for k, v in given.items() if k in of_plan}))
-    limits: Limits = _usable(lambda: Limits(**{k: v for k, v in given.items() if k not in of_plan}))
+    changed = {k: v for k, v in given.items() if k not in of_plan}
+    limits: Limits = _usable(lambda: replace(saved.limits, **changed))
     return Replanning(saved, params, limits, saved.supervisor)
 
 
@@ -156,6 +168,7 @@ def _document(
         "plan": _plan_record(made, since_s),
         "limits": settings.dump(planning.limits),
         "params": settings.dump(planning.params),
+        "robot": settings.dump(planning.robot),
         "tolerance": settings.dump(planning.tolerance),
         "spread": settings.dump(spread) if spread else None,
         "hindsight": [
@@ -185,6 +198,9 @@ def _plan_record(made: Plan, since_s: float) -> dict[str, Any]:
         "velocity_error_mps": made.velocity_error_mps,
         "costate": made.costate.tolist(),
         "violation_m": made.violation_m,
+        "margin_m": made.margin_m,
+        "limit": made.binding or None,
+        "abort_margin_m": made.abort_margin_m,
     }
 
 
@@ -217,7 +233,7 @@ def _print(
 
 
 def _plan_facts(planning: Replanning, at_s: float, made: Plan, spread: Spread | None) -> list[tuple[str, str]]:
-    facts = [("status", made.status.value)]
+    facts = [("robot", planning.robot.described(planning.params)), ("status", _status(made))]
     if made.found:
         facts += [
             ("capture", f"at {at_s + made.t_go_s:.3f} s, {made.t_go_s:.4f} s after planning"),
@@ -226,9 +242,22 @@ def _plan_facts(planning: Replanning, at_s: float, made: Plan, spread: Spread | 
         ]
     basis = "certified without the limits" if planning.limits.any else "certified"
     facts.append(("no capture before", f"{made.lower_bound_s:.4f} s after planning ({basis})"))
-    if made.thrust is not None:
-        facts.append(("limits", f"checked between nodes, worst {made.violation_m:.1e} m"))
+    if made.binding:
+        facts.append(("smallest margin", f"{made.margin_m:.4f} m ({made.binding}); excess {made.violation_m:.1e} m"))
+    if abs(made.abort_margin_m) < float("inf"):
+        facts.append(("margin of an abort", f"{made.abort_margin_m:.3f} m of clearance, from any instant"))
     return facts + _spread_rows(spread)
+
+
+def _status(made: Plan) -> str:
+    """Return what is known about the plan, in words."""
+    words = {
+        "optimal": f"optimal within {max(made.gap_s, 0.0):.1e} s",
+        "feasible": f"found; at most {made.gap_s:.2f} s later than the earliest possible capture",
+        "none_found": "none found; a capture may exist",
+        "infeasible_within_horizon": "proven impossible within the horizon",
+    }
+    return words.get(made.status.value, made.status.value)
 
 
 def _spread_rows(spread: Spread | None) -> list[tuple[str, str]]:
@@ -238,13 +267,25 @@ def _spread_rows(spread: Spread | None) -> list[tuple[str, str]]:
     return [
         (
             "t_go over belief",
-            f"mean {t.mean:.3f} s, 5-95 % {t.p05:.3f} to {t.p95:.3f} s; {spread.infeasible} infeasible",
+            f"mean {t.mean:.3f} s, 5-95 % {t.p05:.3f} to {t.p95:.3f} s; {spread.infeasible} without a plan",
         ),
         ("miss over belief", f"mean {1e3 * m.mean:.2f} mm, 5-95 % {1e3 * m.p05:.2f} to {1e3 * m.p95:.2f} mm"),
         ("speed over belief", f"mean {1e3 * v.mean:.2f} mm/s, 5-95 % {1e3 * v.p05:.2f} to {1e3 * v.p95:.2f} mm/s"),
         ("angle over belief", f"mean {a.mean:.3f} deg, 5-95 % {a.p05:.3f} to {a.p95:.3f} deg"),
-        ("capture probability", f"{spread.probability:.3f} of {spread.futures} draws, flown without replanning"),
+        (
+            "capture probability",
+            f"{spread.probability:.3f} (95 % {spread.probability_95[0]:.3f} to {spread.probability_95[1]:.3f}) "
+            f"in {spread.futures} draws without replanning",
+        ),
+        *_contact_rows(spread),
     ]
+
+
+def _contact_rows(spread: Spread) -> list[tuple[str, str]]:
+    if not spread.contact >= 0.0:
+        return []
+    low, high = spread.contact_95
+    return [("contact probability", f"{spread.contact:.3f} (95 % {low:.3f} to {high:.3f}) outside the corridor")]
 
 
 def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
@@ -265,11 +306,11 @@ def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
     )
     left_out = len(hindsight) - len(rows)
     return Table(
-        "Hindsight: each plan against the truth at its end",
+        "Plans against ground truth at their planned end",
         ("made at\n[s]", "status", "capture\n[s]", "early by\n[s]", "miss\n[mm]", "speed\n[mm/s]", "angle\n[deg]"),
         rows,
         align="rlr",
-        note=f"{left_out} further plans end after the log, or were not found" if left_out else "",
+        note=f"{left_out} further plans end after the log or were not found" if left_out else "",
     )
 
 
@@ -277,14 +318,14 @@ def _execution_table(execution: Execution) -> Table:
     from avsreplay.report.table import Table
 
     rows = tuple((f"{t_s:.2f}", action, rule) for t_s, action, rule in execution.actions)
-    return Table("Flight under the supervisor", ("from\n[s]", "action", "rule"), rows, align="rl")
+    return Table("Simulated approach under the supervisor", ("from\n[s]", "action", "rule"), rows, align="rl")
 
 
 def _outcome_lines(execution: Execution, planning: Replanning) -> list[str]:
     lines = [f"outcome: {execution.outcome(planning.tolerance)}"]
     if execution.miss is not None:
         m = execution.miss
-        error = f"{1e3 * m.distance_m:.2f} mm off, {1e3 * m.speed_mps:.2f} mm/s, {m.angle_deg:.3f} deg"
+        error = f"distance {1e3 * m.distance_m:.2f} mm, {1e3 * m.speed_mps:.2f} mm/s, {m.angle_deg:.3f} deg"
         lines.append(f"gripper closed at {m.at_s:.3f} s: {error}")
     return lines
 

@@ -7,6 +7,7 @@ independent sigma; ``transition`` applies the chain rule for sigma3(sigma1, sigm
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -195,6 +196,12 @@ def grasp_trajectory(x: State) -> Trajectory:
         return position, velocity
 
     return at
+
+
+def fixture_attitude(x: State) -> Callable[[Array], Array]:
+    """Times (n,) >= 0 [s after now] -> attitudes q_ac (n, 4) of the fixture, undisturbed."""
+    path = rotation_path(x)
+    return lambda times: geometry.multiply(path.at(np.asarray(times, dtype=np.float64))[0], x.q_bc)
 
 
 def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) -> Forecast:

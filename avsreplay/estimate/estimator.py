@@ -7,6 +7,7 @@ at intervals; where the fit contradicts it, the fit is used again.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -196,6 +197,10 @@ class Estimator:
     def motion(self, belief: Belief) -> Trajectory:
         """The predicted path of the grasp point after the belief's instant."""
         return dynamics.grasp_trajectory(belief.x)
+
+    def attitude(self, belief: Belief) -> Callable[[Array], Array]:
+        """The predicted attitudes q_ac (n, 4) of the fixture at times (n,) [s after the belief's instant]."""
+        return dynamics.fixture_attitude(belief.x)
 
     def forecast(self, belief: Belief, times_s: Array) -> Forecast:
         """Predicted 1 sigma of the grasp point.

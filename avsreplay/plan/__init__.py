@@ -3,9 +3,9 @@
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.evaluation import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
-from avsreplay.plan.limits import Limits, Scene
+from avsreplay.plan.limits import Limits, Scene, TargetGeometry, hull_vertices
 from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of
-from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.rendezvous import PlanParams, RobotParams, rendezvous
 from avsreplay.plan.supervisor import (
     RULES,
     Action,
@@ -15,13 +15,14 @@ from avsreplay.plan.supervisor import (
     SupervisorMemory,
     SupervisorParams,
 )
-from avsreplay.plan.uncertainty import Future, Spread, draws, spread
+from avsreplay.plan.uncertainty import Disturbance, Future, Spread, draws, spread
 
 __all__ = [
     "RULES",
     "Action",
     "CostatePath",
     "Decision",
+    "Disturbance",
     "Execution",
     "Facts",
     "Future",
@@ -32,6 +33,7 @@ __all__ = [
     "Motion",
     "PlanParams",
     "PlannerInput",
+    "RobotParams",
     "RobotPath",
     "Scene",
     "Segment",
@@ -40,10 +42,12 @@ __all__ = [
     "Supervisor",
     "SupervisorMemory",
     "SupervisorParams",
+    "TargetGeometry",
     "Tolerance",
     "constrained",
     "draws",
     "execute",
+    "hull_vertices",
     "interpolated",
     "miss",
     "path_of",

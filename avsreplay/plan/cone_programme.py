@@ -1,8 +1,9 @@
-"""For a fixed end time: the least thrust under convex limits, a second-order cone programme.
+"""One convex subproblem of the constrained planner: a second-order cone programme with free end time.
 
-Thrust is constant over each of N equal intervals, so velocities are linear and positions quadratic between nodes, and
-a bound on thrust or speed at the nodes is a bound everywhere. Lengths are in units of the way to go, times in units of
-the end time: the programme has the same shape whatever the target's size.
+Thrust is constant over each of N equal intervals of length h. In the scaled variables q = h v and w = h^2 u the
+dynamics r' = r + q + w/2, q' = q + w are linear also for free h. The bound |w| <= a_max h^2 is replaced by its tangent
+in h, which lies below, so every solution obeys the true bound and the true dynamics. Only the motion of the target with
+the end time is linearised.
 """
 
 from __future__ import annotations
@@ -20,53 +21,71 @@ Index = NDArray[np.signedinteger[Any]]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ConeConstraint:
-    """|across| <= slope * along + mouth at some nodes, along and across taken from ``apex`` about ``axis``.
+class PointRows:
+    """Scalar rows c.(r - origin) + rate (h/h_ref - 1) of the robot's position at given instants.
 
     Attributes:
-        nodes: (m,) node numbers from 1.  apex, axis: (m, 3) [m], unit.  slope: tan of the half-angle.
-        mouth: (m,) radius at the apex, less what keeps the path inside between nodes [m].
+        interval: (m,) number of the interval, from 0.
+        fraction: (m,) position of the instant within its interval, 0 to 1.
+        vector: (m, 3) coefficients c in {A}.
+        offset: (m,) value of -c.origin plus the constant of the row [m].
+        rate: (m,) change of the row with the relative change of h, from the motion of the target [m].
+        slack: (m,) coefficient of the common slack variable.
     """
 
-    nodes: Index
-    apex: Array
-    axis: Array
-    slope: float
-    mouth: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class HalfSpaces:
-    """``normal . r >= offset`` at some nodes. nodes (m,), normal (m, 3) unit, offset (m,) [m]."""
-
-    nodes: Index
-    normal: Array
+    interval: Index
+    fraction: Array
+    vector: Array
     offset: Array
+    rate: Array
+    slack: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ConeProgramme:
-    """From (r0, v0) to (r1, v1) in t seconds over n intervals, under the limits given.
+class Subproblem:
+    """Least end time near a reference. Lengths in metres, times in seconds.
 
     Attributes:
-        speed: bound on |v| [m/s].  contact: (acceleration (3,), bound): |u - acceleration| <= bound at the end.
+        n, h: Number of intervals and reference length of an interval.
+        r0, v0: (3,) position and velocity at the start.
+        rho, rate, acceleration: (3,) motion of the goal at the reference end time n h.
+        a_max: Bound on the thrust.
+        change: Largest relative change of h.
+        weight: Cost of the slack, in relative end time per length scale.
+        speed: Bound on the speed.
+        contact: Bound on |u - acceleration| in the last interval.
+        planes: Rows that must be at least 0.
+        cones: Rows in groups of ``size``; in each group the first row bounds the norm of the others.
     """
 
-    t: float
     n: int
+    h: float
     r0: Array
     v0: Array
-    r1: Array
-    v1: Array
+    rho: Array
+    rate: Array
+    acceleration: Array
+    a_max: float
+    change: float
+    weight: float = 1000.0
     speed: float | None = None
-    contact: tuple[Array, float] | None = None
-    funnels: tuple[ConeConstraint, ...] = ()
-    walls: tuple[HalfSpaces, ...] = ()
+    contact: float | None = None
+    planes: tuple[PointRows, ...] = ()
+    cones: tuple[tuple[int, PointRows], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Solution:
+    """Solution of a subproblem: interval length h [s], thrust u (n, 3) [m/s2] and the slack [m]."""
+
+    h: float
+    u: Array
+    slack: float
 
 
 @dataclass(slots=True)
 class _Rows:
-    """Rows of A x + s = b in the making, s in a product of cones."""
+    """Rows of A x + s = b, collected as triplets; s lies in a product of cones."""
 
     rows: list[Index] = field(default_factory=list)
     columns: list[Index] = field(default_factory=list)
@@ -74,119 +93,128 @@ class _Rows:
     right: list[Array] = field(default_factory=list)
     count: int = 0
 
-    def put(self, rows: Index, columns: Index, value: Any) -> None:
-        """Entries ``value`` at rows (counted from the present block) and columns."""
+    def put(self, rows: Index, columns: Any, value: Any) -> None:
+        """Add entries at rows (counted from the current block) and columns."""
         self.rows.append(self.count + rows)
-        self.columns.append(np.broadcast_to(columns, rows.shape))
+        self.columns.append(np.broadcast_to(np.asarray(columns), rows.shape))
         self.values.append(np.broadcast_to(np.asarray(value, dtype=np.float64), rows.shape))
 
     def close(self, right: Array) -> None:
-        """End the present block of rows with its right-hand side."""
+        """End the current block with its right-hand side."""
         self.right.append(right)
         self.count += len(right)
 
 
-def solve(p: ConeProgramme) -> tuple[float, Array] | None:
-    """Least bound on thrust [m/s2] and the thrust (n, 3) that keeps it; None where the limits cannot be met."""
+def solve(p: Subproblem) -> Solution | None:
+    """Solve a subproblem with Clarabel. Returns None where the solver fails."""
     clarabel: Any = importlib.import_module("clarabel")
     from scipy import sparse
 
-    way = max(float(np.linalg.norm(p.r1 - p.r0 - p.v0 * p.t)), float(np.linalg.norm(p.v1 - p.v0)) * p.t, 1e-9)
-    n, size = p.n, 9 * p.n + 7
+    n = p.n
+    scale = max(float(np.linalg.norm(p.rho - p.r0 - p.v0 * n * p.h)), 0.5 * p.a_max * (n * p.h) ** 2, 1e-9)
+    size = 9 * n + 8
     rows = _Rows()
-    _dynamics(rows, p, way)
+    _dynamics(rows, p, scale)
     cones = [clarabel.ZeroConeT(rows.count)]
-    cones += [clarabel.SecondOrderConeT(4)] * _norms(rows, p, way)
-    cones += [clarabel.SecondOrderConeT(4)] * _funnels(rows, p, way)
-    walls = _walls(rows, p, way)
-    cones += [clarabel.NonnegativeConeT(walls)] if walls else []
-    A = sparse.csc_matrix(
-        (np.concatenate(rows.values), (np.concatenate(rows.rows), np.concatenate(rows.columns))), (rows.count, size)
-    )
+    start = rows.count
+    _bounds(rows, p)
+    for plane in p.planes:
+        _point_rows(rows, p, plane, scale)
+    cones.append(clarabel.NonnegativeConeT(rows.count - start))
+    cones += [clarabel.SecondOrderConeT(4)] * _norms(rows, p, scale)
+    for dimension, cone in p.cones:
+        _point_rows(rows, p, cone, scale)
+        cones += [clarabel.SecondOrderConeT(dimension)] * (len(cone.interval) // dimension)
+    triplets = (np.concatenate(rows.values), (np.concatenate(rows.rows), np.concatenate(rows.columns)))
+    A = sparse.csc_matrix(triplets, (rows.count, size))
     cost = np.zeros(size)
-    cost[-1] = 1.0
-    nothing = sparse.csc_matrix((size, size))
-    found = clarabel.DefaultSolver(nothing, cost, A, np.concatenate(rows.right), cones, _settings(clarabel)).solve()
+    cost[-2:] = 1.0, p.weight
+    none = sparse.csc_matrix((size, size))
+    found = clarabel.DefaultSolver(none, cost, A, np.concatenate(rows.right), cones, _settings(clarabel)).solve()
     if str(found.status) not in ("Solved", "AlmostSolved"):
         return None
-    x = np.array(found.x)
-    u = x[6 * (n + 1) : -1].reshape(n, 3) * (way / p.t**2)
-    return float(np.sqrt(np.max(np.sum(u * u, axis=1)))), u
+    x = np.asarray(found.x)
+    h = p.h * float(x[-2])
+    return Solution(h, x[6 * (n + 1) : -2].reshape(n, 3) * (scale / h**2), scale * max(float(x[-1]), 0.0))
 
 
 def _settings(clarabel: Any) -> Any:
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.max_threads = 1
-    settings.tol_gap_abs = settings.tol_gap_rel = 1e-10
-    settings.tol_feas = 1e-11
+    settings.tol_gap_abs = settings.tol_gap_rel = 1e-8
+    settings.tol_feas = 1e-9
+    settings.presolve_enable = False
     return settings
 
 
-def _dynamics(rows: _Rows, p: ConeProgramme, way: float) -> None:
-    """Let r' = r + h v + h^2/2 u and v' = v + h u over each interval, and both ends. Variables: r, v, u, bound."""
-    n, h = p.n, 1.0 / p.n
-    k, at_v, at_u = np.arange(3 * n), 3 * (n + 1), 6 * (n + 1)
-    for column, factor in ((k + 3, 1.0), (k, -1.0), (at_v + k, -h), (at_u + k, -0.5 * h * h)):
+def _dynamics(rows: _Rows, p: Subproblem, scale: float) -> None:
+    """R' = r + q + w/2 and q' = q + w over each interval; the start. Variables: r, q, w, h/h_ref, slack."""
+    n = p.n
+    k, q, w = np.arange(3 * n), 3 * (n + 1), 6 * (n + 1)
+    for column, factor in ((k + 3, 1.0), (k, -1.0), (q + k, -1.0), (w + k, -0.5)):
         rows.put(k, column, factor)
     rows.close(np.zeros(3 * n))
-    for column, factor in ((at_v + k + 3, 1.0), (at_v + k, -1.0), (at_u + k, -h)):
+    for column, factor in ((q + k + 3, 1.0), (q + k, -1.0), (w + k, -1.0)):
         rows.put(k, column, factor)
     rows.close(np.zeros(3 * n))
     j = np.arange(3)
-    pace = way / p.t
-    for first, value in ((0, p.r0 / way), (at_v, p.v0 / pace), (3 * n, p.r1 / way), (at_v + 3 * n, p.v1 / pace)):
-        rows.put(j, first + j, 1.0)
-        rows.close(value)
+    rows.put(j, j, 1.0)
+    rows.close(p.r0 / scale)
+    rows.put(j, q + j, 1.0)
+    rows.put(j, 9 * n + 6, -p.v0 * p.h / scale)
+    rows.close(np.zeros(3))
 
 
-def _norms(rows: _Rows, p: ConeProgramme, way: float) -> int:
-    """|u| <= bound, |v| <= speed, |u_last - a| <= contact. Returns how many cones of 4 these are."""
-    n, at_v, at_u = p.n, 3 * (p.n + 1), 6 * (p.n + 1)
-    k, count = np.arange(n), n
-    rows.put(4 * k, np.array(9 * n + 6), -1.0)
+def _bounds(rows: _Rows, p: Subproblem) -> None:
+    """1 - change <= h/h_ref <= 1 + change and slack >= 0."""
+    rows.put(np.array([0, 1]), 9 * p.n + 6, np.array([-1.0, 1.0]))
+    rows.put(np.array([2]), 9 * p.n + 7, -1.0)
+    rows.close(np.array([p.change - 1.0, 1.0 + p.change, 0.0]))
+
+
+def _norms(rows: _Rows, p: Subproblem, scale: float) -> int:
+    """Thrust, speed, contact and end condition. Returns the number of cones of dimension 4."""
+    n, q, w, h = p.n, 3 * (p.n + 1), 6 * (p.n + 1), 9 * p.n + 6
+    k, j, count = np.arange(n), np.arange(3), n
+    bound = p.a_max * p.h**2 / scale  # |w| <= bound (2 h/h_ref - 1), the tangent of h^2
+    rows.put(4 * k, h, -2.0 * bound)
     for c in range(3):
-        rows.put(4 * k + 1 + c, at_u + 3 * k + c, -1.0)
-    rows.close(np.zeros(4 * n))
+        rows.put(4 * k + 1 + c, w + 3 * k + c, -1.0)
+    rows.close(np.tile((-bound, 0.0, 0.0, 0.0), n))
     if p.speed is not None:
+        rows.put(4 * k, h, -p.speed * p.h / scale)
         for c in range(3):
-            rows.put(4 * k + 1 + c, at_v + 3 * k + 3 + c, -1.0)
-        rows.close(np.tile((p.speed * p.t / way, 0.0, 0.0, 0.0), n))
+            rows.put(4 * k + 1 + c, q + 3 * k + 3 + c, -1.0)
+        rows.close(np.zeros(4 * n))
         count += n
     if p.contact is not None:
-        acceleration, bound = p.contact
-        j = np.arange(3)
-        rows.put(1 + j, at_u + 3 * (n - 1) + j, -1.0)
-        rows.close(np.array([bound, *(-acceleration)]) * (p.t**2 / way))
+        pull, reach = p.acceleration * p.h**2 / scale, p.contact * p.h**2 / scale
+        rows.put(np.array([0, 1, 2, 3]), h, np.array([-2.0 * reach, *(2.0 * pull)]))
+        rows.put(1 + j, w + 3 * (n - 1) + j, -1.0)
+        rows.close(np.array([-reach, *pull]))
         count += 1
-    return count
+    shift = p.rate * n * p.h / scale  # of the goal with h/h_ref
+    rows.put(np.zeros(1, dtype=np.int64), h + 1, -1.0)
+    rows.put(1 + j, 3 * n + j, -1.0)
+    rows.put(1 + j, h, shift)
+    rows.close(np.array([0.0, *(shift - p.rho / scale)]))
+    turn = p.acceleration * n * p.h  # of the goal's velocity with h/h_ref
+    rows.put(np.zeros(1, dtype=np.int64), h + 1, -1.0 / n)
+    rows.put(1 + j, q + 3 * n + j, -1.0)
+    rows.put(1 + j, h, (p.rate + turn) * p.h / scale)
+    rows.close(np.array([0.0, *(turn * p.h / scale)]))
+    return count + 2
 
 
-def _funnels(rows: _Rows, p: ConeProgramme, way: float) -> int:
-    """Rows s = (slope axis.(r - apex) + mouth, (I - axis axis^T)(r - apex)) in the cone of 4, each node."""
-    count = 0
-    for f in p.funnels:
-        m = np.arange(len(f.nodes))
-        first = 3 * f.nodes
-        along = np.sum(f.axis * f.apex, axis=1)
-        right = np.empty((len(m), 4))
-        right[:, 0] = (f.mouth - f.slope * along) / way
-        right[:, 1:] = -(f.apex - f.axis * along[:, None]) / way
-        for c in range(3):
-            rows.put(4 * m, first + c, -f.slope * f.axis[:, c])
-            for d in range(3):
-                rows.put(4 * m + 1 + d, first + c, f.axis[:, c] * f.axis[:, d] - float(c == d))
-        rows.close(right.ravel())
-        count += len(m)
-    return count
-
-
-def _walls(rows: _Rows, p: ConeProgramme, way: float) -> int:
-    count = 0
-    for w in p.walls:
-        m = np.arange(len(w.nodes))
-        for c in range(3):
-            rows.put(m, 3 * w.nodes + c, -w.normal[:, c])
-        rows.close(-w.offset / way)
-        count += len(m)
-    return count
+def _point_rows(rows: _Rows, p: Subproblem, points: PointRows, scale: float) -> None:
+    m, first = np.arange(len(points.interval)), 3 * points.interval
+    q, w = 3 * (p.n + 1), 6 * (p.n + 1)
+    s = points.fraction
+    for c in range(3):
+        rows.put(m, first + c, -points.vector[:, c])
+        rows.put(m, q + first + c, -s * points.vector[:, c])
+        rows.put(m, w + first + c, -0.5 * s * s * points.vector[:, c])
+    rows.put(m, 9 * p.n + 6, -points.rate / scale)
+    rows.put(m, 9 * p.n + 7, -points.slack)
+    rows.close((points.offset - points.rate) / scale)

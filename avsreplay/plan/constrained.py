@@ -1,288 +1,321 @@
-"""The least time under limits: fixed end times are cone programmes, the end time is searched for.
+"""Time-optimal rendezvous under constraints by successive convexification.
 
-The unconstrained least time is a certified lower bound. From it the search goes up by stated steps, on a coarse grid,
-to the first end time whose least thrust a*(t) does not pass a_max, and then down into that step by false position on
-the fine one. Limits that turn with the target leave no body that shrinks with time, so nothing certifies the times
-between two steps: such a plan is ``feasible``, and its ``lower_bound_s`` and ``scan_s`` say how far. Where no limit
-acts the two times agree and the plan is ``optimal``.
-A plan is checked between its nodes too; what sticks out there is taken off the limit at the nodes around.
+Each iteration linearises the constraints about a reference path and solves a second-order cone programme with free end
+time. Most constraints are alternatives (inside the cone, or outside its range); the reference decides which one holds
+at an instant. Several initial paths with different arrival times and sides lead to different local minima; the earliest
+capture is kept. A plan is accepted only after the true constraints hold at sixteen instants of every interval.
+
+The least time without constraints is a certified lower bound of the time with constraints.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
-from avsreplay.plan.cone_programme import ConeConstraint, ConeProgramme, HalfSpaces, solve
-from avsreplay.plan.limits import Limits, SampledScene, Scene
-from avsreplay.plan.path import StepPath
+from avsreplay.plan.cone_programme import solve
+from avsreplay.plan.convexification import (
+    BETWEEN,
+    Case,
+    Reference,
+    dense_margins,
+    excess,
+    instants,
+    linearised,
+    turn_rate,
+)
+from avsreplay.plan.limits import CONSTRAINTS, Limits, SampledScene, Scene
+from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.records import Plan, PlanStatus
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-BETWEEN = 8  # instants a thrust interval is checked at
-VIOLATION_M = 5e-7  # what may stick out of a limit [m]
-PASSES = 8  # solve, check, tighten
-COARSE = 4  # the scan's intervals are this many times longer
-CLEARLY_SHORT = 1.02  # thrust needed in units of a_max that no further pass can bring below 1
-SAME_TIME_S = 1e-3  # closer than this to the lower bound no limit acts: the intervals alone make the difference
-THRUST_TOLERANCE = 1e-7  # of a_max
-_CONES = np.array([[True], [True], [False]])
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Known:
-    """What one end time teaches the next: which nodes each limit holds at, and how much is taken off there.
-
-    Attributes:
-        active: (3, n + 1) cone, last metres, sphere.  off: (3, n + 1) [m].
-        slack: what may stick out [m].  path: (n + 1, 3) last positions, None at first.
-    """
-
-    active: Array
-    off: Array
-    slack: float
-    path: Array | None = None
-
-    @classmethod
-    def nothing(cls, n: int, slack: float) -> _Known:
-        """Over n intervals, before anything was tried."""
-        return cls(np.zeros((3, n + 1), dtype=bool), np.zeros((3, n + 1)), slack)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Case:
-    """Everything that does not change with the end time."""
-
-    scene: Scene
-    sampled: SampledScene
-    limits: Limits
-    params: PlanParams
-    r0: Array
-    v0: Array
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
-    """One end time. ``thrust`` is the least bound, infinite where the limits cannot be met or were not in time."""
-
-    t: float
-    thrust: float
-    flight: StepPath | None
-    known: _Known
+COARSE_NODES = 16  # thrust intervals while initial paths are compared
+ITERATIONS = 14  # of one initial path
+TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
+SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
+TURN_RAD = 0.5  # the target may turn by this much between two iterations
+ABORT_S = 30.0  # duration of an abort
+ABORTS = 16  # instants at which an abort is tried
 
 
 def constrained(
-    scene: Scene, r0: Array, v0: Array, params: PlanParams, limits: Limits, t_ns: int = 0, extent_m: float = 8.0
+    scene: Scene,
+    r0: Array,
+    v0: Array,
+    params: PlanParams,
+    limits: Limits,
+    t_ns: int = 0,
+    extent_m: float = 8.0,
+    warm: tuple[RobotPath, float] | None = None,
 ) -> Plan:
-    """Plan under limits. Lengths left out of them are taken from the target's extent.
+    """Plan a rendezvous under constraints.
 
     Args:
-        scene: grasp point, fixture axis and mass centre after t_ns.
-        r0: (3,) robot in {A} at t_ns [m].
+        scene: The target after t_ns.
+        r0: (3,) position of the robot in {A} at t_ns [m].
         v0: (3,) its velocity [m/s].
-        params: see PlanParams.
-        limits: see Limits.
-        t_ns: instant of planning.
-        extent_m: bounding diagonal of the target [m].
+        params: Thrust, horizon, latency and grid.
+        limits: The constraints; lengths that are not set are taken from the target's extent.
+        t_ns: Instant of planning.
+        extent_m: Diagonal of the target's bounding box [m].
+        warm: A path planned earlier and the time since its begin [s]; it is the first initial path.
 
     Returns:
-        Plan with ``thrust`` (n, 3) and ``violation_m``; its costate is NaN.
+        A plan with status ``optimal`` (within ``gap_s`` of the certified lower bound, which is the least time without
+        constraints), ``feasible`` (all constraints hold, a local minimum), ``none_found`` (no plan was found, but one
+        may exist) or ``infeasible_within_horizon`` (certified).
 
     Raises:
-        ValueError: naming a value that cannot be right, or what the scene does not know.
+        ValueError: A value is not valid, or the scene lacks what a constraint needs.
     """
     limits = limits.resolved(extent_m)
     scene.check(limits)
     free = rendezvous(scene.goal, r0, v0, params, t_ns)
-    if not free.found or free.t_go_s - params.latency_s <= 0.0:
+    if not free.found or not limits.any or free.t_go_s <= params.latency_s:
         return free
-    case = _Case(scene, SampledScene(scene, params.horizon_s, params.grid_s), limits, params, r0, v0)
-    found = _search(case, free.t_go_s - params.latency_s)
-    return _plan(case, free, found, t_ns)
+    free = _bounded_by_speed(scene, free, np.asarray(r0, float), params, limits)
+    if not free.found:
+        return free
+    sampled = SampledScene(scene, params.horizon_s, params.grid_s)
+    case = Case(sampled, limits, params, np.asarray(r0, float), np.asarray(v0, float), 1e-5 * extent_m)
+    unlimited = _free_plan(case, free)
+    return unlimited or _graded(case, free, _best_path(case, free, warm), t_ns)
 
 
-def _plan(case: _Case, free: Plan, found: _Trial | None, t_ns: int) -> Plan:
+def _bounded_by_speed(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:
+    """Raise the certified lower bound to the first time at which the distance can be covered at the largest speed.
+
+    The distance between two samples of the goal is bounded below by the largest speed of the goal, times 1.5.
+    """
+    if limits.speed_max_mps is None:
+        return free
+    times = np.linspace(0.0, params.horizon_s, math.ceil(params.horizon_s / params.grid_s) + 1)
+    rho, rate = scene.goal(times)
+    away = np.linalg.norm(rho - r0, axis=1)
+    sag = 0.5 * times[1] * MOTION_FACTOR * float(np.linalg.norm(rate, axis=1).max())
+    reachable = np.minimum(away[1:], away[:-1]) - sag <= limits.speed_max_mps * times[1:]
+    if not reachable.any():
+        nan = math.nan
+        status, bound = PlanStatus.INFEASIBLE, params.horizon_s
+        return Plan(free.t_ns, status, nan, np.full(6, nan), free.a_max, bound, nan, nan, nan)
+    return replace(free, lower_bound_s=max(free.lower_bound_s, float(times[int(reachable.argmax())])))
+
+
+def _free_plan(case: Case, free: Plan) -> Plan | None:
+    """Return the plan without constraints where it satisfies all of them; None where it does not."""
+    path, limits = path_of(free, case.r0, case.v0), case.limits
+    times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * limits.nodes + 1)
+    if limits.speed_max_mps is not None:
+        speed = np.linalg.norm(path.at(times)[1], axis=1)
+        if speed.max() > limits.speed_max_mps:
+            return None
+    if limits.contact_accel_mps2 is not None:
+        rate = case.scene.goal(np.array([path.t_go_s, path.t_go_s - 1e-4]))[1]
+        relative = path.thrust(times[-1:])[0] - (rate[0] - rate[1]) / 1e-4
+        if float(np.linalg.norm(relative)) > limits.contact_accel_mps2:
+            return None
+    worst, name = _worst(case, path)
+    if worst < 0.0:
+        return None
+    return replace(free, violation_m=0.0, margin_m=worst, binding=name, abort_margin_m=_abort_margin(case, path))
+
+
+def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
     nan, none = math.nan, np.full(6, math.nan)
-    if found is None or found.flight is None:
-        status = PlanStatus.INFEASIBLE
+    if found is None:
+        status = PlanStatus.NOT_FOUND
         return Plan(t_ns, status, nan, none, free.a_max, free.lower_bound_s, nan, nan, nan)
-    path = found.flight
-    same = path.t_go_s - free.lower_bound_s <= SAME_TIME_S
-    position, velocity = path.terminal_errors(case.scene.goal)
+    position, velocity = found.terminal_errors(case.scene.goal)
+    worst, name = _worst(case, found)
     return Plan(
         t_ns=t_ns,
-        status=PlanStatus.OPTIMAL if same and case.limits.keepout_m is None else PlanStatus.FEASIBLE,
-        t_go_s=path.t_go_s,
+        status=PlanStatus.OPTIMAL if found.t_go_s - free.lower_bound_s <= SAME_TIME_S else PlanStatus.FEASIBLE,
+        t_go_s=found.t_go_s,
         costate=none,
         a_max=free.a_max,
         lower_bound_s=free.lower_bound_s,
         position_error_m=position,
         velocity_error_mps=velocity,
-        u_max=path.u_max(),
-        latency_s=path.latency_s,
-        thrust=path.u,
-        violation_m=float(max(v.max() for v in violations(case.sampled, case.limits, path))),
+        u_max=found.u_max(),
+        latency_s=found.latency_s,
+        thrust=found.u,
+        violation_m=max(-worst, 0.0),
+        margin_m=worst,
+        binding=name,
+        abort_margin_m=_abort_margin(case, found),
     )
 
 
-def _search(case: _Case, t: float) -> _Trial | None:
-    """Up from t by steps to the first end time that thrust suffices for, then down into the last step."""
-    low = _try(case, t, _Known.nothing(case.limits.nodes, VIOLATION_M))
-    if _suffices(case, low):
-        return low
-    for _ in range(4):  # hardly short: the limits, or the intervals alone, cost little
-        if low.thrust >= CLEARLY_SHORT * case.params.a_max_mps2:
+def _abort_margin(case: Case, path: RobotPath) -> float:
+    """Return the smallest margin of the clearance if the robot aborts at any of some instants outside the corridor.
+
+    An abort is the largest acceleration away from the centre of mass for ABORT_S seconds. NaN without a clearance.
+    """
+    limits = case.limits
+    if limits.clearance_m is None or case.scene.surface is None:
+        return math.nan
+    begin = np.linspace(case.wait_s, path.t_go_s, ABORTS, endpoint=False)
+    r, v = path.at(begin)
+    outside = np.linalg.norm(r - case.sampled.at(begin)[0], axis=1) > (limits.final_range_m or 0.0)
+    begin, r, v = begin[outside], r[outside], v[outside]
+    if not len(begin):
+        return math.nan
+    rho, R = case.sampled.at(begin)
+    centre = rho + R @ (np.zeros(3) if case.scene.centre_c is None else case.scene.centre_c)
+    away = (r - centre) / np.maximum(np.linalg.norm(r - centre, axis=1, keepdims=True), 1e-9)
+    after = np.linspace(0.0, ABORT_S, 3 * ABORTS)[None, :, None]
+    positions = r[:, None] + v[:, None] * after + 0.5 * case.params.a_max_mps2 * away[:, None] * after**2
+    times = (begin[:, None] + after[0, :, 0]).ravel()
+    y = case.sampled.coordinates(times, positions.reshape(-1, 3))
+    return float(case.scene.surface(y)[1].min()) - limits.clearance_m
+
+
+def _worst(case: Case, path: RobotPath) -> tuple[float, str]:
+    """Return the smallest margin along a path and the constraint that has it, "" without geometric constraints."""
+    if not case.limits.geometric:
+        return math.inf, ""
+    values = dense_margins(case, path)[1].between
+    least = values.min(axis=0)
+    return float(least.min()), CONSTRAINTS[int(least.argmin())] if np.isfinite(least).any() else ""
+
+
+def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> StepPath | None:
+    """Return the earliest capture found.
+
+    A warm start that converges is taken. Otherwise every initial path is iterated on a coarse grid with a coarse check,
+    and the results are refined in the order of their arrival times.
+    """
+    if warm is not None:
+        found = _converged(case, _warm(case, *warm))
+        if found is not None:
+            return found
+    coarse = replace(case, limits=replace(case.limits, nodes=min(COARSE_NODES, case.limits.nodes)), coarse=True)
+    drafts: list[StepPath] = []
+    for reference in _initial(coarse, free):
+        draft = _converged(coarse, reference)
+        if draft is not None:
+            drafts.append(draft)
+        if drafts and reference.t > 1.5 * min(d.t_go_s for d in drafts):
             break
-        high = _try(case, low.t + _stride(low, case), low.known)
-        if _suffices(case, high):
-            return _close_in(case, low, high)
-        low = high
-    below = _scan(case, t)
-    return None if below is None else _refine(case, *below, t)
-
-
-def _suffices(case: _Case, trial: _Trial) -> bool:
-    return trial.thrust <= case.params.a_max_mps2 * (1.0 + THRUST_TOLERANCE)
-
-
-def _scan(case: _Case, t: float) -> tuple[float, float] | None:
-    """The first step of the coarse scan that ends with enough thrust: its two ends."""
-    end = case.params.horizon_s - case.params.latency_s
-    known = _Known.nothing(max(case.limits.nodes // COARSE, 8), 0.5 * (case.limits.mouth_m or 0.0))
-    low = _try(case, t, known)
-    while low.t < end:
-        known = replace(low.known, active=low.known.active * _CONES)  # where one path met the sphere another may not
-        high = _try(case, min(low.t + case.limits.scan_s, end), known)
-        if _suffices(case, high):
-            return low.t, high.t
-        low = high
-    return None
-
-
-def _refine(case: _Case, low_t: float, high_t: float, least: float) -> _Trial | None:
-    """The same step on the fine grid, moved by whole steps where the two grids do not agree."""
-    end, step = case.params.horizon_s - case.params.latency_s, case.limits.scan_s
-    high = _try(case, high_t, _Known.nothing(case.limits.nodes, VIOLATION_M))
-    while not _suffices(case, high):
-        if high.t >= end:
-            return None
-        low_t, high = high.t, _try(case, min(high.t + step, end), high.known)
-    low = _try(case, low_t, high.known)
-    while _suffices(case, low) and low.t > least:
-        high, low = low, _try(case, max(low.t - step, least), low.known)
-    return low if _suffices(case, low) else _close_in(case, low, high)
-
-
-def _stride(low: _Trial, case: _Case) -> float:
-    """At most the stated step; less where a target at rest would be met before (thrust falls as 1/t^2)."""
-    if not math.isfinite(low.thrust):
-        return case.limits.scan_s
-    short = low.thrust / case.params.a_max_mps2 - 1.0
-    return min(case.limits.scan_s, max(low.t * short, 1e-4))
-
-
-def _close_in(case: _Case, low: _Trial, high: _Trial) -> _Trial:
-    """False position on log(a*/a_max); ``high`` always suffices."""
-    a_max, side = case.params.a_max_mps2, 1.0
-    for _ in range(12):
-        if high.thrust >= a_max * (1.0 - 1e-5) or high.t - low.t <= 1e-5:
+    best: StepPath | None = None
+    for draft in sorted(drafts, key=lambda d: d.t_go_s):
+        if best is not None and draft.t_go_s > best.t_go_s:
             break
-        f_high = math.log(high.thrust / a_max)
-        f_low = math.log(low.thrust / a_max) * side if math.isfinite(low.thrust) else -f_high
-        share = min(max(f_low / (f_low - f_high), 0.05), 0.98)
-        tried = _try(case, low.t + share * (high.t - low.t), high.known)
-        if _suffices(case, tried):
-            high, side = tried, 0.5 * side
-        else:
-            low, side = tried, 1.0
-    return high
+        refined = _converged(case, _warm(case, draft, 0.0))
+        if refined is not None and (best is None or refined.t_go_s < best.t_go_s):
+            best = refined
+    return best
 
 
-def _try(case: _Case, t: float, known: _Known) -> _Trial:
-    """The least thrust for one end time, with nothing sticking out between nodes."""
-    wait, n = case.params.latency_s, known.active.shape[1] - 1
-    rho, rate = case.scene.goal(np.array([wait + t, wait + t - 1e-4]))
-    start = case.r0 + wait * case.v0
-    base = ConeProgramme(t, n, start, case.v0, rho[0], rate[0], case.limits.speed_max_mps)
-    if case.limits.contact_accel_mps2 is not None:
-        base = replace(base, contact=((rate[0] - rate[1]) / 1e-4, case.limits.contact_accel_mps2))
-    nodes = case.sampled.at(wait + np.linspace(0.0, t, n + 1))
-    for _ in range(PASSES):
-        funnels, walls = _limits_at(case.limits, nodes, known)
-        found = solve(replace(base, funnels=funnels, walls=walls))
-        if found is None:
-            return _Trial(t, math.inf, None, known)
-        if found[0] > CLEARLY_SHORT * case.params.a_max_mps2:  # a limit added can only ask for more
-            return _Trial(t, found[0], None, known)
-        flight = StepPath(case.r0, case.v0, found[1], wait, wait + t)
-        out = violations(case.sampled, case.limits, flight)
-        known = _learn(known, out, flight.nodes()[0])
-        if max(v.max() for v in out) <= known.slack:
-            return _Trial(t, found[0], flight, known)
-    return _Trial(t, math.inf, None, known)
+def _warm(case: Case, path: RobotPath, since_s: float) -> Reference:
+    t = max(path.t_go_s - since_s - case.wait_s, 1e-3)
+    return Reference(t, path.at(since_s + case.wait_s + t * instants(case.limits.nodes))[0])
 
 
-def _limits_at(
-    limits: Limits, nodes: tuple[Array, Array, Array], known: _Known
-) -> tuple[tuple[ConeConstraint, ...], tuple[HalfSpaces, ...]]:
-    apex, axis, centre = nodes
-    mouth = limits.mouth_m or 0.0
-    funnels = []
-    for row, degrees in enumerate((limits.cone_deg, limits.final_deg)):
-        k = np.flatnonzero(known.active[row])
-        if degrees is not None and len(k):
-            slope = math.tan(math.radians(degrees))
-            funnels.append(ConeConstraint(k, apex[k], axis[k], slope, mouth - known.off[row, k]))
-    k = np.flatnonzero(known.active[2])
-    if limits.keepout_m is None or known.path is None or not len(k):
-        return tuple(funnels), ()
-    out = known.path[k] - centre[k]
-    normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-12)
-    offset = limits.keepout_m + known.off[2, k] + np.sum(normal * centre[k], axis=1)
-    return tuple(funnels), (HalfSpaces(k, normal, offset),)
-
-
-def violations(scene: SampledScene, limits: Limits, flight: StepPath) -> Sequence[Array]:
-    """What sticks out of cone, last metres and sphere [m], each (n * 8 + 1,) over the flight, 0 inside."""
-    n = len(flight.u)
-    times = np.linspace(flight.latency_s, flight.t_go_s, BETWEEN * n + 1)
-    r, _ = flight.at(times)
-    apex, axis, centre = scene.at(times)
-    from_apex = r - apex
-    distance = np.linalg.norm(from_apex, axis=1)
-    stride = float(np.abs(np.diff(distance)).max())  # a limit begins somewhere between two instants: take the earlier
-    along = np.sum(from_apex * axis, axis=1)
-    across = np.linalg.norm(from_apex - along[:, None] * axis, axis=1)
-    zero = np.zeros(len(times))
-    out = [zero, zero, zero]
-    for i, degrees, reach in ((0, limits.cone_deg, limits.cone_range_m), (1, limits.final_deg, limits.final_range_m)):
-        if degrees is not None:
-            excess = across - math.tan(math.radians(degrees)) * along - (limits.mouth_m or 0.0)
-            out[i] = np.where(distance <= (reach or math.inf) + stride, np.maximum(excess, 0.0), 0.0)
-    if limits.keepout_m is not None:
-        inside = limits.keepout_m - np.linalg.norm(r - centre, axis=1)
-        out[2] = np.where(distance > (limits.keepout_release_m or 0.0) - stride, np.maximum(inside, 0.0), 0.0)
+def _initial(case: Case, free: Plan) -> list[Reference]:
+    """Initial paths: the free plan, then flights to a point on the fixture's axis and along the axis, ever later."""
+    s, wait, least = instants(case.limits.nodes), case.wait_s, free.t_go_s - case.wait_s
+    out = [Reference(least, path_of(free, case.r0, case.v0).at(wait + least * s)[0])]
+    if not case.limits.geometric:
+        return out
+    turn = turn_rate(case, wait + least)
+    t, end = 1.1 * least, case.params.horizon_s - wait
+    step = min(max(0.15 * least, 0.9 / max(turn, 1e-6)), 0.5 * least)
+    while t <= end and len(out) < 9:
+        out.append(Reference(t, _via_axis(case, t, s)))
+        t += step
     return out
 
 
-def _learn(known: _Known, out: Sequence[Array], path: Array) -> _Known:
-    """Put the limit on, and take off it what stuck out, at the nodes round every violation."""
-    active, off = known.active.copy(), known.off.copy()
-    n = active.shape[1] - 1
-    for row, values in enumerate(out):
-        cell = values[1:].reshape(n, BETWEEN).max(axis=1)
-        worst = np.maximum(np.concatenate([cell[:1], cell]), np.concatenate([cell, cell[-1:]]))
-        touched = worst > 0.0
-        touched[0] = False  # where the robot is when it plans cannot be changed
-        bound = np.where(active[row, 1:] & (active[row, :-1] | (np.arange(n) == 0)), cell, 0.0)  # held at both ends
-        sag = np.maximum(np.concatenate([bound[:1], bound]), np.concatenate([bound, bound[-1:]]))
-        off[row] += np.where(sag > 0.0, 1.2 * sag + 0.2 * known.slack, 0.0)
-        active[row] |= touched
-    return _Known(active, off, known.slack, path)
+def _via_axis(case: Case, t: float, s: Array) -> Array:
+    """Positions (2 n, 3) of a flight around the target to the fixture's axis, then along it to the goal."""
+    scene, limits = case.scene, case.limits
+    axis = np.array([1.0, 0.0, 0.0]) if scene.axis_c is None else scene.axis_c
+    ranges = [limits.cone_range_m if limits.cone_deg else 0.0, limits.final_range_m if limits.final_deg else 0.0]
+    length = 1.05 * max(*(r or 0.0 for r in ranges), limits.mouth_m or 0.0)
+    last_s = min(1.4 * math.sqrt(2.0 * length / case.params.a_max_mps2), 0.6 * t)
+    times = case.wait_s + t * s
+    rho, R = case.sampled.at(times)
+    entry = np.array([case.wait_s + t - last_s])
+    rho_e, R_e = case.sampled.at(entry)
+    x = np.clip(s * t / max(t - last_s, 1e-9), 0.0, 1.0)[:, None]
+    start = case.r0 + case.wait_s * case.v0
+    blend = x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    r = start + blend * (rho_e[0] + length * (R_e[0] @ axis) - start)
+    left = np.clip((1.0 - s) * t / last_s, 0.0, 1.0)[:, None]
+    along = rho + length * left**2 * (R @ axis)
+    r = np.where(s[:, None] * t >= t - last_s, along, r)
+    return _around(case, r, rho, R, s * t < t - last_s)
+
+
+def _around(case: Case, r: Array, rho: Array, R: Array, free: NDArray[np.bool_]) -> Array:
+    """Move the points (n, 3) that lie inside the sphere around the target outward onto it, where ``free``."""
+    limits, scene = case.limits, case.scene
+    centre_c = np.zeros(3) if scene.centre_c is None else scene.centre_c
+    radius = limits.keepout_m or 0.0
+    if limits.clearance_m is not None or limits.cone_deg is not None:
+        radius = max(radius, float(np.linalg.norm(centre_c)) + (limits.clearance_m or 0.0))
+    centre = rho + R @ centre_c
+    away = r - centre
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    inside = free[:, None] & (distance < radius)
+    return np.where(inside, centre + away / np.maximum(distance, 1e-9) * radius, r)
+
+
+def _converged(case: Case, reference: Reference) -> StepPath | None:
+    """Iterate from a reference until the end time no longer changes; return the earliest feasible path seen."""
+    best: StepPath | None = None
+    n = case.limits.nodes
+    off = np.zeros((2 * n, len(CONSTRAINTS)))
+    change, slack = _trust(case, reference), math.inf
+    for iteration in range(ITERATIONS):
+        problem = linearised(case, reference, off, change)
+        found = solve(problem)
+        if found is None:
+            return best
+        t = n * found.h
+        path = StepPath(case.r0, case.v0, found.u, case.wait_s, case.wait_s + t)
+        over = excess(case, path)
+        if found.slack <= case.buffer_m:
+            path = _exact_end(case, path)
+            allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
+            if _feasible(case, path, over, allowed) and (best is None or path.t_go_s < best.t_go_s):
+                best = path
+        settled = abs(t - reference.t) <= TIME_TOLERANCE_S
+        if settled and best is not None and path.t_go_s <= best.t_go_s + TIME_TOLERANCE_S:
+            return best
+        if (iteration >= 6 and best is None and found.slack > 0.9 * slack) or t > case.params.horizon_s - case.wait_s:
+            return best
+        if abs(t - reference.t) <= 0.02 * t:
+            off += 1.2 * over + np.where(over > 0.0, case.buffer_m, 0.0)
+        slack, reference = found.slack, Reference(t, path.at(case.wait_s + t * instants(n))[0])
+        change = max(0.5 * change, 1e-3) if iteration >= 6 else _trust(case, reference)
+    return best
+
+
+def _trust(case: Case, reference: Reference) -> float:
+    """Return the largest relative change of the end time: the target may turn by TURN_RAD at most."""
+    turn = turn_rate(case, case.wait_s + reference.t) * reference.t
+    return float(min(0.25, TURN_RAD / max(turn, 1e-9)))
+
+
+def _feasible(case: Case, path: StepPath, over: Array, allowed: float) -> bool:
+    position, velocity = path.terminal_errors(case.scene.goal)
+    short = path.t_go_s <= case.params.horizon_s
+    exact = position <= 1e-8 and velocity <= 1e-8 and path.u_max() <= case.params.a_max_mps2
+    return bool(short and exact and over.max() <= allowed)
+
+
+def _exact_end(case: Case, path: StepPath) -> StepPath:
+    """Remove the terminal errors by the thrust correction of least norm."""
+    n, h = len(path.u), path.step_s
+    rho, rate = case.scene.goal(np.array([path.t_go_s]))
+    r, v = path.nodes()
+    k = np.arange(n)
+    rows = np.stack([h * h * (n - k - 0.5), np.full(n, h)])  # effect of u_k on the last position and velocity
+    errors = np.stack([rho[0] - r[-1], rate[0] - v[-1]])
+    return replace(path, u=path.u + rows.T @ np.linalg.solve(rows @ rows.T, errors))

@@ -13,13 +13,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from avsreplay.geometry import Array
+from avsreplay.plan.constrained import constrained
+from avsreplay.plan.limits import Limits, Scene, margin
 from avsreplay.plan.path import RobotPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
-from avsreplay.records import Forecast, Plan, Trajectory
-
-Planner = Callable[[Trajectory, Array, Array, PlanParams, int], Plan]
-"""Makes a capture plan from (goal, r0, v0, params, t_ns)."""
+from avsreplay.records import Forecast, Plan
 
 _CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 
@@ -32,19 +31,15 @@ class PlannerInput:
         t_ns: Instant of the scan.
         gamma: 1 if the scan is healthy, else 0.
         converged: Whether the estimate may be used for planning.
-        goal: Trajectory of the grasp point in {A} after t_ns.
+        scene: The target in {A} after t_ns.
         forecast: Times (n,) [s after t_ns] -> 1 sigma of the grasp point if no further measurement arrives.
-        standoff: Trajectory of the approach point, fixed in the target; None: a hold brakes to rest.
-        margin: Position and velocity (3,) of the robot -> smallest margin of the constraints, negative if violated.
     """
 
     t_ns: int
     gamma: int
     converged: bool
-    goal: Trajectory
+    scene: Scene
     forecast: Callable[[Array], Forecast]
-    standoff: Trajectory | None = None
-    margin: Callable[[Array, Array], float] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,6 +51,7 @@ class Segment:
         r0, v0: (3,) position [m] and velocity [m/s] of the robot in {A} at t_ns.
         path: Path from t_ns on; None: the robot coasts.
         previous: Segment flown before t_ns, None where t_ns has passed.
+        capture: Whether the segment ends at the grasp point.
     """
 
     t_ns: int
@@ -63,6 +59,7 @@ class Segment:
     v0: Array
     path: RobotPath | None = None
     previous: Segment | None = None
+    capture: bool = False
 
     def at(self, t_ns: int) -> tuple[Array, Array]:
         """Return position [m] and velocity [m/s] (3,) of the robot in {A} at an instant."""
@@ -104,15 +101,19 @@ class GuidanceState:
 class Guidance:
     """Flies the rendezvous under the decisions of a supervisor."""
 
-    def __init__(self, params: PlanParams, supervisor: Supervisor, planner: Planner = rendezvous) -> None:
+    def __init__(
+        self, params: PlanParams, supervisor: Supervisor, limits: Limits | None = None, extent_m: float = 8.0
+    ) -> None:
         """Create the guidance of one run.
 
         Args:
             params: Parameters of robot and planner.
             supervisor: Supervisor with resolved parameters.
-            planner: Makes a capture plan from (goal, r0, v0, params, t_ns).
+            limits: Constraints of every capture plan; none where None.
+            extent_m: Diagonal of the target's bounding box [m].
         """
-        self.params, self.supervisor, self.planner = params, supervisor, planner
+        self.params, self.supervisor = params, supervisor
+        self.limits = (limits or Limits()).resolved(extent_m)
 
     def initial(self, t_ns: int) -> GuidanceState:
         """Return the state at the first scan: the robot at its configured position and velocity."""
@@ -147,7 +148,7 @@ class Guidance:
         if decision.action not in _CLOSING:
             return self._withdraw(state, known)
         if segment is None:  # the approach resumes between two replanning instants
-            plan, segment = self._plan(state.segment, known.goal, known.t_ns, self.planner)
+            plan, segment = self._capture_plan(state.segment, known)
         return replace(state, plan=plan, segment=segment or state.segment, made_ns=None)
 
     def _replan(self, state: GuidanceState, known: PlannerInput) -> tuple[Plan | None, Segment | None]:
@@ -160,26 +161,54 @@ class Guidance:
         left_s = (state.segment.end_ns - known.t_ns) * 1e-9 if closing else math.inf
         if not self._due(age_s, left_s):
             return state.plan, flown
-        plan, segment = self._plan(state.segment, known.goal, known.t_ns, self.planner)
+        plan, segment = self._capture_plan(state.segment, known)
+        if segment is None and flown is not None and self._still_valid(flown, known):
+            return state.plan, flown
         return plan, segment or flown
+
+    def _still_valid(self, flown: Segment, known: PlannerInput) -> bool:
+        """Return whether the end of the segment agrees with the present estimate within the capture tolerance."""
+        left_s = (flown.end_ns - known.t_ns) * 1e-9
+        if left_s <= 0.0:
+            return False
+        r, v = flown.at(flown.end_ns)
+        rho, rate = known.scene.goal(np.array([left_s]))
+        p = self.supervisor.params
+        near = float(np.linalg.norm(r - rho[0])) <= (p.capture_pos_m or 0.0)
+        return near and float(np.linalg.norm(v - rate[0])) <= (p.capture_speed_mps or 0.0)
 
     def _due(self, age_s: float, left_s: float) -> bool:
         """Return whether to replan: at the period, at every scan near the end, not where a plan would come too late."""
         near = left_s <= 2.0 * self.supervisor.params.commit_s
         return (age_s >= self.params.replan_period_s - 1e-6 or near) and left_s > self.params.latency_s
 
-    def _plan(self, segment: Segment, goal: Trajectory, t_ns: int, planner: Planner) -> tuple[Plan, Segment | None]:
+    def _capture_plan(self, segment: Segment, known: PlannerInput) -> tuple[Plan, Segment | None]:
+        """Plan the capture under the limits; the path of the current segment is the first initial path."""
+
+        def planner(scene: Scene, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
+            if not self.limits.any:
+                return rendezvous(scene.goal, r0, v0, params, t_ns)
+            since_s = (t_ns - segment.t_ns) * 1e-9 + self.params.latency_s
+            closing = segment.path is not None and segment.capture and since_s >= 0.0
+            warm = (segment.path, since_s) if closing and segment.path is not None else None
+            return constrained(scene, r0, v0, params, self.limits, t_ns, warm=warm)
+
+        plan, made = self._plan(segment, known.scene, known.t_ns, planner)
+        return plan, made and replace(made, capture=True)
+
+    def _plan(self, segment: Segment, scene: Scene, t_ns: int, planner: _Planner) -> tuple[Plan, Segment | None]:
         """Plan from the state that the current segment reaches when the latency is over."""
         wait_s = self.params.latency_s
         begin_ns = t_ns + round(wait_s * 1e9)
         r0, v0 = segment.at(begin_ns)
         # the robot flies the current segment during the latency, so the planner starts at its end without latency
         late = replace(self.params, latency_s=0.0)
-        plan = planner(lambda t: goal(t + wait_s), r0, v0, late, t_ns)
+        plan = planner(scene.after(wait_s) if wait_s else scene, r0, v0, late, t_ns)
         if not plan.found:
             return plan, None
         previous = segment if t_ns < segment.t_ns else replace(segment, previous=None)
-        return _counted_from_planning(plan, wait_s), Segment(begin_ns, r0, v0, path_of(plan, r0, v0), previous)
+        made = Segment(begin_ns, r0, v0, path_of(plan, r0, v0), previous)
+        return _counted_from_planning(plan, wait_s), made
 
     def _facts(self, state: GuidanceState, known: PlannerInput, plan: Plan | None, segment: Segment | None) -> Facts:
         planned = plan is not None and plan.found
@@ -195,9 +224,9 @@ class Guidance:
             pos_1s_m=float(sigma.pos_1s_m[-1]),
             vel_1s_mps=float(sigma.vel_1s_mps[-1]),
             rot_1s_deg=math.degrees(float(sigma.rot_1s_rad[-1])),
-            distance_m=float(np.linalg.norm(known.goal(np.zeros(1))[0][0] - position)),
+            distance_m=float(np.linalg.norm(known.scene.goal(np.zeros(1))[0][0] - position)),
             now_1s_m=float(sigma.pos_1s_m[0]),
-            margin=known.margin(position, velocity) if known.margin else 1.0,
+            margin=self._margin(state, known.scene, position, velocity),
         )
 
     def _withdraw(self, state: GuidanceState, known: PlannerInput) -> GuidanceState:
@@ -206,21 +235,43 @@ class Guidance:
         due = state.made_ns is None or (known.t_ns - state.made_ns) * 1e-9 >= self.params.replan_period_s - 1e-6
         if action is Action.STAND_STILL or not due or (action is Action.ABORT and state.made_ns is not None):
             return state
-        _, segment = self._plan(state.segment, self._retreat_goal(state, known), known.t_ns, rendezvous)
+        _, segment = self._plan(state.segment, self._refuge(state, known), known.t_ns, _unconstrained)
         return replace(state, segment=segment or state.segment, made_ns=known.t_ns)
 
-    def _retreat_goal(self, state: GuidanceState, known: PlannerInput) -> Trajectory:
-        """Return the goal of a hold (approach point, or rest) or of a retreat (rest at a distance)."""
-        position, velocity = state.segment.at(known.t_ns)
-        if state.decision.action is Action.HOLD:
-            braking = velocity * np.linalg.norm(velocity) / (2.0 * self.params.a_max_mps2)
-            return known.standoff or _rest(position + braking)
-        target = known.goal(np.zeros(1))[0][0]
-        away = position - target
+    def _refuge(self, state: GuidanceState, known: PlannerInput) -> Scene:
+        """Return the rest point of a hold, a retreat or an abort, moving with the centre of mass.
+
+        The robot brakes as hard as possible. If it would stop closer to the sphere that contains the target than the
+        standoff (hold) or the retreat distance, the rest point has this distance, directly away from the target.
+        """
+        p, scene = self.supervisor.params, known.scene
+        r, v = state.segment.at(known.t_ns)
+        centre = scene.centre(np.array([0.0, 1.0]))
+        drift = centre[1] - centre[0]
+        relative = v - drift
+        away = r - centre[0]
         distance = float(np.linalg.norm(away))
-        if distance <= 0.0:
-            away, distance = np.array([1.0, 0.0, 0.0]), 1.0
-        return _rest(target + away / distance * max(distance, self.supervisor.params.retreat_m or 0.0))
+        outward = away / distance if distance > 0.0 else np.array([1.0, 0.0, 0.0])
+        hold = state.decision.action is Action.HOLD
+        least = scene.radius_m + ((p.standoff_m if hold else p.retreat_m) or 0.0)
+        rest = away + relative * np.linalg.norm(relative) / (2.0 * self.params.a_max_mps2)
+        if float(np.linalg.norm(rest)) < least:
+            rest = outward * max(least, distance)
+        return Scene(lambda t: (centre[0] + rest + t[:, None] * drift, np.tile(drift, (len(t), 1))))
+
+    def _margin(self, state: GuidanceState, scene: Scene, r: Array, v: Array) -> float:
+        """Return the margin of the constraints; what the plan in force itself violates at its start is accepted."""
+        if not self.limits.any:
+            return 1.0
+        accepted = 0.0 if state.plan is None or math.isnan(state.plan.violation_m) else state.plan.violation_m
+        return margin(scene, self.limits, r, v) + accepted
+
+
+_Planner = Callable[[Scene, Array, Array, PlanParams, int], Plan]
+
+
+def _unconstrained(scene: Scene, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
+    return rendezvous(scene.goal, r0, v0, params, t_ns)
 
 
 def _left_s(plan: Plan | None, segment: Segment | None, t_ns: int) -> float:
@@ -240,7 +291,3 @@ def _counted_from_planning(plan: Plan, wait_s: float) -> Plan:
         costate=c / np.linalg.norm(c),
         latency_s=wait_s,
     )
-
-
-def _rest(point: Array) -> Trajectory:
-    return lambda t: (np.tile(point, (len(t), 1)), np.zeros((len(t), 3)))

@@ -1,20 +1,26 @@
-"""The constraints that the paper's abstract names, and the target as they see it.
+"""Constraints of the approach, and the target as the planner uses it.
 
-Line of sight: the robot stays in a cone at the grasp point that turns with the target. Smooth capture: equal velocity,
-and a bounded acceleration relative to the grasp point at contact. Physical: thrust, speed. And a sphere to stay out of.
+All geometric constraints are fixed in the fixture's frame {C}: the approach cone (line of sight), the narrower corridor
+of the last metres, a sphere around the centre of mass, and the clearance to the surface of the target. A robot at r has
+the coordinates y = R_ac' (r - rho) in {C}.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.records import Trajectory
 from avsreplay.settings import Settings, setting
+
+CONSTRAINTS = ("cone", "corridor", "sphere", "body", "workspace")
+"""Names of the geometric constraints, in the order of the columns of ``margins``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +56,41 @@ class Limits(Settings):
         above=0.0,
         of_extent=0.06,
     )
-    nodes: int = setting(100, "Thrust intervals of a constrained plan.", low=8)
-    scan_s: float = setting(0.25, "Step of the search over the capture time.", unit="s", above=0.0)
+    clearance_m: float | None = setting(
+        None,
+        "Smallest distance of the end-effector's centre to the target's surface outside the final approach cone.",
+        unit="m",
+        above=0.0,
+    )
+    clearance_sigmas: float = setting(
+        3.0, "Predicted standard deviations of the surface's position added to the clearance.", low=0.0
+    )
+    base_m: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "Position of the robot's base in {A}, the centre of its workspace.", unit="m"
+    )
+    reach_max_m: float | None = setting(
+        None, "Largest distance of the end-effector from the base.", unit="m", above=0.0
+    )
+    reach_min_m: float | None = setting(
+        None, "Smallest distance of the end-effector from the base.", unit="m", above=0.0
+    )
+    nodes: int = setting(40, "Thrust intervals of a constrained plan.", low=8)
+
+    def widened(self, radius_m: float) -> Limits:
+        """Return the limits for an end-effector of a radius [m], which is added to the clearance."""
+        if radius_m <= 0.0 or (self.clearance_m is None and self.final_deg is None):
+            return self
+        return replace(self, clearance_m=(self.clearance_m or 0.0) + radius_m)
 
     @property
     def any(self) -> bool:
-        """Is there a limit at all?"""
-        named = (self.cone_deg, self.final_deg, self.speed_max_mps, self.contact_accel_mps2, self.keepout_m)
+        """Whether there is a constraint besides the thrust."""
+        return self.geometric or self.speed_max_mps is not None or self.contact_accel_mps2 is not None
+
+    @property
+    def geometric(self) -> bool:
+        """Whether there is a constraint on the position relative to the target."""
+        named = (self.cone_deg, self.final_deg, self.keepout_m, self.clearance_m, self.reach_max_m, self.reach_min_m)
         return any(value is not None for value in named)
 
 
@@ -65,77 +99,238 @@ class Scene:
     """The target after the instant of planning.
 
     Attributes:
-        goal: the grasp point.
-        axis: times (n,) -> (n, 3) unit vectors in {A}, outward along the fixture; the cones open along it.
-        centre: times (n,) -> (n, 3) mass centre [m]; the sphere stands round it.
+        goal: Trajectory of the grasp point, the origin of {C}, in {A}.
+        attitude: Times (n,) [s] -> q_ac (n, 4) of the fixture; None where only speed and contact are limited.
+        axis_c: (3,) outward axis of the fixture in {C}, unit; cone and corridor open along it.
+        centre_c: (3,) centre of mass in {C} [m], the centre of the sphere; None where unknown.
+        surface: Points (n, 3) in {C} -> closest points (n, 3) of the target's surface and signed distances (n,),
+            negative inside, infinite where far; None: unknown.
+        sigma: Times (n,) ascending [s] -> predicted 1 sigma of the position [m] and attitude [rad] of {C}, each (n,).
+        radius_m: Radius of the sphere about the centre of mass that contains the target in every attitude.
     """
 
     goal: Trajectory
-    axis: Callable[[Array], Array] | None = None
-    centre: Callable[[Array], Array] | None = None
+    attitude: Callable[[Array], Array] | None = None
+    axis_c: Array | None = None
+    centre_c: Array | None = None
+    surface: Callable[[Array], tuple[Array, Array]] | None = None
+    sigma: Callable[[Array], tuple[Array, Array]] | None = None
+    radius_m: float = 0.0
+
+    def centre(self, times: Array) -> Array:
+        """Return the centre of mass (n, 3) in {A} at times (n,) [s]; the grasp point where it is unknown."""
+        position = self.goal(times)[0]
+        if self.attitude is None or self.centre_c is None:
+            return position
+        return np.asarray(position + geometry.matrix(self.attitude(times)) @ self.centre_c)
+
+    def after(self, delay_s: float) -> Scene:
+        """Return the scene with times counted from ``delay_s`` later."""
+        goal, attitude, sigma = self.goal, self.attitude, self.sigma
+        return replace(
+            self,
+            goal=lambda t: goal(t + delay_s),
+            attitude=attitude and (lambda t: attitude(t + delay_s)),
+            sigma=sigma and (lambda t: sigma(t + delay_s)),
+        )
 
     def check(self, limits: Limits) -> None:
-        """Raises ValueError where a limit needs what the scene does not know."""
-        if self.axis is None and (limits.cone_deg is not None or limits.final_deg is not None):
+        """Raise ValueError where a constraint needs what the scene does not contain."""
+        if limits.geometric and self.attitude is None:
+            raise ValueError("cone, corridor, sphere and clearance need the fixture's attitude, and the scene has none")
+        if self.axis_c is None and (limits.cone_deg is not None or limits.final_deg is not None):
             raise ValueError("cone_deg and final_deg need the fixture's axis, and the scene has none")
+        if limits.clearance_m is not None and self.surface is None:
+            raise ValueError("clearance_m needs the target's surface, and the scene has none")
+        if limits.clearance_m is not None and limits.final_deg is None:
+            raise ValueError("clearance_m needs final_deg: contact is possible only inside the corridor")
         if limits.keepout_m is not None:
-            self._check_sphere(limits.keepout_m, limits.keepout_release_m or 0.0)
+            if self.centre_c is None:
+                raise ValueError("keepout_m needs the mass centre, and the scene has none")
+            most = float(np.linalg.norm(self.centre_c)) + (limits.keepout_release_m or 0.0)
+            if limits.keepout_m >= most:
+                raise ValueError(f"keepout_m is {limits.keepout_m}, must be below {most:.3f}: arm and release distance")
 
-    def _check_sphere(self, radius: float, release: float) -> None:
-        if self.centre is None:
-            raise ValueError("keepout_m needs the mass centre, and the scene has none")
-        now = np.zeros(1)
-        arm = float(np.linalg.norm(self.goal(now)[0] - self.centre(now)))
-        if radius >= arm + release:
-            raise ValueError(f"keepout_m is {radius}, must be below {arm + release:.3f}: arm and keepout_release_m")
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TargetGeometry:
+    """What guidance knows about the target's shape.
+
+    Attributes:
+        axis_c: (3,) outward axis of the fixture in {C}, unit.
+        hull_c: (n, 3) vertices of the convex hull in {C} [m].
+        surface: Closest points of the surface, see ``Scene``; None where no clearance is asked for.
+    """
+
+    axis_c: Array
+    hull_c: Array
+    surface: Callable[[Array], tuple[Array, Array]] | None = None
+
+    def radius(self, centre_c: Array) -> float:
+        """Return the radius of the sphere about a centre (3,) in {C} that contains the target [m]."""
+        return float(np.sqrt(np.max(np.sum((self.hull_c - centre_c) ** 2, axis=1))))
+
+
+def hull_vertices(vertices: Array) -> Array:
+    """Return the vertices (m, 3) of the convex hull of points (n, 3), or the points themselves where it has none."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    points = np.asarray(vertices, dtype=np.float64)
+    try:
+        return np.ascontiguousarray(points[np.sort(ConvexHull(points).vertices)])
+    except QhullError:
+        return points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Margins:
+    """Margins of the geometric constraints at n points; a constraint holds where its margin is not negative.
+
+    Attributes:
+        first: (n, 5) margins of the first alternatives in the order of ``CONSTRAINTS`` [m]: inside the cone, inside the
+            corridor, within the release distance of the sphere, inside the corridor instead of at the clearance.
+        second: (n, 5) margins of the second alternatives [m]: outside the range of the cone, outside that of the
+            corridor, outside the sphere, at the clearance, inside the workspace. Infinite where a constraint is off.
+        foot: (n, 3) closest points of the surface in {C}.
+        distance: (n,) signed distance to the surface [m], infinite where far or not asked for.
+        clearance: (n,) required clearance [m].
+    """
+
+    first: Array
+    second: Array
+    foot: Array
+    distance: Array
+    clearance: Array
+
+    @property
+    def values(self) -> Array:
+        """Margins (n, 5) of the constraints: the larger one of the alternatives [m]."""
+        return np.maximum(self.first, self.second)
+
+    @property
+    def inside(self) -> NDArray[np.bool_]:
+        """Whether the first alternative has the larger margin (n, 5)."""
+        return np.asarray(self.first > self.second)
+
+    @property
+    def between(self) -> Array:
+        """Margins (n - 1, 5) between consecutive points: where the alternatives change, that of the crossing."""
+        difference = self.first - self.second
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = difference[:-1] / (difference[:-1] - difference[1:])
+            crossing = self.first[:-1] + share * (self.first[1:] - self.first[:-1])
+        changes = (difference[:-1] > 0.0) != (difference[1:] > 0.0)
+        least = np.minimum(self.values[:-1], self.values[1:])
+        return np.where(changes & np.isfinite(crossing), np.minimum(least, crossing), least)
+
+
+def margins(scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array, Array] | None = None) -> Margins:
+    """Evaluate the geometric constraints.
+
+    Cone: inside it, or outside its range. Corridor: likewise. Sphere: near the grasp point, or outside the sphere.
+    Body: inside the corridor and its range, or at least the clearance away from the surface. Workspace: the distance
+    from the robot's base in {A}.
+
+    Args:
+        scene: The target.
+        limits: Resolved limits.
+        y: (n, 3) positions in {C} [m].
+        r: (n, 3) the same positions in {A} [m].
+        sigma: Predicted 1 sigma of position [m] and attitude [rad] at each point, each (n,).
+    """
+    n = len(y)
+    first, second = np.full((n, 5), -math.inf), np.full((n, 5), math.inf)
+    foot, gap, clearance = np.zeros((n, 3)), np.full(n, math.inf), np.zeros(n)
+    distance = np.linalg.norm(y, axis=1)
+    mouth, reach = limits.mouth_m or 0.0, limits.final_range_m or 0.0
+    corridor = np.full(n, -math.inf)
+    if scene.axis_c is not None:
+        along = y @ scene.axis_c
+        across = np.linalg.norm(y - along[:, None] * scene.axis_c, axis=1)
+        for i, degrees, length in ((0, limits.cone_deg, limits.cone_range_m or 0.0), (1, limits.final_deg, reach)):
+            if degrees is not None:
+                within = math.tan(math.radians(degrees)) * along + mouth - across
+                first[:, i], second[:, i] = within, distance - length
+                corridor = np.minimum(within, reach - distance) if i else corridor
+    if limits.keepout_m is not None and scene.centre_c is not None:
+        first[:, 2] = (limits.keepout_release_m or 0.0) - distance
+        second[:, 2] = np.linalg.norm(y - scene.centre_c, axis=1) - limits.keepout_m
+    if limits.clearance_m is not None and scene.surface is not None:
+        foot, gap = scene.surface(y)
+        clearance = np.full(n, limits.clearance_m)
+        if sigma is not None:
+            clearance += limits.clearance_sigmas * (sigma[0] + sigma[1] * distance)
+        first[:, 3], second[:, 3] = corridor, gap - clearance
+    if limits.reach_max_m is not None or limits.reach_min_m is not None:
+        from_base = np.linalg.norm(r - np.array(limits.base_m), axis=1)
+        second[:, 4] = np.minimum((limits.reach_max_m or math.inf) - from_base, from_base - (limits.reach_min_m or 0.0))
+    return Margins(first, second, foot, gap, clearance)
 
 
 def margin(scene: Scene, limits: Limits, r: Array, v: Array) -> float:
-    """Least margin of the limits for a robot at r, v (3,) now, below 0 where one is broken.
+    """Return the smallest margin of the constraints for a robot now, negative if one is violated.
 
-    A plan may lie on a limit, and the target's estimate moves: lengths have the cone's mouth [m] to spare, speed a
-    twentieth of itself. ``limits`` must be resolved. Infinite where no limit holds here.
+    A plan may touch a constraint, and the estimate of the target moves between scans: lengths are extended by the
+    radius of the cone at the grasp point, the speed by a twentieth.
+
+    Args:
+        scene: The target.
+        limits: Resolved limits.
+        r: (3,) position of the robot in {A} [m].
+        v: (3,) its velocity [m/s].
+
+    Returns:
+        The margin in metres or metres per second, infinite where no constraint holds.
     """
-    now, least = np.zeros(1), math.inf
-    from_apex = r - scene.goal(now)[0][0]
-    distance, spare = float(np.linalg.norm(from_apex)), limits.mouth_m or 0.0
-    cones = ((limits.cone_deg, limits.cone_range_m), (limits.final_deg, limits.final_range_m))
-    for degrees, reach in cones if scene.axis else ():
-        if degrees is not None and distance <= (reach or math.inf):
-            along = float(from_apex @ scene.axis(now)[0]) if scene.axis else 0.0
-            across = math.sqrt(max(distance * distance - along * along, 0.0))
-            least = min(least, math.tan(math.radians(degrees)) * along + 2.0 * spare - across)
-    if limits.keepout_m is not None and scene.centre and distance > (limits.keepout_release_m or 0.0):
-        least = min(least, float(np.linalg.norm(r - scene.centre(now)[0])) - limits.keepout_m + spare)
+    least, now = math.inf, np.zeros(1)
+    if limits.geometric and scene.attitude is not None:
+        y = (r - scene.goal(now)[0]) @ geometry.matrix(scene.attitude(now)[0])
+        least = float(margins(scene, limits, y, r[None]).values.min()) + (limits.mouth_m or 0.0)
     if limits.speed_max_mps is not None:
         least = min(least, 1.05 * limits.speed_max_mps - float(np.linalg.norm(v)))
     return least
 
 
 class SampledScene:
-    """A scene called on a grid and joined by cubic splines, for the many instants between nodes; it grows as needed."""
+    """Motion of {C} sampled on a grid and interpolated by cubic splines; the grid is extended when needed."""
 
     def __init__(self, scene: Scene, horizon_s: float, step_s: float) -> None:
-        self._scene, self._horizon_s, self._step_s = scene, horizon_s, step_s
+        self.scene, self._horizon_s, self._step_s = scene, horizon_s, step_s
         self._end_s = 0.0
-        self._spline: Callable[[Array], Array] | None = None
+        self._spline: Callable[..., Array] | None = None
+        self._sigma: tuple[Array, Array, Array] | None = None
 
-    def at(self, times: Array) -> tuple[Array, Array, Array]:
-        """Grasp point, axis and mass centre, each (n, 3), at times (n,) [s after planning]."""
-        last = float(times[-1])
+    def at(self, times: Array, order: int = 0) -> tuple[Array, Array]:
+        """Return rho (n, 3) and R_ac (n, 3, 3), or their derivatives of an order, at times (n,) [s]."""
+        last = float(times.max())
         if self._spline is None or last > self._end_s:
             self._end_s = min(max(1.5 * last, 8.0 * self._step_s), max(self._horizon_s, last))
             self._spline = self._joined(self._end_s)
-        values: Array = self._spline(times)
-        return values[:, :3], values[:, 3:6], values[:, 6:]
+        values = self._spline(times, order)
+        return values[:, :3], values[:, 3:].reshape(-1, 3, 3)
 
-    def _joined(self, end_s: float) -> Callable[[Array], Array]:
+    def coordinates(self, times: Array, r: Array) -> Array:
+        """Return the coordinates in {C} (n, 3) of positions r (n, 3) in {A}."""
+        rho, R = self.at(times)
+        out: Array = np.einsum("nij,ni->nj", R, r - rho)
+        return out
+
+    def sigma(self, times: Array) -> tuple[Array, Array] | None:
+        """Return the predicted 1 sigma of position [m] and attitude [rad] at times (n,); None where unknown."""
+        if self.scene.sigma is None:
+            return None
+        if self._sigma is None:
+            grid = np.linspace(0.0, self._horizon_s, 49)
+            self._sigma = (grid, *self.scene.sigma(grid))
+        grid, position, attitude = self._sigma
+        return np.interp(times, grid, position), np.interp(times, grid, attitude)
+
+    def _joined(self, end_s: float) -> Callable[..., Array]:
         from scipy.interpolate import CubicSpline
 
-        scene = self._scene
         times = np.linspace(0.0, end_s, max(math.ceil(end_s / self._step_s), 4) + 1)
-        zero = np.zeros((len(times), 3))
-        columns = [scene.goal(times)[0], scene.axis(times) if scene.axis else zero]
-        columns.append(scene.centre(times) if scene.centre else zero)
-        spline: Callable[[Array], Array] = CubicSpline(times, np.concatenate(columns, axis=1))
+        turn = np.tile(np.eye(3).ravel(), (len(times), 1))
+        if self.scene.attitude is not None:
+            turn = geometry.matrix(self.scene.attitude(times)).reshape(-1, 9)
+        spline: Callable[..., Array] = CubicSpline(times, np.concatenate([self.scene.goal(times)[0], turn], axis=1))
         return spline

@@ -52,14 +52,20 @@ class SupervisorParams(Settings):
     )
     recover_scans: int = setting(2, "Consecutive healthy scans that end a hold.", low=1)
     hold_limit_s: float = setting(60.0, "A hold or retreat that lasts longer becomes an abort.", unit="s", above=0.0)
+    attempts_max: int = setting(5, "Number of approaches after which the next withdrawal becomes an abort.", low=1)
+    approach_limit_s: float = setting(
+        600.0, "Time since the first approach after which the robot aborts unless it captures.", unit="s", above=0.0
+    )
     standoff_m: float | None = setting(
         None,
-        "Distance of the approach point from the grasp point along the fixture's axis.",
+        "Distance that a hold keeps from the sphere which contains the target in every attitude.",
         unit="m",
         above=0.0,
         of_extent=0.125,
     )
-    retreat_m: float | None = setting(None, "Distance of a retreat.", unit="m", above=0.0, of_extent=0.5)
+    retreat_m: float | None = setting(
+        None, "Distance that a retreat or an abort keeps from that sphere.", unit="m", above=0.0, of_extent=0.5
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,6 +107,8 @@ class SupervisorMemory:
         healthy_run: Number of consecutive healthy scans.
         held_since_s: Begin of the current hold or retreat [s], None outside one.
         moving: Whether the robot has left its initial position.
+        began_s: Time of the first approach [s], None before it.
+        attempts: Number of approaches begun.
     """
 
     action: Action = Action.STAND_STILL
@@ -109,6 +117,8 @@ class SupervisorMemory:
     healthy_run: int = 0
     held_since_s: float | None = None
     moving: bool = False
+    began_s: float | None = None
+    attempts: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +152,7 @@ _COMPARE: Mapping[str, Callable[[float, float], bool]] = MappingProxyType(
     {"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq}
 )
 
+_CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 _MOVING, _AT_REST = Condition("moving", "==", 1), Condition("moving", "==", 0)
 _HEALTHY, _FAULTY = Condition("gamma", "==", 1), Condition("gamma", "==", 0)
 _AT_END, _HOLDING = Condition("t_go_s", "<=", "commit_s"), Condition("holding", "==", 1)
@@ -151,6 +162,13 @@ RULES: tuple[Rule, ...] = (
     Rule("aborted", Action.ABORT, (Condition("aborted", "==", 1),), "an abort is final"),
     Rule("captured", Action.CAPTURE, (Condition("captured", "==", 1),), "a capture is flown to its end"),
     Rule("held_too_long", Action.ABORT, (Condition("held_s", ">", "hold_limit_s"),), "the time limit is exceeded"),
+    Rule("too_long", Action.ABORT, (Condition("approach_s", ">", "approach_limit_s"),), "the approach takes too long"),
+    Rule(
+        "too_many_attempts",
+        Action.ABORT,
+        (_HOLDING, Condition("attempts", ">=", "attempts_max")),
+        "every attempt was withdrawn",
+    ),
     Rule("constraint_broken", Action.RETREAT, (_MOVING, Condition("margin", "<", 0.0)), "a constraint is violated"),
     Rule(
         "too_close_unsure",
@@ -231,7 +249,16 @@ class Supervisor:
         holding = rule.action in (Action.HOLD, Action.RETREAT)
         since = (memory.held_since_s if memory.held_since_s is not None else facts.t_s) if holding else None
         moving = memory.moving or rule.action is not Action.STAND_STILL
-        after = replace(now, action=rule.action, rule=rule.name, held_since_s=since, moving=moving)
+        begins = rule.action in _CLOSING and memory.action not in _CLOSING
+        after = replace(
+            now,
+            action=rule.action,
+            rule=rule.name,
+            held_since_s=since,
+            moving=moving,
+            began_s=facts.t_s if begins and memory.began_s is None else memory.began_s,
+            attempts=memory.attempts + begins,
+        )
         return after, Decision(rule.action, rule.name)
 
     def error_ratio(self, facts: Facts) -> float:
@@ -257,6 +284,8 @@ class Supervisor:
             "t_go_s": facts.t_go_s if facts.planned else math.inf,
             "error_ratio": self.error_ratio(facts),
             "held_s": held,
+            "approach_s": 0.0 if memory.began_s is None else facts.t_s - memory.began_s,
+            "attempts": float(memory.attempts),
             "blind_s": math.inf if memory.seen_s is None else facts.t_s - memory.seen_s,
             "healthy_run": float(memory.healthy_run),
             "distance_margin_m": facts.distance_m - self.params.sigmas * facts.now_1s_m,

@@ -1,4 +1,4 @@
-"""Monte Carlo evaluation of a plan over the belief from which it was made.
+"""Monte Carlo evaluation of a plan over the belief from which it was made and over the errors of the thrust.
 
 The planner does not depend on the estimator: each draw of the error state is passed as one possible future of the
 target.
@@ -15,22 +15,18 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.plan.evaluation import Tolerance
+from avsreplay.plan.limits import Limits, Scene, margins
 from avsreplay.plan.path import RobotPath
-from avsreplay.plan.rendezvous import PlanParams, rendezvous
-from avsreplay.records import Trajectory
+from avsreplay.records import Plan
+
+CONTACT_INSTANTS = 401  # instants of a plan at which contact is checked
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Future:
-    """One possible motion of the target after the instant of planning.
+    """One possible motion of the target after the instant of planning; attitude errors need the scene's attitude."""
 
-    Attributes:
-        goal: Trajectory of the grasp point.
-        attitude: Time after planning [s] -> q_ac (4,); None where the attitude is not evaluated.
-    """
-
-    goal: Trajectory
-    attitude: Callable[[float], Array] | None = None
+    scene: Scene
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +46,12 @@ class Spread:
     Attributes:
         futures: Number of futures.
         t_go_s: Least time to go in each future.
-        infeasible: Number of futures without a capture within the horizon.
+        infeasible: Number of futures for which no plan was found.
         miss_m, speed_mps, angle_deg: Terminal errors of the one plan in each future.
         probability: Fraction of futures in which the errors are within the tolerance.
+        probability_95: Its Wilson 95 % interval.
+        contact: Fraction of futures in which the end-effector touches the body outside the corridor; NaN: not checked.
+        contact_95: Its Wilson 95 % interval.
     """
 
     futures: int
@@ -62,6 +61,32 @@ class Spread:
     speed_mps: Band
     angle_deg: Band
     probability: float
+    probability_95: tuple[float, float]
+    contact: float = math.nan
+    contact_95: tuple[float, float] = (math.nan, math.nan)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Disturbance:
+    """Errors of the thrust: accelerations that are constant over each second, normal, independent between the axes.
+
+    Attributes:
+        sigma_mps2: 1 sigma of each axis [m/s2].
+        rng: Random generator.
+    """
+
+    sigma_mps2: float
+    rng: np.random.Generator
+
+    def deviation(self, times: Array) -> tuple[Array, Array]:
+        """Draw one deviation of position [m] and velocity [m/s], each (n, 3), at times (n,) ascending from 0 [s]."""
+        steps = max(math.ceil(float(times[-1])), 1)
+        u = self.sigma_mps2 * self.rng.standard_normal((steps, 3))
+        v = np.concatenate([np.zeros((1, 3)), np.cumsum(u, axis=0)])
+        r = np.concatenate([np.zeros((1, 3)), np.cumsum(v[:-1] + 0.5 * u, axis=0)])
+        k = np.minimum(times.astype(np.int64), steps - 1)
+        s = (times - k)[:, None]
+        return r[k] + s * v[k] + 0.5 * s * s * u[k], v[k] + s * u[k]
 
 
 def draws(P: Array, count: int, rng: np.random.Generator) -> Array:
@@ -99,32 +124,39 @@ def _root(P: Array) -> Array:
 def spread(
     path: RobotPath,
     futures: Sequence[Future],
-    start: tuple[Array, Array],
-    params: PlanParams,
+    planner: Callable[[Scene], Plan],
     tolerance: Tolerance,
     attitude: Array | None = None,
+    disturbance: Disturbance | None = None,
+    limits: Limits | None = None,
 ) -> Spread:
     """Evaluate one plan in every future, and plan anew for each future.
 
     Args:
         path: Path planned for the mean of the belief.
         futures: Possible motions of the target, equally probable.
-        start: Position and velocity (3,) of the robot at the instant of planning.
-        params: Parameters of robot and planner.
+        planner: Plans for a future from the same start, under the same limits.
         tolerance: Largest errors of a capture.
         attitude: (4,) q_ac of the gripper at the end.
+        disturbance: Errors of the thrust; none where None.
+        limits: Resolved limits whose clearance is the radius of the end-effector; None: contact is not checked.
 
     Raises:
         ValueError: There is no future.
     """
     if not futures:
         raise ValueError("there is no future in which to evaluate the plan")
-    end = np.array([path.t_go_s])
-    r, v = path.at(end)
-    misses = np.array([_terminal_errors(future, end, r[0], v[0], attitude) for future in futures])
-    own = np.array([rendezvous(future.goal, *start, params).t_go_s for future in futures])
-    limits = (tolerance.position_m, tolerance.speed_mps, tolerance.angle_deg)
-    inside = np.all((misses <= limits) | np.isnan(misses), axis=1)
+    times = np.linspace(0.0, path.t_go_s, CONTACT_INSTANTS)
+    r, v = path.at(times)
+    misses, touched = np.empty((len(futures), 3)), np.zeros(len(futures), dtype=bool)
+    for k, future in enumerate(futures):
+        dr, dv = disturbance.deviation(times) if disturbance else (0.0 * r, 0.0 * v)
+        misses[k] = _terminal_errors(future.scene, times[-1:], r[-1] + dr[-1], v[-1] + dv[-1], attitude)
+        touched[k] = limits is not None and _touches(future.scene, limits, times, r + dr)
+    own = np.array([planner(future.scene).t_go_s for future in futures])
+    allowed = (tolerance.position_m, tolerance.speed_mps, tolerance.angle_deg)
+    inside = np.all((misses <= allowed) | np.isnan(misses), axis=1)
+    checked = limits is not None and futures[0].scene.surface is not None
     return Spread(
         futures=len(futures),
         t_go_s=_band(own),
@@ -133,16 +165,36 @@ def spread(
         speed_mps=_band(misses[:, 1]),
         angle_deg=_band(misses[:, 2]),
         probability=float(inside.mean()),
+        probability_95=_wilson(int(inside.sum()), len(futures)),
+        contact=float(touched.mean()) if checked else math.nan,
+        contact_95=_wilson(int(touched.sum()), len(futures)) if checked else (math.nan, math.nan),
     )
 
 
+def _touches(scene: Scene, limits: Limits, times: Array, r: Array) -> bool:
+    """Return whether the end-effector touches the body outside the corridor at one of the instants before the end."""
+    if scene.attitude is None or scene.surface is None:
+        return False
+    R = geometry.matrix(scene.attitude(times[:-1]))
+    y = np.einsum("nij,ni->nj", R, r[:-1] - scene.goal(times[:-1])[0])
+    return bool(margins(scene, limits, y, r[:-1]).values[:, 3].min() < 0.0)
+
+
+def _wilson(successes: int, count: int) -> tuple[float, float]:
+    """Return the Wilson 95 % interval of a fraction."""
+    z2 = 1.96**2
+    centre = (successes + 0.5 * z2) / (count + z2)
+    half = 1.96 / (count + z2) * math.sqrt(successes * (count - successes) / count + 0.25 * z2)
+    return max(centre - half, 0.0), min(centre + half, 1.0)
+
+
 def _terminal_errors(
-    future: Future, end: Array, r: Array, v: Array, attitude: Array | None
+    scene: Scene, end: Array, r: Array, v: Array, attitude: Array | None
 ) -> tuple[float, float, float]:
-    rho, rate = future.goal(end)
+    rho, rate = scene.goal(end)
     turn = math.nan
-    if attitude is not None and future.attitude is not None:
-        q = geometry.multiply(geometry.conjugate(future.attitude(float(end[0]))), attitude)
+    if attitude is not None and scene.attitude is not None:
+        q = geometry.multiply(geometry.conjugate(scene.attitude(end)[0]), attitude)
         turn = math.degrees(float(geometry.angle(q)))
     return float(np.linalg.norm(rho[0] - r)), float(np.linalg.norm(rate[0] - v)), turn
 

@@ -1,0 +1,234 @@
+"""Linearisation of the constraints about a reference path, and the check of the true constraints between the nodes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Array
+from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
+from avsreplay.plan.limits import CONSTRAINTS, Limits, Margins, SampledScene, Scene, margins
+from avsreplay.plan.path import RobotPath, StepPath
+from avsreplay.plan.rendezvous import PlanParams
+
+BETWEEN = 16  # instants of every interval at which the true constraints are checked
+THRUST_SHARE = 1.0 - 1e-5  # of a_max that is planned with; the rest corrects the terminal errors
+RESERVE = 3.0  # margin at the checked instants in units of the buffer, for the instants between them
+LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """Everything that does not change with the reference."""
+
+    sampled: SampledScene
+    limits: Limits
+    params: PlanParams
+    r0: Array
+    v0: Array
+    buffer_m: float
+    coarse: bool = False
+
+    @property
+    def wait_s(self) -> float:
+        """Coasting time before the thrust [s]."""
+        return self.params.latency_s
+
+    @property
+    def scene(self) -> Scene:
+        """The target."""
+        return self.sampled.scene
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reference:
+    """A path to linearise about: thrust time t [s] and positions (2 n, 3) at the middle and end of every interval."""
+
+    t: float
+    r: Array
+
+
+def instants(n: int) -> Array:
+    """Middle and end of every interval, as fractions of the flight (2 n,)."""
+    return np.arange(1, 2 * n + 1) / (2.0 * n)
+
+
+def turn_rate(case: Case, t: float) -> float:
+    """Return the angular rate of the target [rad/s]."""
+    rate = case.sampled.at(np.array([t]), 1)[1]
+    return float(np.linalg.norm(rate)) / math.sqrt(2.0)
+
+
+def dense_margins(case: Case, path: RobotPath) -> tuple[Array, Margins]:
+    """Return the instants of the check and the margins there."""
+    times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * case.limits.nodes + 1)
+    r = path.at(times)[0]
+    y = case.sampled.coordinates(times, r)
+    y[-1] = 0.0  # the grasp point itself
+    return times, margins(case.scene, case.limits, y, r, case.sampled.sigma(times))
+
+
+def excess(case: Case, path: StepPath) -> Array:
+    """Return the largest violation near the middle and the end of every interval (2 n, 4) [m]."""
+    n = len(path.u)
+    if not case.limits.geometric:
+        return np.zeros((2 * n, len(CONSTRAINTS)))
+    times, found = dense_margins(case, path)
+    fraction = (times[1:] - times[0]) / (times[-1] - times[0])
+    over = np.maximum(RESERVE * case.buffer_m - found.between - allowed(found.values[0], fraction), 0.0)
+    half = over.reshape(2 * n, BETWEEN // 2, -1).max(axis=1)
+    after = np.concatenate([half[1:], half[-1:]])
+    return np.asarray(np.maximum(half, after))
+
+
+def allowed(start: Array, fraction: Array) -> Array:
+    """Return the violation that is accepted while the robot returns from a violation at the start."""
+    shrinking = np.maximum(1.0 - fraction / LEAD_BACK, 0.0)
+    return np.asarray(np.maximum(-start, 0.0)[None, :] * shrinking[:, None])
+
+
+def linearised(case: Case, reference: Reference, off: Array, change: float) -> Subproblem:
+    """Return the convex subproblem at a reference."""
+    n, t = case.limits.nodes, reference.t
+    rho, rate = case.scene.goal(np.array([case.wait_s + t, case.wait_s + t - 1e-4]))
+    problem = Subproblem(
+        n=n,
+        h=t / n,
+        r0=case.r0 + case.wait_s * case.v0,
+        v0=case.v0,
+        rho=rho[0],
+        rate=rate[0],
+        acceleration=(rate[0] - rate[1]) / 1e-4,
+        a_max=case.params.a_max_mps2 * THRUST_SHARE,
+        change=change,
+        speed=case.limits.speed_max_mps,
+        contact=case.limits.contact_accel_mps2,
+    )
+    if not case.limits.geometric:
+        return problem
+    rows = _RowMaker(case, reference)
+    start = margins(
+        case.scene, case.limits, case.sampled.coordinates(np.zeros(1), case.r0[None]), case.r0[None]
+    ).values[0]
+    return rows.added(problem, off - allowed(start, instants(n)))
+
+
+class _RowMaker:
+    """Rows of the geometric constraints at the middle and the end of every interval."""
+
+    def __init__(self, case: Case, reference: Reference) -> None:
+        n = case.limits.nodes
+        s = instants(n)
+        times = case.wait_s + reference.t * s
+        self.limits, self.scene = case.limits, case.scene
+        self.rho, self.R = case.sampled.at(times)
+        drho, dR = case.sampled.at(times, 1)
+        self.y = np.einsum("nij,ni->nj", self.R, reference.r - self.rho)
+        dy = np.einsum("nij,ni->nj", dR, reference.r - self.rho) - np.einsum("nij,ni->nj", self.R, drho)
+        self.dy = dy * (reference.t * s)[:, None]  # change with the relative change of the end time
+        self.interval = np.arange(2 * n) // 2
+        self.fraction = np.where(np.arange(2 * n) % 2 == 0, 0.5, 1.0)
+        self.r = reference.r
+        self.found = margins(case.scene, case.limits, self.y, reference.r, case.sampled.sigma(times))
+        self.near = np.ones(2 * n, dtype=bool)
+        self.near[-1] = False  # the grasp point itself is the end condition
+
+    def rows(self, k: Index, vector: Array, constant: Array, slack: float) -> PointRows:
+        """Return rows vector.y + constant (+ slack) at the points k; vector (m, 3) in {C}."""
+        in_a = np.einsum("nij,nj->ni", self.R[k], vector)
+        offset = constant - np.sum(in_a * self.rho[k], axis=1)
+        rate = np.sum(vector * self.dy[k], axis=1)
+        return PointRows(self.interval[k], self.fraction[k], in_a, offset, rate, np.full(len(k), slack))
+
+    def added(self, problem: Subproblem, off: Array) -> Subproblem:
+        """Return the subproblem with the rows of all constraints."""
+        planes: list[PointRows] = []
+        cones: list[tuple[int, PointRows]] = []
+        limits, y, inside = self.limits, self.y, self.found.inside
+        on = np.isfinite(self.found.values) & self.near[:, None]
+        distance = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
+        for i, degrees, length in (
+            (0, limits.cone_deg, limits.cone_range_m),
+            (1, limits.final_deg, limits.final_range_m),
+        ):
+            if degrees is not None:
+                k = np.flatnonzero(on[:, i] & inside[:, i])
+                cones.append(self.cone(k, degrees, off[k, i]))
+                k = np.flatnonzero(on[:, i] & ~inside[:, i])
+                planes.append(self.rows(k, y[k] / distance[k], -(length or 0.0) - off[k, i], 1.0))
+        if limits.keepout_m is not None and self.scene.centre_c is not None:
+            k = np.flatnonzero(on[:, 2] & inside[:, 2])
+            cones.append(self.ball(k, (limits.keepout_release_m or 0.0) - off[k, 2]))
+            k = np.flatnonzero(on[:, 2] & ~inside[:, 2])
+            out = y[k] - self.scene.centre_c
+            normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
+            planes.append(self.rows(k, normal, -normal @ self.scene.centre_c - limits.keepout_m - off[k, 2], 1.0))
+        if limits.clearance_m is not None:
+            self._body(planes, cones, on[:, 3], off[:, 3])
+        self._workspace(planes, cones, np.flatnonzero(self.near), off[:, 4])
+        return replace(
+            problem,
+            planes=tuple(p for p in planes if len(p.interval)),
+            cones=tuple(c for c in cones if len(c[1].interval)),
+        )
+
+    def _body(
+        self, planes: list[PointRows], cones: list[tuple[int, PointRows]], on: NDArray[np.bool_], off: Array
+    ) -> None:
+        """Add the clearance to the surface, or the corridor with its range where the reference is inside it."""
+        found, limits = self.found, self.limits
+        k = np.flatnonzero(on & found.inside[:, 3])
+        cones.append(self.cone(k, limits.final_deg or 0.0, off[k]))
+        cones.append(self.ball(k, (limits.final_range_m or 0.0) - off[k]))
+        k = np.flatnonzero(on & ~found.inside[:, 3])
+        foot = found.foot[k]
+        gap = found.distance[k]
+        normal = (self.y[k] - foot) / np.where(np.abs(gap) > 1e-9, gap, 1e-9)[:, None]
+        planes.append(self.rows(k, normal, -np.sum(normal * foot, axis=1) - found.clearance[k] - off[k], 1.0))
+
+    def _workspace(self, planes: list[PointRows], cones: list[tuple[int, PointRows]], k: Index, off: Array) -> None:
+        """Add the shell around the robot's base, which is fixed in {A}."""
+        limits, base, m = self.limits, np.array(self.limits.base_m), len(k)
+
+        def rows(vector: Array, constant: Array, slack: float) -> PointRows:
+            interval, fraction = self.interval[k], self.fraction[k]
+            return PointRows(interval, fraction, vector, constant - vector @ base, np.zeros(m), np.full(m, slack))
+
+        if limits.reach_max_m is not None:
+            parts = [rows(np.zeros((m, 3)), limits.reach_max_m - off[k], 1.0)]
+            parts += [rows(np.tile(e, (m, 1)), np.zeros(m), 0.0) for e in np.eye(3)]
+            cones.append((4, _interleaved(parts)))
+        if limits.reach_min_m is not None:
+            out = self.r[k] - base
+            normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
+            planes.append(rows(normal, -limits.reach_min_m - off[k], 1.0))
+
+    def cone(self, k: Index, degrees: float, off: Array) -> tuple[int, PointRows]:
+        """Return |across| <= tan(degrees) along + mouth - off at the points k."""
+        axis = np.asarray(self.scene.axis_c)
+        across = np.linalg.svd(axis[None, :])[2][1:]
+        first = np.tile(math.tan(math.radians(degrees)) * axis, (len(k), 1))
+        rows = [self.rows(k, first, (self.limits.mouth_m or 0.0) - off, 1.0)]
+        rows += [self.rows(k, np.tile(e, (len(k), 1)), np.zeros(len(k)), 0.0) for e in across]
+        return 3, _interleaved(rows)
+
+    def ball(self, k: Index, radius: Array) -> tuple[int, PointRows]:
+        """Return |y| <= radius at the points k."""
+        rows = [self.rows(k, np.zeros((len(k), 3)), radius, 1.0)]
+        rows += [self.rows(k, np.tile(e, (len(k), 1)), np.zeros(len(k)), 0.0) for e in np.eye(3)]
+        return 4, _interleaved(rows)
+
+
+def _interleaved(rows: list[PointRows]) -> PointRows:
+    """Return rows of equal length ordered point by point."""
+
+    def mixed(name: str) -> Any:
+        stacked = np.stack([getattr(row, name) for row in rows], axis=1)
+        return stacked.reshape(-1, *stacked.shape[2:])
+
+    names = ("interval", "fraction", "vector", "offset", "rate", "slack")
+    return PointRows(*(mixed(name) for name in names))

@@ -1,0 +1,102 @@
+"""Properties of guidance over random sequences of healthy and faulty scans, lost convergence, growing uncertainty."""
+
+import numpy as np
+import pytest
+
+from avsreplay.geometry import exp
+from avsreplay.plan import Action, Guidance, Limits, PlannerInput, PlanParams, Scene, Supervisor, SupervisorParams
+from avsreplay.plan.limits import margin
+from avsreplay.records import Forecast
+
+RADIUS = 1.5
+CENTRE = np.array([0.0, 0.0, 6.0])
+DRIFT = np.array([0.004, -0.003, 0.002])
+PARAMS = SupervisorParams(approach_limit_s=70.0, hold_limit_s=25.0, attempts_max=3).resolved(8.0)
+ROBOT = PlanParams(a_max_mps2=0.05, horizon_s=60.0)
+WITHDRAWN = (Action.HOLD, Action.RETREAT, Action.ABORT)
+
+
+def scene(rng):
+    """A target that turns at a random constant rate, with the grasp point 1 m from its centre of mass."""
+    w = rng.normal(size=3)
+    w *= rng.uniform(0.02, 0.12) / np.linalg.norm(w)
+    arm, x = np.array([1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0])
+
+    def attitude(t):
+        return exp(np.asarray(t)[:, None] * w)
+
+    def goal(t):
+        from scipy.spatial.transform import Rotation
+
+        c = Rotation.from_quat(attitude(t)).apply(arm)
+        return CENTRE + np.outer(t, DRIFT) + c, DRIFT + np.cross(w, c)
+
+    return Scene(goal, attitude, x, -arm, radius_m=RADIUS)
+
+
+def inputs(rng, end_s=160.0, step_s=0.5):
+    """Scans in random runs of healthy, faulty and unconverged; the uncertainty grows while no scan is healthy."""
+    target, growth = scene(rng), rng.uniform(0.0, 1.0)
+    mode, until, healthy_s = "healthy", 3.0, 0.0
+    for t in np.arange(0.0, end_s, step_s):
+        if t >= until:
+            mode = rng.choice(["healthy", "faulty", "lost"], p=[0.5, 0.4, 0.1])
+            until = t + rng.uniform(0.5, 20.0)
+        healthy_s = t if mode == "healthy" else healthy_s
+
+        def forecast(dt, since=t - healthy_s):
+            grown = 0.002 * (1.0 + growth * (since + dt))
+            return Forecast(dt, grown, 0.3 * grown, 0.1 * grown)
+
+        yield PlannerInput(round(t * 1e9), int(mode == "healthy"), mode != "lost", target.after(t), forecast)
+
+
+def flights(seed, limits=None, end_s=160.0):
+    """Input and state after each scan of one random sequence."""
+    guidance = Guidance(ROBOT, Supervisor(PARAMS), limits)
+    yield from guidance.fly(inputs(np.random.default_rng(seed), end_s))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_every_sequence_ends_and_attempts_are_limited(seed):
+    states = [state for _, state in flights(seed)]
+    last = states[-1].decision.action
+    assert last in (Action.CAPTURE, Action.ABORT) or states[-1].supervisor.began_s is None
+    assert states[-1].supervisor.attempts <= PARAMS.attempts_max
+    actions = [state.decision.action for state in states]
+    for final in (Action.CAPTURE, Action.ABORT):
+        if final in actions:
+            assert set(actions[actions.index(final) :]) == {final}
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_withdrawal_comes_no_closer_than_braking_needs(seed):
+    """Distance d0, approach speed v0 along the line of sight: never nearer than d0 - v0^2 / (2 a)."""
+    begin = None
+    for known, state in flights(seed):
+        t = known.t_ns * 1e-9
+        position, velocity = state.segment.at(known.t_ns)
+        centre = CENTRE + t * DRIFT
+        away = position - centre
+        distance = float(np.linalg.norm(away))
+        if state.decision.action not in WITHDRAWN:
+            begin = None
+            continue
+        if begin is None:
+            speed = float(np.linalg.norm(velocity - DRIFT))
+            begin = (t, distance - speed**2 / (2 * ROBOT.a_max_mps2))
+        assert distance >= begin[1] - 1e-3
+        if t - begin[0] > 40.0:
+            assert distance >= RADIUS + PARAMS.standoff_m - 1e-3
+
+
+def test_limits_hold_in_every_plan_of_a_flight():
+    limits = Limits(cone_deg=30.0, final_deg=12.0).resolved(8.0)
+    constrained = 0
+    for known, state in flights(3, limits, end_s=20.0):
+        plan = state.plan
+        if plan is None or not plan.found or plan.t_ns != known.t_ns:
+            continue
+        constrained += plan.thrust is not None
+        assert plan.margin_m >= 0.0 or margin(known.scene, limits, *state.segment.at(known.t_ns)) < limits.mouth_m
+    assert constrained > 3
