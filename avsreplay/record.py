@@ -101,7 +101,8 @@ def surface_for(scenario: Scenario, model: Path | None = None, cloud_ok: bool = 
 
 def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ticker: Ticker | None = None) -> Recorded:
     """Record a simulation; the ground truth is stamped with the true instants."""
-    simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model))
+    meshes = {name: read_surface(path) for name, path in scenario.meshes.items()}
+    simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model), meshes)
     with (
         _writer(output, simulation.header, options) as writer,
         _ticked(ticker, simulation.scans(), simulation.count) as scans,

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,6 +79,40 @@ def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
         optics.width_rad[inside] = math.radians(material.specular_width_deg)
         optics.dropouts[inside] = material.dropout_ratio
     return optics
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TracedRays:
+    """Rays cast on surfaces.
+
+    Attributes:
+        ranges: (n,) to the first surface [m], inf without one.
+        returned: (n,) range of the return [m], inf without one.
+        cosines: (n,) cosine of the angle of incidence.
+        intensities: (n,) intensity of the return, 0 without one.
+        dropouts: (n,) probability that the return is lost.
+    """
+
+    ranges: Array
+    returned: Array
+    cosines: Array
+    intensities: Array
+    dropouts: Array
+
+    @classmethod
+    def empty(cls, n: int) -> TracedRays:
+        """Rays that meet nothing."""
+        return cls(np.full(n, np.inf), np.full(n, np.inf), np.zeros(n), np.zeros(n), np.zeros(n))
+
+    def nearer(self, other: TracedRays) -> TracedRays:
+        """Ray by ray the nearer surface; it blocks the other one also where it gives no return."""
+        other_first = other.ranges < self.ranges
+        names = [field.name for field in fields(self)]
+        return TracedRays(*(np.where(other_first, getattr(other, name), getattr(self, name)) for name in names))
+
+    def chosen(self, index: NDArray[np.intp]) -> TracedRays:
+        """Some of the rays."""
+        return TracedRays(*(getattr(self, field.name)[index] for field in fields(self)))
 
 
 def beam(directions: Array, divergence_rad: float) -> Array:

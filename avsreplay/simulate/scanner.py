@@ -19,8 +19,9 @@ from avsreplay.geometry import Array, frozen, rotate
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.motion import Motion
-from avsreplay.simulate.optics import Material, beam, face_optics, merged
+from avsreplay.simulate.optics import FaceOptics, Material, TracedRays, beam, face_optics, merged
 from avsreplay.simulate.ray_casting import Engine, RayCaster
+from avsreplay.simulate.scene import SceneBody
 
 
 class Preset(Enum):
@@ -192,33 +193,60 @@ class Scanner:
         """The engine that casts the rays."""
         return self._caster.engine
 
-    def cast(self, t_s: float) -> Returns:
-        """The returns of a scan at ``t_s`` [s] without noise; beams without a return are left out."""
-        R_ac, t_ac = self._poses(t_s)
-        near = self._may_hit(R_ac, t_ac)
-        R_ca = np.swapaxes(R_ac[near] if len(R_ac) > 1 else R_ac, -1, -2)
-        origins = rotate(R_ca, -(t_ac[near] if len(t_ac) > 1 else t_ac))
-        found = [self._traced(origins, rotate(R_ca, rays[near])) for rays in self._rays]
-        ranges, cosines, intensities, dropouts = (np.stack(part) for part in zip(*found, strict=True))
-        directions, times = self._rays[0][near], self._times[near]
-        if len(found) == 1:
-            returns = Returns(directions, ranges[0], times, cosines[0], intensities[0], dropouts[0])
-        else:
-            mean, intensity, weights = merged(ranges, intensities, self.params.merge_m)
-            cosine, lost = (weights * cosines).sum(axis=0), (weights * dropouts).sum(axis=0)
-            returns = Returns(directions, mean, times, cosine, intensity, lost)
+    def cast(self, t_s: float, bodies: Sequence[SceneBody] = ()) -> Returns:
+        """The returns of a scan without noise; beams without a return are left out.
+
+        Args:
+            t_s: Time of the scan [s].
+            bodies: Objects beside the target that are present.
+        """
+        poses = self._poses(t_s)
+        near = self._may_hit(*poses)
+        found = [self._traced(self._caster, self._optics, poses, rays, near) for rays in self._rays]
+        for body in bodies:
+            placed = body.params.poses(np.array([t_s]) if self.params.pattern is Pattern.FLASH else t_s + self._times)
+            every = np.arange(len(self._times))
+            for k, rays in enumerate(self._rays):
+                found[k] = found[k].nearer(self._traced(body.caster, body.optics, placed, rays, every))
+        if bodies:
+            near = np.arange(len(self._times))
+        returns = self._beams([each.chosen(near) for each in found], near)
         return returns.keep(np.isfinite(returns.ranges) & (returns.intensities >= self.params.intensity_min))
 
-    def _traced(self, origins: Array, directions: Array) -> tuple[Array, Array, Array, Array]:
-        """Range (inf: no return), cosine of incidence, intensity and probability of a dropout of each ray in {C}."""
+    def _beams(self, rays: list[TracedRays], near: NDArray[np.intp]) -> Returns:
+        """The returns of beams from those of their rays."""
+        ranges, intensities = np.stack([r.returned for r in rays]), np.stack([r.intensities for r in rays])
+        if len(rays) == 1:
+            mean, intensity, weights = ranges[0], intensities[0], np.ones((1, len(near)))
+        else:
+            mean, intensity, weights = merged(ranges, intensities, self.params.merge_m)
+        cosines = (weights * np.stack([r.cosines for r in rays])).sum(axis=0)
+        dropouts = (weights * np.stack([r.dropouts for r in rays])).sum(axis=0)
+        return Returns(self._rays[0][near], mean, self._times[near], cosines, intensity, dropouts)
+
+    def _traced(
+        self,
+        caster: RayCaster,
+        optics: FaceOptics,
+        poses: tuple[Array, Array],
+        rays: Array,
+        near: NDArray[np.intp],
+    ) -> TracedRays:
+        """Rays (n, 3) in {A} on one surface with these poses; only those in ``near`` are cast."""
+        R, t = poses
+        R_inverse = np.swapaxes(R[near] if len(R) > 1 else R, -1, -2)
+        origins = rotate(R_inverse, -(t[near] if len(t) > 1 else t))
         p = self.params
-        ranges, cosines, faces = self._caster.ranges(origins, directions)
+        ranges, cosines, faces = caster.ranges(origins, rotate(R_inverse, rays[near]))
         seen = (ranges >= p.range_min_m) & (ranges <= p.range_max_m)
         seen &= cosines >= math.cos(math.radians(p.max_incidence_deg))
-        intensities, dropouts = np.zeros(len(ranges)), np.zeros(len(ranges))
-        intensities[seen] = self._optics.intensity(faces[seen], cosines[seen], ranges[seen], p.reference_m)
-        dropouts[seen] = self._optics.dropouts[faces[seen]]
-        return np.where(seen, ranges, np.inf), cosines, intensities, dropouts
+        traced = TracedRays.empty(len(rays))
+        traced.ranges[near], traced.cosines[near] = ranges, cosines
+        back = near[seen]
+        traced.returned[back] = ranges[seen]
+        traced.intensities[back] = optics.intensity(faces[seen], cosines[seen], ranges[seen], p.reference_m)
+        traced.dropouts[back] = optics.dropouts[faces[seen]]
+        return traced
 
     def disturb(self, returns: Returns, rng: np.random.Generator, noise_factor: float = 1.0) -> Returns:
         """Add range noise and outliers, remove dropouts, and quantise the ranges."""

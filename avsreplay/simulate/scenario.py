@@ -19,6 +19,7 @@ from avsreplay.simulate.faults import InjectedFault
 from avsreplay.simulate.motion import MotionParams
 from avsreplay.simulate.optics import Material
 from avsreplay.simulate.scanner import Preset, ScannerParams
+from avsreplay.simulate.scene import SceneObject
 from avsreplay.simulate.target import TargetParams
 
 MAX_SCANS = 10_000_000
@@ -65,6 +66,7 @@ class ScenarioParams(Settings):
     motion: MotionParams = setting(MotionParams, "The target's motion.")
     scanner: ScannerParams = setting(ScannerParams, "The scanner.")
     material: tuple[Material, ...] = setting((), "Optical properties of parts of the target, one table each.")
+    object: tuple[SceneObject, ...] = setting((), "Objects beside the target, one table each.")
     fault: tuple[InjectedFault, ...] = setting((), "The injected faults, one table [[fault]] each.")
     start: StartParams | None = setting(
         None, "The initial belief.", unset="the log has none, and the estimator starts cold"
@@ -99,6 +101,11 @@ class Scenario:
         if not self.params.target.model:
             return None
         return (self.folder or Path()) / self.params.target.model
+
+    @property
+    def meshes(self) -> dict[str, Path]:
+        """The mesh files of its objects, by the names that it gives them."""
+        return {each.model: (self.folder or Path()) / each.model for each in self.params.object if each.model}
 
 
 def load_scenario(path: Path | None = None, seed: int | None = None) -> Scenario:

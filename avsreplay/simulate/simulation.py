@@ -6,7 +6,7 @@ Every scan has its own random streams, one per purpose, so that a fault added to
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -18,6 +18,7 @@ from avsreplay.simulate.motion import Motion
 from avsreplay.simulate.ray_casting import Engine
 from avsreplay.simulate.scanner import Pattern, Returns, Scanner
 from avsreplay.simulate.scenario import Scenario, belief
+from avsreplay.simulate.scene import SceneBody, scene_bodies
 from avsreplay.simulate.target import body
 
 EPOCH_NS = (
@@ -41,6 +42,7 @@ class Simulation:
     _scenario: Scenario = field(repr=False)
     _motion: Motion = field(repr=False)
     _scanner: Scanner = field(repr=False)
+    _bodies: Sequence[SceneBody] = field(repr=False, default=())
 
     @property
     def engine(self) -> Engine:
@@ -54,7 +56,12 @@ class Simulation:
     def truth_of(self, scan: Scan) -> Truth:
         """Return the ground truth at one of this simulation's scans: pose, full state and injected fault."""
         state = self.truth(scan.log_ns)
-        return Truth(state.T_ac, state, next((kind.value for kind in self._faults(scan.log_ns)), None))
+        kinds = [kind.value for kind in self._faults(scan.log_ns)]
+        kinds += [body.params.name for body in self._present(scan.log_ns) if body.params.duration_s is not None]
+        return Truth(state.T_ac, state, next(iter(kinds), None))
+
+    def _present(self, log_ns: int) -> list[SceneBody]:
+        return [body for body in self._bodies if body.params.present((log_ns - EPOCH_NS) / NS)]
 
     def _faults(self, log_ns: int) -> dict[Kind, InjectedFault]:
         return faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
@@ -93,7 +100,7 @@ class Simulation:
     def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault], state: State) -> Returns:
         """Ray casting, occlusion, noise, bias, clutter: in the order in which they act on the light."""
         noise, wrong = self._rng("noise", k), self._rng("fault", k)
-        returns = self._scanner.cast((log_ns - EPOCH_NS) / NS)
+        returns = self._scanner.cast((log_ns - EPOCH_NS) / NS, self._present(log_ns))
         for kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
             if kind in now:
                 returns = faults.occlude(returns, faults.strength(now[kind]), self._side(now[kind]), wrong)
@@ -114,12 +121,13 @@ class Simulation:
         return _generator(self._scenario.params.seed, stream, k)
 
 
-def simulate(scenario: Scenario, surface: Surface) -> Simulation:
+def simulate(scenario: Scenario, surface: Surface, meshes: Mapping[str, Surface] | None = None) -> Simulation:
     """The simulation of a scenario.
 
     Args:
         scenario: The scenario.
         surface: The model in {C}.
+        meshes: Surface of every mesh that an object of the scenario names.
 
     Raises:
         UsageError: The model has no mass properties.
@@ -133,17 +141,19 @@ def simulate(scenario: Scenario, surface: Surface) -> Simulation:
     start = None
     if params.start is not None:
         start = belief(params.start, first, EPOCH_NS, _generator(params.seed, "start", 0))
+    others = [each.label(EPOCH_NS) for each in params.object]
     header = LogHeader(
         surface=surface,
         scenario=scenario.text,
         seed=params.seed,
-        labels=tuple(faults.label(f, EPOCH_NS) for f in params.fault),
+        labels=(*(faults.label(f, EPOCH_NS) for f in params.fault), *(label for label in others if label)),
         start=start,
         truth=first,
         notes={"source": "simulated", "name": params.name, "ray_engine": scanner.engine.value},
     )
     count = int(params.duration_s * params.rate_hz + 1e-9)
-    return Simulation(header, count, scenario, motion, scanner)
+    bodies = scene_bodies(params.object, dict(meshes or {}), params.scanner.engine)
+    return Simulation(header, count, scenario, motion, scanner, bodies)
 
 
 def _generator(seed: int, stream: str, k: int) -> np.random.Generator:

@@ -101,7 +101,8 @@ class Expansion:
         log = str(folder / values["log"]) if campaign.logs else ""
         model = str(folder / campaign.model) if campaign.model else ""
         assignments = (*self._run, *run)
-        inputs = [self._inputs.get(path, "") for path in (log, model or _model_of(scenario, home))]
+        named = _models_of(scenario, home)
+        inputs = [self._inputs.get(path, "") for path in (log, model or named[0], *named[1:])]
         content = [FORMAT, avsreplay.__version__, scenario, inputs, assignments, campaign.scans]
         digest = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:24]
         return Task(digest, scenario, str(home), log, model, assignments, campaign.scans)
@@ -160,14 +161,15 @@ def _inputs(loaded: LoadedCampaign, bases: Mapping[str, Mapping[str, Any]]) -> d
     campaign = loaded.campaign
     paths = {str(loaded.folder / name) for name in (*campaign.logs, campaign.model) if name}
     texts = {name: tomli_w.dumps(table) for name, table in bases.items()}
-    paths |= {_model_of(text, (loaded.folder / name).parent) for name, text in texts.items()}
+    paths |= {path for name, text in texts.items() for path in _models_of(text, (loaded.folder / name).parent)}
     return {path: _sha256(Path(path)) for path in sorted(paths - {""})}
 
 
-def _model_of(scenario: str, folder: Path) -> str:
-    """Path of the model that a scenario names, "" where it names none."""
-    model = toml_document.parse(scenario, "scenario").table.get("target", {}).get("model") if scenario else None
-    return str(folder / model) if model else ""
+def _models_of(scenario: str, folder: Path) -> tuple[str, ...]:
+    """Paths of the target's model that a scenario names ("" for none) and of the meshes of its objects."""
+    table = toml_document.parse(scenario, "scenario").table if scenario else {}
+    names = [table.get("target", {}).get("model"), *(each.get("model") for each in table.get("object", ()))]
+    return tuple(str(folder / name) if name else "" for name in names)
 
 
 def _sha256(path: Path) -> str:

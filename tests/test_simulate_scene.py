@@ -1,0 +1,136 @@
+"""Objects beside the target: what they hide, what they return, how they move, and their labels."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+
+from avsreplay import geometry, toml_document
+from avsreplay.errors import UsageError
+from avsreplay.log import open_source
+from avsreplay.record import RecordOptions, record_scenario
+from avsreplay.simulate import EPOCH_NS, builtin_surface, load_scenario, scenario_of, simulate
+from avsreplay.simulate.scene import SceneObject
+from avsreplay.simulate.target import ply_bytes
+
+SURFACE = builtin_surface()
+BASE = """
+seed = 3
+duration_s = 4.0
+rate_hz = 1.0
+[motion]
+position_m = [0.0, 0.0, 5.0]
+[scanner]
+rays = [60, 60]
+noise_m = 0.0
+outlier_ratio = 0.0
+"""
+
+
+def scans_of(extra="", meshes=None):
+    simulation = simulate(scenario_of(toml_document.parse(BASE + extra, "s.toml")), SURFACE, meshes)
+    scans = list(simulation.scans())
+    return simulation, scans, [np.asarray(scan.points, dtype=np.float64) for scan in scans]
+
+
+def test_a_wall_behind_the_target_returns_what_the_target_does_not_cover():
+    wall = "[[object]]\nname = 'wall'\nsize_m = [20.0, 20.0, 0.1]\nposition_m = [0.0, 0.0, 9.0]\n"
+    flat = "max_incidence_deg = 90.0\n"  # every ray on the target returns
+    _, _, alone = scans_of(flat)
+    simulation, scans, both = scans_of(flat + wall)
+    for target, scene in zip(alone, both, strict=True):
+        on_wall = np.abs(scene[:, 2] - 8.95) < 1e-5
+        assert len(scene) == 60 * 60
+        assert {tuple(p) for p in scene[~on_wall]} == {tuple(p) for p in target}
+        assert on_wall.sum() == 60 * 60 - len(target)
+    assert simulation.header.labels == ()  # it stays, so it is no fault
+    assert all(simulation.truth_of(scan).fault is None for scan in scans)
+
+
+def test_a_wall_in_front_hides_the_target():
+    near = "[[object]]\nname = 'wall'\nsize_m = [9.0, 9.0, 0.1]\nposition_m = [0.0, 0.0, 2.0]\n"
+    for points in scans_of(near)[2]:
+        assert_allclose(points[:, 2], 1.95, atol=1e-6)
+
+
+def test_a_black_object_hides_what_is_behind_without_returning_anything():
+    near = "[[object]]\nname = 'plate'\nsize_m = [9.0, 9.0, 0.1]\nposition_m = [0.0, 0.0, 2.0]\nreflectance = 0.0\n"
+    _, _, points = scans_of("intensity_min = 1e-6\n" + near)
+    assert [len(p) for p in points] == [0] * 4
+
+
+def test_an_object_for_a_part_of_the_log_is_labelled_like_a_fault():
+    arm = "[[object]]\nname = 'arm'\nsize_m = [0.2, 3.0, 0.2]\nposition_m = [0.0, 1.0, 1.5]\n"
+    arm += "start_s = 1.0\nduration_s = 2.0\nharmful = true\n"
+    _, _, alone = scans_of()
+    simulation, scans, both = scans_of(arm)
+    (label,) = simulation.header.labels
+    second = 1_000_000_000
+    assert (label.kind, label.harmful) == ("arm", True)
+    assert (label.start_ns - EPOCH_NS, label.end_ns - EPOCH_NS) == (second, 3 * second)
+    assert [simulation.truth_of(scan).fault for scan in scans] == [None, "arm", "arm", None]
+    for k, (target, scene) in enumerate(zip(alone, both, strict=True)):
+        assert np.array_equal(target, scene) == (k in (0, 3))
+        if k in (1, 2):
+            on_arm = scene[:, 2] < 1.7
+            assert on_arm.sum() > 50
+            assert np.abs(scene[on_arm, 0]).max() <= 0.1 + 1e-6
+
+
+@pytest.mark.parametrize("pattern", ["flash", "raster"])
+def test_an_occluder_is_where_its_motion_puts_it(pattern):
+    """A turning and moving box: every point on it is on its surface at the time of its ray."""
+    text = "[[object]]\nname = 'box'\nsize_m = [1.0, 0.6, 0.4]\nposition_m = [-0.5, 0.0, 2.0]\n"
+    text += "velocity_mps = [0.3, 0.0, 0.05]\nrate_radps = [0.1, 0.4, -0.3]\n"
+    scanner = "pattern = 'raster'\nscan_s = 0.9\n" if pattern == "raster" else ""
+    _, scans, clouds = scans_of(scanner + text)
+    for k, (scan, points) in enumerate(zip(scans, clouds, strict=True)):
+        times = k + (np.zeros(len(points)) if scan.times_s is None else scan.times_s.astype(np.float64))
+        centre = np.array([-0.5, 0.0, 2.0]) + times[:, None] * np.array([0.3, 0.0, 0.05])
+        R = geometry.matrix(geometry.exp(times[:, None] * np.array([0.1, 0.4, -0.3])))
+        inside = np.abs(np.einsum("nji,nj->ni", R, points - centre)) / np.array([0.5, 0.3, 0.2])
+        on_box = inside.max(axis=1) < 1.01
+        assert on_box.sum() > 30
+        assert_allclose(inside[on_box].max(axis=1), 1.0, atol=1e-4)
+
+
+def test_objects_leave_the_truth_and_the_noise_of_the_target_alone():
+    far = "[[object]]\nname = 'far'\nsize_m = [0.1, 0.1, 0.1]\nposition_m = [0.0, 0.0, -5.0]\n"
+    first, _, alone = scans_of()
+    second, _, both = scans_of(far)
+    assert all(np.array_equal(a, b) for a, b in zip(alone, both, strict=True))
+    assert np.array_equal(first.truth(EPOCH_NS).r_a, second.truth(EPOCH_NS).r_a)
+
+
+def test_a_mesh_is_read_from_the_scenario_s_folder_and_recorded(tmp_path):
+    (tmp_path / "second.ply").write_bytes(ply_bytes(SURFACE.vertices, SURFACE.faces))
+    text = BASE + "[[object]]\nname = 'debris'\nmodel = 'second.ply'\nposition_m = [1.5, 0.0, 8.0]\nduration_s = 2.0\n"
+    (tmp_path / "s.toml").write_text(text)
+    done = record_scenario(load_scenario(tmp_path / "s.toml"), tmp_path / "s.mcap", RecordOptions())
+    assert [fault[0] for fault in done.faults] == ["debris"]
+    with open_source(tmp_path / "s.mcap") as source:
+        counts = [len(scan.points) for scan in source.scans()]
+        assert [label.kind for label in source.header.labels] == ["debris"]
+    assert min(counts[:2]) > max(counts[2:])
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        ("size_m = [1.0, 1.0, 0.0]", "object.0.size_m"),
+        ("attitude_xyzw = [0.0, 0.0, 0.0, 2.0]", "unit quaternion"),
+        ("shape = 'wall'", "unknown key"),
+        ("duration_s = 0.0", "above 0"),
+    ],
+)
+def test_a_wrong_object_is_named(text, word):
+    with pytest.raises(UsageError, match=word):
+        scenario_of(toml_document.parse(f"[[object]]\nname = 'x'\n{text}\n", "s.toml"))
+
+
+def test_presence_is_half_open():
+    thing = SceneObject("x", start_s=1.0, duration_s=2.0)
+    assert [thing.present(t) for t in (0.999, 1.0, 2.999, 3.0)] == [False, True, True, False]
+    assert replace(thing, duration_s=None).present(math.inf)
