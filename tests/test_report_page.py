@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import dataclasses
 import html.parser
 import itertools
 import json
@@ -19,7 +20,7 @@ from avsreplay.cli.report import command
 from avsreplay.errors import AvsError
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State
-from avsreplay.report.charts import charts, derived, embed, spans
+from avsreplay.report.charts import charts, derived, embed, most_telling, spans
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import build_page, render
 from avsreplay.report.result import load_result
@@ -211,6 +212,60 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     assert not (tmp_path / "x.html").exists()
 
 
+def test_a_long_run_is_thinned_to_its_telling_scans(make_rows):
+    rows = [dataclasses.replace(r, pos_err_m=0.9) if r.seq == 1234 else r for r in make_rows(3000)]
+    kept = most_telling(rows, 500, always=(77,))
+    assert len(kept) <= 500
+    assert {0, 77, 1234, 2999, 20, 26} <= set(kept)  # 20 and 26: gamma changes
+    assert most_telling(rows, 3000) == list(range(3000))
+
+
+@pytest.mark.slow
+def test_60000_scans_make_a_page_below_10_mb_that_says_what_it_shows(make_rows):
+    rows = make_rows(60_000)
+    page = _page(rows)
+    assert len(page) < 10e6
+    assert re.search(r"The charts show \d+ of 60000 scans", page)
+    assert "60000 scans" in page.split("<main>")[0] or "of 60000 scans used" in page
+
+
+def test_values_are_in_millimetres_where_the_tables_say_so(make_rows):
+    found = {c["key"]: c for c in charts(derived(make_rows(40)), None, {"rms_max_m": 0.05})}
+    assert (found["fit"]["unit"], found["fit"]["factor"]) == ("mm", 1000.0)
+    assert found["fit"]["levels"] == [{"y": 50.0, "label": "limit", "colour": 3}]
+    far = {c["key"]: c for c in charts(derived(make_rows(40, pos_err_m=3.0)))}
+    assert far["position"]["unit"] == "m"
+
+
+def test_a_kind_has_the_same_colour_and_pattern_on_every_page(make_rows):
+    def styles(rows):
+        return {(s["lane"], s["word"]): (s["colour"], s["pattern"]) for s in spans(rows)}
+
+    one = styles(make_rows(40))
+    two = styles(
+        [dataclasses.replace(r, gamma=0, reason="fit_error", fault=None) if r.seq < 5 else r for r in make_rows(40)]
+    )
+    shared = one.keys() & two.keys()
+    assert ("injected", "full_occlusion") in shared
+    assert all(one[kind] == two[kind] for kind in shared)
+    words = ["not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged", "doubtful", "clock"]
+    rows = [dataclasses.replace(r, gamma=0, reason=word) for r, word in zip(make_rows(8), words, strict=True)]
+    flagged = [style for (lane, _), style in styles(rows).items() if lane == "flagged"]
+    assert len(set(flagged)) == len(words)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"pos_err_m": None, "rot_err_deg": None}, "no truth to compare with"),
+        ({"gamma": 0, "reason": "not_aligned", "converged": False}, "rms in coasting scans"),
+        ({"gamma": 0, "reason": "not_aligned", "converged": False}, "none of the 40 scans was used"),
+    ],
+)
+def test_statements_are_right_in_every_state(make_rows, changes, says):
+    assert says in _page(make_rows(40, **changes))
+
+
 # Machado, Oliveira, Fernandes 2009, severity 1: what linear RGB becomes to an eye that lacks one kind of cone.
 EYES = {
     "all cones": np.eye(3),
@@ -353,7 +408,7 @@ def test_hover_reads_every_chart_at_once_and_lets_go(opened, make_rows):
     hovered = _text(browser, "#now")
     k = int(re.match(r"scan (\d+)", hovered)[1])
     assert abs(k - 30) <= 2
-    assert float(_text(browser, "#chart-position output")) == pytest.approx(rows[k].pos_err_m, rel=1e-3)
+    assert float(_text(browser, "#chart-position output")) == pytest.approx(1000 * rows[k].pos_err_m, rel=1e-3)
     assert float(_text(browser, "#chart-nees output")) == pytest.approx(rows[k].nees, rel=1e-3)
     ActionChains(browser).move_to_element(browser.find_element("id", "verdict")).perform()
     _settled(browser)
@@ -518,3 +573,42 @@ def test_a_comparison_overlays_and_reads_runs_of_different_rates(browser, tmp_pa
     assert one == two != "\u2013"
     _slide(browser, 5)
     assert browser.execute_script(outputs)[1] == "\u2013"
+
+
+@pytest.mark.slow
+def test_a_value_between_two_scans_without_one_is_drawn(opened, make_rows):
+    rows = [dataclasses.replace(r, rms_m=0.01 if r.seq == 30 else None) for r in make_rows(300)]
+    browser = opened(rows=rows)
+    script = """const c = document.querySelector('#chart-fit canvas');
+    const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+    let n = 0;
+    for (let i = 0; i < d.length; i += 4) if (d[i] < 40 && d[i + 1] > 80 && d[i + 2] > 140 && d[i + 3] > 200) n++;
+    return n;"""
+    assert browser.execute_script(script) > 4
+
+
+@pytest.mark.slow
+def test_zoom_and_scan_stand_in_the_address(opened):
+    browser = opened()
+    _slide(browser, 10)
+    assert "row=10" in browser.execute_script("return location.hash")
+    browser.execute_script("location.hash = '#t=2,4&row=17'")
+    _settled(browser)
+    assert browser.execute_script("return document.getElementById('slider').value") == "17"
+    browser.refresh()
+    _settled(browser)
+    assert browser.execute_script("return document.getElementById('slider').value") == "17"
+    assert browser.execute_script("return location.hash") == "#t=2,4&row=17"
+
+
+@pytest.mark.slow
+def test_a_bar_has_a_tooltip_and_hovering_moves_the_3d_view(opened):
+    browser = opened()
+    script = """const over = document.querySelector('#chart-state .u-over'), r = over.getBoundingClientRect();
+    const x = r.width * 22 / 59, y = r.height / 6;
+    over.dispatchEvent(new MouseEvent('mousemove', { clientX: r.left + x, clientY: r.top + y, bubbles: true }));
+    return over.title;"""
+    assert browser.execute_script(script).startswith("flagged: no scan, 4.00 s to 5.00 s")
+    _settled(browser)
+    assert "no points of this scan" in _text(browser, "#scene")  # the scan under the pointer is in the blackout
+    assert not _text(browser, "#now").startswith("scan 0 ")

@@ -216,7 +216,8 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
     labels = header.labels if header.labels or header.seed is not None else None
     facts = facts_record(labels=labels, truth=run.truth, counts=dict(summary.counts))
     changed = changed_settings(dump(run.config), dump(type(run.config)()))
-    return {**run.facts(), "changed_settings": changed, "facts": facts, "versions": versions()}
+    limits = dump(run.config.faults.resolved(run.surface.extent))
+    return {**run.facts(), "limits": limits, "changed_settings": changed, "facts": facts, "versions": versions()}
 
 
 def _print(wanted: Wanted, done: _Finished) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Iterable, Sequence
+import zlib
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,18 @@ _DIRECT = (
     *("r_pos_m", "r_rot_deg", "capture_time_s", "earliest_capture_s", "plan_miss_m"),
 )
 _WINDOW = 10
+_KINDS = {  # place: colour and pattern
+    "flagged": (
+        *("not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged"),
+        *("doubtful", "sensor_bias", "clock"),
+    ),
+    "injected": (
+        *("occlusion", "partial_occlusion", "dropped", "clutter", "range_bias", "frozen"),
+        *("empty", "noise_burst", "stamp_jump"),
+    ),
+    "action": ("approach", "hold", "stand_still", "capture", "retreat", "abort", "approach_on_prediction"),
+}
+_FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
 
 def derived(rows: Sequence[Row]) -> Columns:
@@ -99,29 +112,46 @@ def _chart(
     bands: Sequence[tuple[str, int]] = (),
     levels: Sequence[tuple[float, str, int]] = (),
     log: bool = False,
+    sigma: bool = True,
 ) -> Chart:
-    """One chart; ``bands`` are names whose columns end in ``_lo`` and ``_hi``, ``levels`` horizontal lines."""
+    """One chart; ``bands`` are names whose columns end in ``_lo`` and ``_hi`` (1 sigma each if ``sigma``)."""
     return {
         "key": key,
         "title": title,
         "unit": unit,
         "log": log,
         "series": list(series),
-        "bands": [{"stem": stem, "colour": colour} for stem, colour in bands],
+        "bands": [{"stem": stem, "colour": colour, "sigma": sigma} for stem, colour in bands],
         "levels": [{"y": y, "label": label, "colour": colour} for y, label, colour in levels],
     }
 
 
-def charts(columns: Columns, truth: State | None = None) -> list[Chart]:
-    """The charts that have data, in reading order."""
-    whole = [*_error_charts(), *_measurement_charts(), *_parameter_charts(truth), *_plan_charts()]
+def charts(columns: Columns, truth: State | None = None, limits: Mapping[str, float] | None = None) -> list[Chart]:
+    """The charts that have data, in reading order.
+
+    Args:
+        columns: from ``derived``.
+        truth: true parameters, drawn as horizontal lines.
+        limits: limits of the fault detector: ``rms_max_m``, ``alpha_max_m`` and ``length_m`` [m].
+    """
+    whole = [*_error_charts(), *_measurement_charts(limits or {}), *_parameter_charts(truth), *_plan_charts()]
     kept = []
     for chart in whole:
         chart["series"] = [s for s in chart["series"] if s["column"] in columns]
         chart["bands"] = [b for b in chart["bands"] if f"{b['stem']}_lo" in columns]
         if chart["series"]:
-            kept.append(chart)
+            kept.append(_in_millimetres(chart, columns))
     return kept
+
+
+def _in_millimetres(chart: Chart, columns: Columns) -> Chart:
+    """A chart in metres whose values are below 1 m is drawn in millimetres, as in the tables."""
+    if chart["unit"] != "m" or chart["key"] == "arm":
+        return chart
+    if max(float(np.nanmax(np.abs(columns[s["column"]]))) for s in chart["series"]) >= 1.0:
+        return chart
+    levels = [level | {"y": 1000.0 * level["y"]} for level in chart["levels"]]
+    return chart | {"unit": "mm", "factor": 1000.0, "levels": levels}
 
 
 def _error_charts() -> list[Chart]:
@@ -141,15 +171,19 @@ def _error_charts() -> list[Chart]:
     ]
 
 
-def _measurement_charts() -> list[Chart]:
+def _measurement_charts(limits: Mapping[str, float]) -> list[Chart]:
+    rms, alpha, length = (limits.get(name) for name in ("rms_max_m", "alpha_max_m", "length_m"))
+    fit = [(rms, "limit", 3)] if rms else []
+    jump = [(alpha, "smallest limit", 3)] if alpha else []
+    turn = [(float(np.degrees(alpha / length)), "smallest limit", 3)] if alpha and length else []
     nis = [(NIS_BAND[0], "2.5 %", 3), (NIS_BAND[1], "97.5 %", 3)]
     nees = [(NEES_BAND[0], "2.5 %", 3), (NEES_BAND[1], "97.5 %", 3)]
     return [
-        _chart("fit", "Fit error", "m", [_line("rms_m", "rms over inliers", 0)]),
+        _chart("fit", "Fit error", "m", [_line("rms_m", "rms over inliers", 0)], levels=fit),
         _chart("inliers", "Inlier ratio", "", [_line("inlier_ratio", "inliers / points", 0)]),
         _chart("nis", "Innovation squared (NIS)", "", [_line("nis", "NIS", 0, points=True)], levels=nis, log=True),
-        _chart("innovation", "Position innovation", "m", [_line("innov_m", "length", 0)], log=True),
-        _chart("turn", "Attitude innovation", "deg", [_line("innov_deg", "angle", 0)], log=True),
+        _chart("innovation", "Position innovation", "m", [_line("innov_m", "length", 0)], levels=jump, log=True),
+        _chart("turn", "Attitude innovation", "deg", [_line("innov_deg", "angle", 0)], levels=turn, log=True),
         _chart("nees", "Estimation error squared (NEES)", "", [_line("nees", "NEES", 0)], levels=nees, log=True),
     ]
 
@@ -195,6 +229,7 @@ def _plan_charts() -> list[Chart]:
             "s",
             [_line("capture_time_s", "planned", 0), _line("earliest_capture_s", "certified lower bound", 1, dash=True)],
             bands=[("capture_time_s", 0)],
+            sigma=False,
         ),
         _chart(
             "miss", "Miss distance in hindsight", "m", [_line("plan_miss_m", "of the plan made then", 1, points=True)]
@@ -210,7 +245,15 @@ def spans(rows: Sequence[Row], episodes: Sequence[Episode] = ()) -> list[dict[st
     flagged = [None if row.gamma == 1 else row.reason for row in rows]
     bare = [_bare(e, rows) for e in episodes if not e.scans and rows]
     actions = _runs(rows, [row.action or None for row in rows], "action")
-    return _runs(rows, flagged, "flagged") + _runs(rows, [row.fault for row in rows], "injected") + bare + actions
+    found = _runs(rows, flagged, "flagged") + _runs(rows, [row.fault for row in rows], "injected") + bare + actions
+    return [span | _style(span["lane"], span["word"]) for span in found]
+
+
+def _style(lane: str, word: str) -> dict[str, int]:
+    """Colour and pattern of a kind, the same on every page."""
+    known = _KINDS[lane]
+    place = known.index(word) if word in known else zlib.crc32(word.encode())
+    return {"colour": place % 6, "pattern": (place // 6 + _FIRST_PATTERN[lane]) % 6}
 
 
 def _bare(episode: Episode, rows: Sequence[Row]) -> dict[str, Any]:
@@ -231,3 +274,20 @@ def _runs(rows: Sequence[Row], words: Sequence[str | None], lane: str) -> list[d
     for span in out:
         span["from"], span["to"] = rows[span["first"]].t_s, rows[span["last"]].t_s
     return out
+
+
+def most_telling(rows: Sequence[Row], most: int, always: Iterable[int] = ()) -> list[int]:
+    """Indices of at most about ``most`` rows: of every interval the first row and those with the largest errors.
+
+    Rows at which gamma, reason, fault or action change are kept, and those in ``always``.
+    """
+    if len(rows) <= most:
+        return list(range(len(rows)))
+    states = [(row.gamma, row.reason, row.fault, row.action) for row in rows]
+    turns = [k for k in range(1, len(rows)) if states[k] != states[k - 1]]
+    kept = {0, len(rows) - 1, *always, *(turns if len(turns) <= most // 4 else ())}
+    step = -(-len(rows) * 5 // (most - len(kept)))
+    peaks = [np.nan_to_num(values(rows, name), nan=-1.0) for name in ("pos_err_m", "rot_err_deg", "nis", "rms_m")]
+    for begin in range(0, len(rows), step):
+        kept |= {begin, *(begin + int(np.argmax(peak[begin : begin + step])) for peak in peaks)}
+    return sorted(kept)

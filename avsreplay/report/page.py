@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from avsreplay.records import State
-from avsreplay.report.charts import Chart, Columns, charts, derived, embed, pack, spans, values
+from avsreplay.report.charts import Chart, Columns, charts, derived, embed, most_telling, pack, spans, values
 from avsreplay.report.comparison_tables import changes_table, gate_table, settings_table
 from avsreplay.report.conclusion import ComparedRun, Conclusion
 from avsreplay.report.export import StampedPose
@@ -29,6 +29,7 @@ from avsreplay.report.verdict import moments_table, verdict_of, verdict_table
 from avsreplay.report.view import View, scene
 from avsreplay.rows import Row
 
+MOST_ROWS = 20_000
 _SCRIPTS = ("uPlot.iife.min.js", "charts.js", "scene.js", "page.js")
 
 
@@ -136,25 +137,31 @@ def build_page(
     Returns:
         The page as text.
     """
+    verdict = verdict_of(rows, summary, header)
+    kept = most_telling(rows, MOST_ROWS, (moment.row for moment in verdict.moments))
+    place, all_rows, rows = {k: n for n, k in enumerate(kept)}, rows, [rows[k] for k in kept]
     columns = derived(rows)
     t1 = summary.convergence.t1_s
     data = {
         "runs": [{"name": title, "t": pack(values(rows, "t_s"), "f8"), "columns": _packed(columns)}],
-        "charts": charts(columns, truth),
+        "charts": charts(columns, truth, (header or {}).get("limits")),
         "spans": spans(rows, summary.faults.episodes),
         "marks": [] if t1 is None else [{"t": t1, "label": "t_1"}],
         "states": [[row.gamma, row.reason, row.fault or ""] for row in rows],
         "scans": [row.seq for row in rows],
         "scene": scene(rows, dict(poses), view),
     }
-    verdict = verdict_of(rows, summary, header)
     errors, faults, *others = summary_tables(summary, rows)
     parts: list[Part] = [errors, *others, facts_table("Run", fact_lines(summary))]
     if header:
         text = json.dumps(header, indent=2, ensure_ascii=False, default=str)
         parts.append(Folded("Configuration and versions", text))
-    lead = [verdict_table(verdict), moments_table(verdict), faults]
-    return build(title, [verdict.line, in_one_line(summary)], parts, data, lead)
+    lead = [verdict_table(verdict), moments_table(verdict, place), faults]
+    lines = [verdict.line, in_one_line(summary)]
+    if len(rows) < len(all_rows):
+        count = f"{len(rows)} of {len(all_rows)} scans"
+        lines.append(f"The charts show {count}: of every interval the first scan and those with the largest errors.")
+    return build(title, lines, parts, data, lead)
 
 
 def _packed(columns: Columns) -> dict[str, Any]:

@@ -324,11 +324,14 @@ def verdict_table(verdict: Verdict) -> Table:
     return Table("Verdict", ("what", "value"), tuple(rows), align="l")
 
 
-def moments_table(verdict: Verdict) -> Table:
-    """The worst moments; a click leads to the scan."""
+def moments_table(verdict: Verdict, place: Mapping[int, int] | None = None) -> Table:
+    """The worst moments; with ``place`` (row -> row of a page) a click leads to the scan."""
     rows = tuple(
         (
-            TableCell(f"{m.start_s:.1f}" if m.start_s == m.end_s else f"{m.start_s:.1f} to {m.end_s:.1f}", scan=m.row),
+            TableCell(
+                f"{m.start_s:.1f}" if m.start_s == m.end_s else f"{m.start_s:.1f} to {m.end_s:.1f}",
+                scan=(place or {}).get(m.row),
+            ),
             m.what,
             m.cause,
         )

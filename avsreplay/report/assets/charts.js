@@ -34,12 +34,40 @@ const Charts = (() => {
     const at = new Map(t.map((v, k) => [v, k]));
     return { t, place: runs.map((r) => Array.from(r.t, (v) => at.get(v))) };
   }
-  function spread(line, run, values, log) {
-    const usable = (v) => Number.isFinite(v) && (!log || v > 0) ? v : null;
+  function spread(line, run, values, log, factor) {
+    const usable = (v) => Number.isFinite(v) && (!log || v > 0) ? v * factor : null;
     if (!line.place) return Array.from(values, usable);
     const out = new Array(line.t.length);
     line.place[run].forEach((k, i) => { out[k] = usable(values[i]); });
     return out;
+  }
+
+  // Values between two scans without a value: a line does not show them.
+  function alone(values) {
+    const out = [], none = (v) => v === null || v === undefined;
+    for (let i = 0; i < values.length; i++) if (!none(values[i]) && none(values[i - 1]) && none(values[i + 1])) out.push(i);
+    return out;
+  }
+
+  // Patterns, so that kinds differ without colour: solid, lines in four directions, dots.
+  const tiles = new Map(), swatches = [];
+  function pattern(ctx, k, style) {
+    const key = [k, style, colour(k), devicePixelRatio].join();
+    if (style === 0) return alpha(k, 0.45);
+    if (!tiles.has(key)) {
+      const n = 8 * devicePixelRatio, tile = document.createElement("canvas"), c = tile.getContext("2d");
+      tile.width = tile.height = n;
+      c.fillStyle = alpha(k, 0.22); c.fillRect(0, 0, n, n);
+      c.strokeStyle = c.fillStyle = colour(k); c.lineWidth = 1.5 * devicePixelRatio;
+      const line = (x0, y0, x1, y1) => { c.beginPath(); c.moveTo(x0 * n, y0 * n); c.lineTo(x1 * n, y1 * n); c.stroke(); };
+      if (style === 1) { line(-0.25, 0.25, 0.25, -0.25); line(0, 1, 1, 0); line(0.75, 1.25, 1.25, 0.75); }
+      if (style === 2) { line(-0.25, 0.75, 0.25, 1.25); line(0, 0, 1, 1); line(0.75, -0.25, 1.25, 0.25); }
+      if (style === 3) line(0, 0.5, 1, 0.5);
+      if (style === 4) line(0.5, 0, 0.5, 1);
+      if (style === 5) { c.beginPath(); c.arc(n / 2, n / 2, n / 5, 0, 7); c.fill(); }
+      tiles.set(key, ctx.createPattern(tile, "repeat"));
+    }
+    return tiles.get(key);
   }
 
   function axes(log) {
@@ -94,8 +122,9 @@ const Charts = (() => {
         const y = Math.round(u.valToPos(level.y, "y", true));
         ctx.strokeStyle = ctx.fillStyle = colour(level.colour);
         ctx.beginPath(); ctx.moveTo(bbox.left, y); ctx.lineTo(bbox.left + bbox.width, y); ctx.stroke();
-        ctx.textAlign = "right"; ctx.textBaseline = "bottom";
-        ctx.fillText(level.label, bbox.left + bbox.width - 4 * px, y - 1);
+        const below = y - 14 * px < bbox.top;
+        ctx.textAlign = "right"; ctx.textBaseline = below ? "top" : "bottom";
+        ctx.fillText(level.label, bbox.left + bbox.width - 4 * px, below ? y + 2 * px : y - 1);
       }
       ctx.strokeStyle = ctx.fillStyle = theme.ink;
       for (const mark of shared.marks) {
@@ -138,6 +167,12 @@ const Charts = (() => {
     return svg;
   }
 
+  function bar(span) {
+    const canvas = el("canvas", { width: 22 * devicePixelRatio, height: 10 * devicePixelRatio, "aria-hidden": "true", class: "bar-swatch" });
+    const paint = () => { const c = canvas.getContext("2d"); c.clearRect(0, 0, canvas.width, canvas.height); c.fillStyle = pattern(c, span.colour, span.pattern); c.fillRect(0, 0, canvas.width, canvas.height); };
+    paint(); swatches.push(paint);
+    return canvas;
+  }
   function figure(host, spec, shared) {
     const unit = spec.unit ? [" ", el("span", {}, "[" + spec.unit + "]")] : [];
     const caption = el("figcaption", {}, el("h2", {}, spec.title, ...unit));
@@ -156,14 +191,21 @@ const Charts = (() => {
   function lineChart(host, spec, shared) {
     const { node, caption } = figure(host, spec, shared);
     const data = [shared.line.t], series = [{}], bands = [], outputs = [], main = [];
-    const add = (run, column, options) => { data.push(spread(shared.line, run, shared.runs[run].columns[column], spec.log)); series.push(options); return series.length - 1; };
+    const columns = (run) => shared.runs[run].columns;
+    const add = (run, values, options) => { data.push(spread(shared.line, run, values, spec.log, spec.factor || 1)); series.push(options); return series.length - 1; };
     for (const b of spec.bands) {
       const hidden = { stroke: "transparent", width: 0, points: { show: false } };
-      bands.push({ series: [add(0, b.stem + "_hi", hidden), add(0, b.stem + "_lo", hidden)], fill: () => alpha(b.colour, 0.16) });
+      const high = columns(0)[b.stem + "_hi"], low = columns(0)[b.stem + "_lo"];
+      bands.push({ series: [add(0, high, hidden), add(0, low, hidden)], fill: () => alpha(b.colour, 0.16) });
+      if (b.sigma) {
+        const wider = high.map((v, k) => 1.5 * v - 0.5 * low[k]), lower = low.map((v, k) => 1.5 * v - 0.5 * high[k]);
+        bands.push({ series: [add(0, wider, hidden), add(0, lower, hidden)], fill: () => alpha(b.colour, 0.08) });
+      }
     }
     for (const s of spec.series) {
       const dots = { show: true, size: 4, width: 1, stroke: () => colour(s.colour), fill: () => colour(s.colour) };
-      const at = add(s.run || 0, s.column, { label: s.label, stroke: () => colour(s.colour), width: 1.6, dash: s.dash ? [6, 4] : undefined, points: s.points ? dots : undefined, paths: s.points ? () => null : undefined, spanGaps: false });
+      const single = { size: 5, width: 1, stroke: () => colour(s.colour), fill: () => colour(s.colour), filter: (u, at, show) => show ? null : alone(u.data[at]) };
+      const at = add(s.run || 0, columns(s.run || 0)[s.column], { label: s.label, stroke: () => colour(s.colour), width: 1.6, dash: s.dash ? [6, 4] : undefined, points: s.points ? dots : single, paths: s.points ? () => null : undefined, spanGaps: false });
       main.push(at);
       const output = el("output", {}, "–"), key = el("button", { type: "button", class: "key", "aria-pressed": "true", title: "show or hide" }, swatch(s.colour, s.dash, s.points), s.label, output);
       key.addEventListener("click", () => { const show = key.getAttribute("aria-pressed") !== "true"; key.setAttribute("aria-pressed", String(show)); u.setSeries(at, { show }); });
@@ -182,7 +224,7 @@ const Charts = (() => {
     const words = Array.from(new Set(shared.spans.map((s) => s.lane + " " + s.word)));
     for (const word of words) {
       const first = shared.spans.find((s) => s.lane + " " + s.word === word);
-      const key = el("button", { type: "button", class: "key", title: "go to the first" }, swatch(words.indexOf(word), false, false), first.word.replaceAll("_", " "));
+      const key = el("button", { type: "button", class: "key", title: "go to the first" }, bar(first), first.word.replaceAll("_", " "));
       key.addEventListener("click", () => shared.choose(first.first));
       caption.append(key);
     }
@@ -194,9 +236,9 @@ const Charts = (() => {
       ctx.beginPath(); ctx.rect(bbox.left, bbox.top, bbox.width, bbox.height); ctx.clip();
       ctx.font = 11 * px + "px system-ui, sans-serif"; ctx.textBaseline = "middle"; ctx.textAlign = "left";
       for (const s of shared.spans) {
-        const k = words.indexOf(s.lane + " " + s.word), top = bbox.top + tall * names.indexOf(s.lane) + 2 * px;
+        const k = s.colour, top = bbox.top + tall * names.indexOf(s.lane) + 2 * px;
         const x0 = u.valToPos(s.from - shared.half, "x", true), wide = Math.max(u.valToPos(s.to + shared.half, "x", true) - x0, 2 * px);
-        ctx.fillStyle = alpha(k, 0.45); ctx.fillRect(x0, top, wide, tall - 4 * px);
+        ctx.fillStyle = pattern(ctx, k, s.pattern); ctx.fillRect(x0, top, wide, tall - 4 * px);
         ctx.strokeStyle = colour(k); ctx.lineWidth = px; ctx.strokeRect(x0, top, wide, tall - 4 * px);
         const text = s.word.replaceAll("_", " ");
         const left = Math.max(x0, bbox.left), seen = Math.min(x0 + wide, bbox.left + bbox.width) - left;
@@ -206,7 +248,13 @@ const Charts = (() => {
     };
     const lanes = options(spec, shared, [{}, { show: false }], { range: () => [0, names.length], draw });
     lanes.axes[1] = { ...lanes.axes[1], splits: () => names.map((_, k) => k + 0.5), values: () => [...names].reverse(), grid: { show: false } };
-    return finish(new uPlot(lanes, [shared.line.t, shared.line.t.map(() => 0)], node), spec, [], shared);
+    const u = new uPlot(lanes, [shared.line.t, shared.line.t.map(() => 0)], node);
+    u.over.addEventListener("mousemove", (event) => {
+      const t = u.posToVal(event.offsetX, "x"), lane = names[Math.floor(event.offsetY / u.over.clientHeight * names.length)];
+      const hit = shared.spans.filter((s) => s.lane === lane && s.from - shared.half <= t && t <= s.to + shared.half);
+      u.over.title = hit.map((s) => `${s.lane}: ${s.word.replaceAll("_", " ")}, ${s.from.toFixed(2)} s to ${s.to.toFixed(2)} s`).join("\n");
+    });
+    return finish(u, spec, [], shared);
   }
 
   // hooks: hover(idx or null), choose(idx).
@@ -230,6 +278,8 @@ const Charts = (() => {
       for (const c of all) if (c.u !== source) c.u.setScale("x", { min, max });
       syncing = false;
       pins();
+      const whole = min <= t[0] && max >= t[t.length - 1];
+      if (hooks.zoomed) hooks.zoomed(whole ? null : [min, max]);
     };
     shared.key = (event, node) => {
       if (event.target !== node || event.ctrlKey || event.metaKey || event.altKey) return;
@@ -261,6 +311,7 @@ const Charts = (() => {
       const a = Math.max(t[0], middle - half), b = Math.min(t[t.length - 1], middle + half);
       if (b > a) all[0].u.setScale("x", { min: a, max: b });
     }
+    function zoomTo(a, b) { if (b > a) all[0].u.setScale("x", { min: a, max: b }); }
     function reset() { all[0].u.setScale("x", { min: t[0], max: t[t.length - 1] }); }
     function choose(k) { chosen = k; pins(); readouts(); }
     function resize() {
@@ -268,8 +319,8 @@ const Charts = (() => {
       for (const c of all) if (c.u.width !== width) c.u.setSize({ width, height: c.u.height });
       requestAnimationFrame(pins);
     }
-    function repaint() { readTheme(); for (const c of all) c.u.redraw(false, true); }
-    return { t, runs, choose, reset, resize, repaint };
+    function repaint() { readTheme(); swatches.forEach((paint) => paint()); for (const c of all) c.u.redraw(false, true); }
+    return { t, runs, choose, reset, resize, repaint, zoomTo };
   }
   return { build };
 })();

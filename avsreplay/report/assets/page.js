@@ -13,9 +13,9 @@
   const wish = matchMedia("(prefers-color-scheme: dark)");
   paintTheme(wish.matches);
 
-  let view = { choose() {}, resize() {} };
+  let zoom = null, ready = false, view = { choose() {}, resize() {} };
   if (page.scene) document.querySelector("main").classList.add("two");
-  const charts = Charts.build(by("charts"), page, { hover: tell, choose });
+  const charts = Charts.build(by("charts"), page, { hover: tell, choose, zoomed(range) { zoom = range; remember(); } });
   const t = charts.t, last = t.length - 1;
   if (page.scene) view = Scene.build(by("scene"), page.scene, t);
   let chosen = 0, timer = null;
@@ -27,12 +27,27 @@
     const state = gamma === 1 ? "● used" : (reason === "no_scan" ? "~ " : "✗ ") + reason.replaceAll("_", " ");
     return `scan ${page.scans[k]} · ${t[k].toFixed(2)} s · ${state}` + (fault ? ` · injected: ${fault.replaceAll("_", " ")}` : "");
   }
-  function tell(hovered) { now.textContent = words(hovered === null ? chosen : hovered); }
+  function tell(hovered) {
+    const k = hovered === null ? chosen : hovered;
+    now.textContent = words(k);
+    view.choose(k);
+  }
+  // The zoom and the chosen scan stand in the address, so that a view can be sent to someone else.
+  function remember() {
+    if (!ready) return;
+    const parts = [...(zoom ? ["t=" + zoom.map((v) => +v.toPrecision(8)).join(",")] : []), ...(chosen ? ["row=" + chosen] : [])];
+    history.replaceState(null, "", parts.length ? "#" + parts.join("&") : location.pathname + location.search);
+  }
+  function recall() {
+    const said = new URLSearchParams(location.hash.slice(1)), range = (said.get("t") || "").split(",").map(Number), row = Number(said.get("row"));
+    if (range.length === 2 && range.every(Number.isFinite)) charts.zoomTo(range[0], range[1]);
+    if (Number.isInteger(row) && row > 0 && row <= last) choose(row);
+  }
   function choose(k) {
     chosen = k;
     slider.value = String(k);
     slider.setAttribute("aria-valuetext", words(k));
-    charts.choose(k); view.choose(k); tell(null);
+    charts.choose(k); tell(null); remember();
   }
   function stop() { clearInterval(timer); timer = null; play.textContent = "Play"; play.setAttribute("aria-pressed", "false"); }
   function start() {
@@ -53,5 +68,8 @@
   });
   new ResizeObserver(() => { charts.resize(); view.resize(); }).observe(by("charts"));
   choose(0);
+  recall();
+  ready = true;
+  addEventListener("hashchange", recall);
   root.dataset.ready = String(Math.round(performance.now()));
 })();
