@@ -82,6 +82,22 @@ class RunConfig(Settings):
             raise ValueError(f"fixture_axis_c is {self.fixture_axis_c}, must be of unit length")
 
 
+PAPER = (
+    "estimator.start=paper",
+    "estimator.constraint=gain",
+    "estimator.noise=r0",
+    "estimator.adapt=matrix",
+    "estimator.robust=false",
+    "estimator.audit_poses=0",
+    "faults.policy=all",
+    "consistency.slack=1e9",
+    "convergence.criterion=covariance",
+    "deskew=false",
+    "reacquire=false",
+)
+"""Settings of the method as printed: start, noise adaptation, gain constraint, fault rule and convergence."""
+
+
 def parse_pose(text: str) -> Pose:
     """Parse ``x,y,z,qx,qy,qz,qw`` into the pose T_ac. Raises ValueError with what is wrong."""
     try:

@@ -161,6 +161,16 @@ def test_ring_buffer_agrees_with_the_recursion() -> None:
             assert np.abs(noise.matrix_noise(window, np.eye(6), w) - Sigma).max() < 1e-13
 
 
+def test_the_papers_noise_is_sigma_plus_the_latest_hph() -> None:
+    """R = mean of r r' over the window + H P+ H' of the last epoch alone, as printed."""
+    rng = np.random.Generator(np.random.PCG64(8))
+    window, residuals, spreads = noise.NoiseWindow.empty(), rng.normal(size=(6, 6)), rng.uniform(1.0, 2.0, size=6)
+    for r, size in zip(residuals, spreads, strict=True):
+        window = noise.push(window, r, size * np.eye(6), np.eye(6), 6)
+    want = residuals.T @ residuals / 6 + spreads[-1] * np.eye(6)
+    assert np.abs(noise.matrix_noise(window, np.eye(6), 6) - want).max() < 1e-12
+
+
 def test_before_a_full_window_r0_stands() -> None:
     R0 = np.diag(np.arange(1.0, 7.0))
     window = fill(noise.NoiseWindow.empty(), np.ones((5, 6)), 6)

@@ -268,3 +268,15 @@ def test_no_parameter_class_validates_by_hand():
             if isinstance(cls, type) and issubclass(cls, Settings) and cls is not Settings:
                 assert "__post_init__" not in vars(cls), cls
                 assert "resolved" not in vars(cls), cls
+
+
+def test_the_papers_settings_are_settings() -> None:
+    """Every assignment of ``--paper`` is accepted and differs from the default."""
+    from avsreplay.config import PAPER, load_config
+
+    plain, paper = load_config(None, {}, ()), load_config(None, {}, PAPER)
+    for assignment in PAPER:
+        first, second = plain, paper
+        for name in assignment.partition("=")[0].split("."):
+            first, second = getattr(first, name), getattr(second, name)
+        assert first != second, assignment

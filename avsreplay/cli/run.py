@@ -58,6 +58,7 @@ class _Start(click.ParamType[str | float]):
 @click.option(
     "--start", "starts", type=_Start(), multiple=True, help="Initialisation of the estimate, or start time [s]."
 )
+@click.option("--paper", is_flag=True, help="The method as printed in the paper, without any addition (docs/paper.md).")
 @source_options
 @click.option("--golden", type=PATH, help="Compare with these rows; exit code 1 if they differ.")
 @click.option("--update-golden", type=PATH, help="Write the rows to this golden file.")
@@ -133,6 +134,10 @@ def _job(log: Path, flags: dict[str, Any]) -> Job:
 
     config_file, assignments = take_run_settings(flags)
     starts = flags.pop("starts")
+    if flags.pop("paper"):
+        from avsreplay.config import PAPER
+
+        assignments = PAPER + assignments
     assignments += tuple(f"estimator.start={mode}" for mode in starts if isinstance(mode, str))
     flags["start_s"] = next((start for start in reversed(starts) if isinstance(start, float)), None)
     return Job(source=log, options=read_options(flags), config_file=config_file, assignments=assignments)

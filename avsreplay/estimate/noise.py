@@ -1,7 +1,7 @@
 """The measurement noise R: registration covariance or R0, adapted from residuals, and its correlation in time.
 
 Adaptation (eq:R_resudua2) uses a ring buffer that is summed anew at each epoch, so that rounding errors do not
-accumulate. Two rules. ``matrix`` is the paper's: R = mean of r r' + H P+ H', six by six, over R0. ``scale`` keeps the
+accumulate. Two rules. ``matrix`` is the paper's: R = Sigma + H P+ H', Sigma the mean of r r'. ``scale`` keeps the
 shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
 attitude, s^2 = mean of tr(R_b^-1 (r r' + H P+ H')) / 3 over the block. It estimates two numbers from a window instead
 of 21, so its own scatter does not spoil the consistency. The mean uses the weights of the updates: outliers are no
@@ -49,9 +49,10 @@ def integrated_autocorrelation(e: Array) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseEpoch:
-    """One healthy epoch: outer (6, 6) = r r' + H P+ H', its trace by block relative to the base R, its weight."""
+    """One healthy epoch: r r' (6, 6), H P+ H' (6, 6), trace of their sum by block relative to the base R, weight."""
 
     outer: Array
+    HPH: Array
     ratios: tuple[float, float]
     weight: float
 
@@ -80,9 +81,9 @@ def push(
     window: NoiseWindow, residual: Array, HPH: Array, base: Array, length: int, weight: float = 1.0
 ) -> NoiseWindow:
     """The window with one more epoch: residual (6,) after the update, H P+ H' (6, 6), the base R that was used."""
-    outer = residual[:, None] * residual + HPH
-    position, attitude = np.linalg.solve(_blocks(base), _blocks(outer)).trace(axis1=1, axis2=2).tolist()
-    epoch = NoiseEpoch(outer, (position / 3.0, attitude / 3.0), weight)
+    outer = residual[:, None] * residual
+    position, attitude = np.linalg.solve(_blocks(base), _blocks(outer + HPH)).trace(axis1=1, axis2=2).tolist()
+    epoch = NoiseEpoch(outer, HPH, (position / 3.0, attitude / 3.0), weight)
     return _summed((*window.epochs[-length + 1 :], epoch), length)
 
 
@@ -105,18 +106,20 @@ def _summed(epochs: tuple[NoiseEpoch, ...], length: int) -> NoiseWindow:
 
 
 def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
-    """The paper's R: R0 until the window is full, then the mean over it."""
+    """The paper's R: R0 until the window is full, then Sigma, the mean of r r' over it, plus the latest H P+ H'."""
     if len(window.epochs) < length:
         return R0
     weight = sum(epoch.weight for epoch in window.epochs)
-    return np.asarray(sum(epoch.weight * epoch.outer for epoch in window.epochs) / weight)
+    Sigma = np.asarray(sum(epoch.weight * epoch.outer for epoch in window.epochs) / weight)
+    return Sigma + window.epochs[-1].HPH
 
 
 def filled(base: Array, factors: Array, length: int) -> NoiseWindow:
     """A full window with the noise ``factors`` (2,) of attitude and position that a fit found on ``base`` (6, 6)."""
     attitude, position = factors.tolist()
     s = factors[::-1].repeat(3)
-    return _summed((NoiseEpoch(base * np.outer(s, s), (position**2, attitude**2), 1.0),) * length, length)
+    epoch = NoiseEpoch(base * np.outer(s, s), np.zeros((6, 6)), (position**2, attitude**2), 1.0)
+    return _summed((epoch,) * length, length)
 
 
 def floored(R: Array, R0: Array, fraction: float) -> Array:
