@@ -228,6 +228,47 @@ def test_neighbours_kept_over_many_passes_are_those_of_a_search(name: str, facin
     assert kept.searched < plain.searched
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_newton_steps_end_at_the_fixed_point_of_horns_iteration(seed: int) -> None:
+    """Horn's passes alone, continued to 1e-10, stay where Newton's ended; they need many times more passes."""
+    trimesh = pytest.importorskip("trimesh")
+    parts = [
+        trimesh.creation.box((1.0, 0.7, 0.4)),
+        trimesh.creation.box((0.5, 0.2, 0.9)),
+        trimesh.creation.icosphere(2, 0.4),
+    ]
+    parts[1].apply_translation((0.6, 0.2, 0.3)), parts[2].apply_translation((-0.5, 0.3, 0.2))
+    body = trimesh.util.concatenate(parts)
+    mesh = surface(body.vertices, body.faces)
+    scan = scan_of(mesh, 3000, seed, noise=0.004)
+    model = SurfaceIndex.build(mesh, 0.3)
+    found = model.icp(scan, GUESS, IcpParams(n_max=200))
+    horn = IcpParams(n_max=3000, n_plane=0, gate_m=found.gate_m, tighten=0.0, eps_rad=1e-10, eps_m=1e-10, newton=False)
+    on = model.icp(scan, found.T_ca, horn)
+    assert found.converged
+    assert found.iterations <= 12
+    assert np.abs(found.T_ca - on.T_ca).max() < 2e-5
+    slow = model.icp(scan, GUESS, IcpParams(n_max=3000, newton=False, n_plane=0, eps_rad=1e-8, eps_m=1e-8))
+    assert slow.iterations > 2 * found.iterations
+
+
+@pytest.mark.parametrize("seen", ["plate", "side of a cylinder"])
+def test_directions_that_cannot_be_observed_are_left_at_the_guess(seen: str) -> None:
+    r = rng(25)
+    if seen == "plate":
+        mesh = surface([[-50.0, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], [[0, 1, 2], [0, 2, 3]])
+        p = np.column_stack([r.uniform(-1, 1, (2000, 2)), np.zeros(2000)])
+    else:
+        trimesh = pytest.importorskip("trimesh")
+        tube = trimesh.creation.cylinder(1.0, 100.0, sections=360)
+        mesh, angle = surface(tube.vertices, tube.faces), r.uniform(-1.2, 1.2, 2000)
+        p = np.column_stack([np.cos(angle), np.sin(angle), r.uniform(-1, 1, 2000)])
+    off = Pose(exp([0.01, -0.02, 0.0]), [0.01, 0.02, 0.03])
+    found = SurfaceIndex.build(mesh, 1.0).icp(off.apply(p + 1e-3 * r.standard_normal(p.shape)), Pose.identity())
+    assert np.abs(found.T_ca[:3, 3]).max() < 0.2
+    assert found.rms_m < 2e-3
+
+
 def scan_of(mesh: Surface, n: int, seed: int, noise: float = 0.003) -> Array:
     r = rng(seed)
     corners = mesh.vertices[mesh.faces][r.integers(len(mesh.faces), size=n)]

@@ -36,6 +36,7 @@ class Index:
         threads: int = 1,
         keep: bool = False,
         facing: bool = False,
+        newton: bool = False,
     ) -> tuple[Any, ...]: ...
     def normal_equations(
         self,

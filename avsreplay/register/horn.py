@@ -12,7 +12,7 @@ from avsreplay.records import Fit
 from avsreplay.register.backend import Target
 from avsreplay.register.surface_index import IcpParams
 
-PLANE_PASSES = 6
+PLANE_PASSES = 3
 
 
 class HornBackend:
@@ -25,7 +25,9 @@ class HornBackend:
 
     name: ClassVar[str] = "horn"
     accuracy: ClassVar[tuple[float, float]] = (0.001, 1e-05)
-    about: ClassVar[str] = "point-to-plane start, then Horn's quaternion ICP to its fixed point on the mesh itself, C++"
+    about: ClassVar[str] = (
+        "point-to-plane start, then Newton steps to the fixed point of Horn's quaternion ICP on the mesh itself, C++"
+    )
     requires: ClassVar[tuple[tuple[str, str], ...]] = (("avsreplay.register._kernel", "avsreplay"),)
     get: ClassVar[str] = "a C++17 compiler, then pip install ."
 

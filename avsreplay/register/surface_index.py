@@ -40,14 +40,15 @@ class IcpParams(Settings):
 
     Rejection rule: a point is used while its distance to the surface is below the gate; after each pass
     gate = min(gate, max(floor_m, tighten * rms of that pass)), so the gate never grows. ``tighten`` 0: constant gate.
-    Stopping rule: the last step rotated by less than ``eps_rad`` and moved the centroid of the inliers by less than
-    ``eps_m``, and the gate changed by less than 1 %. Only Horn passes (point to point) can end the loop.
+    Stopping rule: Horn's step (point to point) of a pass rotates by less than ``eps_rad`` and moves the centroid of the
+    inliers by less than ``eps_m``, the gate changed by less than 1 %, and with ``newton`` Newton's step is as small.
     """
 
     n_max: int = setting(100, "Largest number of passes of both kinds.", low=1)
     n_plane: int = setting(
-        6, "Point-to-plane passes before Horn's; fewer are made once a step meets the stopping rule.", low=0
+        3, "Point-to-plane passes before Horn's; fewer are made once a step meets the stopping rule.", low=0
     )
+    newton: bool = setting(True, "Take Newton steps towards the fixed point of Horn's iteration.")
     gate_m: float | None = setting(None, "First rejection distance.", unit="m", low=0.0, unset="the reach of the index")
     tighten: float = setting(3.0, "Gate in units of the rms of the last pass; 0 keeps it constant.", low=0.0)
     floor_m: float | None = setting(None, "Smallest gate.", unit="m", low=0.0, unset="1/500 of the model's extent")
@@ -203,7 +204,9 @@ class SurfaceIndex:
     def icp(self, points: NDArray[Any], T_ca: ArrayLike | Pose, params: IcpParams | None = None) -> IcpResult:
         """Align the scan ``points`` (n, 3) [m] in {A} to the model from the guess ``T_ca`` (4, 4).
 
-        Point-to-plane passes come first, then Horn's point-to-point passes until their fixed point (eq:ICP).
+        Point-to-plane passes come first, then Newton's method goes to the fixed point of Horn's point-to-point
+        iteration (eq:ICP), which is a stationary point of the sum of squared distances. A Newton step that raises the
+        sum is replaced by Horn's step. The last pass is Horn's and verifies the fixed point.
         The rotation of the guess is re-orthonormalised. With fewer than 6 inliers the loop ends, not converged.
         """
         params = params or IcpParams()
@@ -211,7 +214,7 @@ class SurfaceIndex:
         floor = self.extent_m / 500.0 if params.floor_m is None else params.floor_m
         eps_m = 1e-6 * self.extent_m if params.eps_m is None else params.eps_m
         rule = (params.n_max, params.n_plane, gate, params.tighten, floor, params.eps_rad, eps_m)
-        flags = (params.threads, params.keep, params.facing)
+        flags = (params.threads, params.keep, params.facing, params.newton)
         return IcpResult(*self._index.icp(_points(points), _rigid(T_ca), *rule, *flags))
 
     def normal_equations(

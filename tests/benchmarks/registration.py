@@ -216,10 +216,10 @@ def peers(make: dict[str, Callable[[], Callable[[], tuple[Array, int]]]]) -> Ite
 
 
 def fixed(n_max: int, n_plane: int = 0, **more: Any) -> IcpParams:
-    return IcpParams(n_max=n_max, n_plane=n_plane, tighten=0.0, eps_rad=0.0, eps_m=0.0, **more)
+    return IcpParams(n_max=n_max, n_plane=n_plane, tighten=0.0, eps_rad=0.0, eps_m=0.0, newton=False, **more)
 
 
-def settled(n_plane: int = 6, **more: Any) -> IcpParams:
+def settled(n_plane: int = 3, **more: Any) -> IcpParams:
     return IcpParams(n_max=200, n_plane=n_plane, eps_rad=EPS_RAD, eps_m=EPS_M, **more)
 
 
@@ -280,7 +280,7 @@ def converged(cloud: Surface, surface: Surface, args: argparse.Namespace) -> Non
         guess = off(truth, deg, metres, 4)
         cases = {
             "ours, mesh, sides that face the camera": Case(ours(mesh, scan, guess, settled(facing=True))),
-            "the same, Horn only": Case(ours(mesh, scan, guess, settled(0, facing=True))),
+            "the same, Horn only": Case(ours(mesh, scan, guess, settled(0, facing=True, newton=False))),
             "ours, mesh, both sides": Case(ours(mesh, scan, guess, settled())),
             "ours, mesh, both sides, gate not tightened": Case(ours(mesh, scan, guess, settled(tighten=0.0))),
             "ours, cloud": Case(ours(model, scan, guess, settled())),

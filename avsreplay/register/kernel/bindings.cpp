@@ -125,11 +125,11 @@ class Index {
   }
 
   nb::tuple icp(nb::handle points, const Doubles& T_ca, int n_max, int n_plane, double gate, double tighten,
-                double floor, double eps_rad, double eps_m, int threads, bool keep, bool facing) const {
+                double floor, double eps_rad, double eps_m, int threads, bool keep, bool facing, bool newton) const {
     const Cloud cloud(points);
     const View v = cloud.view();
     const Rows T = rows(T_ca);
-    const Rule rule{n_max, n_plane, gate, tighten, floor, eps_rad, eps_m, facing, keep};
+    const Rule rule{n_max, n_plane, gate, tighten, floor, eps_rad, eps_m, facing, keep, newton};
     Outcome o;
     {
       nb::gil_scoped_release release;
@@ -216,7 +216,7 @@ NB_MODULE(_kernel, m) {
            nb::arg("camera_c").none() = nb::none())
       .def("icp", &Index::icp, nb::arg("points"), nb::arg("T_ca"), nb::arg("n_max"), nb::arg("n_plane"),
            nb::arg("gate_m"), nb::arg("tighten"), nb::arg("floor_m"), nb::arg("eps_rad"), nb::arg("eps_m"),
-           nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false)
+           nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false, nb::arg("newton") = false)
       .def("normal_equations", &Index::normal_equations, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"),
            nb::arg("threads") = 1, nb::arg("facing") = false)
       .def_prop_ro("nbytes", &Index::bytes)

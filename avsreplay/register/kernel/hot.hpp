@@ -13,7 +13,8 @@ struct View {
 
 constexpr int CHUNK = 512;  // points; partial sums are added in the order of chunks
 
-enum class Pass { point, plane };
+// What a pass adds up: Horn's moments, those and the second derivative of the cost, or the plane's normal equations.
+enum class Pass { point, newton, plane };
 
 // What one pass does.
 struct Look {
@@ -28,8 +29,10 @@ struct Look {
 // Sums over a chunk or a scan; p, foot relative to the model's centre, e = n . (foot - p), J = [p x n, n].
 //   always: [0] inliers, [1] sum d2, [2] points not finite, [3] searches made, [4..6] sum p
 //   point:  [7..9] sum foot, [10..18] sum p foot', row by row
+//   newton: those, [19..39] lower triangle of sum sign J'J with v in the place of n, [40] sum whole, [41..43] sum whole p,
+//           [44..49] lower triangle of sum whole p p'; see Stiffness
 //   plane:  [7..27] lower triangle of sum J'J, row by row, [28..33] sum J'e, [34] sum e^2
-constexpr int SUMS = 35;
+constexpr int SUMS = 50;
 struct Sums {
   double v[SUMS];
 };

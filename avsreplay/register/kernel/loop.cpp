@@ -68,19 +68,46 @@ double worst() { return std::numeric_limits<double>::infinity(); }
 // The pose about the model's centre, where the sums live.
 void recentre(double* T, const Vec3& by) { T[3] += by.x, T[7] += by.y, T[11] += by.z; }
 
-bool advance(const Store& s, const Sums& sums, bool plane, Outcome& o) {
-  Step step{};
-  if (plane) {
-    if (!plane_step(sums, step)) return false;
-  } else {
-    step = horn_step(sums);
-  }
-  recentre(o.T, {-s.centre.x, -s.centre.y, -s.centre.z});
-  compose(step.D, o.T);
-  recentre(o.T, s.centre);
-  o.turn = step.turn, o.move = step.move;
-  return true;
+void apply(const Store& s, const Step& step, double* T) {
+  recentre(T, {-s.centre.x, -s.centre.y, -s.centre.z});
+  compose(step.D, T);
+  recentre(T, s.centre);
 }
+
+// Decides between Newton's and Horn's step after the plane passes. A Newton step stands while the sum of min(d^2, gate^2)
+// over the scan falls; else it is undone and Horn's step, which cannot raise the sum, is made in its place. After a few
+// such failures only Horn's steps are made.
+class Newton {
+ public:
+  struct Choice {
+    Step step;
+    bool undo;     // go back to the pose before the last step first
+    bool settled;  // the pose is stationary as far as Newton's step can tell
+  };
+
+  Choice choose(const Sums& sums, double outside, double gate, double longest, double eps_rad, double eps_m) {
+    const Step horn = horn_step(sums);
+    const double cost = sums.v[1] + outside * gate * gate;
+    const bool comparable = used_ && gate == gate_;
+    if (comparable && !(cost < cost_)) {
+      ++failures_, used_ = false;
+      return {horn_, true, false};
+    }
+    used_ = false, gate_ = gate, cost_ = cost, horn_ = horn;
+    Step step;
+    if (failures_ >= MOST_FAILURES || !newton_step(sums, longest, step)) return {horn, false, true};
+    if (step.turn < eps_rad && step.move < eps_m) return {horn, false, true};
+    used_ = true;
+    return {step, false, false};
+  }
+
+ private:
+  static constexpr int MOST_FAILURES = 3;
+  double cost_ = 0, gate_ = 0;
+  Step horn_{};
+  int failures_ = 0;
+  bool used_ = false;
+};
 
 }  // namespace
 
@@ -102,20 +129,37 @@ Outcome icp(const Store& s, const Code& code, const View& v, const double* T, co
   Outcome o{};
   std::memcpy(o.T, T, sizeof o.T);
   o.gate = rule.gate, o.turn = o.move = worst(), o.rms = std::numeric_limits<double>::quiet_NaN();
+  Newton newton;
+  double before[12];
   bool plane = rule.n_plane > 0;
   while (o.passes < rule.n_max && !o.converged) {
     if (sides.look_from(o.T)) memory.forget_radii();
-    const Pass kind = plane ? Pass::plane : Pass::point;
+    const Pass kind = plane ? Pass::plane : rule.newton ? Pass::newton : Pass::point;
     const Look look{o.T, o.gate, memory.lead(o.turn, o.move), kind, rule.facing, &sides.facing()};
     const Sums sums = run_pass(s, code, v, look, memory.data(), team);
     ++o.passes;
     o.inliers = (int64_t)sums.v[0], o.ignored = (int64_t)sums.v[2], o.searched += (int64_t)sums.v[3];
     o.rms = o.inliers ? std::sqrt(sums.v[1] / sums.v[0]) : std::numeric_limits<double>::quiet_NaN();
-    if (o.inliers < MIN_INLIERS || !advance(s, sums, plane, o)) break;
+    if (o.inliers < MIN_INLIERS) break;
     const double gate = rule.tighten > 0 ? std::min(o.gate, std::max(rule.floor, rule.tighten * o.rms)) : o.gate;
-    const bool small = o.turn < rule.eps_rad && o.move < rule.eps_m && gate >= 0.99 * o.gate;
+    const bool steady = gate >= 0.99 * o.gate;
+    Step step{};
+    if (plane && !plane_step(sums, rule.gate, step)) break;
+    if (!plane) step = horn_step(sums);
+    const bool small = step.turn < rule.eps_rad && step.move < rule.eps_m && steady;
+    bool settled = !plane;
+    if (kind == Pass::newton) {
+      const double outside = (double)(v.n - o.ignored - o.inliers);
+      const Newton::Choice c = newton.choose(sums, outside, o.gate, rule.gate, rule.eps_rad, rule.eps_m);
+      settled = c.settled;
+      if (c.undo) std::memcpy(o.T, before, sizeof before);
+      if (!(small && settled)) step = c.step;
+    }
+    o.converged = small && settled;
+    std::memcpy(before, o.T, sizeof before);
+    apply(s, step, o.T);
+    o.turn = step.turn, o.move = step.move;
     o.gate = gate;
-    o.converged = small && !plane;
     plane = plane && o.passes < rule.n_plane && !small;
   }
   return o;

@@ -8,7 +8,7 @@ namespace avs {
 struct Rule {
   int n_max, n_plane;
   double gate, tighten, floor, eps_rad, eps_m;
-  bool facing, keep;
+  bool facing, keep, newton;
 };
 
 struct Outcome {

@@ -9,7 +9,8 @@ enum Treat : uint8_t { IGNORED, SEARCHED, KEPT };
 struct Chunk {
   alignas(32) double p[3][CHUNK];   // moved, relative to the model's centre
   alignas(32) double f[3][CHUNK];   // foot, the same
-  alignas(32) double n[3][CHUNK];   // normal
+  alignas(32) double n[3][CHUNK];   // normal, or v of the stiffness
+  alignas(32) double sign[CHUNK], whole[CHUNK];  // of the stiffness
   alignas(32) double d2[CHUNK];
   alignas(32) double take[CHUNK];   // 1: an inlier, 0: not
   double c[3][CHUNK];               // moved, in {C}
@@ -65,20 +66,25 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
   }
 }
 
-static inline void enter(const Store& s, Chunk& c, int i, const Foot& f, int32_t lane, bool inlier, bool normals) {
+template <class Kind>
+static inline void enter(const Store& s, Chunk& c, int i, const Best& best, bool inlier, Pass kind) {
+  const Foot& f = best.foot;
   c.take[i] = inlier ? 1 : 0;
   c.d2[i] = inlier ? f.d2 : 0;
   c.p[0][i] = inlier ? c.c[0][i] - s.centre.x : 0, c.f[0][i] = inlier ? f.x - s.centre.x : 0;
   c.p[1][i] = inlier ? c.c[1][i] - s.centre.y : 0, c.f[1][i] = inlier ? f.y - s.centre.y : 0;
   c.p[2][i] = inlier ? c.c[2][i] - s.centre.z : 0, c.f[2][i] = inlier ? f.z - s.centre.z : 0;
-  if (!normals) return;
-  const Vec3 n = inlier ? s.normals[(size_t)lane] : Vec3{0, 0, 0};
-  c.n[0][i] = n.x, c.n[1][i] = n.y, c.n[2][i] = n.z;
+  if (kind == Pass::point) return;
+  Stiffness k{{0, 0, 0}, 0, 0};
+  if (inlier) k = kind == Pass::plane ? Stiffness{s.normals[(size_t)best.lane], 1, 0} : Kind::stiffness(s, (uint32_t)best.lane, f.feature);
+  c.n[0][i] = k.v.x, c.n[1][i] = k.v.y, c.n[2][i] = k.v.z, c.sign[i] = k.sign, c.whole[i] = k.whole;
 }
+
+static inline Best none() { return {{0, 0, 0, 0, 0, FACE}, -1}; }
 
 template <class Kind>
 static inline Best keep_one(const Scope& o, const Query& q, const Kept& kept) {
-  if (kept.lane < 0) return {{0, 0, 0, 0, 0}, -1};
+  if (kept.lane < 0) return none();
   return {Kind::foot(o.s, (uint32_t)kept.lane, q), kept.lane};
 }
 
@@ -111,12 +117,12 @@ static inline void fetch_ahead(const Store& s, const uint32_t* list, const Kept*
 }
 
 template <class Kind>
-static void search(const Scope& o, int64_t first, int n, bool normals, Kept* kept, Chunk& c, Sums& out) {
+static void search(const Scope& o, int64_t first, int n, Pass kind, Kept* kept, Chunk& c, Sums& out) {
   int32_t last = -1;
   for (int i = 0; i < n; ++i) {
     if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.list[i + AHEAD], kept ? kept + first + i + AHEAD : nullptr);
     if (c.search[i] == IGNORED) {
-      enter(o.s, c, i, {}, -1, false, normals);
+      enter<Kind>(o.s, c, i, none(), false, kind);
       continue;
     }
     const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
@@ -130,13 +136,13 @@ static void search(const Scope& o, int64_t first, int n, bool normals, Kept* kep
       out.v[3] += 1;
     }
     last = best.lane;
-    enter(o.s, c, i, best.foot, best.lane, best.lane >= 0 && best.foot.d2 < o.bound2, normals);
+    enter<Kind>(o.s, c, i, best, best.lane >= 0 && best.foot.d2 < o.bound2, kind);
   }
 }
 
 static void clear_tail(int n, Chunk& c) {
   for (int i = n; i < (n + 3) / 4 * 4; ++i) {
-    c.take[i] = c.d2[i] = 0;
+    c.take[i] = c.d2[i] = c.sign[i] = c.whole[i] = 0;
     for (int k = 0; k < 3; ++k) c.p[k][i] = c.f[k][i] = c.n[k][i] = 0;
   }
 }
@@ -152,6 +158,26 @@ static void sum_point(int n, const Chunk& c, Sums& out) {
   }
   out.v[0] = sum_in_order(a[0]), out.v[1] = sum_in_order(a[1]);
   for (int k = 0; k < 15; ++k) out.v[4 + k] = sum_in_order(a[2 + k]);
+}
+
+static void sum_newton(int n, const Chunk& c, Sums& out) {
+  D4 a[31] = {};
+  for (int i = 0; i < n; i += 4) {
+    const D4 p[3] = {load4(c.p[0] + i), load4(c.p[1] + i), load4(c.p[2] + i)};
+    const D4 m[3] = {load4(c.n[0] + i), load4(c.n[1] + i), load4(c.n[2] + i)};
+    const D4 j[6] = {p[1] * m[2] - p[2] * m[1], p[2] * m[0] - p[0] * m[2], p[0] * m[1] - p[1] * m[0], m[0], m[1], m[2]};
+    const D4 sign = load4(c.sign + i), whole = load4(c.whole + i);
+    int t = 0;
+    for (int r = 0; r < 6; ++r) {
+      const D4 row = sign * j[r];
+      for (int q = 0; q <= r; ++q, ++t) a[t] = a[t] + row * j[q];
+    }
+    a[t] = a[t] + whole, ++t;
+    for (int r = 0; r < 3; ++r, ++t) a[t] = a[t] + whole * p[r];
+    for (int r = 0; r < 3; ++r)
+      for (int q = 0; q <= r; ++q, ++t) a[t] = a[t] + whole * p[r] * p[q];
+  }
+  for (int k = 0; k < 31; ++k) out.v[19 + k] = sum_in_order(a[k]);
 }
 
 static void sum_plane(int n, const Chunk& c, Sums& out) {
@@ -187,9 +213,10 @@ static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last
   const Vec3 eye{look.T[3], look.T[7], look.T[11]};
   Scope o = scope_of(s, *look.facing, false, look.gate, look.lead);
   if (look.sided && s.mesh) o.eye = &eye;
-  search<Kind>(o, first, n, look.kind == Pass::plane, kept, c, out);
+  search<Kind>(o, first, n, look.kind, kept, c, out);
   clear_tail(n, c);
   look.kind == Pass::plane ? sum_plane(n, c, out) : sum_point(n, c, out);
+  if (look.kind == Pass::newton) sum_newton(n, c, out);
 }
 
 template <class Kind>
@@ -201,7 +228,7 @@ static void closest_kind(const Store& s, const View& v, int64_t first, int64_t l
   for (int64_t i = first; i < last; ++i) {
     double p[3];
     read(v, i, p);
-    Best best{{0, 0, 0, 0, 0}, -1};
+    Best best = none();
     if (finite(p)) {
       const Query q = query(s, p[0], p[1], p[2]);
       const uint32_t* list = list_of(s, word_at(s, q.x, q.y, q.z));

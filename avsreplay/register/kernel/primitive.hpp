@@ -1,8 +1,19 @@
 // Distances to eight points or triangles at once in single precision, and to one in double.
 // Included inside a namespace named after the instruction set.
+// Where on its triangle a foot lies. The sides are ab, ac and bc.
+enum Feature : uint8_t { FACE, SIDE_AB, SIDE_AC, SIDE_BC, CORNER };
+
 struct Foot {
   double d2, x, y, z;
   double height;  // distance of the query from the triangle's plane: how squarely it faces
+  Feature feature;
+};
+
+// Second derivative of half the squared distance to the foot's feature: sign v v' + whole I. A face: n n'; a side of
+// direction t: I - t t'; a corner: I.
+struct Stiffness {
+  Vec3 v;
+  double sign, whole;
 };
 
 struct Query {
@@ -24,8 +35,11 @@ struct Points {
   static Foot foot(const Store& s, uint32_t lane, const Query& q) {
     const Vec3& p = s.points[lane];
     const double dx = p.x - q.x, dy = p.y - q.y, dz = p.z - q.z;
-    return {dx * dx + dy * dy + dz * dz, p.x, p.y, p.z, 0};
+    return {dx * dx + dy * dy + dz * dz, p.x, p.y, p.z, 0, CORNER};
   }
+
+  // The distance's second derivative is approximated by that to the tangent plane, as if the cloud were dense.
+  static Stiffness stiffness(const Store& s, uint32_t lane, Feature) { return {s.normals[lane], 1, 0}; }
 
   // Squared distances that differ by no more are a tie.
   static double tie(const Store&, double) { return 0; }
@@ -85,10 +99,11 @@ struct Triangles {
     const double x = dx * t.u.x + dy * t.u.y + dz * t.u.z, y = dx * t.w.x + dy * t.w.y + dz * t.w.z;
     const double z = dx * t.n.x + dy * t.n.y + dz * t.n.z;
     double fx = x, fy = y, e = 0;
+    Feature feature = FACE;
     const double bx = t.length - t.cx, rx = t.length - x;
-    if (y < 0 || x * t.cy - y * t.cx < 0 || rx * t.cy - y * bx < 0) e = on_sides(t, x, y, fx, fy);
+    if (y < 0 || x * t.cy - y * t.cx < 0 || rx * t.cy - y * bx < 0) e = on_sides(t, x, y, fx, fy, feature);
     return {z * z + e, t.a.x + fx * t.u.x + fy * t.w.x, t.a.y + fx * t.u.y + fy * t.w.y,
-            t.a.z + fx * t.u.z + fy * t.w.z, std::fabs(z)};
+            t.a.z + fx * t.u.z + fy * t.w.z, std::fabs(z), feature};
   }
 
   // Rounding sets the distances to the faces of a common side apart; this is well above it.
@@ -101,18 +116,31 @@ struct Triangles {
 
   static double unit(double t) { return t < 0 ? 0 : t > 1 ? 1 : t; }
 
-  static double on_sides(const Triangle& t, double x, double y, double& fx, double& fy) {
+  static double on_sides(const Triangle& t, double x, double y, double& fx, double& fy, Feature& feature) {
     const double bx = t.length - t.cx, rx = t.length - x;
     fx = x < 0 ? 0 : x > t.length ? t.length : x;
     fy = 0;
     double e = (x - fx) * (x - fx) + y * y;
     const double p = unit((x * t.cx + y * t.cy) * t.inv_ac2), r = unit((rx * bx + y * t.cy) * t.inv_bc2);
     const double side[2][2] = {{p * t.cx, p * t.cy}, {t.length - r * bx, r * t.cy}};
-    for (const auto& f : side) {
+    double along = fx / t.length;
+    feature = SIDE_AB;
+    for (int k = 0; k < 2; ++k) {
+      const double* f = side[k];
       const double d = (x - f[0]) * (x - f[0]) + (y - f[1]) * (y - f[1]);
-      if (d < e) e = d, fx = f[0], fy = f[1];
+      if (d < e) e = d, fx = f[0], fy = f[1], feature = k == 0 ? SIDE_AC : SIDE_BC, along = k == 0 ? p : r;
     }
+    if (!(along > 0 && along < 1)) feature = CORNER;
     return e;
+  }
+
+  static Stiffness stiffness(const Store& s, uint32_t lane, Feature feature) {
+    const Triangle& t = s.triangles[lane];
+    if (feature == FACE) return {t.n, 1, 0};
+    if (feature == CORNER) return {{0, 0, 0}, 0, 1};
+    const double x = feature == SIDE_AB ? 1 : feature == SIDE_AC ? t.cx : t.length - t.cx;
+    const double y = feature == SIDE_AB ? 0 : feature == SIDE_AC ? t.cy : -t.cy, inv = 1 / std::sqrt(x * x + y * y);
+    return {{inv * (x * t.u.x + y * t.w.x), inv * (x * t.u.y + y * t.w.y), inv * (x * t.u.z + y * t.w.z)}, -1, 1};
   }
 
   static void prefetch(const Store& s, uint32_t lane) {

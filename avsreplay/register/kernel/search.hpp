@@ -67,7 +67,7 @@ template <class Kind>
 class Search {
  public:
   Search(const Scope& scope, const Query& q)
-      : o_(scope), s_(scope.s), q_(q), best_{{scope.bound2, 0, 0, 0, 0}, -1},
+      : o_(scope), s_(scope.s), q_(q), best_{{scope.bound2, 0, 0, 0, 0, FACE}, -1},
         p_{(float)(q.x - s_.centre.x), (float)(q.y - s_.centre.y), (float)(q.z - s_.centre.z)},
         exact_(lenient(s_, scope.bound, 0.f)), limit_(lenient(s_, scope.bound, scope.lead)) {}
 

@@ -19,13 +19,14 @@ void turn(double& u, double& v, double c, double s) {
   v = s * u + c * v, u = x;
 }
 
-void rotate_pair(double (&A)[4][4], double (&V)[4][4], int i, int j) {
+template <int N>
+void rotate_pair(double (&A)[N][N], double (&V)[N][N], int i, int j) {
   const double theta = (A[j][j] - A[i][i]) / (2 * A[i][j]);
   const double t = (theta < 0 ? -1 : 1) / (std::fabs(theta) + std::sqrt(theta * theta + 1));
   const double c = 1 / std::sqrt(t * t + 1), s = t * c;
-  for (int k = 0; k < 4; ++k) turn(A[k][i], A[k][j], c, s);
-  for (int k = 0; k < 4; ++k) turn(A[i][k], A[j][k], c, s);
-  for (int k = 0; k < 4; ++k) turn(V[k][i], V[k][j], c, s);
+  for (int k = 0; k < N; ++k) turn(A[k][i], A[k][j], c, s);
+  for (int k = 0; k < N; ++k) turn(A[i][k], A[j][k], c, s);
+  for (int k = 0; k < N; ++k) turn(V[k][i], V[k][j], c, s);
 }
 
 // Unit eigenvector of the largest eigenvalue of a symmetric matrix, by Jacobi's rotations.
@@ -57,25 +58,60 @@ void place(double* D, const double* from, const double* to) {
   for (int i = 0; i < 3; ++i) D[4 * i + 3] = to[i] - (D[4 * i] * from[0] + D[4 * i + 1] * from[1] + D[4 * i + 2] * from[2]);
 }
 
-// Cholesky of the 6 x 6 normal matrix with a trace of damping, so that a free direction stays put.
-bool solve6(double (&L)[6][6], double* b) {
-  for (int i = 0; i < 6; ++i) L[i][i] += 1e-9 * L[i][i] + 1e-30;
+// Eigenvalues (the diagonal that remains) and eigenvectors (columns of V) of a symmetric 6 x 6 by Jacobi's rotations.
+void eigen6(double (&A)[6][6], double (&V)[6][6]) {
   for (int i = 0; i < 6; ++i)
-    for (int j = 0; j <= i; ++j) {
-      double s = L[i][j];
-      for (int k = 0; k < j; ++k) s -= L[i][k] * L[j][k];
-      if (i == j && !(s > 0)) return false;
-      L[i][j] = i == j ? std::sqrt(s) : s / L[j][j];
+    for (int j = 0; j < 6; ++j) V[i][j] = i == j ? 1 : 0;
+  for (int sweep = 0; sweep < 40; ++sweep) {
+    double off = 0, diagonal = 0;
+    for (int i = 0; i < 6; ++i) {
+      diagonal += A[i][i] * A[i][i];
+      for (int j = i + 1; j < 6; ++j) off += A[i][j] * A[i][j];
     }
+    if (!(off > 1e-32 * diagonal)) break;
+    for (int i = 0; i < 5; ++i)
+      for (int j = i + 1; j < 6; ++j)
+        if (A[i][j] != 0) rotate_pair(A, V, i, j);
+  }
+}
+
+constexpr double OBSERVABLE = 1e-6;  // least eigenvalue over the largest, with turns in units of the inliers' radius
+
+// b = H^+ b without the directions that are not observable; `radius`: turns times it are lengths.
+bool solve6(double (&H)[6][6], double* b, double& radius) {
+  const double turns = H[0][0] + H[1][1] + H[2][2], shifts = H[3][3] + H[4][4] + H[5][5];
+  if (!(turns > 0 && shifts > 0 && std::isfinite(turns) && std::isfinite(shifts))) return false;
+  radius = std::sqrt(turns / shifts);
+  double A[6][6], V[6][6], c[6], x[6] = {};
   for (int i = 0; i < 6; ++i) {
-    for (int k = 0; k < i; ++k) b[i] -= L[i][k] * b[k];
-    b[i] /= L[i][i];
+    c[i] = b[i] / (i < 3 ? radius : 1);
+    for (int j = 0; j < 6; ++j) A[i][j] = H[i][j] / ((i < 3 ? radius : 1) * (j < 3 ? radius : 1));
   }
-  for (int i = 5; i >= 0; --i) {
-    for (int k = i + 1; k < 6; ++k) b[i] -= L[k][i] * b[k];
-    b[i] /= L[i][i];
+  eigen6(A, V);
+  double most = 0;
+  for (int k = 0; k < 6; ++k) most = A[k][k] > most ? A[k][k] : most;
+  for (int k = 0; k < 6; ++k) {
+    if (!(A[k][k] > OBSERVABLE * most)) continue;
+    double along = 0;
+    for (int i = 0; i < 6; ++i) along += V[i][k] * c[i];
+    for (int i = 0; i < 6; ++i) x[i] += V[i][k] * along / A[k][k];
   }
-  return true;
+  for (int i = 0; i < 6; ++i) b[i] = x[i] / (i < 3 ? radius : 1);
+  return most > 0;
+}
+
+// The step d = [turn; shift] about c, shortened to `longest`.
+bool to_step(double* d, const double* c, double radius, double longest, Step& s) {
+  const double length = radius * norm3(d) + norm3(d + 3);
+  if (length > longest)
+    for (int i = 0; i < 6; ++i) d[i] *= longest / length;
+  const double angle = norm3(d), f = angle > 1e-9 ? std::sin(angle / 2) / angle : 0.5;
+  const double q[4] = {std::cos(angle / 2), f * d[0], f * d[1], f * d[2]}, to[3] = {c[0] + d[3], c[1] + d[4], c[2] + d[5]};
+  rotation(q, s.D);
+  place(s.D, c, to);
+  s.turn = angle;
+  s.move = norm3(d + 3);
+  return std::isfinite(s.turn) && std::isfinite(s.move);
 }
 
 // The normal equations about c instead of the origin: p x n - c x n, that is J S with S = [I 0; [c x] I] in rows.
@@ -122,23 +158,35 @@ Step horn_step(const Sums& sums) {
   return s;
 }
 
-bool plane_step(const Sums& sums, Step& s) {
+bool plane_step(const Sums& sums, double longest, Step& s) {
   const double* a = sums.v;
   const double c[3] = {a[4] / a[0], a[5] / a[0], a[6] / a[0]};
-  double H[6][6], b[6];
+  double H[6][6], b[6], radius = 0;
   int k = 7;
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j <= i; ++j) H[i][j] = a[k++];
   for (int i = 0; i < 6; ++i) b[i] = a[k++];
   shift(H, b, c);
-  if (!solve6(H, b)) return false;
-  const double angle = norm3(b), f = angle > 1e-9 ? std::sin(angle / 2) / angle : 0.5;
-  const double q[4] = {std::cos(angle / 2), f * b[0], f * b[1], f * b[2]}, to[3] = {c[0] + b[3], c[1] + b[4], c[2] + b[5]};
-  rotation(q, s.D);
-  place(s.D, c, to);
-  s.turn = angle;
-  s.move = norm3(b + 3);
-  return std::isfinite(s.turn) && std::isfinite(s.move);
+  return solve6(H, b, radius) && to_step(b, c, radius, longest, s);
+}
+
+bool newton_step(const Sums& sums, double longest, Step& s) {
+  const double* a = sums.v;
+  const double c[3] = {a[4] / a[0], a[5] / a[0], a[6] / a[0]};
+  // - gradient = [sum p x foot; sum foot - p].
+  double H[6][6], b[6] = {a[15] - a[17], a[16] - a[12], a[11] - a[13], a[7] - a[4], a[8] - a[5], a[9] - a[6]}, radius = 0;
+  int k = 19;
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j <= i; ++j) H[i][j] = a[k++];
+  // The part that resists motion in every direction: [|p|^2 I - p p', [p]; [p]', I], lower triangle.
+  const double w = a[40], *p = a + 41, *pp = a + 44, trace = pp[0] + pp[2] + pp[5];
+  k = 0;
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j <= i; ++j) H[i][j] += (i == j ? trace : 0) - pp[k++];
+  for (int i = 0; i < 3; ++i) H[3 + i][3 + i] += w;
+  H[3][1] += p[2], H[3][2] -= p[1], H[4][0] -= p[2], H[4][2] += p[0], H[5][0] += p[1], H[5][1] -= p[0];
+  shift(H, b, c);
+  return solve6(H, b, radius) && to_step(b, c, radius, longest, s);
 }
 
 void compose(const double* D, double* T) {

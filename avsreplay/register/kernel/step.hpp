@@ -11,8 +11,13 @@ struct Step {
 
 // Horn 1987 (equations section 6): M of the cross-covariance, scalar first; its largest eigenvector.
 Step horn_step(const Sums& sums);
-// One Gauss-Newton step of sum (n . (foot - D p))^2 about the inliers' centroid; false where the normal matrix is singular.
-bool plane_step(const Sums& sums, Step& step);
+// One Gauss-Newton step of sum (n . (foot - D p))^2 about the inliers' centroid; false where nothing is observable.
+// Directions whose information is below 1e-6 of the largest are left as they are. `longest`: the step is shortened so that
+// no inlier is expected to move farther [m].
+bool plane_step(const Sums& sums, double longest, Step& step);
+// One Newton step of the sum of squared distances of the inliers, whose stationary points are the fixed points of Horn's
+// iteration: the gradient from Horn's moments, the second derivative from each foot's face, edge or vertex.
+bool newton_step(const Sums& sums, double longest, Step& step);
 void compose(const double* D, double* T);  // T = D T, both rows of [R t]
 
 }  // namespace avs
