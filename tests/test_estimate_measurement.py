@@ -7,6 +7,7 @@ import pytest
 import tumbling
 
 from avsreplay import geometry
+from avsreplay.estimate import measurement
 from avsreplay.estimate.dynamics import grasp_jacobian
 from avsreplay.estimate.error_state import boxminus, boxplus
 from avsreplay.estimate.measurement import (
@@ -107,3 +108,13 @@ def test_residual_is_the_innovation_at_the_posterior(x: State) -> None:
     pose = x.T_ac @ Pose(geometry.exp([0.02, -0.05, 0.01]), np.array([0.1, 0.2, 0.3]))
     posterior = boxplus(x, np.linspace(-0.02, 0.03, 20))
     assert np.abs(residual(posterior, x, innovation_vector(x, pose)) - innovation_vector(posterior, pose)).max() < 1e-14
+
+
+def test_an_information_matrix_that_is_numerically_singular_gives_a_finite_covariance():
+    v = np.array([1.0, -1.0, 0.5, 2.0, 0.0, 1.0])
+    info = 1e20 * np.outer(v, v)
+    info[4] = info[:, 4] = 0.0
+    covariance = measurement._inverse(info)
+    assert np.isfinite(covariance).all()
+    assert np.linalg.eigvalsh(covariance).min() >= -1e-9 * np.abs(covariance).max()
+    assert v @ info @ covariance @ v == pytest.approx(v @ v, rel=1e-3)

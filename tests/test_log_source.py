@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,9 @@ from true_scans import true_scans
 from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
-from avsreplay.log import ClockChoice, SourceOptions, open_source
+from avsreplay.log import ClockChoice, LogWriter, SourceOptions, open_source
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, schema_text
+from avsreplay.log.doctor import examine
 from avsreplay.records import Scan, ScanStatus
 
 CLOUDS = scans(12, 150)
@@ -180,6 +182,26 @@ def test_a_truncated_database_is_reported_with_a_hint(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes()[:20_000])
     with pytest.raises(UnreadableInput, match="recover"):
         open_source(path)
+
+
+@pytest.mark.parametrize("stamps", [(2**63 - 2, 2**63 - 1), (0, 2**63 - 1), (5, 2**62), (-(2**63), 2**62)])
+def test_times_that_ros_cannot_hold_are_cut_and_can_be_recorded(stamps: tuple[int, int], tmp_path: Path) -> None:
+    """sqlite stores 64 bits of nanoseconds, ROS 2 and with it every log 31 bits of seconds."""
+    path = tmp_path / "x.db3"
+    with closing(sqlite3.connect(path)) as db:
+        db.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)")
+        db.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+        db.execute("INSERT INTO topics VALUES(1, '/points', 'sensor_msgs/msg/PointCloud2', 'cdr')")
+        for k, stamp in enumerate(stamps * 2):
+            payload = point_cloud2(0, "c", np.ones((5, 3), np.float32), None)
+            db.execute("INSERT INTO messages VALUES(?, 1, ?, ?)", (k, stamp, payload))
+        db.commit()
+    examine(path)
+    with open_source(path) as source, LogWriter(tmp_path / "y.mcap", source.header) as writer:
+        for scan in source.scans():
+            writer.write(scan)
+    with open_source(tmp_path / "y.mcap") as again:
+        assert len(list(again.scans())) == 4
 
 
 @pytest.mark.parametrize("schema", [

@@ -67,10 +67,19 @@ def registration_noise(alignment: Alignment, x: State, free: tuple[float, float]
     if alignment.covariance is not None:
         C = alignment.covariance
     elif np.any(alignment.info):
-        C = np.asarray(np.linalg.inv(alignment.info + np.diag(np.repeat(np.asarray(free) ** -2.0, 3))))
+        C = _inverse(alignment.info + np.diag(np.repeat(np.asarray(free) ** -2.0, 3)))
     else:
         return None
     return in_camera(C, alignment.T_ac.q, x.q_bc)
+
+
+def _inverse(info: Array) -> Array:
+    """The inverse; if ``info`` is numerically singular, eigenvalues are raised to 1e-15 of the largest."""
+    try:
+        return np.asarray(np.linalg.inv(info))
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(info)
+        return np.asarray((vectors / np.maximum(values, 1e-15 * values[-1])) @ vectors.T)
 
 
 def in_camera(C: Array, q_ac: Array, q_bc: Array) -> Array:

@@ -12,7 +12,7 @@ from avsreplay.log.cdr import Cursor
 from avsreplay.log.mcap_format import ChunkStore
 from avsreplay.log.options import Loss, TopicInfo
 
-MAX_NS = 2**63 - 1
+MAX_NS = (2**31 - 2) * 1_000_000_000  # a ROS 2 time has 31 bits of seconds; a later one is cut to this
 CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2",)
 Sink = Callable[[str, str, int, bytes | memoryview], None]
 """Receives (type, encoding, log time [ns], payload) of each message of a topic, in file order."""
@@ -41,7 +41,7 @@ class CloudIndex:
     def add(self, clocks: tuple[int, int, int], container: int, offset: int, size: int) -> None:
         """Append a message with its (log, publish, header) times [ns]."""
         for column, value in zip((self.log_ns, self.publish_ns, self.header_ns), clocks, strict=True):
-            column.append(max(-(2**63), min(value, MAX_NS)))
+            column.append(max(-MAX_NS, min(value, MAX_NS)))
         self.container.append(container)
         self.offset.append(offset)
         self.size.append(size)
@@ -89,7 +89,7 @@ class MessageTable:
     def add(self, topic: str, times: tuple[int, int], payload: memoryview, place: tuple[int, int]) -> None:
         """Add a message of a declared topic: (log, publish) times [ns], payload and (container, offset)."""
         known = self._topics[topic]
-        log_ns = min(times[0], MAX_NS)
+        log_ns = max(-MAX_NS, min(times[0], MAX_NS))
         known.add(log_ns)
         if known.type in CLOUD_TYPES:
             clocks = (log_ns, times[1], _stamp(payload, known.encoding))

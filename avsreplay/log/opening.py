@@ -267,7 +267,8 @@ def _times(path: Path, files: list[Path], found: TimedPoses | None) -> list[int]
             raise UnreadableInput(what, where=shown(listed), hint="one line a scan")
         return times
     if all(_STAMPED.match(p.stem) for p in files):
-        return [int(p.stem) if "." not in p.stem else seconds_to_ns(p.stem) or 0 for p in files]
+        stamps = [seconds_to_ns(p.stem if "." in p.stem else f"{p.stem}e-9") for p in files]
+        return [t_ns or 0 for t_ns in stamps] if None not in stamps else None
     return list(found.t_ns) if found is not None and found.t_ns is not None and len(found.t_ns) == len(files) else None
 
 

@@ -32,7 +32,7 @@ class SourceOptions(Settings):
     )
     truth_file: Path | None = setting(None, "File of true poses beside the log (TUM, KITTI, EuRoC, Stanford .conf).")
     truth_gap_s: float = setting(
-        1.0, "Widest gap between two true poses that is interpolated across.", unit="s", low=0.0
+        1.0, "Widest gap between two true poses that is interpolated across.", unit="s", low=0.0, high=1e6
     )
     model: Path | None = setting(None, "Model file.", unset="the log's own model")
     cloud_model: bool = setting(False, "The model may be a point cloud without faces.")
@@ -61,7 +61,7 @@ class SourceOptions(Settings):
     sensor_topic: str | None = setting(
         None, "Topic of the sensor's pose, with which the clouds are transformed into the fixed frame."
     )
-    rate_hz: float = setting(1.0, "Scan rate of a folder of scans.", unit="Hz", above=0.0, high=1e6)
+    rate_hz: float = setting(1.0, "Scan rate of a folder of scans.", unit="Hz", low=1e-4, high=1e6)
     strict: bool = setting(False, "Any loss of data is an error (exit code 3).")
     max_message_mib: int = setting(
         128, "Largest message, chunk or attachment that is read.", unit="MiB", low=1, high=4096

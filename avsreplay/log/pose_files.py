@@ -20,6 +20,8 @@ from avsreplay.geometry import Pose, matrix, normalise
 from avsreplay.log.bytes_io import shown
 
 _MAX_BYTES = 256 << 20
+_MAX_SECONDS = 2**31 - 2  # a ROS 2 time has 31 bits of seconds
+_MAX_METRES = 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +62,7 @@ def seconds_to_ns(text: str) -> int | None:
     """Convert decimal seconds to nanoseconds without rounding to a binary fraction; None if it is not a number."""
     try:
         value = Decimal(text)
-        return int((value * 1_000_000_000).to_integral_value()) if abs(value) < 9_000_000_000 else None
+        return int((value * 1_000_000_000).to_integral_value()) if abs(value) < _MAX_SECONDS else None
     except (InvalidOperation, ValueError):
         return None
 
@@ -83,7 +85,10 @@ def _line(words: list[str], commas: bool, where: str) -> tuple[int | None, Pose]
     try:
         if commas:  # EuRoC: nanoseconds, scalar first
             values = [float(w) for w in words[1:8]]
-            return int(words[0]), _pose(values[:3], [*values[4:7], values[3]])
+            stamp = int(words[0])
+            if abs(stamp) >= _MAX_SECONDS * 1_000_000_000:
+                raise ValueError
+            return stamp, _pose(values[:3], [*values[4:7], values[3]])
         if len(words) == 12:
             return None, _from_rows([float(w) for w in words])
         t_ns, values = seconds_to_ns(words[0]), [float(w) for w in words[1:8]]
@@ -96,7 +101,7 @@ def _line(words: list[str], commas: bool, where: str) -> tuple[int | None, Pose]
 
 
 def _pose(t: list[float], q: list[float]) -> Pose:
-    if len(t) != 3 or len(q) != 4 or not all(map(math.isfinite, (*t, *q))) or not 0.5 < math.hypot(*q) < 2.0:
+    if len(t) != 3 or len(q) != 4 or not all(abs(v) < _MAX_METRES for v in (*t, *q)) or not 0.5 < math.hypot(*q) < 2.0:
         raise ValueError
     return Pose(np.array(q), np.array(t))
 
@@ -104,7 +109,7 @@ def _pose(t: list[float], q: list[float]) -> Pose:
 def _from_rows(values: list[float]) -> Pose:
     T = np.vstack([np.array(values).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
     R = T[:3, :3]
-    if not np.isfinite(T).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
+    if not (np.abs(T) < _MAX_METRES).all() or np.abs(R @ R.T - np.eye(3)).max() > 1e-2 or np.linalg.det(R) < 0:
         raise ValueError
     return Pose.from_matrix(T)
 
@@ -133,7 +138,7 @@ def _bmesh_pose(words: list[str], where: str) -> Pose:
         values = [float(w) for w in words[2:9]]
     except ValueError:
         values = []
-    if len(values) != 7 or not all(map(math.isfinite, values)) or math.hypot(*values[3:]) < 0.5:
+    if len(values) != 7 or not all(abs(v) < _MAX_METRES for v in values) or math.hypot(*values[3:]) < 0.5:
         hint = "write: bmesh name tx ty tz qx qy qz qw"
         raise UnreadableInput("not a bmesh line", where=where, hint=hint)
     q_ac = normalise(values[3:])

@@ -17,7 +17,7 @@ from avsreplay.log.cdr import Cursor
 from avsreplay.log.index import Sink
 from avsreplay.records import State
 
-_MAX_TRANSFORMS = 4096
+_MAX_TRANSFORMS, _MAX_VALUE = 4096, 1e9
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +38,7 @@ def read_pose(kind: str, payload: bytes | memoryview, encoding: str = "cdr") -> 
 
 def checked(out: Transform) -> Transform:
     """Return the transform. Raises BadMessage if it is not finite or its quaternion is far from unit length."""
-    if not all(map(math.isfinite, out.pose)) or not 0.5 < math.hypot(*out.pose[3:]) < 2.0:
+    if not all(abs(v) < _MAX_VALUE for v in out.pose) or not 0.5 < math.hypot(*out.pose[3:]) < 2.0:
         raise BadMessage("a pose that is not finite or has no unit quaternion")
     return out
 
@@ -123,7 +123,7 @@ class PoseTrack:
     def body(self, t_ns: int, constants: State) -> State | None:
         """Return the full state from poses of {B} in {A} and twists in {B}; ``constants`` gives sigma, c_b and q_bc."""
         row = self._at(t_ns)
-        if row is None or not np.isfinite(row[7:]).all():
+        if row is None or not (np.abs(row[7:]) < _MAX_VALUE).all():
             return None
         q_ab = row[3:7]
         v_a = geometry.matrix(q_ab) @ row[7:10]
