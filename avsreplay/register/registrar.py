@@ -102,7 +102,7 @@ class Registrar:
         results: list[Alignment] = []
         for part, first, last in attempts:
             results.append(self._acquired(scan, part, self._global.search(part, first, last)))
-            if results[-1].measured:
+            if results[-1].measured or results[-1].status is AlignStatus.FAILED:
                 return results[-1]
         return results[0]
 
@@ -111,6 +111,8 @@ class Registrar:
         T_ca, few = search.best.T_ca, self._restarter.part(part)
         width = max(self.limits.gate_m, 3.0 * self._restarter.measure(few, T_ca).noise_m)
         found = self._graded(scan, T_ca.inverse(), width)
+        if found.status is AlignStatus.FAILED:
+            return found
         if not search.found or not found.measured:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None)
         if self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan)).reason:
