@@ -1,4 +1,4 @@
-"""What one scan leaves behind, typed: the outcome of the pipeline, and its score against ground truth.
+"""The typed result of one scan: plan, outcome of the pipeline, and score against ground truth.
 
 ``pipeline.step`` makes the Outcome without access to ground truth; ``score.Scorer`` makes the Score afterwards;
 ``rows.Row.of`` turns the two into columns.
@@ -6,8 +6,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import TypeVar
 
 import numpy as np
@@ -20,11 +22,71 @@ from avsreplay.records import (
     Forecast,
     Innovation,
     Manoeuvre,
-    Plan,
     Scan,
     ScanStatus,
     Verdict,
 )
+
+
+class PlanStatus(Enum):
+    """Result of the planner."""
+
+    OPTIMAL = "optimal"  # first feasible time, certified to the stated gap
+    FEASIBLE = "feasible"  # satisfies all constraints; no claim of least time
+    NOT_FOUND = "none_found"  # the search found no plan; there may be one
+    INFEASIBLE = "infeasible_within_horizon"  # certified: there is no plan within the horizon
+    NO_CONVERGENCE = "no_convergence"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Plan:
+    """A rendezvous in least time: meet the grasp point in position and velocity with |u| <= a_max (eq:terminal).
+
+    Attributes:
+        t_ns: Instant of planning.
+        t_go_s: Time from t_ns to the capture [s], NaN where there is none.
+        costate: (6,) [c1, c2] of the primer vector p = c2 - c1 tau, tau from t_ns, of unit norm; NaN for a plan with
+            ``thrust``.
+        a_max: Bound on the thrust [m/s2].
+        lower_bound_s: Certified lower bound of t_go_s [s].
+        position_error_m, velocity_error_mps: Terminal errors of the propagated plan.
+        u_max: Largest |u| found along the propagated plan [m/s2].
+        latency_s: Coasting time before the thrust [s].
+        thrust: (n, 3) acceleration in {A} over n equal intervals [m/s2]; None where the costate defines the thrust.
+        violation_m: Largest excess over the geometric constraints along the plan [m]; NaN without constraints.
+        margin_m: Smallest margin of the geometric constraints along the plan [m]; NaN without constraints.
+        binding: Name of the constraint with this margin, "" without constraints.
+        abort_margin_m: Smallest margin of the clearance if the robot aborts at any instant before the corridor [m]; NaN
+            without a clearance.
+        steps: Number of steps of the search.
+    """
+
+    t_ns: int
+    status: PlanStatus
+    t_go_s: float
+    costate: Array
+    a_max: float
+    lower_bound_s: float
+    position_error_m: float
+    velocity_error_mps: float
+    u_max: float
+    latency_s: float = 0.0
+    thrust: Array | None = None
+    violation_m: float = math.nan
+    margin_m: float = math.nan
+    binding: str = ""
+    abort_margin_m: float = math.nan
+    steps: int = 0
+
+    @property
+    def gap_s(self) -> float:
+        """Difference between the time to go and its certified lower bound [s]."""
+        return self.t_go_s - self.lower_bound_s
+
+    @property
+    def found(self) -> bool:
+        """Is there a capture to fly?"""
+        return self.status in (PlanStatus.OPTIMAL, PlanStatus.FEASIBLE)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

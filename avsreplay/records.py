@@ -6,7 +6,6 @@ also the frame of the model. ``T_ac`` is the pose of {C} in {A}. SI units and ra
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -69,16 +68,6 @@ class Reason(Enum):
     DOUBTFUL = "doubtful"  # large innovation: not decided yet whether scan, sensor or target is the cause
     SENSOR_BIAS = "sensor_bias"  # the measured poses have a constant offset that motion does not explain
     CLOCK = "clock"  # the stamp steps back or jumps
-
-
-class PlanStatus(Enum):
-    """Result of the planner."""
-
-    OPTIMAL = "optimal"  # first feasible time, certified to the stated gap
-    FEASIBLE = "feasible"  # satisfies all constraints; no claim of least time
-    NOT_FOUND = "none_found"  # the search found no plan; there may be one
-    INFEASIBLE = "infeasible_within_horizon"  # certified: there is no plan within the horizon
-    NO_CONVERGENCE = "no_convergence"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -334,54 +323,3 @@ class Forecast:
 
 Trajectory = Callable[[Array], tuple[Array, Array]]
 """Times (n,) [s after now] -> positions (n, 3) [m] and velocities (n, 3) [m/s] of the grasp point in {A}."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Plan:
-    """A rendezvous in least time: meet the grasp point in position and velocity with |u| <= a_max (eq:terminal).
-
-    Attributes:
-        t_ns: Instant of planning.
-        t_go_s: Time from t_ns to the capture [s], NaN where there is none.
-        costate: (6,) [c1, c2] of the primer vector p = c2 - c1 tau, tau from t_ns, of unit norm; NaN for a plan with
-            ``thrust``.
-        a_max: Bound on the thrust [m/s2].
-        lower_bound_s: Certified lower bound of t_go_s [s].
-        position_error_m, velocity_error_mps: Terminal errors of the propagated plan.
-        u_max: Largest |u| found along the propagated plan [m/s2].
-        latency_s: Coasting time before the thrust [s].
-        thrust: (n, 3) acceleration in {A} over n equal intervals [m/s2]; None where the costate defines the thrust.
-        violation_m: Largest excess over the geometric constraints along the plan [m]; NaN without constraints.
-        margin_m: Smallest margin of the geometric constraints along the plan [m]; NaN without constraints.
-        binding: Name of the constraint with this margin, "" without constraints.
-        abort_margin_m: Smallest margin of the clearance if the robot aborts at any instant before the corridor [m]; NaN
-            without a clearance.
-        steps: Number of steps of the search.
-    """
-
-    t_ns: int
-    status: PlanStatus
-    t_go_s: float
-    costate: Array
-    a_max: float
-    lower_bound_s: float
-    position_error_m: float
-    velocity_error_mps: float
-    u_max: float
-    latency_s: float = 0.0
-    thrust: Array | None = None
-    violation_m: float = math.nan
-    margin_m: float = math.nan
-    binding: str = ""
-    abort_margin_m: float = math.nan
-    steps: int = 0
-
-    @property
-    def gap_s(self) -> float:
-        """Difference between the time to go and its certified lower bound [s]."""
-        return self.t_go_s - self.lower_bound_s
-
-    @property
-    def found(self) -> bool:
-        """Is there a capture to fly?"""
-        return self.status in (PlanStatus.OPTIMAL, PlanStatus.FEASIBLE)

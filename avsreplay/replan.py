@@ -16,6 +16,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.geometry import Array
+from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan import (
     Execution,
@@ -30,7 +31,7 @@ from avsreplay.plan import (
     TargetGeometry,
     Tolerance,
 )
-from avsreplay.records import Belief, Plan, State, Surface
+from avsreplay.records import Belief, State, Surface
 from avsreplay.report.result import Result, load_result
 from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row

@@ -8,9 +8,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from avsreplay.outcome import PlanStatus
 from avsreplay.plan import Limits, PlanParams, Scene, StepPath, constrained, path_of, rendezvous
 from avsreplay.plan.limits import margin
-from avsreplay.records import PlanStatus
 
 ORIGIN = np.zeros(3)
 PARAMS = PlanParams(a_max_mps2=0.05)

@@ -7,9 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from avsreplay.outcome import PlanStatus
 from avsreplay.plan import CostatePath, PlanParams, rendezvous
 from avsreplay.plan.reachable_set import gauge, integrals, support
-from avsreplay.records import PlanStatus
 
 ORIGIN = np.zeros(3)
 GAUSS = np.polynomial.legendre.leggauss(200)

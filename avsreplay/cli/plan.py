@@ -10,8 +10,8 @@ import click
 from avsreplay.cli.setting_options import setting
 
 if TYPE_CHECKING:
+    from avsreplay.outcome import Plan
     from avsreplay.plan import Execution, Limits, Miss, PlanParams, Spread
-    from avsreplay.records import Plan
     from avsreplay.replan import Replanning, Saved
     from avsreplay.report.table import Table
 

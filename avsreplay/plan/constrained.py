@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
+from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.convexification import (
     BETWEEN,
@@ -31,7 +32,6 @@ from avsreplay.plan.convexification import (
 from avsreplay.plan.limits import CONSTRAINTS, Limits, SampledScene, Scene
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
-from avsreplay.records import Plan, PlanStatus
 
 COARSE_NODES = 16  # thrust intervals while initial paths are compared
 ITERATIONS = 14  # of one initial path

@@ -13,12 +13,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from avsreplay.geometry import Array
+from avsreplay.outcome import Plan
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.limits import Limits, Scene, margin
 from avsreplay.plan.path import RobotPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
-from avsreplay.records import Forecast, Plan
+from avsreplay.records import Forecast
 
 _CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 

@@ -14,8 +14,9 @@ from typing import Protocol
 import numpy as np
 
 from avsreplay.geometry import Array, frozen
+from avsreplay.outcome import Plan
 from avsreplay.plan.reachable_set import integrals
-from avsreplay.records import Plan, Trajectory
+from avsreplay.records import Trajectory
 
 MOTION_FACTOR = 1.5  # bounds on the goal's motion: this factor times the largest difference quotient on the grid
 _HERMITE = 1.0 / 384.0  # position error of a cubic Hermite interval in units of d^4 |d4 rho|

@@ -15,9 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avsreplay.geometry import Array
+from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan.path import CostatePath, SampledGoal, sample_goal
 from avsreplay.plan.reachable_set import Gauge, gauge
-from avsreplay.records import Plan, PlanStatus, Trajectory
+from avsreplay.records import Trajectory
 from avsreplay.settings import Settings, setting
 
 MAX_STEPS = 400

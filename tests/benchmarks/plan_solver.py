@@ -13,9 +13,9 @@ import numpy as np
 from plan_problems import problems
 from scipy.integrate import solve_ivp
 
+from avsreplay.outcome import PlanStatus
 from avsreplay.plan import CostatePath, Limits, PlanParams, Scene, constrained, path_of, rendezvous
 from avsreplay.plan.reachable_set import gauge
-from avsreplay.records import PlanStatus
 
 ORIGIN = np.zeros(3)
 HEAD = (
