@@ -16,7 +16,7 @@ from avsreplay.cli.compare import command
 from avsreplay.errors import AvsError, CheckFailed, UnreadableInput, UsageError
 from avsreplay.records import Label
 from avsreplay.report.compare import METRICS, first_divergence, metrics
-from avsreplay.report.gate import Rule, RuleOutcome, check_gate, github_lines, judge, junit, load_rules
+from avsreplay.report.gate import GateRule, RuleOutcome, check_gate, github_lines, judge, junit, load_rules
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import build_comparison
 from avsreplay.report.result import load_result, write_manifest
@@ -78,26 +78,29 @@ BASE = {"pose_pos_rmse_m": 0.004, "false_alarms": 0.0, "t1_s": None, "healthy": 
     ],
 )
 def test_each_limit_holds_up_to_its_edge(limits, value, ok):
-    rule = Rule("pose_pos_rmse_m", **limits)
+    rule = GateRule("pose_pos_rmse_m", **limits)
     (outcome,) = judge([rule], [("base", BASE), ("new", BASE | {"pose_pos_rmse_m": value})])
     assert (outcome.run, outcome.ok) == ("new", ok)
     assert ok == (outcome.why == "")
 
 
 def test_a_ratio_to_nothing_allows_nothing():
-    rule = Rule("false_alarms", max_ratio=2.0)
+    rule = GateRule("false_alarms", max_ratio=2.0)
     outcomes = judge([rule], [("a", BASE), ("b", BASE), ("c", BASE | {"false_alarms": 1.0})])
     assert [o.ok for o in outcomes] == [True, False]
 
 
 def test_a_missing_figure_breaks_the_rule_unless_optional():
     runs = [("a", BASE), ("b", BASE)]
-    assert [o.ok for o in judge([Rule("t1_s", max=10), Rule("t1_s", max=10, optional=True)], runs)] == [False, True]
-    assert not judge([Rule("t1_s", max_ratio=2)], [("a", BASE), ("b", BASE | {"t1_s": 3.0})])[0].ok
+    assert [o.ok for o in judge([GateRule("t1_s", max=10), GateRule("t1_s", max=10, optional=True)], runs)] == [
+        False,
+        True,
+    ]
+    assert not judge([GateRule("t1_s", max_ratio=2)], [("a", BASE), ("b", BASE | {"t1_s": 3.0})])[0].ok
 
 
 def test_an_optional_rule_does_not_skip_a_lost_value():
-    rules = [Rule("t1_s", max_increase=2.0, optional=True), Rule("capture_s", max=40.0, optional=True)]
+    rules = [GateRule("t1_s", max_increase=2.0, optional=True), GateRule("capture_s", max=40.0, optional=True)]
     base = BASE | {"t1_s": 8.0, "capture_s": 29.0}
     outcomes = judge(rules, [("base", base), ("new", base | {"t1_s": None, "capture_s": None})])
     assert [o.ok for o in outcomes] == [False, False]
@@ -107,16 +110,16 @@ def test_an_optional_rule_does_not_skip_a_lost_value():
 def test_a_run_that_used_no_scan_cannot_pass(make_rows):
     rows = make_rows(30, gamma=0, reason="not_aligned", nis=None)
     figures = metrics(Summary.fold(rows))
-    outcomes = judge([Rule("false_alarms", max=1000.0, optional=True)], [("run", figures)], baseline=False)
+    outcomes = judge([GateRule("false_alarms", max=1000.0, optional=True)], [("run", figures)], baseline=False)
     assert outcomes[-1].why == "the run used no scan"
     with pytest.raises(CheckFailed):
         check_gate(outcomes)
 
 
 def test_one_run_is_judged_by_absolute_rules_only():
-    assert judge([Rule("healthy", min=90)], [("a", BASE)])[0].ok
+    assert judge([GateRule("healthy", min=90)], [("a", BASE)])[0].ok
     with pytest.raises(UsageError, match="needs a baseline"):
-        judge([Rule("healthy", min_ratio=0.9)], [("a", BASE)])
+        judge([GateRule("healthy", min_ratio=0.9)], [("a", BASE)])
 
 
 @pytest.mark.parametrize(
@@ -144,8 +147,8 @@ EVIL = 'a<b> & "c":,%\n::error::d'
 
 def _outcomes():
     return [
-        RuleOutcome("run", Rule("t1_s", max=10), 5.0, True),
-        RuleOutcome(EVIL, Rule("t1_s", max=10, note="later is useless"), 11.0, False, "11 > 10, max 10"),
+        RuleOutcome("run", GateRule("t1_s", max=10), 5.0, True),
+        RuleOutcome(EVIL, GateRule("t1_s", max=10, note="later is useless"), 11.0, False, "11 > 10, max 10"),
     ]
 
 

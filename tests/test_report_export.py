@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Pose, exp
-from avsreplay.report.columns_page import columns_page, row_schema, schema_text
+from avsreplay.report.columns_page import columns_page, row_schema, row_schema_text
 from avsreplay.report.export import (
-    document,
     dump_document,
     row_poses,
+    run_document,
     stamp_text,
     write_csv,
     write_kitti,
@@ -178,7 +178,7 @@ def test_the_document_is_strict_json(make_rows):
     summary = Summary.fold(rows)
     text = dump_document(rows, summary, {"seed": 7, "empty": {}})
     whole = json.loads(text, parse_constant=pytest.fail)
-    assert whole == document(rows, summary, {"seed": 7, "empty": {}})
+    assert whole == run_document(rows, summary, {"seed": 7, "empty": {}})
     assert list(whole) == ["format", "verdict", "header", "summary", "rows"]
     assert [parse_row(r, "x") for r in whole["rows"]] == [dataclasses.replace(r, rms_m=None) for r in rows]
 
@@ -189,7 +189,7 @@ def test_the_document_of_no_rows_is_json_too():
 
 def test_the_column_list_of_the_docs_is_in_step():
     assert (ROOT / "docs" / "columns.md").read_text(encoding="utf-8") == columns_page()
-    assert (ROOT / "docs" / "rows.schema.json").read_text(encoding="utf-8") == schema_text()
+    assert (ROOT / "docs" / "rows.schema.json").read_text(encoding="utf-8") == row_schema_text()
 
 
 def test_the_schema_knows_every_column_and_its_type(make_rows):

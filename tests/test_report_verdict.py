@@ -83,6 +83,7 @@ def test_the_end_of_the_log_without_a_used_scan_fails(make_rows):
         ({"nis": 40.0}, Grade.CHECK, "only 0 % of NIS inside the 95 % band"),
         ({"consistent": False}, Grade.CHECK, "the innovations are inconsistent in 100 of 100 scans, first at 0.0 s"),
         ({"reinitialised": 2}, Grade.CHECK, "the estimate was reinitialised 2 times, first at 0.0 s"),
+        ({"manoeuvres": 1, "manoeuvre_s": 4.0}, Grade.CHECK, "the target manoeuvred once, the last time at 4.0 s"),
         ({"converged": False}, Grade.CHECK, "did not converge"),
     ],
 )

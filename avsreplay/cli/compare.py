@@ -186,7 +186,7 @@ def _paired(base: _Group, other: _Group) -> list[tuple[Result, Result]]:
 
 
 def _outcomes(
-    rules: Sequence[gates.Rule], base: _Group, pairs: Sequence[tuple[_Group, list[tuple[Result, Result]]]]
+    rules: Sequence[gates.GateRule], base: _Group, pairs: Sequence[tuple[_Group, list[tuple[Result, Result]]]]
 ) -> list[gates.RuleOutcome]:
     """The rules on every run against its own baseline; on the runs themselves where there is only one group."""
     if not rules:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from avsreplay.report.golden import GoldenResult
     from avsreplay.report.summary import Summary
-    from avsreplay.report.verdict import Verdict
+    from avsreplay.report.verdict import RunVerdict
     from avsreplay.result_dir import ResultDirectory
     from avsreplay.rows import Row
     from avsreplay.run import Job, Listener, Run
@@ -160,7 +160,7 @@ class _Finished:
     rows: Sequence[Row]
     summary: Summary
     record: dict[str, Any]
-    verdict: Verdict
+    verdict: RunVerdict
     scans_per_s: float
 
 
@@ -267,7 +267,7 @@ def _gate(wanted: Wanted, done: _Finished) -> None:
         raise KeyboardInterrupt
 
 
-def _print_differences(result: GoldenResult, verdict: Verdict, *, to_stderr: bool) -> None:
+def _print_differences(result: GoldenResult, verdict: RunVerdict, *, to_stderr: bool) -> None:
     from avsreplay.report.comparison_tables import golden_table
     from avsreplay.report.table import make_console, print_line, print_table
 

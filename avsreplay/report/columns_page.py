@@ -54,7 +54,7 @@ def row_schema() -> dict[str, Any]:
     }
 
 
-def schema_text() -> str:
+def row_schema_text() -> str:
     """Return the schema as text."""
     return json.dumps(row_schema(), indent=1, ensure_ascii=False) + "\n"
 
@@ -62,4 +62,4 @@ def schema_text() -> str:
 if __name__ == "__main__":
     import sys
 
-    sys.stdout.write(schema_text() if "--schema" in sys.argv else columns_page())
+    sys.stdout.write(row_schema_text() if "--schema" in sys.argv else columns_page())

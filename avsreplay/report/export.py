@@ -121,7 +121,7 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
         pq.write_table(pa.table(table, schema=schema), part)
 
 
-def document(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> dict[str, Any]:
+def run_document(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> dict[str, Any]:
     """Return ``{"format", "verdict", "header", "summary", "rows"}`` as plain JSON values (NaN is null)."""
     names = [f.name for f in dataclasses.fields(Row)]
     return {
@@ -143,7 +143,7 @@ def summary_record(summary: Summary) -> dict[str, Any]:
 
 def dump_document(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> str:
     """The document as text with one line per row, ending in a line end."""
-    whole = document(rows, summary, header)
+    whole = run_document(rows, summary, header)
     lines = ",\n".join(json.dumps(row, ensure_ascii=False, allow_nan=False) for row in whole.pop("rows"))
     head = json.dumps(whole, ensure_ascii=False, allow_nan=False, indent=1)
     return f'{head[:-2]},\n "rows": [\n{lines}\n ]\n}}\n'

@@ -17,7 +17,7 @@ _RELATIVE = _LIMITS[2:]
 
 
 @dataclass(frozen=True, slots=True)
-class Rule(Settings):
+class GateRule(Settings):
     """One rule on one metric; all given limits must hold.
 
     A run without a value breaks the rule, unless it is ``optional`` and the baseline has no value either.
@@ -61,7 +61,7 @@ class Rule(Settings):
 class GateRules(Settings):
     """The file: ``[[rule]]`` tables."""
 
-    rule: tuple[Rule, ...] = setting((), "The rules.")
+    rule: tuple[GateRule, ...] = setting((), "The rules.")
 
     def check(self) -> None:
         """Raise ValueError where there is no rule."""
@@ -74,13 +74,13 @@ class RuleOutcome:
     """One rule applied to one run; ``why`` states the broken limit with both numbers."""
 
     run: str
-    rule: Rule
+    rule: GateRule
     value: float | None
     ok: bool
     why: str = ""
 
 
-def load_rules(path: str | Path) -> tuple[Rule, ...]:
+def load_rules(path: str | Path) -> tuple[GateRule, ...]:
     """Read the rules of a TOML file.
 
     Raises:
@@ -91,7 +91,7 @@ def load_rules(path: str | Path) -> tuple[Rule, ...]:
 
 
 def judge(
-    rules: Sequence[Rule], runs: Sequence[tuple[str, Mapping[str, float | None]]], *, baseline: bool = True
+    rules: Sequence[GateRule], runs: Sequence[tuple[str, Mapping[str, float | None]]], *, baseline: bool = True
 ) -> list[RuleOutcome]:
     """Apply every rule to every run but the baseline, which is the first; a run that used no scan always fails.
 
@@ -113,17 +113,17 @@ def judge(
 
 
 def _outcomes(
-    rules: Sequence[Rule], run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]
+    rules: Sequence[GateRule], run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]
 ) -> list[RuleOutcome]:
     """The outcome of every rule, and a broken rule on the healthy scans where the run has none."""
     outcomes = [_outcome(rule, run, figures, base) for rule in rules]
     if not figures.get("healthy"):
-        outcomes.append(RuleOutcome(run, Rule("healthy", min=1.0), 0.0, False, "the run used no scan"))
+        outcomes.append(RuleOutcome(run, GateRule("healthy", min=1.0), 0.0, False, "the run used no scan"))
     return outcomes
 
 
 def _outcome(
-    rule: Rule, run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]
+    rule: GateRule, run: str, figures: Mapping[str, float | None], base: Mapping[str, float | None]
 ) -> RuleOutcome:
     value, reference = figures.get(rule.metric), base.get(rule.metric)
     if value is None and reference is not None:

@@ -71,7 +71,7 @@ def render(template: str, **context: Any) -> Markup:
     return Markup(_environment().get_template(template).render(**context))
 
 
-def build(
+def build_html(
     title: str,
     lines: Sequence[str],
     parts: Iterable[Part],
@@ -161,7 +161,7 @@ def build_page(
     if len(rows) < len(all_rows):
         count = f"{len(rows)} of {len(all_rows)} scans"
         lines.append(f"The charts show {count}: of every interval the first scan and those with the largest errors.")
-    return build(title, lines, parts, data, lead)
+    return build_html(title, lines, parts, data, lead)
 
 
 def _packed(columns: Columns) -> dict[str, Any]:
@@ -197,7 +197,9 @@ def build_comparison(
     lead = [*(settings_table(c) for c in conclusions), gate_table(outcomes)]
     parts = [changes_table(runs[0].name, c, show_all=True) for c in conclusions]
     names = ", ".join(run.name for run in runs)
-    return build("Comparison", [*lines, f"{len(runs)} runs: {names}.{_gate_sentence(outcomes)}"], parts, data, lead)
+    return build_html(
+        "Comparison", [*lines, f"{len(runs)} runs: {names}.{_gate_sentence(outcomes)}"], parts, data, lead
+    )
 
 
 def _gate_sentence(outcomes: Sequence[RuleOutcome]) -> str:

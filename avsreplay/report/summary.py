@@ -43,7 +43,7 @@ class Share:
 
 
 @dataclass(frozen=True, slots=True)
-class Observability:
+class ObservabilitySummary:
     """The Gramian at the last scan, and the time of the first scan at which its rank was 20 (None: never)."""
 
     log10_cond: float | None
@@ -53,7 +53,7 @@ class Observability:
 
 
 @dataclass(frozen=True, slots=True)
-class Convergence:
+class ConvergenceSummary:
     """t_1: time of the first scan whose estimate the planner may use; whether it holds at the end; times withdrawn."""
 
     t1_s: float | None
@@ -101,8 +101,8 @@ class Summary:
     nees: Share | None
     nees_blocks: Mapping[str, Share]
     reference: str | None
-    observability: Observability
-    convergence: Convergence
+    observability: ObservabilitySummary
+    convergence: ConvergenceSummary
     capture: Capture
     counts: Mapping[str, int] = field(default_factory=dict)
 
@@ -224,7 +224,7 @@ class SummaryFold:
             nees_blocks=self._blocks(),
             reference=self._reference,
             observability=self._observability(),
-            convergence=Convergence(self._t1_s, bool(last and last.converged), self._withdrawn),
+            convergence=ConvergenceSummary(self._t1_s, bool(last and last.converged), self._withdrawn),
             capture=self._capture.result(),
             counts=self._counts,
         )
@@ -247,11 +247,11 @@ class SummaryFold:
         )
         return Errors(Statistics.of(position), Statistics.of(rotation))
 
-    def _observability(self) -> Observability:
+    def _observability(self) -> ObservabilitySummary:
         row = self._last
         if row is None:
-            return Observability(None, None, None, None)
-        return Observability(row.ogm_log10_cond, row.ogm_log10_cond_scaled, row.ogm_rank, self._full_rank_s)
+            return ObservabilitySummary(None, None, None, None)
+        return ObservabilitySummary(row.ogm_log10_cond, row.ogm_log10_cond_scaled, row.ogm_rank, self._full_rank_s)
 
 
 def _share(values: Sequence[float], band: tuple[float, float]) -> Share | None:

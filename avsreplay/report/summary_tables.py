@@ -11,7 +11,7 @@ from avsreplay.report.scan_table import print_sparks, scan_table
 from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Capture, Parameter, Statistics
 from avsreplay.report.table import Table, TableCell, decimals, facts_table, number, print_line, print_table
-from avsreplay.report.verdict import Verdict, moments_table, verdict_table
+from avsreplay.report.verdict import RunVerdict, moments_table, verdict_table
 from avsreplay.rows import Row
 
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
@@ -21,7 +21,7 @@ def print_tables(
     console: Console,
     rows: Sequence[Row],
     summary: Summary,
-    verdict: Verdict | None = None,
+    verdict: RunVerdict | None = None,
     *,
     every: int | None = None,
     show_all: bool = False,

@@ -34,7 +34,7 @@ class Grade(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Reason:
+class Concern:
     """One reason against PASS: what, when and how bad, in a sentence."""
 
     grade: Grade
@@ -58,7 +58,7 @@ class Moment:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class RunVerdict:
     """The verdict on one run.
 
     Attributes:
@@ -71,7 +71,7 @@ class Verdict:
     """
 
     grade: Grade
-    reasons: tuple[Reason, ...]
+    reasons: tuple[Concern, ...]
     first_pose: str
     robot: str
     changed: tuple[str, ...]
@@ -100,7 +100,7 @@ class Verdict:
         }
 
 
-def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> Verdict:
+def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> RunVerdict:
     """Judge a run.
 
     Args:
@@ -114,8 +114,8 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     header = header or {}
     extent_m = (header.get("model") or {}).get("extent_m")
     stopped = header.get("interrupted_after")
-    outside = [Reason(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
-    outside += [Reason(Grade.CHECK, text) for text in header.get("preflight") or ()]
+    outside = [Concern(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
+    outside += [Concern(Grade.CHECK, text) for text in header.get("preflight") or ()]
     found = (
         _use(rows, summary),
         _errors(rows, extent_m),
@@ -124,7 +124,7 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
         _data(rows, summary),
     )
     reasons = sorted((*outside, *chain.from_iterable(found)), key=lambda reason: reason.grade is not Grade.FAIL)
-    return Verdict(
+    return RunVerdict(
         grade=reasons[0].grade if reasons else Grade.PASS,
         reasons=tuple(reasons),
         first_pose=first_pose(rows, header),
@@ -134,11 +134,11 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     )
 
 
-def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Reason]:
+def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Scans that updated the filter; those with a harmful fault are not expected to."""
     if not summary.healthy:
         common = max(summary.reasons, key=lambda name: summary.reasons[name], default="no scan")
-        yield Reason(Grade.FAIL, f"none of the {summary.scans} scans was used (mostly {_plain(common)})")
+        yield Concern(Grade.FAIL, f"none of the {summary.scans} scans was used (mostly {_plain(common)})")
         return
     expected = summary.scans - (summary.faults.harmful_scans if summary.faults.known else 0)
     share = min(summary.healthy / expected, 1.0) if expected else 1.0
@@ -146,78 +146,85 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Reason]:
         common = max(summary.reasons, key=lambda name: summary.reasons[name])
         grade = Grade.FAIL if share < USED_FAIL else Grade.CHECK
         text = f"only {summary.healthy} of {summary.scans} scans were used (mostly {_plain(common)})"
-        yield Reason(grade, text)
+        yield Concern(grade, text)
     last = next((k for k in range(len(rows) - 1, -1, -1) if rows[k].gamma == 1), 0)
     if rows[-1].t_s - rows[last].t_s > 0.1 * (rows[-1].t_s - rows[0].t_s) and len(rows) - last > 3:
-        yield Reason(Grade.FAIL, f"no scan after {rows[last].t_s:.1f} s was used, the estimate is only a prediction")
+        yield Concern(Grade.FAIL, f"no scan after {rows[last].t_s:.1f} s was used, the estimate is only a prediction")
 
 
-def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Reason]:
+def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     """Errors over all scans, coasting included, and the fit to the model."""
     position, turn = _median(rows, "pos_err_m"), _median(rows, "rot_err_deg")
     if position is not None and extent_m and position > ERROR_CHECK * extent_m:
         grade = Grade.FAIL if position > ERROR_FAIL * extent_m else Grade.CHECK
         share = 100 * position / extent_m
-        yield Reason(grade, f"the median position error of all scans is {position:.3g} m, {share:.1f} % of the model")
+        yield Concern(grade, f"the median position error of all scans is {position:.3g} m, {share:.1f} % of the model")
     if turn is not None and turn > TURN_CHECK:
         grade = Grade.FAIL if turn > TURN_FAIL else Grade.CHECK
-        yield Reason(grade, f"the median attitude error of all scans is {turn:.3g} deg")
+        yield Concern(grade, f"the median attitude error of all scans is {turn:.3g} deg")
     fit = _median([row for row in rows if row.gamma == 1], "rms_m")
     if fit is not None and extent_m and fit > FIT_CHECK * extent_m:
         share = 100 * fit / extent_m
         text = f"the scans fit the model badly: median rms {1000 * fit:.3g} mm, {share:.1f} % of its extent"
-        yield Reason(Grade.CHECK, f"{text}; check unit, scale and model")
+        yield Concern(Grade.CHECK, f"{text}; check unit, scale and model")
 
 
-def _faults(summary: Summary) -> Iterator[Reason]:
+def _faults(summary: Summary) -> Iterator[Concern]:
     faults = summary.faults
     missed = [e for e in faults.episodes if e.harmful and not e.detected]
     if missed:
         first = f"{_plain(missed[0].kind)} at {missed[0].start_s:.1f} s"
         text = f"{len(missed)} of {faults.injected} harmful faults were not detected, the first: {first}"
-        yield Reason(Grade.FAIL, text)
+        yield Concern(Grade.FAIL, text)
     lost = next((e for e in faults.episodes if e.lost), None)
     if lost is not None:
-        yield Reason(Grade.FAIL, f"the estimate did not recover from {_plain(lost.kind)} at {lost.start_s:.1f} s")
+        yield Concern(Grade.FAIL, f"the estimate did not recover from {_plain(lost.kind)} at {lost.start_s:.1f} s")
     if faults.known and faults.false_alarm_rate > FALSE_ALARMS:
         share = 100 * faults.false_alarm_rate
-        yield Reason(Grade.CHECK, f"{faults.false_alarms} scans without a fault were rejected ({share:.1f} %)")
+        yield Concern(Grade.CHECK, f"{faults.false_alarms} scans without a fault were rejected ({share:.1f} %)")
 
 
-def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Reason]:
+def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Consistency, reinitialisation and convergence."""
     for name, share in (("NEES", summary.nees), ("NIS", summary.nis)):
         if share is not None and share.count >= 10 and share.inside < INSIDE_LEAST:
             low = "too small (overconfident)" if share.median > share.high else "too large"
             where = f"the covariance is {low}, " if not share.low <= share.median <= share.high else ""
-            yield Reason(Grade.CHECK, f"{where}only {100 * share.inside:.0f} % of {name} inside the 95 % band")
+            yield Concern(Grade.CHECK, f"{where}only {100 * share.inside:.0f} % of {name} inside the 95 % band")
     inconsistent = [row for row in rows if row.consistent is False]
     if len(inconsistent) > 0.1 * len(rows):
         begin = inconsistent[0].t_s
         text = f"the innovations are inconsistent in {len(inconsistent)} of {len(rows)} scans, first at {begin:.1f} s"
-        yield Reason(Grade.CHECK, text)
+        yield Concern(Grade.CHECK, text)
     if summary.reinitialised:
         when = next(row.t_s for row in rows if row.reinitialised)
         text = f"the estimate was reinitialised {_times(summary.reinitialised)}, first at {when:.1f} s"
-        yield Reason(Grade.CHECK, f"{text}, because the poses contradicted it")
+        yield Concern(Grade.CHECK, f"{text}, because the poses contradicted it")
+    if rows and rows[-1].manoeuvres:
+        count, last = rows[-1].manoeuvres, rows[-1].manoeuvre_s
+        yield Concern(Grade.CHECK, f"the target manoeuvred {_times(count)}, the last time at {last or 0.0:.1f} s")
+    biased = [row for row in rows if row.reason == "sensor_bias"]
+    if biased:
+        text = f"the sensor had a bias in {len(biased)} scans, first at {biased[0].t_s:.1f} s"
+        yield Concern(Grade.CHECK, text)
     searches = [row for row in rows[1:] if row.guess == "acquired" and row.gamma == 1]
     if searches and rows[0].gamma == 1:
         text = f"the pose was searched again {_times(len(searches))}, first at {searches[0].t_s:.1f} s"
-        yield Reason(Grade.CHECK, text)
+        yield Concern(Grade.CHECK, text)
     t1 = summary.convergence
     if rows and t1.t1_s is None:
         blocks = f" (not converged: {rows[-1].unconverged_blocks})" if rows[-1].unconverged_blocks else ""
-        yield Reason(Grade.CHECK, f"the estimate did not converge, so no capture is planned{blocks}")
+        yield Concern(Grade.CHECK, f"the estimate did not converge, so no capture is planned{blocks}")
     elif rows and not t1.at_end:
-        yield Reason(Grade.CHECK, f"convergence, reached at {t1.t1_s:.1f} s, does not hold at the end")
+        yield Concern(Grade.CHECK, f"convergence, reached at {t1.t1_s:.1f} s, does not hold at the end")
 
 
-def _data(rows: Sequence[Row], summary: Summary) -> Iterator[Reason]:
+def _data(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Errors of the back end, losses and clock problems of the log."""
     failed = [row for row in rows if row.status == "failed"]
     if failed:
         grade = Grade.FAIL if len(failed) > 0.5 * len(rows) else Grade.CHECK
-        yield Reason(grade, f"{len(failed)} of {len(rows)} registrations failed, the first: {failed[0].message}")
+        yield Concern(grade, f"{len(failed)} of {len(rows)} registrations failed, the first: {failed[0].message}")
     for name, text in (
         ("losses", "damaged places of the log were left out"),
         ("stamps_unset", "scans have no time stamp"),
@@ -225,7 +232,7 @@ def _data(rows: Sequence[Row], summary: Summary) -> Iterator[Reason]:
         ("stamps_jumped", "time stamps jump"),
     ):
         if summary.counts.get(name):
-            yield Reason(Grade.CHECK, f"{summary.counts[name]} {text}")
+            yield Concern(Grade.CHECK, f"{summary.counts[name]} {text}")
 
 
 def _times(count: int) -> str:
@@ -311,7 +318,7 @@ def _cause(row: Row) -> str:
     return _plain(row.reason) if row.gamma == 0 else ""
 
 
-def verdict_table(verdict: Verdict) -> Table:
+def verdict_table(verdict: RunVerdict) -> Table:
     """Reasons, first pose, robot and changed settings, as on terminal and page."""
     marks = {Grade.FAIL: "bad", Grade.CHECK: "warn", Grade.PASS: "good"}
     rows: list[tuple[str | TableCell, ...]] = [
@@ -324,7 +331,7 @@ def verdict_table(verdict: Verdict) -> Table:
     return Table("Verdict", ("what", "value"), tuple(rows), align="l")
 
 
-def moments_table(verdict: Verdict, place: Mapping[int, int] | None = None) -> Table:
+def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -> Table:
     """The worst moments; with ``place`` (row -> row of a page) a click leads to the scan."""
     rows = tuple(
         (

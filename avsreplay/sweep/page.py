@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from avsreplay.report.episodes import Peak
-from avsreplay.report.page import Part, Section, build, render
+from avsreplay.report.page import Part, Section, build_html, render
 from avsreplay.report.table import Table
 from avsreplay.sweep.fault_kinds import NONE, FaultKind
 from avsreplay.sweep.statistics import Quantiles, Rate, Roc, Typical
@@ -51,7 +51,7 @@ def build_sweep_page(summary: SweepSummary) -> str:
     parts += [Section("Faults by kind", _KINDS_TEXT), kinds] if kinds.rows else []
     if summary.worst:
         parts += [Section("Worst runs", _WORST_TEXT), worst_table(summary.worst)]
-    return build(summary.name, [_status_line(summary)], parts)
+    return build_html(summary.name, [_status_line(summary)], parts)
 
 
 def worst_table(worst: Sequence[WorstRun]) -> Table:
