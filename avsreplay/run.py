@@ -24,7 +24,7 @@ from avsreplay.log.cloud_stream import ahead
 from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
 from avsreplay.records import Belief, Scan, ScanStatus, State, Surface, Truth
-from avsreplay.register import Registrar
+from avsreplay.register import ModelCheck, Registrar
 from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
 from avsreplay.score import Scorer, matched_truth
@@ -100,6 +100,7 @@ class Run:
         config: effective configuration.
         surface: model of the target.
         registrar: registers scans against that model.
+        model_check: what the rows taken so far say of the model.
     """
 
     def __init__(self, job: Job) -> None:
@@ -117,6 +118,7 @@ class Run:
             self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
             self.surface: Surface = self._model()
             self.registrar = Registrar(self.surface, self.config.register)
+            self.model_check = ModelCheck(self.registrar, self.surface)
             self._stages = self._new_stages()
         except BaseException:
             self.source.close()
@@ -175,6 +177,7 @@ class Run:
             outcomes = ahead(outcomes, self.job.prefetch)
         for state, outcome in outcomes:
             truth = self._truth_of(outcome.scan)
+            self.model_check.add(outcome.scan.points, outcome.alignment)
             row = Row.of(outcome, scorer.score(state, outcome, truth))
             self._fold.add(row)
             if truth.state is not None:

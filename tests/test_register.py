@@ -267,6 +267,30 @@ def test_a_degenerate_view_has_no_covariance(registrar: Registrar) -> None:
     assert "slides along x" in found.free_directions
 
 
+@pytest.mark.parametrize("guess_deg", [0.0, 3.0])
+def test_a_cylinder_seen_from_the_side_keeps_its_place_along_the_axis(guess_deg: float) -> None:
+    """The middle of the barrel alone determines neither the position along the axis nor the rotation about it."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 65)[:-1]
+    rim = np.column_stack([1.8 * np.cos(angle), 1.8 * np.sin(angle), np.zeros(64)])
+    k, n = np.arange(64), (np.arange(64) + 1) % 64
+    faces = np.vstack([np.column_stack([k, n, k + 64]), np.column_stack([n, n + 64, k + 64])]).astype(np.int32)
+    barrel = Surface(np.vstack([rim - [0, 0, 4.5], rim + [0, 0, 4.5]]), faces, "barrel", "")
+    rng, T_ac = _rng(), Pose(exp([np.pi / 2, 0.0, 0.0]), np.array([0.0, 0.0, 20.0]))
+    a, z = rng.uniform(0.0, 2.0 * np.pi, 20000), rng.uniform(-3.0, 3.0, 20000)
+    normals = np.column_stack([np.cos(a), np.sin(a), 0.0 * a])
+    points = T_ac.apply(1.8 * normals + z[:, None] * [0.0, 0.0, 1.0])
+    seen = np.einsum("ij,ij->i", normals @ T_ac.R.T, points) < -0.2 * np.linalg.norm(points, axis=1)
+    scan = points[seen][:3000] + rng.normal(0.0, 0.01, (3000, 3))
+    guess = T_ac @ Pose(exp(np.radians(guess_deg) * np.array([0.8, 0.6, 0.0])), np.zeros(3))
+    found = Registrar(barrel).register(scan, guess)
+    step = T_ac.inverse() @ found.T_ac
+    assert found.status is AlignStatus.DEGENERATE
+    assert "slides along z" in found.free_directions
+    assert np.degrees(np.arccos(step.R[2, 2])) < 0.1  # the axis is found
+    assert np.linalg.norm(step.t[:2]) < 0.01
+    assert abs(step.t[2]) < 0.05  # and the position along it stays that of the guess
+
+
 # --- what the camera can see
 
 

@@ -185,13 +185,21 @@ def _replayed(run: Run, advice: list[str], target: ResultDirectory | None, to_re
             viewer.close()
         summary = run.summary()
         record = _record(run, summary)
-        record["preflight"] = advice
+        record["preflight"] = [*advice, *_model_notes(run)]
         if interrupted:
             record["interrupted_after"] = len(rows)
             click.echo(f"avsreplay: interrupted; the results of {len(rows)} of {len(run)} scans are kept", err=True)
         if keeper:
             keeper.finish(rows, record)
     return _Finished(rows, summary, record, verdict_of(rows, summary, record), len(rows) / seconds)
+
+
+def _model_notes(run: Run) -> tuple[str, ...]:
+    """What the rows say of the model, also printed on stderr."""
+    notes = run.model_check.notes()
+    for note in notes:
+        click.echo(f"avsreplay: model: {note}", err=True)
+    return notes
 
 
 def _collect(found: Iterator[Row], rows: list[Row]) -> bool:

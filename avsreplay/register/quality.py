@@ -28,6 +28,7 @@ SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
 ALONE = 1e-9  # keeps a motion finite that only one patch determines
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
+LEAST_RESIDUALS = 50
 AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
 
 
@@ -297,3 +298,37 @@ def _axis(vector: Array) -> str:
         return "xyz"[k]
     unit = unit * np.sign(unit[k])
     return "(" + ", ".join(f"{value + 0.0:.2f}" for value in unit) + ")"
+
+
+def scale_error(
+    index: SurfaceIndex, p: Array, camera_c: Array | None, width_m: float, rounds: int
+) -> tuple[float, float] | None:
+    """See ``Registrar.scale_error``."""
+    delta, share = 0.0, 0.0
+    moved = Pose.identity()
+    for _ in range(rounds):
+        q = moved.apply(p) / (1.0 + delta)
+        found = index.closest(q, camera_c=camera_c)
+        near = found.d2 < width_m**2
+        if np.count_nonzero(near) < LEAST_RESIDUALS:
+            return None
+        n, q = found.normal[near], q[near]
+        e = np.einsum("ij,ij->i", n, q - found.foot[near])
+        J, a = _jacobian(q - q.mean(axis=0), n), np.einsum("ij,ij->i", n, q - q.mean(axis=0))
+        J, a, e = _weighted(J, a, e)
+        free = a - J @ np.linalg.lstsq(J, a, rcond=1e-6)[0]
+        share = float(free @ free) / max(float(a @ a), np.finfo(float).tiny)
+        step = float(free @ e) / max(float(free @ free), np.finfo(float).tiny)
+        d = np.linalg.lstsq(J, e - step * a, rcond=1e-6)[0]
+        turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
+        centre = q.mean(axis=0)
+        moved = Pose(turn.q, (1.0 + delta) * (centre - turn.R @ centre - d[3:])) @ moved
+        delta = (1.0 + delta) * (1.0 + step) - 1.0
+    return delta, share
+
+
+def _weighted(J: Array, a: Array, e: Array) -> tuple[Array, Array, Array]:
+    """Rows times the square root of their Cauchy weight; scale: robust standard deviation of e."""
+    noise = max(SIGMA_PER_MEDIAN * float(np.median(np.abs(e))), np.finfo(float).tiny)
+    root = 1.0 / np.sqrt(1.0 + (e / (2.0 * noise)) ** 2)
+    return J * root[:, None], a * root, e * root

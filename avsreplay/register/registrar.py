@@ -137,6 +137,21 @@ class Registrar:
         d2 = self._index.closest(T_ac.inverse().apply(points)).d2
         return np.asarray(np.sqrt(np.minimum(d2, min(most_m, self._index.reach_m) ** 2)))
 
+    def scale_error(self, p: Array, camera_c: Array, width_m: float, rounds: int) -> tuple[float, float] | None:
+        """Return delta (target over model, less 1) from points of a registered scan, and the information on it.
+
+        Args:
+            p: (n, 3) points in {C} [m], at the registered pose.
+            camera_c: (3,) camera position in {C} [m].
+            width_m: residuals beyond this distance are not used.
+            rounds: times the points are matched again.
+
+        Returns:
+            delta, and the share of n . p that no pose explains; None with fewer than 50 residuals.
+        """
+        camera = camera_c if self._visibility.sided else None
+        return quality.scale_error(self._index, p, camera, width_m, rounds)
+
     def search(self, points: NDArray[Any]) -> SearchResult:
         """Return the best and second best pose of a scan (n, 3) in {A} [m], finite, n >= 1."""
         return self._global.search(points)

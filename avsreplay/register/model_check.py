@@ -1,0 +1,119 @@
+"""Errors of the model that a run reveals: its size, inverted faces, a mirrored or a wrong shape.
+
+Size: along a run, the factor between target and model is estimated from the residuals of registered scans. With
+T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
+n . (p - c) = J d + delta n . p. Least squares per scan give delta after the pose is eliminated; scans are weighted by
+the information on delta, and their spread gives the standard error (jackknife over scans). Noise makes thin parts
+appear thicker, so errors below the rms fit error in units of the extent are not reported.
+
+Shape: if no scan was registered, the global search is repeated with the mirrored model. The unit of the model is
+checked before a run (``preflight``).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Array
+from avsreplay.records import Alignment, AlignStatus, Surface
+from avsreplay.register.registrar import Registrar
+from avsreplay.register.segments import without_scattered_points
+from avsreplay.register.visibility import is_outward
+
+POINTS = 1500  # per scan
+EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
+WIDTH_OF_EXTENT = 0.02  # residuals used
+ROUNDS = 3  # of matching again with the scaled scan
+LEAST_INFORMATION = 1e-3  # share of n . p that the pose cannot explain
+LEAST_ERROR, SIGMAS = 0.005, 4.0  # of delta, to be reported
+
+
+class ModelCheck:
+    """Collects scans of one run.
+
+    Args:
+        registrar: of the run.
+        surface: its model.
+    """
+
+    def __init__(self, registrar: Registrar, surface: Surface) -> None:
+        self._registrar, self._surface = registrar, surface
+        self._seen, self._aligned = 0, 0
+        self._deltas: list[float] = []
+        self._weights: list[float] = []
+        self._rms: list[float] = []
+        self._unmatched: NDArray[Any] | None = None
+
+    def add(self, points: NDArray[Any], found: Alignment | None) -> None:
+        """Take one scan (n, 3) in {A} [m] and its alignment, if there is one."""
+        if found is None or not len(points):
+            return
+        if found.status is not AlignStatus.ALIGNED:
+            self._unmatched = points if self._unmatched is None else self._unmatched
+            return
+        self._aligned += 1
+        if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS:
+            self._measure(points, found)
+
+    def scale(self) -> tuple[float, float] | None:
+        """Return the size of the target over that of the model and its standard error; None with too few scans."""
+        if len(self._deltas) < LEAST_SCANS:
+            return None
+        delta, weight = np.array(self._deltas), np.array(self._weights)
+        weight = np.minimum(weight, 4.0 * np.median(weight))
+        mean = float(weight @ delta / weight.sum())
+        without = (weight @ delta - weight * delta) / (weight.sum() - weight)
+        n = len(delta)
+        return 1.0 + mean, float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+
+    def notes(self) -> tuple[str, ...]:
+        """Return what the run says of the model, one line each; empty if there is nothing to say."""
+        if not self._aligned:
+            return () if self._unmatched is None else (self._diagnosis(self._unmatched),)
+        return (*self._inverted(), *self._size())
+
+    def _inverted(self) -> tuple[str, ...]:
+        if is_outward(replace(self._surface, faces=self._surface.faces[:, ::-1])):
+            return ("the faces of the model point inwards: the side that the camera sees is not used",)
+        return ()
+
+    def _size(self) -> tuple[str, ...]:
+        found = self.scale()
+        if found is None:
+            return ()
+        least = max(LEAST_ERROR + float(np.median(self._rms)), SIGMAS * found[1])
+        if abs(found[0] - 1.0) < least:
+            return ()
+        small = "small" if found[0] > 1.0 else "large"
+        percent = 100.0 * abs(found[0] - 1.0)
+        return (
+            f"the model is {percent:.1f} % too {small} (1 sigma {100.0 * found[1]:.1f} %): "
+            f"multiply --model-scale by {found[0]:.4f}",
+        )
+
+    def _measure(self, points: NDArray[Any], alignment: Alignment) -> None:
+        finite = np.asarray(points[np.isfinite(points).all(axis=1)], dtype=np.float64)
+        T_ca = alignment.T_ac.inverse()
+        p = T_ca.apply(finite[:: max(1, len(finite) // POINTS)])
+        measured = self._registrar.scale_error(p, T_ca.t, WIDTH_OF_EXTENT * self._surface.extent, ROUNDS)
+        if measured is not None and measured[1] > LEAST_INFORMATION:
+            self._deltas.append(measured[0])
+            self._weights.append(measured[1])
+            self._rms.append(alignment.rms_m / self._surface.extent)
+
+    def _diagnosis(self, points: NDArray[Any]) -> str:
+        """Try the mirrored model on a scan that was not registered."""
+        finite = np.isfinite(points).all(axis=1)
+        scan = without_scattered_points(np.asarray(points[finite], dtype=np.float64))
+        mirrored = replace(self._surface, vertices=self._surface.vertices * [-1.0, 1.0, 1.0])
+        if len(scan) and self._fits(replace(mirrored, faces=mirrored.faces[:, ::-1]), scan):
+            return "the scans fit the mirror image of the model: is an axis of the model or of the scans inverted?"
+        return "no pose of the model explains the scans: is it the right model, in metres?"
+
+    def _fits(self, surface: Surface, scan: Array) -> bool:
+        params = replace(self._registrar.params, reach_m=None, gate_m=None, eps_m=None, noise_m=None)
+        return Registrar(surface, params).acquire(scan).measured

@@ -1,0 +1,75 @@
+"""Errors of the model are found from a run: size, inverted faces, mirror image, another object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Surface
+from avsreplay.register import ModelCheck, Registrar
+from avsreplay.register.contract import boxes, view
+
+SEED = 3
+
+
+def scans(surface: Surface, count: int, sigma: float = 0.01) -> list[tuple[Array, Pose]]:
+    """Views of the surface from random sides, with noise along the ray."""
+    rng, found = np.random.default_rng(SEED), []
+    for _ in range(count):
+        q = rng.standard_normal(4)
+        T_ac = Pose(q / np.linalg.norm(q), np.array([0.0, 0.0, 3.0 * surface.extent]))
+        points = T_ac.apply(view(surface, 3000, T_ac.inverse().t))
+        found.append((points * (1.0 + sigma * rng.standard_normal((len(points), 1)) / (3.0 * surface.extent)), T_ac))
+    return found
+
+
+def checked(model: Surface, measured: Surface, count: int = 30) -> ModelCheck:
+    registrar = Registrar(model)
+    check = ModelCheck(registrar, model)
+    for points, T_ac in scans(measured, count):
+        check.add(points, registrar.register(points, T_ac))
+    return check
+
+
+@pytest.mark.parametrize(
+    "factor", [pytest.param(0.98, marks=pytest.mark.slow), 1.01, pytest.param(1.03, marks=pytest.mark.slow)]
+)
+def test_an_error_of_size_is_measured(factor: float) -> None:
+    model = boxes()
+    check = checked(model, replace(model, vertices=factor * model.vertices))
+    found = check.scale()
+    assert found is not None
+    assert found[0] == pytest.approx(factor, abs=0.002)
+    assert f"multiply --model-scale by {found[0]:.4f}" in check.notes()[0]
+
+
+@pytest.mark.slow
+def test_a_correct_model_raises_no_note() -> None:
+    assert checked(boxes(), boxes()).notes() == ()
+
+
+def test_few_scans_say_nothing_of_the_size() -> None:
+    check = checked(boxes(), boxes(), count=4)
+    assert check.scale() is None
+    assert check.notes() == ()
+
+
+@pytest.mark.slow
+def test_inverted_faces_are_reported() -> None:
+    model = boxes()
+    assert "inwards" in checked(replace(model, faces=model.faces[:, ::-1]), model).notes()[0]
+
+
+@pytest.mark.slow
+def test_a_mirrored_model_and_another_object_are_told_apart() -> None:
+    model = boxes()
+    mirrored = replace(model, vertices=model.vertices * [-1.0, 1.0, 1.0], faces=model.faces[:, ::-1])
+    sphere = np.random.default_rng(SEED).standard_normal((3000, 3))
+    for points, word in ((scans(mirrored, 1)[0][0], "mirror image"), (sphere + [0.0, 0.0, 20.0], "right model")):
+        registrar = Registrar(model)
+        check = ModelCheck(registrar, model)
+        check.add(points, registrar.acquire(points))
+        assert word in check.notes()[0]
