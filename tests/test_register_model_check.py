@@ -67,8 +67,8 @@ def test_inverted_faces_are_reported() -> None:
 def test_a_mirrored_model_and_another_object_are_told_apart() -> None:
     model = boxes()
     mirrored = replace(model, vertices=model.vertices * [-1.0, 1.0, 1.0], faces=model.faces[:, ::-1])
-    sphere = np.random.default_rng(SEED).standard_normal((3000, 3))
-    for points, word in ((scans(mirrored, 1)[0][0], "mirror image"), (sphere + [0.0, 0.0, 20.0], "right model")):
+    sphere = np.random.default_rng(SEED).standard_normal((3000, 3)) + np.array([0.0, 0.0, 20.0])
+    for points, word in ((scans(mirrored, 1)[0][0], "mirror image"), (sphere, "right model")):
         registrar = Registrar(model)
         check = ModelCheck(registrar, model)
         check.add(points, registrar.acquire(points))
