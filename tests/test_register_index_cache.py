@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import hashlib
+import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from avsreplay.errors import UsageError
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
+from avsreplay.register import index_cache
+from avsreplay.register.params import RegisterParams
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import SurfaceIndex
 
 kernel = pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
@@ -90,6 +93,51 @@ def test_no_payload_leads_a_search_astray(surface: Surface, tmp_path: Path) -> N
     assert restored < 40
 
 
-def test_a_folder_that_is_not_there_is_said(surface: Surface, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="not saved"):
-        SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path / "none")
+def test_a_missing_folder_is_made_and_an_unusable_one_changes_nothing(surface: Surface, tmp_path: Path) -> None:
+    want = answers(SurfaceIndex.build(surface, 0.5))
+    assert not SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path / "a" / "b").restored
+    assert SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path / "a" / "b").restored
+    (tmp_path / "file").write_bytes(b"")
+    built = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path / "file" / "below")
+    assert answers(built) == want
+    assert (tmp_path / "file").read_bytes() == b""
+
+
+def test_writers_at_the_same_time_leave_one_whole_file(surface: Surface, tmp_path: Path) -> None:
+    def build() -> None:
+        SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
+
+    writers = [threading.Thread(target=build) for _ in range(6)]
+    for writer in writers:
+        writer.start()
+    for writer in writers:
+        writer.join()
+    assert saved(tmp_path).suffix == ".avsindex"
+    assert SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path).restored
+
+
+def test_the_users_cache_folder_follows_the_platform(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert index_cache.user_folder() == tmp_path / "avsreplay"
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for relative in ("", "cache"):
+        monkeypatch.setenv("XDG_CACHE_HOME", relative)
+        assert index_cache.user_folder() == tmp_path / "home" / ".cache" / "avsreplay"
+    monkeypatch.setattr("sys.platform", "win32")
+    monkeypatch.delenv("LOCALAPPDATA", raising=False)
+    assert index_cache.user_folder() is None
+
+
+def test_a_registrar_keeps_the_index_of_a_large_model_unless_told_not_to(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    large = Surface(rng(5).standard_normal((index_cache.LEAST_PRIMITIVES, 3)), NO_FACES, "test", "")
+    small = Surface(large.vertices[:100], NO_FACES, "test", "")
+    Registrar(large, RegisterParams(index_cache=False))
+    Registrar(small)
+    assert not list(tmp_path.iterdir())
+    Registrar(large)
+    assert len(list((tmp_path / "avsreplay").iterdir())) == 1

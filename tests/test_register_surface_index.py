@@ -279,3 +279,22 @@ def test_a_thin_plate_is_not_pulled_to_its_far_side(build: Build) -> None:
     assert abs(z[1]) > 5 * abs(z[0])
     assert sums.inliers == 3000
     assert np.sqrt(sums.sum_e2 / 3000) == pytest.approx(0.006, rel=0.1)
+
+
+@pytest.mark.parametrize("size", [1e10, 1e20, 1e30, 1e100])
+def test_a_stray_vertex_is_named_as_too_large(size: float) -> None:
+    mesh = shape()
+    vertices = mesh.vertices.copy()
+    vertices[3, 1] = size
+    with pytest.raises(UsageError, match="too large"):
+        SurfaceIndex.build(Surface(vertices, mesh.faces, "boxes", ""), 0.5)
+
+
+@pytest.mark.parametrize("size", [1e3, 1e6, 1e9])
+def test_a_stray_vertex_within_the_limit_is_indexed(size: float) -> None:
+    mesh = shape()
+    vertices = np.vstack([mesh.vertices, [0.0, size, 0.0], [1.0, size, 0.0]])
+    faces = np.vstack([mesh.faces, [[0, len(vertices) - 2, len(vertices) - 1]]])
+    index = SurfaceIndex.build(Surface(vertices, faces, "boxes", ""), 0.5)
+    q = on(mesh, 50, 30)
+    assert np.sqrt(index.closest(q).d2).max() < 1e-9 * size

@@ -2,7 +2,8 @@
 
 A file is ``<key>.avsindex``: 8 bytes of magic, the SHA-256 of the payload, the payload. The key is the SHA-256 of the
 layout version, the byte order, the reach and the vertices and faces of the surface, so a changed model, reach or
-version uses another file. A file that is truncated, altered or of another kind is ignored.
+version uses another file. A file that is truncated, altered or of another kind is ignored. A folder that cannot be
+written to is no error: the index is then built in every run, with the same result.
 """
 
 from __future__ import annotations
@@ -16,10 +17,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.errors import UsageError
 from avsreplay.geometry import Array
 
 MAGIC = b"AVSINDEX"
+LEAST_PRIMITIVES = 20_000  # a smaller model is indexed faster than a file is found
+
+
+def user_folder() -> Path | None:
+    """Return the cache folder of avsreplay for this user by the rules of the platform; None where there is no home."""
+    given = {"win32": "LOCALAPPDATA", "darwin": ""}.get(sys.platform, "XDG_CACHE_HOME")
+    base = Path(os.environ.get(given, "")) if given else Path()
+    if base.is_absolute():  # a relative path is invalid by the XDG specification
+        return base / "avsreplay"
+    if sys.platform == "win32":
+        return None
+    try:
+        return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "avsreplay"
+    except RuntimeError:  # no home folder
+        return None
 
 
 def path_of(folder: Path, layout: int, vertices: Array, faces: NDArray[np.int32], reach_m: float) -> Path:
@@ -41,21 +56,17 @@ def read(path: Path) -> bytes | None:
     return payload if whole else None
 
 
-def write(path: Path, payload: bytes) -> None:
-    """Write the file atomically. Raises UsageError if the folder cannot be written to."""
+def write(path: Path, payload: bytes) -> bool:
+    """Write the file completely or not at all; return whether it was written."""
+    name = ""
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem[:8], suffix=".part")
-    except OSError as error:
-        raise _unwritable(path, error) from None
-    try:
         with os.fdopen(handle, "wb") as out:
             out.write(MAGIC + hashlib.sha256(payload).digest() + payload)
         Path(name).replace(path)
-    except OSError as error:
-        Path(name).unlink(missing_ok=True)
-        raise _unwritable(path, error) from None
-
-
-def _unwritable(path: Path, error: OSError) -> UsageError:
-    reason = error.strerror or "cannot be written"
-    return UsageError(f"index not saved: {reason}", where=str(path.parent), hint="name a folder that can be written to")
+    except OSError:
+        if name:
+            Path(name).unlink(missing_ok=True)
+        return False
+    return True

@@ -90,6 +90,7 @@ class RegisterParams(Settings):
         0.0, "Edge length of the voxels of which one point each is kept; 0 keeps all points.", unit="m", low=0.0
     )
     threads: int = setting(1, "Largest number of threads of a back end; the result does not depend on it.", low=1)
+    index_cache: bool = setting(True, "Keep the index of a large model in the user's cache folder between runs.")
     acquire: AcquireParams = setting(AcquireParams, "The global search.")
 
     def check(self) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
-from avsreplay.register import quality
+from avsreplay.register import index_cache, quality
 from avsreplay.register.backend import Target, build, load
 from avsreplay.register.global_search import GlobalSearch, SearchResult
 from avsreplay.register.horn import HornBackend
@@ -54,7 +54,7 @@ class Registrar:
         self.params = params or RegisterParams()
         self.limits = self.params.limits(surface.extent)
         factory = load(self.params.backend)  # before the index, so that a wrong name is reported at once
-        self._index = SurfaceIndex.build(surface, self.limits.reach_m)
+        self._index = _indexed(surface, self.limits.reach_m, self.params)
         self._visibility = Visibility(surface, self.params.camera)
         self._target = Target(surface, self._index, self.limits, self._visibility)
         self._backend = build(self.params.backend, factory, self._target)
@@ -226,3 +226,9 @@ class Registrar:
         except Exception as error:  # an error of a library is a status of this scan, not the end of a replay
             return f"{name} failed: {type(error).__name__}: {error}".splitlines()[0][:MESSAGE_LENGTH]
         return fit if finite else f"{name} returned a pose that is not finite"
+
+
+def _indexed(surface: Surface, reach_m: float, params: RegisterParams) -> SurfaceIndex:
+    large = max(len(surface.vertices), len(surface.faces)) >= index_cache.LEAST_PRIMITIVES
+    cache_dir = index_cache.user_folder() if params.index_cache and large else None
+    return SurfaceIndex.build(surface, reach_m, threads=params.threads, cache_dir=cache_dir)

@@ -33,6 +33,9 @@ from avsreplay.records import Surface
 from avsreplay.register import index_cache
 from avsreplay.settings import Settings, setting
 
+LARGEST_M = 1e9  # coordinates [m]
+MOST_PRIMITIVES = 50_000_000
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IcpParams(Settings):
@@ -166,11 +169,11 @@ class SurfaceIndex:
             reach_m: largest distance at which a closest point is searched [m].
             threads: threads that build the index; the result does not depend on it.
             portable: use only the instructions that every processor of this kind has; the results are identical.
-            cache_dir: folder in which the index is looked up and saved under the hash of the surface.
+            cache_dir: folder in which the index is looked up and, where possible, saved under the hash of the surface.
 
         Raises:
-            UsageError: a surface with no primitive, a coordinate that is not finite, a face that refers to a missing
-                vertex, or a reach that is not positive.
+            UsageError: a surface with no primitive, too many or too large a surface, a coordinate that is not finite,
+                a face that refers to a missing vertex, or a reach that is not positive.
             MissingBackend: the C++ extension is not built.
         """
         vertices, faces = _checked(surface, reach_m)
@@ -271,9 +274,24 @@ def _checked(surface: Surface, reach_m: float) -> tuple[Array, NDArray[np.int32]
         raise UsageError("the model has no point", where=surface.name, hint="give a mesh or a cloud")
     if not np.isfinite(vertices).all():
         raise UsageError("the model has a coordinate that is not finite", where=surface.name, hint="repair the model")
+    _check_size(surface, vertices, faces)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UsageError("a face refers to a missing vertex", where=surface.name, hint="repair the model")
     return vertices, faces
+
+
+def _check_size(surface: Surface, vertices: Array, faces: NDArray[np.int32]) -> None:
+    """Raise UsageError for a model that single precision or 32-bit indices cannot represent."""
+    largest = float(np.abs(vertices).max())
+    if largest > LARGEST_M:
+        what, hint = (
+            f"a coordinate of {largest:.3g} m is too large",
+            "remove stray vertices, or scale the model to metres",
+        )
+        raise UsageError(what, where=surface.name, hint=hint)
+    if max(len(vertices), len(faces)) > MOST_PRIMITIVES:
+        what = f"{len(vertices)} vertices and {len(faces)} faces are more than the limit of {MOST_PRIMITIVES}"
+        raise UsageError(what, where=surface.name, hint="simplify the model")
 
 
 def _with_area(vertices: Array, faces: NDArray[np.int32]) -> NDArray[np.int32]:

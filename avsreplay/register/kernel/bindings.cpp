@@ -1,10 +1,11 @@
-// The door to Python: checks shapes, keeps the arrays alive, lets go of the interpreter while it works.
+// The Python interface: checks shapes, keeps the arrays alive, releases the interpreter lock while it works.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 #include <nanobind/stl/optional.h>
 
 #include <algorithm>
+#include <cmath>
 #include <cstring>
 #include <stdexcept>
 
@@ -80,11 +81,28 @@ Numpy matrix(const double* rows34) {
   return out;
 }
 
+// Every number that is used as an index, and coordinates whose squares single precision can hold.
+void check(const Doubles& vertices, const Ints& faces, const Ints& kept) {
+  constexpr double largest = 1e15;
+  constexpr size_t most = (size_t)1 << 30;
+  require(vertices.shape(0) <= most && kept.size() <= most && faces.size() <= 3 * most, "the surface has too many parts");
+  for (size_t k = 0; k < vertices.size(); ++k)
+    require(std::fabs(vertices.data()[k]) <= largest, "a coordinate is not finite or too large");
+  for (size_t k = 0; k < kept.size(); ++k) {
+    const int64_t f = kept.data()[k];
+    require(f >= 0 && 3 * f + 2 < (int64_t)faces.size(), "a kept face is not there");
+    for (int64_t i = 3 * f; i < 3 * f + 3; ++i)
+      require(faces.data()[i] >= 0 && faces.data()[i] < (int64_t)vertices.shape(0), "a face refers to a missing vertex");
+  }
+}
+
 class Index {
  public:
   Index(Doubles vertices, Ints faces, Ints kept, double reach, int threads, bool portable)
       : portable_(portable) {
     require(vertices.ndim() == 2 && vertices.shape(1) == 3 && vertices.shape(0) > 0, "vertices must be (n, 3), n > 0");
+    require(reach > 0 && reach < 1e12, "the reach must be positive and finite");
+    check(vertices, faces, kept);
     const Surface s{vertices.data(), (int64_t)vertices.shape(0), faces.data(), kept.data(), (int64_t)kept.shape(0)};
     nb::gil_scoped_release release;
     Team team(threads);
