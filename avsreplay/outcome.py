@@ -19,6 +19,7 @@ from avsreplay.records import (
     BLOCKS,
     Alignment,
     Belief,
+    BodyParameters,
     Forecast,
     Innovation,
     Manoeuvre,
@@ -136,6 +137,7 @@ class Outcome:
         belief: estimate after the update.
         pose: estimated T_ac, the pose of {C} in {A}.
         pose_covariance: (6, 6) covariance of that pose: position in {A} [m], half-angle vector in {B} [rad].
+        body: inertia, mass centre and rate in {C}.
         estimator: estimator in use: near, start, fit or filter.
         sigma_hits: how often the bounds of the inertia ratios limited the gain so far.
         r_floors: how many eigenvalues of R were raised to their lower limit so far.
@@ -156,6 +158,7 @@ class Outcome:
     belief: Belief
     pose: Pose
     pose_covariance: Array
+    body: BodyParameters
     estimator: str
     sigma_hits: int
     r_floors: int

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
+from avsreplay.estimate.body import body_parameters
 from avsreplay.estimate.deskew import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor import observability
@@ -198,6 +199,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         belief=track.belief,
         pose=track.belief.x.T_ac,
         pose_covariance=stages.estimator.pose_covariance(track.belief),
+        body=body_parameters(track.belief),
         estimator=track.mode,
         sigma_hits=track.sigma_hits,
         r_floors=track.r_floors,

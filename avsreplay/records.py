@@ -308,6 +308,27 @@ class Manoeuvre:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BodyParameters:
+    """Parameters of the target in {C}, independent of the order of the principal axes.
+
+    Attributes:
+        inertia, inertia_1s: (3, 3) inertia tensor about the centre of mass over its trace, and 1 sigma of its entries.
+        moments, moments_1s: (3,) principal moments over their sum, ascending, and their 1 sigma.
+        centre_c: (3,) centre of mass [m].  centre_1s_m: its 1 sigma, root of the trace [m].
+        rate_c: (3,) angular rate [rad/s].  rate_1s_radps: its 1 sigma, root of the trace [rad/s].
+    """
+
+    inertia: Array
+    inertia_1s: Array
+    moments: Array
+    moments_1s: Array
+    centre_c: Array
+    centre_1s_m: float
+    rate_c: Array
+    rate_1s_radps: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
     """Predicted standard deviations of the grasp point; each is the root of the trace of its 3x3 covariance.
 

@@ -194,6 +194,31 @@ class Row:
     muw: float | None = _number(lambda o, s: float(o.belief.x.q_bc[3]), "See mux.")
     mu_1s_deg: float | None = _number(lambda o, s: full_angle_deg(np.diag(o.belief.P)[BLOCKS["mu"]].sum()),
         "Standard deviation of mu (root of the trace).", "deg")
+    com_x_m: float | None = _metres(lambda o, s: float(o.body.centre_c[0]), "Centre of mass in {C}.")
+    com_y_m: float | None = _metres(lambda o, s: float(o.body.centre_c[1]), "See com_x_m.")
+    com_z_m: float | None = _metres(lambda o, s: float(o.body.centre_c[2]), "See com_x_m.")
+    com_1s_m: float | None = _number(lambda o, s: o.body.centre_1s_m,
+        "Standard deviation of the centre of mass in {C} (root of the trace).", "m")
+    rate_cx_radps: float | None = _number(lambda o, s: float(o.body.rate_c[0]), "Angular rate in {C}.", "rad/s")
+    rate_cy_radps: float | None = _number(lambda o, s: float(o.body.rate_c[1]), "See rate_cx_radps.", "rad/s")
+    rate_cz_radps: float | None = _number(lambda o, s: float(o.body.rate_c[2]), "See rate_cx_radps.", "rad/s")
+    rate_c_1s_radps: float | None = _number(lambda o, s: o.body.rate_1s_radps,
+        "Standard deviation of the angular rate in {C} (root of the trace).", "rad/s")
+    ixx: float | None = _number(lambda o, s: float(o.body.inertia[0, 0]),
+        "Inertia tensor about the centre of mass, in {C}, divided by its trace; independent of the order of the axes.")
+    iyy: float | None = _number(lambda o, s: float(o.body.inertia[1, 1]), "See ixx.")
+    izz: float | None = _number(lambda o, s: float(o.body.inertia[2, 2]), "See ixx.")
+    ixy: float | None = _number(lambda o, s: float(o.body.inertia[0, 1]), "See ixx.")
+    ixz: float | None = _number(lambda o, s: float(o.body.inertia[0, 2]), "See ixx.")
+    iyz: float | None = _number(lambda o, s: float(o.body.inertia[1, 2]), "See ixx.")
+    inertia_1s: float | None = _number(lambda o, s: float(o.body.inertia_1s.max()),
+        "Largest standard deviation of an entry of that tensor.")
+    moment_small: float | None = _number(lambda o, s: float(o.body.moments[0]),
+        "Smallest principal moment of inertia, divided by the sum of the three.")
+    moment_middle: float | None = _number(lambda o, s: float(o.body.moments[1]), "See moment_small.")
+    moment_large: float | None = _number(lambda o, s: float(o.body.moments[2]), "See moment_small.")
+    moments_1s: float | None = _number(lambda o, s: float(o.body.moments_1s.max()),
+        "Largest standard deviation of the three moments.")
 
     pos_err_m: float | None = _error_m(_ESTIMATE[0], "Distance of the estimated from the true position.", table=True)
     rot_err_deg: float | None = _error_deg(_ESTIMATE[1], "Angle between estimated and true attitude.", table=True)

@@ -128,6 +128,11 @@ def _axes(M: Array, near: Array) -> Array:
     return out
 
 
+def inertia_matrices(y: Array) -> Array:
+    """Traceless symmetric matrices (n, 3, 3) of the chart's inertia steps (n, 5)."""
+    return np.asarray(np.tensordot(y, _BASIS, 1))
+
+
 def to_chart(x: State) -> Chart:
     """Chart coordinates of a state; |sigma| must be below 1."""
     R_bc = geometry.matrix(x.q_bc)
