@@ -1,0 +1,127 @@
+"""Scans as the reconstruction uses them: thinned, with normals, weights and the place of the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Scan
+
+NEIGHBOURS = 12  # nearest points from which a normal is estimated
+ISOLATED = 4.0  # a point is isolated if its fourth neighbour is farther than this many times the median
+FAR_OF_EXTENT = 0.6  # a scan whose centroid is farther than this from the origin of {A} was taken from the origin
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanView:
+    """A scan thinned for registration.
+
+    Attributes:
+        t_ns: instant.  camera: (3,) position of the camera in {A} [m].
+        points: (n, 3) thinned points in {A} [m].  normals: (n, 3) unit normals toward the camera.
+        weight: (n,) cosine of the inclination to the line of sight: grazing points are the least accurate.
+        full: (m, 3) all points in {A} [m].
+    """
+
+    t_ns: int
+    camera: Array
+    points: Array
+    normals: Array
+    weight: Array
+    full: NDArray[np.float32]
+
+
+def thinned_views(scans: Sequence[Scan], size_m: float) -> list[ScanView]:
+    """The scans without isolated points, thinned to voxels of the given size, with normals and weights."""
+    clouds = [_connected(np.asarray(scan.points, dtype=np.float64)) for scan in scans]
+    camera = _camera(clouds)
+    views = []
+    for scan, full in zip(scans, clouds, strict=True):
+        points = thinned(full, size_m)
+        normals, lines = normals_of(points, full, camera), camera - points
+        weight = np.einsum("ni,ni->n", normals, lines) / np.linalg.norm(lines, axis=1)
+        views.append(ScanView(scan.t_ns, camera, points, normals, weight, full.astype(np.float32)))
+    return views
+
+
+def _connected(points: Array) -> Array:
+    """The points without isolated ones: the fourth neighbour is farther away than ISOLATED times the median."""
+    distance = np.asarray(cKDTree(points).query(points, k=5)[0])[:, 4]
+    return np.asarray(points[distance < ISOLATED * np.median(distance)])
+
+
+def _camera(clouds: Sequence[Array]) -> Array:
+    """Position of the camera in {A} [m]: the origin, unless the scans surround it or lie close to it.
+
+    Scans that were moved toward the origin do not show where the camera was, only that it is the same place for all
+    of them. It is then taken as far away along one line of sight: a surface is sampled in proportion to the cosine of
+    its inclination to that line, so the mean square of the cosine is largest along it. Of the two ends of the line the
+    one is chosen from which the surfaces are convex on average, because a camera sees the outside of the target.
+    """
+    extents = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in clouds]
+    distances = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds]
+    if np.median(distances) > FAR_OF_EXTENT * np.median(extents):
+        return np.zeros(3)
+    scatter, sides = np.zeros((3, 3)), []
+    for points, extent in zip(clouds, extents, strict=True):
+        thin = thinned(points, extent / 40.0)
+        normals = normals_of(thin, points, points.mean(axis=0))
+        scatter += normals.T @ normals
+        sides.append((thin - points.mean(axis=0), normals))
+    towards = np.linalg.eigh(scatter)[1][:, 2]
+    bulge = sum(float(np.einsum("ni,ni->", n * np.sign(n @ towards)[:, None], p)) for p, n in sides)
+    return np.asarray(np.copysign(100.0 * max(extents), bulge) * towards)
+
+
+def thinned(points: Array, size_m: float) -> Array:
+    """The point nearest to the mean of each voxel: a measured point, because a mean lies inside a curved surface."""
+    _, inverse = np.unique(np.floor(points / size_m).astype(np.int64), axis=0, return_inverse=True)
+    cell = inverse.ravel()
+    off = np.linalg.norm(points - means(points, cell)[cell], axis=1)
+    order = np.lexsort((np.arange(len(points)), off, cell))
+    first = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    return np.asarray(points[order[first]])
+
+
+def means(values: Array, cell: NDArray[np.intp]) -> Array:
+    """Mean (m, k) of the rows of ``values`` (n, k) that share a cell."""
+    count = np.bincount(cell)
+    return np.stack([np.bincount(cell, column) / count for column in values.T], axis=1)
+
+
+def normals_of(points: Array, full: Array, camera: Array) -> Array:
+    """Unit normals (n, 3) toward the camera: smallest principal direction of the nearest points of the whole scan."""
+    _, index = cKDTree(full).query(points, k=min(NEIGHBOURS, len(full)))
+    near = full[index] - full[index].mean(axis=1, keepdims=True)
+    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
+    normals = vectors[:, :, 0]
+    away = np.einsum("ni,ni->n", normals, points - camera) > 0.0
+    normals[away] *= -1.0
+    return np.asarray(normals)
+
+
+def sight_lines(views: Sequence[ScanView], T_ca: Sequence[Pose]) -> Array:
+    """(n, 3) unit vectors in {C} from the scanned surface to the camera."""
+    lines = [T.R @ (v.camera - v.points.mean(axis=0)) for v, T in zip(views, T_ca, strict=True)]
+    return np.array([line / np.linalg.norm(line) for line in lines])
+
+
+def turn(a: Pose, b: Pose) -> float:
+    """Angle between two attitudes [rad]."""
+    return float(geometry.angle(geometry.multiply(geometry.conjugate(a.q), b.q)))
+
+
+def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float) -> Array:
+    """How far the surface that was measured in the direction of each point p lies behind it [m]; 0 where none was."""
+    rays, own = measured - camera, p - camera
+    far, r = np.linalg.norm(rays, axis=1), np.linalg.norm(own, axis=1)
+    distances, nearest = cKDTree(rays / far[:, None]).query(own / r[:, None], k=3)
+    d, index = np.asarray(distances), np.asarray(nearest)
+    hit = d[:, 2] < spacing_m / r
+    return np.where(hit, far[index].min(axis=1) - r, 0.0)
