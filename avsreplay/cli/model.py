@@ -77,7 +77,7 @@ def _text(made: Reconstruction, found: Deviations | None) -> str:
     lines = [
         f"scans used:     {made.used} of {made.offered}, {made.searches} of them needed a search",
         f"surface:        {said['points']} points, median 1 sigma {1e3 * said['median_one_sigma_m']:.2f} mm",
-        f"seen from:      {100.0 * made.coverage:.0f} % of all directions; the target turned by {made.turn_deg:.0f} deg",
+        f"seen from:      {100.0 * made.coverage:.0f} % of all directions; the target turned {made.turn_deg:.0f} deg",
         f"consistency:    {1e3 * made.rms_m:.2f} mm rms between overlapping scans",
     ]
     if found:

@@ -27,6 +27,8 @@ from avsreplay.records import Scan, Surface
 
 __all__ = ["Deviations", "Reconstruction", "ReconstructionParams", "deviations", "ply_bytes", "reconstruct"]
 
+WEAKEST = 1e-3  # below this ratio of the eigenvalues of a registration, a surface does not determine the pose
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
@@ -98,13 +100,12 @@ def reconstruct(scans: Iterable[Scan], params: ReconstructionParams | None = Non
     )
 
 
-def _refuse_still(turn: float, weakest: Sequence[float]) -> None:
-    if float(np.median(weakest)) < 1e-5:
-        raise UnreadableInput("the surface does not determine the attitude (a sphere or a plane)", hint="give a model")
-    if turn < np.radians(5.0):
-        raise UnreadableInput(
-            f"the target turned by {np.degrees(turn):.1f} deg only", hint="a model needs several sides"
-        )
+def _refuse_still(turned: float, weakest: Sequence[float]) -> None:
+    if turned < np.radians(5.0):
+        what = f"the scans show a turn of {np.degrees(turned):.1f} deg only"
+        known = float(np.median(weakest)) > WEAKEST
+        why = "the target is at rest" if known else "its surface does not determine its attitude, as that of a sphere"
+        raise UnreadableInput(f"{what}: {why}", hint="a model needs scans of several sides")
 
 
 def _notes(used: int, offered: int, coverage: float) -> tuple[str, ...]:
