@@ -111,6 +111,11 @@ def parse_pose(text: str) -> Pose:
     return Pose(values[3:], values[:3])  # type: ignore[arg-type]
 
 
+def pose_text(pose: Pose) -> str:
+    """The text that ``parse_pose`` reads as this pose."""
+    return ",".join(repr(float(v)) for v in (*pose.t, *pose.q))
+
+
 def load_config(file: Path | None, log_table: Mapping[str, Any], assignments: Sequence[str]) -> RunConfig:
     """Return the effective configuration.
 

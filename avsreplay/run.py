@@ -14,7 +14,7 @@ from typing import Any
 
 from avsreplay import pipeline, settings
 from avsreplay.build import first_state, stages
-from avsreplay.config import Against, RunConfig, load_config
+from avsreplay.config import Against, RunConfig, load_config, pose_text
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.params import EstimatorParams
@@ -23,12 +23,14 @@ from avsreplay.log import Source, SourceOptions, open_source
 from avsreplay.log.cloud_stream import ahead
 from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
-from avsreplay.records import Belief, Scan, ScanStatus, State, Surface, Truth
+from avsreplay.reconstruct import Reconstruction, at_grasp, reconstruct, surface_of
+from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.register import ModelCheck, Registrar
 from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
 from avsreplay.score import Scorer, matched_truth
 
+RECONSTRUCTED = Path("auto")  # the model that is built from the log itself
 MOST_LOSSES = 100  # listed one by one in run.json
 
 
@@ -112,10 +114,14 @@ class Run:
             MissingBackend: the back end is not installed.
         """
         self.job = job
-        self.source: Source = open_source(job.source, job.options)
+        unknown = job.options.model == RECONSTRUCTED
+        self.source: Source = open_source(job.source, replace(job.options, model=None) if unknown else job.options)
+        self._made: Reconstruction | None = None
         try:
-            header = self.source.header
+            header = self.header = self._without_model() if unknown else self.source.header
             self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
+            if self._made is not None and self.config.init == "log" and self._made.poses[0][0] == self._first_ns:
+                self.config = replace(self.config, init=pose_text(self._made.poses[0][1]))
             self.surface: Surface = self._model()
             self.registrar = Registrar(self.surface, self.config.register)
             self.model_check = ModelCheck(self.registrar, self.surface)
@@ -190,7 +196,7 @@ class Run:
     @property
     def truth(self) -> State | None:
         """True state at the last scan that has one, its principal axes in the order of the estimate's."""
-        return self.source.header.truth if self._end is None else matched_truth(*self._end)
+        return self.header.truth if self._end is None else matched_truth(*self._end)
 
     def summary(self) -> Summary:
         """Summarise the rows taken so far."""
@@ -213,7 +219,7 @@ class Run:
         }
 
     def _new_stages(self) -> Stages:
-        return stages(self.config, self.source.header, self.surface, self.registrar, self.source.truth_of)
+        return stages(self.config, self.header, self.surface, self.registrar, self._true)
 
     def _outcomes(self, ready: Stages, progress: Progress | None, what: str) -> Iterator[tuple[PipelineState, Outcome]]:
         """The pipeline over the scans, which are decoded ahead on a thread that ends with this generator."""
@@ -227,6 +233,8 @@ class Run:
     def _scorer(self) -> Scorer:
         """Against the truth of the log, or against the reference within its span."""
         reference, poses = self._reference, self.source.truth_poses()
+        if self._made is not None:
+            poses = [] if self._T_cr is None else [(t_ns, pose @ self._T_cr) for t_ns, pose in poses]
         if reference is not None:
             inside = [t for t in self._reference_instants if reference.epoch_ns <= t <= reference.end_ns]
             poses = [(t_ns, reference.at(t_ns).T_ac) for t_ns in inside]
@@ -234,7 +242,7 @@ class Run:
 
     def _truth_of(self, scan: Scan) -> Truth:
         """The truth at a scan; where a reference is asked for, that in place of the true pose."""
-        truth = self.source.truth_of(scan)
+        truth = self._true(scan)
         if self._reference is None:
             return truth
         try:
@@ -243,8 +251,27 @@ class Run:
             pose = None
         return replace(truth, pose=pose, state=None)
 
+    def _without_model(self) -> LogHeader:
+        """Reconstruct the model; start and true state of the log refer to another frame {C} and are dropped."""
+        scans = list(self.source.scans())
+        self._first_ns = scans[0].t_ns if scans else 0
+        self._made = at_grasp(reconstruct(scans))
+        true = {scan.t_ns: self.source.truth_of(scan).pose for scan in scans}
+        known = ((true[t_ns], T_ac) for t_ns, T_ac in self._made.poses)
+        # true {C} to reconstructed {C}: the two coincide, by definition, at the first scan that has both
+        self._T_cr = next((truth.inverse() @ T_ac for truth, T_ac in known if truth is not None), None)
+        return replace(self.source.header, surface=surface_of(self._made), start=None, truth=None)
+
+    def _true(self, scan: Scan) -> Truth:
+        """The truth of the log; with a reconstructed model its pose, as that of the reconstructed frame."""
+        truth = self.source.truth_of(scan)
+        if self._made is None:
+            return truth
+        pose = None if truth.pose is None or self._T_cr is None else truth.pose @ self._T_cr
+        return replace(truth, pose=pose, state=None)
+
     def _model(self) -> Surface:
-        surface = self.source.header.surface
+        surface = self.header.surface
         if surface is None:
             raise UsageError("the log holds no model", where=str(self.job.source), hint="name one with --model FILE")
         return surface

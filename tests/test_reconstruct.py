@@ -9,10 +9,10 @@ import pytest
 from scipy.spatial import ConvexHull, cKDTree
 
 from avsreplay import geometry
-from avsreplay.errors import UnreadableInput
+from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
-from avsreplay.reconstruct import reconstruct
+from avsreplay.reconstruct import at_grasp, reconstruct
 from avsreplay.records import Scan
 
 CORNERS = np.random.default_rng(11).normal(size=(14, 3)) * [0.5, 0.35, 0.25]
@@ -62,6 +62,7 @@ def full_turn():
     return scans, truth, reconstruct(scans)
 
 
+@pytest.mark.slow
 def test_every_scan_of_a_full_turn_is_used_and_the_turn_closes(full_turn):
     _, truth, made = full_turn
     assert made.used == 25
@@ -71,6 +72,7 @@ def test_every_scan_of_a_full_turn_is_used_and_the_turn_closes(full_turn):
     assert abs(errors(made, truth)[-1, 0]) < 0.5  # one full turn: the last pose is the first again
 
 
+@pytest.mark.slow
 def test_points_lie_on_the_body_and_normals_point_outward(full_turn):
     _, truth, made = full_turn
     _, first = made.poses[0]
@@ -133,6 +135,7 @@ def test_too_few_scans_are_refused():
         reconstruct(scans)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_model_that_run_accepts(cli, fixtures_folder, tmp_path):
     done = cli("model", fixtures_folder / "tumble.mcap", "-o", tmp_path / "m.ply", "--json")
     assert done.code == 0, done.err
@@ -151,3 +154,29 @@ def test_the_dragon_is_rebuilt_from_fifteen_scans(shared_data):
         made = reconstruct(source.scans())
     assert made.used == 15
     assert made.rms_m < 0.4e-3
+
+
+@pytest.mark.slow
+def test_run_replays_a_log_against_the_model_that_it_builds_itself(cli, fixtures_folder):
+    done = cli("run", fixtures_folder / "tumble.mcap", "--model", "auto", "--json")
+    assert done.code == 0, done.err
+    rows = json.loads(done.out)["rows"]
+    healthy = [r for r in rows if r["gamma"] == 1]
+    assert len(healthy) >= 25
+    assert all(r["gamma"] == 0 for r in rows if r["fault"] == "occlusion")
+    assert np.sqrt(np.mean([r["pos_err_m"] ** 2 for r in healthy])) < 0.02  # relative to the first scan, 5 m target
+    assert all(r["nees"] is None for r in rows)  # the true state refers to another frame
+
+
+@pytest.mark.slow
+def test_the_frame_is_moved_to_a_grasp_point_with_x_along_the_normal(full_turn):
+    _, _, made = full_turn
+    at = at_grasp(made)
+    near = np.linalg.norm(at.points, axis=1) < 0.03
+    assert near.sum() > 3
+    assert at.normals[near].mean(axis=0)[0] > 0.97
+    (_, before), (_, after) = made.poses[7], at.poses[7]
+    moved = before.inverse() @ after
+    np.testing.assert_allclose(moved.apply(at.points), made.points, atol=1e-9)
+    with pytest.raises(UsageError, match="from the surface"):
+        at_grasp(made, np.array([9.0, 0.0, 0.0]))

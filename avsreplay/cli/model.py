@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, output_is_free, read_options, source_options
+from avsreplay.cli.options import PATH, Numbers, read_options, source_options
 from avsreplay.cli.progress import tracked
 
 if TYPE_CHECKING:
@@ -26,25 +26,43 @@ Examples:
 @click.argument("log", type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, help="The model to write (.ply): points with normals.")
 @click.option("--against", type=PATH, help="CAD model to compare the result with; the points are coloured by distance.")
+@click.option(
+    "--grasp",
+    type=Numbers(3),
+    metavar="X,Y,Z",
+    help="Grasp point in the frame that the same command without this option writes [m]; default: the flattest patch.",
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
 @source_options
-def command(log: Path, output: Path, against: Path | None, overwrite: bool, as_json: bool, **reading: Any) -> None:
+def command(
+    log: Path,
+    output: Path,
+    against: Path | None,
+    grasp: tuple[float, ...] | None,
+    overwrite: bool,
+    as_json: bool,
+    **reading: Any,
+) -> None:
     """Build a model of the target from the scans of LOG, without a model and without an initial guess.
 
-    The result is a point cloud with normals in a frame {C} that is fixed to the target: its axes are those of the
-    camera frame at the first scan, its origin is the centroid of that scan. Ground truth in LOG is not used.
+    The result is a point cloud with normals in a frame {C} that is fixed to the target: its origin is a grasp point
+    on the surface and its x axis the outward normal there. Ground truth in LOG is not used. 'avsreplay run LOG
+    --model auto' builds the model and replays the log against it in one step.
     """
-    from avsreplay.log import open_source, read_surface
-    from avsreplay.reconstruct import deviations, ply_bytes, reconstruct
-    from avsreplay.report.atomic import atomic_path
+    import numpy as np
 
-    output_is_free(output, overwrite=overwrite)
+    from avsreplay.files import check_output, output_path
+    from avsreplay.log import open_source, read_surface
+    from avsreplay.reconstruct import at_grasp, deviations, ply_bytes, reconstruct
+
+    check_output(output, overwrite=overwrite)
     cad = read_surface(against) if against else None
     with open_source(log, read_options(reading)) as source:
-        made = reconstruct(tracked(source.scans(), len(source), "reading"))
+        made = at_grasp(reconstruct(tracked(source.scans(), len(source), "reading")))
+    made = made if grasp is None else at_grasp(made, np.array(grasp))
     found = deviations(made, cad) if cad else None
-    with atomic_path(output) as path:
+    with output_path(output, overwrite=overwrite) as path:
         path.write_bytes(ply_bytes(made, found))
     click.echo(json.dumps(document(made, found), indent=2) if as_json else _text(made, found))
 

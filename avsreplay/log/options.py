@@ -34,7 +34,9 @@ class SourceOptions(Settings):
     truth_gap_s: float = setting(
         1.0, "Widest gap between two true poses that is interpolated across.", unit="s", low=0.0, high=1e6
     )
-    model: Path | None = setting(None, "Model file.", unset="the log's own model")
+    model: Path | None = setting(
+        None, "Model file; 'auto' builds the model from the scans of the log.", unset="the log's own model"
+    )
     cloud_model: bool = setting(False, "The model may be a point cloud without faces.")
     model_scale: float = setting(
         1.0, "Factor from the unit of the model to metres: 0.001 for a model in millimetres.", above=0.0

@@ -7,25 +7,37 @@ see the same side again after a turn (loop closure). (3) Fusion: points and norm
 voxel grid; a voxel through which rays of other scans have passed is removed (free-space carving by vote).
 
 The frame {C} of the model is fixed to the target. Its axes are those of {A} at the first scan that is used, and its
-origin is the centroid of that scan. Ground truth is never read.
+origin is the centroid of that scan, until ``at_grasp`` moves it to a grasp point. Ground truth is never read.
 """
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from avsreplay.errors import UnreadableInput
+from avsreplay import geometry
+from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.fusion import all_poses, directions, fused, refined
 from avsreplay.reconstruct.tracking import ReconstructionParams, track
 from avsreplay.reconstruct.views import thinned_views
 from avsreplay.records import Scan, Surface
 
-__all__ = ["Deviations", "Reconstruction", "ReconstructionParams", "deviations", "ply_bytes", "reconstruct"]
+__all__ = [
+    "Deviations",
+    "Reconstruction",
+    "ReconstructionParams",
+    "at_grasp",
+    "deviations",
+    "ply_bytes",
+    "reconstruct",
+    "surface_of",
+]
 
 WEAKEST = 1e-3  # below this ratio of the eigenvalues of a registration, a surface does not determine the pose
 
@@ -115,6 +127,46 @@ def _notes(used: int, offered: int, coverage: float) -> tuple[str, ...]:
     if coverage < 0.5:
         notes.append(f"the target was seen from {100.0 * coverage:.0f} % of all directions only")
     return tuple(notes)
+
+
+def at_grasp(made: Reconstruction, grasp: Array | None = None) -> Reconstruction:
+    """Move the frame {C} to a grasp point: origin there, x axis along the outward normal of the surface.
+
+    Args:
+        made: the reconstruction.
+        grasp: (3,) in {C} [m]; None chooses the flattest patch: the one whose normals differ least within a radius of
+            4 % of the extent, among patches that enough scans have seen.
+
+    Raises:
+        UsageError: the point is farther from the surface than 5 % of the extent.
+    """
+    extent, tree = float(np.linalg.norm(np.ptp(made.points, axis=0))), cKDTree(made.points)
+    if grasp is None:
+        chosen = np.flatnonzero(made.scans >= np.median(made.scans))[::4]
+        near: list[list[int]] = list(tree.query_ball_point(made.points[chosen], 0.04 * extent))
+        full = np.median([len(k) for k in near])
+        flat = [float(np.linalg.norm(made.normals[k].mean(axis=0))) if len(k) >= full else 0.0 for k in near]
+        grasp = made.points[chosen[int(np.argmax(flat))]]
+    distance, nearest = tree.query(grasp)
+    if distance > 0.05 * extent:
+        hint = "give a point of the reconstructed model, in its frame"
+        raise UsageError(f"the grasp point is {distance:.3f} m from the surface", where="--grasp", hint=hint)
+    index = tree.query_ball_point(made.points[nearest], 0.04 * extent)
+    x = made.normals[index].mean(axis=0)
+    x /= np.linalg.norm(x)
+    y = np.cross([0.0, 0.0, 1.0] if abs(x[2]) < 0.9 else [1.0, 0.0, 0.0], x)
+    y /= np.linalg.norm(y)
+    T_old_new = Pose(geometry.quaternion(np.column_stack([x, y, np.cross(x, y)])), np.asarray(grasp))
+    poses = tuple((t_ns, T_ac @ T_old_new) for t_ns, T_ac in made.poses)
+    inverse = T_old_new.inverse()
+    return replace(made, points=inverse.apply(made.points), normals=made.normals @ inverse.R.T, poses=poses)
+
+
+def surface_of(made: Reconstruction) -> Surface:
+    """The reconstruction as the model of a replay: a point cloud in {C}."""
+    data = ply_bytes(made)
+    none = np.zeros((0, 3), dtype=np.int32)
+    return Surface(made.points, none, "reconstructed.ply", hashlib.sha256(data).hexdigest(), data)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
