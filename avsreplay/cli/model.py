@@ -19,7 +19,7 @@ Examples:
   avsreplay model tumble.mcap -o model.ply
   avsreplay model scans/ -o model.ply --every-scan 2
   avsreplay model tumble.mcap -o model.ply --against cad.obj    deviations from a CAD model
-  avsreplay run tumble.mcap --model model.ply --cloud-model     replay against the result"""
+  avsreplay run tumble.mcap --model auto                        build the model and replay against it"""
 
 
 @click.command("model", epilog=EPILOG)

@@ -15,6 +15,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -143,7 +144,7 @@ def at_grasp(made: Reconstruction, grasp: Array | None = None) -> Reconstruction
     extent, tree = float(np.linalg.norm(np.ptp(made.points, axis=0))), cKDTree(made.points)
     if grasp is None:
         chosen = np.flatnonzero(made.scans >= np.median(made.scans))[::4]
-        near: list[list[int]] = list(tree.query_ball_point(made.points[chosen], 0.04 * extent))
+        near: Any = tree.query_ball_point(made.points[chosen], 0.04 * extent)
         full = np.median([len(k) for k in near])
         flat = [float(np.linalg.norm(made.normals[k].mean(axis=0))) if len(k) >= full else 0.0 for k in near]
         grasp = made.points[chosen[int(np.argmax(flat))]]
