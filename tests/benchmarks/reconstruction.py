@@ -70,7 +70,8 @@ def report(log: Path, options: SourceOptions) -> None:
     rms = np.sqrt(np.mean(errors**2, axis=0))
     print(
         f"{log.name}: {made.used} of {made.offered} scans, {made.searches} searches, pose rms {1e3 * rms[0]:.2f} mm "
-        f"{rms[1]:.3f} deg, surface median {1e3 * np.median(surface_m):.2f} mm, 95 % {1e3 * np.quantile(surface_m, 0.95):.2f} mm, "
+        f"{rms[1]:.3f} deg, surface median {1e3 * np.median(surface_m):.2f} mm, "
+        f"95 % {1e3 * np.quantile(surface_m, 0.95):.2f} mm, "
         f"coverage {100 * made.coverage:.0f} %, {spent:.1f} s"
     )
 
