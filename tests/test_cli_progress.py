@@ -49,3 +49,27 @@ def test_a_closed_pipe_is_not_a_failed_check(fixtures_folder):
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
     assert done.returncode == 141, done.stderr
     assert "Traceback" not in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
+def test_a_log_goes_through_a_pipe(fixtures_folder, tmp_path, cli):
+    program, log = f"{sys.executable} -m avsreplay", fixtures_folder / "tumble.mcap"
+    pipe = f"{program} record {log} -o - --n-scans 6 | {program} run - -o {tmp_path / 'piped'}"
+    done = subprocess.run(["bash", "-c", f"set -o pipefail; {pipe}"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "-: 6 scans" in done.stderr
+    assert cli("record", log, "-o", tmp_path / "log.mcap", "--n-scans", 6).code == 0
+    assert cli("run", tmp_path / "log.mcap", "-o", tmp_path / "direct").code == 0
+    piped, direct = ((tmp_path / name / "rows.jsonl").read_bytes() for name in ("piped", "direct"))
+    assert piped == direct
+
+
+def test_a_terminal_gets_no_binary_log(monkeypatch):
+    from pathlib import Path
+
+    from avsreplay.cli.options import output_file
+    from avsreplay.errors import UsageError
+
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    with pytest.raises(UsageError, match="binary"), output_file(Path("-")):
+        pass

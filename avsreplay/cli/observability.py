@@ -122,13 +122,15 @@ def _noise(row: Row) -> Array | None:
 def _print(found: dict[str, Any]) -> None:
     from avsreplay.report.table import Table, make_console, print_line, print_table
 
-    title = f"Observability Gramian, {found['healthy_scans']} scans: rank, log10 of its condition raw and scaled"
+    motion = f"along one motion fitted to {found['healthy_scans']} scans"
+    title = f"Observability Gramian {motion}: rank, log10 of its condition raw and scaled"
     heads = [head for name in HEADS.values() for head in (f"{name}\nrank", "\nraw", "\nscaled")]
     rows = tuple(
         (f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name]))) for line in found["lines"]
     )
     console = make_console(plain_width=WIDTH)
-    print_table(console, Table(title, ("t\n[s]", *heads), rows, align="r"))
+    note = "'run' sums the Gramian along the estimates available at each scan, so that its values differ from these"
+    print_table(console, Table(title, ("t\n[s]", *heads), rows, align="r", note=note))
     for name, words in found["weakest"].items():
         if words:
             print_line(console, f"weakest, {HEADS[name]}: " + "; ".join(words))

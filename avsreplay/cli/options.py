@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -102,3 +106,36 @@ def load(path: Path) -> Result:
     for line in result.warnings:
         click.echo(f"avsreplay: warning: {line}", err=True)
     return result
+
+
+@contextmanager
+def log_file(log: Path) -> Iterator[Path]:
+    """Yield the log; for "-" a temporary file with all bytes of standard input."""
+    if str(log) != "-":
+        yield log
+        return
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "stdin"
+        with path.open("wb") as file:
+            shutil.copyfileobj(sys.stdin.buffer, file)
+        yield path
+
+
+@contextmanager
+def output_file(output: Path) -> Iterator[Path]:
+    """Yield the path to write to; for "-" a temporary file that goes to standard output after the block.
+
+    Raises:
+        UsageError: standard output is a terminal.
+    """
+    if str(output) != "-":
+        yield output
+        return
+    if sys.stdout.isatty():
+        raise UsageError("a log is binary", where="-o -", hint="redirect the output to a file or a pipe")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "stdout.mcap"
+        yield path
+        with path.open("rb") as file:
+            shutil.copyfileobj(file, sys.stdout.buffer)
+        sys.stdout.buffer.flush()

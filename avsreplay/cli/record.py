@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, read_options, source_options
+from avsreplay.cli.options import PATH, output_file, read_options, source_options
 from avsreplay.cli.progress import tracked
 from avsreplay.cli.setting_options import source_setting
 from avsreplay.errors import DataLost
@@ -31,7 +31,7 @@ Examples:
 
 @click.command("record", epilog=EPILOG)
 @click.argument("source", required=False, type=PATH)
-@click.option("-o", "--output", required=True, type=PATH, help="The log to write (.mcap).")
+@click.option("-o", "--output", required=True, type=PATH, help="The log to write (.mcap); - is standard output.")
 @click.option("--seed", type=click.IntRange(0), help="Seed of a simulation, over the scenario's own.")
 @source_setting("--start", "start_s", type=float)
 @source_options
@@ -58,8 +58,11 @@ def command(
     from avsreplay.record import RecordOptions, record
 
     options = RecordOptions(model=model, cloud_model=bool(cloud_model), overwrite=overwrite, compression=compression)
-    done = record(source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
-    click.echo(json.dumps(dataclasses.asdict(done), indent=2) if as_json else _sentence(done))
+    with output_file(output) as path:
+        done = record(source, path, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
+    done = dataclasses.replace(done, path=str(output))
+    text = json.dumps(dataclasses.asdict(done), indent=2) if as_json else _sentence(done)
+    click.echo(text, err=str(output) == "-")
     if done.losses or done.damaged:
         lost = f"{len(done.losses)} damaged places, {done.damaged} messages that could not be decoded were left out"
         raise DataLost(lost, where=str(source), hint="see 'avsreplay doctor'")

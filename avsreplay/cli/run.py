@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, read_options, source_options
+from avsreplay.cli.options import PATH, log_file, read_options, source_options
 from avsreplay.cli.setting_options import run_settings, take_run_settings
 from avsreplay.errors import CheckFailed, DataLost, UsageError
 from avsreplay.files import check_output
@@ -30,6 +30,7 @@ EPILOG = """\b
 Examples:
   avsreplay run tumble.mcap
   avsreplay run y.mcap --model m.ply --topic /points --truth-topic /truth/pose --init truth -o results/
+  avsreplay record scenario.toml -o - | avsreplay run -
   avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
   avsreplay run tumble.mcap --set faults.policy=all --set plan.a_max_mps2=0.02 --json
 
@@ -84,7 +85,8 @@ class _Start(click.ParamType[str | float]):
 def command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
-    LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs no option.
+    LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs no option. With - as
+    LOG the log is read from standard input to its end, and then replayed.
     """
     from avsreplay.result_dir import ResultDirectory
     from avsreplay.run import Run
@@ -92,7 +94,7 @@ def command(log: Path, **flags: Any) -> None:
     wanted = Wanted(**{field.name: flags.pop(field.name) for field in fields(Wanted)})
     wanted.check()
     target = ResultDirectory(wanted.output, overwrite=wanted.overwrite) if wanted.output else None
-    with Run(_job(log, flags)) as run:
+    with log_file(log) as path, Run(_job(path, flags)) as run:
         advice = _checked(run)
         done = _replayed(run, advice, target, wanted.to_rerun)
         _print(wanted, done)
