@@ -1,5 +1,7 @@
 """The true motion against DOP853, its conserved quantities, and the paper's ratio form of the same dynamics."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -153,3 +155,50 @@ def test_disturbed_motion_is_continuous_and_repeats():
 def test_wrong_motions_are_refused_by_name(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         MotionParams(**wrong)
+
+
+def _clohessy_wiltshire(n, t, r, v):
+    """Closed form in the rotating frame: x radial, y along-track, z along the normal; (3,) each."""
+    c, s = np.cos(n * t), np.sin(n * t)
+    x, y, z = r
+    vx, vy, vz = v
+    return np.array(
+        [
+            (4 - 3 * c) * x + s / n * vx + 2 / n * (1 - c) * vy,
+            6 * (s - n * t) * x + y - 2 / n * (1 - c) * vx + (4 * s - 3 * n * t) / n * vy,
+            c * z + s / n * vz,
+        ]
+    )
+
+
+@pytest.mark.parametrize("n", [0.00113, 0.02])
+def test_the_relative_orbit_is_that_of_clohessy_and_wiltshire(n):
+    """In the inertial axes of {A}, against the closed form in rotating axes, over 600 s."""
+    radial, normal = np.array([0.6, 0.0, 0.8]), np.array([0.0, -1.0, 0.0])
+    along = np.cross(normal, radial)
+    r0, v0 = np.array(PARAMS.position_m), np.array(PARAMS.velocity_mps)
+    params = replace(PARAMS, orbit_rate_radps=n, radial_a=tuple(radial), orbit_normal_a=tuple(normal))
+    path = Motion(BODY, params, 600.0, rng())
+    axes = np.stack([radial, along, normal])
+    v_rotating = axes @ (v0 - n * np.cross(normal, r0))
+    times = np.linspace(0.0, 600.0, 61)
+    _, _, centre, velocity = path.states(times)
+    for t, r in zip(times, centre, strict=True):
+        c, s = np.cos(n * t), np.sin(n * t)
+        now = np.stack([c * radial + s * along, -s * radial + c * along, normal])
+        expected = _clohessy_wiltshire(n, t, axes @ r0, v_rotating) @ now
+        assert_allclose(r, expected, atol=1e-9 * max(1.0, np.abs(expected).max()))
+    numeric = (path.states(times[1:-1] + 1e-3)[2] - path.states(times[1:-1] - 1e-3)[2]) / 2e-3
+    assert_allclose(velocity[1:-1], numeric, atol=1e-5 * np.abs(velocity).max())
+    free = Motion(BODY, PARAMS, 600.0, rng()).states([600.0])[2][0]
+    assert np.linalg.norm(free - centre[-1]) > 0.5  # the approximation of free motion is off by that
+
+
+def test_an_orbit_does_not_change_the_attitude():
+    moving = Motion(BODY, replace(PARAMS, orbit_rate_radps=0.00113), SPAN, rng())
+    assert_allclose(moving.states(TIMES)[0], Motion(BODY, PARAMS, SPAN, rng()).states(TIMES)[0], atol=1e-12)
+
+
+def test_axes_of_an_orbit_must_be_orthonormal():
+    with pytest.raises(ValueError, match="right angles"):
+        replace(PARAMS, radial_a=(1.0, 0.0, 0.0), orbit_normal_a=(0.8, 0.6, 0.0))

@@ -1,10 +1,12 @@
 """The true motion of a rigid body, integrated with its full inertia tensor in the axes of {C} (not with sigma).
 
     I dw/dt = -w x (I w) + torque,   dq/dt = 1/2 q o [w; 0]   (Hamilton product, w in body axes)
+    d2r/dt2 = force + gravity gradient of the camera's orbit, where there is one
 
-The right-hand sides are quadratic, so the Taylor coefficients of the solution follow by recurrence. A step covers at
-most 0.25 rad with 22 terms (truncation error below 1e-13); the polynomial is also the dense output. The arithmetic uses
-Python floats only, so the result has the same bits on any machine.
+The right-hand sides are quadratic, or linear with known coefficients, so the Taylor coefficients of the solution follow
+by recurrence. A step covers at most 0.25 rad with 22 terms (truncation error below 1e-13); the polynomial is also the
+dense output. The arithmetic uses Python floats only: the same bits on any machine, except for the sine
+and cosine of the orbit.
 """
 
 from __future__ import annotations
@@ -44,6 +46,18 @@ class MotionParams(Settings):
     velocity_mps: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0), "Initial velocity of the mass centre in {A}.", unit="m/s"
     )
+    orbit_rate_radps: float = setting(
+        0.0,
+        "Mean motion of the camera's circular orbit, whose gravity gradient acts on the relative motion"
+        " (Clohessy-Wiltshire); 0: none.",
+        unit="rad/s",
+        low=0.0,
+        high=0.1,
+    )
+    radial_a: tuple[float, float, float] = setting(
+        (1.0, 0.0, 0.0), "Unit vector from the centre of the Earth to the camera in {A}, at the start."
+    )
+    orbit_normal_a: tuple[float, float, float] = setting((0.0, 1.0, 0.0), "Unit normal of the orbit in {A}.")
     torque_std_radps2: float = setting(
         0.0,
         "1 sigma of the disturbance torque over the trace of the inertia, each axis of {C}.",
@@ -59,6 +73,10 @@ class MotionParams(Settings):
         """Raise ValueError where the attitude is not a unit quaternion."""
         if not math.isclose(math.hypot(*self.attitude_xyzw), 1.0, abs_tol=1e-3):
             raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
+        radial, normal = self.radial_a, self.orbit_normal_a
+        units = [math.isclose(math.hypot(*axis), 1.0, abs_tol=1e-6) for axis in (radial, normal)]
+        if not all(units) or abs(sum(a * b for a, b in zip(radial, normal, strict=True))) > 1e-6:
+            raise ValueError("radial_a and orbit_normal_a must be unit vectors at right angles to each other")
 
 
 class Motion:
@@ -132,7 +150,9 @@ def _integrate(body: Body, params: MotionParams, span_s: float, rng: np.random.G
         while t < until:
             momentum = math.sqrt(sum(x * x for x in _times(inertia, now.w)))
             end = min(until, t + STEP_RAD * least / momentum) if momentum > 0.0 else until
-            terms = _terms(now, inertia, torque, force)
+            if params.orbit_rate_radps > 0.0:
+                end = min(end, t + STEP_RAD / params.orbit_rate_radps)
+            terms = _terms(now, inertia, torque, _translation(now, params, t, force))
             starts.append(t)
             table.append(terms)
             now, t = _at_end(terms, end - t), end
@@ -152,13 +172,57 @@ def _windows(
         yield k * params.disturbance_step_s, (k + 1) * params.disturbance_step_s, torque, force
 
 
-def _terms(now: _Instant, inertia: Rows, torque: Vector, force: Vector) -> list[Vector]:
+def _terms(
+    now: _Instant, inertia: Rows, torque: Vector, translation: tuple[list[Vector], list[Vector]]
+) -> list[Vector]:
     """Taylor coefficients about ``now``, ORDER + 1 rows of 13."""
-    zero = (0.0, 0.0, 0.0)
-    centre = [now.r, now.v, tuple(0.5 * f for f in force)] + [zero] * (ORDER - 2)
-    velocity = [now.v, force] + [zero] * (ORDER - 1)
     turning = _turning(now, inertia, _inverse(inertia), torque)
-    return [(*q, *w, *r, *v) for (q, w), r, v in zip(turning, centre, velocity, strict=True)]
+    return [(*q, *w, *r, *v) for (q, w), r, v in zip(turning, *translation, strict=True)]
+
+
+def _translation(now: _Instant, params: MotionParams, t: float, force: Vector) -> tuple[list[Vector], list[Vector]]:
+    """Taylor coefficients of mass centre and velocity about the time t [s].
+
+    The axes of {A} are inertial. With the mean motion n and the radial unit vector o(t) the relative acceleration is
+    that of Clohessy and Wiltshire, n^2 (3 o o' - 1) r, to first order in the distance.
+    """
+    zero = (0.0, 0.0, 0.0)
+    if params.orbit_rate_radps == 0.0:
+        centre = [now.r, now.v, tuple(0.5 * f for f in force)] + [zero] * (ORDER - 2)
+        return centre, [now.v, force] + [zero] * (ORDER - 1)
+    gradients = _gravity_gradient(params, t)
+    centre, velocity = [now.r], [now.v]
+    for k in range(ORDER):
+        rates = list(force) if k == 0 else [0.0, 0.0, 0.0]
+        for i in range(k + 1):
+            rates = [a + b for a, b in zip(rates, _times(gradients[i], centre[k - i]), strict=True)]
+        centre.append(tuple(x / (k + 1) for x in velocity[k]))
+        velocity.append(tuple(x / (k + 1) for x in rates))
+    return centre, velocity
+
+
+def _gravity_gradient(params: MotionParams, t: float) -> list[Rows]:
+    """Taylor coefficients of n^2 (3 o o' - 1) about the time t [s].
+
+    With the radial vector e and the along-track vector f at the time 0, o = e cos(n t) + f sin(n t), so that
+    o o' = (e e' + f f') / 2 + cos(2 n t) (e e' - f f') / 2 + sin(2 n t) (e f' + f e') / 2.
+    """
+    n, e, m = params.orbit_rate_radps, params.radial_a, params.orbit_normal_a
+    f = (m[1] * e[2] - m[2] * e[1], m[2] * e[0] - m[0] * e[2], m[0] * e[1] - m[1] * e[0])
+
+    def entry(i: int, j: int, one: float, c: float, s: float) -> float:
+        dyad = (one + c) * e[i] * e[j] + (one - c) * f[i] * f[j] + s * (e[i] * f[j] + f[i] * e[j])
+        return 1.5 * dyad - (one if i == j else 0.0)
+
+    found: list[Rows] = []
+    scale = 1.0
+    for k in range(ORDER):
+        phase = 2.0 * n * t + 0.5 * math.pi * k
+        c, s = scale * math.cos(phase), scale * math.sin(phase)
+        one = 1.0 if k == 0 else 0.0
+        found.append([[n * n * entry(i, j, one, c, s) for j in range(3)] for i in range(3)])
+        scale *= 2.0 * n / (k + 1)
+    return found
 
 
 def _turning(now: _Instant, inertia: Rows, inverse: Rows, torque: Vector) -> list[tuple[Vector, Vector]]:
