@@ -224,7 +224,7 @@ def fold(stages: Stages, state: PipelineState, scans: Iterable[Scan]) -> Iterato
 def planned_segment(state: PipelineState) -> Segment | None:
     """The flight of the capture plan that was made at the last scan, None where none was made or none is flown."""
     guidance, track = state.guidance, state.track
-    if guidance is None or track is None or guidance.plan is None or guidance.segment.path is None:
+    if guidance is None or track is None or guidance.plan is None or not guidance.segment.capture:
         return None
     return guidance.segment if guidance.plan.t_ns == track.belief.t_ns else None
 

@@ -18,6 +18,7 @@ from avsreplay.plan.rendezvous import PlanParams
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
 THRUST_SHARE = 1.0 - 1e-5  # of a_max that is planned with; the rest corrects the terminal errors
 RESERVE = 3.0  # margin at the checked instants in units of the buffer, for the instants between them
+FAR = 2e4  # a constraint with a larger margin at the reference, in units of the buffer, is left out of the programme
 LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight
 
 
@@ -125,6 +126,7 @@ class _RowMaker:
         s = instants(n)
         times = case.wait_s + reference.t * s
         self.limits, self.scene = case.limits, case.scene
+        self.far_m = FAR * case.buffer_m
         self.rho, self.R = case.sampled.at(times)
         drho, dR = case.sampled.at(times, 1)
         self.y = np.einsum("nij,ni->nj", self.R, reference.r - self.rho)
@@ -149,7 +151,7 @@ class _RowMaker:
         planes: list[PointRows] = []
         cones: list[tuple[int, PointRows]] = []
         limits, y, inside = self.limits, self.y, self.found.inside
-        on = np.isfinite(self.found.values) & self.near[:, None]
+        on = (self.found.values < self.far_m) & self.near[:, None]
         distance = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
         for i, degrees, length in (
             (0, limits.cone_deg, limits.cone_range_m),

@@ -14,8 +14,8 @@ from avsreplay.record import record
 SCENARIO = """\
 name = "blackout-before-capture"
 seed = 1
-duration_s = 75.0
-rate_hz = 3.0
+duration_s = 55.0
+rate_hz = 4.0
 
 [target]
 shape = "satellite"
@@ -28,7 +28,7 @@ velocity_mps = [-0.002, 0.001, 0.001]
 
 [scanner]
 fov_deg = [48.0, 48.0]
-rays = [50, 50]
+rays = [90, 90]
 noise_m = 0.008
 engine = "exact"
 
@@ -41,7 +41,7 @@ duration_s = 12.0
 final_deg = 15.0
 clearance_m = 0.1
 """
-STARTS_S = (32.0, 41.0)
+STARTS_S = (14.0, 24.0)
 HEAD = "| occlusion from | actions | closed at | miss | relative speed | angle |\n|---|---|---|---|---|---|"
 
 

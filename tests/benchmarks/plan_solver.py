@@ -14,7 +14,7 @@ from plan_problems import problems
 from scipy.integrate import solve_ivp
 
 from avsreplay.outcome import PlanStatus
-from avsreplay.plan import CostatePath, Limits, PlanParams, Scene, constrained, path_of, rendezvous
+from avsreplay.plan import CostatePath, PlanParams, rendezvous
 from avsreplay.plan.reachable_set import gauge
 
 ORIGIN = np.zeros(3)
@@ -145,68 +145,6 @@ def versus(compare):
     print(f"  by more than 0.1 s in {np.sum(late > 0.1)}")
 
 
-def turning(rate, phase, arm=1.0, distance=5.0):
-    """A target that turns about y at ``rate``, its fixture's axis along the arm."""
-    centre = np.array([0.0, 0.0, distance])
-
-    def axis(t):
-        return np.stack([np.sin(rate * t + phase), 0 * t, -np.cos(rate * t + phase)], 1)
-
-    def turn(t):
-        return rate * np.stack([np.cos(rate * t + phase), 0 * t, np.sin(rate * t + phase)], 1)
-
-    return Scene(lambda t: (centre + arm * axis(t), arm * turn(t)), axis, lambda t: np.tile(centre, (len(t), 1)))
-
-
-def limited(count):
-    """Constrained plans: time, what sticks out between nodes, and agreement with the free plan where no limit acts."""
-    kinds = {
-        "no limit": Limits(),
-        "speed 0.4 m/s": Limits(speed_max_mps=0.4),
-        "contact 0.03 m/s2": Limits(contact_accel_mps2=0.03),
-        "cone 35 deg": Limits(cone_deg=35.0),
-        "cone 35, last 8 deg": Limits(cone_deg=35.0, final_deg=8.0),
-        "sphere 1.3 m": Limits(keepout_m=1.3),
-    }
-    rng = np.random.default_rng(3)
-    scenes = [turning(rng.uniform(0.02, 0.05), rng.uniform(0.0, 0.8)) for _ in range(count)]
-    print("\nlimits (100 nodes)      plans  found  median_ms  worst_ms  worst_between_m  later_than_free_s")
-    for name, limits in kinds.items():
-        spans, out, late = [], [0.0], []
-        for scene in scenes:
-            begin = time.process_time()
-            plan = constrained(scene, ORIGIN, ORIGIN, PlanParams(), limits)
-            spans.append(1e3 * (time.process_time() - begin))
-            if plan.found:
-                late.append(plan.t_go_s - plan.lower_bound_s)
-                out.append(sticks_out(scene, limits.resolved(8.0), plan))
-        print(
-            f"{name:22s} {count:6d} {len(late):6d} {np.median(spans):10.1f} {max(spans):9.1f} {max(out):16.1e}"
-            f"  {np.median(late):.4f} to {max(late):.4f}"
-        )
-
-
-def sticks_out(scene, limits, plan):
-    """Worst excess over any limit at 20,000 instants, from the scene itself [m] (speed: [m/s])."""
-    times = np.linspace(0.0, plan.t_go_s, 20_001)
-    r, v = path_of(plan, ORIGIN, ORIGIN).at(times)
-    (apex, _), axis, centre = scene.goal(times), scene.axis(times), scene.centre(times)
-    away = np.linalg.norm(r - apex, axis=1)
-    along = np.sum((r - apex) * axis, axis=1)
-    across = np.linalg.norm(r - apex - along[:, None] * axis, axis=1)
-    worst = 0.0
-    for degrees, reach in ((limits.cone_deg, limits.cone_range_m), (limits.final_deg, limits.final_range_m)):
-        if degrees is not None:
-            worst = max(worst, np.max((across - np.tan(np.radians(degrees)) * along - limits.mouth_m)[away <= reach]))
-    if limits.keepout_m is not None:
-        worst = max(
-            worst, np.max((limits.keepout_m - np.linalg.norm(r - centre, axis=1))[away > limits.keepout_release_m])
-        )
-    if limits.speed_max_mps is not None:
-        worst = max(worst, np.linalg.norm(v, axis=1).max() - limits.speed_max_mps)
-    return float(worst)
-
-
 def main():
     args = argparse.ArgumentParser(description=__doc__)
     args.add_argument("--quick", action="store_true")
@@ -215,7 +153,6 @@ def main():
     print(HEAD)
     measured("ordinary", problems(6 if args.quick else 18, hard=False))
     compare = measured("hard", problems(20 if args.quick else 180, hard=True))
-    limited(4 if args.quick else 20)
     if args.casadi:
         versus(compare[: args.casadi])
 
