@@ -1,0 +1,87 @@
+"""Constraints of the approach: margins of the alternatives, the workspace, and the limits in the rows of a run."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from avsreplay import replay
+from avsreplay.build import target_geometry
+from avsreplay.plan import Limits, PlanParams, RobotParams, Scene, constrained, path_of
+from avsreplay.plan.limits import margins
+from avsreplay.simulate import builtin_surface
+
+X = np.array([1.0, 0.0, 0.0])
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+TUMBLE = Path(__file__).parents[1] / "fixtures" / "tumble.mcap"
+
+
+def still(**more):
+    """A target at rest 5 m away whose fixture faces the robot."""
+    goal = lambda t: (np.tile([0.0, 0.0, 5.0], (len(t), 1)), np.zeros((len(t), 3)))  # noqa: E731
+    half_turn = np.array([0.0, math.sqrt(0.5), 0.0, math.sqrt(0.5)])  # x of {C} along -z of {A}
+    return Scene(goal, lambda t: np.tile(half_turn, (len(t), 1)), X, -X, **more)
+
+
+def test_the_cone_holds_inside_its_range_only():
+    limits = Limits(cone_deg=45.0, cone_range_m=2.0, mouth_m=0.01)
+    y = np.array([[1.0, 0.5, 0.0], [0.5, 1.0, 0.0], [-1.0, 0.0, 0.0], [-3.0, 0.0, 0.0]])
+    found = margins(still(), limits, y, y).values[:, 0]
+    assert found == pytest.approx([1.0 + 0.01 - 0.5, 0.5 + 0.01 - 1.0, -1.0 + 0.01, 1.0])
+
+
+def test_a_change_of_alternative_between_two_points_is_seen():
+    """Outside the range at one point, inside the cone at the next; in between neither holds."""
+    limits = Limits(cone_deg=30.0, cone_range_m=2.0, mouth_m=0.01)
+    y = np.array([[1.5, 1.5, 0.0], [1.5, 0.8, 0.0]])
+    found = margins(still(), limits, y, y)
+    assert found.values[:, 0].min() > 0.0
+    t = np.linspace(0.0, 1.0, 1001)[:, None]
+    dense = margins(still(), limits, y[0] + t * (y[1] - y[0]), np.zeros((1001, 3))).values[:, 0].min()
+    assert dense < 0.0
+    assert found.between[0, 0] == pytest.approx(dense, abs=0.05)
+
+
+def test_signed_distance_of_the_built_in_target():
+    surface = builtin_surface()
+    target = target_geometry(surface, (1.0, 0.0, 0.0), True)
+    inside, outside = np.array([[-0.8, 0.0, 0.0]]), np.array([[2.0, 0.0, 0.0]])
+    assert target.surface(inside)[1][0] < 0.0
+    foot, distance = target.surface(outside)
+    assert distance[0] == pytest.approx(np.linalg.norm(outside - foot))
+    assert target.radius(np.zeros(3)) == pytest.approx(np.linalg.norm(surface.vertices, axis=1).max())
+
+
+def test_the_workspace_is_a_shell_about_the_base():
+    limits = Limits(reach_max_m=6.0, reach_min_m=2.0, base_m=(0.0, 3.0, 0.0))
+    plan = constrained(still(), np.zeros(3), np.array([0.0, 0.12, 0.0]), PlanParams(), limits)
+    assert plan.found
+    path = path_of(plan, np.zeros(3), np.array([0.0, 0.12, 0.0]))
+    away = np.linalg.norm(path.at(np.linspace(0.0, plan.t_go_s, 4001))[0] - np.array([0.0, 3.0, 0.0]), axis=1)
+    assert away.max() <= 6.0
+    assert away.min() >= 2.0
+    far = constrained(still(), np.zeros(3), np.zeros(3), PlanParams(), Limits(reach_max_m=4.0))
+    assert not far.found  # the grasp point itself is out of reach
+
+
+def test_thrust_and_size_of_the_robot():
+    robot = RobotParams(mass_kg=80.0, thrust_max_n=2.0, radius_m=0.15)
+    assert robot.applied(PlanParams()).a_max_mps2 == pytest.approx(0.025)
+    assert Limits(final_deg=10.0, clearance_m=0.1).widened(0.15).clearance_m == pytest.approx(0.25)
+    assert Limits(final_deg=10.0).widened(0.15).clearance_m == pytest.approx(0.15)
+    assert Limits().widened(0.15) == Limits()
+    assert "80 kg, at most 0.025 m/s2, radius 0.15 m" in robot.described(PlanParams())
+    with pytest.raises(ValueError, match="together"):
+        RobotParams(mass_kg=80.0)
+
+
+def test_every_plan_of_a_run_obeys_the_limits():
+    limits = ("limits.final_deg=15", "limits.clearance_m=0.1")
+    rows = [row for row in replay(TUMBLE, *limits) if row.plan_status is not None]
+    planned = [row for row in rows if row.plan_status in ("optimal", "feasible")]
+    assert planned
+    assert all(row.plan_margin_m >= 0.0 and row.plan_limit in ("corridor", "body") for row in planned)
+    free = [row for row in replay(TUMBLE) if row.capture_time_s is not None]
+    assert min(r.capture_time_s for r in planned) >= min(r.capture_time_s for r in free) - 1e-6
+    assert all(row.plan_margin_m is None for row in free)
