@@ -209,7 +209,7 @@ class Alignment:
         info: (6, 6) information of the error d = [theta; v], both in {C} [rad, m], where
             T_ac_true = T_ac @ Exp(d); singular in directions that are not determined.
         covariance: (6, 6) calibrated covariance of the same d, None if the view is degenerate.
-        message: why the back end failed, empty if it did not.
+        message: why the back end failed or the pose is not accepted, else empty.
         free_directions: directions that the view does not determine ("slides along x"), empty if none.
     """
 

@@ -115,8 +115,9 @@ class Registrar:
             return found
         if not search.found or not found.measured:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None)
-        if self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan)).reason:
-            return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None)
+        reason = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan)).reason
+        if reason:
+            return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason)
         if search.ambiguous and search.second is not None:
             words = quality.turn_words(search.best.T_ca @ search.second.T_ca.inverse())
             return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
@@ -178,7 +179,8 @@ class Registrar:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
         if Budget(len(scan), found.iterations * len(scan)).allows(SEARCH_WORK):
             return self.acquire(scan)
-        return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None)
+        far = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a global search"
+        return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=far)
 
     def _doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment) -> bool:
         """A failure, or a poor fit away from the guess: possibly a local minimum next to the true pose."""
@@ -199,10 +201,11 @@ class Registrar:
         width = max(self.limits.gate_m, 3.0 * kept.noise_m)
         unchanged = kept.T_ca.t.tobytes() == first.T_ac.inverse().t.tobytes() and width == self.limits.gate_m
         final = first if unchanged else self._graded(scan, kept.T_ca.inverse(), width)
-        if not final.measured or not self._test.check(few, final.T_ac.inverse()).reason:
+        reason = self._test.check(few, final.T_ac.inverse()).reason if final.measured else ""
+        if not reason:
             return final
         status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
-        return replace(final, status=status, covariance=None, free_directions="")
+        return replace(final, status=status, covariance=None, free_directions="", message=reason)
 
     def _graded(self, scan: NDArray[Any], guess: Pose, width_m: float | None = None) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
