@@ -70,6 +70,7 @@ class Summary:
         registration_healthy, registration_flagged: errors of the measured poses.
         reasons: why scans were flagged.  status: scans by the status of their registration.
         counts: losses and clock problems, given by the caller.
+        manoeuvres: of the target.  violations: consistency checks that the estimate failed.
         weighed_down: healthy poses with a Cauchy weight below 1.  reinitialised: reinitialisations of the estimate.
         coasts: intervals of prediction without measurement.  interval_s: median between scans.
         gaps: intervals between scans longer than 1.5 times the median.
@@ -97,6 +98,8 @@ class Summary:
     r_floors: int | None
     weighed_down: int
     reinitialised: int | None
+    manoeuvres: int | None
+    violations: int | None
     nis: Share | None
     nees: Share | None
     nees_blocks: Mapping[str, Share]
@@ -219,6 +222,8 @@ class SummaryFold:
             r_floors=last.r_floors if last else None,
             weighed_down=self._weighed_down,
             reinitialised=last.reinitialised if last else None,
+            manoeuvres=last.manoeuvres if last else None,
+            violations=last.violations if last else None,
             nis=_share(self._values.get("nis/healthy", []), NIS_BAND),
             nees=_share(self._values.get("nees", []), NEES_BAND),
             nees_blocks=self._blocks(),

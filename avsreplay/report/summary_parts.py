@@ -65,7 +65,7 @@ class Parameter:
 
 
 def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
-    """Inertia ratios, varrho and mu of a row, against ``truth`` where it is given."""
+    """Parameters of the body of a row, the paper's and those in {C}, against ``truth`` where it is given."""
     sigma = (None, None) if truth is None else ((float(truth.sigma[0]),), (float(truth.sigma[1]),))
     found = [
         _vector("sigma1", "", (row.sigma1,), sigma[0], row.sigma1_1s),
@@ -74,8 +74,35 @@ def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
             "c (varrho)", "m", (row.cx_m, row.cy_m, row.cz_m), None if truth is None else _tuple(truth.c_b), row.c_1s_m
         ),
         _attitude(row, truth),
+        *_in_fixture_frame(row, truth),
     ]
     return tuple(p for p in found if p is not None)
+
+
+def _in_fixture_frame(row: Row, truth: State | None) -> list[Parameter | None]:
+    """Parameters that do not depend on the order of the principal axes: moments, inertia and mass centre in {C}."""
+    moments = tensor = centre = None
+    if truth is not None:
+        R_cb, found = geometry.matrix(truth.q_bc).T, _moments(truth)
+        moments, centre = _tuple(np.sort(found)), _tuple(-R_cb @ truth.c_b)
+        full = R_cb @ np.diag(found) @ R_cb.T
+        tensor = _tuple(full[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]])
+    small = (row.moment_small, row.moment_middle, row.moment_large)
+    entries = (row.ixx, row.iyy, row.izz, row.ixy, row.ixz, row.iyz)
+    return [
+        _vector("moments / sum, ascending", "", small, moments, row.moments_1s),
+        _vector("inertia / trace in {C}: xx yy zz xy xz yz", "", entries, tensor, row.inertia_1s),
+        _vector("mass centre in {C}", "m", (row.com_x_m, row.com_y_m, row.com_z_m), centre, row.com_1s_m),
+    ]
+
+
+def _moments(x: State) -> geometry.Array:
+    """Principal moments (3,) over their sum, from the inertia ratios: I / tr I is 1 over the diagonal of B(sigma)."""
+    s1, s2 = float(x.sigma[0]), float(x.sigma[1])
+    xx = 1.0 + (2.0 + s1 * s2 + s1) / (1.0 - s2)
+    yy = 1.0 + (2.0 + s1 * s2 - s2) / (1.0 + s1)
+    zz = 1.0 + (2.0 + s1 - s2) / (1.0 + s1 * s2)
+    return 1.0 / np.array([xx, yy, zz])
 
 
 def _tuple(values: geometry.Array | None) -> tuple[float, ...] | None:

@@ -224,6 +224,8 @@ def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     if summary.reinitialised is not None:
         taken = f"{summary.weighed_down} healthy poses down-weighted (NIS above its 99.99 % point)"
         yield "outliers", f"{taken}; estimate reinitialised {summary.reinitialised} times"
+    if summary.manoeuvres is not None:
+        yield "manoeuvres", f"{summary.manoeuvres} found; {summary.violations or 0} consistency checks failed"
     seen = summary.observability
     if seen.rank is not None:
         full = "never full" if seen.full_rank_s is None else f"full from {seen.full_rank_s:.2f} s"

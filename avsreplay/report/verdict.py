@@ -207,6 +207,7 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     if biased:
         text = f"the sensor had a bias in {len(biased)} scans, first at {biased[0].t_s:.1f} s"
         yield Concern(Grade.CHECK, text)
+    yield from _failed_checks(rows, summary)
     searches = [row for row in rows[1:] if row.guess == "acquired" and row.gamma == 1]
     if searches and rows[0].gamma == 1:
         text = f"the pose was searched again {_times(len(searches))}, first at {searches[0].t_s:.1f} s"
@@ -217,6 +218,14 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         yield Concern(Grade.CHECK, f"the estimate did not converge, so no capture is planned{blocks}")
     elif rows and not t1.at_end:
         yield Concern(Grade.CHECK, f"convergence, reached at {t1.t1_s:.1f} s, does not hold at the end")
+
+
+def _failed_checks(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
+    """Consistency checks of the estimate that need no ground truth."""
+    if summary.violations:
+        when = next(row.t_s for row in rows if row.violations)
+        text = f"the estimate failed {summary.violations} consistency checks, the first at {when:.1f} s"
+        yield Concern(Grade.CHECK, text)
 
 
 def _data(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
