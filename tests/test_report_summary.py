@@ -310,3 +310,16 @@ def test_a_shuffled_log_has_the_same_errors(make_rows):
     shuffled = list(rows)
     random.Random(3).shuffle(shuffled)
     assert Summary.fold(shuffled).pose_healthy == Summary.fold(rows).pose_healthy
+
+
+def test_moments_follow_from_the_inertia_ratios() -> None:
+    """Moments 4, 8, 5 over their sum, whatever the order of the axes that gives the ratios."""
+    from itertools import permutations
+
+    from avsreplay.records import State
+    from avsreplay.report.summary_parts import _moments
+
+    for xx, yy, zz in permutations((4.0, 8.0, 5.0)):
+        sigma = np.array([(yy - zz) / xx, (zz - xx) / yy])
+        x = State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, sigma, np.zeros(3), [0, 0, 0, 1.0])
+        assert _moments(x) == pytest.approx(np.array([xx, yy, zz]) / 17.0)
