@@ -145,3 +145,32 @@ def test_a_run_streams_to_rerun(fixtures_folder, tmp_path):
         rows = list(run.rows([stream]))
         stream.close()
     assert (tmp_path / "x.rrd").stat().st_size > 100 * len(rows)
+
+
+def test_an_empty_folder_takes_the_results(cli, fixtures_folder, tmp_path):
+    (tmp_path / "results").mkdir()
+    done = cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 3, "-o", tmp_path / "results")
+    assert done.code == 0, done.err
+    assert (tmp_path / "results" / "rows.jsonl").is_file()
+    again = cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 3, "-o", tmp_path / "results")
+    assert again.code == 2
+    assert "already exists" in again.err
+
+
+def test_a_golden_failure_begins_with_the_settings_that_differ(cli, fixtures_folder, tmp_path):
+    log, golden = fixtures_folder / "tumble.mcap", tmp_path / "rows.jsonl"
+    assert cli("run", log, "--n-scans", 4, "--update-golden", golden).code == 0
+    done = cli("run", log, "--n-scans", 4, "--golden", golden, "--set", "register.n_max=1")
+    assert done.code == 1
+    heading = "settings that differ from their defaults: register.n_max = 1 (default 200)"
+    assert done.out.index(heading) < done.out.index("Golden: first")
+
+
+@pytest.mark.slow
+def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
+    log = fixtures_folder / "tumble.mcap"
+    assert cli("run", log, "--require", "pass").code == 0
+    done = cli("run", log, "--n-scans", 5, "--require", "pass")  # too short to converge
+    assert done.code == 1
+    assert "the verdict is CHECK" in done.err
+    assert cli("run", log, "--n-scans", 5, "--require", "check").code == 0
