@@ -88,3 +88,17 @@ def test_a_single_wild_scan_changes_nothing() -> None:
     assert result.error[-1][0] == pytest.approx(clean.error[-1][0], abs=1e-3)
     assert result.track is not None
     assert result.track.manoeuvres == ()
+
+
+def test_a_covariance_that_rounding_left_indefinite_still_has_a_root() -> None:
+    from avsreplay.estimate.hypotheses import cholesky_root
+
+    rng = np.random.default_rng(5)
+    factor = rng.normal(size=(12, 3))
+    indefinite = factor @ factor.T - 1e-10 * np.eye(12)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(indefinite)
+    root = cholesky_root(indefinite)
+    assert np.abs(root @ root.T - indefinite).max() < 1e-8 * np.trace(indefinite)
+    definite = indefinite + np.eye(12)
+    np.testing.assert_array_equal(cholesky_root(definite), np.linalg.cholesky(definite))

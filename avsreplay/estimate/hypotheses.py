@@ -100,7 +100,7 @@ def explain(
     """
     start = epochs[0].track.belief
     window = _window(epochs, start, torque, force)
-    root = np.asarray(np.linalg.cholesky(window.C), dtype=np.float64)
+    root = cholesky_root(window.C)
     white = np.asarray(np.linalg.solve(root, window.y), dtype=np.float64)
     free = -0.5 * float(white @ white) - float(np.log(np.diagonal(root)).sum())
     n = len(epochs)
@@ -112,6 +112,17 @@ def explain(
         _frozen(window, first_doubtful, n),
     ]
     return sorted(found, key=lambda e: -e.log_evidence)
+
+
+def cholesky_root(C: Array) -> Array:
+    """Lower Cholesky factor of a covariance; one that rounding left indefinite gets the least sufficient diagonal."""
+    scale = float(np.trace(C)) / len(C)
+    for k in range(-14, 1):
+        try:
+            return np.asarray(np.linalg.cholesky(C + (10.0**k * scale if k > -14 else 0.0) * np.eye(len(C))))
+        except np.linalg.LinAlgError:
+            continue
+    raise ValueError("the covariance of the window is not finite")
 
 
 def _window(epochs: Sequence[Epoch], start: Belief, torque: float, force: float) -> _Window:
