@@ -244,7 +244,7 @@ def _difference(a: Pose, b: Pose, R_ba: Array) -> Array:
 
 def _gaussian(y: Array, C: Array) -> tuple[float, float]:
     """Log density of N(0, C) at y without its constant, and the squared whitened norm."""
-    root = np.linalg.cholesky(C)
+    root = cholesky_root(C)
     white = np.linalg.solve(root, y)
     chi2 = float(white @ white)
     return -0.5 * chi2 - float(np.log(np.diagonal(root)).sum()), chi2
