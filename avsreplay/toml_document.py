@@ -233,7 +233,7 @@ def _line_of(text: str, path: Sequence[str | int]) -> int | None:
     return None
 
 
-def write(value: Any, name: str = "") -> str:
+def to_toml(value: Any, name: str = "") -> str:
     """A parameter object as commented TOML that ``build`` reads back; a setting without a value is a comment.
 
     Args:

@@ -117,7 +117,7 @@ def test_help_of_an_option_is_the_declared_meaning(name):
 
 
 def test_every_setting_is_written_with_its_meaning():
-    text = toml_document.write(RunConfig())
+    text = toml_document.to_toml(RunConfig())
     flat = " ".join(line.removeprefix("# ") for line in text.splitlines())
     for entry in settings.entries(RunConfig):
         assert entry.declared.doc in flat, entry.key

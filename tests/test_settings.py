@@ -233,7 +233,7 @@ CHANGES = ["register.gate_m=0.123", "estimator.start=cold", "init=auto", "plan.r
 @pytest.mark.parametrize("assignments", [[], CHANGES])
 def test_a_written_configuration_reads_back_as_the_same_object(assignments):
     config = load_config(None, {}, assignments)
-    text = toml_document.write(config)
+    text = toml_document.to_toml(config)
     assert toml_document.build(RunConfig, toml_document.parse(text, "c.toml")) == config
     assert max(len(line) for line in text.splitlines()) <= 120
     assert ("# reach_m is not set: 0.15 of the target's extent" in text.splitlines()) == (

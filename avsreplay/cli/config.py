@@ -65,7 +65,7 @@ def command(log: Path | None, as_json: bool, markdown: bool, **flags: Any) -> No
     if as_json:
         click.echo(json.dumps(settings.dump(config), indent=1))
     else:
-        click.echo(toml_document.write(config, "Settings of 'avsreplay run', to be read with --config"), nl=False)
+        click.echo(toml_document.to_toml(config, "Settings of 'avsreplay run', to be read with --config"), nl=False)
 
 
 def _own_table(log: Path) -> dict[str, Any]:

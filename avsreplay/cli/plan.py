@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.setting_options import setting
+from avsreplay.cli.setting_options import setting_option
 
 if TYPE_CHECKING:
     from avsreplay.outcome import Plan
@@ -32,20 +32,20 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
 @click.command("plan", epilog=EPILOG)
 @click.argument("result", type=click.Path(path_type=Path))
 @click.option("--at", "at_s", type=float, help="Plan from this time [s]; default: from convergence.")
-@setting("--a-max", "a_max_mps2", type=float, owner=PLAN)
-@setting("--horizon", "horizon_s", type=float, owner=PLAN)
-@setting("--latency", "latency_s", type=float, owner=PLAN)
-@setting("--period", "replan_period_s", type=float, owner=PLAN)
-@setting("--from", "robot_position_m", metavar="X,Y,Z", owner=PLAN)
-@setting("--cone-deg", type=float, owner=LIMITS)
-@setting("--cone-range", "cone_range_m", type=float, owner=LIMITS)
-@setting("--final-deg", type=float, owner=LIMITS)
-@setting("--final-range", "final_range_m", type=float, owner=LIMITS)
-@setting("--speed-max", "speed_max_mps", type=float, owner=LIMITS)
-@setting("--contact-accel", "contact_accel_mps2", type=float, owner=LIMITS)
-@setting("--keepout", "keepout_m", type=float, owner=LIMITS)
-@setting("--keepout-release", "keepout_release_m", type=float, owner=LIMITS)
-@setting("--clearance", "clearance_m", type=float, owner=LIMITS)
+@setting_option("--a-max", "a_max_mps2", type=float, owner=PLAN)
+@setting_option("--horizon", "horizon_s", type=float, owner=PLAN)
+@setting_option("--latency", "latency_s", type=float, owner=PLAN)
+@setting_option("--period", "replan_period_s", type=float, owner=PLAN)
+@setting_option("--from", "robot_position_m", metavar="X,Y,Z", owner=PLAN)
+@setting_option("--cone-deg", type=float, owner=LIMITS)
+@setting_option("--cone-range", "cone_range_m", type=float, owner=LIMITS)
+@setting_option("--final-deg", type=float, owner=LIMITS)
+@setting_option("--final-range", "final_range_m", type=float, owner=LIMITS)
+@setting_option("--speed-max", "speed_max_mps", type=float, owner=LIMITS)
+@setting_option("--contact-accel", "contact_accel_mps2", type=float, owner=LIMITS)
+@setting_option("--keepout", "keepout_m", type=float, owner=LIMITS)
+@setting_option("--keepout-release", "keepout_release_m", type=float, owner=LIMITS)
+@setting_option("--clearance", "clearance_m", type=float, owner=LIMITS)
 @click.option(
     "--set",
     "assignments",

@@ -78,7 +78,7 @@ class SettingOption(click.Option):
         return super().get_help_record(ctx)
 
 
-def setting(*names: str, **more: Any) -> Callable[[F], F]:
+def setting_option(*names: str, **more: Any) -> Callable[[F], F]:
     """Decorator: an option for one setting, see SettingOption."""
     return click.option(*names, cls=SettingOption, **more)
 
@@ -87,7 +87,7 @@ def source_setting(*names: str, **more: Any) -> Callable[[F], F]:
     """Decorator: an option for one setting of how a source is read."""
     if "is_flag" in more:
         more.setdefault("default", None)
-    return setting(*names, owner="avsreplay.log:SourceOptions", **more)
+    return setting_option(*names, owner="avsreplay.log:SourceOptions", **more)
 
 
 def _variable(name: str) -> str:
@@ -97,7 +97,9 @@ def _variable(name: str) -> str:
 def run_settings(command: F) -> F:
     """Add the settings of a run to a command: one option each for the frequent ones, ``--config`` and ``--set``."""
     options = [
-        setting(f"--{name}", key=key, envvar=_variable(name), metavar="log|truth|auto|POSE" if name == "init" else None)
+        setting_option(
+            f"--{name}", key=key, envvar=_variable(name), metavar="log|truth|auto|POSE" if name == "init" else None
+        )
         for name, key in ASSIGNED.items()
     ]
     file = click.Path(path_type=Path)

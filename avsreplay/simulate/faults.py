@@ -9,7 +9,7 @@ dropped            none                                         yes      no mess
 empty              none                                         yes      a message without a point
 clutter            added points over returns (0.5)              no       points anywhere about the target
 range_bias         added to every range [m] (0.3)               yes      the target seems farther away
-noise_burst        factor on the range noise (5.0)              no       as it says
+noise_burst        factor on the range noise (5.0)              no       more range noise
 frozen             none                                         yes      the last scan before the window again
 stamp_jump         added to the stamps [s] (30.0)               yes      log time stays true
 =================  ===========================================  =======  ========================================

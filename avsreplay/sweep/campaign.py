@@ -42,7 +42,7 @@ class Axis(Settings):
 
 
 @dataclass(frozen=True, slots=True)
-class Case(Settings):
+class CampaignCase(Settings):
     """One table [[case]]: settings that go together; cases are alternatives, each combined with the grid."""
 
     name: str = setting(doc="Name of the case in tables.")
@@ -101,7 +101,7 @@ class Campaign(Settings):
     scans: bool = setting(True, "Keep one line per scan (scans.parquet), from which the ROC curves are made.")
     set: Any = setting(dict, "Settings of every run.")
     grid: tuple[Axis, ...] = setting((), "What is varied.")
-    case: tuple[Case, ...] = setting((), "Alternatives.")
+    case: tuple[CampaignCase, ...] = setting((), "Alternatives.")
     draw: tuple[Draw, ...] = setting((), "What is drawn.")
     success: tuple[SuccessCriterion, ...] = setting((), "What counts as a success.")
 

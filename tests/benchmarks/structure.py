@@ -216,7 +216,7 @@ def settings(root: Path) -> dict:
         "    for f in dataclasses.fields(cls):\n"
         "        inner = hints[f.name]\n"
         "        if dataclasses.is_dataclass(inner): yield from walk(inner, prefix + f.name + '.')\n"
-        "        else: yield prefix + f.name, bool(f.metadata.get('doc') or f.metadata.get('meaning'))\n"
+        "        else: yield prefix + f.name, bool('setting' in f.metadata and f.metadata['setting'].doc)\n"
         "print(json.dumps(list(walk(RunConfig))))\n"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, text=True, check=False)
