@@ -121,7 +121,7 @@ class Monitors:
         found = None if healthy is None else estimator.residual_after(track, prior, healthy)
         if healthy is None or found is None:
             return ()
-        return violations(track.belief, estimator.pose_covariance(track.belief), found[0], healthy.R, found[1])
+        return violations(track.belief, estimator.pose_covariance(track.belief), *found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -102,3 +102,8 @@ def test_a_covariance_that_rounding_left_indefinite_still_has_a_root() -> None:
     assert np.abs(root @ root.T - indefinite).max() < 1e-8 * np.trace(indefinite)
     definite = indefinite + np.eye(12)
     np.testing.assert_array_equal(cholesky_root(definite), np.linalg.cholesky(definite))
+
+
+@pytest.mark.parametrize("case", [surprises.Case("rest", speed=1e-6, seconds=20.0), surprises.Case("c", seconds=20.0)])
+def test_a_clean_log_fails_no_check(case: surprises.Case) -> None:
+    assert surprises.run(case, 0).violations == []

@@ -149,8 +149,8 @@ class Estimator:
 
     def residual_after(
         self, track: Track, prediction: Prediction, innovation: Innovation
-    ) -> tuple[Array, Array] | None:
-        """Residual (6,) of the measured pose after the update, and the inflation (2,) that the update allowed for.
+    ) -> tuple[Array, Array, Array] | None:
+        """Residual (6,) of the measured pose after the update, its noise R (6, 6) by now, and its inflation (2,).
 
         None where the scan did not change the estimate: before the first fit, and between two fits with a
         non-Gaussian likelihood.
@@ -164,7 +164,8 @@ class Estimator:
         if between or track.mode not in ("fit", "filter"):
             return None
         left = residual(track.belief.x, prediction.belief.x, innovation.alpha)
-        return left, NO_INFLATION if track.inflation is None else track.inflation
+        R = self.noise.rescaled(innovation.R, prediction.window, track.window)
+        return left, R, NO_INFLATION if track.inflation is None else track.inflation
 
     def _replayed(self, track: Track, epoch: Epoch) -> Track:
         """A stored scan, predicted and used again from another track."""

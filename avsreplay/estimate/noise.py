@@ -179,6 +179,13 @@ class Noise:
         s = window.factors if self.params.adapt is Adaptation.SCALE else _ONES
         return np.asarray(R / (s[:, None] * s))
 
+    def rescaled(self, R: Array, before: NoiseWindow, after: NoiseWindow) -> Array:
+        """An R that ``of`` returned with one window, as it is with the factors of another."""
+        if self.params.adapt is not Adaptation.SCALE:
+            return R
+        s = after.factors / before.factors
+        return np.asarray(R * (s[:, None] * s))
+
     def floors(self, R: Array) -> int:
         """How many eigenvalues of R lie on the floor."""
         return at_floor(R, self._R0, self.params.r_floor)

@@ -13,7 +13,7 @@ from avsreplay.settings import Settings, given, setting
 
 __all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
-_MOST_ALIKE = 50.0  # scans: a view that does not turn would never say anything new
+_MOST_ALIKE = 50.0  # scans with correlated errors, at most: a view that does not turn would otherwise have no limit
 _EDGE_LEAN = 20.0  # by tests/benchmarks/estimate_noise.py: 9 to 33 on five meshes
 
 
@@ -152,7 +152,7 @@ class EstimatorParams(Settings):
         return lean / (1.0 + lean)
 
     def colour(self, turn_rad: float, share: float) -> float:
-        """How many times less than white ones poses say whose view turns by ``turn_rad`` from one to the next.
+        """Factor on the variance of poses with correlated errors; the view turns by ``turn_rad`` between them.
 
         Neighbours have ``share`` of their variance in common over ``correlated_rad``: 1 + 2 sum of correlations.
         """

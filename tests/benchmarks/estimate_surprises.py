@@ -174,7 +174,7 @@ def run(case: Case, seed: int, tested: bool = True) -> Result:
         found = estimator.residual_after(track, prediction, innovation) if verdict.gamma else None
         if found is not None:
             covariance = estimator.pose_covariance(track.belief)
-            failed = violations(track.belief, covariance, found[0], innovation.R, found[1])
+            failed = violations(track.belief, covariance, *found)
         result.violations += list(failed)
         honest = honest and not track.doubtful and not failed
         forecast = estimator.track_forecast(track, test.params.times_s)

@@ -1,4 +1,4 @@
-// The door to Python: checks shapes, lets go of the interpreter while it walks.
+// Python bindings: array shapes are checked, and the interpreter lock is released during the computation.
 #include <nanobind/nanobind.h>
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>

@@ -11,7 +11,7 @@ struct State {
   double q_ab[4], w_b[3], r_a[3], v_a[3], sigma[2], c_b[3], q_bc[4];
 };
 
-// What a pose says at a prior: derivative H, innovation alpha, its covariance S, and the noise R in it.
+// A measured pose at a prior: Jacobian H, innovation alpha, its covariance S, and the measurement noise R in S.
 struct Pose {
   double H[SEEN][DIM], alpha[SEEN], S[SEEN][SEEN], R[SEEN][SEEN];
 };
