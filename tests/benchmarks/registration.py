@@ -10,6 +10,7 @@ installed are left out and named.
 from __future__ import annotations
 
 import argparse
+import os
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -22,7 +23,9 @@ import numpy as np
 
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
+from avsreplay.register.params import RegisterParams
 from avsreplay.register.reference import best_motion
+from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 from avsreplay.simulate import builtin_surface
 
@@ -229,13 +232,9 @@ def index(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
     jobs: list[tuple[str, Surface, float]] = [("built-in mesh", surface, REACH_M), (cloud.name, cloud, REACH_M)]
     if not args.quick:
         jobs.append(("500000 points", sample(surface, 500_000, 1), REACH_M))
-    hubble = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "spacecraft-meshes" / "HST.obj"
-    if hubble.exists():
-        import trimesh
-
-        mesh = trimesh.load(hubble, force="mesh")
-        hst = Surface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32), "HST mesh", "")
-        jobs.append((f"HST mesh ({len(hst.faces)} triangles)", hst, 0.05 * hst.extent))
+    hubble = shared("spacecraft-meshes", "HST.obj")
+    if hubble is not None:
+        jobs.append((f"HST mesh ({len(hubble.faces)} triangles)", hubble, 0.05 * hubble.extent))
     for name, target, reach in jobs:
         clock, processor = [], []
         for _ in range(1 if args.quick else 3):
@@ -345,7 +344,106 @@ def views(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
             print(f"{name:40} {middle[0]:8.4f} ({most[0]:.4f}) deg {middle[1]:8.3f} ({most[1]:.3f}) mm")
 
 
-PARTS = {"index": index, "speed": speed, "passes": passes, "converged": converged, "views": views}
+def shared(*path: str) -> Surface | None:
+    """A mesh of the shared test data, or None where the data is not there."""
+    file = Path(__file__).resolve().parents[2].parent.joinpath("shared", "data", *path)
+    file = file if file.exists() else Path(os.environ.get("AVSREPLAY_SHARED_DATA", "")).joinpath(*path)
+    if not file.is_file():
+        print(f"left out: {path[-1]} (not there)")
+        return None
+    import trimesh
+
+    mesh = trimesh.load(file, force="mesh", process=False)
+    return Surface(np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int32), file.stem, "")
+
+
+def stage() -> Surface:
+    """A cylinder with a nozzle: the shape of a rocket's upper stage."""
+    import trimesh
+
+    tank = trimesh.creation.cylinder(1.2, 6.0, sections=96)
+    nozzle = trimesh.creation.cone(0.9, 1.6, sections=96)
+    nozzle.apply_translation((0.15, 0.1, 2.4))
+    body = trimesh.util.concatenate([tank, nozzle])
+    return Surface(np.asarray(body.vertices, float), np.asarray(body.faces, np.int32), "stage", "")
+
+
+def scaled(surface: Surface) -> Surface:
+    """The surface at the size of the built-in target, so that the noise and the starts are the same for all."""
+    size = 5.3 / surface.extent
+    return Surface(surface.vertices * size, surface.faces, surface.name, "")
+
+
+def meshes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
+    """Six meshes: index, one searched pass, and the whole of Registrar.register against the peers' registration."""
+    files = [
+        ("spacecraft-meshes", "HST.obj"),
+        ("spacecraft-meshes", "Kepler.obj"),
+        ("stanford-bunny", "bun_zipper.ply"),
+        ("stanford-dragon", "dragon_vrip_res3.ply"),
+    ]
+    found = [shared(*file) for file in (files[:1] if args.quick else files)]
+    for mesh in [surface, *(scaled(each) for each in found if each is not None), stage()]:
+        one_mesh(mesh, args)
+
+
+def one_mesh(mesh: Surface, args: argparse.Namespace) -> None:
+    reach = 0.15 * mesh.extent
+    start, busy = time.perf_counter(), time.process_time()
+    index = SurfaceIndex.build(mesh, reach)
+    built = time.process_time() - busy
+    clock = time.perf_counter() - start
+    print(
+        f"\n{mesh.name}: {len(mesh.faces)} triangles; index {built:.3f} s ({clock:.3f} by the clock), "
+        f"{index.nbytes / 1e6:.1f} MB"
+    )
+    registrar, two = (Registrar(mesh, RegisterParams(threads=t, index_cache=False)) for t in (1, 2))
+    points = sample(mesh, args.model, 1).vertices
+    normals = SurfaceIndex.build(sample(mesh, args.model, 1), reach).closest(points).normal
+    for outliers, deg, metres in ((0.0, 0.5, 0.01), (0.05, 3.0, 0.05), (0.0, 10.0, 0.15)):
+        scan, truth = look(mesh, args.scan, outliers, 3)
+        guess = off(truth, deg, metres, 4)
+        cases = {
+            "register, 1 thread": Case(registered(registrar, scan, guess)),
+            "register, 2 threads": Case(registered(two, scan, guess)),
+            "  align alone": Case(aligned(registrar, scan, guess)),
+            "  20 searched passes": Case(ours(index, scan, truth, fixed(20, keep=False, facing=True, gate_m=0.05))),
+        }
+        makers = {
+            "small_gicp GICP": partial(small_gicp, points, scan, guess, "GICP", 200, EPS_RAD),
+            "small_gicp PLANE_ICP": partial(small_gicp, points, scan, guess, "PLANE_ICP", 200, EPS_RAD),
+            "Open3D point-to-plane (its own threads)": partial(open3d_plane, points, normals, scan, guess),
+        }
+        cases.update(peers(makers))
+        in_turn(cases, args.reps)
+        table(
+            f"{mesh.name}, scan {len(scan)}, outliers {outliers:.0%}, start {deg} deg",
+            cases,
+            truth,
+            "register, 1 thread",
+        )
+        searched = statistics.median(cases["  20 searched passes"].cpu) / 20 / len(scan)
+        align = ratio(cases["  align alone"].cpu, cases["register, 1 thread"].cpu)
+        print(f"searched pass {1e9 * searched:.0f} ns a point; outside align {100 * (1 - align):.0f} % of register")
+
+
+def registered(registrar: Registrar, scan: Array, guess: Pose) -> Callable[[], tuple[Array, int]]:
+    def run() -> tuple[Array, int]:
+        found = registrar.register(scan, guess.inverse())
+        return found.T_ac.inverse().matrix, found.iterations
+
+    return run
+
+
+def aligned(registrar: Registrar, scan: Array, guess: Pose) -> Callable[[], tuple[Array, int]]:
+    def run() -> tuple[Array, int]:
+        found = registrar._backend.align(scan, guess)
+        return found.T_ca.matrix, found.iterations
+
+    return run
+
+
+PARTS = {"meshes": meshes, "index": index, "speed": speed, "passes": passes, "converged": converged, "views": views}
 
 
 def main() -> None:
