@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles.residuals import residuals, summed
 from scipy.spatial.transform import Rotation
 
 from avsreplay import geometry
@@ -13,7 +14,7 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.records import AlignStatus, Fit, Surface
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import boxes, example_pose, plate_scan, view
-from avsreplay.register.quality import grade, residuals, unobservable_directions
+from avsreplay.register.quality import evidence, grade, unobservable_directions
 from avsreplay.register.reference import best_motion, horn_matrix
 from avsreplay.register.sampling import sample, thin
 from avsreplay.register.surface_index import SurfaceIndex
@@ -158,6 +159,27 @@ def test_information_is_the_curvature_of_the_cost(surface: Surface, registrar: R
         assert inside.mean() > 0.97  # the rest have their foot on an edge, where the foot slides to another face
 
 
+def test_sums_over_patches_are_those_of_the_residuals(surface: Surface, scan: np.ndarray) -> None:
+    """The kernel's sums against numpy, point by point; the patches in any order; few patches: a point each."""
+    T_ca, index = example_pose().inverse(), SurfaceIndex.build(surface, 0.5)
+    for points in (scan, scan[:40], scan[:1], scan[:0]):
+        plain = residuals(index, Visibility(surface), points, T_ca, 0.05)
+        found = evidence(index, Visibility(surface), points, T_ca, 0.05)
+        assert (found.points, found.inliers) == (len(points), plain.inliers)
+        assert len(found.counts) == plain.patch.max(initial=-1) + 1
+        assert sorted(found.counts) == sorted(np.bincount(plain.patch))
+        np.testing.assert_allclose(found.normals.sum(axis=0), plain.J.T @ plain.J, rtol=1e-10, atol=1e-9)
+        np.testing.assert_allclose(found.gradients.sum(axis=0), plain.J.T @ plain.e, rtol=1e-9, atol=1e-9)
+        if plain.inliers:
+            np.testing.assert_allclose(found.centre, plain.p.mean(axis=0), atol=1e-12)
+            assert found.rms_m == pytest.approx(np.sqrt(plain.d2.mean()), rel=1e-12)
+            assert found.noise_m == pytest.approx(max(1.4826 * np.median(np.abs(plain.e)), 5e-8), rel=1e-9)
+            whole = summed(plain.J, plain.e, plain.patch)
+            order = np.argsort(np.unique(plain.patch, return_index=True)[1])  # by the first point of each patch
+            np.testing.assert_allclose(found.normals, whole.normals[order], rtol=1e-8, atol=1e-9)
+            np.testing.assert_allclose(found.gradients, whole.gradients[order], rtol=1e-8, atol=1e-9)
+
+
 def test_covariance_shrinks_with_points_and_grows_with_noise(surface: Surface, registrar: Registrar) -> None:
     T_ac, rng = example_pose(), _rng()
     exact = {n: T_ac.apply(view(surface, n, T_ac.inverse().t)) for n in (3000, 12000)}
@@ -216,6 +238,10 @@ def test_points_of_one_instant_have_it_in_every_direction(registrar: Registrar, 
 # --- what a view leaves free
 
 
+def _free(J: np.ndarray, centre: np.ndarray) -> tuple[str, ...]:
+    return unobservable_directions(J.T @ J, len(J), centre)
+
+
 def _plane(normal: np.ndarray, about: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     rng = _rng()
     u, v = np.linalg.svd(normal[None])[2][1:]
@@ -227,7 +253,7 @@ def _plane(normal: np.ndarray, about: np.ndarray) -> tuple[np.ndarray, np.ndarra
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_plane_slides_along_two_axes_and_turns_about_the_third(axis: int) -> None:
     names = "xyz"
-    found = unobservable_directions(*_plane(np.eye(3)[axis], np.array([3.0, -2.0, 1.0])))
+    found = _free(*_plane(np.eye(3)[axis], np.array([3.0, -2.0, 1.0])))
     others = [f"slides along {names[k]}" for k in range(3) if k != axis]
     assert sorted(found) == sorted([*others, f"turns about {names[axis]}"])
 
@@ -237,7 +263,7 @@ def test_a_cylinder_slides_along_and_turns_about_its_axis() -> None:
     angle, z = rng.uniform(0, 2 * np.pi, 2000), rng.uniform(-1, 1, 2000)
     n = np.stack([np.cos(angle), np.sin(angle), np.zeros(2000)], axis=1)
     points = 0.5 * n + np.array([0, 0, 1.0]) * z[:, None]
-    assert sorted(unobservable_directions(np.hstack([np.cross(points, n), n]), points.mean(0))) == [
+    assert sorted(_free(np.hstack([np.cross(points, n), n]), points.mean(0))) == [
         "slides along z",
         "turns about z",
     ]
@@ -246,15 +272,13 @@ def test_a_cylinder_slides_along_and_turns_about_its_axis() -> None:
 def test_a_sphere_turns_about_everything_and_a_full_view_about_nothing(surface: Surface) -> None:
     n = _rng().normal(size=(3000, 3))
     n /= np.linalg.norm(n, axis=1, keepdims=True)
-    assert sorted(unobservable_directions(np.hstack([np.cross(n, n), n]), np.zeros(3))) == [
-        f"turns about {axis}" for axis in "xyz"
-    ]
+    assert sorted(_free(np.hstack([np.cross(n, n), n]), np.zeros(3))) == [f"turns about {axis}" for axis in "xyz"]
     points, normals = sample(surface, 3000)
-    assert unobservable_directions(np.hstack([np.cross(points, normals), normals]), points.mean(0)) == ()
+    assert _free(np.hstack([np.cross(points, normals), normals]), points.mean(0)) == ()
 
 
 def test_a_slanted_slide_is_named_by_its_direction() -> None:
-    found = unobservable_directions(*_plane(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.zeros(3)))
+    found = _free(*_plane(np.array([1.0, 1.0, 0.0]) / np.sqrt(2), np.zeros(3)))
     assert "slides along z" in found
     assert any(words.startswith("slides along (") for words in found)
 

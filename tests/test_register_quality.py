@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
+from oracles.residuals import summed
 
-from avsreplay.register.quality import Residuals, jackknife_covariance, unbounded_directions, without_dominant_patches
+from avsreplay.register.quality import jackknife_covariance, unbounded_directions, without_dominant_patches
 
 
 def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:
@@ -14,51 +13,48 @@ def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:
     rng = np.random.default_rng(11)
     J = rng.normal(size=(20000, 6))
     e = rng.normal(0.0, 0.3, 20000)
-    P = jackknife_covariance(Residuals(20000, 20000, 0.3, J, e, np.zeros(3), 0.3, np.arange(20000)))
+    P = jackknife_covariance(summed(J, e, np.arange(20000)))
     oracle = 0.09 * np.linalg.inv(J.T @ J)
     np.testing.assert_allclose(P, oracle, atol=0.1 * oracle[0, 0])
 
 
-def _in_patches(seed: int) -> Residuals:
+PATCH = np.arange(600) // 20
+
+
+def _rows(seed: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
-    J, e = rng.normal(size=(600, 6)), rng.normal(0.0, 0.3, 600)
-    return Residuals(600, 600, 0.3, J, e, np.zeros(3), 0.3, np.arange(600) // 20)
+    return rng.normal(size=(600, 6)), rng.normal(0.0, 0.3, 600)
 
 
 def test_covariance_is_the_jackknife_over_patches() -> None:
     """Fitted again without each patch in turn: the moves, squared and summed."""
-    found = _in_patches(3)
-    whole = np.linalg.lstsq(found.J, found.e, rcond=None)[0]
-    settled = replace(found, e=found.e - found.J @ whole)
-    moves = []
-    for k in range(30):
-        rest = settled.patch != k
-        moves.append(np.linalg.lstsq(settled.J[rest], settled.e[rest], rcond=None)[0])
+    J, e = _rows(3)
+    e = e - J @ np.linalg.lstsq(J, e, rcond=None)[0]
+    moves = [np.linalg.lstsq(J[k != PATCH], e[k != PATCH], rcond=None)[0] for k in range(30)]
     oracle = np.array(moves).T @ np.array(moves)
-    np.testing.assert_allclose(jackknife_covariance(settled), oracle, rtol=1e-6, atol=1e-9 * oracle.max())
+    np.testing.assert_allclose(jackknife_covariance(summed(J, e, PATCH)), oracle, rtol=1e-6, atol=1e-9 * oracle.max())
 
 
-def test_what_one_patch_holds_alone_is_not_held() -> None:
+def test_a_motion_that_one_patch_alone_determines_is_not_counted() -> None:
     """Nothing but patch 7 sees the last motion: it is left out, and the motion is free; without it nothing is lone."""
-    found = _in_patches(4)
-    J = found.J.copy()
-    J[found.patch != 7, 5] = 0.0
-    left = without_dominant_patches(replace(found, J=J))
-    assert len(left.J) == 580
-    assert np.all(left.J[:, 5] == 0.0)
-    assert left.patch.max() == 28
+    J, e = _rows(4)
+    found = summed(J, e, PATCH)
     assert without_dominant_patches(found) is found
+    J[PATCH != 7, 5] = 0.0
+    left = without_dominant_patches(summed(J, e, PATCH))
+    assert left.counts.sum() == 580
+    assert np.all(left.normals[:, 5] == 0.0)
+    assert len(left.normals) == len(left.gradients) == 29
 
 
-def test_patches_are_left_out_until_none_holds_a_motion_alone() -> None:
+def test_patches_are_left_out_until_none_determines_a_motion_alone() -> None:
     """Patch 7 holds the last motion, 8 what is left of it without 7, 9 the rest: all three go, one after the other."""
-    found = _in_patches(4)
-    J = found.J.copy()
+    J, e = _rows(4)
     for patch in range(30):
-        J[found.patch == patch, 5] *= {7: 1.0, 8: 1e-2, 9: 1e-4}.get(patch, 0.0)
-    left = without_dominant_patches(replace(found, J=J))
-    assert np.all(left.J[:, 5] == 0.0)
-    assert len(left.J) == 540
+        J[patch == PATCH, 5] *= {7: 1.0, 8: 1e-2, 9: 1e-4}.get(patch, 0.0)
+    left = without_dominant_patches(summed(J, e, PATCH))
+    assert np.all(left.normals[:, 5] == 0.0)
+    assert left.counts.sum() == 540
 
 
 def test_a_motion_known_no_better_than_the_targets_size_is_loose() -> None:

@@ -46,6 +46,16 @@ class Index:
         threads: int = 1,
         facing: bool = False,
     ) -> tuple[Any, ...]: ...
+    def evidence(
+        self,
+        points: NDArray[Any],
+        T_ca: NDArray[np.float64],
+        gate_m: float,
+        patch_m: float,
+        least_patches: int,
+        facing: bool = False,
+        threads: int = 1,
+    ) -> tuple[Any, ...]: ...
     @property
     def nbytes(self) -> int: ...
     @property

@@ -6,7 +6,7 @@ appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -33,57 +33,48 @@ AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Residuals:
-    """Residuals of the inliers at a pose, all in {C}.
+class Evidence:
+    """Sums over the inliers at a pose, by patches of the model; all in {C}.
 
     Attributes:
         points: points of the scan.
         inliers: points nearer than the gate to the model, or to its faces that face the camera if that is known.
         rms_m: rms of their distances.
-        J: (k, 6) rows [p x n, n].
-        e: (k,) n . (p - closest point) [m].
         centre: (3,) centroid of the inliers.
-        noise_m: robust standard deviation of e.
-        patch: (k,) number of the patch of the model on which each inlier lies.
-        normals: (m, 6, 6) sums of J'J over each of the m patches.
+        noise_m: robust standard deviation of e = n . (p - closest point).
+        counts: (m,) inliers of each patch.
+        normals: (m, 6, 6) sums of J'J over each patch.
         gradients: (m, 6) sums of e J over each patch.
     """
 
     points: int
     inliers: int
     rms_m: float
-    J: Array
-    e: Array
     centre: Array
     noise_m: float
-    patch: NDArray[np.intp]
-    normals: Array = field(init=False)
-    gradients: Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        normals, gradients = _patch_sums(self.J, self.e, self.patch)
-        object.__setattr__(self, "normals", normals)
-        object.__setattr__(self, "gradients", gradients)
+    counts: NDArray[np.int64]
+    normals: Array
+    gradients: Array
 
 
-def residuals(
+def evidence(
     index: SurfaceIndex,
     visibility: Visibility,
     points: NDArray[Any],
     T_ca: Pose,
     gate_m: float,
     noise_m: float | None = None,
-) -> Residuals:
-    """Return the residuals of ``points`` (n, 3) in {A} [m] at ``T_ca``; ``noise_m`` None: estimated from them."""
-    moved, found, near = _matched(index, visibility, points, T_ca, gate_m)
-    p, n = moved[near], found.normal[near]
-    e = np.einsum("ij,ij->i", n, p - found.foot[near])
-    count = len(p)
-    rms = float(np.sqrt(found.d2[near].mean())) if count else float("nan")
-    centre = p.mean(axis=0) if count else np.zeros(3)
-    J = _jacobian(p, n)
-    noise = noise_m or _noise(e, gate_m)
-    return Residuals(len(points), count, rms, J, e, centre, noise, _patches(p, PATCH_OF_EXTENT * index.extent_m))
+) -> Evidence:
+    """Return the sums for ``points`` (n, 3) in {A} [m] at ``T_ca``; ``noise_m`` None: estimated from the residuals.
+
+    A patch is what lies in one cube; each point is its own patch if there are not more than ``LEAST_PATCHES`` cubes.
+    """
+    facing = visibility.camera_c(index, points, T_ca) is not None
+    found = index.evidence(points, T_ca, gate_m, PATCH_OF_EXTENT * index.extent_m, LEAST_PATCHES, facing=facing)
+    rms = float(np.sqrt(found.sum_d2 / found.inliers)) if found.inliers else float("nan")
+    noise = noise_m or max(SIGMA_PER_MEDIAN * found.median_m, NOISE_FLOOR_OF_GATE * gate_m)
+    sums = (found.counts, found.normals, found.gradients)
+    return Evidence(len(points), found.inliers, rms, found.centre, noise, *sums)
 
 
 def instants(
@@ -121,21 +112,7 @@ def _jacobian(p: Array, n: Array) -> Array:
     return np.hstack([np.cross(p, n), n])
 
 
-def _patches(p: Array, size_m: float) -> NDArray[np.intp]:
-    """Number of the cubic cell in which each point lies; each point is its own patch if there are too few cells."""
-    cells = np.floor(p / size_m).astype(np.int64)
-    cells -= cells.min(axis=0, initial=0)
-    code = (cells[:, 0] * (cells[:, 1].max(initial=0) + 1) + cells[:, 1]) * (cells[:, 2].max(initial=0) + 1)
-    patch = np.unique(code + cells[:, 2], return_inverse=True)[1].reshape(-1)
-    return patch if patch.max(initial=0) >= LEAST_PATCHES else np.arange(len(p))
-
-
-def _noise(e: Array, gate_m: float) -> float:
-    floor = NOISE_FLOOR_OF_GATE * gate_m
-    return max(SIGMA_PER_MEDIAN * float(np.median(np.abs(e))), floor) if len(e) else floor
-
-
-def jackknife_covariance(found: Residuals) -> Array:
+def jackknife_covariance(found: Evidence) -> Array:
     """Return the delete-a-block jackknife covariance (6, 6) of d = [theta; v], with patches of the model as blocks.
 
     Errors within a patch may be correlated (the model is wrong there, a range error at grazing incidence, outliers near
@@ -149,8 +126,8 @@ def jackknife_covariance(found: Residuals) -> Array:
     return 0.5 * (P + P.T)
 
 
-def without_dominant_patches(found: Residuals) -> Residuals:
-    """Return the residuals without the patches that give more than ``DOMINANT`` of the information on some motion.
+def without_dominant_patches(found: Evidence) -> Evidence:
+    """Return the evidence without the patches that give more than ``DOMINANT`` of the information on some motion.
 
     Example: the barely visible side of a box is determined by a few points next to its edge, which may belong to the
     neighbouring side.
@@ -159,24 +136,11 @@ def without_dominant_patches(found: Residuals) -> Residuals:
         share = found.normals @ np.linalg.pinv(found.normals.sum(axis=0), hermitian=True)
         lone = np.trace(share, axis1=1, axis2=2) > DOMINANT  # the largest eigenvalue is at most the trace
         lone[lone] = np.linalg.eigvals(share[lone]).real.max(axis=1, initial=0.0) > DOMINANT
-        keep = ~lone[found.patch]
-        if not lone.any() or np.count_nonzero(keep) < 6:
+        keep = ~lone
+        if not lone.any() or found.counts[keep].sum() < 6:
             return found
-        patch = np.unique(found.patch[keep], return_inverse=True)[1].reshape(-1)
-        found = replace(found, J=found.J[keep], e=found.e[keep], patch=patch)
-
-
-def _patch_sums(J: Array, e: Array, patch: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Sums of J'J (m, 6, 6) and of e J (m, 6) over each patch."""
-    count = int(patch.max(initial=-1)) + 1
-    normals = np.empty((count, 6, 6))
-    for a in range(6):
-        for b in range(a + 1):
-            normals[:, a, b] = normals[:, b, a] = np.bincount(patch, J[:, a] * J[:, b], count)
-    g = np.empty((count, 6))
-    for a in range(6):
-        g[:, a] = np.bincount(patch, J[:, a] * e, count)
-    return normals, g
+        sums = {"normals": found.normals[keep], "gradients": found.gradients[keep]}
+        found = replace(found, counts=found.counts[keep], **sums)
 
 
 def grade(
@@ -193,11 +157,12 @@ def grade(
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
-    found = residuals(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m)
+    found = evidence(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m)
     overlap = found.inliers >= max(params.min_inliers, params.min_inlier_ratio * found.points)
     found = without_dominant_patches(found) if overlap else found
-    info = frozen(found.J.T @ found.J / found.noise_m**2)
-    weakest = unobservable_directions(found.J, found.centre) if overlap else ()
+    total = found.normals.sum(axis=0)
+    info = frozen(total / found.noise_m**2)
+    weakest = unobservable_directions(total, int(found.counts.sum()), found.centre) if overlap else ()
     P: Array | None = COVARIANCE_FACTOR * jackknife_covariance(found) if overlap and not weakest else None
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
@@ -230,22 +195,24 @@ def _status(overlap: bool, converged: bool, free: bool) -> AlignStatus:
     return AlignStatus.DEGENERATE if free else AlignStatus.ALIGNED
 
 
-def scaled_information(J: Array, centre: Array) -> tuple[Array, float]:
+def scaled_information(total: Array, count: int, centre: Array) -> tuple[Array, float]:
     """Return the mean of J'J (6, 6) with rotations about ``centre`` in units of the rms radius L, and L [m].
 
-    Each diagonal entry is the mean squared change of surface distance per squared unit of point motion, between 0 and
-    about 1, whatever the size of the target.
+    ``total`` is the sum of J'J over ``count`` points, with rotations about the origin. Each diagonal entry is the mean
+    squared change of surface distance per squared unit of point motion, between 0 and about 1, whatever the size of the
+    target.
     """
-    n = J[:, 3:]
-    turns = J[:, :3] - np.cross(centre, n)  # (p - centre) x n
-    radius = float(np.sqrt(np.mean(np.sum(turns**2, axis=1))))
-    scaled = np.hstack([turns / max(radius, np.finfo(float).tiny), n])
-    return scaled.T @ scaled / len(J), radius
+    shift = np.eye(6)
+    shift[3:, :3] = geometry.skew(centre)  # (p - centre) x n = p x n - centre x n
+    mean = shift.T @ total @ shift / count
+    radius = float(np.sqrt(max(np.trace(mean[:3, :3]), 0.0)))
+    scale = np.repeat([1.0 / max(radius, np.finfo(float).tiny), 1.0], 3)
+    return scale[:, None] * mean * scale, radius
 
 
-def unobservable_directions(J: Array, centre: Array) -> tuple[str, ...]:
+def unobservable_directions(total: Array, count: int, centre: Array) -> tuple[str, ...]:
     """Name every motion whose scaled information is below ``FREE_BELOW``; empty if all six are observable."""
-    info, _ = scaled_information(J, centre)
+    info, _ = scaled_information(total, count, centre)
     values, vectors = np.linalg.eigh(info)
     free = vectors[:, values < FREE_BELOW].T
     return tuple(_words(row) for row in _sparse_basis(free))

@@ -134,6 +134,31 @@ class NormalEquations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class PatchSums:
+    """Sums over the inliers at a pose by patches of the model, with J and e as in :class:`NormalEquations`, e negated.
+
+    Attributes:
+        points: points of the scan, also those that are not finite.
+        inliers: points nearer than the gate.
+        sum_d2: sum of the squared distances to the closest points [m^2].
+        median_m: median of |e| [m].
+        centre: (3,) centroid of the inliers in {C} [m].
+        counts: (m,) inliers of each patch.
+        normals: (m, 6, 6) sums of J'J.
+        gradients: (m, 6) sums of e J with e = n . (p_c - foot).
+    """
+
+    points: int
+    inliers: int
+    sum_d2: float
+    median_m: float
+    centre: Array
+    counts: NDArray[np.int64]
+    normals: Array
+    gradients: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class SurfaceIndex:
     """An indexed surface. Build it with :meth:`build`; it is read-only and may be shared by threads.
 
@@ -235,6 +260,26 @@ class SurfaceIndex:
         """
         gate = self.reach_m if gate_m is None else min(gate_m, self.reach_m)
         return NormalEquations(*self._index.normal_equations(_points(points), _rigid(T_ca), gate, threads, facing))
+
+    def evidence(
+        self,
+        points: NDArray[Any],
+        T_ca: ArrayLike | Pose,
+        gate_m: float,
+        patch_m: float,
+        least_patches: int,
+        *,
+        threads: int = 1,
+        facing: bool = False,
+    ) -> PatchSums:
+        """Return sums over the inliers of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4).
+
+        A patch is what lies in one cube of side ``patch_m`` [m] in {C}; with at most ``least_patches`` occupied cubes
+        each point is a patch. ``facing``: as in :class:`IcpParams`.
+        """
+        gate = min(gate_m, self.reach_m)
+        rule = (gate, patch_m, least_patches, facing, threads)
+        return PatchSums(*self._index.evidence(_points(points), _rigid(T_ca), *rule))
 
 
 def _kernel() -> Any:

@@ -10,6 +10,7 @@
 #include <stdexcept>
 
 #include "build.hpp"
+#include "evidence.hpp"
 #include "loop.hpp"
 #include "save.hpp"
 
@@ -178,6 +179,34 @@ class Index {
     return nb::make_tuple(info, gradient, (int64_t)s.v[0], s.v[34], s.v[1], v.n - ignored, ignored);
   }
 
+  nb::tuple evidence(nb::handle points, const Doubles& T_ca, double gate, double side, int least, bool facing,
+                     int threads) const {
+    require(gate > 0 && side > 0, "gate and patch size must be positive");
+    const Cloud cloud(points);
+    const View v = cloud.view();
+    const Rows T = rows(T_ca);
+    Evidence e;
+    {
+      nb::gil_scoped_release release;
+      Team team(threads);
+      e = avs::evidence(store_, code(), v, T.v, {gate, side, least, facing}, team);
+    }
+    const size_t m = e.patches.size();
+    double *N, *g, *c;
+    int64_t* count;
+    auto normals = array<double>({m, 6, 6}, &N), gradients = array<double>({m, 6}, &g), centre = array<double>({3}, &c);
+    auto counts = array<int64_t>({m}, &count);
+    for (size_t k = 0; k < m; ++k) {
+      const PatchSums& from = e.patches[k];
+      for (int r = 0, t = 0; r < 6; ++r)
+        for (int q = 0; q <= r; ++q, ++t) N[36 * k + 6 * r + q] = N[36 * k + 6 * q + r] = from.normals[t];
+      std::memcpy(g + 6 * k, from.gradients, sizeof from.gradients);
+      count[k] = from.points;
+    }
+    std::memcpy(c, e.centre, sizeof e.centre);
+    return nb::make_tuple(e.points, e.inliers, e.sum_d2, e.median, centre, counts, normals, gradients);
+  }
+
   size_t bytes() const { return store_.bytes(); }
   const char* isa() const { return code().name; }
 
@@ -237,6 +266,8 @@ NB_MODULE(_kernel, m) {
            nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false, nb::arg("newton") = false)
       .def("normal_equations", &Index::normal_equations, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"),
            nb::arg("threads") = 1, nb::arg("facing") = false)
+      .def("evidence", &Index::evidence, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"), nb::arg("patch_m"),
+           nb::arg("least_patches"), nb::arg("facing") = false, nb::arg("threads") = 1)
       .def_prop_ro("nbytes", &Index::bytes)
       .def_prop_ro("isa", &Index::isa)
       .def_prop_ro("shape", &Index::shape);
