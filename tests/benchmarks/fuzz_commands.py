@@ -44,13 +44,13 @@ seed = 1
 duration_s = 0.5
 rate_hz = 4.0
 [target]
-shape = "cube"
+shape = "satellite"
 [motion]
 position_m = [0.1, 0.0, 5.0]
 rate_radps = [0.06, 0.064, -0.048]
 [scanner]
 fov_deg = [48.0, 48.0]
-rays = [16, 16]
+rays = [32, 32]
 noise_m = 0.008
 [[fault]]
 kind = "occlusion"
@@ -79,6 +79,8 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "truth_file"): ("log.mcap", "--truth", "IN", *RUN),
     ("run", "golden"): ("log.mcap", "--golden", "IN", *RUN),
     ("info", "source"): ("IN",),
+    ("info", "model"): ("log.mcap", "--model", "IN"),
+    ("info", "truth_file"): ("log.mcap", "--truth", "IN"),
     ("doctor", "source"): ("IN", "--repair", "OUT.mcap"),
     ("bench", "log"): ("IN", "--scans", "1"),
     ("bench", "model"): ("log.mcap", "--model", "IN", "--scans", "1"),
