@@ -94,11 +94,15 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("compare", "gate"): ("result", "result", "--gate", "IN", "--junit", "OUT.xml"),
     ("sweep", "campaign"): ("IN", "--plan"),
     ("sweep", "output"): ("campaign.toml", "-o", "IN", "--limit", "0", "--workers", "0"),
+    ("model", "log"): ("IN", "-o", "OUT.ply"),
+    ("model", "against"): ("log.mcap", "--against", "IN", "-o", "OUT.ply"),
+    ("model", "model"): ("log.mcap", "--model", "IN", "-o", "OUT.ply"),
+    ("model", "truth_file"): ("log.mcap", "--truth", "IN", "-o", "OUT.ply"),
     ("config", "log"): ("IN",),
     ("config", "config_file"): ("--config", "IN"),
 }
 SEEDS: dict[str, tuple[str, ...]] = {
-    "source": ("log.mcap", "log.mcap", "scenario.toml", "scans"), "log": ("log.mcap",),
+    "source": ("log.mcap", "log.mcap", "scenario.toml", "scans"), "log": ("log.mcap",), "against": ("model.ply",),
     "model": ("model.ply", "model.obj"),
     "truth_file": ("result/truth.tum",), "config_file": ("config.toml",), "golden": ("result/rows.jsonl",),
     "result": ("result",), "results": ("result",), "gate": ("rules.toml",), "campaign": ("campaign.toml",),

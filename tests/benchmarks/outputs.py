@@ -42,6 +42,7 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("export", "output"): ("result", "--to", "csv", "-o", "OUT", "--overwrite"),
     ("compare", "output"): ("result", "result", "-o", "OUT", "--overwrite"),
     ("compare", "junit"): ("result", "result", "--gate", "rules.toml", "--junit", "OUT"),
+    ("model", "output"): ("log.mcap", "-o", "OUT", "--overwrite"),
     ("sweep", "output"): ("campaign.toml", "-o", "OUT", "--workers", "0"),
 }
 FOLDERS = {("run", "output"), ("sweep", "output")}
@@ -132,12 +133,12 @@ def is_complete(case: tuple[str, str], path: Path) -> bool:
                 return not source.losses
     except AvsError:
         return False
-    text = path.read_text(encoding="utf-8")
-    ends = {".html": "</html>", ".xml": "</testsuites>", ".csv": "\n", ".jsonl": "\n"}
+    text = path.read_text(encoding="utf-8", errors="replace")
+    ends = {".html": "</html>", ".xml": "</testsuites>", ".csv": "\n", ".jsonl": "\n", ".ply": ""}
     return text.rstrip(" ").endswith(ends[path.suffix]) or text.rstrip().endswith(ends[path.suffix])
 
 
-SUFFIX = {"record": ".mcap", "doctor": ".mcap", "report": ".html", "export": ".csv", "plan": ".csv"}
+SUFFIX = {"record": ".mcap", "doctor": ".mcap", "report": ".html", "export": ".csv", "plan": ".csv", "model": ".ply"}
 
 
 def kill_one(case: tuple[str, str], seeds: Path, root: Path, fraction: float, seconds: float) -> str:
