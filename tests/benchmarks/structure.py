@@ -239,10 +239,13 @@ def traced(root: Path) -> dict:
 def scan_path(root: Path) -> dict:
     """Files, functions and calls of the package between two rows."""
     sys.path.insert(0, str(root))
-    import avsreplay
+    try:
+        from avsreplay.run import Job, Run
+    except ImportError:  # the name in earlier versions
+        from avsreplay.job import Job, Run
 
     package = str(root / "avsreplay")
-    rows = avsreplay.replay(root / "fixtures" / "tumble.mcap")
+    rows = Run(Job(source=root / "fixtures" / "tumble.mcap", prefetch=0)).rows()
     next(rows)
     counts = []
     while (count := calls_of_next(rows, package)) is not None:
