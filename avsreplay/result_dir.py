@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.estimate.measurement import measurement_jacobian
-from avsreplay.files import check_output, output_folder, read_npz
+from avsreplay.files import check_output, output_folder
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.result_log import ResultFrame, ResultLog
+from avsreplay.numpy_archive import read_npz
 from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief, State, Surface

@@ -18,7 +18,8 @@ import pytest
 
 from avsreplay import files
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.files import check_output, output_folder, output_path, output_text, parse_json, read_npz
+from avsreplay.files import check_output, output_folder, output_path, output_text, parse_json
+from avsreplay.numpy_archive import read_npz
 
 posix = pytest.mark.skipif(os.name != "posix", reason="file nodes of POSIX")
 

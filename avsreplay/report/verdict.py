@@ -342,15 +342,8 @@ def verdict_table(verdict: RunVerdict) -> Table:
 
 def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -> Table:
     """The worst moments; with ``place`` (row -> row of a page) a click leads to the scan."""
-    rows = tuple(
-        (
-            TableCell(
-                f"{m.start_s:.1f}" if m.start_s == m.end_s else f"{m.start_s:.1f} to {m.end_s:.1f}",
-                scan=(place or {}).get(m.row),
-            ),
-            m.what,
-            m.cause,
-        )
-        for m in verdict.moments
-    )
-    return Table("Worst moments", ("t\n[s]", "what", "cause"), rows, align="l")
+    rows = []
+    for m in verdict.moments:
+        span = " to ".join(dict.fromkeys((f"{m.start_s:.1f}", f"{m.end_s:.1f}")))
+        rows.append((TableCell(span, scan=(place or {}).get(m.row)), m.what, m.cause))
+    return Table("Worst moments", ("t\n[s]", "what", "cause"), tuple(rows), align="l")

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.files import output_path, read_npz
+from avsreplay.files import output_path
 from avsreplay.geometry import Array, Pose
+from avsreplay.numpy_archive import read_npz
 from avsreplay.records import Surface
 from avsreplay.report.charts import pack, values
 from avsreplay.rows import Row
