@@ -1,4 +1,4 @@
-// The whole hot code of one instruction set. AVS_ISA names it and AVS_CODE its door.
+// All code that is compiled once for each instruction set. AVS_ISA names its namespace and AVS_CODE the function that returns it.
 #include <algorithm>
 #include <cmath>
 #include <cstring>
