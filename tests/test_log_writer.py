@@ -250,3 +250,10 @@ def test_crop_keeps_the_points_inside(tmp_path: Path) -> None:
         (two, _) = source.scans()
     distance = np.linalg.norm(whole.points.astype(np.float64), axis=1)
     assert len(two.points) == ((distance >= 1.0) & (distance <= 2.0)).sum()
+
+
+def test_a_state_that_is_not_finite_is_one_line_and_leaves_no_file(tmp_path: Path) -> None:
+    label = Label("occlusion", 0, 1, True, float("inf"))
+    with pytest.raises(UsageError, match="not finite"):
+        LogWriter(tmp_path / "a.mcap", LogHeader(labels=(label,)))
+    assert not list(tmp_path.iterdir())

@@ -158,9 +158,16 @@ class LogWriter:
         # The library closes a chunk only after it exceeds its size; sizes and spans are therefore checked here.
         self._writer: Any = Writer(self._stream, 1 << 62, kinds[compression], enable_data_crcs=True)
 
+        try:
+            record = encode_header(header)
+        except ValueError:
+            self._discard()
+            hint = "check the numbers of the scenario"
+            raise UsageError("a state of the scenario is not finite", where=str(self._path), hint=hint) from None
+
         def begin() -> None:
             self._writer.start(profile="ros2", library=LIBRARY)
-            self._writer.add_metadata(HEADER_RECORD, encode_header(header))
+            self._writer.add_metadata(HEADER_RECORD, record)
             if header.surface is not None:
                 data = surface_bytes(header.surface)
                 self._writer.add_attachment(0, 0, header.surface.name, "application/octet-stream", data)
