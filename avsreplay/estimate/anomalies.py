@@ -1,6 +1,7 @@
 """What the estimator does with a large innovation: it defers the scan, decides over the next ones, and acts.
 
-A scan whose NIS is above the 99.99 % point, or whose pose jumps, is doubtful. It does not change the estimate. After
+A scan whose NIS is above the 99.99 % point, scaled by the median NIS of the accepted scans, or whose pose jumps, is
+doubtful. It does not change the estimate. After
 three to five doubtful scans ``hypotheses`` decides. Free motion: the scans are used after all. Manoeuvre: rate and
 velocity are fitted anew from its instant on, with inertia, axes and centre of mass kept. Sensor bias: the estimate
 coasts while the offset lasts. Before the estimate has converged, the poses before a jump may as well be the biased
@@ -29,6 +30,7 @@ from avsreplay.records import Belief, Innovation, Manoeuvre, Reason, Verdict
 
 _FEWEST, _MOST, _RECENT = 3, 5, 3  # doubtful scans before a decision, accepted scans looked back on
 _MARGIN = 6.0  # log odds of the best hypothesis over the next, for a decision before _MOST
+_FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 15, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
 _READY = 8  # poses that the estimate must be based on
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
@@ -59,9 +61,10 @@ class AnomalyTest:
     ) -> tuple[Track, Verdict]:
         """The track after a measured scan, and the verdict on it. ``update`` applies the scan to a track."""
         nis = epoch.innovation.nis
-        suspicious = verdict.reason is Reason.POSE_JUMP or (verdict.gamma == 1 and nis > GATE)
+        suspicious = verdict.reason is Reason.POSE_JUMP or (verdict.gamma == 1 and nis > GATE * _nis_scale(track))
         if not self.enabled or verdict.reason not in _TESTED or not _ready(track):
-            return update(track), verdict
+            after = update(track)
+            return (_with_nis(after, track, nis) if verdict.gamma else after), verdict
         if not suspicious:
             return self._accepted(track, epoch, update), verdict
         if track.bias is not None and self._still_biased(track.bias, epoch.innovation):
@@ -74,7 +77,7 @@ class AnomalyTest:
     def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:
         """A scan that agrees with the prediction: the doubtful scans before it were bad."""
         after = update(replace(track, doubtful=(), bias=None))
-        return replace(after, recent=(*track.recent, epoch)[-_RECENT:])
+        return _with_nis(replace(after, recent=(*track.recent, epoch)[-_RECENT:]), track, epoch.innovation.nis)
 
     def _decided(self, track: Track) -> tuple[Track, Verdict]:
         """The track after a decision, or still in doubt."""
@@ -169,6 +172,20 @@ class AnomalyTest:
         for epoch in epochs:
             out = self._replay(out, epoch)
         return replace(out, reinitialised=track.reinitialised + 1, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
+
+
+def _nis_scale(track: Track) -> float:
+    """How many times larger than chi-square the NIS of the accepted scans is: their median over that of chi-square.
+
+    Registration errors beyond the claimed covariance enlarge every NIS. The test asks for a scan that stands out.
+    """
+    if len(track.nis) < _FEWEST_NIS:
+        return 1.0
+    return max(1.0, float(np.median(track.nis)) / _MEDIAN_CHI2)
+
+
+def _with_nis(after: Track, before: Track, nis: float) -> Track:
+    return replace(after, nis=(*before.nis, nis)[-_MOST_NIS:])
 
 
 def _ready(track: Track) -> bool:

@@ -48,7 +48,7 @@ class Track:
         reinitialised: how often a fit replaced the filter's estimate, or the given start was rejected.
         inflation: (2,) factor on R for errors correlated in time (attitude, position) by the last fit; None before it.
         prior, prior_ns: Gaussian prior of the fit and its instant: the given start, or that after a manoeuvre.
-        recent: the last accepted scans.  doubtful: the scans not yet decided on.
+        recent: the last accepted scans.  doubtful: the scans not yet decided on.  nis: of the last healthy scans.
         bias: an error of the sensor in effect, None where there is none.
         manoeuvres: all that were found.
     """
@@ -68,6 +68,7 @@ class Track:
     prior_ns: int = 0
     recent: tuple[Epoch, ...] = ()
     doubtful: tuple[Epoch, ...] = ()
+    nis: tuple[float, ...] = ()
     bias: SensorBias | None = None
     manoeuvres: tuple[Manoeuvre, ...] = ()
 
