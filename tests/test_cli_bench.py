@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from avsreplay.cli.bench import command, measure
+from avsreplay.cli.bench import benchmark_backends, command
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Pose, exp
 from avsreplay.register.contract import boxes, example_pose, view
@@ -27,7 +27,7 @@ def _scans(count: int, truth: bool = True) -> list[tuple[np.ndarray, Pose | None
 @pytest.mark.parametrize("truth", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_every_scan_but_the_first_is_counted(monkeypatch: pytest.MonkeyPatch, truth: bool) -> None:
     monkeypatch.setattr("avsreplay.cli.bench._peak_mib", lambda *_: 1.0)
-    tallies = measure(["horn", "small_gicp"], boxes(), _scans(4, truth))
+    tallies = benchmark_backends(["horn", "small_gicp"], boxes(), _scans(4, truth))
     for tally in tallies:
         record = tally.summary()
         assert (record["scans"], record["failures"], record["peak_mib"]) == (3, 0, 1.0)
@@ -41,7 +41,7 @@ def test_a_scan_of_nothing_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr("avsreplay.cli.bench._peak_mib", lambda *_: None)
     scans = _scans(3)
     away = (scans[-1][0] + 100.0, scans[-1][1])
-    (tally,) = measure(["horn"], boxes(), [*scans, away])
+    (tally,) = benchmark_backends(["horn"], boxes(), [*scans, away])
     assert tally.failures == 1
 
 
@@ -53,10 +53,10 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
     for arguments, error in asked.items():
         assert isinstance(CliRunner().invoke(command, list(arguments)).exception, error)
     with pytest.raises(UsageError):
-        measure(["no_such"], boxes(), [])
+        benchmark_backends(["no_such"], boxes(), [])
 
 
 def test_a_missing_library_is_said_before_anything_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("avsreplay.register.kiss.KissBackend.requires", (("no_such_module", "kiss-icp"),))
     with pytest.raises(MissingBackend):
-        measure(["kiss"], boxes(), _scans(1))
+        benchmark_backends(["kiss"], boxes(), _scans(1))

@@ -132,7 +132,7 @@ class _NotFinite(_Raising):
 
 @pytest.mark.parametrize("fake", [_Raising, _NotFinite])
 def test_a_back_ends_trouble_is_a_status(monkeypatch, surface: Surface, scan: np.ndarray, fake) -> None:
-    monkeypatch.setattr("avsreplay.register.registrar.load", lambda name: fake)
+    monkeypatch.setattr("avsreplay.register.registrar.load_backend", lambda name: fake)
     found = Registrar(surface).register(scan, example_pose())
     assert found.status is AlignStatus.FAILED
     assert np.isfinite(found.T_ac.matrix).all()

@@ -103,13 +103,13 @@ def test_every_built_in_back_end_is_registered_with_an_install_hint() -> None:
 
 def test_an_unknown_name_lists_the_registered_names() -> None:
     with pytest.raises(UsageError, match=r"'icp'.*horn.*kiss.*reference"):
-        backend.load("icp")
+        backend.load_backend("icp")
 
 
 def test_a_missing_library_gives_an_install_hint(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("avsreplay.register.kiss.KissBackend.requires", (("no_such_module", "kiss-icp"),))
     with pytest.raises(MissingBackend, match="pip install kiss-icp"):
-        backend.load("kiss")
+        backend.load_backend("kiss")
     assert [state.installed for state in backend.available() if state.name == "kiss"] == [False]
 
 
@@ -151,7 +151,7 @@ def test_command_fails_if_a_law_is_broken(monkeypatch: pytest.MonkeyPatch) -> No
 
 def _install(monkeypatch: pytest.MonkeyPatch, fake: type) -> None:
     for module in ("registrar", "contract"):
-        monkeypatch.setattr(f"avsreplay.register.{module}.load", lambda name: fake)
+        monkeypatch.setattr(f"avsreplay.register.{module}.load_backend", lambda name: fake)
 
 
 def _installed(name: str) -> bool:

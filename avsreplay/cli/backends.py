@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from avsreplay.register.backend import Availability
-    from avsreplay.register.contract import Finding
+    from avsreplay.register.contract import LawResult
 
 
 EPILOG = """\b
@@ -63,7 +63,7 @@ def _check(name: str, as_json: bool) -> None:
         raise CheckFailed(f"{len(broken)} of {len(findings)} laws broken: {'; '.join(broken)}", where=name)
 
 
-def _finding_row(finding: Finding) -> tuple[str, ...]:
+def _finding_row(finding: LawResult) -> tuple[str, ...]:
     return finding.law, "yes" if finding.held else "NO", finding.detail
 
 

@@ -86,14 +86,14 @@ def command(log: Path, backends: str, model: Path | None, topic: str | None, sca
         taken = [(scan.points, source.truth_of(scan).pose) for scan in source.scans()]
     if surface is None:
         raise UsageError("the log has no model", where=str(log), hint="name one with --model")
-    summaries = [tally.summary() for tally in measure(names, surface, taken)]
+    summaries = [tally.summary() for tally in benchmark_backends(names, surface, taken)]
     if as_json:
         click.echo(json.dumps({"log": str(log), "backends": summaries}, indent=2))
     else:
         _print(summaries)
 
 
-def measure(names: list[str], surface: Surface, scans: list[TrueScan]) -> list[Tally]:
+def benchmark_backends(names: list[str], surface: Surface, scans: list[TrueScan]) -> list[Tally]:
     """Every back end on every scan that has points; all on one scan before any goes on to the next.
 
     A scan is its points (n, 3) in {A} [m] and the true pose T_ac, or None.

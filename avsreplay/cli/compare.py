@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, load
+from avsreplay.cli.options import PATH, read_result
 from avsreplay.errors import DataLost, UsageError
 from avsreplay.files import check_output, output_text
 from avsreplay.report import gate as gates
@@ -154,7 +154,7 @@ class _Group:
 def _group(path: Path) -> _Group:
     """The result at ``path``, or all results in its subfolders."""
     inside = sorted(found.parent for found in path.glob("*/rows.jsonl")) if not (path / "rows.jsonl").is_file() else []
-    runs = tuple(load(folder) for folder in inside or [path])
+    runs = tuple(read_result(folder) for folder in inside or [path])
     return _Group(path.resolve().name if inside else runs[0].name, runs)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from avsreplay.cli.options import PATH, load
+from avsreplay.cli.options import PATH, read_result
 from avsreplay.errors import UsageError
 from avsreplay.files import STDOUT, check_output
 from avsreplay.report import export
@@ -38,7 +38,7 @@ def command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) 
     CSV and Parquet hold every column of every scan with units in the headings; TUM and KITTI hold poses of {C} in {A}.
     """
     check_output(output, overwrite=overwrite)
-    found, quiet = load(result), output == STDOUT
+    found, quiet = read_result(result), output == STDOUT
     if kind in ("csv", "parquet"):
         (export.write_csv if kind == "csv" else export.write_parquet)(output, found.rows)
         click.echo(f"{output}: {len(found.rows)} rows", err=quiet)

@@ -48,7 +48,7 @@ def command(source: Path, as_json: bool, **reading: Any) -> None:
         advice = preflight(opened, opened.header.surface) if info.cloud_topic or info.scans else []
     if as_json:
         checks = [dataclasses.asdict(a) for a in advice]
-        click.echo(json.dumps({**document(info), "checks": checks}, indent=2))
+        click.echo(json.dumps({**_document(info), "checks": checks}, indent=2))
     else:
         _print(info, advice)
     if info.losses:
@@ -56,7 +56,7 @@ def command(source: Path, as_json: bool, **reading: Any) -> None:
         raise DataLost(what, where=info.path, hint="run avsreplay doctor for details")
 
 
-def document(info: LogInfo) -> dict[str, Any]:
+def _document(info: LogInfo) -> dict[str, Any]:
     """Return the JSON document: the fields of ``LogInfo`` and the rate of each topic."""
     out = dataclasses.asdict(info)
     for table, topic in zip(out["topics"], info.topics, strict=True):

@@ -54,7 +54,7 @@ def command(
 
     from avsreplay.files import check_output, output_path
     from avsreplay.log import open_source, read_surface
-    from avsreplay.reconstruct import at_grasp, deviations, ply_bytes, reconstruct
+    from avsreplay.reconstruct import at_grasp, deviations, reconstruct, reconstruction_ply
 
     check_output(output, overwrite=overwrite)
     cad = read_surface(against) if against else None
@@ -63,11 +63,11 @@ def command(
     made = made if grasp is None else at_grasp(made, np.array(grasp))
     found = deviations(made, cad) if cad else None
     with output_path(output, overwrite=overwrite) as path:
-        path.write_bytes(ply_bytes(made, found))
-    click.echo(json.dumps(document(made, found), indent=2) if as_json else _text(made, found))
+        path.write_bytes(reconstruction_ply(made, found))
+    click.echo(json.dumps(_document(made, found), indent=2) if as_json else _text(made, found))
 
 
-def document(made: Reconstruction, found: Deviations | None) -> dict[str, Any]:
+def _document(made: Reconstruction, found: Deviations | None) -> dict[str, Any]:
     """Return the JSON document: figures of the reconstruction and of its deviations from a CAD model."""
     out: dict[str, Any] = {
         "scans_used": made.used,
@@ -91,7 +91,7 @@ def document(made: Reconstruction, found: Deviations | None) -> dict[str, Any]:
 
 
 def _text(made: Reconstruction, found: Deviations | None) -> str:
-    said = document(made, found)
+    said = _document(made, found)
     lines = [
         f"scans used:     {made.used} of {made.offered}, {made.searches} of them needed a search",
         f"surface:        {said['points']} points, median 1 sigma {1e3 * said['median_one_sigma_m']:.2f} mm",

@@ -98,7 +98,7 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
         raise UsageError(str(error), hint="correct the option") from None
 
 
-def load(path: Path) -> Result:
+def read_result(path: Path) -> Result:
     """Read and verify a saved result; warn on stderr if it could not be verified or its log was damaged."""
     from avsreplay.report.result import load_result
 

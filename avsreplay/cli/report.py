@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from avsreplay.cli.options import PATH, load
+from avsreplay.cli.options import PATH, read_result
 from avsreplay.errors import UnreadableInput
 from avsreplay.files import STDOUT, check_output
 
@@ -41,7 +41,7 @@ def write_page(result: Path, target: Path, title: str | None = None) -> str:
     from avsreplay.files import output_text
     from avsreplay.report.page import build_page
 
-    found = load(result)
+    found = read_result(result)
     if not found.rows:
         raise UnreadableInput("holds no row", where=str(result), hint="name the result of a run with at least one scan")
     page = build_page(

@@ -17,7 +17,7 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.log import mcap_format as mcap
 from avsreplay.log.bytes_io import BadMessage, ByteFile, shown
 from avsreplay.log.index import MAX_NS, Recording, Sink
-from avsreplay.log.mcap_format import Channel, ChunkStore, Fields, RecordSink, Summary, read_summary
+from avsreplay.log.mcap_format import Channel, ChunkStore, Fields, RecordSink, SummarySection, read_summary
 from avsreplay.log.mcap_salvage import ChannelTable, begins_record, first_chunk, hides_chunk, next_record
 from avsreplay.log.options import Loss
 from avsreplay.log.surface import MODEL_ENDINGS
@@ -55,7 +55,7 @@ class McapFile(Recording):
         self._copy_to = copy_to
         super().__init__(path, limit, sinks)
         self.closed_properly = False
-        self.summary, self.data_end, self.unchecked = Summary(), (0, 0), 0
+        self.summary, self.data_end, self.unchecked = SummarySection(), (0, 0), 0
         self._channels = ChannelTable(self._table)
         self._model: tuple[str, int, int] | None = None
         self._bad_chunk: Loss | None = None
@@ -111,7 +111,7 @@ class McapFile(Recording):
             )
         self._account(summary)
 
-    def _step(self, at: int, summary: Summary) -> int:
+    def _step(self, at: int, summary: SummarySection) -> int:
         """Process one record and return the offset of the next one."""
         if at + 9 > self._size:
             self._lose(Loss("the file is cut inside a record", at, self._size - at))
@@ -272,7 +272,7 @@ class McapFile(Recording):
             self._lose(self._bad_chunk)
             self._bad_chunk = None
 
-    def _resync(self, at: int, summary: Summary, why: str) -> int:
+    def _resync(self, at: int, summary: SummarySection, why: str) -> int:
         """Return the next offset after ``at`` where a readable record begins."""
         inner = self._swallowed(self._trusted - 1, at)
         if inner is not None:  # the record before this one declared too many bytes
@@ -287,12 +287,12 @@ class McapFile(Recording):
         self._lose(Loss(why, at, resume - at))
         return resume
 
-    def _adopt(self, summary: Summary) -> None:
+    def _adopt(self, summary: SummarySection) -> None:
         """Add the channels of an intact summary, in case the chunk that defines them is lost."""
         for opcode, fields in summary.definitions:
             (self._channels.schema if opcode == mcap.SCHEMA else self._channels.channel)(fields)
 
-    def _account(self, summary: Summary) -> None:
+    def _account(self, summary: SummarySection) -> None:
         """List the messages that the summary counts and the pass did not find."""
         if self._orphans:
             self._lose(Loss("messages of a channel whose definition is lost", 0, 0, messages=self._orphans))

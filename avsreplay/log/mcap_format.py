@@ -200,7 +200,7 @@ _FOOTER_HEAD = b"\x02\x14\x00\x00\x00\x00\x00\x00\x00"
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
+class SummarySection:
     """The summary section.
 
     Attributes:
@@ -216,15 +216,15 @@ class Summary:
     trouble: str = ""
 
 
-def read_summary(file: ByteFile, limit: int) -> Summary:
+def read_summary(file: ByteFile, limit: int) -> SummarySection:
     """Return the summary of a file; if its checksum is wrong, an empty one that states why."""
     try:
         return _read(file, limit)
     except BadMessage as error:
-        return Summary(trouble=str(error))
+        return SummarySection(trouble=str(error))
 
 
-def _read(file: ByteFile, limit: int) -> Summary:
+def _read(file: ByteFile, limit: int) -> SummarySection:
     if file.size < 8 + TAIL:
         raise BadMessage("no footer")
     tail = file.read(file.size - TAIL, TAIL)
@@ -232,7 +232,7 @@ def _read(file: ByteFile, limit: int) -> Summary:
         raise BadMessage("no footer")
     start, crc = int.from_bytes(tail[9:17], "little"), int.from_bytes(tail[25:29], "little")
     if start == 0:
-        return Summary()
+        return SummarySection()
     inside = 8 < start <= file.size - TAIL and file.size - start <= limit
     data = file.read(start, file.size - TAIL - start + 25) if inside else b""
     if inside and (not crc or zlib.crc32(data) == crc):
@@ -258,11 +258,11 @@ def _moved(file: ByteFile, crc: int) -> tuple[int, memoryview] | None:
     return None
 
 
-def _walk(start: int, view: memoryview) -> Summary:
+def _walk(start: int, view: memoryview) -> SummarySection:
     messages, definitions = None, list[tuple[int, Fields]]()
     for opcode, begin, end in records(view):
         if opcode in (SCHEMA, CHANNEL):
             definitions.append((opcode, Fields(view[begin:end])))
         elif opcode == STATISTICS:
             messages = Fields(view[begin:end]).number(8)
-    return Summary(start, messages, tuple(definitions))
+    return SummarySection(start, messages, tuple(definitions))

@@ -22,11 +22,11 @@ from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.convexification import (
     BETWEEN,
     Case,
-    Reference,
+    ReferencePath,
+    convex_subproblem,
     dense_margins,
     excess,
-    instants,
-    linearised,
+    interval_fractions,
     turn_rate,
 )
 from avsreplay.plan.limits import CONSTRAINTS, Limits, SampledScene, Scene
@@ -211,22 +211,22 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
     return best
 
 
-def _warm(case: Case, path: RobotPath, since_s: float) -> Reference:
+def _warm(case: Case, path: RobotPath, since_s: float) -> ReferencePath:
     t = max(path.t_go_s - since_s - case.wait_s, 1e-3)
-    return Reference(t, path.at(since_s + case.wait_s + t * instants(case.limits.nodes))[0])
+    return ReferencePath(t, path.at(since_s + case.wait_s + t * interval_fractions(case.limits.nodes))[0])
 
 
-def _initial(case: Case, free: Plan) -> list[Reference]:
+def _initial(case: Case, free: Plan) -> list[ReferencePath]:
     """Initial paths: the free plan, then flights to a point on the fixture's axis and along the axis, ever later."""
-    s, wait, least = instants(case.limits.nodes), case.wait_s, free.t_go_s - case.wait_s
-    out = [Reference(least, path_of(free, case.r0, case.v0).at(wait + least * s)[0])]
+    s, wait, least = interval_fractions(case.limits.nodes), case.wait_s, free.t_go_s - case.wait_s
+    out = [ReferencePath(least, path_of(free, case.r0, case.v0).at(wait + least * s)[0])]
     if not case.limits.geometric:
         return out
     turn = turn_rate(case, wait + least)
     t, end = 1.1 * least, case.params.horizon_s - wait
     step = min(max(0.15 * least, 0.9 / max(turn, 1e-6)), 0.5 * least)
     while t <= end and len(out) < 9:
-        out.append(Reference(t, _via_axis(case, t, s)))
+        out.append(ReferencePath(t, _via_axis(case, t, s)))
         t += step
     return out
 
@@ -266,14 +266,14 @@ def _around(case: Case, r: Array, rho: Array, R: Array, free: NDArray[np.bool_])
     return np.where(inside, centre + away / np.maximum(distance, 1e-9) * radius, r)
 
 
-def _converged(case: Case, reference: Reference) -> StepPath | None:
+def _converged(case: Case, reference: ReferencePath) -> StepPath | None:
     """Iterate from a reference until the end time no longer changes; return the earliest feasible path seen."""
     best: StepPath | None = None
     n = case.limits.nodes
     off = np.zeros((2 * n, len(CONSTRAINTS)))
     change, slack = _trust(case, reference), math.inf
     for iteration in range(ITERATIONS):
-        problem = linearised(case, reference, off, change)
+        problem = convex_subproblem(case, reference, off, change)
         found = solve(problem)
         if found is None:
             return best
@@ -292,12 +292,12 @@ def _converged(case: Case, reference: Reference) -> StepPath | None:
             return best
         if abs(t - reference.t) <= 0.02 * t:
             off += 1.2 * over + np.where(over > 0.0, case.buffer_m, 0.0)
-        slack, reference = found.slack, Reference(t, path.at(case.wait_s + t * instants(n))[0])
+        slack, reference = found.slack, ReferencePath(t, path.at(case.wait_s + t * interval_fractions(n))[0])
         change = max(0.5 * change, 1e-3) if iteration >= 6 else _trust(case, reference)
     return best
 
 
-def _trust(case: Case, reference: Reference) -> float:
+def _trust(case: Case, reference: ReferencePath) -> float:
     """Return the largest relative change of the end time: the target may turn by TURN_RAD at most."""
     turn = turn_rate(case, case.wait_s + reference.t) * reference.t
     return float(min(0.25, TURN_RAD / max(turn, 1e-9)))

@@ -46,14 +46,14 @@ class Case:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Reference:
+class ReferencePath:
     """A path to linearise about: thrust time t [s] and positions (2 n, 3) at the middle and end of every interval."""
 
     t: float
     r: Array
 
 
-def instants(n: int) -> Array:
+def interval_fractions(n: int) -> Array:
     """Middle and end of every interval, as fractions of the flight (2 n,)."""
     return np.arange(1, 2 * n + 1) / (2.0 * n)
 
@@ -92,7 +92,7 @@ def allowed(start: Array, fraction: Array) -> Array:
     return np.asarray(np.maximum(-start, 0.0)[None, :] * shrinking[:, None])
 
 
-def linearised(case: Case, reference: Reference, off: Array, change: float) -> Subproblem:
+def convex_subproblem(case: Case, reference: ReferencePath, off: Array, change: float) -> Subproblem:
     """Return the convex subproblem at a reference."""
     n, t = case.limits.nodes, reference.t
     rho, rate = case.scene.goal(np.array([case.wait_s + t, case.wait_s + t - 1e-4]))
@@ -115,15 +115,15 @@ def linearised(case: Case, reference: Reference, off: Array, change: float) -> S
     start = margins(
         case.scene, case.limits, case.sampled.coordinates(np.zeros(1), case.r0[None]), case.r0[None]
     ).values[0]
-    return rows.added(problem, off - allowed(start, instants(n)))
+    return rows.added(problem, off - allowed(start, interval_fractions(n)))
 
 
 class _RowMaker:
     """Rows of the geometric constraints at the middle and the end of every interval."""
 
-    def __init__(self, case: Case, reference: Reference) -> None:
+    def __init__(self, case: Case, reference: ReferencePath) -> None:
         n = case.limits.nodes
-        s = instants(n)
+        s = interval_fractions(n)
         times = case.wait_s + reference.t * s
         self.limits, self.scene = case.limits, case.scene
         self.far_m = FAR * case.buffer_m

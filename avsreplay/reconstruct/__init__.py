@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose
-from avsreplay.reconstruct.fusion import all_poses, directions, fused, refined
+from avsreplay.reconstruct.fusion import all_poses, fused, refined, turn_and_coverage
 from avsreplay.reconstruct.tracking import ReconstructionParams, track
 from avsreplay.reconstruct.views import thinned_views
 from avsreplay.records import Scan, Surface
@@ -35,8 +35,8 @@ __all__ = [
     "ReconstructionParams",
     "at_grasp",
     "deviations",
-    "ply_bytes",
     "reconstruct",
+    "reconstruction_ply",
     "surface_of",
 ]
 
@@ -103,7 +103,7 @@ def reconstruct(scans: Iterable[Scan], params: ReconstructionParams | None = Non
         )
     keys, rms = refined(views, tracked, p, extent)
     poses = all_poses(views, tracked, keys, p, extent)
-    turned, coverage = directions([views[k] for k in poses], list(poses.values()))
+    turned, coverage = turn_and_coverage([views[k] for k in poses], list(poses.values()))
     _refuse_still(turned, tracked.weakest)
     surface = fused(views, poses, p.voxel * extent)
     notes = _notes(len(poses), len(views), coverage)
@@ -165,7 +165,7 @@ def at_grasp(made: Reconstruction, grasp: Array | None = None) -> Reconstruction
 
 def surface_of(made: Reconstruction) -> Surface:
     """The reconstruction as the model of a replay: a point cloud in {C}."""
-    data = ply_bytes(made)
+    data = reconstruction_ply(made)
     none = np.zeros((0, 3), dtype=np.int32)
     return Surface(made.points, none, "reconstructed.ply", hashlib.sha256(data).hexdigest(), data)
 
@@ -220,7 +220,7 @@ def deviations(made: Reconstruction, cad: Surface) -> Deviations:
     return Deviations(T_mc, signed, most, ratio, float(np.median(known)), float(np.quantile(known, 0.95)))
 
 
-def ply_bytes(made: Reconstruction, found: Deviations | None = None) -> bytes:
+def reconstruction_ply(made: Reconstruction, found: Deviations | None = None) -> bytes:
     """Return a binary PLY file: points, normals, ``one_sigma`` [m], number of scans, and colours of the deviations.
 
     Args:

@@ -153,7 +153,7 @@ def _solid(
     return np.asarray(through * (len(numbers) / len(asked)) <= 0.34 * seen)
 
 
-def directions(views: Sequence[ScanView], poses: Sequence[Pose]) -> tuple[float, float]:
+def turn_and_coverage(views: Sequence[ScanView], poses: Sequence[Pose]) -> tuple[float, float]:
     """Largest turn between two poses [rad], and the share of all directions in {C} from which a scan was taken."""
     turns = [turn(poses[0], T) for T in poses]
     seen = sight_lines(views, [T.inverse() for T in poses])

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from avsreplay.register.backend import Availability, Backend, Target, available
 from avsreplay.register.model_check import ModelCheck
-from avsreplay.register.params import Limits, RegisterParams
+from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
 
-__all__ = ["Availability", "Backend", "Limits", "ModelCheck", "RegisterParams", "Registrar", "Target", "available"]
+__all__ = [
+    "Availability",
+    "Backend",
+    "ModelCheck",
+    "RegisterParams",
+    "Registrar",
+    "RegistrationLimits",
+    "Target",
+    "available",
+]

@@ -19,7 +19,7 @@ from avsreplay.geometry import Pose
 from avsreplay.records import Fit, Surface
 
 if TYPE_CHECKING:
-    from avsreplay.register.params import Limits
+    from avsreplay.register.params import RegistrationLimits
     from avsreplay.register.surface_index import SurfaceIndex
     from avsreplay.register.visibility import Visibility
 
@@ -39,7 +39,7 @@ class Target:
 
     surface: Surface
     index: SurfaceIndex
-    limits: Limits
+    limits: RegistrationLimits
     visibility: Visibility
 
 
@@ -88,7 +88,7 @@ def names() -> tuple[str, ...]:
     return tuple(sorted({entry.name for entry in metadata.entry_points(group=GROUP)}))
 
 
-def load(name: str) -> Factory:
+def load_backend(name: str) -> Factory:
     """Return the class of a back end.
 
     Raises:
@@ -106,7 +106,7 @@ def load(name: str) -> Factory:
     return cast(Factory, factory)
 
 
-def build(name: str, factory: Factory, target: Target) -> Backend:
+def create_backend(name: str, factory: Factory, target: Target) -> Backend:
     """Build the back end. Raises MissingBackend if its library is installed but cannot be imported."""
     try:
         return factory(target)

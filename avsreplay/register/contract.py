@@ -15,7 +15,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register.backend import load
+from avsreplay.register.backend import load_backend
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import sample
@@ -42,7 +42,7 @@ FACES = np.array([(a, b, c) for p, q, r, s in QUADS for a, b, c in ((p, q, r), (
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class LawResult:
     """Result of one law: its name, whether it holds and the figures in one line."""
 
     law: str
@@ -67,7 +67,7 @@ class Bench:
         self.guess = self.T_ac @ Pose(
             exp(np.radians([2.0, -1.5, 1.0])), self.surface.extent * np.array([0.006, -0.005, 0.004])
         )
-        self.accuracy: tuple[float, float] = getattr(load(backend), "accuracy", ACCURACY)
+        self.accuracy: tuple[float, float] = getattr(load_backend(backend), "accuracy", ACCURACY)
         self.registrar = Registrar(self.surface, self.params)
 
     def fresh(self, surface: Surface | None = None, params: RegisterParams | None = None) -> Registrar:
@@ -80,19 +80,19 @@ class Bench:
         return float(geometry.angle(step.q)), float(np.linalg.norm(step.t)) / self.surface.extent
 
 
-def recovers(bench: Bench) -> Finding:
+def recovers(bench: Bench) -> LawResult:
     """An exact scan is registered to the true pose from a guess a few degrees off."""
     return _aligned_near(
         "recovers the exact pose", bench, bench.registrar.register(bench.scan, bench.guess), bench.T_ac
     )
 
 
-def stays(bench: Bench) -> Finding:
+def stays(bench: Bench) -> LawResult:
     """Started at the true pose it stays there."""
     return _aligned_near("stays at the true pose", bench, bench.registrar.register(bench.scan, bench.T_ac), bench.T_ac)
 
 
-def inverse(bench: Bench) -> Finding:
+def inverse(bench: Bench) -> LawResult:
     """T_ac carries points of the model onto the scan, and its inverse carries the scan onto the surface."""
     found = bench.registrar.register(bench.scan, bench.guess)
     there = found.T_ac.apply(view(bench.surface, POINTS, bench.T_ac.inverse().t))
@@ -100,10 +100,10 @@ def inverse(bench: Bench) -> Finding:
     back = _rms(bench.registrar.distance(bench.scan, found.T_ac, bench.surface.extent)) / bench.surface.extent
     held = bool(max(off, back) < 2.0 * (np.radians(bench.accuracy[0]) + bench.accuracy[1]))
     detail = f"rms {off:.1e} of the extent, inverse {back:.1e}"
-    return Finding("T_ac carries the model onto the scan", held, detail)
+    return LawResult("T_ac carries the model onto the scan", held, detail)
 
 
-def information(bench: Bench) -> Finding:
+def information(bench: Bench) -> LawResult:
     """The information is the Hessian of half the sum of squared distances over the variance, by finite differences."""
     sigma = 1e-3 * bench.surface.extent
     found = bench.fresh(params=replace(bench.params, noise_m=sigma)).register(bench.scan, bench.guess)
@@ -112,10 +112,10 @@ def information(bench: Bench) -> Finding:
     error, size = (float(np.linalg.norm(A * np.outer(scale, scale))) for A in (found.info - H, H))
     held = found.status is AlignStatus.ALIGNED and error < HESSIAN_WITHIN * size
     detail = f"relative difference {error / size:.1e}" if size > 0.0 else found.status.value
-    return Finding("the information is the Hessian of the cost", held, detail)
+    return LawResult("the information is the Hessian of the cost", held, detail)
 
 
-def camera_moved(bench: Bench) -> Finding:
+def camera_moved(bench: Bench) -> LawResult:
     """Moving scan and guess together in {A} moves the pose with them. The camera position is not used."""
     registrar = bench.fresh(params=replace(bench.params, camera=Camera.NONE))
     still = registrar.register(bench.scan, bench.guess)
@@ -123,7 +123,7 @@ def camera_moved(bench: Bench) -> Finding:
     return _same("moving the scan and the guess moves the pose", bench, MOVE @ still.T_ac, moved.T_ac)
 
 
-def model_moved(bench: Bench) -> Finding:
+def model_moved(bench: Bench) -> LawResult:
     """With the model in another frame the pose is of that frame. A sampled or gridded model may differ slightly."""
     motion = Pose(MOVE.q, bench.scale * MOVE.t)
     other = replace(bench.surface, vertices=motion.apply(bench.surface.vertices), sha256="moved")
@@ -131,14 +131,14 @@ def model_moved(bench: Bench) -> Finding:
     return _aligned_near("a model in another frame gives the same target", bench, moved, bench.T_ac @ motion.inverse())
 
 
-def order(bench: Bench) -> Finding:
+def order(bench: Bench) -> LawResult:
     """The order of the points in a scan does not matter."""
     shuffled = bench.scan[np.random.default_rng(SEED).permutation(len(bench.scan))]
     first, second = (bench.registrar.register(scan, bench.guess).T_ac for scan in (bench.scan, shuffled))
     return _same("the order of points does not matter", bench, first, second)
 
 
-def views(bench: Bench) -> Finding:
+def views(bench: Bench) -> LawResult:
     """A strided view, or single precision, gives the same pose as contiguous double precision."""
     wide = np.zeros((len(bench.scan), 5), dtype=np.float32)
     wide[:, 1:4] = bench.scan
@@ -147,20 +147,20 @@ def views(bench: Bench) -> Finding:
     return _same("strided single precision is accepted", bench, plain, strided)
 
 
-def repeats(bench: Bench) -> Finding:
+def repeats(bench: Bench) -> LawResult:
     """Two runs, and a second registrar, give identical bits."""
     runs = [r.register(bench.scan, bench.guess) for r in (bench.registrar, bench.registrar, bench.fresh())]
     bits = {(run.T_ac.q.tobytes(), run.T_ac.t.tobytes(), run.iterations, run.inliers) for run in runs}
-    return Finding("runs repeat to the bit", len(bits) == 1, f"{len(bits)} different results of 3")
+    return LawResult("runs repeat to the bit", len(bits) == 1, f"{len(bits)} different results of 3")
 
 
-def far(bench: Bench) -> Finding:
+def far(bench: Bench) -> LawResult:
     """A scan ten extents away has no overlap."""
     away = bench.scan + 10.0 * bench.surface.extent
     return _refused("far apart is no overlap", bench.registrar.register(away, bench.guess), AlignStatus.NO_OVERLAP)
 
 
-def planar(bench: Bench) -> Finding:
+def planar(bench: Bench) -> LawResult:
     """A plane leaves two translations and a rotation unobservable, and is not called aligned."""
     found = bench.registrar.register(bench.T_ac.apply(plate_scan(bench.scale)), bench.T_ac)
     words = found.status is not AlignStatus.DEGENERATE or found.free_directions != ""
@@ -168,33 +168,33 @@ def planar(bench: Bench) -> Finding:
     return replace(finding, held=finding.held and words)
 
 
-def collinear(bench: Bench) -> Finding:
+def collinear(bench: Bench) -> LawResult:
     """A line of points is not called aligned."""
     line = bench.T_ac.apply(plate_scan(bench.scale)[:30].repeat(4, axis=0))
     return _refused("a line is not aligned", bench.registrar.register(line, bench.T_ac))
 
 
-def few(bench: Bench) -> Finding:
+def few(bench: Bench) -> LawResult:
     """One, two and five points are not called aligned."""
     found = [bench.registrar.register(bench.scan[:k], bench.T_ac) for k in (1, 2, 5)]
     return replace(_refused("a handful of points is not aligned", found[-1]), held=all(map(_honest, found)))
 
 
-def empty(bench: Bench) -> Finding:
+def empty(bench: Bench) -> LawResult:
     """A scan without a finite point has the status NO_POINTS and keeps the guess."""
     found = [bench.registrar.register(scan, bench.guess) for scan in (np.empty((0, 3)), np.full((50, 3), np.nan))]
     held = all(a.status is AlignStatus.NO_POINTS and max(bench.gap(a.T_ac, bench.guess)) < 1e-12 for a in found)
-    return Finding("an empty scan is no points", held, found[0].status.value)
+    return LawResult("an empty scan is no points", held, found[0].status.value)
 
 
-def not_finite(bench: Bench) -> Finding:
+def not_finite(bench: Bench) -> LawResult:
     """Points that are not finite change nothing."""
     dirty = np.insert(bench.scan, [10, 500, 500], [[np.nan, 0, 0], [np.inf, 0, 0], [0, -np.inf, 0]], axis=0)
     clean, found = (bench.registrar.register(scan, bench.guess).T_ac for scan in (bench.scan, dirty))
     return _same("points that are not finite change nothing", bench, clean, found)
 
 
-Law = Callable[[Bench], Finding]
+Law = Callable[[Bench], LawResult]
 LAWS: tuple[Law, ...] = (
     recovers,
     stays,
@@ -214,7 +214,7 @@ LAWS: tuple[Law, ...] = (
 )
 
 
-def check(backend: str, scale: float = 1.0) -> tuple[Finding, ...]:
+def check(backend: str, scale: float = 1.0) -> tuple[LawResult, ...]:
     """Check every law.
 
     Args:
@@ -278,17 +278,17 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def _aligned_near(law: str, bench: Bench, found: Alignment, truth: Pose) -> Finding:
+def _aligned_near(law: str, bench: Bench, found: Alignment, truth: Pose) -> LawResult:
     turn, shift = bench.gap(truth, found.T_ac)
     near = np.degrees(turn) < bench.accuracy[0] and shift < bench.accuracy[1]
     held = found.status is AlignStatus.ALIGNED and bool(near)
-    return Finding(law, held, f"{found.status.value}, {np.degrees(turn):.1e} deg, {shift:.1e} of the extent")
+    return LawResult(law, held, f"{found.status.value}, {np.degrees(turn):.1e} deg, {shift:.1e} of the extent")
 
 
-def _same(law: str, bench: Bench, first: Pose, second: Pose) -> Finding:
+def _same(law: str, bench: Bench, first: Pose, second: Pose) -> LawResult:
     turn, shift = bench.gap(first, second)
     held = bool(turn < SAME_RAD and shift < SAME_OF_EXTENT)
-    return Finding(law, held, f"{np.degrees(turn):.1e} deg, {shift:.1e} of the extent")
+    return LawResult(law, held, f"{np.degrees(turn):.1e} deg, {shift:.1e} of the extent")
 
 
 def _honest(found: Alignment) -> bool:
@@ -296,6 +296,6 @@ def _honest(found: Alignment) -> bool:
     return found.status is not AlignStatus.ALIGNED and bool(finite.all())
 
 
-def _refused(law: str, found: Alignment, *allowed: AlignStatus) -> Finding:
+def _refused(law: str, found: Alignment, *allowed: AlignStatus) -> LawResult:
     held = _honest(found) and (not allowed or found.status in allowed)
-    return Finding(law, held, f"{found.status.value}{': ' + found.free_directions if found.free_directions else ''}")
+    return LawResult(law, held, f"{found.status.value}{': ' + found.free_directions if found.free_directions else ''}")

@@ -37,7 +37,7 @@ def user_folder() -> Path | None:
         return None
 
 
-def path_of(folder: Path, layout: int, vertices: Array, faces: NDArray[np.int32], reach_m: float) -> Path:
+def cache_path(folder: Path, layout: int, vertices: Array, faces: NDArray[np.int32], reach_m: float) -> Path:
     """Return the file name of the index of this surface and reach in ``folder``."""
     key = hashlib.sha256(f"{layout} {sys.byteorder} {float(reach_m).hex()} {vertices.shape} {faces.shape}".encode())
     key.update(vertices.tobytes())

@@ -9,7 +9,7 @@ from avsreplay.settings import Settings, given, setting
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class RegistrationLimits:
     """The parameters of a back end, every length given.
 
     Attributes:
@@ -98,9 +98,11 @@ class RegisterParams(Settings):
         if self.reach_m is not None and self.gate_m is not None and self.gate_m > self.reach_m:
             raise ValueError(f"gate_m is {self.gate_m}, must not exceed reach_m = {self.reach_m}")
 
-    def limits(self, extent_m: float) -> Limits:
+    def limits(self, extent_m: float) -> RegistrationLimits:
         """These parameters for a model of this extent [m] (the diagonal of its bounding box)."""
         auto = replace(self, reach_m=None, gate_m=None).resolved(extent_m)
         reach = given(auto.reach_m) if self.reach_m is None else self.reach_m
         gate = given(auto.gate_m) if self.gate_m is None else self.gate_m
-        return Limits(max(reach, gate), min(gate, reach), self.n_max, self.eps_rad, given(auto.eps_m), self.threads)
+        return RegistrationLimits(
+            max(reach, gate), min(gate, reach), self.n_max, self.eps_rad, given(auto.eps_m), self.threads
+        )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
-from avsreplay.register.params import Limits, RegisterParams
+from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.surface_index import Closest, SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
@@ -148,7 +148,7 @@ def grade(
     visibility: Visibility,
     points: NDArray[Any],
     fit: Fit,
-    limits: Limits,
+    limits: RegistrationLimits,
     params: RegisterParams,
 ) -> Alignment:
     """Measure the quality of the pose of a back end.

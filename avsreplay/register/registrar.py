@@ -14,7 +14,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register import index_cache, quality
-from avsreplay.register.backend import Target, build, load
+from avsreplay.register.backend import Target, create_backend, load_backend
 from avsreplay.register.global_search import GlobalSearch, SearchResult
 from avsreplay.register.horn import HornBackend
 from avsreplay.register.params import RegisterParams
@@ -53,11 +53,11 @@ class Registrar:
         """
         self.params = params or RegisterParams()
         self.limits = self.params.limits(surface.extent)
-        factory = load(self.params.backend)  # before the index, so that a wrong name is reported at once
+        factory = load_backend(self.params.backend)  # before the index, so that a wrong name is reported at once
         self._index = _indexed(surface, self.limits.reach_m, self.params)
         self._visibility = Visibility(surface, self.params.camera)
         self._target = Target(surface, self._index, self.limits, self._visibility)
-        self._backend = build(self.params.backend, factory, self._target)
+        self._backend = create_backend(self.params.backend, factory, self._target)
         self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
         self._restarter = Restarter(self._target, self._test)
 

@@ -207,7 +207,7 @@ class SurfaceIndex:
             raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
         kernel = _kernel()
         size = len(kept) if len(faces) else len(vertices)
-        path = None if cache_dir is None else index_cache.path_of(cache_dir, kernel.LAYOUT, vertices, faces, reach_m)
+        path = None if cache_dir is None else index_cache.cache_path(cache_dir, kernel.LAYOUT, vertices, faces, reach_m)
         saved = None if path is None else index_cache.read(path)
         index = None if saved is None else _restored(kernel, saved, size, len(faces) or size, len(faces) > 0, portable)
         restored = index is not None
