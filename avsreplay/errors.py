@@ -4,17 +4,18 @@ from __future__ import annotations
 
 
 class AvsError(Exception):
-    """An error that the user can correct; its text is one line: where, what is wrong, what to do.
-
-    Args:
-        what: what is wrong, in one sentence without a full stop.
-        where: file, key, topic or option that it concerns.
-        hint: what to do about it.
-    """
+    """An error that the user can correct; its text is one line: where, what is wrong, what to do."""
 
     exit_code = 2
 
     def __init__(self, what: str, *, where: str | None = None, hint: str | None = None) -> None:
+        """Create the error.
+
+        Args:
+            what: what is wrong, in one sentence without a full stop.
+            where: file, key, topic or option that it concerns.
+            hint: what to do about it.
+        """
         super().__init__(what)
         self.what = what
         self.where = where

@@ -19,7 +19,15 @@ Array = NDArray[np.float64]
 
 
 def frozen(values: ArrayLike, *shape: int) -> Array:
-    """Return a read-only float64 copy in C order; its shape is checked against ``shape`` (-1: any size)."""
+    """Return a read-only float64 copy in C order.
+
+    Args:
+        values: numbers of any shape.
+        shape: required shape, -1 for any size of a dimension; any shape is allowed if it is omitted.
+
+    Raises:
+        ValueError: the values have another shape.
+    """
     array = np.array(values, dtype=np.float64, order="C")
     if shape and array.shape != shape and not _fits(array.shape, shape):
         raise ValueError(f"expected shape {shape}, got {array.shape}")

@@ -116,7 +116,19 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
 def record_source(
     source: Path, output: Path, reading: SourceOptions, options: RecordOptions, ticker: Ticker | None = None
 ) -> Recorded:
-    """Record the scans, ground truth, labels and model of a source, stamped with the selected clock."""
+    """Record the scans, ground truth, labels and model of a source, stamped with the selected clock.
+
+    Args:
+        source: log, bag or folder of scans.
+        output: log to write (.mcap).
+        reading: how to read the source.
+        options: how to write the log; a model in it replaces that of ``reading``.
+        ticker: shows progress.
+
+    Raises:
+        UsageError: the output is the source or cannot be written, or an option is invalid.
+        UnreadableInput: the source or the model cannot be read, or the output cannot be written.
+    """
     if output.exists() and source.exists() and output.samefile(source):
         raise UsageError("the output is the source", where=str(output), hint="name another output")
     reading = replace(

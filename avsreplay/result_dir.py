@@ -191,17 +191,18 @@ class ViewWriter:
 
 
 class ResultDirectory:
-    """The folder of a result; it appears when the ``with`` block ends without an error, and not otherwise.
-
-    Args:
-        path: the folder.
-        overwrite: whether an existing result may be replaced.
-
-    Raises:
-        UsageError: the folder exists, is not a result, or its name cannot be used.
-    """
+    """The folder of a result; it appears when the ``with`` block ends without an error, and not otherwise."""
 
     def __init__(self, path: Path, *, overwrite: bool = False) -> None:
+        """Check that the folder can be written.
+
+        Args:
+            path: the folder.
+            overwrite: whether an existing result may be replaced.
+
+        Raises:
+            UsageError: the folder exists, is not a result, or its name cannot be used.
+        """
         self.path, self._stack = path, ExitStack()
         check_output(path, folder=True)
         if path.exists() and not overwrite and any(path.iterdir()):
@@ -273,17 +274,18 @@ class ResultWriter:
 
 
 class RerunStream:
-    """A listener that sends model, cloud, poses and scalars to a Rerun viewer (extra ``rerun``).
-
-    Args:
-        surface: model of the target.
-        file: .rrd file to write instead of opening a viewer.
-
-    Raises:
-        MissingBackend: rerun-sdk is not installed.
-    """
+    """A listener that sends model, cloud, poses and scalars to a Rerun viewer (extra ``rerun``)."""
 
     def __init__(self, surface: Surface, file: Path | None = None) -> None:
+        """Start the viewer or open the file, and send the model.
+
+        Args:
+            surface: model of the target.
+            file: .rrd file to write instead of opening a viewer.
+
+        Raises:
+            MissingBackend: rerun-sdk is not installed.
+        """
         try:
             import rerun
         except ModuleNotFoundError:

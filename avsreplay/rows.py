@@ -319,7 +319,12 @@ class Row:
 
     @classmethod
     def of(cls, outcome: Outcome, score: Score) -> Row:
-        """Flatten an outcome and its score into the row of the scan."""
+        """Flatten an outcome and its score into the row of the scan.
+
+        Args:
+            outcome: result of the pipeline for the scan.
+            score: its comparison with the ground truth.
+        """
         return cls(**{name: value(outcome, score) for name, value in _VALUES})
 
 

@@ -71,13 +71,14 @@ class Job:
 
 
 class HealthyPoses:
-    """Collects the healthy poses of a run, for a fit to all of them. May serve as a listener.
-
-    Args:
-        params: of the estimator, with auto values resolved.
-    """
+    """Collects the healthy poses of a run, for a fit to all of them. May serve as a listener."""
 
     def __init__(self, params: EstimatorParams) -> None:
+        """Start without poses.
+
+        Args:
+            params: of the estimator, with auto values resolved.
+        """
         self._params, self._fixes = params, list[PoseFix]()
 
     def __call__(self, scan: ReplayedScan) -> None:
@@ -85,7 +86,12 @@ class HealthyPoses:
         self.add(scan.state, scan.outcome)
 
     def add(self, state: PipelineState, outcome: Outcome) -> None:
-        """Take the outcome of one scan and the state after it."""
+        """Take the outcome of one scan; a pose that is not healthy is ignored.
+
+        Args:
+            state: state of the pipeline after the scan.
+            outcome: outcome of the scan.
+        """
         if outcome.verdict.gamma and state.track is not None and state.last_pose is not None:
             self._fixes.append(healthy_pose(state.track, outcome.scan.t_ns, state.last_pose, self._params))
 
@@ -107,6 +113,9 @@ class Run:
 
     def __init__(self, job: Job) -> None:
         """Open the log and index the model.
+
+        Args:
+            job: the log, its reading options and the settings of the run.
 
         Raises:
             UnreadableInput: the log or the model cannot be read.
@@ -148,12 +157,18 @@ class Run:
         return len(self.source)
 
     def fit_reference(self, progress: Progress | None = None) -> Reference:
-        """Replay the log once and fit one motion to all healthy poses; errors are then taken against it.
+        """Replay the log once and fit one motion to all healthy poses; errors are then computed against this motion.
 
-        ``rows`` does so itself, without progress, where ``reference`` is "fit" and this was not called before.
+        ``rows`` calls this method if ``reference`` is "fit" and it was not called before.
+
+        Args:
+            progress: shows the progress of this replay.
+
+        Returns:
+            The fitted motion.
 
         Raises:
-            UsageError: fewer than four healthy poses.
+            UsageError: there are fewer than four healthy poses.
         """
         ready = self._new_stages()
         poses, instants = HealthyPoses(ready.estimator.params), set[int]()
@@ -168,9 +183,16 @@ class Run:
     def rows(self, listeners: Iterable[Listener] = (), progress: Progress | None = None) -> Iterator[Row]:
         """Replay the log row by row.
 
+        Args:
+            listeners: called with each scan, in this order, before its row is yielded.
+            progress: shows the progress of the replay.
+
+        Yields:
+            One row per selected scan; a scan that could not be used has a status that says why.
+
         Raises:
-            UnreadableInput: the log holds no scan.
-            UsageError: the first pose or the reference cannot be had.
+            UnreadableInput: no scan is selected.
+            UsageError: the first pose or the reference motion cannot be determined.
         """
         if not len(self.source):
             hint = "widen the selection, or see 'avsreplay info'"

@@ -23,15 +23,16 @@ from avsreplay.records import Belief, State, Truth
 
 
 class Scorer:
-    """Scores the outcomes of a replay in their order.
-
-    Args:
-        estimator: predicts the attitude at the end of a planned flight.
-        poses: true poses T_ac by instant, ascending; with fewer than four, plans are not scored.
-        reference: what the errors are taken against, "truth" or "fit".
-    """
+    """Scores the outcomes of a replay in their order."""
 
     def __init__(self, estimator: Estimator, poses: Sequence[tuple[int, Pose]], reference: str) -> None:
+        """Interpolate the true poses.
+
+        Args:
+            estimator: predicts the attitude at the end of a planned flight.
+            poses: true poses T_ac by instant, ascending; with fewer than four, plans are not scored.
+            reference: what the errors are taken against, "truth" or "fit".
+        """
         self._estimator, self._reference = estimator, reference
         self._epoch_ns = poses[0][0] if poses else 0
         self._motion: Motion | None = None

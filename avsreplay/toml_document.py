@@ -64,7 +64,15 @@ def load(path: str | Path) -> Document:
 
 
 def parse(text: str, name: str) -> Document:
-    """Parse TOML text; ``name`` is what error messages call it."""
+    """Parse TOML text.
+
+    Args:
+        text: the text.
+        name: name of the document in error messages.
+
+    Raises:
+        UsageError: the text is not TOML.
+    """
     try:
         return Document(name, tomllib.loads(text), text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
@@ -73,7 +81,15 @@ def parse(text: str, name: str) -> Document:
 
 
 def override(document: Document, assignments: Sequence[str]) -> Document:
-    """The document with ``a.b=value`` assignments applied; a value is TOML, or else taken as text."""
+    """Return the document with assignments applied.
+
+    Args:
+        document: the document; it is not changed.
+        assignments: each ``a.b=value``; a value that is not TOML is taken as text.
+
+    Raises:
+        UsageError: an assignment has another form, or a part of its key is not a table.
+    """
     table, origins = _deep_copy(document.table), dict(document.origins)
     for assignment in assignments:
         key, sep, raw = assignment.partition("=")

@@ -72,9 +72,15 @@ class Tally:
 def command(log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool) -> None:
     """Time registration back ends side by side on the scans of LOG, in turn.
 
-    The guess is the pose of the scan before: the truth's where the log has one, else each back end's own. The figures
-    of one run compare; the times of two runs need not.
-    """
+    The initial guess is the pose of the previous scan: the true pose if the log has it, otherwise the pose that the same
+    back end found. Times can be compared within one run, but not between two runs.
+
+    \f
+    Raises:
+        UsageError: no back end is named, a back end is unknown, or the log has no model.
+        MissingBackend: a back end is not installed.
+        UnreadableInput: the log or the model cannot be read.
+    """  # noqa: D301
     from avsreplay.errors import UsageError
     from avsreplay.log import SourceOptions, open_source
 

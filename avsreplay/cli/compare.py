@@ -97,7 +97,13 @@ def command(
 
     Errors cover all scans, coasting included; a value that a run has lost is worse. Intervals are 95 % bootstrap
     intervals of the paired difference. The conclusion on a metric without one needs a change above 10 %.
-    """
+
+    \f
+    Raises:
+        UsageError: an option needs --gate, an output cannot be written, or a run has no partner in the baseline.
+        UnreadableInput: a result or the rules cannot be read.
+        CheckFailed: a rule of the gate is broken.
+    """  # noqa: D301
     if (junit or github) and not gate:
         raise UsageError("--junit and --github need --gate", hint="name the rules with --gate rules.toml")
     if output:

@@ -17,7 +17,12 @@ Examples:
 @click.command("completion", epilog=EPILOG)
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def command(shell: str) -> None:
-    """Print the completion script for SHELL."""
+    """Print the completion script for SHELL.
+
+    \f
+    Raises:
+        UsageError: the shell is not supported.
+    """  # noqa: D301
     from avsreplay.cli import group
 
     found = get_completion_class(shell)

@@ -36,7 +36,13 @@ def command(
     """Check SOURCE: structure, checksums, clocks, gaps, duplicates, points, layout and truth.
 
     The exit code is 0 if no part is lost, else 4 (3 with --strict).
-    """
+
+    \f
+    Raises:
+        UsageError: an option is invalid, or the repaired file cannot be written.
+        UnreadableInput: SOURCE cannot be read, or it has errors and --strict is given.
+        DataLost: SOURCE has errors.
+    """  # noqa: D301
     from avsreplay.errors import UsageError
     from avsreplay.log import SourceOptions
     from avsreplay.log.doctor import examine

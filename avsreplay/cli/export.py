@@ -36,7 +36,13 @@ def command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) 
     """Write RESULT, a directory made by 'avsreplay run -o', as CSV, Parquet, TUM or KITTI at full precision.
 
     CSV and Parquet hold every column of every scan with units in the headings; TUM and KITTI hold poses of {C} in {A}.
-    """
+
+    \f
+    Raises:
+        UsageError: the output cannot be written, or the result has no poses of the requested kind.
+        UnreadableInput: RESULT cannot be read.
+        MissingBackend: pyarrow is needed and not installed.
+    """  # noqa: D301
     check_output(output, overwrite=overwrite)
     found, quiet = read_result(result), output == STDOUT
     if kind in ("csv", "parquet"):

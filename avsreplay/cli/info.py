@@ -38,7 +38,13 @@ def command(source: Path, as_json: bool, **reading: Any) -> None:
     transforms and time stamps; each finding names the option to add.
 
     The exit code is 4 if a part of SOURCE could not be read.
-    """
+
+    \f
+    Raises:
+        UsageError: an option is invalid.
+        UnreadableInput: SOURCE cannot be read.
+        DataLost: a part of SOURCE could not be read.
+    """  # noqa: D301
     from avsreplay.errors import DataLost
     from avsreplay.log import open_source
     from avsreplay.preflight import preflight

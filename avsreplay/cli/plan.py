@@ -82,7 +82,10 @@ def command(
 
     The saved beliefs are used and nothing is replayed. The output contains the plan, its distribution over the belief
     and, if the log has ground truth, the errors of plans made at regular intervals and a simulated approach.
-    """
+    \f
+    Raises:
+        UsageError: an option or setting is invalid, or --export has no plan.  UnreadableInput: RESULT cannot be read.
+    """  # noqa: D301
     from avsreplay.errors import UsageError
     from avsreplay.files import check_output
     from avsreplay.replan import load_saved, with_settings

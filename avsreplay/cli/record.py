@@ -54,7 +54,13 @@ def command(
     SOURCE is a scenario (.toml), a folder of PLY or PCD scans, a ROS 1 or ROS 2 bag, or an MCAP; without it the
     built-in scenario is simulated. The log holds the model, the scenario and the truth,
     so that 'avsreplay run' needs no option.
-    """
+
+    \f
+    Raises:
+        UsageError: an option does not apply to SOURCE, or the output cannot be written.
+        UnreadableInput: SOURCE or the model cannot be read.
+        DataLost: a part of SOURCE could not be read and was left out of the log.
+    """  # noqa: D301
     from avsreplay.record import RecordOptions, record
 
     options = RecordOptions(model=model, cloud_model=bool(cloud_model), overwrite=overwrite, compression=compression)

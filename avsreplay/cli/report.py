@@ -37,7 +37,19 @@ def command(result: Path, output: Path | None, title: str | None, overwrite: boo
 
 
 def write_page(result: Path, target: Path, title: str | None = None) -> str:
-    """Write the page of ``result`` to ``target`` and return one line about it."""
+    """Write the page of a result.
+
+    Args:
+        result: Result directory of a run or its rows.jsonl.
+        target: HTML file to write.
+        title: Title of the page; the name of the result if None.
+
+    Returns:
+        One line with the file and its size.
+
+    Raises:
+        UnreadableInput: The result cannot be read or holds no row.
+    """
     from avsreplay.files import output_text
     from avsreplay.report.page import build_page
 

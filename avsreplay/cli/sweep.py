@@ -73,7 +73,14 @@ def command(
     Each finished run is saved at once: the same command continues after an interruption. Results are one row per
     run (results.parquet), one row per scan (scans.parquet), summary.json and report.html; they do not depend on the
     number of workers.
-    """
+
+    \f
+    Raises:
+        UsageError: no output directory is given, or the campaign is invalid.
+        UnreadableInput: a file cannot be read or written.
+        MissingBackend: pyarrow is not installed.
+        DataLost: a run failed, crashed or lost data.
+    """  # noqa: D301
     from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
     from avsreplay.sweep.parquet import arrow
 

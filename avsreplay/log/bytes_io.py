@@ -29,12 +29,14 @@ class ByteFile:
 
     Attributes:
         size: size in bytes at the time of opening.
-
-    Raises:
-        UnreadableInput: the file does not exist or cannot be opened.
     """
 
     def __init__(self, path: Path) -> None:
+        """Open the file.
+
+        Raises:
+            UnreadableInput: the file does not exist or cannot be opened.
+        """
         try:
             self._file = path.open("rb", buffering=0)
             self.size = path.stat().st_size

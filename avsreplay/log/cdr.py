@@ -33,6 +33,15 @@ class Cursor:
     __slots__ = ("data", "order", "pos", "ros1")
 
     def __init__(self, payload: bytes | memoryview, encoding: str = "cdr") -> None:
+        """Start at the first field of a message.
+
+        Args:
+            payload: the bytes of the message.
+            encoding: ``cdr`` (the payload begins with the four-byte encapsulation) or ``ros1``.
+
+        Raises:
+            BadMessage: the CDR encapsulation is missing or unknown.
+        """
         view = memoryview(payload).cast("B")
         self.pos = 0
         self.ros1 = encoding == "ros1"
@@ -69,7 +78,11 @@ class Cursor:
         return int(self._take("i", 4))
 
     def f64s(self, count: int) -> tuple[float, ...]:
-        """Return the next ``count`` doubles of an array of fixed length."""
+        """Return the next ``count`` doubles of an array of fixed length.
+
+        Raises:
+            BadMessage: the message ends before them.
+        """
         start = self.pos if self.ros1 else (self.pos + 7) & -8
         try:
             values = struct.unpack_from(f"{self.order}{count}d", self.data, start)
@@ -79,7 +92,11 @@ class Cursor:
         return values
 
     def octets(self) -> memoryview:
-        """Return the next sequence of octets as a view."""
+        """Return the next sequence of octets as a view.
+
+        Raises:
+            BadMessage: the message ends inside the sequence.
+        """
         size = self.u32()
         start = self.pos
         if start + size > len(self.data):

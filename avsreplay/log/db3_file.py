@@ -24,21 +24,22 @@ _MAX_ID = 1 << 62  # used if the last id is unknown: the stride doubles, so few 
 
 
 class Db3File(Recording):
-    """One sqlite3 file of a ROS 2 bag, indexed on construction.
-
-    Args:
-        path: the file.
-        limit: largest message that is read [bytes].
-        sinks: called with every message of a topic during the pass.
-
-    Raises:
-        UnreadableInput: the file does not exist or is not the database of a bag.
-    """
+    """One sqlite3 file of a ROS 2 bag, indexed on construction."""
 
     kind = "ros2 bag"
     profile = "ros2"
 
     def __init__(self, path: Path, limit: int, sinks: dict[str, Sink] | None = None) -> None:
+        """Open and index the database.
+
+        Args:
+            path: the file.
+            limit: largest message that is read [bytes].
+            sinks: called with every message of a topic during the pass.
+
+        Raises:
+            UnreadableInput: the file does not exist or is not the database of a bag.
+        """
         super().__init__(path, limit, sinks)
         self._sinks = frozenset(sinks or ())
         self._topics: dict[int, str] = {}

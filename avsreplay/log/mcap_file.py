@@ -31,20 +31,11 @@ _MAX_LOSSES = 10_000
 class McapFile(Recording):
     """One MCAP file, indexed on construction.
 
-    Args:
-        path: the file.
-        limit: largest message, chunk or attachment that is read [bytes].
-        sinks: called with every message of a topic during the pass.
-        copy_to: receives every intact record (for a repair).
-
     Attributes:
         closed_properly: whether the file has a data-end record.
         summary: the summary section as far as it is valid.
         data_end: (offset, checksum) of the data-end record.
         unchecked: number of chunks without a checksum.
-
-    Raises:
-        UnreadableInput: the file does not exist, is empty or is not MCAP.
     """
 
     kind = "mcap"
@@ -52,6 +43,17 @@ class McapFile(Recording):
     def __init__(
         self, path: Path, limit: int, sinks: dict[str, Sink] | None = None, copy_to: RecordSink | None = None
     ) -> None:
+        """Open and index the file.
+
+        Args:
+            path: the file.
+            limit: largest message, chunk or attachment that is read [bytes].
+            sinks: called with every message of a topic during the pass.
+            copy_to: receives every intact record (for a repair).
+
+        Raises:
+            UnreadableInput: the file does not exist, is empty or is not MCAP.
+        """
         self._copy_to = copy_to
         super().__init__(path, limit, sinks)
         self.closed_properly = False

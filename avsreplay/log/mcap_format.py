@@ -58,7 +58,11 @@ class Fields:
         self.view, self.at = view, 0
 
     def number(self, size: int) -> int:
-        """Return the next unsigned little-endian number."""
+        """Return the next unsigned little-endian number of ``size`` bytes.
+
+        Raises:
+            BadMessage: the record ends before it.
+        """
         raw = self.view[self.at : self.at + size]
         if len(raw) < size:
             raise BadMessage("a record ends inside a number")
@@ -66,7 +70,11 @@ class Fields:
         return int.from_bytes(raw, "little")
 
     def take(self, size: int) -> memoryview:
-        """Return the next ``size`` bytes."""
+        """Return the next ``size`` bytes.
+
+        Raises:
+            BadMessage: the record ends before them.
+        """
         if self.at + size > len(self.view):
             raise BadMessage(f"a record holds {len(self.view) - self.at} of {size} bytes")
         self.at += size

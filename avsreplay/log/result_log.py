@@ -64,17 +64,18 @@ class ResultFrame:
 
 
 class ResultLog:
-    """Writer of ``result.mcap``; ``close`` finishes the file. The bytes depend only on what is written.
-
-    Args:
-        path: the file.
-        surface: the target model, written as a marker.
-
-    Raises:
-        UnreadableInput: the file cannot be written.
-    """
+    """Writer of ``result.mcap``; ``close`` finishes the file. The bytes depend only on what is written."""
 
     def __init__(self, path: Path, surface: Surface) -> None:
+        """Create the file and write the model.
+
+        Args:
+            path: the file.
+            surface: the target model, written as a marker.
+
+        Raises:
+            UnreadableInput: the file cannot be written.
+        """
         from mcap.writer import CompressionType, Writer
         from rosbags.typesys import Stores, get_typestore
 

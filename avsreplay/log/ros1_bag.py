@@ -46,21 +46,22 @@ class _Record:
 
 
 class Ros1Bag(Recording):
-    """One ROS 1 bag, indexed on construction.
-
-    Args:
-        path: the file.
-        limit: largest message or chunk that is read [bytes].
-        sinks: called with every message of a topic during the pass.
-
-    Raises:
-        UnreadableInput: the file does not exist or cannot be read.
-    """
+    """One ROS 1 bag, indexed on construction."""
 
     kind = "ros1 bag"
     profile = "ros1"
 
     def __init__(self, path: Path, limit: int, sinks: dict[str, Sink] | None = None) -> None:
+        """Open and index the bag.
+
+        Args:
+            path: the file.
+            limit: largest message or chunk that is read [bytes].
+            sinks: called with every message of a topic during the pass.
+
+        Raises:
+            UnreadableInput: the file does not exist or cannot be read.
+        """
         super().__init__(path, limit, sinks)
         self._topics: dict[int, str] = {}
         self._bad_chunk: Loss | None = None

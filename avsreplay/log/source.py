@@ -44,6 +44,18 @@ class Source:
         extra: dict[str, str] | None = None,
         losses: tuple[Loss, ...] = (),
     ) -> None:
+        """Combine the parts of an open source; ``open_source`` does this for a path.
+
+        Args:
+            path: the log or folder.
+            clouds: the clouds of the selected topic, with their recorded times.
+            header: the header of the log.
+            options: how the source is read.
+            ground_truth: true poses and states, as far as they are known.
+            files: the files of the source, in the order of the checksum.
+            extra: ``profile`` and ``library`` of the file for ``info``, where it states them.
+            losses: parts that could not be read, apart from those of ``clouds``.
+        """
         self.path, self.header, self.options = path, header, options
         self._clouds, self._ground_truth, self._files = clouds, ground_truth, tuple(files)
         self._extra = extra or {}
@@ -106,11 +118,28 @@ class Source:
         return ahead(scans, prefetch) if prefetch else scans
 
     def scan_at(self, seq: int) -> Scan:
-        """Return the selected scan with this index. Raises IndexError where there is none."""
+        """Return one selected scan.
+
+        Args:
+            seq: index among the selected scans, from 0.
+
+        Returns:
+            The scan; without points and with the status DAMAGED if it cannot be decoded.
+
+        Raises:
+            IndexError: there is no such scan.
+        """
         return self._scan(seq, self._selected[seq])
 
     def truth_of(self, scan: Scan) -> Truth:
-        """Return the ground truth at one of this source's scans: pose, full state and injected fault, where known."""
+        """Return the ground truth at a scan.
+
+        Args:
+            scan: a scan of this source.
+
+        Returns:
+            The true pose T_ac, the full state and the injected fault, each None where it is not known.
+        """
         lookup, place = self._ground_truth.truth, self._selected[scan.seq]
         pose = None if lookup is None else lookup(scan.t_ns, place, scan.frame)
         return Truth(pose, self._body_at(scan.t_ns), self._fault(scan.log_ns))

@@ -43,20 +43,6 @@ class LogWriter:
 
     The file is written under ``<name>.partial`` and renamed when it is complete. An exception inside the ``with``
     removes it. If the disk is full, the complete chunks are kept under the partial name and the error states this.
-
-    Args:
-        path: the output.
-        header: scenario, seed, labels and model; the model is attached.
-        overwrite: replace an existing output.
-        compression: ``zstd``, ``lz4`` or ``none``.
-        chunk_bytes, chunk_s: a chunk is written when it reaches this size or this span of the log clock [s].
-        streaming: write under the final name from the first byte, for a reader that follows the file.
-        point_type: type of the stored coordinates, ``float32`` or ``float64``.
-
-    Raises:
-        UsageError: the output exists, or its folder does not.
-        UnreadableInput: the output cannot be written.
-        ValueError: an argument is out of range.
     """
 
     def __init__(
@@ -71,6 +57,23 @@ class LogWriter:
         streaming: bool = False,
         point_type: str = "float32",
     ) -> None:
+        """Open the output and write the header.
+
+        Args:
+            path: the output.
+            header: scenario, seed, labels and model; the model is attached.
+            overwrite: replace an existing output.
+            compression: ``zstd``, ``lz4`` or ``none``.
+            chunk_bytes: a chunk is written when it reaches this size.
+            chunk_s: a chunk is also written when it reaches this span of the log clock [s].
+            streaming: write under the final name from the first byte, for a reader that follows the file.
+            point_type: type of the stored coordinates, ``float32`` or ``float64``.
+
+        Raises:
+            UsageError: the output exists, or its folder does not.
+            UnreadableInput: the output cannot be written.
+            ValueError: an argument is out of range.
+        """
         if compression not in ("zstd", "lz4", "none"):
             raise ValueError(f"compression is {compression!r}, not zstd, lz4 or none")
         if chunk_bytes < 1 or chunk_s <= 0.0:
@@ -103,6 +106,9 @@ class LogWriter:
 
     def write(self, scan: Scan) -> None:
         """Append the cloud of a scan with the stamp ``scan.t_ns`` at the log time ``scan.log_ns``.
+
+        Args:
+            scan: its points in the camera frame {A} [m], and the times of the points [s] if it has them, are stored.
 
         Raises:
             ValueError: a time is outside the range of a log.

@@ -137,7 +137,15 @@ class LoadedCampaign:
 
 
 def load_campaign(path: Path) -> LoadedCampaign:
-    """Read a campaign file. Raises UnreadableInput or UsageError with file and line."""
+    """Read a campaign file.
+
+    Args:
+        path: the TOML file; file names in it are relative to its folder.
+
+    Raises:
+        UnreadableInput: the file cannot be read.
+        UsageError: the file is not TOML, or a key or value is invalid; the message gives file and line.
+    """
     document = toml_document.load(path)
     return LoadedCampaign(toml_document.build(Campaign, document), Path(path).parent, str(path))
 

@@ -90,7 +90,12 @@ class Expansion:
                 yield Point(index, cell, repeat, seed, values, self.task(values, repeat))
 
     def task(self, values: Mapping[str, Any], repeat: int) -> Task:
-        """The task of a combination, drawn values included, in a repeat."""
+        """Return the task of one run.
+
+        Args:
+            values: Values of the combination by key, including the values drawn for this repeat.
+            repeat: Number of the repeat, from 0; the seed of the scenario is derived from it.
+        """
         campaign, folder = self.loaded.campaign, self.loaded.folder
         of_case: Mapping[str, Any] = next((case.set for case in campaign.case if case.name == values.get("case")), {})
         every = {**campaign.set, **of_case, **{k: v for k, v in values.items() if k not in _NAMED}}
@@ -117,7 +122,10 @@ class Expansion:
 
 
 def expand(loaded: LoadedCampaign) -> Expansion:
-    """The runs of a campaign; every value of every axis is checked before anything runs.
+    """Return the runs of a campaign; every value of every axis is checked before the first run starts.
+
+    Args:
+        loaded: the campaign and its folder.
 
     Raises:
         UsageError: A wrong key or value; the message names it.

@@ -26,20 +26,29 @@ T = TypeVar("T")
 
 
 class Journal:
-    """The finished runs of a campaign in one folder; a context manager while runs are added.
+    """Journal of the finished runs of a campaign in one folder; a context manager while runs are added.
 
-    Opening it to add runs locks the folder, so that two campaigns cannot write to it at once.
+    Entering the context locks the folder, so that two campaigns cannot write to it at the same time.
 
     Attributes:
+        folder: The folder.
+        path: The file ``journal.txt`` in the folder.
         status: Status of every finished run, by its id.
-        damaged: Lines that were set aside, without a last line cut off by a kill.
+        damaged: Lines that were set aside, except a last line that is incomplete because the process was killed.
 
     Raises:
-        UnreadableInput: A file cannot be read or written.
-        UsageError: On entering, where another process uses the folder; it is named.
+        UsageError: On entering the context, another process uses the folder; the message names the folder.
     """
 
     def __init__(self, folder: Path) -> None:
+        """Read the journal of a folder, if there is one.
+
+        Args:
+            folder: Folder of the campaign; it is created on entering the context.
+
+        Raises:
+            UnreadableInput: The journal cannot be read.
+        """
         self.folder = folder
         self.path = folder / "journal.txt"
         self.status: dict[str, str] = {}
@@ -75,7 +84,15 @@ class Journal:
         return run_id in self.status
 
     def add(self, result: RunResult) -> None:
-        """Append a result and flush it; a run that is there already is left out."""
+        """Append a result and flush it; a run that is already in the journal is ignored.
+
+        Args:
+            result: The result of a finished run; its scans, if any, are written to a file of their own.
+
+        Raises:
+            RuntimeError: The journal is used outside its context.
+            UnreadableInput: A file cannot be written.
+        """
         stream = self._stream
         if stream is None:
             raise RuntimeError("the journal is not open")
@@ -93,7 +110,15 @@ class Journal:
         self._note(result.id, result.status, len(line))
 
     def result(self, run_id: str) -> RunResult:
-        """The result of a run without its scans. Raises KeyError for one that is not finished."""
+        """Return the result of a run without its scans.
+
+        Args:
+            run_id: Identifier of the run's task.
+
+        Raises:
+            KeyError: The run is not finished.
+            UnreadableInput: The journal cannot be read.
+        """
         start, size = self._places[run_id]
 
         def read() -> bytes:
@@ -104,7 +129,14 @@ class Journal:
         return _result(self._guarded(read))
 
     def scans(self, run_id: str) -> list[tuple[Any, ...]]:
-        """The scans of a run in the order of SCAN_COLUMNS. Raises UnreadableInput where they are damaged."""
+        """Return the scans of a run in the order of SCAN_COLUMNS; an empty list if none are kept.
+
+        Args:
+            run_id: Identifier of the run's task.
+
+        Raises:
+            UnreadableInput: The file of the scans is damaged.
+        """
         part = self._part(run_id)
         return read_scans(part) if part.exists() else []
 
@@ -123,7 +155,11 @@ class Journal:
         return len(bad)
 
     def forget(self, statuses: tuple[str, ...]) -> None:
-        """Drop the runs that ended with one of these statuses, so that they are made again."""
+        """Remove the runs with given statuses from the journal, so that they are made again.
+
+        Args:
+            statuses: The statuses, for example "failed" and "crashed".
+        """
         self._keep([run_id for run_id, status in self.status.items() if status not in statuses])
 
     def _part(self, run_id: str) -> Path:

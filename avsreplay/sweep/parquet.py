@@ -29,7 +29,15 @@ def scan_schema() -> Any:
 
 
 def write_scans(path: Path, rows: Sequence[tuple[Any, ...]]) -> None:
-    """Write the scans of one run, one row each in the order of SCAN_COLUMNS."""
+    """Write the scans of one run.
+
+    Args:
+        path: The Parquet file; its folder is created.
+        rows: One tuple per scan in the order of SCAN_COLUMNS.
+
+    Raises:
+        UnreadableInput: The folder cannot be created or the file cannot be written.
+    """
     schema = scan_schema().remove(0)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -29,6 +29,14 @@ _FIXED = ("index", "cell", "repeat", "seed", "id", "status", "error")
 def write_results(plan: Expansion, journal: Journal, folder: Path) -> SweepSummary:
     """Write ``results.parquet``, ``scans.parquet`` (where scans are kept), ``summary.json`` and ``report.html``.
 
+    Args:
+        plan: The runs of the campaign.
+        journal: Journal of the finished runs; runs that are not finished are left out.
+        folder: Folder to write to.
+
+    Returns:
+        The summary that ``summary.json`` and ``report.html`` show.
+
     Raises:
         MissingBackend: pyarrow is not installed.
         UnreadableInput: A file cannot be read or written.
