@@ -72,8 +72,8 @@ class Tally:
 def command(log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool) -> None:
     """Time registration back ends side by side on the scans of LOG, in turn.
 
-    The initial guess is the pose of the previous scan: the true pose if the log has it, otherwise the pose that the same
-    back end found. Times can be compared within one run, but not between two runs.
+    The initial guess is the pose of the previous scan: the true pose if the log has it, otherwise the pose that the
+    same back end found. Times can be compared within one run, but not between two runs.
 
     \f
     Raises:
