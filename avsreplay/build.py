@@ -37,7 +37,7 @@ def stages(
         truth_of: truth at a scan; used for the first pose alone, where the configuration starts from the truth.
 
     Raises:
-        UsageError: a near start is asked for and the log gives none.
+        UsageError: the configuration requires the start of the log, and the log contains none.
     """
     start = header.start if config.init == "log" or config.estimator.start is Start.NEAR else None
     limits = config.limits.widened(config.robot.radius_m)
@@ -57,7 +57,13 @@ def stages(
 
 
 def target_geometry(surface: Surface, axis_c: tuple[float, float, float], clearance: bool) -> TargetGeometry:
-    """Return the geometry of the target for guidance; the surface is indexed only where a clearance is asked for."""
+    """Return the geometry of the target for guidance.
+
+    Args:
+        surface: model of the target in {C} [m].
+        axis_c: outward axis of the fixture in {C}.
+        clearance: whether distances to the surface are needed; only then is the surface indexed.
+    """
     axis, hull = np.array(axis_c), hull_vertices(surface.vertices)
     if not clearance:
         return TargetGeometry(axis, hull)
@@ -74,7 +80,11 @@ def target_geometry(surface: Surface, axis_c: tuple[float, float, float], cleara
 
 
 def first_state(ready: Stages) -> PipelineState:
-    """Return the state before the first scan."""
+    """Return the state before the first scan.
+
+    Args:
+        ready: the stages of the run; their prior standard deviations scale the observability Gramian.
+    """
     start = ready.estimator.start
     prior_1s = ready.estimator.params.start_1s if start is None else np.sqrt(np.diag(start.P))
     return PipelineState(ready.monitors.initial(prior_1s))

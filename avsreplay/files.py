@@ -109,7 +109,7 @@ def _check_place(path: Path, overwrite: bool, folder: bool) -> None:
 
 @contextmanager
 def output_path(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]:
-    """Give a path to write to; on success its content becomes ``path``, on failure nothing is changed.
+    """Yield a path to write to; on success its content replaces ``path``, on failure ``path`` is unchanged.
 
     Args:
         path: the output.
@@ -140,7 +140,12 @@ def output_path(path: str | Path, *, overwrite: bool = True) -> Iterator[Path]:
 
 @contextmanager
 def output_text(path: str | Path, *, overwrite: bool = True) -> Iterator[IO[str]]:
-    """Open an output as UTF-8 text with Unix line ends; see ``output_path``. ``-`` is standard output."""
+    """Open an output as UTF-8 text with Unix line ends; see ``output_path`` for the errors.
+
+    Args:
+        path: the output; ``-`` is standard output.
+        overwrite: whether an existing file may be replaced.
+    """
     if Path(path) == STDOUT:
         yield sys.stdout
         sys.stdout.flush()
@@ -154,7 +159,10 @@ def output_text(path: str | Path, *, overwrite: bool = True) -> Iterator[IO[str]
 
 @contextmanager
 def output_folder(path: Path) -> Iterator[Path]:
-    """Give a temporary folder; on success it replaces the folder ``path``, on failure nothing is changed.
+    """Yield a temporary folder; on success it replaces the folder ``path``, on failure ``path`` is unchanged.
+
+    Args:
+        path: the folder.
 
     Raises:
         UsageError: the folder cannot be written (see ``check_output``).
@@ -232,7 +240,7 @@ def _part(place: Path, *, folder: bool = False) -> Iterator[Path]:
 
 
 def _lock(part: Path) -> int | None:
-    """Lock a temporary file as long as this process lives; None if the system or file system cannot."""
+    """Lock a temporary file until this process ends; None if the system or file system cannot lock files."""
     try:
         import fcntl
     except ModuleNotFoundError:  # Windows: an open file cannot be removed there
@@ -279,7 +287,16 @@ def sha256(path: Path) -> str:
 
 
 def read_limited(path: Path, limit: int, hint: str) -> bytes:
-    """Return the bytes of a regular file of at most ``limit`` bytes. Raises UnreadableInput otherwise."""
+    """Return the bytes of a regular file.
+
+    Args:
+        path: the file.
+        limit: largest size that is accepted [bytes].
+        hint: what the error message advises.
+
+    Raises:
+        UnreadableInput: it is not a regular file, is larger, or cannot be read.
+    """
     try:
         found = path.stat()
         if not stat.S_ISREG(found.st_mode):

@@ -43,7 +43,14 @@ IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])
 
 
 def skew(v: ArrayLike) -> Array:
-    """Return the matrix [v x] with ``skew(v) @ u == cross(v, u)``. (..., 3) -> (..., 3, 3)."""
+    """Return the matrix [v x] with ``skew(v) @ u == cross(v, u)``.
+
+    Args:
+        v: (..., 3) vectors.
+
+    Returns:
+        (..., 3, 3) skew-symmetric matrices.
+    """
     a: Array = np.asarray(v, dtype=np.float64)
     if a.ndim == 1:
         x, y, z = a.tolist()
@@ -55,7 +62,14 @@ def skew(v: ArrayLike) -> Array:
 
 
 def normalise(q: ArrayLike) -> Array:
-    """Return the unit quaternion with w >= 0 (if w is 0: first non-zero component > 0). (..., 4)."""
+    """Return the unit quaternion with w >= 0 (if w is 0: first non-zero component > 0).
+
+    Args:
+        q: (..., 4) quaternions ``[x y z w]``, not zero.
+
+    Returns:
+        (..., 4) unit quaternions of the same rotation.
+    """
     unit: Array = np.asarray(q, dtype=np.float64)
     if unit.ndim == 1 and unit.any():
         return _normalised(*unit.tolist())
@@ -73,7 +87,15 @@ def _normalised(x: float, y: float, z: float, w: float) -> Array:
 
 
 def multiply(q_ab: ArrayLike, q_bc: ArrayLike) -> Array:
-    """Return the Hamilton product ``q_ac``. (..., 4) x (..., 4) -> (..., 4)."""
+    """Return the Hamilton product ``q_ac = q_ab q_bc``.
+
+    Args:
+        q_ab: (..., 4) quaternions ``[x y z w]`` from b to a.
+        q_bc: (..., 4) quaternions from c to b; the leading dimensions are broadcast.
+
+    Returns:
+        (..., 4) quaternions from c to a.
+    """
     a, b = np.asarray(q_ab, dtype=np.float64), np.asarray(q_bc, dtype=np.float64)
     if a.ndim == b.ndim == 1:
         return np.array(_product(*a.tolist(), *b.tolist()))
@@ -94,12 +116,26 @@ def _product(ax: Any, ay: Any, az: Any, aw: Any, bx: Any, by: Any, bz: Any, bw: 
 
 
 def conjugate(q_ab: ArrayLike) -> Array:
-    """Return the conjugate ``q_ba``. (..., 4)."""
+    """Return the conjugate ``q_ba``.
+
+    Args:
+        q_ab: (..., 4) quaternions ``[x y z w]``.
+
+    Returns:
+        (..., 4) quaternions; for unit quaternions the inverse rotation.
+    """
     return np.asarray(np.multiply(q_ab, [-1.0, -1.0, -1.0, 1.0]), dtype=np.float64)
 
 
 def matrix(q_ab: ArrayLike) -> Array:
-    """Return R_ab = I + 2 w [v x] + 2 [v x]^2 (paper, eq:R): active. (..., 4) -> (..., 3, 3)."""
+    """Return the active rotation matrix R_ab = I + 2 w [v x] + 2 [v x]^2 (paper, eq:R).
+
+    Args:
+        q_ab: (..., 4) unit quaternions ``[x y z w]``.
+
+    Returns:
+        (..., 3, 3) rotation matrices.
+    """
     q: Array = np.asarray(q_ab, dtype=np.float64)
     R = np.empty((*q.shape[:-1], 3, 3))
     x, y, z, w = q.tolist() if q.ndim == 1 else (q[..., 0], q[..., 1], q[..., 2], q[..., 3])
@@ -123,14 +159,29 @@ def matrix(q_ab: ArrayLike) -> Array:
 
 
 def rotate(R_ab: ArrayLike, v_b: ArrayLike) -> Array:
-    """Return R_ab v_b, summed term by term for the same bits on any processor. (..., 3, 3) x (..., 3)."""
+    """Return R_ab v_b, summed term by term for the same bits on any processor.
+
+    Args:
+        R_ab: (..., 3, 3) rotation matrices.
+        v_b: (..., 3) vectors in b.
+
+    Returns:
+        (..., 3) vectors in a.
+    """
     R, v = np.asarray(R_ab, dtype=np.float64), np.asarray(v_b, dtype=np.float64)
     out: Array = R[..., :, 0] * v[..., :1] + R[..., :, 1] * v[..., 1:2] + R[..., :, 2] * v[..., 2:]
     return out
 
 
 def quaternion(R_ab: ArrayLike) -> Array:
-    """Return the unit quaternion of a rotation matrix, w >= 0. (..., 3, 3) -> (..., 4)."""
+    """Return the unit quaternion of a rotation matrix.
+
+    Args:
+        R_ab: (..., 3, 3) rotation matrices.
+
+    Returns:
+        (..., 4) unit quaternions ``[x y z w]`` with w >= 0.
+    """
     R = np.asarray(R_ab, dtype=np.float64)
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     four_q_qT = np.empty((*R.shape[:-2], 4, 4))  # row k is 4 q_k q: the row of the largest q_k is well conditioned
@@ -150,14 +201,28 @@ def quaternion(R_ab: ArrayLike) -> Array:
 
 
 def exp(rotvec: ArrayLike) -> Array:
-    """Return the quaternion of a rotation vector [rad]. (..., 3) -> (..., 4)."""
+    """Return the quaternion of a rotation vector.
+
+    Args:
+        rotvec: (..., 3) rotation vectors (full angle) [rad].
+
+    Returns:
+        (..., 4) unit quaternions ``[x y z w]``.
+    """
     v = np.asarray(rotvec, dtype=np.float64)
     half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(half / np.pi) * v, np.cos(half)], axis=-1)
 
 
 def log(q: ArrayLike) -> Array:
-    """Return the rotation vector [rad], angle in [0, pi]. (..., 4) -> (..., 3)."""
+    """Return the rotation vector of a quaternion.
+
+    Args:
+        q: (..., 4) quaternions ``[x y z w]``, not zero.
+
+    Returns:
+        (..., 3) rotation vectors [rad] with an angle in [0, pi].
+    """
     unit = normalise(q)
     v, w = unit[..., :3], unit[..., 3:]
     norm = np.linalg.norm(v, axis=-1, keepdims=True)
@@ -168,14 +233,30 @@ def log(q: ArrayLike) -> Array:
 
 
 def angle(q: ArrayLike) -> Array:
-    """Return the rotation angle [rad] in [0, pi]. (..., 4) -> (...)."""
+    """Return the rotation angle of a quaternion.
+
+    Args:
+        q: (..., 4) quaternions ``[x y z w]``; their length does not matter.
+
+    Returns:
+        (...) angles in [0, pi] [rad].
+    """
     a: Array = np.asarray(q, dtype=np.float64)
     theta: Array = 2.0 * np.arctan2(np.linalg.norm(a[..., :3], axis=-1), np.abs(a[..., 3]))
     return theta
 
 
 def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:
-    """Interpolate at constant rate along the shorter arc, q0 at fraction 0, q1 at 1. (4,) x (4,) -> (4,)."""
+    """Interpolate between two rotations at constant rate along the shorter arc.
+
+    Args:
+        q0: (4,) unit quaternion at fraction 0.
+        q1: (4,) unit quaternion at fraction 1.
+        fraction: position between the two.
+
+    Returns:
+        (4,) unit quaternion.
+    """
     return normalise(multiply(q0, exp(fraction * log(multiply(conjugate(q0), q1)))))
 
 
@@ -202,7 +283,11 @@ class Pose:
 
     @classmethod
     def from_matrix(cls, T_ab: ArrayLike) -> Pose:
-        """Convert a (4, 4) homogeneous matrix; the rotation is orthonormalised through its quaternion."""
+        """Convert a homogeneous matrix; the rotation is orthonormalised through its quaternion.
+
+        Args:
+            T_ab: (4, 4) homogeneous matrix, translation in [m].
+        """
         T = np.asarray(T_ab, dtype=np.float64)
         return cls(quaternion(T[:3, :3]), T[:3, 3])
 
@@ -228,5 +313,12 @@ class Pose:
         return Pose(multiply(self.q, other.q), rotate(self.R, other.t) + self.t)
 
     def apply(self, points_b: ArrayLike) -> Array:
-        """Transform points (..., 3) from b to a."""
+        """Transform points from b to a.
+
+        Args:
+            points_b: (..., 3) coordinates in b [m].
+
+        Returns:
+            (..., 3) coordinates in a [m].
+        """
         return np.asarray(points_b, dtype=np.float64) @ self.R.T + self.t

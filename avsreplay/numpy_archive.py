@@ -32,6 +32,9 @@ def parse_npy(data: bytes) -> NDArray[Any]:
 
     numpy's own reader allocates the sizes in the header, evaluates the header and may unpickle.
 
+    Args:
+        data: the bytes of the file.
+
     Raises:
         BadFile: the file is malformed, or is not an array of integers or floats.
     """
@@ -51,7 +54,15 @@ def parse_npy(data: bytes) -> NDArray[Any]:
 
 
 def read_members(data: bytes, limit: int) -> dict[str, bytes]:
-    """Return the members of a zip archive by name. Raises BadFile if it is malformed or larger than ``limit``."""
+    """Return the members of a zip archive by name.
+
+    Args:
+        data: the bytes of the archive.
+        limit: largest total size of the members after decompression [bytes].
+
+    Raises:
+        BadFile: the archive is malformed, or its members are larger.
+    """
     out: dict[str, bytes] = {}
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:

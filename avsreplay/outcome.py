@@ -180,7 +180,7 @@ class PoseError:
 
 @dataclass(frozen=True, slots=True)
 class CaptureError:
-    """Gripper against true grasp point at the planned instant; NaN where the truth does not tell."""
+    """Gripper against true grasp point at the planned instant; NaN where the truth is not known at that instant."""
 
     distance_m: float
     speed_mps: float
@@ -267,23 +267,41 @@ def capture_error_values(
 
 
 def deviation(block: str, k: int | None = None) -> Value[float | None]:
-    """Return the root of the trace of a block of P, or the standard deviation of one of its states."""
+    """Return the root of the trace of a block of P, or the standard deviation of one of its states.
+
+    Args:
+        block: name of the block of error states.
+        k: index of a state in the block; the whole block if None.
+    """
     where = BLOCKS[block] if k is None else BLOCKS[block].start + k
     return lambda o, s: float(np.sqrt(np.diag(o.belief.P)[where].sum()))
 
 
 def full_angle_deg(variance: float) -> float:
-    """Return the standard deviation of a full angle [deg] from the variance of the half angle [rad^2]."""
+    """Return the standard deviation of a full angle [deg].
+
+    Args:
+        variance: variance of the half angle [rad^2]; negative values count as 0.
+    """
     return float(np.degrees(2.0 * np.sqrt(max(float(variance), 0.0))))
 
 
 def position_1s_m(covariance: Array) -> float:
-    """Return the root of the trace of the position block [m]."""
+    """Return the root of the trace of the position block [m].
+
+    Args:
+        covariance: (6, 6) covariance of a pose, position first [m2].
+    """
     return float(np.sqrt(max(np.diag(covariance)[:3].sum(), 0.0)))
 
 
 def since_start_s(outcome: Outcome, t_ns: int) -> float:
-    """Return the seconds from the first scan of the replay."""
+    """Return the seconds from the first scan of the replay to an instant.
+
+    Args:
+        outcome: any outcome of the replay.
+        t_ns: the instant [ns].
+    """
     return (t_ns - outcome.start_ns) * 1e-9
 
 

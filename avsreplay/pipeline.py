@@ -68,7 +68,11 @@ class Monitors:
     convergence: Convergence
 
     def initial(self, prior_1s: Array) -> MonitorState:
-        """Return the state before the first scan; ``prior_1s`` (20,) are the prior standard deviations."""
+        """Return the state before the first scan.
+
+        Args:
+            prior_1s: (20,) prior standard deviations of the error states.
+        """
         return MonitorState(observability.gramian(prior_1s), self.consistency.initial(), self.convergence.initial())
 
     def observe(
@@ -80,7 +84,16 @@ class Monitors:
         gamma: int,
         track: Track,
     ) -> tuple[MonitorState, MonitorReport]:
-        """Take one scan: its prior, innovation and gamma, and the estimate after it."""
+        """Process one scan.
+
+        Args:
+            state: state of the monitors before the scan.
+            estimator: estimator of the run.
+            prior: prediction at the scan.
+            innovation: of the measurement; None where nothing was measured.
+            gamma: 1 if the fault detector accepts the measurement, else 0.
+            track: estimate after the scan.
+        """
         gramian = self._gramian(state.gramian, estimator, prior, innovation if gamma else None, track)
         rank = observability.measure(gramian)
         consistency = self.consistency.observe(state.consistency, innovation, gamma)
@@ -174,7 +187,16 @@ class PipelineState:
 
 
 def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineState, Outcome]:
-    """Process one scan. A bad scan still produces an outcome."""
+    """Process one scan. A bad scan still produces an outcome.
+
+    Args:
+        stages: the stages of the run.
+        state: state before the scan.
+        scan: points in {A} [m] with their instant.
+
+    Returns:
+        The state after the scan and the outcome of the scan.
+    """
     state, track, measurement = _track(stages, state, scan)
     predicted = stages.estimator.predict(track, scan.t_ns)
     measurement = measurement or _register(stages, state, scan, predicted)
@@ -222,7 +244,11 @@ def fold(stages: Stages, state: PipelineState, scans: Iterable[Scan]) -> Iterato
 
 
 def planned_segment(state: PipelineState) -> Segment | None:
-    """The flight of the capture plan that was made at the last scan, None where none was made or none is flown."""
+    """Return the flight of the capture plan made at the last scan; None where none was made or none is flown.
+
+    Args:
+        state: state after that scan.
+    """
     guidance, track = state.guidance, state.track
     if guidance is None or track is None or guidance.plan is None or not guidance.segment.capture:
         return None
@@ -319,6 +345,6 @@ def target_scene(estimator: Estimator, belief: Belief, target: TargetGeometry, f
 def planner_input(
     estimator: Estimator, belief: Belief, target: TargetGeometry, gamma: int, converged: bool, forecast: Forecaster
 ) -> PlannerInput:
-    """Return what guidance may know after a scan."""
+    """Return the input of guidance after a scan."""
     scene = target_scene(estimator, belief, target, forecast)
     return PlannerInput(belief.t_ns, gamma, converged, scene, forecast)

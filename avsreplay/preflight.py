@@ -97,7 +97,15 @@ def _share_on_model(source: Source, registrar: Registrar) -> float | None:
 
 
 def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
-    """Largest distance between two points (n, 3) [m], by two sweeps; ``trimmed`` leaves out the outermost 2 %."""
+    """Return the approximate largest distance between two points, found by two sweeps.
+
+    Args:
+        points: (n, 3) coordinates [m].
+        trimmed: leave out the 2 % of the points that are farthest from the median.
+
+    Returns:
+        The distance [m]; 0 without points.
+    """
     points = np.asarray(points, dtype=np.float64)
     if not len(points):
         return 0.0
@@ -207,7 +215,11 @@ def _clock(info: LogInfo) -> list[Advice]:
 
 
 def advice_table(found: Sequence[Advice]) -> Table:
-    """The findings with the option to add."""
+    """Return a table of the findings with the option to add for each.
+
+    Args:
+        found: the findings of ``preflight``.
+    """
     marks = {"ok": "good", "check": "warn", "fail": "bad"}
     rows = tuple((TableCell(a.about, marks[a.grade]), a.text, a.option) for a in found)
     return Table("Checks before a run", ("check", "finding", "option to add"), rows, align="l")

@@ -92,15 +92,28 @@ def record(
 def surface_for(scenario: Scenario, model: Path | None = None, cloud_ok: bool = False) -> Surface:
     """Return the model of a scenario: ``model`` if given, else the file it names, else its built-in shape.
 
+    Args:
+        scenario: the scenario.
+        model: model file that replaces that of the scenario.
+        cloud_ok: whether a model without faces is accepted.
+
     Raises:
-        UnreadableInput: the file cannot be read.  UsageError: it holds no faces and ``cloud_ok`` is False.
+        UnreadableInput: the file cannot be read.
+        UsageError: the file holds no faces and ``cloud_ok`` is False.
     """
     path = model or scenario.model
     return read_surface(path, cloud_ok) if path is not None else builtin_surface(scenario.params.target.shape)
 
 
 def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ticker: Ticker | None = None) -> Recorded:
-    """Record a simulation; the ground truth is stamped with the true instants."""
+    """Record a simulation; the ground truth is stamped with the true instants.
+
+    Args:
+        scenario: what to simulate.
+        output: log to write (.mcap).
+        options: how to write the log; a model in it replaces that of the scenario.
+        ticker: shows progress.
+    """
     meshes = {name: read_surface(path) for name, path in scenario.meshes.items()}
     simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model), meshes)
     with (

@@ -86,7 +86,14 @@ class Saved:
         return self.rows[0].t_ns
 
     def index_at(self, at_s: float | None) -> int:
-        """The last scan not after ``at_s``; None: the first converged one. Raises UsageError where there is none."""
+        """Return the index of the scan from which to plan.
+
+        Args:
+            at_s: the last scan not after this time is taken [s after the first scan]; None: the first converged scan.
+
+        Raises:
+            UsageError: the time is outside the result, or the estimate never converged.
+        """
         if at_s is None:
             converged = [k for k, row in enumerate(self.rows) if row.converged]
             if not converged:
@@ -102,8 +109,13 @@ class Saved:
 def load_saved(path: Path, extent_m: float | None = None) -> Saved:
     """Read a result directory.
 
+    Args:
+        path: the directory.
+        extent_m: diagonal of the target's bounding box [m]; that of the result if None.
+
     Raises:
-        UnreadableInput: it is none.  UsageError: a setting in it cannot be right, or the target's size is not known.
+        UnreadableInput: the path is not a complete result directory.
+        UsageError: a setting in it is invalid, or the size of the target is not known.
     """
     result = load_result(path)
     beliefs = read_beliefs(path / "beliefs.npz")
@@ -140,10 +152,14 @@ def _table(cls: Any, config: Mapping[str, Any], name: str) -> Any:
 
 
 def with_settings(saved: Saved, assignments: Sequence[str]) -> Saved:
-    """Return the saved result with settings of the planner changed by assignments such as ``supervisor.sigmas=2``.
+    """Return the saved result with changed settings of the planner.
+
+    Args:
+        saved: the saved result.
+        assignments: settings such as ``supervisor.sigmas=2``.
 
     Raises:
-        UsageError: An assignment has no such form, an unknown key or a wrong value.
+        UsageError: an assignment has another form, an unknown key or a wrong value.
     """
     tables: dict[str, Any] = {}
     for name, values in (("plan", saved.plan), ("limits", saved.limits), ("robot", saved.robot)):
@@ -177,7 +193,7 @@ def _extent(result: Result, path: Path) -> float:
 
 
 class Replanning:
-    """Plans from a saved result with other settings."""
+    """Planner for a saved result with other settings."""
 
     def __init__(
         self,
@@ -197,7 +213,7 @@ class Replanning:
             robot: The robot; that of the run where None.
 
         Raises:
-            UsageError: A clearance is asked for and the result contains no model.
+            UsageError: A clearance is required and the result contains no model.
         """
         self.saved, self.supervisor, self.robot = saved, supervisor, robot or saved.robot
         self.params = self.robot.applied(params)
@@ -223,7 +239,11 @@ class Replanning:
         return Tolerance(s.capture_pos_m or 0.0, s.capture_speed_mps or 0.0, s.capture_angle_deg)
 
     def plan_at(self, index: int) -> Plan:
-        """Plan from the belief after a scan, under the limits."""
+        """Plan from the belief after a scan, under the limits.
+
+        Args:
+            index: index of the scan.
+        """
         belief = self.saved.beliefs[index]
         return self._planned(self._scene(belief), belief.t_ns)
 
@@ -240,15 +260,31 @@ class Replanning:
         return plan.constrained(scene, *self.start, self.params, self.limits, t_ns, self.saved.extent_m, warm=start)
 
     def path(self, made: Plan) -> plan.RobotPath:
-        """Return the path of a plan from the start."""
+        """Return the path of a plan from the start.
+
+        Args:
+            made: a plan that was found.
+        """
         return plan.path_of(made, *self.start)
 
     def attitude(self, belief: Belief, after_s: float) -> Array:
-        """Return the predicted q_ac (4,) a time after a belief."""
+        """Return the predicted q_ac (4,) a time after a belief.
+
+        Args:
+            belief: the belief.
+            after_s: the time [s].
+        """
         return np.asarray(self.saved.estimator.attitude(belief)(np.array([after_s]))[0])
 
     def spread_at(self, index: int, made: Plan, count: int, seed: int) -> Spread:
-        """Return the distribution of a plan over draws from the belief from which it was made."""
+        """Return the distribution of a plan over draws from the belief from which it was made.
+
+        Args:
+            index: index of the scan at which the plan was made.
+            made: the plan; it must have been found.
+            count: number of draws.
+            seed: seed of the draws.
+        """
         belief = self.saved.beliefs[index]
         offsets = plan.draws(belief.P, count, np.random.Generator(np.random.PCG64(seed)))
         drawn = [replace(belief, x=_bounded(boxplus(belief.x, d))) for d in offsets]
@@ -266,7 +302,7 @@ class Replanning:
         return plan.spread(path, futures, planner, self.tolerance, aimed, disturbance, body)
 
     def miss_at(self, index: int, made: Plan) -> Miss | None:
-        """Return the error of a plan against ground truth; None without truth, or where it ends after the log."""
+        """Return the error of a plan made at scan ``index`` against the truth; None without truth or after the log."""
         if self.saved.truth is None or not made.found:
             return None
         belief = self.saved.beliefs[index]
@@ -275,7 +311,14 @@ class Replanning:
         return found if np.isfinite(found.distance_m) else None
 
     def hindsight(self, period_s: float) -> list[tuple[float, Plan, Miss | None]]:
-        """Plan every ``period_s`` from convergence on, each time from the start: (made at [s], plan, error)."""
+        """Plan at regular intervals from convergence on, each time from the start.
+
+        Args:
+            period_s: shortest time between two plans [s].
+
+        Returns:
+            For each plan: time of planning [s after the first scan], the plan, and its error (see ``miss_at``).
+        """
         out: list[tuple[float, Plan, Miss | None]] = []
         due_s = 0.0
         for k, row in enumerate(self.saved.rows):

@@ -44,12 +44,20 @@ MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in _BLOCKS for k in range(siz
 
 
 def mean_vector(x: State) -> Array:
-    """Return the mean as one vector (22,) in the order of ``MEAN_COLUMNS``."""
+    """Return the mean as one vector (22,) in the order of ``MEAN_COLUMNS``.
+
+    Args:
+        x: the mean of a belief.
+    """
     return np.concatenate([getattr(x, name) for name, _ in _BLOCKS])
 
 
 def pose_covariance(belief: Belief) -> Array:
-    """Return the (6, 6) covariance of the pose of {C}: position in {A} [m], rotation vector in {A} [rad]."""
+    """Return the (6, 6) covariance of the pose of {C}: position in {A} [m], rotation vector in {A} [rad].
+
+    Args:
+        belief: mean and covariance of the estimator.
+    """
     H = measurement_jacobian(belief.x)
     to_a = np.zeros((6, 6))
     to_a[:3, :3] = np.eye(3)
@@ -60,8 +68,11 @@ def pose_covariance(belief: Belief) -> Array:
 def read_beliefs(path: Path) -> list[Belief]:
     """Read ``beliefs.npz`` of a result directory.
 
+    Args:
+        path: the file.
+
     Raises:
-        UnreadableInput: it is missing or not as a run writes it.
+        UnreadableInput: the file is missing or not as a run writes it.
     """
     shapes = {"t_ns": ("i", (None,)), "x": ("f", (None, len(MEAN_COLUMNS))), "P": ("f", (None, 20, 20))}
     hint = "name a directory written by run -o"
@@ -220,7 +231,12 @@ class ResultDirectory:
         self._stack.__exit__(kind, error, traceback)
 
     def write(self, rows: Sequence[Row], beliefs: Beliefs) -> None:
-        """Write rows, trajectories and beliefs."""
+        """Write rows, trajectories and beliefs.
+
+        Args:
+            rows: one per scan.
+            beliefs: collected during the run.
+        """
         write_rows(self._part / "rows.jsonl", rows)
         write_tum(self._part / "estimate.tum", row_poses(rows, "estimate"))
         write_tum(self._part / "registration.tum", row_poses(rows, "registration"))
@@ -265,7 +281,12 @@ class ResultWriter:
         return self._beliefs, self._view, self._log
 
     def finish(self, rows: Sequence[Row], record: Mapping[str, Any]) -> None:
-        """Write what needs the whole run; ``record`` is ``run.json``."""
+        """Write what needs the whole run.
+
+        Args:
+            rows: one per scan.
+            record: content of ``run.json``.
+        """
         self._log.close()
         self._directory.write(rows, self._beliefs)
         write_view(self._directory.file("view.npz"), self._view.view())

@@ -67,7 +67,17 @@ def column(
     atol: float = 0.0,
     table: bool = False,
 ) -> T:
-    """Declare a row field: its value and its metadata. Every field's default is None."""
+    """Declare a row field: its value and its metadata. Every field's default is None.
+
+    Args:
+        value: takes the value from an outcome and its score.
+        doc: meaning.
+        unit: as printed in table headings, "" if none.
+        fmt: format specification for tables.
+        rtol: relative golden tolerance; 0 with ``atol`` 0 means exact.
+        atol: absolute golden tolerance.
+        table: shown in the per-scan table.
+    """
     meta = {"unit": unit, "fmt": fmt, "rtol": rtol, "atol": atol, "doc": doc, "table": table, "value": value}
     return cast(T, dataclasses.field(default=None, metadata=meta))
 

@@ -108,7 +108,7 @@ class Run:
         config: effective configuration.
         surface: model of the target.
         registrar: registers scans against that model.
-        model_check: what the rows taken so far say of the model.
+        model_check: check of the model by the rows processed so far.
     """
 
     def __init__(self, job: Job) -> None:
@@ -153,7 +153,7 @@ class Run:
         self.source.close()
 
     def __len__(self) -> int:
-        """How many scans are due."""
+        """Return the number of selected scans."""
         return len(self.source)
 
     def fit_reference(self, progress: Progress | None = None) -> Reference:
@@ -263,7 +263,7 @@ class Run:
         return Scorer(self._stages.estimator, poses, self.config.reference.value)
 
     def _truth_of(self, scan: Scan) -> Truth:
-        """The truth at a scan; where a reference is asked for, that in place of the true pose."""
+        """Return the truth at a scan; the pose is that of the reference motion if one was fitted."""
         truth = self._true(scan)
         if self._reference is None:
             return truth

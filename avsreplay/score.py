@@ -44,7 +44,13 @@ class Scorer:
         self._captured_ns: int | None = None
 
     def score(self, state: PipelineState, outcome: Outcome, truth: Truth) -> Score:
-        """Compare an outcome, and the pipeline's state after it, with the truth at its scan."""
+        """Compare an outcome with the truth at its scan.
+
+        Args:
+            state: state of the pipeline after the scan.
+            outcome: outcome of the scan.
+            truth: ground truth at the scan.
+        """
         captured = self._planned if state.captured_ns != self._captured_ns else None
         self._captured_ns = state.captured_ns
         planned = self._new_plan(state)
@@ -81,13 +87,23 @@ class Scorer:
 
 
 def pose_error(pose: Pose, truth: Pose) -> PoseError:
-    """Distance [m] and angle [deg] between two poses."""
+    """Return the distance [m] and the angle [deg] between two poses.
+
+    Args:
+        pose: estimated or measured pose T_ac.
+        truth: true pose T_ac.
+    """
     turn = geometry.multiply(geometry.conjugate(truth.q), pose.q)
     return PoseError(float(np.linalg.norm(pose.t - truth.t)), float(np.degrees(geometry.angle(turn))))
 
 
 def matched_truth(belief: Belief, truth: State) -> State:
-    """The true state with its principal axes in the order that is nearest to the estimate's."""
+    """Return the true state with its principal axes in the order that is nearest to that of the estimate.
+
+    Args:
+        belief: the estimate and its covariance.
+        truth: true state at the same instant.
+    """
     return nearest_permutation(belief, truth)[0]
 
 

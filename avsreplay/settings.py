@@ -64,12 +64,20 @@ class Setting:
 
     @property
     def automatic(self) -> str:
-        """What applies where the setting is not given, "" where it always has a value."""
+        """Return what applies if the setting is not given, "" if it always has a value."""
         per_second = " per second" if self.unit == "m/s" else ""
         return self.unset if self.of_extent is None else f"{self.of_extent:g} of the target's extent{per_second}"
 
     def check(self, name: str, value: Any) -> None:
-        """Raise SettingError where a number, or one of a tuple of numbers, is outside the range."""
+        """Check that a value is in the range.
+
+        Args:
+            name: Name of the field, for the error message.
+            value: The value; a tuple is checked number by number, anything else but a number is accepted.
+
+        Raises:
+            SettingError: A number is outside the range.
+        """
         several = isinstance(value, tuple)
         for number in value if several else (value,):
             if isinstance(number, (int, float)) and not isinstance(number, bool) and not self._allows(number):
@@ -94,6 +102,12 @@ class SettingError(ValueError):
     """A value outside its declared range; ``name`` is the field."""
 
     def __init__(self, name: str, message: str) -> None:
+        """Create the error.
+
+        Args:
+            name: Name of the field.
+            message: What is wrong.
+        """
         super().__init__(message)
         self.name = name
 
@@ -146,13 +160,24 @@ class Settings:
 
 
 def declared_of(field: dataclasses.Field[Any]) -> Setting:
-    """The declaration of a field (an empty one where it was not declared with ``setting``)."""
+    """Return the declaration of a field, an empty one if it was not declared with ``setting``.
+
+    Args:
+        field: A field of a dataclass.
+    """
     found: Setting = field.metadata.get("setting", Setting(doc=""))
     return found
 
 
 def given(value: float | None) -> float:
-    """A value that ``resolved`` has filled in. Raises ValueError where it has not."""
+    """Return a value that ``resolved`` has filled in.
+
+    Args:
+        value: Value of a setting that scales with the target.
+
+    Raises:
+        ValueError: The value is None.
+    """
     if value is None:
         raise ValueError("a setting that scales with the target has no value yet: call resolved(extent_m) first")
     return value
@@ -175,7 +200,12 @@ class Entry:
 
 
 def entries(cls: Any, prefix: str = "") -> Iterator[Entry]:
-    """Every setting of a class and of the tables inside it, in order of declaration."""
+    """Yield every setting of a class and of the tables inside it, in order of declaration.
+
+    Args:
+        cls: A dataclass of settings.
+        prefix: Text before each key, for example ``register.``.
+    """
     hints = typing.get_type_hints(cls)
     for each in dataclasses.fields(cls):
         key, inner = f"{prefix}{each.name}", _inner(hints[each.name])
@@ -195,7 +225,11 @@ def _inner(hint: Any) -> Any:
 
 
 def dump(value: Any) -> Any:
-    """A dataclass as plain JSON/TOML values (enums by value, tuples as lists, None left in)."""
+    """Return a value as plain JSON or TOML values: tables as dicts, enums by value, tuples as lists; None is kept.
+
+    Args:
+        value: A dataclass, or a value inside one.
+    """
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: dump(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, enum.Enum):

@@ -29,7 +29,7 @@ _KEY = re.compile(r"^\s*([A-Za-z0-9_\-.\"']+)\s*=")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Document:
-    """A parsed TOML text that knows the line of a key; ``origins`` names keys that came from elsewhere."""
+    """A parsed TOML text; ``origins`` names the source of keys that do not come from this text."""
 
     name: str
     table: Mapping[str, Any]
@@ -37,7 +37,11 @@ class Document:
     origins: Mapping[tuple[str, ...], str] = dataclasses.field(default_factory=dict)
 
     def where(self, path: Sequence[str | int]) -> str:
-        """``name:line`` of the key at ``path`` (array-of-tables entries by index), ``name`` if it has no line."""
+        """Return ``name:line`` of a key, ``name`` if it has no line, or where an assignment replaced it.
+
+        Args:
+            path: the keys from the root to the key; the entries of an array of tables by index.
+        """
         wanted = tuple(map(str, path))
         given_by = [name for key, name in self.origins.items() if key[: len(wanted)] == wanted]
         if given_by:
@@ -47,7 +51,15 @@ class Document:
 
 
 def load(path: str | Path) -> Document:
-    """Read a TOML file. Raises UnreadableInput where it cannot be read, UsageError where it is not TOML."""
+    """Read a TOML file.
+
+    Args:
+        path: the file.
+
+    Raises:
+        UnreadableInput: the file cannot be read, is not UTF-8 text or is larger than 1 MiB.
+        UsageError: the file is not TOML.
+    """
     path = Path(path)
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -118,10 +130,15 @@ def _deep_copy(value: Any) -> Any:
 
 
 def build(cls: type[T], document: Document, path: Sequence[str | int] = ()) -> T:
-    """The dataclass ``cls`` from the table at ``path`` of a document (an absent table gives the defaults).
+    """Return an instance of ``cls`` made from a table of a document.
+
+    Args:
+        cls: a dataclass of settings.
+        document: the document.
+        path: the keys from the root to the table; an absent table gives the defaults.
 
     Raises:
-        UsageError: An unknown key, a missing one, a wrong type, or a value that the class refuses.
+        UsageError: a key is unknown or missing, a type is wrong, or the class refuses a value.
     """
     table: Any = document.table
     for part in path:
@@ -130,7 +147,7 @@ def build(cls: type[T], document: Document, path: Sequence[str | int] = ()) -> T
 
 
 class _Builder:
-    """Builds one object; it knows the document for places and the whole tree of keys for suggestions."""
+    """Builds one object; uses the document for line numbers and all keys for suggestions."""
 
     def __init__(self, cls: Any, document: Document, path: _Path) -> None:
         self.document = document
@@ -292,7 +309,11 @@ def _assignment(leaf: str, value: Any, entry: Entry) -> str:
 
 
 def toml_value(value: Any) -> str:
-    """A value as TOML on one line."""
+    """Return a value as TOML on one line.
+
+    Args:
+        value: a number, text, flag, list, tuple, enum or dataclass.
+    """
     import tomli_w
 
     text = tomli_w.dumps({"v": dump(value)}).removeprefix("v = ").rstrip("\n")

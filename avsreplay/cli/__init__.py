@@ -58,7 +58,7 @@ class _Commands(click.Group):
         return list(SUMMARIES)
 
     def invoke(self, ctx: click.Context) -> object:
-        """Run a command; an environment variable that no command knows is an error."""
+        """Run a command; an environment variable that belongs to no command is an error."""
         unknown = sorted(name for name in os.environ if name.startswith("AVSREPLAY_"))
         if unknown:
             known = list(self._variables(ctx))

@@ -41,7 +41,7 @@ class Tally:
     failures: int = 0
 
     def summary(self) -> dict[str, Any]:
-        """One flat record; None where there is nothing to say."""
+        """Return one flat record; None for a value that was not measured."""
         import numpy as np
 
         def rms(values: list[float]) -> float | None:
@@ -100,7 +100,7 @@ def command(log: Path, backends: str, model: Path | None, topic: str | None, sca
 
 
 def benchmark_backends(names: list[str], surface: Surface, scans: list[TrueScan]) -> list[Tally]:
-    """Every back end on every scan that has points; all on one scan before any goes on to the next.
+    """Time every back end on every scan that has points; all back ends process a scan before the next scan is taken.
 
     A scan is its points (n, 3) in {A} [m] and the true pose T_ac, or None.
 
@@ -162,7 +162,7 @@ def _registrar(name: str, surface: Surface) -> Registrar:
 
 
 def _peak_mib(name: str, surface: Surface, scans: list[TrueScan]) -> float | None:
-    """Peak memory of a fresh process that builds the back end and registers three scans; None where it is not told."""
+    """Peak memory of a fresh process that builds the back end and registers three scans; None if it is unknown."""
     if sys.platform == "win32":
         return None
     from concurrent.futures import ProcessPoolExecutor

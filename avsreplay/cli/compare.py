@@ -95,7 +95,7 @@ def command(
     RESULTS are directories written by 'avsreplay run -o' or their rows.jsonl; the first is the baseline. A folder of
     several results (one per seed) is compared run by run with the baseline's runs of the same names.
 
-    Errors cover all scans, coasting included; a value that a run has lost is worse. Intervals are 95 % bootstrap
+    Errors cover all scans, coasting included; a missing value counts as worse. Intervals are 95 % bootstrap
     intervals of the paired difference. The conclusion on a metric without one needs a change above 10 %.
 
     \f

@@ -1,4 +1,4 @@
-"""Options that several commands share, and how they become ``SourceOptions``."""
+"""Options that several commands share, and their conversion to ``SourceOptions``."""
 
 from __future__ import annotations
 

@@ -197,7 +197,7 @@ def _replayed(run: Run, advice: list[str], target: ResultDirectory | None, to_re
 
 
 def _model_notes(run: Run) -> tuple[str, ...]:
-    """What the rows say of the model, also printed on stderr."""
+    """Return the findings on the model from the rows; they are also printed on stderr."""
     notes = run.model_check.notes()
     for note in notes:
         click.echo(f"avsreplay: model: {note}", err=True)

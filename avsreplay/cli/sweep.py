@@ -111,7 +111,7 @@ def command(
 
 
 def _report_damage(journal: Journal) -> None:
-    """Say which runs are made again because their results were damaged."""
+    """Print which runs are made again because their results were damaged."""
     again = journal.check_scans()
     if journal.damaged:
         what = f"{len(journal.damaged)} damaged lines of the journal were moved to {journal.folder / 'journal.damaged'}"

@@ -22,6 +22,6 @@ def versions() -> dict[str, str]:
 
 
 def version_text() -> str:
-    """One line for the package, one for the rest."""
+    """Return one line for the package and one for its dependencies."""
     own, *rest = versions().items()
     return f"{own[0]} {own[1]}\n" + ", ".join(f"{name} {version}" for name, version in rest)

@@ -70,7 +70,7 @@ class SourceOptions(Settings):
     )
 
     def check(self) -> None:
-        """Raise ValueError where a crop keeps nothing."""
+        """Raise ValueError if a crop is empty."""
         box = self.crop_box
         if box is not None and not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
             raise ValueError(f"crop_box {box} is empty")

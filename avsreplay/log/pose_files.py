@@ -33,7 +33,7 @@ class TimedPoses:
 
 
 def read_poses(path: Path) -> TimedPoses:
-    """Read a pose file; each line tells its format. Raises UnreadableInput with file and line."""
+    """Read a pose file; the columns of a line determine its format. Raises UnreadableInput with file and line."""
     poses, times = list[Pose](), list[int]()
     for where, words, commas in _lines(path):
         t_ns, pose = _line(words, commas, where)

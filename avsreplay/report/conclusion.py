@@ -1,6 +1,6 @@
 """The conclusion of a comparison: better, worse or no evidence, metric by metric and in one sentence.
 
-A value that one run has lost is worse, never skipped. Where both runs have errors at the same instants, the difference
+A value missing in one run counts as worse. Where both runs have errors at the same instants, the difference
 of their RMSE gets a 95 % interval by a paired bootstrap over blocks of consecutive scans (successive errors are
 correlated). For groups of at least five runs, paired by name, every metric gets the
 interval of its mean paired difference.

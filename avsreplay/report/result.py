@@ -36,7 +36,7 @@ class Result:
     """What a run left behind.
 
     Attributes:
-        name: of its folder.  header: ``run.json`` as it stands, empty where there is none.
+        name: of its folder.  header: content of ``run.json``, empty if the file does not exist.
         truth: the true state at the last scan, its axes named as the estimate's.  poses: true poses of {C} in {A}.
         unverified: why the files could not be compared with run.json; empty if they are as the run wrote them.
         whole: whether it is a result directory, not a single file of rows.
@@ -60,7 +60,7 @@ class Result:
 
     @property
     def warnings(self) -> list[str]:
-        """Return what a reader of figures from this result must know."""
+        """Return the known defects of this result, one sentence each."""
         out = [f"{self.name}: not verified, {self.unverified}"] if self.unverified else []
         out += [f"{self.name}: its log was damaged at {self.losses} places"] if self.losses else []
         return out + ([f"{self.name}: the run was interrupted"] if "interrupted_after" in self.header else [])

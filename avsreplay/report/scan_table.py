@@ -155,7 +155,7 @@ def _block(value: float, top: float) -> str:
 
 
 def print_sparks(console: Console, rows: Sequence[Row]) -> None:
-    """Print pose errors and flagged scans over time; nothing off a terminal, or on a narrow or ASCII one."""
+    """Print pose errors and flagged scans over time; only on a wide terminal with Unicode."""
     if not console.is_terminal or console.width < LEAST_WIDTH or ascii_only(console):
         return
     width = console.width - _LABEL

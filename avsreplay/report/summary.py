@@ -63,7 +63,7 @@ class ConvergenceSummary:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """Everything that is said of a run as a whole.
+    """The results of a run as a whole.
 
     Attributes:
         pose_all, pose_healthy, pose_coasting: errors of the estimate.

@@ -1,4 +1,4 @@
-"""The tables of one run, the same for terminal and page, and what is said of it in single lines."""
+"""The tables of one run, the same for terminal and page, and the single lines that are printed about it."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """One table type for terminal, HTML page and Markdown. Cells are text and never interpreted as markup.
 
-This module and ``scan_table`` are the only ones that know rich. States have a sign as well as a colour (Okabe and
+This module and ``scan_table`` are the only ones that import rich. States have a sign as well as a colour (Okabe and
 Ito's colours), so that a table can be read without colour.
 """
 
@@ -24,7 +24,7 @@ _COLOURS = {"good": "#009E73", "bad": "bold #D55E00", "warn": "#E69F00", "faint"
 
 @dataclass(frozen=True, slots=True)
 class TableCell:
-    """A cell with a meaning of its own.
+    """A cell with a text and a style that states its meaning.
 
     Attributes:
         text: as it is to be read.

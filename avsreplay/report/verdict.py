@@ -106,7 +106,7 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     Args:
         rows: one per scan.
         summary: of the same rows.
-        header: ``run.json``; without it nothing is said of the robot and the settings.
+        header: ``run.json``; without it the text does not mention the robot and the settings.
 
     Returns:
         The verdict.

@@ -76,7 +76,7 @@ def _client(workers: int, scheduler: str | None, dashboard: str) -> Iterator[Any
 
 
 def _on(client: Any, tasks: Iterator[Task]) -> Iterator[RunResult]:
-    """Keep a bounded number of tasks at the scheduler, which runs the tasks of a worker that dies on another."""
+    """Keep a bounded number of tasks at the scheduler, which repeats the tasks of a failed worker on another one."""
     running = _distributed().as_completed()
     held, count, limit = 0, 0, IN_FLIGHT
     while True:

@@ -189,7 +189,7 @@ class Journal:
             source.close()  # Windows does not replace an open file
 
     def _index(self) -> None:
-        """Place and status of every line that is whole; the others are kept apart."""
+        """Read place and status of every intact line; the other lines are collected separately."""
         place = 0
         with self.path.open("rb") as stream:
             for line in stream:

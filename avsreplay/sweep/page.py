@@ -206,7 +206,7 @@ def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
     """A row per kind of fault and combination; without rows where nothing was injected.
 
     Times are in s; errors are position [mm] and rotation [deg] of the estimate. The rows of kind "none" come first:
-    what is flagged there is a false alarm.
+    flagged scans in these rows are false alarms.
     """
     title = "By kind of fault: times in s, errors in mm and deg; ~: harmless by its label; none: outside every window"
     injected = any(cell.kinds.keys() - {NONE} for _, cell in cells)

@@ -107,8 +107,8 @@ class Roc:
 
     Attributes:
         thresholds: Thresholds from strict to lenient.
-        detected: Share of the harmful scans that each flags.
-        false: Share of the other scans that each flags.
+        detected: Share of the harmful scans that are flagged at each threshold.
+        false: Share of the other scans that are flagged at each threshold.
         area: Area under the curve.
         at_one_percent: Threshold at which at most 1 % of the other scans are flagged, and the share it detects.
     """
