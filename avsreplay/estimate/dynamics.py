@@ -182,7 +182,17 @@ def rotation_path(x: State) -> _motion.Path:
 
 
 def grasp_trajectory(x: State) -> Trajectory:
-    """Times (n,) >= 0 [s after now] -> positions and velocities (n, 3) of the grasp point in {A}, undisturbed."""
+    """Positions and velocities of the undisturbed grasp point.
+
+    Args:
+        x: the state now.
+
+    Returns:
+        Function of times (n,) >= 0 [s after now]: positions (n, 3) [m] and velocities (n, 3) [m/s] in {A}.
+
+    Raises:
+        ValueError: by the returned function, for a time that is negative or not finite.
+    """
     path, arm = rotation_path(x), geometry.skew(x.c_b)  # w x c = w' [c x]
 
     def at(times: Array) -> tuple[Array, Array]:

@@ -34,18 +34,19 @@ from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajector
 
 
 class Estimator:
-    """The 20-state noise-adaptive constrained Kalman filter and the batch fit that initialises and checks it.
-
-    Args:
-        params: settings; lengths left out are taken from ``extent_m``.
-        start: the first belief where one is given.
-        extent_m: the target's bounding diagonal [m].
-
-    Raises:
-        UsageError: a near start is requested and none is given.
-    """
+    """The 20-state noise-adaptive constrained Kalman filter and the batch fit that initialises and checks it."""
 
     def __init__(self, params: EstimatorParams, start: Belief | None, extent_m: float) -> None:
+        """Create the estimator of one run.
+
+        Args:
+            params: settings; lengths left out are taken from ``extent_m``.
+            start: the first belief where one is given.
+            extent_m: the target's bounding diagonal [m].
+
+        Raises:
+            UsageError: a near start is requested and none is given.
+        """
         self.params = params.resolved(extent_m)
         if params.start is Start.NEAR and start is None:
             hint = "use start = cold, or a log whose scenario has a [start] table"
@@ -196,11 +197,26 @@ class Estimator:
         return self.batch.check_against_batch(self._filtered(track, prediction, innovation))
 
     def motion(self, belief: Belief) -> Trajectory:
-        """The predicted path of the grasp point after the belief's instant."""
+        """The predicted path of the grasp point without disturbances.
+
+        Args:
+            belief: mean and covariance now; only the mean is used.
+
+        Returns:
+            Function of times (n,) >= 0 [s after the belief's instant]: positions (n, 3) [m] and velocities (n, 3) [m/s]
+            in {A}. It raises ValueError for a time that is negative or not finite.
+        """
         return dynamics.grasp_trajectory(belief.x)
 
     def attitude(self, belief: Belief) -> Callable[[Array], Array]:
-        """The predicted attitudes q_ac (n, 4) of the fixture at times (n,) [s after the belief's instant]."""
+        """The predicted attitudes of the fixture without disturbances.
+
+        Args:
+            belief: mean and covariance now; only the mean is used.
+
+        Returns:
+            Function of times (n,) [s after the belief's instant]: attitudes q_ac (n, 4).
+        """
         return dynamics.fixture_attitude(belief.x)
 
     def forecast(self, belief: Belief, times_s: Array) -> Forecast:
@@ -213,7 +229,14 @@ class Estimator:
         return dynamics.grasp_forecast(belief, times_s, self._torque, self._force)
 
     def pose_covariance(self, belief: Belief) -> Array:
-        """The (6, 6) covariance of the pose of {C}: position in {A} [m], half-angle vector in {B} [rad]."""
+        """The covariance of the pose of {C}, H P H' (H of eq:innovation).
+
+        Args:
+            belief: mean and covariance.
+
+        Returns:
+            (6, 6) covariance: position in {A} [m], half-angle vector in {B} [rad].
+        """
         H = measurement_jacobian(belief.x)
         return np.asarray(H @ belief.P @ H.T)
 

@@ -115,7 +115,17 @@ def explain(
 
 
 def cholesky_root(C: Array) -> Array:
-    """Lower Cholesky factor of a covariance; one that rounding left indefinite gets the least sufficient diagonal."""
+    """Lower Cholesky factor of a covariance that rounding may have made indefinite.
+
+    Args:
+        C: (n, n) covariance.
+
+    Returns:
+        (n, n) factor of C; if C is indefinite, of C plus the smallest sufficient multiple of the identity.
+
+    Raises:
+        ValueError: no multiple suffices, as with a matrix that is not finite.
+    """
     scale = float(np.trace(C)) / len(C)
     for k in range(-14, 1):
         try:

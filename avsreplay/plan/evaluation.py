@@ -55,7 +55,11 @@ class Miss:
     angle_deg: float
 
     def inside(self, tolerance: Tolerance) -> bool:
-        """Return whether the errors are within the tolerance; an unknown angle is accepted."""
+        """Return whether the errors are within the tolerance; an unknown angle is accepted.
+
+        Args:
+            tolerance: Largest errors of a successful capture.
+        """
         angle = math.isnan(self.angle_deg) or self.angle_deg <= tolerance.angle_deg
         return self.distance_m <= tolerance.position_m and self.speed_mps <= tolerance.speed_mps and angle
 
@@ -77,7 +81,11 @@ class Execution:
     ended: Action
 
     def outcome(self, tolerance: Tolerance) -> str:
-        """Return ``captured``, ``outside`` (closed outside the tolerance) or the last action."""
+        """Return ``captured``, ``outside`` (closed outside the tolerance) or the last action.
+
+        Args:
+            tolerance: Largest errors of a successful capture.
+        """
         if self.captured and self.miss is not None:
             return "captured" if self.miss.inside(tolerance) else "outside"
         return self.ended.value

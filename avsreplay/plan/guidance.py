@@ -63,7 +63,14 @@ class Segment:
     capture: bool = False
 
     def at(self, t_ns: int) -> tuple[Array, Array]:
-        """Return position [m] and velocity [m/s] (3,) of the robot in {A} at an instant."""
+        """Return the state of the robot at an instant.
+
+        Args:
+            t_ns: Instant on the clock of the scans [ns].
+
+        Returns:
+            Position (3,) [m] and velocity (3,) [m/s] in {A}.
+        """
         if self.previous is not None and t_ns < self.t_ns:
             return self.previous.at(t_ns)
         span = (t_ns - self.t_ns) * 1e-9
@@ -117,12 +124,23 @@ class Guidance:
         self.limits = (limits or Limits()).resolved(extent_m)
 
     def initial(self, t_ns: int) -> GuidanceState:
-        """Return the state at the first scan: the robot at its configured position and velocity."""
+        """Return the state at the first scan: the robot at its configured position and velocity.
+
+        Args:
+            t_ns: Instant of the first scan [ns].
+        """
         r0, v0 = np.array(self.params.robot_position_m), np.array(self.params.robot_velocity_mps)
         return GuidanceState(Segment(t_ns, r0, v0))
 
     def fly(self, inputs: Iterable[PlannerInput]) -> Iterator[tuple[PlannerInput, GuidanceState]]:
-        """Apply ``step`` to one input after the other."""
+        """Apply ``step`` to one input after the other.
+
+        Args:
+            inputs: What was known after each scan, in the order of the scans.
+
+        Yields:
+            Each input and the state after it.
+        """
         state: GuidanceState | None = None
         for known in inputs:
             state = self.step(state or self.initial(known.t_ns), known)

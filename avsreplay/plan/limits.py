@@ -1,8 +1,7 @@
 """Constraints of the approach, and the target as the planner uses it.
 
-All geometric constraints are fixed in the fixture's frame {C}: the approach cone (line of sight), the narrower corridor
-of the last metres, a sphere around the centre of mass, and the clearance to the surface of the target. A robot at r has
-the coordinates y = R_ac' (r - rho) in {C}.
+The constraints in the fixture's frame {C} are the approach cone (line of sight), the corridor of the last metres, a
+sphere about the centre of mass and the clearance to the surface. A robot at r has y = R_ac' (r - rho) in {C}.
 """
 
 from __future__ import annotations
@@ -19,8 +18,7 @@ from avsreplay.geometry import Array
 from avsreplay.records import Trajectory
 from avsreplay.settings import Settings, setting
 
-CONSTRAINTS = ("cone", "corridor", "sphere", "body", "workspace")
-"""Names of the geometric constraints, in the order of the columns of ``margins``."""
+CONSTRAINTS = ("cone", "corridor", "sphere", "body", "workspace")  # in the order of the columns of ``margins``
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +75,11 @@ class Limits(Settings):
     nodes: int = setting(40, "Thrust intervals of a constrained plan.", low=8)
 
     def widened(self, radius_m: float) -> Limits:
-        """Return the limits for an end-effector of a radius [m], which is added to the clearance."""
+        """Return the limits for an end-effector of a given size.
+
+        Args:
+            radius_m: Its radius [m], added to the clearance; without clearance and corridor the limits do not change.
+        """
         if radius_m <= 0.0 or (self.clearance_m is None and self.final_deg is None):
             return self
         return replace(self, clearance_m=(self.clearance_m or 0.0) + radius_m)
@@ -103,8 +105,7 @@ class Scene:
         attitude: Times (n,) [s] -> q_ac (n, 4) of the fixture; None where only speed and contact are limited.
         axis_c: (3,) outward axis of the fixture in {C}, unit; cone and corridor open along it.
         centre_c: (3,) centre of mass in {C} [m], the centre of the sphere; None where unknown.
-        surface: Points (n, 3) in {C} -> closest points (n, 3) of the target's surface and signed distances (n,),
-            negative inside, infinite where far; None: unknown.
+        surface: Points (n, 3) in {C} -> closest points (n, 3), signed distances (n,) (see ``Margins``); None: unknown.
         sigma: Times (n,) ascending [s] -> predicted 1 sigma of the position [m] and attitude [rad] of {C}, each (n,).
         radius_m: Radius of the sphere about the centre of mass that contains the target in every attitude.
     """
@@ -118,14 +119,22 @@ class Scene:
     radius_m: float = 0.0
 
     def centre(self, times: Array) -> Array:
-        """Return the centre of mass (n, 3) in {A} at times (n,) [s]; the grasp point where it is unknown."""
+        """Return the centre of mass (n, 3) in {A} [m], or the grasp point where it is unknown.
+
+        Args:
+            times: (n,) [s after the instant of planning].
+        """
         position = self.goal(times)[0]
         if self.attitude is None or self.centre_c is None:
             return position
         return np.asarray(position + geometry.matrix(self.attitude(times)) @ self.centre_c)
 
     def after(self, delay_s: float) -> Scene:
-        """Return the scene with times counted from ``delay_s`` later."""
+        """Return the scene with times counted from a later instant.
+
+        Args:
+            delay_s: Delay of that instant [s].
+        """
         goal, attitude, sigma = self.goal, self.attitude, self.sigma
         return replace(
             self,
@@ -135,7 +144,14 @@ class Scene:
         )
 
     def check(self, limits: Limits) -> None:
-        """Raise ValueError where a constraint needs what the scene does not contain."""
+        """Check that the scene contains what the constraints need.
+
+        Args:
+            limits: Resolved limits.
+
+        Raises:
+            ValueError: Something is missing, or ``keepout_m`` is too large to reach the grasp point.
+        """
         if limits.geometric and self.attitude is None:
             raise ValueError("cone, corridor, sphere and clearance need the fixture's attitude, and the scene has none")
         if self.axis_c is None and (limits.cone_deg is not None or limits.final_deg is not None):
@@ -167,12 +183,20 @@ class TargetGeometry:
     surface: Callable[[Array], tuple[Array, Array]] | None = None
 
     def radius(self, centre_c: Array) -> float:
-        """Return the radius of the sphere about a centre (3,) in {C} that contains the target [m]."""
+        """Return the radius of the sphere about a centre that contains the target [m].
+
+        Args:
+            centre_c: (3,) the centre in {C} [m].
+        """
         return float(np.sqrt(np.max(np.sum((self.hull_c - centre_c) ** 2, axis=1))))
 
 
 def hull_vertices(vertices: Array) -> Array:
-    """Return the vertices (m, 3) of the convex hull of points (n, 3), or the points themselves where it has none."""
+    """Return the vertices (m, 3) of the convex hull of points, or the points themselves where it has none.
+
+    Args:
+        vertices: (n, 3) points in any frame.
+    """
     from scipy.spatial import ConvexHull, QhullError
 
     points = np.asarray(vertices, dtype=np.float64)
@@ -189,11 +213,10 @@ class Margins:
     Attributes:
         first: (n, 5) margins of the first alternatives in the order of ``CONSTRAINTS`` [m]: inside the cone, inside the
             corridor, within the release distance of the sphere, inside the corridor instead of at the clearance.
-        second: (n, 5) margins of the second alternatives [m]: outside the range of the cone, outside that of the
-            corridor, outside the sphere, at the clearance, inside the workspace. Infinite where a constraint is off.
-        foot: (n, 3) closest points of the surface in {C}.
-        distance: (n,) signed distance to the surface [m], infinite where far or not asked for.
-        clearance: (n,) required clearance [m].
+        second: (n, 5) margins of the others [m], infinite where off: outside the range of the cone, outside that of the
+            corridor, outside the sphere, at the clearance, inside the workspace.
+        foot: (n, 3) closest points of the surface in {C} [m].  clearance: (n,) required clearance [m].
+        distance: (n,) signed distance to the surface [m], negative inside, infinite where far or not asked for.
     """
 
     first: Array
@@ -225,11 +248,7 @@ class Margins:
 
 
 def margins(scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array, Array] | None = None) -> Margins:
-    """Evaluate the geometric constraints.
-
-    Cone: inside it, or outside its range. Corridor: likewise. Sphere: near the grasp point, or outside the sphere.
-    Body: inside the corridor and its range, or at least the clearance away from the surface. Workspace: the distance
-    from the robot's base in {A}.
+    """Evaluate the geometric constraints; ``Margins`` states the two alternatives of each.
 
     Args:
         scene: The target.
@@ -268,19 +287,13 @@ def margins(scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array
 
 
 def margin(scene: Scene, limits: Limits, r: Array, v: Array) -> float:
-    """Return the smallest margin of the constraints for a robot now, negative if one is violated.
-
-    A plan may touch a constraint, and the estimate of the target moves between scans: lengths are extended by the
-    radius of the cone at the grasp point, the speed by a twentieth.
+    """Return the smallest margin for a robot now [m or m/s]: negative if a constraint is violated, infinite without.
 
     Args:
         scene: The target.
-        limits: Resolved limits.
+        limits: Resolved limits. As estimates change, lengths are extended by ``mouth_m`` and the speed by a twentieth.
         r: (3,) position of the robot in {A} [m].
         v: (3,) its velocity [m/s].
-
-    Returns:
-        The margin in metres or metres per second, infinite where no constraint holds.
     """
     least, now = math.inf, np.zeros(1)
     if limits.geometric and scene.attitude is not None:

@@ -31,10 +31,18 @@ class RobotPath(Protocol):
         """Duration [s after the instant of planning]."""
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return positions [m] and velocities [m/s], each (n, 3) in {A}, at times (n,)."""
+        """Return positions [m] and velocities [m/s], each (n, 3) in {A}.
+
+        Args:
+            times: (n,) [s after the instant of planning].
+        """
 
     def thrust(self, times: Array) -> Array:
-        """Return the acceleration (n, 3) in {A} [m/s2] at times (n,)."""
+        """Return the acceleration (n, 3) in {A} [m/s2].
+
+        Args:
+            times: (n,) [s after the instant of planning].
+        """
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,23 +72,47 @@ class CostatePath:
     def from_normal(
         cls, r0: Array, v0: Array, a_max: float, latency_s: float, thrust_s: float, P0: Array, P1: Array
     ) -> CostatePath:
-        """Return the path whose primer vector is -P, P changing linearly from P0 to P1 over the thrust time."""
+        """Return the path whose primer vector is -P, P changing linearly from P0 to P1 over the thrust time (eq:u).
+
+        Args:
+            r0: (3,) position of the robot in {A} at the instant of planning [m].
+            v0: (3,) its velocity [m/s].
+            a_max: Magnitude of the thrust [m/s2].
+            latency_s: Coasting time before the thrust [s].
+            thrust_s: Duration of the thrust, above 0 [s].
+            P0: (3,) P at the begin of the thrust in {A}; a common factor of P0 and P1 has no effect.
+            P1: (3,) P at its end.
+        """
         c1 = (P1 - P0) / thrust_s
         c = np.concatenate([c1, c1 * latency_s - P0])
         return cls(r0, v0, a_max, latency_s, latency_s + thrust_s, c / np.linalg.norm(c))
 
     @classmethod
     def of(cls, plan: Plan, r0: Array, v0: Array) -> CostatePath:
-        """Return the path of a plan made for a robot at r0 with velocity v0."""
+        """Return the path of an unconstrained plan.
+
+        Args:
+            plan: A plan that was found.
+            r0: (3,) position of the robot in {A} for which the plan was made [m].
+            v0: (3,) its velocity [m/s].
+        """
         return cls(r0, v0, plan.a_max, plan.latency_s, plan.t_go_s, plan.costate)
 
     def p(self, times: Array) -> Array:
-        """Return the primer vector (n, 3) at times (n,)."""
+        """Return the primer vector (n, 3) in {A}, c2 - c1 tau, without unit.
+
+        Args:
+            times: (n,) [s after the instant of planning].
+        """
         out: Array = self.costate[None, 3:] - self.costate[None, :3] * times[:, None]
         return out
 
     def thrust(self, times: Array) -> Array:
-        """Return the acceleration (n, 3) [m/s2] at times (n,); it is zero outside [latency_s, t_go_s]."""
+        """Return the acceleration (n, 3) in {A} [m/s2] (eq:u); it is zero outside [latency_s, t_go_s].
+
+        Args:
+            times: (n,) [s after the instant of planning].
+        """
         p = self.p(times)
         norm = np.linalg.norm(p, axis=1, keepdims=True)
         u: Array = -self.a_max * p / np.where(norm > 0.0, norm, 1.0)
@@ -88,7 +120,11 @@ class CostatePath:
         return np.where(on[:, None], u, 0.0)
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return positions and velocities (n, 3) at times (n,); after the end the robot coasts."""
+        """Return positions [m] and velocities [m/s], each (n, 3) in {A}; after the end the robot coasts.
+
+        Args:
+            times: (n,) [s after the instant of planning].
+        """
         burn = np.clip(times, self.latency_s, self.t_go_s) - self.latency_s
         start = self.p(np.full(len(times), self.latency_s))
         first, second = integrals(-start, -self.p(burn + self.latency_s))
@@ -98,11 +134,19 @@ class CostatePath:
         return self.r0 + self.v0 * times[:, None] + dr, self.v0 + dv
 
     def terminal_errors(self, goal: Trajectory) -> tuple[float, float]:
-        """Return the distance [m] and the relative speed [m/s] to the goal at the end."""
+        """Return the distance [m] and the relative speed [m/s] to the goal at the end (eq:terminal).
+
+        Args:
+            goal: Trajectory of the grasp point in {A}, in seconds after the instant of planning.
+        """
         return _terminal_errors(self, goal)
 
     def u_max(self, nodes: int = 65) -> float:
-        """Return the largest |u| [m/s2] at ``nodes`` instants of the path."""
+        """Return the largest |u| [m/s2] at instants of the thrust; NaN where the end is infinite.
+
+        Args:
+            nodes: Number of equally spaced instants.
+        """
         times = np.linspace(self.latency_s, self.t_go_s, nodes)
         return float(np.max(np.linalg.norm(self.thrust(times), axis=1))) if math.isfinite(self.t_go_s) else math.nan
 
@@ -135,7 +179,7 @@ class StepPath:
         return (self.t_go_s - self.latency_s) / len(self.u)
 
     def nodes(self) -> tuple[Array, Array]:
-        """Return positions and velocities (n + 1, 3) at the ends of the intervals."""
+        """Return positions [m] and velocities [m/s], each (n + 1, 3) in {A}, at the ends of the intervals."""
         h = self.step_s
         zero = np.zeros((1, 3))
         v = self.v0 + np.concatenate([zero, h * np.cumsum(self.u, axis=0)])
@@ -149,12 +193,20 @@ class StepPath:
         return k, since - k * self.step_s
 
     def thrust(self, times: Array) -> Array:
-        """Return the acceleration (n, 3) [m/s2] at times (n,); it is zero outside [latency_s, t_go_s]."""
+        """Return the acceleration (n, 3) in {A} [m/s2]; it is zero outside [latency_s, t_go_s].
+
+        Args:
+            times: (n,) [s after the instant of planning].
+        """
         on = (times >= self.latency_s) & (times <= self.t_go_s)
         return np.where(on[:, None], self.u[self._interval(times)[0]], 0.0)
 
     def at(self, times: Array) -> tuple[Array, Array]:
-        """Return positions and velocities (n, 3) at times (n,); after the end the robot coasts."""
+        """Return positions [m] and velocities [m/s], each (n, 3) in {A}; the robot coasts before and after the thrust.
+
+        Args:
+            times: (n,) [s after the instant of planning].
+        """
         r, v = self.nodes()
         k, s = self._interval(times)
         early = np.minimum(times - self.latency_s, 0.0)[:, None]
@@ -164,7 +216,11 @@ class StepPath:
         return position + early * self.v0 + late * velocity, velocity
 
     def terminal_errors(self, goal: Trajectory) -> tuple[float, float]:
-        """Return the distance [m] and the relative speed [m/s] to the goal at the end."""
+        """Return the distance [m] and the relative speed [m/s] to the goal at the end (eq:terminal).
+
+        Args:
+            goal: Trajectory of the grasp point in {A}, in seconds after the instant of planning.
+        """
         return _terminal_errors(self, goal)
 
     def u_max(self) -> float:

@@ -76,13 +76,21 @@ class RobotParams(Settings):
             raise ValueError("mass_kg and thrust_max_n must be given together")
 
     def applied(self, params: PlanParams) -> PlanParams:
-        """Return the planner's parameters with the acceleration that thrust and mass allow."""
+        """Return the planner's parameters with the acceleration that thrust and mass allow.
+
+        Args:
+            params: The planner's parameters; returned unchanged where the robot has no mass and thrust.
+        """
         if self.mass_kg is None or self.thrust_max_n is None:
             return params
         return replace(params, a_max_mps2=self.thrust_max_n / self.mass_kg)
 
     def described(self, params: PlanParams) -> str:
-        """Return the assumed robot in one line."""
+        """Return the assumed robot in one line.
+
+        Args:
+            params: The planner's parameters, for the position of the robot, the latency and the acceleration.
+        """
         a_max = self.applied(params).a_max_mps2
         mass = "" if self.mass_kg is None else f", {self.mass_kg:g} kg"
         at = ", ".join(f"{x:g}" for x in params.robot_position_m)

@@ -262,7 +262,14 @@ class Supervisor:
         return after, Decision(rule.action, rule.name)
 
     def error_ratio(self, facts: Facts) -> float:
-        """Return the predicted error at the end of the plan over the tolerance; infinite where it is unknown."""
+        """Return the predicted error at the end of the plan over the tolerance; infinite where it is unknown.
+
+        Args:
+            facts: What is known after a scan.
+
+        Returns:
+            ``sigmas`` times the largest of the three ratios 1 sigma / tolerance (position, speed, attitude).
+        """
         p = self.params
         parts = (
             facts.pos_1s_m / (p.capture_pos_m or math.nan),

@@ -79,7 +79,14 @@ class Disturbance:
     rng: np.random.Generator
 
     def deviation(self, times: Array) -> tuple[Array, Array]:
-        """Draw one deviation of position [m] and velocity [m/s], each (n, 3), at times (n,) ascending from 0 [s]."""
+        """Draw one deviation of the robot from its planned path; each call draws a new one from ``rng``.
+
+        Args:
+            times: (n,) ascending from 0 [s].
+
+        Returns:
+            Deviations of position (n, 3) [m] and velocity (n, 3) [m/s].
+        """
         steps = max(math.ceil(float(times[-1])), 1)
         u = self.sigma_mps2 * self.rng.standard_normal((steps, 3))
         v = np.concatenate([np.zeros((1, 3)), np.cumsum(u, axis=0)])

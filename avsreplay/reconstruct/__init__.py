@@ -164,7 +164,11 @@ def at_grasp(made: Reconstruction, grasp: Array | None = None) -> Reconstruction
 
 
 def surface_of(made: Reconstruction) -> Surface:
-    """The reconstruction as the model of a replay: a point cloud in {C}."""
+    """Return the reconstruction as the model of a replay: a point cloud in {C} [m].
+
+    Args:
+        made: the reconstruction.
+    """
     data = reconstruction_ply(made)
     none = np.zeros((0, 3), dtype=np.int32)
     return Surface(made.points, none, "reconstructed.ply", hashlib.sha256(data).hexdigest(), data)

@@ -38,7 +38,15 @@ def user_folder() -> Path | None:
 
 
 def cache_path(folder: Path, layout: int, vertices: Array, faces: NDArray[np.int32], reach_m: float) -> Path:
-    """Return the file name of the index of this surface and reach in ``folder``."""
+    """Return the file name of the index of a surface.
+
+    Args:
+        folder: cache folder.
+        layout: version of the layout of the index.
+        vertices: (n, 3) in {C} [m].
+        faces: (m, 3) vertex indices.
+        reach_m: largest distance of a query [m].
+    """
     key = hashlib.sha256(f"{layout} {sys.byteorder} {float(reach_m).hex()} {vertices.shape} {faces.shape}".encode())
     key.update(vertices.tobytes())
     key.update(faces.tobytes())

@@ -33,14 +33,15 @@ LEAST_ERROR, SIGMAS = 0.005, 4.0  # of delta, to be reported
 
 
 class ModelCheck:
-    """Collects scans of one run.
-
-    Args:
-        registrar: of the run.
-        surface: its model.
-    """
+    """Collects scans of one run and reports errors of the model."""
 
     def __init__(self, registrar: Registrar, surface: Surface) -> None:
+        """Create the check of one run.
+
+        Args:
+            registrar: of the run.
+            surface: its model, vertices in {C} [m].
+        """
         self._registrar, self._surface = registrar, surface
         self._seen, self._aligned = 0, 0
         self._deltas: list[float] = []
@@ -49,7 +50,12 @@ class ModelCheck:
         self._unmatched: NDArray[Any] | None = None
 
     def add(self, points: NDArray[Any], found: Alignment | None) -> None:
-        """Take one scan (n, 3) in {A} [m] and its alignment, if there is one."""
+        """Use one scan.
+
+        Args:
+            points: (n, 3) in {A} [m]; points that are not finite are left out.
+            found: its alignment; None, or a scan without points, is ignored.
+        """
         if found is None or not len(points):
             return
         if found.status is not AlignStatus.ALIGNED:

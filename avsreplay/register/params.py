@@ -99,7 +99,11 @@ class RegisterParams(Settings):
             raise ValueError(f"gate_m is {self.gate_m}, must not exceed reach_m = {self.reach_m}")
 
     def limits(self, extent_m: float) -> RegistrationLimits:
-        """These parameters for a model of this extent [m] (the diagonal of its bounding box)."""
+        """Return the parameters of a back end for a model of a given size.
+
+        Args:
+            extent_m: diagonal of the model's bounding box [m]; automatic lengths are proportional to it.
+        """
         auto = replace(self, reach_m=None, gate_m=None).resolved(extent_m)
         reach = given(auto.reach_m) if self.reach_m is None else self.reach_m
         gate = given(auto.gate_m) if self.gate_m is None else self.gate_m

@@ -134,7 +134,13 @@ class Registrar:
         return quality.instants(self._index, self._visibility, points, times_s, T_ac.inverse(), self.limits.gate_m)
 
     def distance(self, points: NDArray[Any], T_ac: Pose, most_m: float) -> Array:
-        """Return the distance (n,) [m] of points (n, 3) in {A} to the model at a pose, limited to ``most_m``."""
+        """Return the distances (n,) of points to the model [m].
+
+        Args:
+            points: (n, 3) in {A} [m].
+            T_ac: pose of the model.
+            most_m: larger distances are limited to this value [m]; it is at most the reach of the index.
+        """
         d2 = self._index.closest(T_ac.inverse().apply(points)).d2
         return np.asarray(np.sqrt(np.minimum(d2, min(most_m, self._index.reach_m) ** 2)))
 
@@ -154,7 +160,11 @@ class Registrar:
         return quality.scale_error(self._index, p, camera, width_m, rounds)
 
     def search(self, points: NDArray[Any]) -> SearchResult:
-        """Return the best and second best pose of a scan (n, 3) in {A} [m], finite, n >= 1."""
+        """Return the best and the second best pose of a scan by the global search.
+
+        Args:
+            points: (n, 3) finite, n >= 1, in {A} [m].
+        """
         return self._global.search(points)
 
     @cached_property

@@ -80,21 +80,29 @@ class MotionParams(Settings):
 
 
 class Motion:
-    """The motion of a body over [0, span_s].
-
-    Args:
-        body: Its mass properties.
-        params: Initial state and disturbances.
-        span_s: Length [s].
-        rng: For the disturbances.
-    """
+    """The motion of a body over [0, span_s]."""
 
     def __init__(self, body: Body, params: MotionParams, span_s: float, rng: np.random.Generator) -> None:
+        """Integrate the motion.
+
+        Args:
+            body: Its mass properties.
+            params: Initial state and disturbances.
+            span_s: Length [s].
+            rng: Generator of the disturbances.
+        """
         self._body = body
         self._starts, self._coefficients = _integrate(body, params, span_s, rng)
 
     def states(self, times_s: ArrayLike) -> tuple[Array, Array, Array, Array]:
-        """At times (n,) [s]: q_ac (n, 4), rate in {C} (n, 3) [rad/s], mass centre (n, 3) and velocity (n, 3) in {A}."""
+        """Return attitude, angular rate, position and velocity.
+
+        Args:
+            times_s: (n,) [s after the begin].
+
+        Returns:
+            q_ac (n, 4), rate in {C} (n, 3) [rad/s], mass centre (n, 3) [m] and its velocity (n, 3) [m/s] in {A}.
+        """
         times = np.asarray(times_s, dtype=np.float64)
         step = np.clip(np.searchsorted(self._starts, times, side="right") - 1, 0, len(self._starts) - 1)
         tau = (times - self._starts[step])[:, None]
@@ -104,17 +112,32 @@ class Motion:
         return geometry.normalise(value[:, :4]), value[:, 4:7], value[:, 7:10], value[:, 10:]
 
     def poses(self, times_s: ArrayLike) -> tuple[Array, Array]:
-        """Rotations R_ac (n, 3, 3) and fixture positions (n, 3) in {A} at times (n,) [s]."""
+        """Return the poses of the fixture.
+
+        Args:
+            times_s: (n,) [s after the begin].
+
+        Returns:
+            Rotations R_ac (n, 3, 3) and positions of the fixture (n, 3) in {A} [m].
+        """
         q_ac, _, centre, _ = self.states(times_s)
         R_ac = geometry.matrix(q_ac)
         return R_ac, centre - geometry.rotate(R_ac, self._body.centre_c)
 
     def pose(self, t_s: float) -> Pose:
-        """T_ac at an instant [s]."""
+        """Return T_ac.
+
+        Args:
+            t_s: Instant [s after the begin].
+        """
         return self.state(t_s).T_ac
 
     def state(self, t_s: float) -> State:
-        """The full true state at an instant [s]."""
+        """Return the full true state.
+
+        Args:
+            t_s: Instant [s after the begin].
+        """
         q_ac, w_c, centre, velocity = (value[0] for value in self.states([t_s]))
         body = self._body
         return State(

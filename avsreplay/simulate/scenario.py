@@ -126,7 +126,16 @@ def load_scenario(path: Path | None = None, seed: int | None = None) -> Scenario
 
 
 def scenario_of(document: toml_document.Document, seed: int | None = None, folder: Path | None = None) -> Scenario:
-    """The scenario of a parsed document."""
+    """Return the scenario of a parsed document.
+
+    Args:
+        document: The parsed TOML text.
+        seed: Replaces the seed of the document.
+        folder: Folder to which its file names are relative; the working directory where None.
+
+    Raises:
+        UsageError: A key or value is wrong; the message names file and line.
+    """
     params = toml_document.build(ScenarioParams, _with_preset(document))
     if not isinstance(params.run, dict):
         raise UsageError("'run' must be a table", where=document.where(("run",)), hint="write it as [run]")

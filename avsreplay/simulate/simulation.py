@@ -50,11 +50,19 @@ class Simulation:
         return self._scanner.engine
 
     def truth(self, log_ns: int) -> State:
-        """The true state at an instant of the log clock [ns]."""
+        """Return the true state.
+
+        Args:
+            log_ns: Instant on the clock of the log [ns].
+        """
         return self._motion.state((log_ns - EPOCH_NS) / NS)
 
     def truth_of(self, scan: Scan) -> Truth:
-        """Return the ground truth at one of this simulation's scans: pose, full state and injected fault."""
+        """Return the ground truth at one of this simulation's scans: pose, full state and injected fault.
+
+        Args:
+            scan: A scan of ``scans``.
+        """
         state = self.truth(scan.log_ns)
         kinds = [kind.value for kind in self._faults(scan.log_ns)]
         kinds += [body.params.name for body in self._present(scan.log_ns) if body.params.duration_s is not None]

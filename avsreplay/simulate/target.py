@@ -63,7 +63,11 @@ class TargetParams(Settings):
 
 
 def builtin_surface(shape: Shape = Shape.SATELLITE) -> Surface:
-    """The mesh of a built-in target in {C}, with its PLY bytes. Parts that touch keep their own faces."""
+    """Return the mesh of a built-in target in {C}, with its PLY bytes. Parts that touch keep their own faces.
+
+    Args:
+        shape: The built-in target.
+    """
     parts = {
         Shape.SATELLITE: _satellite,
         Shape.BRACKET: _bracket,
@@ -93,7 +97,12 @@ def body(params: TargetParams, surface: Surface) -> Body:
 
 
 def ply_bytes(vertices: NDArray[np.float32] | Array, faces: NDArray[np.int32]) -> bytes:
-    """A triangle mesh as binary little-endian PLY: vertices (n, 3) [m], faces (m, 3)."""
+    """Return a triangle mesh as a binary little-endian PLY file.
+
+    Args:
+        vertices: (n, 3) [m], stored as float32.
+        faces: (m, 3) vertex indices.
+    """
     header = (
         "ply\nformat binary_little_endian 1.0\n"
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
