@@ -218,37 +218,65 @@ Value = Callable[[Outcome, Score], T]
 
 
 def finite(value: float | None) -> float | None:
-    """Return the value, or None where it is NaN or infinite."""
+    """Return a value, or None where it is None, NaN or infinite.
+
+    Args:
+        value: the value.
+    """
     return float(value) if value is not None and np.isfinite(value) else None
 
 
 def if_innovation(get: Callable[[Innovation], float | None]) -> Value[float | None]:
-    """Take a value of the innovation, None where nothing was measured."""
+    """Return a column value taken from the innovation, None where nothing was measured.
+
+    Args:
+        get: takes the value from the innovation.
+    """
     return lambda o, s: None if o.innovation is None else get(o.innovation)
 
 
 def if_planned(get: Callable[[Outcome, Plan], float]) -> Value[float | None]:
-    """Take a value of the capture plan in force, None where there is none."""
+    """Return a column value taken from the capture plan in force, None where there is none.
+
+    Args:
+        get: takes the value from the outcome and its plan.
+    """
     return lambda o, s: get(o, o.plan) if o.plan is not None and o.plan.found else None
 
 
 def last_manoeuvre(get: Callable[[Outcome, Manoeuvre], float]) -> Value[float | None]:
-    """Take a value of the last manoeuvre, None before the first."""
+    """Return a column value taken from the last manoeuvre, None before the first.
+
+    Args:
+        get: takes the value from the outcome and the manoeuvre.
+    """
     return lambda o, s: get(o, o.manoeuvres[-1]) if o.manoeuvres else None
 
 
 def if_measured(get: Callable[[Pose], float]) -> Value[float | None]:
-    """Take a value of the registration's pose, None where nothing was measured."""
+    """Return a column value taken from the registered pose, None where nothing was measured.
+
+    Args:
+        get: takes the value from the pose T_ac.
+    """
     return lambda o, s: float(get(o.alignment.T_ac)) if o.alignment.measured else None
 
 
 def if_points(get: Callable[[Outcome], T]) -> Value[T | None]:
-    """Take a value of the registration, None where the scan holds no point."""
+    """Return a column value of the registration, None where the scan holds no point.
+
+    Args:
+        get: takes the value from the outcome.
+    """
     return lambda o, s: get(o) if len(o.scan.points) else None
 
 
 def pose_error_values(get: Callable[[Score], PoseError | None]) -> tuple[Value[float | None], Value[float | None]]:
-    """Take distance and angle of a pose error, None without truth."""
+    """Return the column values of a pose error: distance [m] and angle [deg], None without truth.
+
+    Args:
+        get: takes the pose error from the score.
+    """
     return (
         lambda o, s: None if (error := get(s)) is None else error.distance_m,
         lambda o, s: None if (error := get(s)) is None else error.angle_deg,
@@ -258,7 +286,11 @@ def pose_error_values(get: Callable[[Score], PoseError | None]) -> tuple[Value[f
 def capture_error_values(
     get: Callable[[Score], CaptureError | None],
 ) -> tuple[Value[float | None], Value[float | None], Value[float | None]]:
-    """Take distance, speed and angle of a capture error, None where there is none."""
+    """Return the column values of a capture error: distance [m], speed [m/s] and angle [deg], None where there is none.
+
+    Args:
+        get: takes the capture error from the score.
+    """
     return (
         lambda o, s: None if (error := get(s)) is None else finite(error.distance_m),
         lambda o, s: None if (error := get(s)) is None else finite(error.speed_mps),
@@ -306,6 +338,10 @@ def since_start_s(outcome: Outcome, t_ns: int) -> float:
 
 
 def status(outcome: Outcome) -> str:
-    """Return the status of the alignment, or of the scan where that is not ok."""
+    """Return the status of the alignment, or of the scan where that is not ok.
+
+    Args:
+        outcome: outcome of the scan.
+    """
     scan = outcome.scan.status
     return outcome.alignment.status.value if scan is ScanStatus.OK else scan.value

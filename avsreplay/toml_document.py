@@ -216,7 +216,7 @@ class _Builder:
     def nearest(self, path: _Path, key: str, value: Any, known: Mapping[str, Any]) -> str:
         """A hint that names the known key most like an unknown one, of this table or of any other."""
         inside: _Path = (key,)
-        while isinstance(value, Mapping) and value:  # an unknown table: what it holds tells which one was meant
+        while isinstance(value, Mapping) and value:  # an unknown table: its content determines the suggestion
             name, value = next(iter(value.items()))
             inside = (*inside, name)
         whole, leaf = _dotted((*path, *inside)), str(inside[-1])

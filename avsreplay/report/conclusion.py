@@ -1,9 +1,9 @@
 """The conclusion of a comparison: better, worse or no evidence, metric by metric and in one sentence.
 
-A value missing in one run counts as worse. Where both runs have errors at the same instants, the difference
-of their RMSE gets a 95 % interval by a paired bootstrap over blocks of consecutive scans (successive errors are
-correlated). For groups of at least five runs, paired by name, every metric gets the
-interval of its mean paired difference.
+A value that is missing in one run counts as worse; it is never skipped. Where both runs have errors at the same
+instants, the difference of their RMSE gets a 95 % interval by a paired bootstrap over blocks of consecutive scans
+(successive errors are correlated). For groups of at least five runs, paired by name, every metric gets the interval of
+its mean paired difference.
 """
 
 from __future__ import annotations

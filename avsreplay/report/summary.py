@@ -1,8 +1,7 @@
 """The summary of a run: one fold over its rows.
 
 Terms: a scan is *healthy* where gamma is 1 and *coasting* where it is 0. Errors are against the log's truth. Sums are
-correctly rounded, so the summary does not depend on their order. The speed in scans per
-second is not part of it.
+correctly rounded, so the summary does not depend on their order. The speed in scans per second is not part of it.
 """
 
 from __future__ import annotations
