@@ -28,10 +28,10 @@ from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import Epoch, Prediction, SensorBias, Track
 from avsreplay.records import Belief, Innovation, Manoeuvre, Reason, Verdict
 
-_FEWEST, _MOST, _RECENT = 3, 5, 3  # doubtful scans before a decision, accepted scans looked back on
-_MARGIN = 6.0  # log odds of the best hypothesis over the next, for a decision before _MOST
+_FEWEST, _MOST, _RECENT = 3, 5, 3  # least and most doubtful scans at a decision; accepted scans kept
+_MARGIN = 6.0  # a decision before _MOST scans needs these log odds of the best hypothesis over the next
 _FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 15, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
-_READY = 8  # poses that the estimate must be based on
+_READY = 8  # least number of poses of an estimate whose prediction can be tested
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
 
@@ -44,7 +44,7 @@ class AnomalyTest:
     Args:
         params: settings, auto values filled in.
         extent_m: the target's bounding diagonal [m].
-        batch: makes the poses that a fit takes.
+        batch: converts healthy scans to the poses of a fit.
         replay: predicts, forms the innovation of a stored scan and updates with it.
     """
 
@@ -102,7 +102,7 @@ class AnomalyTest:
         return replace(track, doubtful=()), Verdict(0, Reason.POSE_JUMP)
 
     def _still_biased(self, bias: SensorBias, innovation: Innovation) -> bool:
-        """Does the offset explain this innovation? It is as uncertain as it was estimated, plus the prediction."""
+        """Return whether the offset explains this innovation, by the covariances of both."""
         left = innovation.alpha - bias.offset
         return float(left @ np.linalg.solve(innovation.S + bias.P, left)) < GATE
 
@@ -177,7 +177,8 @@ class AnomalyTest:
 def _nis_scale(track: Track) -> float:
     """How many times larger than chi-square the NIS of the accepted scans is: their median over that of chi-square.
 
-    Registration errors beyond the claimed covariance enlarge every NIS. The test asks for a scan that stands out.
+    Registration errors beyond the claimed covariance enlarge the NIS of all scans, so that of a doubtful scan must be
+    large compared with that of the accepted scans.
     """
     if len(track.nis) < _FEWEST_NIS:
         return 1.0
@@ -189,5 +190,5 @@ def _with_nis(after: Track, before: Track, nis: float) -> Track:
 
 
 def _ready(track: Track) -> bool:
-    """Is the estimate based on enough poses for its prediction to be tested?"""
+    """Return whether the estimate is based on enough poses for its prediction to be tested."""
     return track.mode == "filter" or (track.mode == "fit" and track.batch is not None and track.batch.count >= _READY)

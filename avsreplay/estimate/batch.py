@@ -1,6 +1,6 @@
 """Maximum likelihood of the 20 initial values over all healthy poses: Levenberg-Marquardt on the manifold.
 
-The motion is taken as deterministic; each pose's residual d = [theta; v] stands in {C}, where its covariance is given.
+The motion is taken as deterministic; the residuals d = [theta; v] are expressed in {C}, where their noise is given.
 Jacobians are H Phi, in the coordinates of ``chart``, which keep the inertia physical without a bound. A prior, given or
 weak, keeps directions finite that the poses do not determine yet. The likelihood is that of an M-estimator: a pose
 above the 99.99 % point of chi-square with 6 degrees of freedom gets Huber's weight in the first descent and Cauchy's in

@@ -9,7 +9,7 @@ with its remaining covariance, carry the second moments. They are propagated to 
 
 The fit takes the motion as deterministic. About its trajectory the problem is linear, so one pass of a Kalman filter
 over the poses, with the disturbance's covariance between them, is the maximum likelihood with process noise. The
-errors are propagated back to the epoch, where the transition is the identity, and stand in chart coordinates.
+errors are propagated back to the epoch, where the transition is the identity, and are expressed in chart coordinates.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from avsreplay.geometry import Array
 from avsreplay.records import Belief, Forecast, State
 
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
-_TRIAL = 2.0  # sigma
+_TRIAL = 2.0  # distance along a direction at which the cost is compared with the Gaussian one [sigma]
 _RISE, _TRIES = 0.5 * _NODE**2, 4
-_PIN_1S = 0.02  # of the direction's sigma
+_PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
-_NEGLIGIBLE = 0.1  # sigma: a correction below this is always applied
+_NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
 _LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
 _DISTURBED = 12  # error states that a disturbance reaches: attitude, rate, position, velocity
-_SPHERE = 3.0  # tr I / I
+_SPHERE = 3.0  # tr I / I of a sphere
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,7 @@ class BatchCovariance:
 
     @property
     def gaussian(self) -> bool:
-        """Is the likelihood Gaussian as far as two sigma?"""
+        """Return whether the likelihood is Gaussian up to two sigma."""
         return not self.directions
 
 
@@ -92,7 +92,7 @@ def covariance_of(poses: Poses, fitted: BatchFit, prior: Prior, params: FitParam
     for value, vector in zip(values[::-1][: params.try_directions], vectors.T[::-1], strict=False):
         axis = vector * scale * np.sqrt(max(float(value), 0.0))
         if _non_gaussian(poses, fitted, prior, params, axis):
-            row = vector / scale / np.sqrt(value)  # 1 at the end of the axis
+            row = vector / scale / np.sqrt(value)  # row @ axis = 1
             points = [_profile(poses, fitted, prior, params, axis, row, s) for s in (_NODE, -_NODE)]
             directions.append(NonGaussianDirection(axis, (points[0], points[1])))
     return BatchCovariance(fitted, tuple(directions))
@@ -135,9 +135,9 @@ def final_mixture(
 
     Args:
         found: the fit and its non-Gaussian directions.
-        poses: that it was made of.
-        prior: of the fit.
-        rules: of the fit.
+        poses: poses of the fit.
+        prior: prior of the fit.
+        rules: settings of the fit.
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
         t_ns: the instant of the last scan [ns].
         after_s: that instant after the epoch [s].

@@ -28,9 +28,9 @@ from avsreplay.records import Belief, Innovation
 
 FEWEST_TO_FIT = 3
 FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
-_RECENT = 0.1  # of the fit's memory: disturbances have changed little of a start given so long ago
-_GAUSSIAN_HALF_RAD = 0.2  # 1 sigma of the given attitude above which it is not Gaussian any more
-_LONGEST_S = 1e9  # range of nanoseconds
+_RECENT = 0.1  # largest age of a given start over the fit's memory; until then disturbances change it little
+_GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
+_LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
 _instant = attrgetter("t_ns")
 
 
@@ -144,7 +144,7 @@ def chart_at(belief: Belief, t_ns: int) -> Chart:
 
 
 def contradicted(belief: Belief, fitted: Belief) -> bool:
-    """Is the belief's mean outside the 99.99 % region of the fit, at one instant?
+    """Return whether the belief's mean is outside the 99.99 % region of the fit, both at one instant.
 
     Both use the same poses, so a consistent belief differs by less than the fit's covariance. The difference is taken
     in the chart, where the order of the axes has no effect.

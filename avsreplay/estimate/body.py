@@ -8,7 +8,7 @@ from avsreplay.estimate.chart import ARM, INERTIA, RATE, inertia_matrices, to_ch
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, BodyParameters
 
-_LARGEST_1S = 3.0  # of the logarithm of the mass moments: beyond, the inertia is undetermined anyway
+_LARGEST_1S = 3.0  # largest 1 sigma of the logarithm of the mass moments; above it the inertia is undetermined
 
 
 def body_parameters(belief: Belief) -> BodyParameters:

@@ -1,11 +1,11 @@
 """Coordinates in which the batch fit is nearly linear, and the permutations of the principal axes.
 
-Everything stands in {C}, and inertia is a traceless symmetric matrix. The second mass moments of a body about its
-centre, E = tr(I)/2 1 - I, are positive definite exactly where the moments of inertia obey the triangle inequalities.
-Their logarithm M, traceless because scale has no effect, is an arbitrary symmetric 3x3 matrix: five numbers for
-(sigma, mu) that need no bounds, do not depend on the order of the axes, and have no singularity where two moments are
-equal. With the eigenvalues m of M, sigma1 = tanh((mz - my) / 2), sigma2 = tanh((mx - mz) / 2),
-sigma3 = tanh((my - mx) / 2); the eigenvectors are the principal axes, A(mu)'.
+Rate, arm and inertia are expressed in {C}, the inertia as a traceless symmetric matrix. The second mass moments of a
+body about its centre, E = tr(I)/2 1 - I, are positive definite exactly where the moments of inertia obey the triangle
+inequalities. Their logarithm M, traceless because scale has no effect, is an arbitrary symmetric 3x3 matrix: five
+numbers for (sigma, mu) that need no bounds, do not depend on the order of the axes, and have no singularity where two
+moments are equal. With the eigenvalues m of M, sigma1 = tanh((mz - my) / 2), sigma2 = tanh((mx - mz) / 2), sigma3 =
+tanh((my - mx) / 2); the eigenvectors are the principal axes, A(mu)'.
 
 Chart step y (20): half angle of eta in {C}, rate in {C}, position and velocity of the fixture in {A}, M (5), arm (3)
 from the centre of mass to the fixture in {C}.
@@ -237,5 +237,5 @@ def nees(belief: Belief, truth: State) -> float:
     matrix, and what cannot be observed is only a direction with a large variance.
     """
     here = to_chart(belief.x)
-    d = to_errors(here) @ to_chart(truth).minus(here)  # back in error states, where P is
+    d = to_errors(here) @ to_chart(truth).minus(here)  # in error states, as P is
     return float(d @ np.linalg.solve(belief.P, d))

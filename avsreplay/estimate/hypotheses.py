@@ -24,9 +24,9 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Belief
 
-_PRIOR_ODDS = math.log(1e-3)  # of every hypothesis relative to free motion with good scans
+_PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _PER_BAD_SCAN = math.log(1e-2)
-_INSTANTS = 8  # tried for a manoeuvre between two scans
+_INSTANTS = 8  # number of instants tried for a manoeuvre between two scans
 _ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
 
 
@@ -56,7 +56,7 @@ class Explanation:
 
     Attributes:
         log_evidence: log of the marginal likelihood times the prior odds.
-        chi2: squared residual, whitened, of the innovations that remains; ``dof`` of them.
+        chi2: squared norm of the whitened residuals of the innovations, ``dof`` of them.
         onset: index of the first affected scan.
         after_s: instant of a manoeuvre after the first scan's prior belief [s], with its standard deviation.
         size, P: (6,) (rate, velocity) of a manoeuvre or the offset of a sensor bias, with its covariance (6, 6).

@@ -31,7 +31,7 @@ from avsreplay.records import Belief, State
 
 _PAIR_RAD = 0.7
 _DRAWS, _EDGE = 500, 0.99
-_DETERMINED = 0.5  # of the prior's sigma: a direction with a larger posterior sigma is determined by the prior
+_DETERMINED = 0.5  # a direction whose posterior sigma is above this share of the prior's is determined by the prior
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +123,10 @@ def poses_of(fixes: tuple[PoseFix, ...], epoch_ns: int | None = None) -> Poses:
 
 
 def weak_prior(poses: Poses, params: EstimatorParams) -> Prior:
-    """The prior of a cold start: a sphere at rest at the first pose, centred at its fixture, everything wide."""
+    """The prior of a cold start, with large standard deviations: a sphere at rest at the first pose.
+
+    The centre of the sphere is at the fixture.
+    """
     mean = Chart(poses.q[0], np.zeros(3), poses.t[0], np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.eye(3))
     arm = params.length("start_varrho_1s_m")
     speed = params.length("start_vel_1s_mps") + params.start_rate_1s_radps * arm
@@ -209,7 +212,7 @@ def batch_estimate(
 
 
 def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior, rules: FitParams) -> bool:
-    """Is the cost of the poses with the given prior too much above the cost without it, at the fitted noise?
+    """Return whether the given prior raises the cost of the poses too much, at the fitted noise.
 
     If the given prior is right, twice the difference is at most chi-square with 20 degrees of freedom.
     """
@@ -224,7 +227,7 @@ def _mean_turn(poses: Poses) -> float:
 
 
 def _determined(found: BatchCovariance, weak: Prior) -> bool:
-    """Is the likelihood Gaussian, and every direction determined by the poses?"""
+    """Return whether the likelihood is Gaussian and every direction is determined by the poses."""
     fitted = found.fitted
     ratio = np.linalg.eigvalsh(fitted.P_chart / np.outer(weak.one_sigma, weak.one_sigma))[-1]
     return found.gaussian and bool(ratio < _DETERMINED**2) and fitted.converged

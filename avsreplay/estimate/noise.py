@@ -4,8 +4,8 @@ Adaptation (eq:R_resudua2) uses a ring buffer that is summed anew at each epoch,
 accumulate. Two rules. ``matrix`` is the paper's: R = Sigma + H P+ H', Sigma the mean of r r'. ``scale`` keeps the
 shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
 attitude, s^2 = mean of tr(R_b^-1 (r r' + H P+ H')) / 3 over the block. It estimates two numbers from a window instead
-of 21, so its own scatter does not spoil the consistency. The mean uses the weights of the updates: outliers are no
-noise.
+of 21, so the scatter of the factors hardly affects the consistency. The mean uses the weights of the updates, so that
+outliers do not increase R.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from avsreplay.geometry import Array, frozen
 from avsreplay.records import Alignment, Belief, Innovation, State
 
 GATE = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom: a pose above it is an outlier
-BOUND = 52.4  # the same with 20 degrees of freedom: a state
+BOUND = 52.4  # the same with 20 degrees of freedom, for a state
 NO_INFLATION = frozen(np.ones(2))
 _ONES = frozen(np.ones(6))
 _FREE_RAD = 1.0  # standard deviation of an attitude direction that a degenerate view does not determine
-_MANY_OUTLIERS = 0.1  # of the window's weight
+_MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of the window's weight
 _LAGS = (5, 10, 20, 40)
 
 
@@ -197,7 +197,7 @@ class Noise:
     def inflation(self, known: Array | None, w_b: Array, dt_ns: int, correlated_share: float) -> Array:
         """(2,) factor on R for errors correlated in time: that of the last fit, else from the rotation between scans.
 
-        The paper's filter takes the errors as white.
+        The paper's filter assumes white errors.
         """
         if known is not None:
             return known

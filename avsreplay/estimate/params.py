@@ -13,35 +13,35 @@ from avsreplay.settings import Settings, given, setting
 
 __all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
-_MOST_ALIKE = 50.0  # scans with correlated errors, at most: a view that does not turn would otherwise have no limit
-_EDGE_LEAN = 20.0  # by tests/benchmarks/estimate_noise.py: 9 to 33 on five meshes
+_MOST_ALIKE = 50.0  # largest number of scans with correlated errors, reached where the view does not turn
+_EDGE_LEAN = 20.0  # from tests/benchmarks/estimate_noise.py, which gives 9 to 33 on five meshes
 
 
 class NoiseSource(Enum):
-    """What the base of R is."""
+    """Source of the base of R."""
 
     REGISTRATION = "registration"  # the alignment's own covariance, R0 where it has none
     R0 = "r0"
 
 
 class Start(Enum):
-    """Where the first belief comes from."""
+    """Source of the first belief."""
 
     AUTO = "auto"  # near where the log or the caller gives one, else cold
     NEAR = "near"  # the given belief
     COLD = "cold"  # rate from the first poses, then the fit over all of them
-    PAPER = "paper"  # the plain filter from zero, everything wide
+    PAPER = "paper"  # the paper's filter from zero with large standard deviations
 
 
 class Constraint(Enum):
-    """What keeps sigma inside its bounds, and where the filter begins from a given belief."""
+    """How sigma stays inside its bounds, and where the filter begins from a given belief."""
 
     CHART = "chart"  # coordinates that have no bounds; a fit with the given belief as its prior comes first
     GAIN = "gain"  # the paper's beta on the gain; the filter begins at once
 
 
 class Adaptation(Enum):
-    """What residuals do to R."""
+    """How the residuals adapt R."""
 
     SCALE = "scale"  # a factor for position and one for attitude
     MATRIX = "matrix"  # the paper's whole matrix, from R0
@@ -178,7 +178,7 @@ class EstimatorParams(Settings):
 
     @property
     def by_gain(self) -> bool:
-        """Is the filter the paper's, its gain constrained; always so from the paper's start."""
+        """Whether the gain is constrained as in the paper; always so with the paper's start."""
         return self.constraint is Constraint.GAIN or self.start is Start.PAPER
 
     def length(self, name: str) -> float:

@@ -1,1 +1,1 @@
-"""Watching the estimate: faults, observability, consistency, convergence."""
+"""Monitors of the estimate: fault detection, observability, consistency, convergence."""

@@ -215,7 +215,10 @@ class Consistency:
         return ConsistencyTrack(frozen(np.vstack([kept, white])))
 
     def judge(self, track: ConsistencyTrack) -> ConsistencyReport:
-        """Test the window. Only a mean NIS above its band (times the slack) is inconsistent: caution is safe."""
+        """Test the window. Only a mean NIS above its band (times the slack) is inconsistent.
+
+        A mean below the band results from a covariance that is too large, which is safe.
+        """
         n = len(track.white)
         if n < self.params.least:
             return ConsistencyReport(None)

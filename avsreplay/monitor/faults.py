@@ -1,8 +1,8 @@
 """The fault rule: gamma for each scan, and why it is 0 (section 6 of the equations).
 
 The pose test is |alpha|_W = sqrt(|d rho|^2 + (L theta)^2) against a limit. While the filter tracks, the limit is
-``alpha_max_m``; where the prediction itself is unsure (the start, a long blackout) it grows to ``sigmas`` times the
-predicted 1 sigma of the same norm, sqrt(tr S_rho + (2 L)^2 tr S_half), so the first healthy scan takes the track up.
+``alpha_max_m``; where the prediction is uncertain (at the start, after a blackout) it grows to ``sigmas`` times the
+predicted 1 sigma of the same norm, sqrt(tr S_rho + (2 L)^2 tr S_half), so that the first healthy scan is accepted.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["FaultDetector", "FaultParams", "Policy", "pose_limit", "weighted_nor
 
 
 class Policy(Enum):
-    """How the fit test and the pose test are joined."""
+    """How the fit test and the pose test are combined."""
 
     ANY = "any"  # either one is a fault
     ALL = "all"  # as printed: a fault only where both fail
@@ -68,7 +68,7 @@ def pose_limit(seen: Innovation, alpha_max_m: float, length_m: float, sigmas: fl
 
 
 class FaultDetector:
-    """Judges one scan at a time; it remembers nothing.
+    """Judges one scan at a time, without state.
 
     Args:
         params: limits; those left out are taken from ``extent_m``, the target's bounding diagonal [m].
@@ -93,7 +93,7 @@ class FaultDetector:
     def _unusable(
         self, status: ScanStatus, alignment: Alignment | None, seen: Innovation | None, prior: Belief
     ) -> Reason | None:
-        """No pose that could be judged at all, whatever the policy."""
+        """Return why the scan has no pose that can be tested, whatever the policy; None if it has one."""
         if status in (ScanStatus.EMPTY, ScanStatus.DAMAGED) or (
             alignment and alignment.status is AlignStatus.NO_POINTS
         ):

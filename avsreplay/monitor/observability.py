@@ -1,9 +1,9 @@
 """The observability Gramian (eq after [eq:S_recursive]), updated scan by scan.
 
 W_o = sum of (H Phi)' (H Phi). Its triangular root is stored, [root; H Phi] re-triangularised: the condition number of
-W_o is the square of the root's, so that 10^30 is still told from 10^16, which the sum itself cannot do. Scaled by the
+W_o is the square of the root's, so values up to 10^30 are resolved; from the sum itself, up to 10^16. Scaled by the
 prior standard deviations it has no units. The rank is relative to the measurement noise: it counts the directions
-about which the poses, weighted by R^-1, say more than the prior does.
+about which the poses, weighted by R^-1, give more information than the prior.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def observe(state: Gramian, Phi: Array, H: Array, R: Array | None) -> Gramian:
     """Return the Gramian after one more scan: Phi_k0 = Phi Phi_k-1,0, and H Phi_k0 is added for a healthy scan.
 
     Args:
-        state: so far.
+        state: the Gramian so far.
         Phi: (n, n) transition from the last scan.
         H: (m, n) measurement Jacobian.
         R: (m, m) measurement noise, None for a faulty scan.

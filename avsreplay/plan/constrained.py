@@ -34,7 +34,7 @@ from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 
 COARSE_NODES = 16  # thrust intervals while initial paths are compared
-ITERATIONS = 14  # of one initial path
+ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
 TURN_RAD = 0.5  # the target may turn by this much between two iterations

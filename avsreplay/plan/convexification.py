@@ -16,7 +16,7 @@ from avsreplay.plan.path import RobotPath, StepPath
 from avsreplay.plan.rendezvous import PlanParams
 
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
-THRUST_SHARE = 1.0 - 1e-5  # of a_max that is planned with; the rest corrects the terminal errors
+THRUST_SHARE = 1.0 - 1e-5  # share of a_max used by the programme; the rest corrects the terminal errors
 RESERVE = 3.0  # margin at the checked instants in units of the buffer, for the instants between them
 FAR = 2e4  # a constraint with a larger margin at the reference, in units of the buffer, is left out of the programme
 LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight

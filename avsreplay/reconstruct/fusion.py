@@ -142,7 +142,7 @@ def fused(
 def _solid(
     points: Array, seen: NDArray[np.int64], views: Sequence[ScanView], poses: dict[int, Pose], size_m: float
 ) -> NDArray[np.bool_]:
-    """Which points no more than a third as many scans have looked through as have seen them."""
+    """Return which points are solid: at most a third as many scans measured through them as measured them."""
     numbers = sorted(poses)
     asked = numbers[:: max(1, len(numbers) // 60)]
     through = np.zeros(len(points))

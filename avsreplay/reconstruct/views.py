@@ -1,4 +1,4 @@
-"""Scans as the reconstruction uses them: thinned, with normals, weights and the place of the camera."""
+"""Scans as the reconstruction uses them: thinned, with normals, weights and the position of the camera."""
 
 from __future__ import annotations
 

@@ -24,12 +24,12 @@ from avsreplay.register.registrar import Registrar
 from avsreplay.register.segments import without_scattered_points
 from avsreplay.register.visibility import is_outward
 
-POINTS = 1500  # per scan
+POINTS = 1500  # points used of each scan
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
-WIDTH_OF_EXTENT = 0.02  # residuals used
-ROUNDS = 3  # of matching again with the scaled scan
-LEAST_INFORMATION = 1e-3  # share of n . p that the pose cannot explain
-LEAST_ERROR, SIGMAS = 0.005, 4.0  # of delta, to be reported
+WIDTH_OF_EXTENT = 0.02  # larger residuals are not used
+ROUNDS = 3  # times the scaled scan is matched again
+LEAST_INFORMATION = 1e-3  # least share of n . p that the pose cannot explain
+LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta|, absolute and in standard errors, that is reported
 
 
 class ModelCheck:
@@ -77,7 +77,7 @@ class ModelCheck:
         return 1.0 + mean, float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
 
     def notes(self) -> tuple[str, ...]:
-        """Return what the run says of the model, one line each; empty if there is nothing to say."""
+        """Return the errors of the model that the run shows, one line each; empty if there are none."""
         if not self._aligned:
             return () if self._unmatched is None else (self._diagnosis(self._unmatched),)
         return (*self._inverted(), *self._size())

@@ -34,14 +34,14 @@ from avsreplay.register.visibility import Visibility
 
 SURFACE_POINTS = 3000
 LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance|
-NORMAL_QUANTILES = np.array([0.38532, 0.52440, 0.67449, 0.84162, 1.03643, 1.28155, 1.64485])  # of |z|, z normal
+NORMAL_QUANTILES = np.array([0.38532, 0.52440, 0.67449, 0.84162, 1.03643, 1.28155, 1.64485])  # for a standard normal
 REFINEMENTS = 2
 NOISE_OF_EXTENT = 0.012  # with more noise than this no pose is accepted
 LEAST_CONTRAST = 6.0
-MOST_VIOLATED = 0.15  # of the surface that is either supported or violated
-MOST_MISSING = 0.1  # of the surface missing, if at least as much of the scan is not on the model
-LEAST_COMPARED = 30  # surface points; with fewer the test has no power
-LEAST_COSINE = 0.25  # of the incidence on a surface point that is expected in the scan
+MOST_VIOLATED = 0.15  # largest violated share of the surface that is either supported or violated
+MOST_MISSING = 0.1  # largest missing share, if at least as large a share of the scan is not on the model
+LEAST_COMPARED = 30  # with fewer surface points the test has no power
+LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of its incidence is larger
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
 POINTS_PER_CELL = 8.0
 GRID = 4096
@@ -164,7 +164,7 @@ class _Image:
         self._points = points[self.in_front(points)]
 
     def in_front(self, points: Array) -> NDArray[np.bool_]:
-        """Within 70 deg of the viewing direction?"""
+        """Return which points are within 70 deg of the viewing direction."""
         return np.asarray(points @ self._axes[2] > 0.34 * np.linalg.norm(points, axis=1))
 
     def plane(self, points: Array) -> Array:

@@ -27,9 +27,9 @@ from avsreplay.register.visibility import Visibility
 
 LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in units of the gate) a fit is close
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
-SEARCH_WORK = 2_000_000  # point searches of the first round of the global search, about
+SEARCH_WORK = 2_000_000  # approximate number of point searches in the first round of the global search
 MOST_SEGMENTS = 3
-MESSAGE_LENGTH = 200  # characters of an error message that are kept
+MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
 
 
 class Registrar:
@@ -80,7 +80,7 @@ class Registrar:
         return self._searched(scan, found) if self._far(guess, found) else found
 
     def acquire(self, points: NDArray[Any]) -> Alignment:
-        """Find the pose without a guess: the best of a search over all attitudes, then registered as any other.
+        """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
 
         Args:
             points: as for :meth:`register`.

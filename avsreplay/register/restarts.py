@@ -21,9 +21,9 @@ from avsreplay.register.backend import Target
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.surface_index import IcpParams
 
-POINTS = 1500  # of the scan, used by restarts
+POINTS = 1500  # points of the scan used by restarts
 START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
-FALL, PASSES = 0.6, 4  # of the rejection distance per stage, and passes per stage
+FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
 BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
 HEALTHY_PASSES = 12  # passes of an ordinary registration, over all points of the scan
@@ -121,7 +121,7 @@ class Restarter:
         return self._least(found)
 
     def work(self, start_m: float) -> int:
-        """Return the passes of one graduated registration, at most."""
+        """Return the largest number of passes of one graduated registration."""
         return PASSES * int(np.ceil(np.log(start_m / (STOP_OF_EXTENT * self._extent)) / -np.log(FALL)))
 
     def _convincing(self, points: NDArray[Any], found: list[Restart]) -> bool:

@@ -9,12 +9,12 @@ import numpy as np
 from avsreplay.geometry import Array
 
 NEIGHBOUR = 8
-SCATTERED = 2.0  # times the distance to the NEIGHBOUR-th neighbour that the denser part of the scan has
+SCATTERED = 2.0  # distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
 BIMODAL = 2.5  # ratio of the upper to the lower quartile of that distance in a scan with scattered points
 LARGER = 1.2  # a connected part larger than this many extents is not the target alone
 VOXEL_OF_EXTENT = 0.04
-LEAST_SHARE, LEAST_POINTS = 0.05, 60  # of a part
+LEAST_SHARE, LEAST_POINTS = 0.05, 60  # least size of a part: share of the scan, and points
 PLANES, TRIALS, PLANE_OF_EXTENT, PLANE_SHARE = 3, 200, 0.01, 0.2
 
 

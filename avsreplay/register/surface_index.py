@@ -33,7 +33,7 @@ from avsreplay.records import Surface
 from avsreplay.register import index_cache
 from avsreplay.settings import Settings, setting
 
-LARGEST_M = 1e9  # coordinates [m]
+LARGEST_M = 1e9  # largest coordinate [m]
 MOST_PRIMITIVES = 50_000_000
 
 
@@ -294,7 +294,7 @@ def _kernel() -> Any:
 def _restored(kernel: Any, saved: bytes, primitives: int, ids: int, mesh: bool, portable: bool) -> Any:
     try:
         return kernel.Index(saved, primitives, ids, mesh, portable)
-    except ValueError:  # damaged: it is built again
+    except ValueError:  # the file is damaged; the index is built again
         return None
 
 

@@ -34,9 +34,9 @@ from avsreplay.simulate.scanner import Returns
 
 NS = 1_000_000_000
 PLATE_RETURN_RATIO = 0.05  # a dark plate: share of the rays it blocks that give a return
-PLATE_DEPTH_RATIO = 0.4  # of the target's median range
+PLATE_DEPTH_RATIO = 0.4  # range of the plate over the median range of the target
 PLATE_TILT = math.tan(math.radians(15.0))
-CLUTTER_RADIUS_RATIO = 1.2  # of the target's bounding sphere
+CLUTTER_RADIUS_RATIO = 1.2  # radius of the ball of clutter over that of the target's bounding sphere
 
 
 class Kind(Enum):

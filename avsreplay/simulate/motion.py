@@ -153,7 +153,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class _Instant:
-    """State at the begin of a step: q_ac, w_c, r_a, v_a."""
+    """State at the start of a step: q_ac, w_c, r_a, v_a."""
 
     q: Vector
     w: Vector

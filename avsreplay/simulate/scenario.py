@@ -74,7 +74,7 @@ class ScenarioParams(Settings):
     run: Any = setting(dict, "Settings of the replay for this log (docs/settings.md).")
 
     def check(self) -> None:
-        """Raise ValueError where the scans are none, too many, or longer than the time between them."""
+        """Raise ValueError where there is no scan, too many, or a scan is longer than the time between scans."""
         if not 1.0 <= self.duration_s * self.rate_hz <= MAX_SCANS:
             raise ValueError(f"{self.duration_s} s at {self.rate_hz} Hz is not between 1 and {MAX_SCANS} scans")
         if self.scanner.scan_s * self.rate_hz > 1.0 + 1e-9:

@@ -1,7 +1,7 @@
 """Objects beside the target: a wall, a second object, the robot's own arm, or a moving occluder.
 
 Each is a box or a mesh in its own frame {S}, which moves in {A} with constant velocity and angular rate. It blocks the
-rays to what is behind it and returns points itself. An object that is there for a part of the log only is labelled in
+rays to what is behind it and returns points itself. An object that is present in part of the log only is labelled in
 the log like a fault.
 """
 
@@ -53,7 +53,7 @@ class SceneObject(Settings):
             raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
 
     def present(self, t_s: float) -> bool:
-        """Whether the object is there at a time after the first scan is due [s]."""
+        """Return whether the object is present at a time [s after the instant of the first scan]."""
         return self.start_s <= t_s and (self.duration_s is None or t_s < self.start_s + self.duration_s)
 
     def poses(self, times_s: Array) -> tuple[Array, Array]:
