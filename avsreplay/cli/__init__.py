@@ -151,7 +151,7 @@ def main() -> None:
     except StdoutClosed:
         code = _silence(141)
     except OSError as error:
-        code = _fail(f"{error.filename or 'standard output'}: {error.strerror or error}", 3)
+        code = _silence(_fail(f"{error.filename or 'standard output'}: {error.strerror or error}", 3))
     except Exception as error:
         code = _crash(error)
     sys.exit(_flushed(code if isinstance(code, int) else 0))
