@@ -151,7 +151,8 @@ def main() -> None:
     except StdoutClosed:
         code = _silence(141)
     except OSError as error:
-        code = _silence(_fail(f"{error.filename or 'standard output'}: {error.strerror or error}", 3))
+        code = _fail(f"{error.filename or 'standard output'}: {error.strerror or error}", 3)
+        code = code if error.filename else _silence(code)
     except Exception as error:
         code = _crash(error)
     sys.exit(_flushed(code if isinstance(code, int) else 0))
