@@ -90,7 +90,7 @@ def test_a_single_wild_scan_changes_nothing() -> None:
     assert result.track.manoeuvres == ()
 
 
-def test_a_covariance_that_rounding_left_indefinite_still_has_a_root() -> None:
+def test_a_covariance_that_is_not_positive_definite_still_has_a_root() -> None:
     from avsreplay.estimate.hypotheses import cholesky_root
 
     rng = np.random.default_rng(5)

@@ -115,7 +115,10 @@ def explain(
 
 
 def cholesky_root(C: Array) -> Array:
-    """Lower Cholesky factor of a covariance that rounding may have made indefinite.
+    """Lower Cholesky factor of a window covariance that may not be positive definite.
+
+    Rounding is one cause. A relative eigenvalue of -2e-4 was seen as well, which is more than rounding; its cause is
+    not known, and the likelihoods of such a window are approximate.
 
     Args:
         C: (n, n) covariance.

@@ -19,7 +19,7 @@ from avsreplay.reconstruct.tracking import (
     patchwork,
     registered,
 )
-from avsreplay.reconstruct.views import ScanView, depth_behind, means, normals_of, sight_lines, thinned, turn
+from avsreplay.reconstruct.views import ScanView, averaged, depth_behind, normals_of, sight_lines, thinned, turn
 from avsreplay.register import global_search
 
 PAIR_TURN_RAD = np.radians(60.0)  # key scans seen from directions closer than this are compared in the refinement
@@ -124,12 +124,7 @@ def fused(
         normals.append(normals_of(fine, full, views[k].camera) @ T_ca.R.T)
         owner.append(np.full(len(fine), k))
     p, n, who = np.vstack(points), np.vstack(normals), np.concatenate(owner)
-    side = np.sign(n @ np.array([0.61, 0.53, 0.59]))
-    cells = np.column_stack([np.floor(p / size_m), side]).astype(np.int64)
-    _, inverse = np.unique(cells, axis=0, return_inverse=True)
-    cell = inverse.ravel()
-    mean, normal = means(p, cell), means(n, cell)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    mean, normal, cell = averaged(p, n, size_m)
     count = np.bincount(cell)
     seen = np.bincount(np.unique(np.column_stack([cell, who]), axis=0)[:, 0], minlength=len(count))
     height = np.einsum("ni,ni->n", p - mean[cell], normal[cell])

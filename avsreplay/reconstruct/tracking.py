@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.reconstruct.views import ScanView, depth_behind, means, turn
+from avsreplay.reconstruct.views import ScanView, averaged, depth_behind, turn
 from avsreplay.register import global_search
 
 SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
@@ -178,17 +178,8 @@ def patchwork(views: Sequence[ScanView], found: Tracked, size_m: float) -> Patch
         T_ca = found.poses[k].inverse()
         points.append(T_ca.apply(views[k].points))
         normals.append(views[k].normals @ T_ca.R.T)
-    return _grid(np.vstack(points), np.vstack(normals), size_m)
-
-
-def _grid(points: Array, normals: Array, size_m: float) -> Patchwork:
-    """Averages over voxels, apart for the two sides of a thin wall."""
-    side = np.sign(normals @ np.array([0.61, 0.53, 0.59]))
-    cells = np.column_stack([np.floor(points / size_m), side]).astype(np.int64)
-    _, inverse = np.unique(cells, axis=0, return_inverse=True)
-    p, n = means(points, inverse.ravel()), means(normals, inverse.ravel())
-    n /= np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-12)
-    return Patchwork(p, n, cKDTree(p))
+    mean, normal, _ = averaged(np.vstack(points), np.vstack(normals), size_m)
+    return Patchwork(mean, normal, cKDTree(mean))
 
 
 def _predicted(views: Sequence[ScanView], found: Tracked, k: int) -> Pose:

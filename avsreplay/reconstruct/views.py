@@ -95,6 +95,20 @@ def means(values: Array, cell: NDArray[np.intp]) -> Array:
     return np.stack([np.bincount(cell, column) / count for column in values.T], axis=1)
 
 
+def averaged(points: Array, normals: Array, size_m: float) -> tuple[Array, Array, NDArray[np.intp]]:
+    """Return mean points and unit normals (m, 3) of the voxels, and the voxel (n,) of every point.
+
+    The two sides of a thin wall, which have opposite normals, are averaged separately.
+    """
+    side = np.sign(normals @ np.array([0.61, 0.53, 0.59]))
+    cells = np.column_stack([np.floor(points / size_m), side]).astype(np.int64)
+    _, inverse = np.unique(cells, axis=0, return_inverse=True)
+    cell = inverse.ravel()
+    mean, normal = means(points, cell), means(normals, cell)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    return mean, normal, cell
+
+
 def normals_of(points: Array, full: Array, camera: Array) -> Array:
     """Unit normals (n, 3) toward the camera: smallest principal direction of the nearest points of the whole scan."""
     _, index = cKDTree(full).query(points, k=min(NEIGHBOURS, len(full)))
