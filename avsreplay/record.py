@@ -10,7 +10,16 @@ from pathlib import Path
 from avsreplay.errors import UsageError
 from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
-from avsreplay.simulate import Engine, Scenario, builtin_surface, load_scenario, simulate
+from avsreplay.simulate import (
+    EPOCH_NS,
+    Engine,
+    RecordedFault,
+    Scenario,
+    builtin_surface,
+    disturbed,
+    load_scenario,
+    simulate,
+)
 
 Ticker = Callable[[Iterable[Scan], int], AbstractContextManager[Iterator[Scan]]]
 """Shows progress: (scans, expected number or 0 if unknown) -> a context manager that yields the scans."""
@@ -18,12 +27,19 @@ Ticker = Callable[[Iterable[Scan], int], AbstractContextManager[Iterator[Scan]]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordOptions:
-    """How to write the log, see log.LogWriter; ``model`` replaces the model of the scenario or source."""
+    """How to write the log, see log.LogWriter; ``model`` replaces the model of the scenario or source.
+
+    Attributes:
+        faults: injected into the scans, with labels.
+        fault_seed: seed of the random numbers of these faults.
+    """
 
     model: Path | None = None
     cloud_model: bool = False
     overwrite: bool = False
     compression: str = "zstd"
+    faults: tuple[RecordedFault, ...] = ()
+    fault_seed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +100,9 @@ def record(
             hint = "leave out the flags for recorded sources"
             raise UsageError("a scenario has no topics or files to read", where=str(source or "record"), hint=hint)
         return record_scenario(load_scenario(source, seed), output, options, ticker)
-    if seed is not None:
-        raise UsageError("a recorded source has no seed", where=str(source), hint="leave out --seed")
+    if seed is not None and not options.faults:
+        hint = "leave out --seed; it is used with --fault only"
+        raise UsageError("a recorded source has no seed", where=str(source), hint=hint)
     return record_source(source, output, reading or SourceOptions(), options, ticker)
 
 
@@ -116,14 +133,17 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
     """
     meshes = {name: read_surface(path) for name, path in scenario.meshes.items()}
     simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model), meshes)
+    header = _labelled(simulation.header, options, EPOCH_NS)
     with (
-        _writer(output, simulation.header, options) as writer,
+        _writer(output, header, options) as writer,
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
-        tally = _fold(scans, simulation.truth_of, writer, true_clock=True)
+        pairs = _with_faults(scans, header, options, EPOCH_NS)
+        tally = _fold(pairs, simulation.truth_of, writer, true_clock=True)
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
     slow = "embreex is not installed: rays were cast by the exact engine, which is slower"
-    return replace(tally.recorded(output, simulation.header), note=slow if by_hand else "")
+    done = tally.recorded(output, header)
+    return replace(done, note=slow if by_hand else done.note)
 
 
 def record_source(
@@ -148,9 +168,11 @@ def record_source(
         reading, model=options.model or reading.model, cloud_model=options.cloud_model or reading.cloud_model
     )
     with open_source(source, reading) as opened:
-        header, due = opened.header, opened.info().scans
+        epoch_ns = opened.scan_at(0).log_ns if len(opened) else 0
+        header, due = _labelled(opened.header, options, epoch_ns), opened.info().scans
         with _writer(output, header, options) as writer, _ticked(ticker, opened.scans(), due) as scans:
-            tally = _fold(scans, opened.truth_of, writer, true_clock=False)
+            pairs = _with_faults(scans, header, options, epoch_ns)
+            tally = _fold(pairs, opened.truth_of, writer, true_clock=False)
         return tally.recorded(output, header, tuple(opened.losses))
 
 
@@ -163,9 +185,12 @@ class _Tally:
     first_ns: int = 0
     last_ns: int = 0
 
-    def add(self, scan: Scan) -> None:
-        self.first_ns = self.first_ns if self.scans else scan.log_ns
+    def span(self, scan: Scan) -> None:
+        """Take the time of a scan, also of one that a fault removes."""
+        self.first_ns = self.first_ns or scan.log_ns
         self.last_ns = scan.log_ns
+
+    def add(self, scan: Scan) -> None:
         self.scans += 1
         self.points += len(scan.points)
         self.empty += not len(scan.points)
@@ -183,25 +208,57 @@ class _Tally:
             seed=header.seed,
             faults=tuple(self._fault(label) for label in header.labels),
             losses=losses,
+            note=self._outside(header),
         )
+
+    def _outside(self, header: LogHeader) -> str:
+        """A remark on faults that begin after the last scan."""
+        late = [label.kind for label in header.labels if label.start_ns > self.last_ns]
+        return f"no scan lies in the window of {', '.join(late)}: the log ends before it" if late else ""
 
     def _fault(self, label: Label) -> tuple[str, float, float, bool]:
         start, end = ((t - self.first_ns) / 1_000_000_000 for t in (label.start_ns, label.end_ns))
         return label.kind, start, end, label.harmful
 
 
-def _fold(scans: Iterable[Scan], truth_of: Callable[[Scan], Truth], writer: LogWriter, true_clock: bool) -> _Tally:
+def _fold(
+    pairs: Iterable[tuple[Scan, Scan | None]],
+    truth_of: Callable[[Scan], Truth],
+    writer: LogWriter,
+    true_clock: bool,
+) -> _Tally:
+    """Write scans with the truth at the scan as it was; a pair is (scan as it was, scan to write or None)."""
     tally = _Tally()
-    for scan in scans:
-        if scan.status is ScanStatus.DAMAGED:
+    for before, scan in pairs:
+        if before.status is ScanStatus.DAMAGED:
             tally.damaged += 1
             continue
+        tally.span(before)
+        if scan is None:
+            continue
         writer.write(scan)
-        truth = truth_of(scan)
+        truth = truth_of(before)
         if truth.pose is not None:
-            writer.write_truth(scan.log_ns, scan.log_ns if true_clock else scan.t_ns, truth.pose, truth.state)
+            writer.write_truth(before.log_ns, before.log_ns if true_clock else before.t_ns, truth.pose, truth.state)
         tally.add(scan)
     return tally
+
+
+def _labelled(header: LogHeader, options: RecordOptions, epoch_ns: int) -> LogHeader:
+    """The header with the labels of the injected faults and the seed of their random numbers."""
+    if not options.faults:
+        return header
+    labels = (*header.labels, *(fault.label(epoch_ns) for fault in options.faults))
+    return replace(header, labels=labels, notes={**header.notes, "fault_seed": str(options.fault_seed)})
+
+
+def _with_faults(
+    scans: Iterable[Scan], header: LogHeader, options: RecordOptions, epoch_ns: int
+) -> Iterator[tuple[Scan, Scan | None]]:
+    if not options.faults:
+        return ((scan, scan) for scan in scans)
+    radius_m = None if header.surface is None else 0.5 * header.surface.extent
+    return disturbed(scans, options.faults, epoch_ns, options.fault_seed, radius_m)
 
 
 def _writer(output: Path, header: LogHeader, options: RecordOptions) -> LogWriter:

@@ -20,19 +20,43 @@ if TYPE_CHECKING:
     from avsreplay.log import SourceOptions
     from avsreplay.record import Recorded
     from avsreplay.records import Scan
+    from avsreplay.simulate import RecordedFault
 
 EPILOG = """\b
 Examples:
   avsreplay record -o tumble.mcap                       the built-in scenario
   avsreplay record scenario.toml -o x.mcap --seed 7     a scenario file
   avsreplay record scans/ -o y.mcap --model m.ply       a folder of scans with a poses file
-  avsreplay record drive.bag -o z.mcap --topic /points  a ROS 1 or 2 bag, or an MCAP"""
+  avsreplay record drive.bag -o z.mcap --topic /points  a ROS 1 or 2 bag, or an MCAP
+  avsreplay record y.mcap -o f.mcap --fault occlusion:10:4 --fault range_bias:20:2:0.05
+
+\b
+Kinds of fault with their default strengths (docs/scenario.md describes them):
+  occlusion:1  partial_occlusion:0.5  dropped  empty  clutter:0.5  range_bias:0.3 [m]  noise_burst:5
+  frozen  stamp_jump:30 [s]  outliers:0.2  subsampled:0.9  frame_rate:2"""
+
+
+class _Fault(click.ParamType["RecordedFault"]):
+    """``kind:start:duration[:strength]``."""
+
+    name = "kind:start:duration[:strength]"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> RecordedFault:
+        from avsreplay.simulate import RecordedFault
+
+        try:
+            return RecordedFault.parse(str(value))
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
 
 
 @click.command("record", epilog=EPILOG)
 @click.argument("source", required=False, type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, help="The log to write (.mcap); - is standard output.")
-@click.option("--seed", type=click.IntRange(0), help="Seed of a simulation, over the scenario's own.")
+@click.option("--seed", type=click.IntRange(0), help="Seed of a simulation or of the faults.")
+@click.option(
+    "--fault", "faults", type=_Fault(), multiple=True, help="Inject a fault [s after the first scan]; repeatable."
+)
 @source_setting("--start", "start_s", type=float)
 @source_options
 @click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True)
@@ -42,6 +66,7 @@ def command(
     source: Path | None,
     output: Path,
     seed: int | None,
+    faults: tuple[RecordedFault, ...],
     model: Path | None,
     cloud_model: bool | None,
     compression: str,
@@ -53,7 +78,8 @@ def command(
 
     SOURCE is a scenario (.toml), a folder of PLY or PCD scans, a ROS 1 or ROS 2 bag, or an MCAP; without it the
     built-in scenario is simulated. The log holds the model, the scenario and the truth,
-    so that 'avsreplay run' needs no option.
+    so that 'avsreplay run' needs no option. Faults may be injected into any of these; each is labelled in the log, and
+    the same seed gives the same bytes.
 
     \f
     Raises:
@@ -63,7 +89,14 @@ def command(
     """  # noqa: D301
     from avsreplay.record import RecordOptions, record
 
-    options = RecordOptions(model=model, cloud_model=bool(cloud_model), overwrite=overwrite, compression=compression)
+    options = RecordOptions(
+        model=model,
+        cloud_model=bool(cloud_model),
+        overwrite=overwrite,
+        compression=compression,
+        faults=faults,
+        fault_seed=seed or 0,
+    )
     with output_file(output) as path:
         done = record(source, path, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
     done = dataclasses.replace(done, path=str(output))

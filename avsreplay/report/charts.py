@@ -57,6 +57,7 @@ _KINDS = {  # place: colour and pattern
     "injected": (
         *("occlusion", "partial_occlusion", "dropped", "clutter", "range_bias", "frozen"),
         *("empty", "noise_burst", "stamp_jump"),
+        *("outliers", "subsampled", "frame_rate"),
     ),
     "action": ("approach", "hold", "stand_still", "capture", "retreat", "abort", "approach_on_prediction"),
 }

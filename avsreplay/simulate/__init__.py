@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from avsreplay.simulate.ray_casting import Engine
+from avsreplay.simulate.recorded_faults import RecordedFault, disturbed
 from avsreplay.simulate.scenario import Scenario, load_scenario, scenario_of
 from avsreplay.simulate.simulation import EPOCH_NS, Simulation, simulate
 from avsreplay.simulate.target import Shape, builtin_surface
@@ -10,10 +11,12 @@ from avsreplay.simulate.target import Shape, builtin_surface
 __all__ = [
     "EPOCH_NS",
     "Engine",
+    "RecordedFault",
     "Scenario",
     "Shape",
     "Simulation",
     "builtin_surface",
+    "disturbed",
     "load_scenario",
     "scenario_of",
     "simulate",

@@ -53,7 +53,7 @@ class Kind(Enum):
     STAMP_JUMP = "stamp_jump"
 
 
-_DEFAULTS: dict[Kind, tuple[float | None, bool]] = {
+DEFAULTS: dict[Kind, tuple[float | None, bool]] = {  # strength and whether it is harmful
     Kind.OCCLUSION: (1.0, True),
     Kind.PARTIAL_OCCLUSION: (0.5, False),
     Kind.DROPPED: (None, True),
@@ -82,14 +82,15 @@ class InjectedFault(Settings):
 
     def check(self) -> None:
         """Raise ValueError where the strength does not fit the kind."""
-        default, _ = _DEFAULTS[self.kind]
+        default, _ = DEFAULTS[self.kind]
         if self.strength is not None and default is None:
             raise ValueError(f"a fault of kind '{self.kind.value}' has no strength")
-        if self.strength is not None and not _fits(self.kind, self.strength):
+        if self.strength is not None and not fits(self.kind, self.strength):
             raise ValueError(f"strength = {self.strength} is out of range for '{self.kind.value}'")
 
 
-def _fits(kind: Kind, value: float) -> bool:
+def fits(kind: Kind, value: float) -> bool:
+    """Return whether a strength is in the range of its kind."""
     if kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
         return 0.0 < value <= 1.0
     return math.isfinite(value) and (value > 0.0 or kind in (Kind.RANGE_BIAS, Kind.STAMP_JUMP))
@@ -97,12 +98,12 @@ def _fits(kind: Kind, value: float) -> bool:
 
 def strength(fault: InjectedFault) -> float:
     """The strength of a fault, the default of its kind where none is given (0 for a kind without strength)."""
-    return fault.strength if fault.strength is not None else _DEFAULTS[fault.kind][0] or 0.0
+    return fault.strength if fault.strength is not None else DEFAULTS[fault.kind][0] or 0.0
 
 
 def label(fault: InjectedFault, epoch_ns: int) -> Label:
     """The label of a fault: a half-open window on the log clock that begins at ``epoch_ns``."""
-    default, harmful = _DEFAULTS[fault.kind]
+    default, harmful = DEFAULTS[fault.kind]
     return Label(
         kind=fault.kind.value,
         start_ns=epoch_ns + round(fault.start_s * NS),
