@@ -92,7 +92,7 @@ def test_plan_spread_hindsight_and_flight(result):
     assert document["execution"]["miss"]["speed_mps"] < 1e-3
 
 
-def test_same_input_same_bytes(result):
+def test_the_same_input_gives_the_same_bytes(result):
     args = (result, "--json", "--samples", 8, "--every", 20)
     assert run(*args).stdout == run(*args).stdout
 
@@ -164,7 +164,7 @@ def test_export_is_the_plan(result, tmp_path):
         (("--set", "supervisor.sigma=3"), "sigma"),
     ],
 )
-def test_what_cannot_be_is_one_line(result, args, says):
+def test_an_impossible_request_is_one_line(result, args, says):
     done = run(result, *args)
     assert isinstance(done.exception, UsageError)
     assert says in str(done.exception)
@@ -175,7 +175,7 @@ def test_what_cannot_be_is_one_line(result, args, says):
     ("name", "value", "says"),
     [("P", -1e-6, "scan 7 has a covariance that is not positive"), ("x", np.nan, "scan 7 is not finite")],
 )
-def test_a_belief_that_cannot_be_is_named(result, tmp_path, name, value, says):
+def test_an_invalid_belief_is_named(result, tmp_path, name, value, says):
     for file in result.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
     with np.load(result / "beliefs.npz") as data:

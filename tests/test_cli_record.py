@@ -49,7 +49,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 @pytest.mark.parametrize("name", ["plain", "ros1", "sqlite", "back"])
-def test_the_same_clouds_bit_for_bit(logs: dict[str, Path], name: str) -> None:
+def test_clouds_are_recorded_bit_for_bit(logs: dict[str, Path], name: str) -> None:
     with open_source(LOG) as source, open_source(logs[name]) as other:
         for one, two in zip(true_scans(source), true_scans(other), strict=True):
             assert one.points.tobytes() == two.points.tobytes()

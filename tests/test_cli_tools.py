@@ -41,7 +41,7 @@ def test_kitti_and_tum_hold_the_same_poses(result, cli, tmp_path):
     np.testing.assert_allclose(kitti[:, :, :3], Rotation.from_quat(tum[:, 4:]).as_matrix(), atol=1e-14)
 
 
-def test_an_existing_export_is_left_alone(result, cli, tmp_path):
+def test_an_existing_export_is_not_overwritten(result, cli, tmp_path):
     target = tmp_path / "rows.csv"
     target.write_text("precious")
     done = cli("export", result, "--to", "csv", "-o", target)
@@ -62,7 +62,7 @@ def test_completion_names_the_commands(cli):
     assert {"plain,record", "plain,report"} <= set(done.out.split())
 
 
-def test_version_names_what_it_stands_on(cli):
+def test_version_lists_the_libraries(cli):
     out = cli("--version").out
     assert out.startswith("avsreplay 0.1.0")
     for name in ("numpy", "mcap", "kiss-icp", "clarabel"):

@@ -64,7 +64,7 @@ def test_to_errors_is_the_derivative_of_to_state(seed: int) -> None:
     assert np.abs(np.transpose(slope) / (2 * eps) - to_errors(c)).max() < 1e-8
 
 
-def test_any_matrix_is_a_body() -> None:
+def test_every_parameter_vector_is_a_valid_inertia() -> None:
     """The triangle inequalities need no guarding: every M gives |sigma| < 1, moments that a mass could have."""
     rng = np.random.Generator(np.random.PCG64(5))
     base = to_chart(tumbling.draw(0, seconds=1.0).states[0])
@@ -77,7 +77,7 @@ def test_any_matrix_is_a_body() -> None:
         assert 2 * moments.max() < moments.sum()
 
 
-def test_equal_moments_are_no_singular_point() -> None:
+def test_equal_moments_are_not_singular() -> None:
     """A sphere's chart moves smoothly through M = 0, where sigma and mu jump."""
     sphere = Chart(
         np.array([0, 0, 0, 1.0]), np.array([0.1, 0, 0]), *[np.zeros(3)] * 2, np.zeros((3, 3)), *[np.ones(3)], np.eye(3)
@@ -91,7 +91,7 @@ def test_equal_moments_are_no_singular_point() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_arc_is_the_motion_and_its_derivative(seed: int) -> None:
+def test_arc_gives_the_motion_and_its_derivative(seed: int) -> None:
     world = tumbling.draw(seed, rate=0.3, seconds=60.0)
     x = world.states[0]
     path = rotation_history(x, world.times)
@@ -188,7 +188,7 @@ def at_the_end(found: BatchCovariance, poses: Poses, prior: Prior, seconds: floa
     return moments(final_mixture(found, poses, prior, FitParams(), (0.0, 0.0), 0, seconds))
 
 
-def test_a_bent_likelihood_is_seen_and_mended() -> None:
+def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
     """Seven bodies seen for 40 s: the curvature alone is far too sure, the mended covariance is not."""
     plain, mended = [], []
     for seed in (3, 6, 9, 15, 2):
@@ -212,7 +212,7 @@ def test_a_long_arc_settles() -> None:
     assert nees(here, world.states[-1]) == pytest.approx(nees(Belief(0, fitted.x, fitted.P), world.states[0]), rel=0.2)
 
 
-def test_a_pinned_fit_holds_its_direction_and_the_rest_gives() -> None:
+def test_a_profile_fit_keeps_the_fixed_direction_and_minimises_over_the_others() -> None:
     world = tumbling.draw(4, seconds=60.0)
     poses, fitted, prior = grown(seen(world, 4), 21, 81, 121)
     row = np.zeros(20)
@@ -240,7 +240,7 @@ def cold(seed: int, seconds: float = 100.0):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 14])
-def test_cold_start_hands_over_and_stays_honest(seed: int) -> None:
+def test_cold_start_hands_over_and_stays_consistent(seed: int) -> None:
     modes, sizes = [], []
     for track, x in cold(seed):
         modes.append(track.mode)
@@ -283,7 +283,7 @@ def test_poses_can_be_cut() -> None:
     assert len(poses.upto(5)) == 5
 
 
-def test_a_body_at_rest_is_no_trouble() -> None:
+def test_a_body_at_rest_is_estimated() -> None:
     """No turn, nothing to tell inertia by: the fit stays with its prior and says so by its covariance."""
     x = State([0, 0, 0, 1.0], np.zeros(3), [0, 0, 5.0], np.zeros(3), np.zeros(2), np.zeros(3), [0, 0, 0, 1.0])
     rng = np.random.Generator(np.random.PCG64(0))

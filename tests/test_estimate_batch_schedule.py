@@ -55,7 +55,7 @@ def frozen_scanner(first: int, count: int, states: list[State]):
     return lambda k, pose: states[first - 1].T_ac if first <= k < first + count else pose
 
 
-def test_a_pose_loses_its_say_beyond_the_gate_and_none_before() -> None:
+def test_a_pose_is_weighted_down_beyond_the_gate_only() -> None:
     P, H, R = np.zeros((20, 20)), np.zeros((6, 20)), np.eye(6)
     for size in (0.0, 1.0, 5.0, 5.27, 5.29, 20.0, 1e6):
         seen = innovation_of(P, H, np.array([size, 0, 0, 0, 0, 0]), R, robust=True)
@@ -66,7 +66,7 @@ def test_a_pose_loses_its_say_beyond_the_gate_and_none_before() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
-def test_a_frozen_scan_that_passes_leaves_the_estimate_honest(seed: int) -> None:
+def test_an_accepted_frozen_scan_leaves_the_estimate_consistent(seed: int) -> None:
     """One and the same fault, and the printed filter denies its error."""
     world = tumbling.draw(seed, seconds=100.0, sigma_max=0.85)
     wrong = frozen_scanner(120, 4, world.states)
@@ -76,7 +76,7 @@ def test_a_frozen_scan_that_passes_leaves_the_estimate_honest(seed: int) -> None
 
 
 @pytest.mark.slow
-def test_a_right_filter_is_left_alone() -> None:
+def test_a_consistent_filter_is_not_changed() -> None:
     """Twenty bodies, three audits each: the fit takes the word from none, and nothing differs in a bit."""
     recalls = 0
     for seed in range(20):
@@ -85,7 +85,7 @@ def test_a_right_filter_is_left_alone() -> None:
     assert recalls <= 1
 
 
-def test_poses_that_contradict_the_filter_withdraw_its_word() -> None:
+def test_poses_that_contradict_the_filter_withdraw_convergence() -> None:
     world = tumbling.draw(1, seconds=100.0, sigma_max=0.85)
     tracks = list(fold(world.times, world.states, WHITE, 1, frozen_scanner(120, 8, world.states)))
     assert not tracks[119].window.many_outliers
@@ -108,7 +108,7 @@ def test_one_wild_pose_does_not_make_the_innovations_inconsistent() -> None:
     assert monitor.judge(plain).consistent is False
 
 
-def test_the_papers_start_stays_the_papers() -> None:
+def test_the_start_of_the_paper_is_not_changed() -> None:
     world = tumbling.draw(2, seconds=40.0)
     track = last(world.times, world.states, replace(WHITE, start=Start.PAPER), 2, frozen_scanner(30, 3, world.states))
     assert track.reinitialised == 0
@@ -122,7 +122,7 @@ def fixes(seed: int, seconds: float) -> tuple[PoseFix, ...]:
     return tuple(PoseFix(round(t * 1e9), a.T_ac, a.covariance) for t, a in zip(world.times, seen, strict=True))
 
 
-def test_without_pushes_the_pass_is_the_fit_and_with_them_it_knows_less() -> None:
+def test_process_noise_increases_the_covariance_and_zero_noise_gives_the_fit() -> None:
     found = fixes(4, 100.0)
     poses, params = poses_of(found), WHITE.resolved(2.0)
     prior = weak_prior(poses, params)
@@ -145,7 +145,7 @@ def test_the_memory_is_where_pushes_have_turned_the_body_by_the_stray() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("start", [Start.NEAR, Start.COLD])
-def test_a_pushed_body_is_told_honestly(start: Start) -> None:
+def test_the_estimate_of_a_disturbed_body_is_consistent(start: Start) -> None:
     """Ten times the default torque noise over 100 s; mean NEES of eight bodies, the fit's word or the filter's."""
     sizes = []
     for seed in range(8):
@@ -175,7 +175,7 @@ def test_the_fit_begins_where_the_belief_came_from() -> None:
 
 
 @pytest.mark.slow
-def test_a_given_start_is_honest_under_precise_poses() -> None:
+def test_a_given_start_is_consistent_under_precise_poses() -> None:
     """Poses far finer than the start: what the printed filter linearises on the way it takes for knowledge."""
     sizes: dict[Constraint, list[float]] = {constraint: [] for constraint in Constraint}
     for seed in range(10):
@@ -221,7 +221,7 @@ def test_a_given_start_that_is_wrong_is_left_out(constraint: Constraint) -> None
         assert nees(track.belief, x) < BAND_20[1]
 
 
-def test_a_right_start_is_kept() -> None:
+def test_a_correct_start_is_kept() -> None:
     for seed in range(6):
         world = tumbling.draw(seed, seconds=30.0, sigma_max=0.85)
         track = last(world.times, world.states, WHITE, seed)

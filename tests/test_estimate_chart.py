@@ -63,7 +63,7 @@ def test_the_covariance_follows(world: tumbling.World, naming: AxisPermutation) 
 
 
 @EACH
-def test_nees_does_not_know_the_names(world: tumbling.World, naming: AxisPermutation) -> None:
+def test_nees_is_independent_of_the_axis_names(world: tumbling.World, naming: AxisPermutation) -> None:
     x = world.states[0]
     d = np.random.Generator(np.random.PCG64(0)).normal(size=20) * 1e-3
     belief = Belief(0, boxplus(x, d), np.eye(20) * 1e-6)
@@ -74,13 +74,13 @@ def test_nees_does_not_know_the_names(world: tumbling.World, naming: AxisPermuta
     assert nees(belief, x) == pytest.approx(size, rel=0.05)
 
 
-def test_a_wrong_body_is_not_excused(world: tumbling.World) -> None:
+def test_a_wrong_inertia_is_not_explained_by_a_permutation(world: tumbling.World) -> None:
     x = world.states[0]
     other = State(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma + 0.1, x.c_b, x.q_bc)
     assert nees(Belief(0, other, np.eye(20) * 1e-6), x) > 1e4
 
 
-def test_a_half_turned_fixture_is_told_apart(world: tumbling.World) -> None:
+def test_a_fixture_turned_by_180_degrees_is_distinguished(world: tumbling.World) -> None:
     """A relabelling keeps the pose; turning the fixture on the body does not."""
     x = world.states[0]
     turned = State(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, geometry.multiply([1.0, 0, 0, 0], x.q_bc))

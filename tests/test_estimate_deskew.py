@@ -49,7 +49,7 @@ def test_float32_points_and_one_instant() -> None:
     assert deskew(np.zeros((0, 3)), np.zeros(0), predict(now)).shape == (0, 3)
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_inputs_of_inconsistent_size_are_refused() -> None:
     seen, times, now, _ = skewed(0.1, 1.0, 2.0)
     with pytest.raises(ValueError, match="do not fit"):
         deskew(seen, times[1:], predict(now))

@@ -195,7 +195,7 @@ def noise_by_quadrature(x: State, moments: np.ndarray, h: float, torque: float) 
 
 @pytest.mark.parametrize("h", [0.05, 0.2, 12.0, 40.0, -0.2, -12.0])
 @pytest.mark.parametrize("seed", range(3))
-def test_noise_is_every_push_carried_to_the_end(seed: int, h: float) -> None:
+def test_noise_is_the_sum_of_propagated_disturbances(seed: int, h: float) -> None:
     x, moments = some_state(seed)
     want = noise_by_quadrature(x, moments, h, 2e-3)
     scale = np.sqrt(np.outer(np.diag(want), np.diag(want)))
@@ -285,7 +285,7 @@ def test_a_path_of_a_body_at_rest_stays_in_one_place() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e12])
-def test_what_is_not_finite_or_turns_for_ever_is_refused(bad: float) -> None:
+def test_a_rate_that_is_not_finite_or_too_large_is_refused(bad: float) -> None:
     x, _ = some_state(1)
     with pytest.raises(ValueError, match="finite"):
         dynamics.flow(x.w_b, x.sigma, bad)
@@ -297,7 +297,7 @@ def test_what_is_not_finite_or_turns_for_ever_is_refused(bad: float) -> None:
         rotation_history(x, np.array([0.0, 1.0, bad]))
 
 
-def test_a_forecast_of_what_spins_too_fast_is_infinite() -> None:
+def test_a_forecast_of_a_rate_that_is_too_large_is_infinite() -> None:
     x = replace(some_state(1)[0], w_b=np.array([1e6, 0.0, 1.0]))
     seen = dynamics.grasp_forecast(Belief(0, x, np.eye(20)), np.array([1.0, 30.0]), 1e-4, 1e-4)
     assert np.all(np.isinf([seen.pos_1s_m, seen.vel_1s_mps, seen.rot_1s_rad]))
@@ -305,7 +305,7 @@ def test_a_forecast_of_what_spins_too_fast_is_infinite() -> None:
         dynamics.grasp_forecast(Belief(0, x, np.eye(20)), np.array([3.0, 1.0]), 0.0, 0.0)
 
 
-def test_noise_rides_along_without_touching_the_motion() -> None:
+def test_process_noise_does_not_change_the_mean_motion() -> None:
     x, _ = some_state(8)
     ratios, times = dynamics.ratios(x.sigma), np.array([0.3, 9.0, 30.0])
     noisy = _motion.follow(x.q_ab, x.w_b, ratios, dynamics.torque_density(x.sigma, 1e-3), times)

@@ -69,7 +69,7 @@ def aimed(x: State, size: float, rng: np.random.Generator, colour: np.ndarray = 
 
 @pytest.mark.parametrize("size", [0.0, 1e-6, 1e-3, 0.1, 0.5])
 @pytest.mark.parametrize("seed", range(12))
-def test_update_is_the_charts(seed: int, size: float) -> None:
+def test_update_agrees_with_the_chart(seed: int, size: float) -> None:
     x, rng = some_state(seed), np.random.Generator(np.random.PCG64([seed, 1]))
     mean, covariance = aimed(x, size, rng, rng.uniform(1.0, 9.0, 2))
     assert mean < 1e-12
@@ -120,7 +120,7 @@ def test_steps_beyond_a_half_turn_and_new_names(seed: int) -> None:
 
 
 @pytest.mark.parametrize("naming", AXIS_PERMUTATIONS[1::3])
-def test_names_of_axes_do_not_matter(naming) -> None:
+def test_the_order_of_axes_does_not_matter(naming) -> None:
     """The same body by other names gets the same update: no oracle."""
     x, rng = some_state(7), np.random.Generator(np.random.PCG64(8))
     P, R = spread_of(x, rng), np.eye(6) * 1e-4
@@ -139,7 +139,7 @@ def test_names_of_axes_do_not_matter(naming) -> None:
     assert np.abs(A - B).max() < 1e-10 * np.abs(A).max()
 
 
-def test_what_is_no_number_stays_none_and_ends() -> None:
+def test_values_that_are_not_numbers_terminate() -> None:
     x, rng = some_state(1), np.random.Generator(np.random.PCG64(0))
     P, H, S = spread_of(x, rng), measurement_jacobian(x), np.eye(6)
     bad = replace(x, w_b=np.array([np.nan, 0.0, 0.0]), sigma=np.array([np.nan, 1.0]))

@@ -194,7 +194,7 @@ def test_floor_acts_on_eigenvalues_in_units_of_r0_and_is_counted() -> None:
 
 
 @pytest.mark.parametrize("rule", [Adaptation.SCALE, Adaptation.MATRIX])
-def test_a_wrong_noise_is_found(rule: Adaptation) -> None:
+def test_a_wrong_noise_level_is_estimated(rule: Adaptation) -> None:
     """A registration that claims a quarter of its variance, or an R0 far off, ends near the true noise."""
     world = tumbling.draw(11, seconds=60.0, hz=5.0)
     params = EstimatorParams(adapt=rule, window=60, correlated_share=0.0, r0_pos_m=0.05, r0_rot_deg=3.0)
@@ -205,7 +205,7 @@ def test_a_wrong_noise_is_found(rule: Adaptation) -> None:
 
 
 @pytest.mark.slow
-def test_scale_keeps_nis_honest_where_the_registration_lies() -> None:
+def test_scale_corrects_nis_when_the_registration_covariance_is_wrong() -> None:
     nis = []
     for seed in range(4):
         world = tumbling.draw(seed, seconds=60.0, hz=5.0)
@@ -230,7 +230,7 @@ def burst(level: float, seconds: float = 20.0):
 
 
 @pytest.mark.slow
-def test_a_burst_is_followed_within_a_window_and_left_again() -> None:
+def test_a_noise_burst_is_followed_within_a_window() -> None:
     """Five times the noise for 20 s, unknown to the registration; a window is 30 scans, 6 s.
 
     It is left over two windows: the first still holds residuals of an estimate the burst had unsettled.
@@ -271,7 +271,7 @@ def test_start_takes_the_rate_from_the_first_poses() -> None:
     assert track.mode == "fit"
 
 
-def test_start_is_honest_about_rate_and_velocity() -> None:
+def test_start_covers_the_error_of_rate_and_velocity() -> None:
     """The rate and velocity errors of many starts fill the covariance the start claims."""
     sizes = []
     for seed in range(40):

@@ -31,7 +31,7 @@ def test_boxplus_and_boxminus_are_inverse(x: State) -> None:
     assert np.abs(boxminus(boxplus(x, d), x) - d).max() < 1e-14
 
 
-def test_error_sides_are_the_papers(x: State) -> None:
+def test_the_error_is_on_the_side_that_the_paper_uses(x: State) -> None:
     d = np.zeros(20)
     d[:3], d[17:] = [0.1, 0.2, -0.1], [0.05, 0.0, 0.1]
     y = boxplus(x, d)

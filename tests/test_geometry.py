@@ -113,18 +113,18 @@ def test_frozen_cannot_be_written_and_checks_its_shape():
 
 
 @pytest.mark.parametrize("function", [geometry.normalise, geometry.matrix])
-def test_a_single_one_is_a_row_of_the_batch_to_the_bit(function):
+def test_a_single_value_equals_the_row_of_the_batch_bit_for_bit(function):
     q = batch(300) * 3.0
     q[:4], q[4:8] = np.eye(4), -np.eye(4)
     q[8:60, 3], q[8:20, 2], q[12:15, 1] = 0.0, 0.0, 0.0
     assert np.array_equal([function(one) for one in q], function(q))
 
 
-def test_a_single_product_is_a_row_of_the_batch_to_the_bit():
+def test_a_single_product_equals_the_row_of_the_batch_bit_for_bit():
     a, b = batch(300, seed=6), batch(300, seed=7)
     assert np.array_equal([geometry.multiply(p, q) for p, q in zip(a, b, strict=True)], geometry.multiply(a, b))
 
 
-def test_a_single_skew_is_a_row_of_the_batch_to_the_bit():
+def test_a_single_skew_matrix_equals_the_row_of_the_batch_bit_for_bit():
     v = batch(50)[:, :3]
     assert np.array_equal([geometry.skew(one) for one in v], geometry.skew(v))

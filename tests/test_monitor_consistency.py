@@ -43,7 +43,7 @@ def test_a_right_filter_stays_in_its_band() -> None:
     assert white >= 198
 
 
-def test_an_over_confident_filter_is_found_and_a_cautious_one_let_be() -> None:
+def test_an_over_confident_filter_is_detected_and_a_conservative_one_is_accepted() -> None:
     assert not any(watch(*draws(seed, factor=1.6)).consistent for seed in range(50))
     cautious = watch(*draws(0, factor=0.5))
     assert cautious.consistent
@@ -59,7 +59,7 @@ def test_correlated_innovations_are_seen() -> None:
     assert watch(red, S).autocorrelation > watch(red, S).autocorrelation_band
 
 
-def test_nothing_is_said_too_early_and_faulty_scans_say_nothing() -> None:
+def test_the_test_needs_enough_healthy_scans() -> None:
     alphas, S = draws(2, n=20)
     assert watch(alphas[:14], S).consistent is None
     assert watch(alphas, S, gammas=[0] * 20).consistent is None

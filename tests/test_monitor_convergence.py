@@ -60,7 +60,7 @@ def test_every_block_counts(block: str) -> None:
     assert track.unknown == (block,)
 
 
-def test_predictive_test_lets_an_unknowable_parameter_pass() -> None:
+def test_predictive_test_ignores_an_unobservable_parameter() -> None:
     """A nearly axisymmetric body: sigma and mu wide, the grasp point's motion known."""
     steps = [(belief(t, sigma=0.5, mu=0.5), ahead()) for t in range(9)]
     assert fold(Convergence(ConvergenceParams(), 8.0), steps).converged

@@ -51,7 +51,7 @@ def test_each_reason(change: dict[str, object], reason: Reason) -> None:
     assert (verdict.gamma, verdict.reason) == (0, reason)
 
 
-def test_scans_that_are_not_there() -> None:
+def test_missing_and_empty_scans_are_faults() -> None:
     assert judge(status=ScanStatus.EMPTY).reason is Reason.NO_SCAN
     assert judge(status=ScanStatus.DAMAGED).reason is Reason.NO_SCAN
     assert judge(status=ScanStatus.CLOCK).reason is Reason.CLOCK

@@ -34,7 +34,7 @@ def test_the_fold_is_the_sum() -> None:
     assert scaled.log10_cond_scaled == pytest.approx(np.log10(np.linalg.cond(D @ W @ D)), abs=1e-5)
 
 
-def test_scale_takes_the_units_away() -> None:
+def test_scaling_makes_the_rank_independent_of_units() -> None:
     """Millimetres instead of metres in half of the states change the raw condition and not the scaled one."""
     units = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
     plain, scaled = gramian(np.ones(6)), gramian(units)
@@ -45,7 +45,7 @@ def test_scale_takes_the_units_away() -> None:
     assert measure(scaled).log10_cond > measure(plain).log10_cond + 3
 
 
-def test_rank_grows_scan_by_scan_and_no_condition_is_said_below_full_rank() -> None:
+def test_rank_grows_scan_by_scan_and_the_condition_needs_full_rank() -> None:
     state, ranks = gramian(np.ones(6)), []
     for Phi, H in chain(2)[:4]:
         state = observe(state, Phi, H, exact(2))
@@ -64,7 +64,7 @@ def test_a_faulty_scan_moves_time_but_adds_nothing() -> None:
     assert np.abs(state.root.T @ state.root - W).max() < 1e-12
 
 
-def test_a_condition_beyond_double_precision_is_still_told() -> None:
+def test_a_condition_beyond_double_precision_is_computed() -> None:
     """10^24 in W: its root holds it, a summed W would not."""
     H = np.diag([1.0, 1e-6])
     state = observe(gramian(np.ones(2)), np.eye(2), H, exact(2))
@@ -101,7 +101,7 @@ def test_the_rank_is_relative_to_the_noise() -> None:
     assert measure(state).rank == 2
 
 
-def test_a_trajectory_at_once_is_the_fold() -> None:
+def test_a_trajectory_in_one_call_equals_the_recursion() -> None:
     steps = chain(4)
     state, Phi_k0, rows = gramian(np.ones(6)), np.eye(6), []
     R = np.diag([0.1, 0.3])

@@ -177,7 +177,7 @@ def test_latency_is_a_coast_and_then_the_same_problem():
     assert late.position_error_m < 1e-8
 
 
-def test_a_goal_that_runs_away_is_infeasible_and_says_until_when():
+def test_a_goal_that_moves_away_is_infeasible_until_the_stated_time():
     plan = rendezvous(
         lambda t: (0.5 * 0.06 * t[:, None] ** 2 + 1.0 + ORIGIN, 0.06 * t[:, None] + ORIGIN), ORIGIN, ORIGIN
     )

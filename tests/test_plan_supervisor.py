@@ -79,7 +79,7 @@ def test_every_rule_is_reached(rule):
     assert after.action is decision.action
 
 
-def test_the_page_tells_of_every_rule():
+def test_the_page_documents_every_rule():
     page = (Path(__file__).parents[1] / "docs" / "planning.md").read_text(encoding="utf-8")
     for rule in RULES:
         assert f"| `{rule.name}` | {rule.action.value} |" in page
@@ -182,13 +182,13 @@ def test_a_biased_estimate_misses_by_its_bias():
     assert execution.miss.distance_m == pytest.approx(0.03, abs=1e-6)
 
 
-def test_blind_but_sure_flies_on():
+def test_without_vision_a_good_prediction_continues():
     execution = fly(turning(), blind=[(15.0, 60.0)])
     assert execution.outcome(Tolerance()) == "captured"
     assert "prediction_good" in rules_of(execution)
 
 
-def test_blind_and_unsure_holds_and_then_captures():
+def test_without_vision_a_poor_prediction_holds_and_then_captures():
     truth = turning()
     execution = fly(truth, blind=[(15.0, 40.0)], growth=2.0)
     assert "prediction_poor" in rules_of(execution)
@@ -197,7 +197,7 @@ def test_blind_and_unsure_holds_and_then_captures():
     assert execution.miss.at_s > 40.0
 
 
-def test_blind_for_too_long_aborts_far_away():
+def test_vision_lost_for_too_long_aborts():
     execution = fly(turning(), blind=[(15.0, 120.0)], growth=2.0, end=120.0)
     assert execution.outcome(Tolerance()) == "abort"
     assert not execution.captured

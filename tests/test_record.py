@@ -117,7 +117,7 @@ def test_the_builtin_scenario_needs_no_argument(monkeypatch, tmp_path):
     assert "model: satellite.ply, seed 1" in done.output
 
 
-def test_json_says_the_same(scenario, tmp_path):
+def test_json_states_the_same(scenario, tmp_path):
     done = CliRunner().invoke(command.command, [str(scenario), "-o", str(tmp_path / "a.mcap"), "--seed", "9", "--json"])
     said = json.loads(done.output)
     assert (said["scans"], said["span_s"], said["seed"], said["bytes"]) == (
@@ -130,7 +130,7 @@ def test_json_says_the_same(scenario, tmp_path):
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_case_made_again_is_the_case_here(case, tmp_path):
+def test_a_fixture_is_reproducible(case, tmp_path):
     """To the bit where this processor rounds as the one that made it, to 1e-12 in the truth in any event."""
     record(FIXTURES / f"{case}.toml", tmp_path / "a.mcap", options=RecordOptions(compression="none"))
     if sha(tmp_path / "a.mcap") == sha(FIXTURES / f"{case}.mcap"):
@@ -166,7 +166,7 @@ def test_a_log_recorded_again_keeps_scans_truth_labels_and_model(tmp_path):
         assert np.array_equal(a.truth.matrix, b.truth.matrix)
 
 
-def test_without_embreex_the_log_is_made_and_it_is_said(scenario, tmp_path, monkeypatch):
+def test_without_embreex_the_log_is_recorded_and_a_note_is_printed(scenario, tmp_path, monkeypatch):
     from avsreplay.simulate import ray_casting
 
     monkeypatch.setattr(ray_casting.importlib.util, "find_spec", lambda name: None)
@@ -182,7 +182,7 @@ def test_every_nth_scan_keeps_its_own_time(tmp_path):
     assert [s.t_ns for s in some] == [s.t_ns for s in all_scans[::5]]
 
 
-def test_a_model_may_stand_in_for_the_shape(scenario, tmp_path):
+def test_a_model_may_replace_the_shape(scenario, tmp_path):
     from avsreplay.simulate import Shape, builtin_surface
 
     model = tmp_path / "bracket.ply"
@@ -197,7 +197,7 @@ def test_a_model_may_stand_in_for_the_shape(scenario, tmp_path):
     assert read(tmp_path / "b.mcap")[0].surface.sha256 == header.surface.sha256
 
 
-def test_an_existing_output_stays_unless_told(scenario, tmp_path):
+def test_an_existing_output_is_kept_without_overwrite(scenario, tmp_path):
     output = tmp_path / "a.mcap"
     output.write_bytes(b"mine")
     with pytest.raises(UsageError, match="--overwrite"):
@@ -215,7 +215,7 @@ def test_a_log_is_not_recorded_onto_itself(tmp_path):
     assert sha(log) == sha(FIXTURES / "tumble.mcap")
 
 
-def test_a_failure_on_the_way_leaves_no_file(scenario, tmp_path):
+def test_a_failure_during_recording_leaves_no_file(scenario, tmp_path):
     @contextmanager
     def failing(scans, due):
         def some():
@@ -249,7 +249,7 @@ def test_bad_input_is_one_line(scenario, tmp_path, source, more, error, words):
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_damage_in_the_source_is_told_and_is_exit_4(tmp_path):
+def test_damage_in_the_source_is_reported_with_exit_4(tmp_path):
     data = bytearray((FIXTURES / "tumble.mcap").read_bytes())
     data[len(data) // 2] ^= 0xFF
     damaged = tmp_path / "damaged.mcap"

@@ -75,7 +75,7 @@ def test_horn_matrix_is_scalar_first() -> None:
 
 
 @pytest.mark.parametrize("backend", ["horn", "reference"])
-def test_exact_scan_comes_back_to_rounding(surface: Surface, scan: np.ndarray, backend: str) -> None:
+def test_an_exact_scan_is_registered_to_rounding(surface: Surface, scan: np.ndarray, backend: str) -> None:
     T_ac = example_pose()
     guess = T_ac @ Pose(exp(np.radians([2.0, -3.0, 1.5])), np.array([0.04, -0.05, 0.03]))
     params = RegisterParams(backend=backend, eps_rad=1e-7, eps_m=1e-7, n_max=1000)  # Horn alone settles slowly
@@ -131,7 +131,7 @@ class _NotFinite(_Raising):
 
 
 @pytest.mark.parametrize("fake", [_Raising, _NotFinite])
-def test_a_back_ends_trouble_is_a_status(monkeypatch, surface: Surface, scan: np.ndarray, fake) -> None:
+def test_a_failure_of_a_back_end_is_a_status(monkeypatch, surface: Surface, scan: np.ndarray, fake) -> None:
     monkeypatch.setattr("avsreplay.register.registrar.load_backend", lambda name: fake)
     found = Registrar(surface).register(scan, example_pose())
     assert found.status is AlignStatus.FAILED
@@ -202,7 +202,7 @@ def test_no_overlap_whatever_the_flag_says(surface: Surface, scan: np.ndarray) -
     assert (found.inliers, found.covariance) == (0, None)
 
 
-def test_not_converged_is_said_and_graded(surface: Surface, scan: np.ndarray) -> None:
+def test_a_registration_that_did_not_converge_is_reported_and_graded(surface: Surface, scan: np.ndarray) -> None:
     guess = example_pose() @ Pose(exp([0.05, 0.0, 0.0]), np.zeros(3))
     found = Registrar(surface, RegisterParams(n_max=2)).register(scan, guess)
     assert found.status is AlignStatus.NOT_CONVERGED
@@ -342,7 +342,7 @@ def test_the_camera_is_the_origin_where_it_can_be(surface: Surface, scan: np.nda
     assert Visibility(inward).camera_c(model, scan, T_ca) is None
 
 
-def test_a_camera_inside_the_model_or_behind_the_measured_sides_is_not_believed(surface: Surface) -> None:
+def test_a_camera_inside_the_model_or_behind_the_measured_sides_is_rejected(surface: Surface) -> None:
     model, T_ca = SurfaceIndex.build(surface, 0.5), example_pose().inverse()
     near = view(surface, 3000, T_ca.t)
     assert Visibility(surface).camera_c(model, near, Pose.identity()) is None
@@ -358,7 +358,7 @@ def test_sight_points_from_the_scan_to_the_camera(surface: Surface, scan: np.nda
 
 
 @pytest.mark.parametrize("offset", [0.06, -0.06])
-def test_a_thin_panel_is_not_laid_on_its_back(offset: float) -> None:
+def test_a_thin_panel_is_not_matched_to_its_reverse_side(offset: float) -> None:
     """Half a panel's thickness off along the sight, either way: only one side of it can have been measured."""
     surface = boxes()
     T_ac = example_pose()

@@ -53,7 +53,7 @@ def test_any_attitude_is_found_without_a_guess(registrar: Registrar) -> None:
         assert np.linalg.norm(step.t) < 0.02
 
 
-def test_a_search_repeats_to_the_bit(registrar: Registrar) -> None:
+def test_a_search_repeats_bit_for_bit(registrar: Registrar) -> None:
     scan = _scan(boxes(), _any_pose(np.random.default_rng(1)), np.random.default_rng(2))
     first, again = registrar.acquire(scan), Registrar(boxes()).acquire(scan)
     assert first.T_ac.matrix.tobytes() == again.T_ac.matrix.tobytes()
@@ -78,7 +78,7 @@ def test_a_symmetric_target_is_said_to_be_ambiguous(size: tuple[float, float, fl
 
 
 @pytest.mark.slow
-def test_another_thing_is_not_found(registrar: Registrar) -> None:
+def test_another_object_is_not_found(registrar: Registrar) -> None:
     rng = np.random.default_rng(SEED)
     cloud = rng.normal(size=(3000, 3))
     sphere = 2.5 * cloud / np.linalg.norm(cloud, axis=1, keepdims=True) + np.array([0.0, 0.0, 9.0])
@@ -131,7 +131,7 @@ def test_the_visible_centre_of_a_sphere_is_towards_the_camera() -> None:
         np.testing.assert_allclose(centres.of(towards), 4.0 / 3.0 * towards, atol=0.15)
 
 
-def test_strays_are_left_out_before_thinning() -> None:
+def test_isolated_points_are_removed_before_thinning() -> None:
     rng = np.random.default_rng(SEED)
     surface = np.concatenate([rng.uniform(-1, 1, (4000, 2)), np.zeros((4000, 1))], axis=1)
     strays = rng.uniform(-10, 10, (80, 3))

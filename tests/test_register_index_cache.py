@@ -43,7 +43,7 @@ def saved(folder: Path) -> Path:
     return path
 
 
-def test_a_restored_index_answers_to_the_bit(surface: Surface, tmp_path: Path) -> None:
+def test_a_restored_index_gives_the_same_bits(surface: Surface, tmp_path: Path) -> None:
     built = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     restored = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     assert (built.restored, restored.restored) == (False, True)
@@ -60,7 +60,7 @@ def test_another_reach_or_surface_is_another_file(surface: Surface, tmp_path: Pa
 
 
 @pytest.mark.parametrize("harm", ["short", "empty", "flipped", "longer", "magic"])
-def test_a_harmed_file_is_built_anew(surface: Surface, tmp_path: Path, harm: str) -> None:
+def test_a_damaged_file_is_rebuilt(surface: Surface, tmp_path: Path, harm: str) -> None:
     want = answers(SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path))
     path = saved(tmp_path)
     data = bytearray(path.read_bytes())
@@ -75,7 +75,7 @@ def test_a_harmed_file_is_built_anew(surface: Surface, tmp_path: Path, harm: str
 
 
 @pytest.mark.slow
-def test_no_payload_leads_a_search_astray(surface: Surface, tmp_path: Path) -> None:
+def test_a_damaged_payload_is_never_used(surface: Surface, tmp_path: Path) -> None:
     """Payloads with a right checksum but random words in them: refused, or searched without leaving the arrays."""
     SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     path = saved(tmp_path)

@@ -345,7 +345,7 @@ def test_strided_and_single_precision_views_are_read_where_they_lie(target: Surf
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e300, -1e300, 1e30])
-def test_points_that_are_no_measurement_change_nothing(target: Surface, bad: float) -> None:
+def test_points_that_are_not_finite_change_nothing(target: Surface, bad: float) -> None:
     scan = scan_of(soup(600, seed=14), 1536, 21)
     model = SurfaceIndex.build(target, 0.4)
     dirty = np.insert(scan, [1536, 1536, 1536], bad, axis=0)

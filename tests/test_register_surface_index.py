@@ -219,7 +219,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_a_surface_that_is_none_is_refused(what: str) -> None:
+def test_an_invalid_surface_is_refused(what: str) -> None:
     with pytest.raises(UsageError, match=what):
         SurfaceIndex.build(BAD[what], 0.5)
 

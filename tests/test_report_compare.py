@@ -51,7 +51,7 @@ def test_no_rows_have_no_figures_and_no_zeros(make_rows):
     assert figures["healthy_ratio"] is None
 
 
-def test_runs_part_at_the_first_scan_beyond_tolerance(make_rows):
+def test_the_first_divergence_is_the_first_scan_beyond_tolerance(make_rows):
     rows = make_rows(40)
     other = [dataclasses.replace(r, x_m=r.x_m + (1e-9 if r.seq < 17 else 0.01)) for r in rows]
     found = first_divergence(rows, other)
@@ -84,7 +84,7 @@ def test_each_limit_holds_up_to_its_edge(limits, value, ok):
     assert ok == (outcome.why == "")
 
 
-def test_a_ratio_to_nothing_allows_nothing():
+def test_a_ratio_to_zero_allows_no_increase():
     rule = GateRule("false_alarms", max_ratio=2.0)
     outcomes = judge([rule], [("a", BASE), ("b", BASE), ("c", BASE | {"false_alarms": 1.0})])
     assert [o.ok for o in outcomes] == [True, False]
@@ -162,7 +162,7 @@ def test_junit_is_well_formed_counts_and_has_no_clock():
     assert "time" not in junit(_outcomes()).replace("t1_s", "")
 
 
-def test_github_lines_cannot_be_broken_out_of():
+def test_github_annotations_are_escaped():
     assert github_lines(_outcomes()[:1]) == ["::notice title=avsreplay gate::1 rules hold"]
     (line,) = github_lines(_outcomes())
     assert "\n" not in line
@@ -227,7 +227,7 @@ def test_json_is_all_there_is_on_stdout(runs):
     assert [o["ok"] for o in whole["gate"]] == [False]
 
 
-def test_runs_of_one_name_are_told_apart(runs):
+def test_runs_of_one_name_are_distinguished(runs):
     other = runs / "elsewhere"
     other.mkdir()
     shutil.copytree(runs / "worse", other / "base")
@@ -267,7 +267,7 @@ def test_the_page_overlays_the_runs_and_keeps_what_is_there(runs):
     assert _run(runs / "base", "-o", runs / "c.html", "--overwrite").exit_code == 0
 
 
-def test_the_page_says_what_the_gate_said(runs):
+def test_the_page_shows_the_result_of_the_gate(runs):
     results = [load_result(runs / name) for name in ("base", "worse")]
     assert "1 of 2 rules broken" in build_comparison(results, [], _outcomes())
     assert "All 1 rules hold" in build_comparison(results, [], _outcomes()[:1])

@@ -92,7 +92,7 @@ def test_one_used_scan_of_35_is_worse_not_better(make_rows):
     assert "t1_s (lost)" in found.sentence
 
 
-def test_what_goes_wrong_no_more_is_not_lost(make_rows):
+def test_a_problem_that_disappears_is_not_a_lost_figure(make_rows):
     found = _changes(conclude("b", [(Saved("a", make_rows(60)), Saved("b", make_rows(60, blackout=range(0))))]))
     assert found["coast_pos_rmse_m"].word == "changed"
 
@@ -125,7 +125,7 @@ def test_groups_of_seeds_get_intervals_and_few_do_not(make_rows):
     assert (few.word, few.low) == ("no evidence", None)
 
 
-def test_no_runs_of_rows_have_a_conclusion(make_rows):
+def test_runs_without_rows_have_a_conclusion(make_rows):
     assert conclude("b", [(Saved("a", make_rows(3)), Saved("b", []))]).word == "worse"
     assert conclude("b", [(Saved("a", []), Saved("b", []))]).word == "same"
 

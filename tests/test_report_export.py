@@ -34,7 +34,7 @@ from avsreplay.rows import Row, columns
 ROOT = Path(__file__).parent.parent
 
 
-def test_rows_survive_the_file_to_the_last_bit(tmp_path, make_rows):
+def test_rows_are_read_back_bit_for_bit(tmp_path, make_rows):
     rows = make_rows(50, x_m=0.1 + 0.2, t_ns=2**62 + 1)
     assert write_rows(tmp_path / "a.jsonl", rows) == 50
     assert read_rows(tmp_path / "a.jsonl") == rows
@@ -80,7 +80,7 @@ def test_an_older_result_lacks_words_and_nulls_only(make_rows):
         parse_row(record | {"action": None}, "x")
 
 
-def test_a_failed_write_leaves_what_was_there(tmp_path, make_rows):
+def test_a_failed_write_keeps_the_old_file(tmp_path, make_rows):
     path = tmp_path / "a.jsonl"
     path.write_text("before")
     with pytest.raises(ZeroDivisionError):
@@ -114,7 +114,7 @@ def test_bad_rows_are_one_line_with_the_place(tmp_path, text, match):
         read_rows(path)
 
 
-def test_text_that_is_no_text(tmp_path):
+def test_bytes_that_are_not_utf8_are_one_line(tmp_path):
     (tmp_path / "a.jsonl").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UnreadableInput, match="not UTF-8"):
         read_rows(tmp_path / "a.jsonl")
@@ -187,7 +187,7 @@ def test_the_document_of_no_rows_is_json_too():
     assert json.loads(dump_document([], Summary.fold([])))["rows"] == []
 
 
-def test_the_column_list_of_the_docs_is_in_step():
+def test_the_column_list_of_the_docs_is_current():
     assert (ROOT / "docs" / "columns.md").read_text(encoding="utf-8") == columns_page()
     assert (ROOT / "docs" / "rows.schema.json").read_text(encoding="utf-8") == row_schema_text()
 

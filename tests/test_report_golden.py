@@ -105,7 +105,7 @@ def test_a_missing_column_fails_on_the_file_side(golden, make_rows):
     assert [(d.seq, d.column, d.expected, d.got) for d in result.differences] == [(None, "nis", ABSENT, "present")]
 
 
-def test_a_column_nobody_declares_fails(golden, make_rows):
+def test_an_undeclared_column_fails(golden, make_rows):
     records = [json.loads(line) | {"extra": 1} for line in golden.read_text().splitlines()]
     golden.write_text("".join(json.dumps(r) + "\n" for r in records))
     result = compare_golden(golden, make_rows(30))
@@ -131,7 +131,7 @@ def test_a_missing_golden_file_fails_the_check(tmp_path, make_rows):
 
 
 @pytest.mark.parametrize("text", ["not json\n", '{"seq": "a"}\n', '{"seq": 1}\n{"seq": 1}\n'])
-def test_a_golden_that_is_no_golden(golden, make_rows, text):
+def test_an_invalid_golden_file_is_one_line(golden, make_rows, text):
     golden.write_text(text)
     with pytest.raises(UnreadableInput):
         compare_golden(golden, make_rows(2))

@@ -63,7 +63,7 @@ def _floats(packed, kind):
     return np.frombuffer(base64.b64decode(packed["data"]), kind)
 
 
-def test_nothing_is_asked_of_the_network(make_rows):
+def test_the_page_makes_no_network_request(make_rows):
     page = _page(make_rows(30))
     assert "default-src 'none'" in page
     outside = re.findall(
@@ -143,13 +143,13 @@ def test_a_scan_far_away_or_of_one_point_can_be_packed(make_rows):
     assert packed["cap_m"] is None
 
 
-def test_spans_are_runs_of_one_word(make_rows):
+def test_spans_are_intervals_of_equal_values(make_rows):
     found = [(s["lane"], s["word"], s["first"], s["last"]) for s in spans(make_rows(40))]
     expected = [("flagged", "no_scan", 20, 25), ("injected", "full_occlusion", 20, 25), ("action", "approach", 0, 39)]
     assert found == expected
 
 
-def test_a_label_that_left_no_scan_is_drawn_too(make_rows):
+def test_a_label_without_scans_is_drawn(make_rows):
     rows = [r for r in make_rows(40) if r.seq != 12]
     dropped = Label("dropped", rows[11].t_ns + 1, rows[12].t_ns - 1)
     found = spans(rows, Summary.fold(rows, labels=[*_labels(rows), dropped]).faults.episodes)
@@ -212,7 +212,7 @@ def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     assert not (tmp_path / "x.html").exists()
 
 
-def test_a_long_run_is_thinned_to_its_telling_scans(make_rows):
+def test_a_long_run_is_thinned_to_its_informative_scans(make_rows):
     rows = [dataclasses.replace(r, pos_err_m=0.9) if r.seq == 1234 else r for r in make_rows(3000)]
     kept = most_telling(rows, 500, always=(77,))
     assert len(kept) <= 500
@@ -366,7 +366,7 @@ def _pin(browser, chart="position"):
 @pytest.mark.slow
 @pytest.mark.parametrize("width", [1280, 390])
 @pytest.mark.parametrize("dark", [False, True])
-def test_it_loads_without_a_word_on_the_console(opened, width, dark):
+def test_it_loads_without_a_console_message(opened, width, dark):
     browser = opened(width=width, dark=dark)
     assert browser.get_log("browser") == []
     assert browser.execute_script("return document.documentElement.dataset.theme") == ("dark" if dark else "light")
@@ -382,7 +382,7 @@ def test_600_scans_are_interactive_within_two_seconds(opened, make_rows):
 
 
 @pytest.mark.slow
-def test_the_slider_moves_the_pins_the_words_and_the_3d_view(opened):
+def test_the_slider_moves_the_markers_the_text_and_the_3d_view(opened):
     browser = opened()
     _slide(browser, 10)
     left, words = _pin(browser), _text(browser, "#now")
@@ -396,7 +396,7 @@ def test_the_slider_moves_the_pins_the_words_and_the_3d_view(opened):
 
 
 @pytest.mark.slow
-def test_hover_reads_every_chart_at_once_and_lets_go(opened, make_rows):
+def test_hover_reads_every_chart_and_ends(opened, make_rows):
     from selenium.webdriver import ActionChains
 
     rows = make_rows(60)
@@ -447,7 +447,7 @@ def test_a_click_chooses_a_scan_and_jump_goes_to_a_fault(opened):
 
 
 @pytest.mark.slow
-def test_keys_alone_will_do(opened):
+def test_the_page_works_with_the_keyboard_alone(opened):
     from selenium.webdriver import Keys
 
     browser = opened()
@@ -501,7 +501,7 @@ def test_play_runs_to_the_end_and_stops(opened):
 
 
 @pytest.mark.slow
-def test_the_theme_button_turns_everything(opened):
+def test_the_theme_button_changes_every_colour(opened):
     browser = opened()
     canvas = browser.find_element("css selector", "#chart-position canvas")
     before = canvas.screenshot_as_png
@@ -512,7 +512,7 @@ def test_the_theme_button_turns_everything(opened):
 
 
 @pytest.mark.slow
-def test_text_stands_out_from_its_ground_in_both_themes(opened):
+def test_text_has_contrast_in_both_themes(opened):
     """WCAG contrast of 4.5 for text, 3 for lines."""
     script = """const s = getComputedStyle(document.documentElement);
     return Object.fromEntries(arguments[0].map((n) => [n, s.getPropertyValue(n).trim()]))"""
@@ -548,7 +548,7 @@ def _contrast(one, two):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("n", [1, 2])
-def test_a_tiny_run_without_anything_else_loads(opened, make_rows, n):
+def test_a_run_of_one_scan_loads(opened, make_rows, n):
     rows = make_rows(n, pos_err_m=None, rot_err_deg=None)
     browser = opened(rows=rows, truth=None, poses=(), view=None) if n == 1 else opened(rows=rows, view=None)
     assert browser.get_log("browser") == []
@@ -588,7 +588,7 @@ def test_a_value_between_two_scans_without_one_is_drawn(opened, make_rows):
 
 
 @pytest.mark.slow
-def test_zoom_and_scan_stand_in_the_address(opened):
+def test_zoom_and_scan_are_in_the_address(opened):
     browser = opened()
     _slide(browser, 10)
     assert "row=10" in browser.execute_script("return location.hash")

@@ -49,7 +49,7 @@ def _ball(n):
     return Surface(np.asarray(mesh.vertices), np.asarray(mesh.faces, np.int32), "ball", "0" * 64)
 
 
-def test_the_summary_comes_back_as_it_was(folder):
+def test_the_summary_is_read_back_unchanged(folder):
     path, summary = folder
     result = load_result(path)
     assert result.summary == summary
@@ -77,7 +77,7 @@ def test_the_view_comes_back_and_its_bytes_are_stable(folder, tmp_path):
 
 
 @pytest.mark.parametrize("most", [50, 300, 2000])
-def test_a_thin_cloud_keeps_its_ends(most):
+def test_a_thinned_cloud_keeps_its_extremes(most):
     points = np.random.default_rng(0).normal(size=(1234, 3))
     cloud = thin_cloud(0, points, points[:, 0], most=most)
     assert len(cloud.points) == min(most, 1234)
@@ -85,7 +85,7 @@ def test_a_thin_cloud_keeps_its_ends(most):
     np.testing.assert_array_equal(cloud.points[:, 0], cloud.residual_m)
 
 
-def test_a_thin_surface_is_small_and_still_there():
+def test_a_thinned_surface_is_small_and_complete():
     ball = _ball(80)
     vertices, faces = thin_surface(ball, most=1000)
     assert 200 < len(faces) <= 1000
@@ -95,7 +95,7 @@ def test_a_thin_surface_is_small_and_still_there():
     assert radius.min() > 0.9
 
 
-def test_a_small_surface_is_left_alone():
+def test_a_small_surface_is_not_changed():
     ball = _ball(10)
     vertices, faces = thin_surface(ball)
     np.testing.assert_array_equal(faces, ball.faces)

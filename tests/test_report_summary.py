@@ -23,7 +23,7 @@ STEP = 200_000_000
 
 
 @given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=40), st.randoms())
-def test_statistics_are_numpys_and_know_no_order(values, rng):
+def test_statistics_agree_with_numpy_in_any_order(values, rng):
     spread = Statistics.of(values)
     array = np.array(values)
     assert spread.count == len(values)
@@ -35,11 +35,11 @@ def test_statistics_are_numpys_and_know_no_order(values, rng):
     assert Statistics.of(shuffled) == spread
 
 
-def test_nothing_has_no_statistics():
+def test_no_values_have_no_statistics():
     assert Statistics.of([]) is None
 
 
-def test_the_bands_are_chi_squares():
+def test_the_bands_are_those_of_chi_squared():
     np.testing.assert_allclose(NIS_BAND, chi2.ppf([0.025, 0.975], 6), atol=5e-5)
     np.testing.assert_allclose(NEES_BAND, chi2.ppf([0.025, 0.975], 20), atol=5e-5)
 
@@ -131,7 +131,7 @@ def test_two_windows_of_one_kind_keep_their_own_scans(clean):
     assert [e.scans for e in Summary.fold(rows, labels=labels).faults.episodes] == [2, 1]
 
 
-def test_a_stamp_pushed_out_of_its_window_still_finds_its_label(clean):
+def test_a_stamp_outside_its_window_is_matched_to_its_label(clean):
     label = _label(clean, "stamp_jump", 12, 12)
     rows = [dataclasses.replace(r, t_ns=r.t_ns + 90_000_000, fault="stamp_jump") if r.seq == 12 else r for r in clean]
     assert Summary.fold(rows, labels=[label]).faults.episodes[0].scans == 1
@@ -149,7 +149,7 @@ def test_without_labels_a_flag_is_not_called_false(clean):
     assert Summary.fold(_flag(clean, {3}), labels=()).faults.known
 
 
-def test_a_track_never_taken_up_again_has_no_recovery_time(clean):
+def test_a_track_that_is_not_recovered_has_no_recovery_time(clean):
     rows = _flag(_flag(clean, range(30, 40)), {28, 29}, fault="clutter")
     faults = Summary.fold(rows, labels=[_label(rows, "clutter", 28, 29)]).faults
     assert faults.episodes[0].detected
@@ -224,7 +224,7 @@ def _truth(**changes):
     return State(**(values | changes))
 
 
-def test_parameters_stand_against_truth(make_rows):
+def test_parameters_are_compared_with_the_truth(make_rows):
     rows = make_rows(40)
     found = {p.name: p for p in Summary.fold(rows, truth=_truth()).parameters}
     assert found["sigma1"].error == pytest.approx(abs(rows[-1].sigma1 - 0.25))
@@ -234,7 +234,7 @@ def test_parameters_stand_against_truth(make_rows):
     assert found["mu"].one_sigma == 0.2
 
 
-def test_the_angle_of_mu_knows_no_sign(make_rows):
+def test_the_angle_of_mu_ignores_the_sign(make_rows):
     rows = make_rows(2, mux=0.0, muy=0.0, muz=-math.sin(0.05), muw=-math.cos(0.05))
     found = {p.name: p for p in Summary.fold(rows, truth=_truth()).parameters}
     assert found["mu"].error == pytest.approx(0.0, abs=1e-6)
@@ -263,13 +263,13 @@ def test_a_replan_is_a_plan_that_differs(make_rows):
     assert capture.std_s == pytest.approx(np.std([30.1, 30.2, 30.3]))
 
 
-def test_a_planner_that_finds_nothing_has_a_word_and_no_time(make_rows):
+def test_a_planner_without_a_plan_has_a_status_and_no_time(make_rows):
     rows = make_rows(20, plan_status="infeasible_within_horizon", capture_time_s=None)
     capture = Summary.fold(rows).capture
     assert (capture.replans, capture.last_s, capture.status) == (0, None, "infeasible_within_horizon")
 
 
-def test_hindsight_gripper_and_actions_are_told(make_rows):
+def test_hindsight_gripper_and_actions_are_reported(make_rows):
     rows = make_rows(6, blackout=range(0))
     rows[1] = dataclasses.replace(rows[1], plan_miss_m=0.02)
     rows[3] = dataclasses.replace(rows[3], plan_miss_m=0.01, action="capture")
@@ -294,7 +294,7 @@ def test_shares_count_what_is_inside(make_rows):
     assert (nis.count, nis.inside, nis.median) == (4, 0.5, 8.0)
 
 
-def test_counts_are_handed_through(make_rows):
+def test_counts_are_passed_on(make_rows):
     counts = {"messages lost": 2}
     assert Summary.fold(make_rows(2), counts=counts).counts == counts
 

@@ -50,13 +50,13 @@ def test_every_width_is_kept_and_what_is_left_out_is_named(make_rows, width):
     assert ("not shown at this width" in text) == (width < 140)
 
 
-def test_units_stand_in_the_heads(make_rows):
+def test_units_are_in_the_headings(make_rows):
     text = _printed(make_rows(30), width=200)
     for unit in ("[m]", "[deg]", "[s]"):
         assert unit in text.split("Errors")[0]
 
 
-def test_heads_lose_the_suffix_and_keep_the_unit():
+def test_headings_omit_the_suffix_and_keep_the_unit():
     heads = {c.name: head(c) for c in columns()}
     assert heads["rms_m"] == "rms\n[m]"
     assert heads["wx_radps"] == "wx\n[rad/s]"
@@ -121,7 +121,7 @@ def test_the_fault_table_says_detected_missed_and_harmless(make_rows):
         assert re.search(pattern, text, re.MULTILINE), pattern
 
 
-def test_the_fault_table_says_when_it_was_seen_and_that_the_track_was_never_taken_up(make_rows):
+def test_the_fault_table_shows_the_detection_time_and_a_track_that_is_not_recovered(make_rows):
     rows = [dataclasses.replace(r, gamma=1, reason="ok", fault=None) for r in make_rows(40)]
     rows = [dataclasses.replace(r, fault="partial_occlusion") if 10 <= r.seq < 30 else r for r in rows]
     rows = [dataclasses.replace(r, gamma=0, reason="fit_error") if r.seq >= 12 else r for r in rows]
@@ -133,7 +133,7 @@ def test_the_fault_table_says_when_it_was_seen_and_that_the_track_was_never_take
     assert "…" not in text
 
 
-def test_speed_stands_in_the_table_only(make_rows):
+def test_speed_is_in_the_table_only(make_rows):
     assert "speed" not in _printed(make_rows(3))
     assert "123.4 scans/s" in _printed(make_rows(3), scans_per_s=123.4)
 
@@ -142,11 +142,11 @@ def test_no_rows_print_a_summary():
     assert "scans" in _printed([])
 
 
-def test_a_brackets_in_a_cell_are_text(make_rows):
+def test_brackets_in_a_cell_are_text(make_rows):
     assert "[bold]" in _printed(make_rows(3, reason="[bold]", gamma=0, fault=None), width=120)
 
 
-def test_naming_the_report_loads_nothing_heavy():
+def test_importing_the_report_loads_no_heavy_library():
     code = "import avsreplay.report, sys; print([m for m in ('rich', 'plotly', 'pyarrow') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"

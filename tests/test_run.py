@@ -24,7 +24,7 @@ def test_json_is_one_document_with_summary_and_rows(result):
     assert len(document["header"]["log"]["sha256"]) == 64
 
 
-def test_result_directory_holds_what_it_promises(result):
+def test_result_directory_holds_every_documented_file(result):
     out, document = result
     names = {p.name for p in out.iterdir()}
     assert {"rows.jsonl", "run.json", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz"} <= names
@@ -50,7 +50,7 @@ def test_beliefs_read_back_as_written(result):
     assert np.linalg.eigvalsh(last.P).min() > 0.0
 
 
-def test_an_existing_result_is_left_alone(result, cli, fixtures_folder):
+def test_an_existing_result_is_not_overwritten(result, cli, fixtures_folder):
     out, _ = result
     before = (out / "rows.jsonl").read_bytes()
     done = cli("run", fixtures_folder / "tumble.mcap", "-o", out, "--n-scans", 3)

@@ -56,7 +56,7 @@ def test_an_error_of_the_pipeline_is_raised_where_the_rows_are_taken(monkeypatch
     assert set(threading.enumerate()) <= before
 
 
-def test_a_replay_that_is_broken_off_leaves_no_thread():
+def test_an_interrupted_replay_leaves_no_thread():
     before = set(threading.enumerate())
     with Run(Job(source=LOG)) as run:
         rows = run.rows()

@@ -182,7 +182,7 @@ def test_a_float_is_accepted_exactly_within_the_bounds(value, name):
     assert accepted == allowed
 
 
-def test_what_scales_with_the_target_is_filled_in_and_what_is_given_stays():
+def test_lengths_that_scale_with_the_target_are_filled_in_and_given_values_are_kept():
     assert Inner().resolved(8.0).limit == 2.0
     assert Inner(limit=3.0).resolved(8.0).limit == 3.0
     for extent in (0.0, math.inf, math.nan):

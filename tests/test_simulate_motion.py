@@ -76,7 +76,7 @@ def test_the_ratio_form_of_the_dynamics_gives_the_same_motion(motion):
     assert_allclose(last.w_b, ends[4:], atol=1e-11)
 
 
-def test_the_fixture_rides_on_the_body(motion):
+def test_the_fixture_is_fixed_to_the_body(motion):
     """T_ac from the state equals the mass centre carried by the model's own coordinates; velocity is its slope."""
     for t in (0.0, 7.3, 61.0):
         R_ac, t_ac = motion.poses([t])
@@ -152,7 +152,7 @@ def test_disturbed_motion_is_continuous_and_repeats():
         {"disturbance_step_s": 0.0},
     ],
 )
-def test_wrong_motions_are_refused_by_name(wrong):
+def test_invalid_motions_are_refused_by_name(wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         MotionParams(**wrong)
 

@@ -52,7 +52,7 @@ def test_every_return_lies_on_the_mesh(engine):
 
 
 @needs_embree
-def test_both_engines_see_the_same():
+def test_both_engines_give_the_same_returns():
     a, b = (scanner(replace(CLEAN, engine=e)).cast(1.0) for e in (Engine.EMBREE, Engine.EXACT))
     assert abs(len(a.ranges) - len(b.ranges)) <= 2
     both = {tuple(d): r for d, r in zip(a.directions, a.ranges, strict=True)}
@@ -218,6 +218,6 @@ def test_a_small_target_is_scanned_as_well():
         {"pattern": Pattern.RASTER},
     ],
 )
-def test_wrong_scanners_are_refused_by_name(wrong):
+def test_invalid_scanners_are_refused_by_name(wrong):
     with pytest.raises(ValueError, match="scan_s" if "pattern" in wrong else next(iter(wrong))):
         ScannerParams(**wrong)

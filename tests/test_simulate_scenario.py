@@ -55,7 +55,7 @@ def plain():
     return scans()
 
 
-def test_the_builtin_scenario_is_the_one_promised():
+def test_the_builtin_scenario_is_the_documented_one():
     s = load_scenario()
     p = s.params
     assert (p.duration_s, p.rate_hz, p.scanner.noise_m, p.scanner.outlier_ratio) == (120.0, 5.0, 0.008, 0.02)
@@ -112,7 +112,7 @@ def test_a_fault_leaves_all_other_scans_as_they_were(plain):
                 assert run[scan.seq].fault is None
 
 
-def test_the_truth_knows_nothing_of_faults(plain):
+def test_faults_do_not_change_the_truth(plain):
     for kind in Kind:
         for scan in scans(fault(kind.value)):
             assert_allclose(scan.truth.matrix, plain[scan.seq].truth.matrix, atol=0)
@@ -243,7 +243,7 @@ def test_without_a_start_table_there_is_no_first_belief():
     assert simulate(scenario("[start]\n"), SURFACE).header.start is not None
 
 
-def test_a_run_table_is_handed_through():
+def test_a_run_table_is_passed_on():
     assert scenario("[run]\nbackend = 'kiss'\n[run.horn]\nn_max = 3\n").params.run == {
         "backend": "kiss",
         "horn": {"n_max": 3},

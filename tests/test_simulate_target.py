@@ -103,7 +103,7 @@ def test_mass_properties_agree_with_trimesh_for_every_shape():
         assert_allclose(found.inertia_c, mesh.moment_inertia / mesh.volume, atol=1e-12)
 
 
-def test_repeated_corners_as_in_stl_change_nothing():
+def test_repeated_vertices_as_in_stl_change_nothing():
     surface = builtin_surface(Shape.BRACKET)
     corners = surface.vertices[surface.faces].reshape(-1, 3)
     soup = Surface(corners, np.arange(len(corners), dtype=np.int32).reshape(-1, 3), "soup", "")

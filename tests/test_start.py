@@ -63,7 +63,7 @@ def test_a_reference_is_called_a_fit_and_never_truth(cli, fixtures_folder):
     assert "Errors against the fitted motion" in printed
 
 
-def test_consistency_is_told_block_by_block(cli, fixtures_folder):
+def test_consistency_is_reported_by_block(cli, fixtures_folder):
     document = json.loads(cli("run", fixtures_folder / "tumble.mcap", "--json").out)
     blocks = document["summary"]["nees_blocks"]
     assert set(blocks) == {"attitude", "rate", "position", "velocity", "sigma", "varrho", "mu"}

@@ -51,7 +51,7 @@ def test_a_grid_is_every_combination_and_every_repeat(tmp_path):
         assert table["duration_s"] == 4.0
 
 
-def test_what_is_not_set_is_as_the_scenario_has_it(tmp_path):
+def test_unset_values_come_from_the_scenario(tmp_path):
     table = tables(plan_of(tmp_path, BASE))[0]
     base = tomllib.loads(load_scenario().text)
     for key in ("motion", "fault", "start", "target", "rate_hz"):
@@ -91,7 +91,7 @@ set = { "scenario.scanner.noise_m" = 0.05, "scenario.fault.0.start_s" = 3.0 }
     assert near["fault"][1:] == noisy["fault"][1:]
 
 
-def test_draws_follow_their_law_and_do_not_disturb_each_other(tmp_path):
+def test_draws_follow_their_distribution_and_are_independent(tmp_path):
     head = "repeats = 300\n[set]\n"
     one = '[[draw]]\nkey = "scenario.scanner.noise_m"\nkind = "uniform"\nlow = 0.01\nhigh = 0.02\n'
     two = '[[draw]]\nkey = "scenario.motion.attitude_xyzw"\nkind = "attitude"\n'

@@ -71,7 +71,7 @@ def test_kinds_are_summed_over_their_windows():
     assert (none.peak_used, none.peak_flagged) == (Peak(0.02, 1.0), Peak())
 
 
-def test_a_kind_without_scans_stands_all_the_same():
+def test_a_kind_without_scans_has_a_row():
     dropped = kinds_of_fault(episode_lines(EPISODES), [])["dropped"]
     assert (dropped.scans, dropped.flagged, dropped.episodes, dropped.detected.share) == (0, None, 1, 1.0)
     assert (dropped.delay_s, dropped.recovery_s, dropped.recovery_scans) == (
@@ -116,7 +116,7 @@ def test_the_campaign_of_faults_has_every_kind_at_three_strengths():
 
 
 @pytest.mark.parametrize("name", ["weak", "medium", "strong"])
-def test_windows_of_the_campaign_stand_apart(name):
+def test_windows_of_the_campaign_do_not_overlap(name):
     params = load_scenario(CAMPAIGN.parent.parent / "scenarios" / f"faults-{name}.toml").params
     ends = [(f.start_s, f.start_s + f.duration_s) for f in params.fault]
     assert all(a[1] + 4.0 < b[0] for a, b in itertools.pairwise(ends))

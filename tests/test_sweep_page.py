@@ -52,7 +52,7 @@ def summary():
     return SweepSummary("a & b", 8, 8, {"ok": 8}, cells, detector)
 
 
-def test_the_page_is_well_formed_and_needs_nothing_else(summary):
+def test_the_page_is_well_formed_and_self_contained(summary):
     page = build_sweep_page(summary)
     checker = Checker()
     checker.feed(page)
@@ -71,7 +71,7 @@ def test_text_from_the_campaign_is_escaped(summary):
     assert "<title>a &amp; b - avsreplay</title>" in page
 
 
-def test_figures_stand_where_their_numbers_are(summary):
+def test_figures_are_placed_at_their_values(summary):
     page = build_sweep_page(summary)
     (dot, *_) = re.findall(r'class="dot" cx="([\d.]+)"', page)
     ends = re.findall(r'<text x="([\d.]+)" y="32" text-anchor="middle">([\d.]+)<', page)
@@ -94,7 +94,7 @@ def _cells(text):
     return [re.findall(r"<t[dh][^>]*>(.*?)</t[dh]>", row) for row in rows]
 
 
-def test_faults_by_kind_stand_together_false_alarms_first(summary):
+def test_faults_are_grouped_by_kind_with_false_alarms_first(summary):
     frozen = FaultKind(
         harmful=True,
         strengths=(),

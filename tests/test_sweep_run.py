@@ -133,7 +133,7 @@ def test_faults_by_kind_need_no_lines_a_scan(campaign, reference, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_limit_is_taken_up_where_it_ended(campaign, reference, tmp_path):
+def test_a_limited_campaign_is_resumed(campaign, reference, tmp_path):
     first = sweep(campaign, tmp_path / "out", "--workers", "0", "--limit", "4")
     assert "4 of 6 runs done" in first.output
     journal = (tmp_path / "out" / "journal.txt").read_bytes()
@@ -146,7 +146,7 @@ def test_a_limit_is_taken_up_where_it_ended(campaign, reference, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_killed_campaign_is_taken_up_again(campaign, reference, tmp_path):
+def test_a_killed_campaign_is_resumed(campaign, reference, tmp_path):
     args = [sys.executable, "-m", "avsreplay", "sweep", str(campaign), "-o", str(tmp_path / "out"), "--workers", "0"]
     process = subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     journal = tmp_path / "out" / "journal.txt"
@@ -199,7 +199,7 @@ def test_a_run_that_fails_is_a_row_and_exit_4(campaign, tmp_path):
     assert "4 of 6 runs done (4 ok)" in retried.output
 
 
-def test_a_run_that_breaks_is_a_row_too(monkeypatch):
+def test_a_run_that_raises_is_a_row(monkeypatch):
     def broken(task):
         raise ZeroDivisionError("by nought\nsecond line")
 
@@ -224,7 +224,7 @@ def test_recorded_logs_are_swept_as_well(tmp_path):
     assert said["status"] == {"ok": 2}
 
 
-def test_a_plan_is_only_told(campaign, tmp_path):
+def test_a_dry_run_only_prints_the_plan(campaign, tmp_path):
     done = CliRunner().invoke(command.command, [str(campaign), "--plan"])
     assert done.output.startswith("small: 6 runs, 2 combinations x 3 repeats\n  scanner.noise_m=0.004\n")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["small.toml"]

@@ -45,7 +45,7 @@ def test_an_interval_is_given_only_where_it_has_its_coverage():
     assert rate(1, 2).low is not None
 
 
-def test_consistency_band_holds_right_runs():
+def test_the_consistency_band_holds_consistent_runs():
     rng = np.random.Generator(np.random.PCG64(2))
     inside = 0
     for _ in range(200):
