@@ -193,11 +193,19 @@ class LogHeader:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """What a back end returns: T_ca (scan {A} into model {C}), iterations, its own convergence flag."""
+    """What a back end returns.
+
+    Attributes:
+        T_ca: pose that takes the scan {A} into the model {C}.
+        iterations: passes made.
+        converged: the back end's own convergence flag.
+        matches: ``IcpResult.matches`` of the last pass, None if there is none; saves time, never changes a result.
+    """
 
     T_ca: Pose
     iterations: int
     converged: bool
+    matches: Any = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -314,6 +314,57 @@ def test_keeping_neighbours_gives_the_same_bits(target: Surface) -> None:
     assert everything(model, scan, FACING) == everything(model, scan, replace(FACING, keep=False))
 
 
+@pytest.mark.parametrize("rule", [IcpParams(few=200), IcpParams(few=200, facing=True)], ids=["both sides", "facing"])
+def test_a_part_of_the_scan_leads_to_the_fixed_point_of_the_whole(target: Surface, rule: IcpParams) -> None:
+    """One more pass of Horn's over all points stays, for any number of threads, with and without kept neighbours."""
+    scan = scan_of(soup(600, seed=14), 5003, 20)
+    model = SurfaceIndex.build(target, 0.4)
+    found = model.icp(scan, GUESS, rule)
+    assert found.converged
+    assert found.searched < found.iterations * len(scan) / 2
+    horn = IcpParams(n_max=1, n_plane=0, newton=False, gate_m=found.gate_m, facing=rule.facing)
+    on = model.icp(scan, found.T_ca, horn)
+    assert on.step_rad < 1e-5
+    assert on.step_m < 1e-6 * model.extent_m
+    for other in (replace(rule, threads=3), replace(rule, keep=False)):
+        assert everything(model, scan, other) == everything(model, scan, rule)
+
+
+def test_a_part_of_the_scan_without_overlap_is_not_used() -> None:
+    """Where the part finds too few inliers all points begin at the guess."""
+    mesh = soup(600, seed=14)
+    model = SurfaceIndex.build(mesh, 0.4)
+    scan = np.full((6000, 3), 50.0)
+    inliers = scan_of(mesh, 40, 21)
+    scan[7 : 7 + len(inliers)] = inliers
+    a, b = model.icp(scan, GUESS, IcpParams(few=6)), model.icp(scan, GUESS)
+    np.testing.assert_array_equal(a.T_ca, b.T_ca)
+
+
+@pytest.mark.parametrize("facing", [False, True])
+@pytest.mark.parametrize("gate", [0.05, 0.2, 0.39])
+def test_matches_of_the_alignment_do_not_change_the_evidence(target: Surface, facing: bool, gate: float) -> None:
+    """Also far from the pose of the alignment, with a wider gate, and for another scan of the same length."""
+    model = SurfaceIndex.build(target, 0.4)
+    scan, other = scan_of(soup(600, seed=14), 3000, 23), scan_of(soup(600, seed=14), 3000, 24)
+    found = model.icp(scan, GUESS, IcpParams(facing=facing, gate_m=0.2))
+    near, far = Pose.from_matrix(found.T_ca), Pose(exp([0.0, 0.05, 0.0]), [0.1, 0.0, 0.0])
+    for points, T in ((scan, near), (scan, far @ near), (other, near)):
+        plain = model.evidence(points, T, gate, 0.3, 24, facing=facing)
+        begun = model.evidence(points, T, gate, 0.3, 24, facing=facing, matches=found.matches, threads=2)
+        for name in ("points", "inliers", "sum_d2", "median_m", "centre", "counts", "normals", "gradients"):
+            assert np.asarray(getattr(plain, name)).tobytes() == np.asarray(getattr(begun, name)).tobytes(), name
+
+
+def test_looks_counts_the_points_on_faces_that_face_the_camera(target: Surface) -> None:
+    model = SurfaceIndex.build(target, 0.4)
+    scan, T = scan_of(soup(600, seed=14), 700, 25), Pose(exp([0.1, 0.0, 0.2]), [0.3, -2.0, 0.1])
+    found = model.closest(T.apply(scan[::3]))
+    near = found.id >= 0
+    facing = np.sum(found.normal[near] * (T.t - found.foot[near]), axis=1) > 0.0
+    assert model.looks(scan, T, 3) == (np.count_nonzero(near), np.count_nonzero(facing))
+
+
 def test_any_instruction_set_gives_the_same_bits(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 5003, 18)
     fast, plain = SurfaceIndex.build(target, 0.4), SurfaceIndex.build(target, 0.4, portable=True)

@@ -5,6 +5,13 @@ from numpy.typing import NDArray
 
 LAYOUT: int
 
+def keep_patches(
+    normals: NDArray[np.float64], counts: NDArray[np.int64], most: float, least: int
+) -> NDArray[np.bool_]: ...
+def jackknife(normals: NDArray[np.float64], gradients: NDArray[np.float64], alone: float) -> NDArray[np.float64]: ...
+
+class Matches: ...
+
 class Index:
     @overload
     def __init__(
@@ -37,6 +44,7 @@ class Index:
         keep: bool = False,
         facing: bool = False,
         newton: bool = False,
+        few: int = 0,
     ) -> tuple[Any, ...]: ...
     def normal_equations(
         self,
@@ -55,7 +63,9 @@ class Index:
         least_patches: int,
         facing: bool = False,
         threads: int = 1,
+        matches: Matches | None = None,
     ) -> tuple[Any, ...]: ...
+    def looks(self, points: NDArray[Any], T_ca: NDArray[np.float64], stride: int) -> tuple[int, int]: ...
     @property
     def nbytes(self) -> int: ...
     @property

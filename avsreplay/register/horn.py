@@ -13,6 +13,7 @@ from avsreplay.register.backend import Target
 from avsreplay.register.surface_index import IcpParams
 
 PLANE_PASSES = 3
+FEW_POINTS = 1000  # of a scan that has many more, for the first passes
 
 
 class HornBackend:
@@ -37,6 +38,7 @@ class HornBackend:
         self._rule = IcpParams(
             n_max=limits.n_max,
             n_plane=min(PLANE_PASSES, limits.n_max),
+            few=FEW_POINTS,
             gate_m=limits.reach_m,
             floor_m=limits.gate_m,
             eps_rad=limits.eps_rad,
@@ -55,4 +57,4 @@ class HornBackend:
     def _run(self, points: NDArray[Any], guess: Pose, rule: IcpParams) -> Fit:
         facing = self._visibility.camera_c(self._index, points, guess) is not None
         found = self._index.icp(points, guess, replace(rule, facing=facing))
-        return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged)
+        return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches)

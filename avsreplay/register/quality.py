@@ -16,7 +16,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.params import RegisterParams, RegistrationLimits
-from avsreplay.register.surface_index import Closest, SurfaceIndex
+from avsreplay.register.surface_index import Closest, SurfaceIndex, kernel_module
 from avsreplay.register.visibility import Visibility
 
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
@@ -25,6 +25,7 @@ LEAST_PATCHES = 24
 COVARIANCE_FACTOR = 1.1
 DOMINANT = 0.5  # a patch that contributes more than this share of the information on some motion is left out
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
+MIN_POINTS = 6  # no patch is left out where fewer points would remain
 ALONE = 1e-9  # keeps a motion finite that only one patch determines
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
@@ -64,13 +65,15 @@ def evidence(
     T_ca: Pose,
     gate_m: float,
     noise_m: float | None = None,
+    matches: Any = None,
 ) -> Evidence:
     """Return the sums for ``points`` (n, 3) in {A} [m] at ``T_ca``; ``noise_m`` None: estimated from the residuals.
 
     A patch is what lies in one cube; each point is its own patch if there are not more than ``LEAST_PATCHES`` cubes.
     """
     facing = visibility.camera_c(index, points, T_ca) is not None
-    found = index.evidence(points, T_ca, gate_m, PATCH_OF_EXTENT * index.extent_m, LEAST_PATCHES, facing=facing)
+    size = PATCH_OF_EXTENT * index.extent_m
+    found = index.evidence(points, T_ca, gate_m, size, LEAST_PATCHES, facing=facing, matches=matches)
     rms = float(np.sqrt(found.sum_d2 / found.inliers)) if found.inliers else float("nan")
     noise = noise_m or max(SIGMA_PER_MEDIAN * found.median_m, NOISE_FLOOR_OF_GATE * gate_m)
     sums = (found.counts, found.normals, found.gradients)
@@ -119,11 +122,8 @@ def jackknife_covariance(found: Evidence) -> Array:
     the surface); patches are taken as independent. Without patch p, with sums N_p = J'J and g_p = sum of e J, d moves
     by (N - N_p)^-1 g_p = N^-1 (I - N_p N^-1)^-1 g_p: a patch with high leverage moves it by more than its residuals.
     """
-    inverse = np.linalg.pinv(found.normals.sum(axis=0), hermitian=True)
-    left = (1.0 + ALONE) * np.eye(6) - found.normals @ inverse
-    moved = np.linalg.solve(left, found.gradients[:, :, None])[:, :, 0] @ inverse
-    P: Array = moved.T @ moved
-    return 0.5 * (P + P.T)
+    P: Array = kernel_module().jackknife(*_contiguous(found.normals, found.gradients), ALONE)
+    return P
 
 
 def without_dominant_patches(found: Evidence) -> Evidence:
@@ -132,15 +132,15 @@ def without_dominant_patches(found: Evidence) -> Evidence:
     Example: the barely visible side of a box is determined by a few points next to its edge, which may belong to the
     neighbouring side.
     """
-    while True:
-        share = found.normals @ np.linalg.pinv(found.normals.sum(axis=0), hermitian=True)
-        lone = np.trace(share, axis1=1, axis2=2) > DOMINANT  # the largest eigenvalue is at most the trace
-        lone[lone] = np.linalg.eigvals(share[lone]).real.max(axis=1, initial=0.0) > DOMINANT
-        keep = ~lone
-        if not lone.any() or found.counts[keep].sum() < 6:
-            return found
-        sums = {"normals": found.normals[keep], "gradients": found.gradients[keep]}
-        found = replace(found, counts=found.counts[keep], **sums)
+    keep = kernel_module().keep_patches(*_contiguous(found.normals), found.counts, DOMINANT, MIN_POINTS)
+    if keep.all():
+        return found
+    sums = {"normals": found.normals[keep], "gradients": found.gradients[keep]}
+    return replace(found, counts=found.counts[keep], **sums)
+
+
+def _contiguous(*arrays: Array) -> tuple[Array, ...]:
+    return tuple(np.ascontiguousarray(each, dtype=np.float64) for each in arrays)
 
 
 def grade(
@@ -157,7 +157,7 @@ def grade(
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
-    found = evidence(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m)
+    found = evidence(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m, fit.matches)
     overlap = found.inliers >= max(params.min_inliers, params.min_inlier_ratio * found.points)
     found = without_dominant_patches(found) if overlap else found
     total = found.normals.sum(axis=0)

@@ -15,7 +15,7 @@ Normal
     vertex. For a point cloud: the eigenvector of the smallest eigenvalue of the scatter of the 10 nearest points; its
     sign is arbitrary.
 Degenerate triangles
-    Triangles without area are left out of the index and counted in ``dropped``.
+    Triangles without area are left out and counted in ``dropped``.
 """
 
 from __future__ import annotations
@@ -48,9 +48,7 @@ class IcpParams(Settings):
     """
 
     n_max: int = setting(100, "Largest number of passes of both kinds.", low=1)
-    n_plane: int = setting(
-        3, "Point-to-plane passes before Horn's; fewer are made once a step meets the stopping rule.", low=0
-    )
+    n_plane: int = setting(3, "Largest number of point-to-plane passes before Horn's.", low=0)
     newton: bool = setting(True, "Take Newton steps towards the fixed point of Horn's iteration.")
     gate_m: float | None = setting(None, "First rejection distance.", unit="m", low=0.0, unset="the reach of the index")
     tighten: float = setting(3.0, "Gate in units of the rms of the last pass; 0 keeps it constant.", low=0.0)
@@ -61,9 +59,8 @@ class IcpParams(Settings):
     )
     threads: int = setting(1, "Largest number of threads; the result is identical to the bit for any number.", low=1)
     facing: bool = setting(False, "Match only faces that face the camera (origin of {A}); needs outward faces.")
-    keep: bool = setting(
-        True, "Keep a correspondence while it provably cannot change; the result is identical to the bit."
-    )
+    few: int = setting(0, "Points of the scan with which a much larger scan is aligned first; 0: none.", low=0)
+    keep: bool = setting(True, "Keep a correspondence while it provably cannot change; does not change a result.")
 
     def check(self) -> None:
         """Raise ValueError where more point-to-plane passes are asked for than passes."""
@@ -94,6 +91,7 @@ class IcpResult:
         step_rad, step_m: the last step.
         ignored: points with a coordinate that is not finite.
         searched: neighbour searches made over all passes.
+        matches: opaque; shortens the search of :meth:`SurfaceIndex.evidence` for the same points.
     """
 
     T_ca: Array
@@ -106,6 +104,7 @@ class IcpResult:
     step_m: float
     ignored: int
     searched: int
+    matches: Any = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,7 +165,7 @@ class SurfaceIndex:
         reach_m: no closest point is searched at this distance or farther.
         extent_m: diagonal of the bounding box of the surface.
         primitives: triangles or points in the index.
-        dropped: triangles without area, left out.
+        dropped: triangles without area.
         restored: the index was read from the cache instead of built.
     """
 
@@ -205,11 +204,10 @@ class SurfaceIndex:
         kept = _with_area(vertices, faces)
         if len(faces) and not len(kept):
             raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
-        kernel = _kernel()
+        kernel = kernel_module()
         size = len(kept) if len(faces) else len(vertices)
         path = None if cache_dir is None else index_cache.cache_path(cache_dir, kernel.LAYOUT, vertices, faces, reach_m)
-        saved = None if path is None else index_cache.read(path)
-        index = None if saved is None else _restored(kernel, saved, size, len(faces) or size, len(faces) > 0, portable)
+        index = None if path is None else _restored(kernel, path, size, len(faces), portable)
         restored = index is not None
         index = index or kernel.Index(vertices, faces, kept, float(reach_m), threads, portable)
         if path is not None and not restored:
@@ -226,15 +224,15 @@ class SurfaceIndex:
 
         With ``camera_c`` (3,) [m] only faces that face this position are searched; a point cloud is searched whole.
         """
-        camera = None if camera_c is None else tuple(np.asarray(camera_c, dtype=np.float64).reshape(3).tolist())
+        camera = None if camera_c is None else tuple(float(x) for x in np.reshape(camera_c, 3))
         return Closest(*self._index.closest(_points(points), threads, camera))
 
     def icp(self, points: NDArray[Any], T_ca: ArrayLike | Pose, params: IcpParams | None = None) -> IcpResult:
         """Align the scan ``points`` (n, 3) [m] in {A} to the model from the guess ``T_ca`` (4, 4).
 
-        Point-to-plane passes come first, then Newton's method goes to the fixed point of Horn's point-to-point
-        iteration (eq:ICP), which is a stationary point of the sum of squared distances. A Newton step that raises the
-        sum is replaced by Horn's step. The last pass is Horn's and verifies the fixed point.
+        Point-to-plane passes, then Newton's method to the fixed point of Horn's point-to-point iteration (eq:ICP), a
+        stationary point of the sum of squared distances. A Newton step that raises the sum is replaced by Horn's. The
+        last pass is Horn's over all points and verifies the fixed point.
         The rotation of the guess is re-orthonormalised. With fewer than 6 inliers the loop ends, not converged.
         """
         params = params or IcpParams()
@@ -242,7 +240,7 @@ class SurfaceIndex:
         floor = self.extent_m / 500.0 if params.floor_m is None else params.floor_m
         eps_m = 1e-6 * self.extent_m if params.eps_m is None else params.eps_m
         rule = (params.n_max, params.n_plane, gate, params.tighten, floor, params.eps_rad, eps_m)
-        flags = (params.threads, params.keep, params.facing, params.newton)
+        flags = (params.threads, params.keep, params.facing, params.newton, params.few)
         return IcpResult(*self._index.icp(_points(points), _rigid(T_ca), *rule, *flags))
 
     def normal_equations(
@@ -271,18 +269,26 @@ class SurfaceIndex:
         *,
         threads: int = 1,
         facing: bool = False,
+        matches: Any = None,
     ) -> PatchSums:
         """Return sums over the inliers of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4).
 
         A patch is what lies in one cube of side ``patch_m`` [m] in {C}; with at most ``least_patches`` occupied cubes
-        each point is a patch. ``facing``: as in :class:`IcpParams`.
+        each point is a patch. ``facing``: as in :class:`IcpParams`. ``matches``: of an alignment of the same points;
+        it does not change the result.
         """
         gate = min(gate_m, self.reach_m)
-        rule = (gate, patch_m, least_patches, facing, threads)
+        rule = (gate, patch_m, least_patches, facing, threads, matches)
         return PatchSums(*self._index.evidence(_points(points), _rigid(T_ca), *rule))
 
+    def looks(self, points: NDArray[Any], T_ca: ArrayLike | Pose, stride: int) -> tuple[int, int]:
+        """Count every ``stride``-th point (n, 3) with a closest point, and those on a face towards the camera."""
+        found: tuple[int, int] = self._index.looks(_points(points), _rigid(T_ca), stride)
+        return found
 
-def _kernel() -> Any:
+
+def kernel_module() -> Any:
+    """Return the C++ extension. Raises MissingBackend if it is not built."""
     try:
         from avsreplay.register import _kernel
     except ImportError:
@@ -291,10 +297,12 @@ def _kernel() -> Any:
     return _kernel
 
 
-def _restored(kernel: Any, saved: bytes, primitives: int, ids: int, mesh: bool, portable: bool) -> Any:
+def _restored(kernel: Any, path: Path, primitives: int, faces: int, portable: bool) -> Any:
+    """The index in this file; None where there is none or the file is damaged: it is then built again."""
+    saved = index_cache.read(path)
     try:
-        return kernel.Index(saved, primitives, ids, mesh, portable)
-    except ValueError:  # the file is damaged; the index is built again
+        return None if saved is None else kernel.Index(saved, primitives, faces or primitives, faces > 0, portable)
+    except ValueError:
         return None
 
 
@@ -306,8 +314,7 @@ def _points(points: NDArray[Any]) -> NDArray[Any]:
 
 
 def _rigid(T_ca: ArrayLike | Pose) -> Array:
-    pose = T_ca if isinstance(T_ca, Pose) else Pose.from_matrix(T_ca)
-    return pose.matrix
+    return (T_ca if isinstance(T_ca, Pose) else Pose.from_matrix(T_ca)).matrix
 
 
 def _checked(surface: Surface, reach_m: float) -> tuple[Array, NDArray[np.int32]]:
@@ -315,10 +322,9 @@ def _checked(surface: Surface, reach_m: float) -> tuple[Array, NDArray[np.int32]
     faces = np.ascontiguousarray(surface.faces, dtype=np.int32).reshape(-1, 3)
     if not (np.isfinite(reach_m) and reach_m > 0.0):
         raise UsageError(f"reach must be positive, got {reach_m}", where=surface.name, hint="give a distance in metres")
-    if not len(vertices):
-        raise UsageError("the model has no point", where=surface.name, hint="give a mesh or a cloud")
-    if not np.isfinite(vertices).all():
-        raise UsageError("the model has a coordinate that is not finite", where=surface.name, hint="repair the model")
+    if not len(vertices) or not np.isfinite(vertices).all():
+        what = "has a coordinate that is not finite" if len(vertices) else "has no point"
+        raise UsageError(f"the model {what}", where=surface.name, hint="repair the model")
     _check_size(surface, vertices, faces)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UsageError("a face refers to a missing vertex", where=surface.name, hint="repair the model")
@@ -329,11 +335,8 @@ def _check_size(surface: Surface, vertices: Array, faces: NDArray[np.int32]) -> 
     """Raise UsageError for a model that single precision or 32-bit indices cannot represent."""
     largest = float(np.abs(vertices).max())
     if largest > LARGEST_M:
-        what, hint = (
-            f"a coordinate of {largest:.3g} m is too large",
-            "remove stray vertices, or scale the model to metres",
-        )
-        raise UsageError(what, where=surface.name, hint=hint)
+        hint = "remove stray vertices, or scale the model to metres"
+        raise UsageError(f"a coordinate of {largest:.3g} m is too large", where=surface.name, hint=hint)
     if max(len(vertices), len(faces)) > MOST_PRIMITIVES:
         what = f"{len(vertices)} vertices and {len(faces)} faces are more than the limit of {MOST_PRIMITIVES}"
         raise UsageError(what, where=surface.name, hint="simplify the model")

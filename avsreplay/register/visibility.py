@@ -54,11 +54,8 @@ class Visibility:
         """Return the camera position (3,) in {C} [m] if the test applies to this scan (n, 3) and pose, else None."""
         if not (self.sided and self._clear(T_ca.t)):
             return None
-        few = points[:: max(1, len(points) // TESTED_POINTS)]
-        found = index.closest(T_ca.apply(few))
-        matched = found.id >= 0
-        facing = np.einsum("ij,ij->i", found.normal[matched], T_ca.t - found.foot[matched]) > 0.0
-        return T_ca.t if facing.sum() >= LEAST_FACING * matched.sum() else None
+        matched, facing = index.looks(points, T_ca, max(1, len(points) // TESTED_POINTS))
+        return T_ca.t if facing >= LEAST_FACING * matched else None
 
     def direction_to_camera(self, points: NDArray[Any]) -> Array | None:
         """Return the unit direction (3,) from a scan (n, 3) in {A} to the camera; None if its position is unknown."""

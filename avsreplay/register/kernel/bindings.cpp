@@ -144,19 +144,22 @@ class Index {
   }
 
   nb::tuple icp(nb::handle points, const Doubles& T_ca, int n_max, int n_plane, double gate, double tighten,
-                double floor, double eps_rad, double eps_m, int threads, bool keep, bool facing, bool newton) const {
+                double floor, double eps_rad, double eps_m, int threads, bool keep, bool facing, bool newton,
+                int64_t few) const {
     const Cloud cloud(points);
     const View v = cloud.view();
     const Rows T = rows(T_ca);
-    const Rule rule{n_max, n_plane, gate, tighten, floor, eps_rad, eps_m, facing, keep, newton};
+    require(few == 0 || few >= 6, "a part of the scan must have at least 6 points");
+    const Rule rule{n_max, n_plane, few, gate, tighten, floor, eps_rad, eps_m, facing, keep, newton};
     Outcome o;
+    Matches matches;
     {
       nb::gil_scoped_release release;
       Team team(threads);
-      o = avs::icp(store_, code(), v, T.v, rule, team);
+      o = avs::icp(store_, code(), v, T.v, rule, team, matches);
     }
     return nb::make_tuple(matrix(o.T), o.passes, o.converged, o.inliers, o.rms, o.gate, o.turn, o.move, o.ignored,
-                          o.searched);
+                          o.searched, nb::cast(std::move(matches)));
   }
 
   nb::tuple normal_equations(nb::handle points, const Doubles& T_ca, double gate, int threads, bool facing) const {
@@ -180,7 +183,7 @@ class Index {
   }
 
   nb::tuple evidence(nb::handle points, const Doubles& T_ca, double gate, double side, int least, bool facing,
-                     int threads) const {
+                     int threads, const Matches* matches) const {
     require(gate > 0 && side > 0, "gate and patch size must be positive");
     const Cloud cloud(points);
     const View v = cloud.view();
@@ -189,7 +192,7 @@ class Index {
     {
       nb::gil_scoped_release release;
       Team team(threads);
-      e = avs::evidence(store_, code(), v, T.v, {gate, side, least, facing}, team);
+      e = avs::evidence(store_, code(), v, T.v, {gate, side, least, facing}, team, matches);
     }
     const size_t m = e.patches.size();
     double *N, *g, *c;
@@ -205,6 +208,19 @@ class Index {
     }
     std::memcpy(c, e.centre, sizeof e.centre);
     return nb::make_tuple(e.points, e.inliers, e.sum_d2, e.median, centre, counts, normals, gradients);
+  }
+
+  nb::tuple looks(nb::handle points, const Doubles& T_ca, int64_t stride) const {
+    require(stride > 0, "the stride must be positive");
+    const Cloud cloud(points);
+    const View v = cloud.view();
+    const Rows T = rows(T_ca);
+    Looks found;
+    {
+      nb::gil_scoped_release release;
+      found = avs::looks(store_, code(), v, T.v, stride);
+    }
+    return nb::make_tuple(found.matched, found.facing);
   }
 
   size_t bytes() const { return store_.bytes(); }
@@ -249,10 +265,41 @@ class Index {
   bool portable_;
 };
 
+using Patches = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
+using Counts = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+
+void check_patches(const Patches& normals) {
+  require(normals.ndim() == 3 && normals.shape(1) == 6 && normals.shape(2) == 6, "the sums of patches must be (m, 6, 6)");
+}
+
+nb::ndarray<nb::numpy, bool> keep_patches(const Patches& normals, const Counts& counts, double most, int64_t least) {
+  check_patches(normals);
+  require(counts.ndim() == 1 && counts.shape(0) == normals.shape(0), "there must be a count for each patch");
+  bool* keep;
+  auto out = array<bool>({normals.shape(0)}, &keep);
+  std::vector<uint8_t> kept(normals.shape(0), 1);
+  drop_dominant(normals.data(), counts.data(), (int64_t)kept.size(), most, least, kept.data());
+  std::copy(kept.begin(), kept.end(), keep);
+  return out;
+}
+
+Numpy jackknife_of(const Patches& normals, const Patches& gradients, double alone) {
+  check_patches(normals);
+  require(gradients.ndim() == 2 && gradients.shape(0) == normals.shape(0) && gradients.shape(1) == 6,
+          "the gradients of patches must be (m, 6)");
+  double* P;
+  Numpy out = array<double>({6, 6}, &P);
+  jackknife(normals.data(), gradients.data(), (int64_t)normals.shape(0), alone, P);
+  return out;
+}
+
 }  // namespace
 
 NB_MODULE(_kernel, m) {
   m.attr("LAYOUT") = LAYOUT;
+  nb::class_<Matches>(m, "Matches");
+  m.def("keep_patches", &keep_patches, nb::arg("normals"), nb::arg("counts"), nb::arg("most"), nb::arg("least"));
+  m.def("jackknife", &jackknife_of, nb::arg("normals"), nb::arg("gradients"), nb::arg("alone"));
   nb::class_<Index>(m, "Index")
       .def(nb::init<Doubles, Ints, Ints, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
            nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
@@ -263,11 +310,14 @@ NB_MODULE(_kernel, m) {
            nb::arg("camera_c").none() = nb::none())
       .def("icp", &Index::icp, nb::arg("points"), nb::arg("T_ca"), nb::arg("n_max"), nb::arg("n_plane"),
            nb::arg("gate_m"), nb::arg("tighten"), nb::arg("floor_m"), nb::arg("eps_rad"), nb::arg("eps_m"),
-           nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false, nb::arg("newton") = false)
+           nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false, nb::arg("newton") = false,
+           nb::arg("few") = 0)
       .def("normal_equations", &Index::normal_equations, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"),
            nb::arg("threads") = 1, nb::arg("facing") = false)
       .def("evidence", &Index::evidence, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"), nb::arg("patch_m"),
-           nb::arg("least_patches"), nb::arg("facing") = false, nb::arg("threads") = 1)
+           nb::arg("least_patches"), nb::arg("facing") = false, nb::arg("threads") = 1,
+           nb::arg("matches").none() = nb::none())
+      .def("looks", &Index::looks, nb::arg("points"), nb::arg("T_ca"), nb::arg("stride"))
       .def_prop_ro("nbytes", &Index::bytes)
       .def_prop_ro("isa", &Index::isa)
       .def_prop_ro("shape", &Index::shape);

@@ -1,7 +1,6 @@
 // The quality of a pose: what its inliers tell, summed over patches of the model.
 #pragma once
-#include "hot.hpp"
-#include "team.hpp"
+#include "loop.hpp"
 
 namespace avs {
 
@@ -25,8 +24,24 @@ struct PatchRule {
   bool facing;
 };
 
-// T: rows of [R t], scan into {C}. Points that are not finite are left out.
+// T: rows of [R t], scan into {C}. Points that are not finite are left out. `matches`: of an alignment of the same scan
+// that ended near T, or null; it shows in the time, never in the result.
 Evidence evidence(const Store& store, const Code& code, const View& points, const double* T, const PatchRule& rule,
-                  Team& team);
+                  Team& team, const Matches* matches);
+
+// How many of every `stride`-th point have a closest point, and how many of those lie on a face that faces t of T.
+struct Looks {
+  int64_t matched = 0, facing = 0;
+};
+Looks looks(const Store& store, const Code& code, const View& points, const double* T, int64_t stride);
+
+// The rest works on m patches: normals (m, 6, 6), gradients (m, 6).
+
+// Clears in `keep` the patches that give more than `most` of the information on some motion of the patches kept, again
+// until there is none. Stops, with `keep` as it was, where fewer than `least` of the `counts` points would be left.
+void drop_dominant(const double* normals, const int64_t* counts, int64_t m, double most, int64_t least, uint8_t* keep);
+
+// P (6, 6) = sum over the patches p of m_p m_p', m_p = N^+ ((1 + alone) I - N_p N^+)^-1 g_p with N the sum of all N_p.
+void jackknife(const double* normals, const double* gradients, int64_t m, double alone, double* P);
 
 }  // namespace avs

@@ -51,6 +51,13 @@ struct Feet {
   double* normal;   // (n, 3)
 };
 
+// A point of the scan and its foot at a pose, both in {C}; `inlier`: the foot is nearer than the gate.
+struct Match {
+  double p[3], n[3];  // the point, and the normal at its foot
+  double e, d2;       // n . (p - foot), and the squared distance
+  bool inlier;
+};
+
 // A cell near a block: the cell's number, the block, their distance in steps.
 struct Near {
   uint64_t cell;
@@ -67,6 +74,8 @@ struct Code {
   void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Facing&, bool sided, const Feet&);
   void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
   void (*pass)(const Store&, const View&, int64_t first, int64_t last, const Look&, Kept*, Sums&);
+  // `kept`: where the searches begin, or null; what is said there must hold for the eye and the gate of `look`.
+  void (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out);
 };
 
 const Code& code_base();

@@ -10,21 +10,20 @@
 namespace avs {
 namespace {
 
-constexpr int64_t MIN_INLIERS = 6;
-
 // Where each point was and what was nearest to it: where its next search begins, or, while it provably cannot have
 // changed, its neighbour. This shows in the time, never in the result.
 class Memory {
  public:
   Memory(const Store& s, int64_t n, bool allowed)
-      : extent_(s.extent), longest_(allowed ? MOST_OF_GRAIN * s.grain : 0), kept_((size_t)n, Kept{0, 0, 0, -1.f, -1}) {}
+      : extent_(s.extent), grain_(s.grain), longest_(allowed ? MOST_OF_GRAIN * s.grain : 0), kept_((size_t)n, Kept{0, 0, 0, -1.f, -1}) {}
 
   Kept* data() { return kept_.data(); }
+  std::vector<Kept> take() { return std::move(kept_); }
 
   // How much farther than the nearest primitive the others must be known for the neighbours to outlast the next steps.
   float lead(double turn, double move) const {
     const double wanted = STEPS * (move + 0.5 * turn * extent_);
-    return wanted < longest_ ? (float)wanted : 0.f;
+    return wanted < longest_ ? (float)std::max(wanted, LEAST_OF_GRAIN * grain_) : 0.f;
   }
 
   void forget_radii() {
@@ -32,8 +31,8 @@ class Memory {
   }
 
  private:
-  static constexpr double MOST_OF_GRAIN = 0.2, STEPS = 4.0;
-  double extent_, longest_;
+  static constexpr double MOST_OF_GRAIN = 0.2, LEAST_OF_GRAIN = 0.02, STEPS = 4.0;
+  double extent_, grain_, longest_;
   std::vector<Kept> kept_;
 };
 
@@ -55,6 +54,7 @@ class Sides {
   }
 
   const Facing& facing() const { return facing_; }
+  Facing take() { return std::move(facing_); }
 
  private:
   const Store& s_;
@@ -109,7 +109,98 @@ class Newton {
   bool used_ = false;
 };
 
+// Every n / m-th point of a scan, at a place within its n / m points that follows no pattern of rows and columns.
+std::vector<double> part(const View& v, int64_t m) {
+  std::vector<double> few((size_t)(3 * m));
+  uint32_t state = 1;
+  for (int64_t k = 0; k < m; ++k) {
+    state = state * 1664525u + 1013904223u;  // Numerical Recipes' generator
+    const int64_t first = k * v.n / m, size = (k + 1) * v.n / m - first, i = first + (int64_t)((uint64_t)(state >> 8) * (uint64_t)size >> 24);
+    for (int a = 0; a < 3; ++a) {
+      const char* at = v.data + i * v.row + a * v.column;
+      float x;
+      double y;
+      v.single ? (void)std::memcpy(&x, at, sizeof x) : (void)std::memcpy(&y, at, sizeof y);
+      few[(size_t)(3 * k + a)] = v.single ? (double)x : y;
+    }
+  }
+  return few;
+}
+
+// The passes over one set of points.
+class Passes {
+ public:
+  Passes(const Store& s, const Code& code, const Rule& rule, Team& team, Sides& sides, Outcome& o)
+      : s_(s), code_(code), rule_(rule), team_(team), sides_(sides), o_(o) {}
+
+  // `few`: the points are a part of the scan. Returns whether there were inliers to the end.
+  bool run(const View& v, Memory& memory, bool plane, bool few) {
+    Newton newton;
+    double before[12];
+    const int most = few ? rule_.n_max / 2 : rule_.n_max, last_plane = o_.passes + rule_.n_plane;
+    while (o_.passes < most && !o_.converged) {
+      if (sides_.look_from(o_.T)) memory.forget_radii();
+      const Pass kind = plane ? Pass::plane : rule_.newton ? Pass::newton : Pass::point;
+      const Look look{o_.T, o_.gate, memory.lead(o_.turn, o_.move), kind, rule_.facing, &sides_.facing()};
+      const Sums sums = run_pass(s_, code_, v, look, memory.data(), team_);
+      if (!note(sums)) return false;
+      const double gate = rule_.tighten > 0 ? std::min(o_.gate, std::max(rule_.floor, rule_.tighten * o_.rms)) : o_.gate;
+      const bool steady = gate >= 0.99 * o_.gate;
+      Step step{};
+      if (plane && !plane_step(sums, rule_.gate, step)) return false;
+      if (!plane) step = horn_step(sums);
+      const bool small = step.turn < rule_.eps_rad && step.move < rule_.eps_m && steady;
+      bool settled = !plane;
+      if (kind == Pass::newton) {
+        const double outside = (double)(v.n - o_.ignored - o_.inliers);
+        const Newton::Choice c = newton.choose(sums, outside, o_.gate, rule_.gate, rule_.eps_rad, rule_.eps_m);
+        settled = c.settled;
+        if (c.undo) std::memcpy(o_.T, before, sizeof before);
+        if (!(small && settled)) step = c.step;
+      }
+      o_.converged = small && settled && !few;
+      std::memcpy(before, o_.T, sizeof before);
+      apply(s_, step, o_.T);
+      o_.turn = step.turn, o_.move = step.move;
+      o_.gate = gate;
+      if (few && (small || (steady && !plane && within_error(step)))) return true;
+      plane = plane && o_.passes < last_plane && !small && !(few && steady && within_error(step));
+    }
+    return true;
+  }
+
+ private:
+  static constexpr int64_t MIN_INLIERS = 6;
+
+  bool note(const Sums& sums) {
+    ++o_.passes;
+    o_.inliers = (int64_t)sums.v[0], o_.ignored = (int64_t)sums.v[2], o_.searched += (int64_t)sums.v[3];
+    o_.rms = o_.inliers ? std::sqrt(sums.v[1] / sums.v[0]) : std::numeric_limits<double>::quiet_NaN();
+    return o_.inliers >= MIN_INLIERS;
+  }
+
+  // Whether a step is below the standard error of a mean over the inliers.
+  bool within_error(const Step& step) const {
+    return step.move + 0.25 * step.turn * s_.extent < o_.rms / std::sqrt((double)o_.inliers);
+  }
+
+  const Store& s_;
+  const Code& code_;
+  const Rule& rule_;
+  Team& team_;
+  Sides& sides_;
+  Outcome& o_;
+};
+
+constexpr int64_t MANY = 4;  // times the few points: a scan from which they are taken
+
 }  // namespace
+
+bool Matches::hold(int64_t n, const Vec3& eye, double most, bool looks) const {
+  if ((int64_t)kept.size() != n || looks != sided || most > gate) return false;
+  const Vec3 d{eye.x - facing.eye.x, eye.y - facing.eye.y, eye.z - facing.eye.z};
+  return !sided || std::sqrt(d.x * d.x + d.y * d.y + d.z * d.z) <= facing.margin;
+}
 
 Sums run_pass(const Store& s, const Code& code, const View& v, const Look& look, Kept* kept, Team& team) {
   const int64_t chunks = (v.n + CHUNK - 1) / CHUNK;
@@ -123,45 +214,29 @@ Sums run_pass(const Store& s, const Code& code, const View& v, const Look& look,
   return total;
 }
 
-Outcome icp(const Store& s, const Code& code, const View& v, const double* T, const Rule& rule, Team& team) {
-  Memory memory(s, v.n, rule.keep);
+Outcome icp(const Store& s, const Code& code, const View& v, const double* T, const Rule& rule, Team& team,
+            Matches& matches) {
   Sides sides(s, code, rule.facing);
   Outcome o{};
-  std::memcpy(o.T, T, sizeof o.T);
-  o.gate = rule.gate, o.turn = o.move = worst(), o.rms = std::numeric_limits<double>::quiet_NaN();
-  Newton newton;
-  double before[12];
+  const auto begin = [&] {
+    std::memcpy(o.T, T, sizeof o.T);
+    o.gate = rule.gate, o.turn = o.move = worst(), o.rms = std::numeric_limits<double>::quiet_NaN();
+  };
+  begin();
+  Passes passes(s, code, rule, team, sides, o);
   bool plane = rule.n_plane > 0;
-  while (o.passes < rule.n_max && !o.converged) {
-    if (sides.look_from(o.T)) memory.forget_radii();
-    const Pass kind = plane ? Pass::plane : rule.newton ? Pass::newton : Pass::point;
-    const Look look{o.T, o.gate, memory.lead(o.turn, o.move), kind, rule.facing, &sides.facing()};
-    const Sums sums = run_pass(s, code, v, look, memory.data(), team);
-    ++o.passes;
-    o.inliers = (int64_t)sums.v[0], o.ignored = (int64_t)sums.v[2], o.searched += (int64_t)sums.v[3];
-    o.rms = o.inliers ? std::sqrt(sums.v[1] / sums.v[0]) : std::numeric_limits<double>::quiet_NaN();
-    if (o.inliers < MIN_INLIERS) break;
-    const double gate = rule.tighten > 0 ? std::min(o.gate, std::max(rule.floor, rule.tighten * o.rms)) : o.gate;
-    const bool steady = gate >= 0.99 * o.gate;
-    Step step{};
-    if (plane && !plane_step(sums, rule.gate, step)) break;
-    if (!plane) step = horn_step(sums);
-    const bool small = step.turn < rule.eps_rad && step.move < rule.eps_m && steady;
-    bool settled = !plane;
-    if (kind == Pass::newton) {
-      const double outside = (double)(v.n - o.ignored - o.inliers);
-      const Newton::Choice c = newton.choose(sums, outside, o.gate, rule.gate, rule.eps_rad, rule.eps_m);
-      settled = c.settled;
-      if (c.undo) std::memcpy(o.T, before, sizeof before);
-      if (!(small && settled)) step = c.step;
-    }
-    o.converged = small && settled;
-    std::memcpy(before, o.T, sizeof before);
-    apply(s, step, o.T);
-    o.turn = step.turn, o.move = step.move;
-    o.gate = gate;
-    plane = plane && o.passes < rule.n_plane && !small;
+  if (rule.few > 0 && v.n >= MANY * rule.few) {
+    const std::vector<double> points = part(v, rule.few);
+    const View few{reinterpret_cast<const char*>(points.data()), rule.few, 3 * (int64_t)sizeof(double), sizeof(double), false};
+    Memory memory(s, few.n, rule.keep);
+    if (passes.run(few, memory, plane, true))
+      plane = false;
+    else
+      begin();
   }
+  Memory memory(s, v.n, rule.keep);
+  passes.run(v, memory, plane, false);
+  matches = {memory.take(), sides.take(), o.gate, rule.facing && s.mesh};
   return o;
 }
 

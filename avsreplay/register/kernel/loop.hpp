@@ -1,5 +1,7 @@
 // The whole alignment, and the sums at one pose.
 #pragma once
+#include <vector>
+
 #include "hot.hpp"
 #include "team.hpp"
 
@@ -7,6 +9,7 @@ namespace avs {
 
 struct Rule {
   int n_max, n_plane;
+  int64_t few;  // points of the passes that come first, see `icp`; 0: all points from the first pass on
   double gate, tighten, floor, eps_rad, eps_m;
   bool facing, keep, newton;
 };
@@ -19,8 +22,21 @@ struct Outcome {
   double rms, gate, turn, move;
 };
 
+// What the last pass knew of each point, so that a later question at a pose near by need not search again.
+struct Matches {
+  std::vector<Kept> kept;
+  Facing facing;
+  double gate = 0;     // [m]
+  bool sided = false;
+
+  // Whether what is kept holds for n points seen from `eye`, with feet up to `gate`.
+  bool hold(int64_t n, const Vec3& eye, double gate, bool sided) const;
+};
+
 Sums run_pass(const Store& store, const Code& code, const View& points, const Look& look, Kept* kept, Team& team);
-// T: rows of [R t], scan into {C}.
-Outcome icp(const Store& store, const Code& code, const View& points, const double* T, const Rule& rule, Team& team);
+// T: rows of [R t], scan into {C}. A scan of many more than `rule.few` points is first aligned by that many of its points,
+// until a step is below the error that so few points leave; then all of its points go to the fixed point.
+Outcome icp(const Store& store, const Code& code, const View& points, const double* T, const Rule& rule, Team& team,
+            Matches& matches);
 
 }  // namespace avs

@@ -220,6 +220,36 @@ static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last
 }
 
 template <class Kind>
+static void match_kind(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept,
+                       Match* out) {
+  Chunk c;
+  Sums counts{};
+  const int n = (int)(last - first);
+  gather(s, v, first, n, look.T, kept, c, counts);
+  const Vec3 eye{look.T[3], look.T[7], look.T[11]};
+  Scope o = scope_of(s, *look.facing, false, look.gate, 0.f);
+  if (look.sided && s.mesh) o.eye = &eye;
+  int32_t last_lane = -1;
+  for (int i = 0; i < n; ++i) {
+    const Kept* memory = kept ? kept + first + i : nullptr;
+    if (i + AHEAD < n) fetch_ahead<Kind>(s, c.list[i + AHEAD], memory ? memory + AHEAD : nullptr);
+    Match& m = out[first + i];
+    m.inlier = false;
+    if (c.search[i] == IGNORED) continue;
+    const Query q = query(s, c.c[0][i], c.c[1][i], c.c[2][i]);
+    const int32_t own = memory ? memory->lane : -1;
+    const Best best = is_kept<Kind>(o, c.search[i], memory)
+                          ? keep_one<Kind>(o, q, *memory)
+                          : search_one<Kind>(o, q, c.list[i], own < 0 && !c.list[i] ? last_lane : own, nullptr);
+    last_lane = best.lane;
+    if (best.lane < 0 || !(best.foot.d2 < o.bound2)) continue;
+    const Vec3& normal = s.normals[(size_t)best.lane];
+    m = {{q.x, q.y, q.z}, {normal.x, normal.y, normal.z}, 0, best.foot.d2, true};
+    m.e = normal.x * (q.x - best.foot.x) + normal.y * (q.y - best.foot.y) + normal.z * (q.z - best.foot.z);
+  }
+}
+
+template <class Kind>
 static void closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const Facing& facing, bool sided,
                          const Feet& out) {
   const double nan = std::numeric_limits<double>::quiet_NaN();

@@ -58,23 +58,6 @@ void place(double* D, const double* from, const double* to) {
   for (int i = 0; i < 3; ++i) D[4 * i + 3] = to[i] - (D[4 * i] * from[0] + D[4 * i + 1] * from[1] + D[4 * i + 2] * from[2]);
 }
 
-// Eigenvalues (the diagonal that remains) and eigenvectors (columns of V) of a symmetric 6 x 6 by Jacobi's rotations.
-void eigen6(double (&A)[6][6], double (&V)[6][6]) {
-  for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j) V[i][j] = i == j ? 1 : 0;
-  for (int sweep = 0; sweep < 40; ++sweep) {
-    double off = 0, diagonal = 0;
-    for (int i = 0; i < 6; ++i) {
-      diagonal += A[i][i] * A[i][i];
-      for (int j = i + 1; j < 6; ++j) off += A[i][j] * A[i][j];
-    }
-    if (!(off > 1e-32 * diagonal)) break;
-    for (int i = 0; i < 5; ++i)
-      for (int j = i + 1; j < 6; ++j)
-        if (A[i][j] != 0) rotate_pair(A, V, i, j);
-  }
-}
-
 constexpr double OBSERVABLE = 1e-6;  // least eigenvalue over the largest, with turns in units of the inliers' radius
 
 // b = H^+ b without the directions that are not observable; `radius`: turns times it are lengths.
@@ -132,6 +115,22 @@ void shift(double (&H)[6][6], double* b, const double* c) {
 }
 
 }  // namespace
+
+void eigen6(double (&A)[6][6], double (&V)[6][6]) {
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) V[i][j] = i == j ? 1 : 0;
+  for (int sweep = 0; sweep < 40; ++sweep) {
+    double off = 0, diagonal = 0;
+    for (int i = 0; i < 6; ++i) {
+      diagonal += A[i][i] * A[i][i];
+      for (int j = i + 1; j < 6; ++j) off += A[i][j] * A[i][j];
+    }
+    if (!(off > 1e-32 * diagonal)) break;
+    for (int i = 0; i < 5; ++i)
+      for (int j = i + 1; j < 6; ++j)
+        if (A[i][j] != 0) rotate_pair(A, V, i, j);
+  }
+}
 
 Step horn_step(const Sums& sums) {
   const double* a = sums.v;
