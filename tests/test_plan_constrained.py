@@ -1,6 +1,7 @@
 """Plans under limits: the limits hold between the nodes too, and what does not act changes nothing."""
 
 import math
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan import Limits, PlanParams, Scene, StepPath, constrained, path_of, rendezvous
+from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.limits import margin
 
 ORIGIN = np.zeros(3)
@@ -172,13 +174,49 @@ def test_margin_is_positive_along_a_plan_and_negative_off_it():
 
 
 def test_a_search_that_fails_does_not_claim_impossibility():
-    """The clearance exceeds the corridor's length, so no plan is found; nothing proves that there is none."""
-    scene = replace(body(), surface=lambda y: (np.zeros_like(y), np.linalg.norm(y, axis=1)))
-    limits = Limits(clearance_m=3.0, final_deg=5.0, final_range_m=0.2)
-    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits)
-    free = rendezvous(scene.goal, ORIGIN, ORIGIN, PARAMS)
+    """A very narrow cone on a fast target: no plan is found; nothing proves that there is none."""
+    limits = Limits(cone_deg=0.1, cone_range_m=4.0, mouth_m=1e-4)
+    plan = constrained(body(0.5), ORIGIN, ORIGIN, PARAMS, limits)
+    free = rendezvous(body(0.5).goal, ORIGIN, ORIGIN, PARAMS)
     assert plan.status is PlanStatus.NOT_FOUND
     assert plan.lower_bound_s == free.lower_bound_s
+
+
+def test_a_corridor_inside_the_clearance_is_proven_impossible():
+    scene = replace(body(), surface=lambda y: (np.zeros_like(y), np.linalg.norm(y, axis=1)))
+    shut = constrained(scene, ORIGIN, ORIGIN, PARAMS, Limits(clearance_m=0.6, final_deg=15.0, final_range_m=0.5))
+    assert shut.status is PlanStatus.INFEASIBLE
+    assert constrained(scene, ORIGIN, ORIGIN, PARAMS, Limits(clearance_m=0.4, final_deg=15.0, final_range_m=0.5)).found
+
+
+def test_a_target_that_never_enters_the_workspace_is_proven_impossible():
+    least, most = 4.0, 6.0  # distance of the grasp point from the origin
+    free = rendezvous(body().goal, ORIGIN, ORIGIN, PARAMS)
+    for limits in (Limits(reach_max_m=least - 0.1), Limits(reach_min_m=most + 0.1)):
+        plan = constrained(body(), ORIGIN, ORIGIN, PARAMS, limits)
+        assert plan.status is PlanStatus.INFEASIBLE
+    inside = constrained(body(), ORIGIN, ORIGIN, PARAMS, Limits(reach_max_m=most + 0.1))
+    assert inside.found
+    assert inside.t_go_s == pytest.approx(free.t_go_s, abs=1e-3)
+    # 26 - 10 cos(0.03 t + 0.5) is the squared distance of the grasp point; it reaches 5.5 m at 50.3 s
+    late = constrained(body(), ORIGIN, ORIGIN, PARAMS, Limits(reach_min_m=5.5))
+    exact = (math.acos((26.0 - 5.5**2) / 10.0) - 0.5) / 0.03
+    assert exact - 0.5 <= late.lower_bound_s <= exact
+
+
+def test_a_warm_start_solves_few_programmes(monkeypatch):
+    module = sys.modules["avsreplay.plan.constrained"]
+    scene, limits = replace(body(0.05, phase=1.8), surface=ball), Limits(final_deg=15.0, clearance_m=0.3)
+    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits)
+    path, solved = path_of(plan, ORIGIN, ORIGIN), []
+    monkeypatch.setattr(module, "solve", lambda p: solved.append(p.n) or solve(p))
+    for since_s in np.arange(1.0, plan.t_go_s - 3.0, 2.0):
+        solved.clear()
+        r, v = (x[0] for x in path.at(np.array([since_s])))
+        later = constrained(scene.after(since_s), r, v, PARAMS, limits, warm=(path, since_s))
+        assert later.t_go_s + since_s == pytest.approx(plan.t_go_s, abs=0.1)
+        assert len(solved) <= 6
+        assert max(solved, default=0) <= limits.nodes
 
 
 def test_a_warm_start_gives_the_same_plan():

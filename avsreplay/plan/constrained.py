@@ -14,28 +14,31 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.convexification import (
     BETWEEN,
+    COARSE_NODES,
     Case,
     ReferencePath,
     convex_subproblem,
     dense_margins,
     excess,
+    initial_references,
     interval_fractions,
+    shortened,
     turn_rate,
+    warm_reference,
 )
 from avsreplay.plan.limits import CONSTRAINTS, Limits, SampledScene, Scene
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 
-COARSE_NODES = 16  # thrust intervals while initial paths are compared
 ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
+RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
 TURN_RAD = 0.5  # the target may turn by this much between two iterations
 ABORT_S = 30.0  # duration of an abort
@@ -77,7 +80,7 @@ def constrained(
     free = rendezvous(scene.goal, r0, v0, params, t_ns)
     if not free.found or not limits.any or free.t_go_s <= params.latency_s:
         return free
-    free = _bounded_by_speed(scene, free, np.asarray(r0, float), params, limits)
+    free = _necessary(scene, free, np.asarray(r0, float), params, limits)
     if not free.found:
         return free
     sampled = SampledScene(scene, params.horizon_s, params.grid_s)
@@ -86,23 +89,47 @@ def constrained(
     return unlimited or _graded(case, free, _best_path(case, free, warm), t_ns)
 
 
-def _bounded_by_speed(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:
-    """Raise the certified lower bound to the first time at which the distance can be covered at the largest speed.
+def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:
+    """Raise the certified lower bound to the first time at which necessary conditions of a capture hold.
 
-    The distance between two samples of the goal is bounded below by the largest speed of the goal, times 1.5.
+    The distance can be covered at the largest speed, and the grasp point is inside the workspace. Between two samples
+    the goal moves by at most half the spacing times its largest speed, times 1.5. Where no time remains the problem is
+    proven infeasible.
     """
-    if limits.speed_max_mps is None:
+    nan = math.nan
+    proven = Plan(free.t_ns, PlanStatus.INFEASIBLE, nan, np.full(6, nan), free.a_max, params.horizon_s, nan, nan, nan)
+    if _closed_off(scene, r0, limits):
+        return proven
+    if limits.speed_max_mps is None and limits.reach_max_m is None and limits.reach_min_m is None:
         return free
     times = np.linspace(0.0, params.horizon_s, math.ceil(params.horizon_s / params.grid_s) + 1)
     rho, rate = scene.goal(times)
-    away = np.linalg.norm(rho - r0, axis=1)
     sag = 0.5 * times[1] * MOTION_FACTOR * float(np.linalg.norm(rate, axis=1).max())
-    reachable = np.minimum(away[1:], away[:-1]) - sag <= limits.speed_max_mps * times[1:]
-    if not reachable.any():
-        nan = math.nan
-        status, bound = PlanStatus.INFEASIBLE, params.horizon_s
-        return Plan(free.t_ns, status, nan, np.full(6, nan), free.a_max, bound, nan, nan, nan)
-    return replace(free, lower_bound_s=max(free.lower_bound_s, float(times[int(reachable.argmax())])))
+
+    def least(x: Array) -> Array:
+        return np.asarray(np.minimum(x[1:], x[:-1]) - sag)
+
+    from_base = np.linalg.norm(rho - np.array(limits.base_m), axis=1)
+    possible = times[1:] >= free.lower_bound_s
+    possible &= least(np.linalg.norm(rho - r0, axis=1)) <= (limits.speed_max_mps or math.inf) * times[1:]
+    possible &= least(from_base) <= (limits.reach_max_m or math.inf)
+    possible &= least(-from_base) <= -(limits.reach_min_m or 0.0)
+    if not possible.any():
+        return proven
+    return replace(free, lower_bound_s=max(free.lower_bound_s, float(times[int(possible.argmax())])))
+
+
+def _closed_off(scene: Scene, r0: Array, limits: Limits) -> bool:
+    """Return whether every point of the corridor is closer to the surface than the clearance, so that none leads in.
+
+    The distance to the surface changes by at most the distance between two points, and the corridor lies within its
+    range of the grasp point.
+    """
+    if limits.clearance_m is None or scene.surface is None:
+        return False
+    length = limits.final_range_m or 0.0
+    outside = float(np.linalg.norm(r0 - scene.goal(np.zeros(1))[0][0])) > length
+    return outside and limits.clearance_m > float(scene.surface(np.zeros((1, 3)))[1][0]) + length
 
 
 def _free_plan(case: Case, free: Plan) -> Plan | None:
@@ -190,13 +217,14 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
     and the results are refined in the order of their arrival times.
     """
     if warm is not None:
-        found = _converged(case, _warm(case, *warm))
+        again = shortened(case, *warm)
+        found = _converged(again, warm_reference(again, *warm))
         if found is not None:
             return found
     coarse = replace(case, limits=replace(case.limits, nodes=min(COARSE_NODES, case.limits.nodes)), coarse=True)
     drafts: list[StepPath] = []
-    for reference in _initial(coarse, free):
-        draft = _converged(coarse, reference)
+    for reference in initial_references(coarse, free):
+        draft = _converged(coarse, reference, 1.1 * min((d.t_go_s for d in drafts), default=math.inf))
         if draft is not None:
             drafts.append(draft)
         if drafts and reference.t > 1.5 * min(d.t_go_s for d in drafts):
@@ -205,76 +233,23 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
     for draft in sorted(drafts, key=lambda d: d.t_go_s):
         if best is not None and draft.t_go_s > best.t_go_s:
             break
-        refined = _converged(case, _warm(case, draft, 0.0))
+        refined = _converged(case, warm_reference(case, draft, 0.0))
         if refined is not None and (best is None or refined.t_go_s < best.t_go_s):
             best = refined
     return best
 
 
-def _warm(case: Case, path: RobotPath, since_s: float) -> ReferencePath:
-    t = max(path.t_go_s - since_s - case.wait_s, 1e-3)
-    return ReferencePath(t, path.at(since_s + case.wait_s + t * interval_fractions(case.limits.nodes))[0])
+def _converged(case: Case, reference: ReferencePath, latest_s: float = math.inf) -> StepPath | None:
+    """Iterate from a reference until the end time no longer changes; return the earliest feasible path seen.
 
-
-def _initial(case: Case, free: Plan) -> list[ReferencePath]:
-    """Initial paths: the free plan, then flights to a point on the fixture's axis and along the axis, ever later."""
-    s, wait, least = interval_fractions(case.limits.nodes), case.wait_s, free.t_go_s - case.wait_s
-    out = [ReferencePath(least, path_of(free, case.r0, case.v0).at(wait + least * s)[0])]
-    if not case.limits.geometric:
-        return out
-    turn = turn_rate(case, wait + least)
-    t, end = 1.1 * least, case.params.horizon_s - wait
-    step = min(max(0.15 * least, 0.9 / max(turn, 1e-6)), 0.5 * least)
-    while t <= end and len(out) < 9:
-        out.append(ReferencePath(t, _via_axis(case, t, s)))
-        t += step
-    return out
-
-
-def _via_axis(case: Case, t: float, s: Array) -> Array:
-    """Positions (2 n, 3) of a flight around the target to the fixture's axis, then along it to the goal."""
-    scene, limits = case.scene, case.limits
-    axis = np.array([1.0, 0.0, 0.0]) if scene.axis_c is None else scene.axis_c
-    ranges = [limits.cone_range_m if limits.cone_deg else 0.0, limits.final_range_m if limits.final_deg else 0.0]
-    length = 1.05 * max(*(r or 0.0 for r in ranges), limits.mouth_m or 0.0)
-    last_s = min(1.4 * math.sqrt(2.0 * length / case.params.a_max_mps2), 0.6 * t)
-    times = case.wait_s + t * s
-    rho, R = case.sampled.at(times)
-    entry = np.array([case.wait_s + t - last_s])
-    rho_e, R_e = case.sampled.at(entry)
-    x = np.clip(s * t / max(t - last_s, 1e-9), 0.0, 1.0)[:, None]
-    start = case.r0 + case.wait_s * case.v0
-    blend = x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
-    r = start + blend * (rho_e[0] + length * (R_e[0] @ axis) - start)
-    left = np.clip((1.0 - s) * t / last_s, 0.0, 1.0)[:, None]
-    along = rho + length * left**2 * (R @ axis)
-    r = np.where(s[:, None] * t >= t - last_s, along, r)
-    return _around(case, r, rho, R, s * t < t - last_s)
-
-
-def _around(case: Case, r: Array, rho: Array, R: Array, free: NDArray[np.bool_]) -> Array:
-    """Move the points (n, 3) that lie inside the sphere around the target outward onto it, where ``free``."""
-    limits, scene = case.limits, case.scene
-    centre_c = np.zeros(3) if scene.centre_c is None else scene.centre_c
-    radius = limits.keepout_m or 0.0
-    if limits.clearance_m is not None or limits.cone_deg is not None:
-        radius = max(radius, float(np.linalg.norm(centre_c)) + (limits.clearance_m or 0.0))
-    centre = rho + R @ centre_c
-    away = r - centre
-    distance = np.linalg.norm(away, axis=1, keepdims=True)
-    inside = free[:, None] & (distance < radius)
-    return np.where(inside, centre + away / np.maximum(distance, 1e-9) * radius, r)
-
-
-def _converged(case: Case, reference: ReferencePath) -> StepPath | None:
-    """Iterate from a reference until the end time no longer changes; return the earliest feasible path seen."""
+    The iterations end without a result where the end time remains later than ``latest_s``.
+    """
     best: StepPath | None = None
     n = case.limits.nodes
     off = np.zeros((2 * n, len(CONSTRAINTS)))
-    change, slack = _trust(case, reference), math.inf
+    change, slack, settled = _trust(case, reference), math.inf, 0
     for iteration in range(ITERATIONS):
-        problem = convex_subproblem(case, reference, off, change)
-        found = solve(problem)
+        found = solve(convex_subproblem(case, reference, off, change))
         if found is None:
             return best
         t = n * found.h
@@ -285,10 +260,12 @@ def _converged(case: Case, reference: ReferencePath) -> StepPath | None:
             allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
             if _feasible(case, path, over, allowed) and (best is None or path.t_go_s < best.t_go_s):
                 best = path
-        settled = abs(t - reference.t) <= TIME_TOLERANCE_S
-        if settled and best is not None and path.t_go_s <= best.t_go_s + TIME_TOLERANCE_S:
+        settled += abs(t - reference.t) <= max(TIME_TOLERANCE_S, RELATIVE_TOLERANCE * t)
+        if settled and best is not None and (settled > 1 or path is best):
             return best
-        if (iteration >= 6 and best is None and found.slack > 0.9 * slack) or t > case.params.horizon_s - case.wait_s:
+        stuck = best is None and found.slack > 0.9 * slack
+        hopeless = iteration >= 3 and (path.t_go_s > latest_s or (stuck and iteration >= 6))
+        if hopeless or t > case.params.horizon_s - case.wait_s:
             return best
         if abs(t - reference.t) <= 0.02 * t:
             off += 1.2 * over + np.where(over > 0.0, case.buffer_m, 0.0)

@@ -1,4 +1,4 @@
-"""Linearisation of the constraints about a reference path, and the check of the true constraints between the nodes."""
+"""Initial paths, linearisation of the constraints about a reference path, and the check of the true constraints."""
 
 from __future__ import annotations
 
@@ -10,15 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
+from avsreplay.outcome import Plan
 from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
 from avsreplay.plan.limits import CONSTRAINTS, Limits, Margins, SampledScene, Scene, margins
-from avsreplay.plan.path import RobotPath, StepPath
+from avsreplay.plan.path import RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
 
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
 THRUST_SHARE = 1.0 - 1e-5  # share of a_max used by the programme; the rest corrects the terminal errors
 RESERVE = 3.0  # margin at the checked instants in units of the buffer, for the instants between them
 FAR = 2e4  # a constraint with a larger margin at the reference, in units of the buffer, is left out of the programme
+COARSE_NODES = 16  # thrust intervals while initial paths are compared
 LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight
 
 
@@ -115,7 +117,7 @@ def convex_subproblem(case: Case, reference: ReferencePath, off: Array, change: 
     start = margins(
         case.scene, case.limits, case.sampled.coordinates(np.zeros(1), case.r0[None]), case.r0[None]
     ).values[0]
-    return rows.added(problem, off - allowed(start, interval_fractions(n)))
+    return rows.added(problem, off + rows.sag[:, None] - allowed(start, interval_fractions(n)))
 
 
 class _RowMaker:
@@ -132,6 +134,9 @@ class _RowMaker:
         self.y = np.einsum("nij,ni->nj", self.R, reference.r - self.rho)
         dy = np.einsum("nij,ni->nj", dR, reference.r - self.rho) - np.einsum("nij,ni->nj", self.R, drho)
         self.dy = dy * (reference.t * s)[:, None]  # change with the relative change of the end time
+        first = case.sampled.coordinates(np.array([case.wait_s]), (case.r0 + case.wait_s * case.v0)[None])
+        bend = np.linalg.norm(np.diff(np.concatenate([first, self.y]), 2, axis=0), axis=1) / 8.0
+        self.sag = np.concatenate([bend, bend[-1:]])  # distance of the path in {C} from its chord between two points
         self.interval = np.arange(2 * n) // 2
         self.fraction = np.where(np.arange(2 * n) % 2 == 0, 0.5, 1.0)
         self.r = reference.r
@@ -234,3 +239,68 @@ def _interleaved(rows: list[PointRows]) -> PointRows:
 
     names = ("interval", "fraction", "vector", "offset", "rate", "slack")
     return PointRows(*(mixed(name) for name in names))
+
+
+def shortened(case: Case, path: RobotPath, since_s: float) -> Case:
+    """Return the case with the interval length of an earlier path: the rest of its flight needs fewer intervals."""
+    if not isinstance(path, StepPath):
+        return case
+    left = math.ceil((path.t_go_s - since_s - case.wait_s) / path.step_s)
+    n = min(max(left, COARSE_NODES), case.limits.nodes)
+    return replace(case, limits=replace(case.limits, nodes=n))
+
+
+def warm_reference(case: Case, path: RobotPath, since_s: float) -> ReferencePath:
+    """Return the rest of an earlier path from ``since_s`` after its begin on as a reference."""
+    t = max(path.t_go_s - since_s - case.wait_s, 1e-3)
+    return ReferencePath(t, path.at(since_s + case.wait_s + t * interval_fractions(case.limits.nodes))[0])
+
+
+def initial_references(case: Case, free: Plan) -> list[ReferencePath]:
+    """Initial paths: the free plan, then flights to a point on the fixture's axis and along the axis, ever later."""
+    s, wait, least = interval_fractions(case.limits.nodes), case.wait_s, free.t_go_s - case.wait_s
+    out = [ReferencePath(least, path_of(free, case.r0, case.v0).at(wait + least * s)[0])]
+    if not case.limits.geometric:
+        return out
+    turn = turn_rate(case, wait + least)
+    t, end = 1.1 * least, case.params.horizon_s - wait
+    step = min(max(0.15 * least, 0.9 / max(turn, 1e-6)), 0.5 * least)
+    while t <= end and len(out) < 9:
+        out.append(ReferencePath(t, _via_axis(case, t, s)))
+        t += step
+    return out
+
+
+def _via_axis(case: Case, t: float, s: Array) -> Array:
+    """Positions (2 n, 3) of a flight around the target to the fixture's axis, then along it to the goal."""
+    scene, limits = case.scene, case.limits
+    axis = np.array([1.0, 0.0, 0.0]) if scene.axis_c is None else scene.axis_c
+    ranges = [limits.cone_range_m if limits.cone_deg else 0.0, limits.final_range_m if limits.final_deg else 0.0]
+    length = 1.05 * max(*(r or 0.0 for r in ranges), limits.mouth_m or 0.0)
+    last_s = min(1.4 * math.sqrt(2.0 * length / case.params.a_max_mps2), 0.6 * t)
+    times = case.wait_s + t * s
+    rho, R = case.sampled.at(times)
+    entry = np.array([case.wait_s + t - last_s])
+    rho_e, R_e = case.sampled.at(entry)
+    x = np.clip(s * t / max(t - last_s, 1e-9), 0.0, 1.0)[:, None]
+    start = case.r0 + case.wait_s * case.v0
+    blend = x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    r = start + blend * (rho_e[0] + length * (R_e[0] @ axis) - start)
+    left = np.clip((1.0 - s) * t / last_s, 0.0, 1.0)[:, None]
+    along = rho + length * left**2 * (R @ axis)
+    r = np.where(s[:, None] * t >= t - last_s, along, r)
+    return _around(case, r, rho, R, s * t < t - last_s)
+
+
+def _around(case: Case, r: Array, rho: Array, R: Array, free: NDArray[np.bool_]) -> Array:
+    """Move the points (n, 3) that lie inside the sphere around the target outward onto it, where ``free``."""
+    limits, scene = case.limits, case.scene
+    centre_c = np.zeros(3) if scene.centre_c is None else scene.centre_c
+    radius = limits.keepout_m or 0.0
+    if limits.clearance_m is not None or limits.cone_deg is not None:
+        radius = max(radius, float(np.linalg.norm(centre_c)) + (limits.clearance_m or 0.0))
+    centre = rho + R @ centre_c
+    away = r - centre
+    distance = np.linalg.norm(away, axis=1, keepdims=True)
+    inside = free[:, None] & (distance < radius)
+    return np.where(inside, centre + away / np.maximum(distance, 1e-9) * radius, r)
