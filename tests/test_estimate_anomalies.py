@@ -90,6 +90,21 @@ def test_a_single_wild_scan_changes_nothing() -> None:
     assert result.track.manoeuvres == ()
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_the_covariance_of_scans_with_common_errors_is_positive_semidefinite(seed: int) -> None:
+    """Neighbouring views may have very different covariances: a nearly degenerate one beside a good one."""
+    rng = np.random.default_rng(seed)
+    R = []
+    for _ in range(6):
+        axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+        R.append(axes @ np.diag(10.0 ** rng.uniform(-6.0, 2.0, size=6)) @ axes.T)
+    C = hypotheses.correlated_noise(R, rng.uniform(0.5, 1.0, size=6).tolist())
+    scale = np.sqrt(np.diag(C))
+    assert np.linalg.eigvalsh(C / np.outer(scale, scale))[0] > -1e-12
+    np.testing.assert_allclose(C[6:12, 6:12], R[1])
+    np.testing.assert_allclose(hypotheses.correlated_noise(R[:2], [0.0, 1.0])[:6, 6:], 0.0)
+
+
 def test_a_covariance_that_is_not_positive_definite_still_has_a_root() -> None:
     from avsreplay.estimate.hypotheses import cholesky_root
 

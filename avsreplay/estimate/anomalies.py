@@ -30,7 +30,7 @@ from avsreplay.records import Belief, Innovation, Manoeuvre, Reason, Verdict
 
 _FEWEST, _MOST, _RECENT = 3, 5, 3  # least and most doubtful scans at a decision; accepted scans kept
 _MARGIN = 6.0  # a decision before _MOST scans needs these log odds of the best hypothesis over the next
-_FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 15, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
+_FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
 _READY = 8  # least number of poses of an estimate whose prediction can be tested
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
@@ -178,7 +178,8 @@ def _nis_scale(track: Track) -> float:
     """How many times larger than chi-square the NIS of the accepted scans is: their median over that of chi-square.
 
     Registration errors beyond the claimed covariance enlarge the NIS of all scans, so that of a doubtful scan must be
-    large compared with that of the accepted scans.
+    large compared with that of the accepted scans. The median is taken over many scans: errors of the registration last
+    for the whole log, while a sensor error that grows over some tens of scans must not raise the gate that detects it.
     """
     if len(track.nis) < _FEWEST_NIS:
         return 1.0

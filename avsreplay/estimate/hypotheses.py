@@ -115,10 +115,7 @@ def explain(
 
 
 def cholesky_root(C: Array) -> Array:
-    """Lower Cholesky factor of a window covariance that may not be positive definite.
-
-    Rounding is one cause. A relative eigenvalue of -2e-4 was seen as well, which is more than rounding; its cause is
-    not known, and the likelihoods of such a window are approximate.
+    """Lower Cholesky factor of a window covariance that rounding may have made indefinite.
 
     Args:
         C: (n, n) covariance.
@@ -155,13 +152,30 @@ def _window(epochs: Sequence[Epoch], start: Belief, torque: float, force: float)
     for i in range(n):
         for j in range(i, n):
             C[i, :, j] = rows[i] @ back[i] @ rows[j].T
-            a, b = epochs[i].innovation, epochs[j].innovation
-            C[i, :, j] += a.R if i == j else math.sqrt(a.share * b.share) * 0.5 * (a.R + b.R)
             C[j, :, i] = C[i, :, j].T
     R_ba = tuple(rotation(propagate_state(start.x, float(t))[0].q_ab).T for t in times)
-    flat = C.reshape(6 * n, 6 * n)
-    R = tuple(e.innovation.R for e in epochs)
+    innovations = [e.innovation for e in epochs]
+    R = tuple(i.R for i in innovations)
+    flat = C.reshape(6 * n, 6 * n) + correlated_noise(R, [i.share for i in innovations])
     return _Window(times, y.reshape(-1), 0.5 * (flat + flat.T), rows, tuple(poses), R, R_ba)
+
+
+def correlated_noise(R: Sequence[Array], shares: Sequence[float]) -> Array:
+    """Covariance (6n, 6n) of the errors of n neighbouring scans that have a share of their variance in common.
+
+    The common part of scan k is sqrt(share_k) L_k z with one z for all scans and R_k = L_k L_k', so the covariance of
+    scans i and j is sqrt(share_i share_j) L_i L_j'. The matrix is positive semidefinite for any R and shares up to 1.
+
+    Args:
+        R: (6, 6) noise of each scan.
+        shares: common share of the variance of each scan, 0 to 1.
+    """
+    roots = [math.sqrt(share) * np.linalg.cholesky(one) for one, share in zip(R, shares, strict=True)]
+    common = np.concatenate(roots)
+    out: Array = common @ common.T
+    for k, one in enumerate(R):
+        out[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = one
+    return out
 
 
 def _evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float, Array, Array]:
