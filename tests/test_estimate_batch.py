@@ -13,12 +13,19 @@ from scipy.stats import chi2
 from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.batch import FitParams, Pin, Poses, Prior, cost, fit, pinned
-from avsreplay.estimate.batch_covariance import BatchCovariance, covariance_of, final_mixture, moments
+from avsreplay.estimate.batch import FitParams, Pin, Poses, Prior, Problem, fit
+from avsreplay.estimate.batch_covariance import (
+    BatchCovariance,
+    covariance_of,
+    final_mixture,
+    moments,
+    process_noise_pass,
+)
 from avsreplay.estimate.chart import Chart, nees, to_chart, to_errors, to_state
-from avsreplay.estimate.dynamics import flow, rotation_history, transition
+from avsreplay.estimate.dynamics import advance, flow, process_noise, rotation_history, transition
 from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
+from avsreplay.estimate.measurement import measurement_jacobian, to_fixture
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.reference import reference_fit
 from avsreplay.geometry import Pose
@@ -105,21 +112,70 @@ def test_arc_gives_the_motion_and_its_derivative(seed: int) -> None:
 
 def test_the_step_follows_the_cost() -> None:
     """The normal equations' right side is minus the gradient of the cost, prior and robust weights included."""
-    from avsreplay.estimate.batch import _Problem
-
     fixes = list(seen(tumbling.draw(3, seconds=20.0), 3))
     fixes[7] = replace(fixes[7], T_ac=fixes[7].T_ac @ Pose(geometry.exp([0.3, 0, 0]), np.array([0.2, 0, 0])))
     poses = poses_of(tuple(fixes))
     prior = weak_prior(poses, WHITE)
     c = to_chart(tumbling.draw(3, seconds=20.0).states[0]).moved(np.full(20, 1e-3))
     pin = Pin(c, np.arange(20.0), 0.3, 0.5)
-    problem = _Problem(poses, prior, FitParams(), np.array([1.3, 0.7]), pin)
-    _, b = problem.normal(problem.at(c))
+    core = Problem(poses, prior, np.array([1.3, 0.7]), c).core
+    core.pin(pin.centre.flat, pin.row, pin.target, pin.one_sigma)
+    b = core.normal()[1]
     for k in range(20):
         step = np.zeros(20)
         step[k] = 1e-6
-        slope = (problem.at(c.moved(step)).cost - problem.at(c.moved(-step)).cost) / 2e-6
+        slope = (core.residuals(c.moved(step).flat)[0] - core.residuals(c.moved(-step).flat)[0]) / 2e-6
         assert b[k] == pytest.approx(-slope, rel=2e-2, abs=2e-2 * np.abs(b).max())
+
+
+def test_a_pass_without_disturbance_is_the_fit() -> None:
+    """One least-squares problem solved pose by pose: mean and covariance of the normal equations."""
+    fixes = seen(tumbling.draw(2, seconds=30.0), 2)
+    poses, fitted, prior = grown(fixes, 61)
+    there = fitted.chart.moved(np.full(20, 1e-5))
+    problem = Problem(poses, prior, fitted.effective, there)
+    A, b = problem.core.normal()
+    y, P = process_noise_pass(there, None, problem, (0.0, 0.0))
+    scale = np.sqrt(np.diag(P))
+    assert np.abs(P / np.outer(scale, scale) - np.linalg.inv(A) / np.outer(scale, scale)).max() < 1e-6
+    assert np.abs((y - np.linalg.solve(A, b)) / scale).max() < 1e-5
+
+
+def test_a_pass_allows_for_the_disturbance_between_poses() -> None:
+    """Against the joint normal of the errors at all poses, from the transition and the noise of each step."""
+    fixes = seen(tumbling.draw(5, seconds=4.0), 5, pos_m=0.002, rot_deg=0.1)
+    poses, noise, at = poses_of(fixes), (1e-3, 1e-3), tumbling.draw(5, seconds=4.0).states[0]
+    prior, x, n = Prior(to_chart(at), np.diag(np.full(20, 1e-2))), at, len(poses)
+    d, G, lag = np.empty((n, 6)), np.empty((n, 6, 20)), []  # residual, Jacobian by the error states then, noise of step
+    Phi = [np.eye(20)]
+    for k in range(n):
+        if k:
+            step = flow(x.w_b, x.sigma, 0.5, noise[0])
+            Phi.append(transition(step, x.sigma, 0.5))
+            lag.append(process_noise(step, 0.5, noise[1]))
+            x = advance(x, step, 0.5)
+        off = Pose(poses.q[k], poses.t[k]).inverse() @ x.T_ac
+        d[k] = np.concatenate([geometry.log(off.q), off.t])
+        G[k] = to_fixture(poses.q[k], x.q_bc) @ measurement_jacobian(x)
+    T = to_errors(prior.mean)
+    ends = [T @ prior.P @ T.T]
+    for k in range(1, n):
+        ends.append(Phi[k] @ ends[-1] @ Phi[k].T + lag[k - 1])
+    far = lambda i, j: np.linalg.multi_dot([np.eye(20), np.eye(20), *Phi[i + 1 : j + 1][::-1]])  # noqa: E731
+    S = np.zeros((6 * n, 6 * n))
+    cross = np.zeros((20, 6 * n))
+    for i in range(n):
+        for j in range(i, n):
+            C = G[i] @ ends[i] @ far(i, j).T @ G[j].T + (poses.C[i] if i == j else 0.0)
+            S[6 * i : 6 * i + 6, 6 * j : 6 * j + 6], S[6 * j : 6 * j + 6, 6 * i : 6 * i + 6] = C, C.T
+        cross[:, 6 * i : 6 * i + 6] = far(i, n - 1) @ ends[i] @ G[i].T
+    K = np.linalg.solve(S, cross.T).T
+    want_y, want_P = -K @ d.reshape(-1), ends[-1] - K @ cross.T
+    y, P = process_noise_pass(prior.mean, None, Problem(poses, prior, np.ones(2)), noise)
+    onward = far(0, n - 1) @ T
+    scale = np.sqrt(np.diag(want_P))
+    assert np.abs((onward @ y - want_y) / scale).max() < 1e-6
+    assert np.abs((onward @ P @ onward.T - want_P) / np.outer(scale, scale)).max() < 1e-6
 
 
 def test_exact_poses_give_the_exact_motion() -> None:
@@ -149,7 +205,7 @@ def test_fit_is_the_optimum_from_any_side() -> None:
     poses, fitted, prior = grown(seen(world, 4), 21, 81, 201)
     again = fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False), fitted.effective)
     assert again.half_chi2 == pytest.approx(fitted.half_chi2, abs=0.02)
-    assert cost(poses, to_chart(world.states[0]), prior, FitParams(), fitted.effective) > fitted.half_chi2
+    assert Problem(poses, prior, fitted.effective).cost(to_chart(world.states[0])) > fitted.half_chi2
 
 
 def test_false_poses_are_weighted_down() -> None:
@@ -185,7 +241,8 @@ def test_residuals_that_stay_widen_the_covariance() -> None:
 
 def at_the_end(found: BatchCovariance, poses: Poses, prior: Prior, seconds: float) -> Belief:
     """The belief at the last pose, without process noise."""
-    return moments(final_mixture(found, poses, prior, FitParams(), (0.0, 0.0), 0, seconds))
+    problem = Problem(poses, prior, found.fitted.effective)
+    return moments(final_mixture(found, problem, poses.latest(12, seconds), (0.0, 0.0), 0, seconds))
 
 
 def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
@@ -194,7 +251,7 @@ def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
     for seed in (3, 6, 9, 15, 2):
         world = tumbling.draw(seed, seconds=40.0)
         poses, fitted, prior = grown(seen(world, seed), 21, 41, 81)
-        found = covariance_of(poses, fitted, prior, FitParams())
+        found = covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams())
         assert not found.gaussian
         plain.append(nees(at_the_end(replace(found, directions=()), poses, prior, 40.0), world.states[-1]) / 20)
         mended.append(nees(at_the_end(found, poses, prior, 40.0), world.states[-1]) / 20)
@@ -206,7 +263,7 @@ def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
 def test_a_long_arc_settles() -> None:
     world = tumbling.draw(4)
     poses, fitted, prior = grown(seen(world, 4), 21, 81, 201)
-    found = covariance_of(poses, fitted, prior, FitParams())
+    found = covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams())
     assert found.gaussian
     here = at_the_end(found, poses, prior, 100.0)
     assert nees(here, world.states[-1]) == pytest.approx(nees(Belief(0, fitted.x, fitted.P), world.states[0]), rel=0.2)
@@ -218,11 +275,10 @@ def test_a_profile_fit_keeps_the_fixed_direction_and_minimises_over_the_others()
     row = np.zeros(20)
     row[12] = 1.0
     shift = 2.0 * np.sqrt(fitted.P_chart[12, 12])
-    held, _ = pinned(
-        poses, fitted.chart, prior, FitParams(), fitted.effective, Pin(fitted.chart, row, shift, 0.01 * shift)
-    )
+    problem = Problem(poses, prior, fitted.effective)
+    held, _ = problem.pinned(fitted.chart, FitParams(), Pin(fitted.chart, row, shift, 0.01 * shift))
     assert held.minus(fitted.chart)[12] == pytest.approx(shift, rel=0.02)
-    rise = cost(poses, held, prior, FitParams(), fitted.effective) - fitted.half_chi2
+    rise = problem.cost(held) - fitted.half_chi2
     assert rise == pytest.approx(2.0, rel=0.5)
 
 

@@ -15,8 +15,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from avsreplay.estimate.batch import FitParams, Prior, fit
-from avsreplay.estimate.batch_covariance import BatchCovariance, final_mixture, moments
+from avsreplay.estimate.batch import FitParams, Prior, Problem, fit
+from avsreplay.estimate.batch_covariance import LATEST, BatchCovariance, final_mixture, moments
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.dynamics import propagate
@@ -155,7 +155,9 @@ class AnomalyTest:
         fitted = fit(poses, prior.mean, prior, rules, factors)
         now_ns, noise = fixes[-1].scan_ns, (self.params.torque_noise_radps15, self.params.force)
         found = BatchCovariance(fitted, ())
-        components = final_mixture(found, poses, prior, rules, noise, now_ns, (now_ns - t_ns) * 1e-9)
+        after_s = (now_ns - t_ns) * 1e-9
+        problem, latest = Problem(poses, prior, fitted.effective), poses.latest(LATEST, after_s)
+        components = final_mixture(found, problem, latest, noise, now_ns, after_s)
         plain = np.array([window[3], window[0]])
         return BatchResult(t_ns, fitted.chart, len(fixes), plain, inflation, moments(components), True, components)
 

@@ -11,23 +11,20 @@ registration are, the covariance is inflated by their integrated autocorrelation
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
-from avsreplay.estimate.chart import RATE, Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import RotationHistory, rotation_history
-from avsreplay.estimate.error_state import DIM, DMU, RHO, SIGMA, VARRHO, VEL
-from avsreplay.estimate.noise import integrated_autocorrelation, weigh
-from avsreplay.geometry import Array, skew
+from avsreplay.estimate import _motion
+from avsreplay.estimate.chart import Chart, to_errors, to_state
+from avsreplay.estimate.noise import integrated_autocorrelation
+from avsreplay.geometry import Array
 from avsreplay.records import State
 from avsreplay.settings import Settings, setting
 
 _FEWEST_FOR_FACTORS = 12
-_LARGEST_RADPS = 0.5  # a step that changes the rate by more than this plus the rate itself is not tried
 _PIN_TOL = 0.02  # half chi-square: tolerance of a fit with one direction fixed
 
 
@@ -58,7 +55,8 @@ class Poses:
     Attributes:
         times_s: (n,) since the fit's epoch [s].  q: (n, 4) q_ac.  t: (n, 3) [m].
         C: (n, 6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
-        root: (n, 6, 6) with root C root' = 1.  R_ca: (n, 3, 3).
+        root: (n, 6, 6) lower triangular with root C root' = 1.
+        info: (n, 2, 3, 3) inverse covariance of the attitude and of the position by itself.
     """
 
     times_s: Array
@@ -66,11 +64,11 @@ class Poses:
     t: Array
     C: Array
     root: Array = field(init=False)
-    R_ca: Array = field(init=False)
+    info: Array = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "root", _inverse(np.linalg.cholesky(self.C)))
-        object.__setattr__(self, "R_ca", np.swapaxes(geometry.matrix(self.q), -1, -2).copy())
+        object.__setattr__(self, "info", _inverse(np.stack([self.C[:, :3, :3], self.C[:, 3:, 3:]], axis=1)))
 
     def __len__(self) -> int:
         return len(self.times_s)
@@ -143,30 +141,6 @@ class BatchFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Residuals:
-    """Residuals d (n, 6) of the poses at a state, weights, cost; and the motion they come from."""
-
-    chart: Chart
-    x: State
-    path: RotationHistory
-    A_ab: Array
-    d: Array
-    weights: Array
-    cost: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Linearised:
-    """Linearisation at a state: residuals d (n, 6), Jacobian J (n, 6, 20) in the chart, weights, cost."""
-
-    chart: Chart
-    d: Array
-    J: Array
-    weights: Array
-    cost: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Pin:
     """A pseudo-measurement row . (chart - centre) = ``target`` with ``one_sigma``: it fixes one direction."""
 
@@ -180,93 +154,74 @@ class Pin:
         return (float(self.row @ chart.minus(self.centre)) - self.target) / self.one_sigma
 
 
-class _Problem:
-    """The cost over the initial values, at given noise factors."""
+class Problem:
+    """The cost over the initial values at given noise factors, its linearisation and its minimum.
 
-    def __init__(self, poses: Poses, prior: Prior, params: FitParams, factors: Array, pin: Pin | None = None) -> None:
-        self.poses, self.prior, self.params, self.pin = poses, prior, params, pin
-        self.redescend = True
+    The loops over the poses are those of the extension (``kernel/fit.cpp``): propagation, transition matrix,
+    measurement Jacobian in the error states at the epoch, M-estimator weights, normal equations in chart steps.
+
+    Args:
+        poses: the measurements.
+        prior: Gaussian prior of the initial values.
+        factors: (2,) on the standard deviations of attitude and position.
+        start: the chart of the first linearisation.
+    """
+
+    def __init__(self, poses: Poses, prior: Prior, factors: Array, start: Chart | None = None) -> None:
+        self.poses, self.prior, self.factors = poses, prior, factors
+        core = _motion.Problem(
+            poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, _inverse(prior.P)
+        )
+        self.core = core
+        self.reweigh(factors)
+        if start is not None:
+            core.linearise(start.flat)
+
+    def reweigh(self, factors: Array, redescend: bool = True) -> None:
+        """Use other noise factors, or Huber's weights in place of Cauchy's, with the same linearisation."""
         self.factors = factors
-        self.prior_info = _inverse(prior.P)
+        self.core.noise(_pair(factors), redescend)
 
-    def at(self, chart: Chart) -> _Linearised:
-        return self.linear(self.residuals(chart))
+    def cost(self, chart: Chart) -> float:
+        """Half chi-square of initial values, including the prior."""
+        return self.core.residuals(chart.flat)[0]
 
-    def residuals(self, chart: Chart) -> _Residuals:
-        x, p = to_state(chart), self.poses
-        path = rotation_history(x, p.times_s)
-        A_ab, d = geometry.matrix(path.q), np.empty((len(p), 6))
-        d[:, :3] = geometry.log(geometry.multiply(geometry.conjugate(p.q), geometry.multiply(path.q, x.q_bc)))
-        off_a = x.r_a + p.times_s[:, None] * x.v_a + A_ab @ x.c_b - p.t
-        d[:, 3:] = (p.R_ca @ off_a[:, :, None])[:, :, 0]
-        return _Residuals(chart, x, path, A_ab, d, *self._weighted(chart, d))
+    def misfit(self, chart: Chart) -> float:
+        """Half chi-square of the poses alone."""
+        return self.core.residuals(chart.flat)[1]
 
-    def reweighted(self, here: _Linearised) -> _Linearised:
-        """The same linearisation with the present noise factors and weight function."""
-        weights, cost = self._weighted(here.chart, here.d)
-        return replace(here, weights=weights, cost=cost)
+    def pinned(self, start: Chart, params: FitParams, pin: Pin) -> tuple[Chart, Array]:
+        """The fit from ``start`` with one direction fixed, and its covariance (20, 20) in the chart."""
+        self.core.pin(pin.centre.flat, pin.row, pin.target, pin.one_sigma)
+        self.core.linearise(start.flat)
+        self.core.descend(params.max_steps, max(params.gain_tol, _PIN_TOL))
+        found = self.chart, self.covariance
+        self.core.unpin()
+        return found
 
-    def linear(self, at: _Residuals) -> _Linearised:
-        """The Jacobian H Phi in chart coordinates."""
-        x, p, turn = at.x, self.poses, at.path.S[:, :3]
-        A_cb, R_cb = geometry.matrix(x.q_bc).T.copy(), p.R_ca @ at.A_ab
-        J = np.zeros((len(p), 6, DIM))
-        for rows, by_turn in ((slice(0, 3), 2.0 * A_cb @ turn), (slice(3, 6), -2.0 * (R_cb @ skew(x.c_b)) @ turn)):
-            J[:, rows, :6], J[:, rows, SIGMA] = by_turn[:, :, :6], by_turn[:, :, 6:]
-        J[:, :3, DMU] = 2.0 * A_cb
-        J[:, 3:, RHO] = p.R_ca
-        J[:, 3:, VEL] = p.R_ca * p.times_s[:, None, None]
-        J[:, 3:, VARRHO] = R_cb
-        J = (J.reshape(-1, DIM) @ to_errors(at.chart)).reshape(J.shape)
-        return _Linearised(at.chart, at.d, J, at.weights, at.cost)
+    @property
+    def chart(self) -> Chart:
+        """Where the cost is linearised."""
+        return Chart.of(self.core.chart)
 
-    def normal(self, here: _Linearised) -> tuple[Array, Array]:
-        """Normal equations of the step: A (20, 20) step = b (20,)."""
-        e, J = self.rows(here)
-        J = J.reshape(-1, DIM)
-        A = J.T @ J + self.prior_info
-        b = -(J.T @ e.reshape(-1)) - self.prior_info @ here.chart.minus(self.prior.mean)
-        if self.pin is not None:
-            row = self.pin.row / self.pin.one_sigma
-            A += np.outer(row, row)
-            b -= row * self.pin.error(here.chart)
-        return A, b
+    @property
+    def covariance(self) -> Array:
+        """(20, 20) inverse of the normal matrix, in chart coordinates."""
+        return _inverse(self.core.normal()[0])
 
-    def rescaled(self, here: _Linearised, P: Array) -> Array:
-        """Noise factors (2,) from the residuals: mean of d' C^-1 d plus J P J', the part that the fit absorbed."""
-        w, found = here.weights, []
-        for rows in (slice(0, 3), slice(3, 6)):
-            info, d, J = _inverse(self.poses.C[:, rows, rows]), here.d[:, rows], here.J[:, rows]
-            size = np.einsum("ni,nij,nj->n", d, info, d) + ((info @ J) * (J @ P)).sum(axis=(1, 2))
-            found.append(np.sqrt(float(w @ size) / (3.0 * float(w.sum()))))
-        return np.array(found)
-
-    def inflation(self, here: _Linearised) -> Array:
+    def inflation(self) -> Array:
         """(2,) 1 + 2 sum of the residuals' autocorrelations, of attitude and position."""
-        e = self.whitened(here.d[:, :, None])[:, :, 0] * np.sqrt(here.weights)[:, None]
+        d = self.core.d / np.repeat(self.factors, 3)
+        e = (self.poses.root @ d[:, :, None])[:, :, 0] * np.sqrt(self.core.weights)[:, None]
         return np.array([integrated_autocorrelation(e[:, :3]), integrated_autocorrelation(e[:, 3:])])
 
-    def rows(self, here: _Linearised) -> tuple[Array, Array]:
-        """Residuals (n, 6) and Jacobian (n, 6, 20), whitened and weighted: each of unit variance."""
-        columns = np.concatenate([here.J, here.d[:, :, None]], axis=2)
-        both = self.whitened(columns) * np.sqrt(here.weights)[:, None, None]
-        return both[:, :, DIM], both[:, :, :DIM]
+    def noise_factors(self) -> Array:
+        """Noise factors (2,) from the residuals: mean of d' C^-1 d plus J P J', the part that the fit absorbed."""
+        return np.sqrt(np.array(self.core.size(self.covariance)))
 
-    def whitened(self, columns: Array) -> Array:
-        """Columns (n, 6, k) whitened by the noise."""
-        out: Array = (self.poses.root / np.repeat(self.factors, 3)) @ columns
-        return out
 
-    def _weighted(self, chart: Chart, d: Array) -> tuple[Array, float]:
-        """M-estimator weights (n,) of the residuals, and the cost."""
-        e = self.whitened(d[:, :, None])
-        chi2 = np.einsum("nij,nij->n", e, e)
-        weights, robust = weigh(chi2, self.redescend)
-        off = chart.minus(self.prior.mean)
-        cost = 0.5 * float(robust.sum()) + 0.5 * float(off @ self.prior_info @ off)
-        if self.pin is not None:
-            cost += 0.5 * self.pin.error(chart) ** 2
-        return weights, cost
+def _pair(factors: Array) -> tuple[float, float]:
+    return float(factors[0]), float(factors[1])
 
 
 def _inverse(A: NDArray[Any]) -> Array:
@@ -284,61 +239,19 @@ def fit(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Ar
     if len(poses) < 3:
         raise ValueError(f"{len(poses)} poses, three at least are needed")
     least = np.sqrt(np.full(2, params.least_inflation))
-    problem = _Problem(poses, prior, params, least if factors is None else factors)
-    problem.redescend = False
-    here, steps, done = _descend(problem, problem.at(start), params.max_steps)
-    problem.redescend = True
-    here, more, done = _descend(problem, problem.reweighted(here), params.max_steps)
+    problem = Problem(poses, prior, least if factors is None else factors, start)
+    problem.reweigh(problem.factors, redescend=False)
+    steps = problem.core.descend(params.max_steps, params.gain_tol)[0]
+    problem.reweigh(problem.factors)
+    more, done = problem.core.descend(params.max_steps, params.gain_tol)
     steps += more
     plain, inflation = problem.factors / least, least**2
     if params.rescale and len(poses) >= _FEWEST_FOR_FACTORS:
         for _ in range(2):
-            plain = problem.rescaled(here, _inverse(problem.normal(here)[0]))
-            inflation = np.maximum(problem.inflation(here), params.least_inflation)
-            problem.factors = plain * np.sqrt(inflation)
-            here, more, done = _descend(problem, problem.reweighted(here), params.max_steps)
+            plain = problem.noise_factors()
+            inflation = np.maximum(problem.inflation(), params.least_inflation)
+            problem.reweigh(plain * np.sqrt(inflation))
+            more, done = problem.core.descend(params.max_steps, params.gain_tol)
             steps += more
-    P = _inverse(problem.normal(here)[0])
-    return BatchFit(here.chart, P, here.cost, here.d, here.weights, plain, inflation, steps, done)
-
-
-def cost(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: Array) -> float:
-    """Half chi-square of initial values, including the prior."""
-    return _Problem(poses, prior, params, factors).residuals(chart).cost
-
-
-def linearised(poses: Poses, chart: Chart, prior: Prior, params: FitParams, factors: Array) -> tuple[Array, Array]:
-    """Residuals (n, 6) and their Jacobian (n, 6, 20) in the chart, whitened and weighted: each of unit variance."""
-    problem = _Problem(poses, prior, params, factors)
-    return problem.rows(problem.at(chart))
-
-
-def pinned(
-    poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Array, pin: Pin
-) -> tuple[Chart, Array]:
-    """The fit with one direction fixed, and its covariance (20, 20) in the chart."""
-    rough = replace(params, gain_tol=max(params.gain_tol, _PIN_TOL))
-    problem = _Problem(poses, prior, rough, factors, pin)
-    here = _descend(problem, problem.at(start), rough.max_steps)[0]
-    return here.chart, _inverse(problem.normal(here)[0])
-
-
-def _descend(problem: _Problem, here: _Linearised, max_steps: int) -> tuple[_Linearised, int, bool]:
-    """Levenberg-Marquardt: the minimum, the steps taken, and whether the stopping rule was met."""
-    damping = 1e-3
-    A, b = problem.normal(here)
-    for count in range(1, max_steps + 1):
-        step = np.asarray(np.linalg.solve(A + damping * np.diag(np.diagonal(A)), b), dtype=np.float64)
-        expected = float(step @ b) - 0.5 * float(step @ A @ step)
-        too_large = float(np.linalg.norm(step[RATE])) > _LARGEST_RADPS + float(np.linalg.norm(here.chart.w_c))
-        trial = None if too_large else problem.residuals(here.chart.moved(step))
-        gain = 0.0 if trial is None else here.cost - trial.cost
-        if trial is not None and gain > 0.0:
-            damping = max(damping * (0.1 if gain > 0.5 * expected else 0.5), 1e-9)
-            here = problem.linear(trial)
-            A, b = problem.normal(here)
-        else:
-            damping *= 8.0
-        if (abs(expected) < problem.params.gain_tol and not too_large) or damping > 1e9:
-            return here, count, True
-    return here, max_steps, False
+    core = problem.core
+    return BatchFit(problem.chart, problem.covariance, core.cost, core.d, core.weights, plain, inflation, steps, done)

@@ -19,19 +19,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.estimate import _motion
-from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Prior, cost, linearised, pinned
+from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Problem
 from avsreplay.estimate.chart import Chart, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import (
-    grasp_forecast,
-    grasp_trajectory,
-    propagate,
+    grasp_prediction,
     propagate_state,
-    ratios,
-    rotation_path,
     torque_density,
 )
-from avsreplay.estimate.error_state import DIM, RHO, VEL
+from avsreplay.estimate.error_state import DIM
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Forecast, State
 
@@ -41,8 +36,7 @@ _RISE, _TRIES = 0.5 * _NODE**2, 4
 _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
-_LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
-_DISTURBED = 12  # error states that a disturbance reaches: attitude, rate, position, velocity
+LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
 _SPHERE = 3.0  # tr I / I of a sphere
 
 
@@ -84,38 +78,44 @@ class BatchCovariance:
         return not self.directions
 
 
-def covariance_of(poses: Poses, fitted: BatchFit, prior: Prior, params: FitParams) -> BatchCovariance:
-    """Test the weakest directions of a fit (relative to the prior) and profile the non-Gaussian ones."""
-    scale = prior.one_sigma
+def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> BatchCovariance:
+    """Test the weakest directions of a fit (relative to the prior) and profile the non-Gaussian ones.
+
+    Args:
+        problem: the cost that was fitted, at the noise factors ``fitted.effective``.
+        fitted: its minimum.
+        params: settings of the fit.
+    """
+    scale = problem.prior.one_sigma
     values, vectors = np.linalg.eigh(fitted.P_chart / np.outer(scale, scale))
     directions = []
     for value, vector in zip(values[::-1][: params.try_directions], vectors.T[::-1], strict=False):
         axis = vector * scale * np.sqrt(max(float(value), 0.0))
-        if _non_gaussian(poses, fitted, prior, params, axis):
+        if _non_gaussian(problem, fitted, params, axis):
             row = vector / scale / np.sqrt(value)  # row @ axis = 1
-            points = [_profile(poses, fitted, prior, params, axis, row, s) for s in (_NODE, -_NODE)]
+            points = [_profile(problem, fitted, params, axis, row, s) for s in (_NODE, -_NODE)]
             directions.append(NonGaussianDirection(axis, (points[0], points[1])))
     return BatchCovariance(fitted, tuple(directions))
 
 
-def _non_gaussian(poses: Poses, fitted: BatchFit, prior: Prior, params: FitParams, axis: Array) -> bool:
+def _non_gaussian(problem: Problem, fitted: BatchFit, params: FitParams, axis: Array) -> bool:
     gaussian = 0.5 * _TRIAL**2
     for side in (_TRIAL, -_TRIAL):
-        rise = cost(poses, fitted.chart.moved(side * axis), prior, params, fitted.effective) - fitted.half_chi2
+        rise = problem.cost(fitted.chart.moved(side * axis)) - fitted.half_chi2
         if not gaussian / params.bend_max < rise < gaussian * params.bend_max:
             return True
     return False
 
 
 def _profile(
-    poses: Poses, fitted: BatchFit, prior: Prior, params: FitParams, axis: Array, row: Array, side: float
+    problem: Problem, fitted: BatchFit, params: FitParams, axis: Array, row: Array, side: float
 ) -> ProfilePoint:
     """The fit with the direction fixed at ``side`` sigma, adjusted at most ``_TRIES`` times until the cost fits."""
     there, P = fitted.chart.moved(side * axis), fitted.P_chart
     for _ in range(_TRIES):
         pin = Pin(fitted.chart, row, side, _PIN_1S)
-        there, P = pinned(poses, there, prior, params, fitted.effective, pin)
-        rise = cost(poses, there, prior, params, fitted.effective) - fitted.half_chi2
+        there, P = problem.pinned(there, params, pin)
+        rise = problem.cost(there) - fitted.half_chi2
         if abs(rise - _RISE) < 0.2 * _RISE:
             break
         side *= float(np.clip(np.sqrt(_RISE / max(rise, 1e-9)), 0.4, 2.5))
@@ -124,9 +124,8 @@ def _profile(
 
 def final_mixture(
     found: BatchCovariance,
-    poses: Poses,
-    prior: Prior,
-    rules: FitParams,
+    problem: Problem,
+    latest: Poses,
     noise: tuple[float, float],
     t_ns: int,
     after_s: float,
@@ -135,9 +134,8 @@ def final_mixture(
 
     Args:
         found: the fit and its non-Gaussian directions.
-        poses: poses of the fit.
-        prior: prior of the fit.
-        rules: settings of the fit.
+        problem: the cost that was fitted.
+        latest: the last poses, with times from the instant of the last scan: those that the mean must agree with.
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
         t_ns: the instant of the last scan [ns].
         after_s: that instant after the epoch [s].
@@ -147,13 +145,14 @@ def final_mixture(
     bases: list[tuple[float, Chart, Pin | None, Array]] = [(1.0 - 2.0 * _WEIGHT * n, fitted.chart, None, axes)]
     bases += [(_WEIGHT, p.chart, p.pin, np.zeros((DIM, DIM))) for d in found.directions for p in d.points]
     out = []
+    recent = Problem(latest, problem.prior, fitted.effective)
     for weight, chart, pin, without in bases:
-        y, P = process_noise_pass(chart, pin, poses, prior, rules, fitted.effective, noise)
+        y, P = process_noise_pass(chart, pin, problem, noise)
         x, step = propagate_chart(chart, after_s)
         base, move = to_chart(x), step @ y
         share = 1.0
         if float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
-            share = _accepted_share(base, move, poses.latest(_LATEST, after_s), prior, rules, fitted.effective)
+            share = _accepted_share(base, move, recent)
         there = base.moved(share * move)
         P = step @ (P - without) @ step.T + (1.0 - share) ** 2 * np.outer(move, move)
         T = to_errors(there)
@@ -162,14 +161,13 @@ def final_mixture(
     return tuple(out)
 
 
-def _accepted_share(base: Chart, move: Array, latest: Poses, prior: Prior, rules: FitParams, factors: Array) -> float:
+def _accepted_share(base: Chart, move: Array, latest: Problem) -> float:
     """The part of the linear correction by process noise that lowers the cost of the latest poses most, 0 if none does.
 
     The correction is a Gauss-Newton step of a linearised problem; along a strongly curved direction a full step can
     be worse than none.
     """
-    charts = [base.moved(share * move) for share in _SHARES]
-    costs = [cost(latest, chart, Prior(chart, prior.P), rules, factors) for chart in charts]
+    costs = [latest.misfit(base.moved(share * move)) for share in _SHARES]
     return _SHARES[int(np.argmin(costs))]
 
 
@@ -204,24 +202,21 @@ def mixture_forecast(
         torque: root density of the angular disturbance [rad/s^1.5].
         force: root density of the linear disturbance [m/s^1.5].
     """
-    total, centre = np.zeros((3, len(times_s))), None
+    times = np.asarray(times_s, dtype=np.float64)
+    total, centre = np.zeros((len(times), 3)), None
     for component in components:
-        now, _ = propagate(component.belief, t_ns, torque, force)
-        found = grasp_forecast(now, times_s, torque, force)
-        motion = _grasp_motion(now.x, times_s)
+        ahead = times + (t_ns - component.belief.t_ns) * 1e-9
+        predicted = grasp_prediction(component.belief, ahead, torque, force)
+        if predicted is None:
+            return Forecast(times, *np.full((3, len(times)), np.inf))
+        variances, motion = predicted
         centre = motion if centre is None else centre
-        own = np.array([found.pos_1s_m, found.vel_1s_mps, found.rot_1s_rad]) ** 2
-        turn = geometry.angle(geometry.multiply(geometry.conjugate(centre[2]), motion[2])) ** 2
-        off = [((motion[k] - centre[k]) ** 2).sum(axis=1) for k in (0, 1)]
-        total += component.weight * (own + np.array([*off, turn]))
-    return Forecast(np.asarray(times_s, dtype=np.float64), *np.sqrt(np.maximum(total, 0.0)))
-
-
-def _grasp_motion(x: State, times_s: Array) -> tuple[Array, Array, Array]:
-    """Position, velocity and attitude q_ac of the grasp point at ``times_s``."""
-    position, velocity = grasp_trajectory(x)(times_s)
-    q_ab, _ = rotation_path(x).at(np.asarray(times_s, dtype=np.float64))
-    return position, velocity, geometry.multiply(q_ab, x.q_bc)
+        position, velocity = ((motion[:, k : k + 3] - centre[:, k : k + 3]) for k in (0, 3))
+        turn = geometry.multiply(geometry.conjugate(centre[:, 6:]), motion[:, 6:])[:, :3]
+        off = np.stack([(d * d).sum(axis=1) for d in (position, velocity, turn)], axis=1)
+        total += component.weight * (variances + off)
+    position, velocity, half_angle = np.sqrt(np.maximum(total, 0.0)).T
+    return Forecast(times, position, velocity, 2.0 * half_angle)
 
 
 def propagate_chart(chart: Chart, h: float) -> tuple[State, Array]:
@@ -236,36 +231,20 @@ def memory_s(torque: float) -> float:
 
 
 def process_noise_pass(
-    chart: Chart,
-    pin: Pin | None,
-    poses: Poses,
-    prior: Prior,
-    rules: FitParams,
-    factors: Array,
-    noise: tuple[float, float],
+    chart: Chart, pin: Pin | None, problem: Problem, noise: tuple[float, float]
 ) -> tuple[Array, Array]:
     """Correction y (20,) of a trajectory at the epoch by process noise, and its covariance P, valid at the last pose.
 
     ``pin`` fixes a direction as in the profile fit; ``noise``: root densities of torque and force as in the filter.
     """
-    rows, J = linearised(poses, chart, prior, rules, factors)
-    into = np.linalg.inv(to_errors(chart))[:, :_DISTURBED]
-    Q = into @ _noise_increments(to_state(chart), poses.times_s, *noise) @ into.T
+    prior = problem.prior
     y, P = -chart.minus(prior.mean), prior.P
     if pin is not None:
         k = P @ pin.row / float(pin.row @ P @ pin.row + pin.one_sigma**2)
         y, P = y - k * (pin.error(chart) * pin.one_sigma + float(pin.row @ y)), P - np.outer(k, pin.row @ P)
-    return _motion.filter(y, np.ascontiguousarray(0.5 * (P + P.T)), rows, J, Q)
-
-
-def _noise_increments(x: State, times_s: Array, torque: float, force: float) -> Array:
-    """(n, 12, 12) process noise of attitude to velocity added before each pose, propagated back to the epoch."""
-    _, _, S, added = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), torque_density(x.sigma, torque), times_s)
-    back = np.linalg.inv(S[:, :, :6])
-    total = np.zeros((len(times_s), _DISTURBED, _DISTURBED))
-    total[:, :6, :6] = back @ added @ np.swapaxes(back, 1, 2)
-    t, one = times_s[:, None, None], force**2 * np.eye(3)
-    total[:, RHO, RHO], total[:, VEL, VEL] = one * t**3 / 3.0, one * t
-    total[:, RHO, VEL] = total[:, VEL, RHO] = -one * t**2 / 2.0
-    total[1:] -= total[:-1].copy()
-    return total
+    T, x = to_errors(chart), to_state(chart)
+    P = T @ P @ T.T
+    problem.core.linearise(chart.flat)
+    y, P = problem.core.smooth(T @ y, 0.5 * (P + P.T), torque_density(x.sigma, noise[0]), noise[1] ** 2)
+    back = np.linalg.inv(T)
+    return back @ y, back @ P @ back.T

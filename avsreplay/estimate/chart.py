@@ -13,6 +13,9 @@ from the centre of mass to the fixture in {C}.
 The order and the signs of the principal axes are arbitrary: (q, mu, sigma) are determined only up to 24 axis
 permutations, proper rotations R_bn (columns: new axes in the old {B}). sigma follows the permutation and changes its
 sign if the permutation is odd: s'_i = parity * s_perm(i). The truth is therefore compared modulo these.
+
+Displacement, difference, state and Jacobian of a chart are computed by the extension (``kernel/chart.cpp``), which the
+fit uses as well.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from itertools import permutations, product
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.estimate import _motion
 from avsreplay.estimate.dynamics import sigma3, sigma_join
 from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W
 from avsreplay.geometry import Array
@@ -30,7 +34,6 @@ from avsreplay.records import Belief, State
 
 ETA, RATE, POSITION, VELOCITY = (slice(k, k + 3) for k in (0, 3, 6, 9))
 INERTIA, ARM = slice(12, 17), slice(17, 20)
-LEAST_GAP = 1e-4  # smallest difference of two eigenvalues of M: the axes of equal moments have no direction
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,40 +95,36 @@ class Chart:
     arm_c: Array
     R_cb: Array
 
-    def moved(self, y: Array) -> Chart:
-        """Displaced by a step y (20,); a half-angle vector longer than 1 is cut to a half turn."""
-        M = self.M + np.tensordot(y[INERTIA], _BASIS, 1)
-        return Chart(
-            geometry.multiply(self.q_ac, _half_angle(y[ETA])),
-            self.w_c + y[RATE],
-            self.t_a + y[POSITION],
-            self.u_a + y[VELOCITY],
-            M,
-            self.arm_c + y[ARM],
-            _axes(M, self.R_cb),
+    @classmethod
+    def of(cls, flat: Array) -> Chart:
+        """The chart of the extension's 34 numbers."""
+        return cls(
+            flat[:4],
+            flat[4:7],
+            flat[7:10],
+            flat[10:13],
+            flat[13:22].reshape(3, 3),
+            flat[22:25],
+            flat[25:].reshape(3, 3),
         )
+
+    @property
+    def flat(self) -> Array:
+        """(34,) all numbers, in the extension's order."""
+        return np.concatenate(
+            (self.q_ac, self.w_c, self.t_a, self.u_a, self.M.reshape(-1), self.arm_c, self.R_cb.reshape(-1))
+        )
+
+    def moved(self, y: Array) -> Chart:
+        """Displaced by a step y (20,); a half-angle vector longer than 1 is cut to a half turn.
+
+        The columns of R_cb are the eigenvectors in the order and with the signs nearest to those before.
+        """
+        return Chart.of(_motion.moved(self.flat, np.ascontiguousarray(y, dtype=np.float64)))
 
     def minus(self, other: Chart) -> Array:
         """The step y (20,) with ``other.moved(y)`` equal to this."""
-        y = np.empty(DIM)
-        y[ETA] = geometry.normalise(geometry.multiply(geometry.conjugate(other.q_ac), self.q_ac))[:3]
-        y[RATE], y[POSITION], y[VELOCITY] = self.w_c - other.w_c, self.t_a - other.t_a, self.u_a - other.u_a
-        y[INERTIA] = np.tensordot(_BASIS, self.M - other.M, 2)
-        y[ARM] = self.arm_c - other.arm_c
-        return y
-
-
-def _half_angle(v: Array) -> Array:
-    n2 = float(v @ v)
-    return np.append(v, np.sqrt(1.0 - n2)) if n2 < 1.0 else np.append(v / np.sqrt(n2), 0.0)
-
-
-def _axes(M: Array, near: Array) -> Array:
-    """R_cb: right-handed eigenvectors of M in the order and with the signs nearest to ``near``."""
-    V = np.linalg.eigh(M)[1]
-    V = V if np.linalg.det(V) > 0.0 else -V
-    out: Array = V @ _R_BN[int(np.argmax(np.tensordot(_R_BN, V.T @ near, 2)))]
-    return out
+        return _motion.minus(self.flat, other.flat)
 
 
 def inertia_matrices(y: Array) -> Array:
@@ -143,46 +142,14 @@ def to_chart(x: State) -> Chart:
     return Chart(q_ac, R_bc.T @ x.w_b, x.T_ac.t, x.fixture_velocity, 0.5 * (M + M.T), R_bc.T @ x.c_b, R_bc.T)
 
 
-def _eigenvalues(c: Chart) -> Array:
-    m: Array = (c.R_cb.T @ c.M @ c.R_cb).diagonal().copy()
-    low, middle, high = np.argsort(m, kind="stable")
-    m[middle] = max(m[middle], m[low] + LEAST_GAP)
-    m[high] = max(m[high], m[middle] + LEAST_GAP)
-    return m
-
-
 def to_state(c: Chart) -> State:
     """The state of chart coordinates, its principal axes being the columns of ``R_cb``."""
-    m = _eigenvalues(c)
-    sigma = np.tanh(0.5 * np.array([m[2] - m[1], m[0] - m[2]]))
-    q_bc = geometry.quaternion(c.R_cb.T)
-    q_ab = geometry.multiply(c.q_ac, geometry.conjugate(q_bc))
-    R_ac = geometry.matrix(c.q_ac)
-    r_a, v_a = c.t_a - R_ac @ c.arm_c, c.u_a - R_ac @ (geometry.skew(c.w_c) @ c.arm_c)
-    return State(q_ab, c.R_cb.T @ c.w_c, r_a, v_a, sigma, c.R_cb.T @ c.arm_c, q_bc)
+    return State(*_motion.state(c.flat))
 
 
 def to_errors(c: Chart) -> Array:
     """Jacobian T (20, 20): error states d = T y of ``to_state`` for a small chart step y."""
-    A, m = c.R_cb.T, _eigenvalues(c)
-    D = A @ _BASIS @ A.T  # the basis in {B}
-    dmu = np.zeros((3, 5))
-    for axis, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
-        dmu[axis] = 0.5 * D[:, i, j] / (m[j] - m[i])
-    sigma = np.tanh(0.5 * np.array([m[2] - m[1], m[0] - m[2]]))
-    T = np.zeros((DIM, DIM))
-    T[0:3, ETA], T[0:3, INERTIA] = A, -dmu
-    T[3:6, RATE], T[3:6, INERTIA] = A, -2.0 * geometry.skew(A @ c.w_c) @ dmu
-    R_ac, arm, turning = geometry.matrix(c.q_ac), geometry.skew(c.arm_c), geometry.skew(c.w_c)
-    twist = geometry.skew(turning @ c.arm_c)
-    T[6:9, POSITION] = T[9:12, VELOCITY] = np.eye(3)
-    T[6:9, ETA], T[6:9, ARM] = 2.0 * R_ac @ arm, -R_ac
-    T[9:12, ETA], T[9:12, RATE], T[9:12, ARM] = 2.0 * R_ac @ twist, R_ac @ arm, -R_ac @ turning
-    T[12, INERTIA] = 0.5 * (1.0 - sigma[0] ** 2) * (D[:, 2, 2] - D[:, 1, 1])
-    T[13, INERTIA] = 0.5 * (1.0 - sigma[1] ** 2) * (D[:, 0, 0] - D[:, 2, 2])
-    T[14:17, ARM], T[14:17, INERTIA] = A, -2.0 * geometry.skew(A @ c.arm_c) @ dmu
-    T[17:20, INERTIA] = dmu
-    return T
+    return _motion.errors(c.flat)
 
 
 def permute_axes(x: State, permutation: AxisPermutation) -> State:

@@ -15,7 +15,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import _motion
-from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W, hamilton, rotation
+from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W, hamilton
 from avsreplay.geometry import IDENTITY_QUAT, Array, skew
 from avsreplay.records import Belief, Forecast, State, Trajectory
 
@@ -225,23 +225,30 @@ def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) 
     times = np.asarray(times_s, dtype=np.float64)
     if times.ndim != 1 or np.any(times[:1] < 0.0) or np.any(times[1:] < times[:-1]):
         raise ValueError("times must ascend from 0")
-    x = belief.x
-    if float(np.abs(x.w_b).max()) * float(times.max(initial=0.0)) > MOST_RAD:
+    predicted = grasp_prediction(belief, times, torque, force)
+    if predicted is None:
         return Forecast(times, *np.full((3, len(times)), np.inf))
-    _, w, S, Q = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), torque_density(x.sigma, torque), times)
-    A_ab = rotation(x.q_ab) @ np.swapaxes(S[:, :3, :3], 1, 2)  # the attitude block of S is A(q_rel)'
-    J = grasp_jacobian(A_ab, w, x.c_b)
-    rotational = J[:, :, :6]
-    J_Phi = J.copy()
-    J_Phi[:, :, :6] = rotational @ S[:, :, :6]
-    J_Phi[:, :, SIGMA] = rotational @ (S[:, :, 6:] @ sigma_join(x.sigma))
-    J_Phi[:, :, VEL] += times[:, None, None] * J[:, :, RHO]
-    rows = np.sum((J_Phi @ belief.P) * J_Phi, axis=2) + np.sum((rotational @ Q) * rotational, axis=2)
-    variances = rows.reshape(-1, 3, 3).sum(axis=2)
-    variances[:, 0] += 3.0 * force**2 * times**3 / 3.0
-    variances[:, 1] += 3.0 * force**2 * times
-    position, velocity, half_angle = np.sqrt(np.maximum(variances, 0.0)).T
+    position, velocity, half_angle = np.sqrt(np.maximum(predicted[0], 0.0)).T
     return Forecast(times, position, velocity, 2.0 * half_angle)
+
+
+def grasp_prediction(belief: Belief, times_s: Array, torque: float, force: float) -> tuple[Array, Array] | None:
+    """Variances (n, 3) of the grasp point's position, velocity and half-angle attitude, and its motion (n, 10).
+
+    The motion is position [m], velocity [m/s] in {A}, and attitude q_ac. None where the target would turn by more than
+    ``MOST_RAD``.
+
+    Args:
+        belief: mean and covariance now.
+        times_s: (n,) >= 0, ascending [s after now].
+        torque: root density of the angular disturbance [rad/s^1.5].
+        force: root density of the linear disturbance [m/s^1.5].
+    """
+    x = belief.x
+    if max(map(abs, x.w_b.tolist())) * float(times_s.max(initial=0.0)) > MOST_RAD:
+        return None
+    P, density = np.ascontiguousarray(belief.P), torque_density(x.sigma, torque)
+    return _motion.forecast(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, P, density, force**2, times_s)
 
 
 def pose_rows(x: State, times_s: Array) -> Array:

@@ -18,8 +18,15 @@ from itertools import pairwise
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, cost, fit
-from avsreplay.estimate.batch_covariance import BatchCovariance, Component, covariance_of, final_mixture, moments
+from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit
+from avsreplay.estimate.batch_covariance import (
+    LATEST,
+    BatchCovariance,
+    Component,
+    covariance_of,
+    final_mixture,
+    moments,
+)
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.error_state import DIM, boxplus, hamilton
@@ -192,11 +199,13 @@ def batch_estimate(
     rejected = last is not None and last.prior_rejected
     if given is not None and not rejected:
         joint = fit(poses, start, given, rules, factors)
-        rejected = _contradicts(poses, fitted, weak, joint, given, rules)
+        rejected = _contradicts(poses, fitted, weak, joint, given)
         fitted, prior = (fitted, weak) if rejected else (joint, given)
-    found = covariance_of(poses, fitted, prior, rules)
+    problem = Problem(poses, prior, fitted.effective)
+    found = covariance_of(problem, fitted, rules)
     now_ns, noise = fixes[-1].scan_ns, (params.torque_noise_radps15, params.force)
-    components = final_mixture(found, poses, prior, rules, noise, now_ns, (now_ns - fixes[0].t_ns) * 1e-9)
+    after_s = (now_ns - fixes[0].t_ns) * 1e-9
+    components = final_mixture(found, problem, poses.latest(LATEST, after_s), noise, now_ns, after_s)
     gaussian = _determined(found, weak)
     return BatchResult(
         epoch_ns=fixes[0].t_ns,
@@ -211,13 +220,13 @@ def batch_estimate(
     )
 
 
-def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior, rules: FitParams) -> bool:
+def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior) -> bool:
     """Return whether the given prior raises the cost of the poses too much, at the fitted noise.
 
     If the given prior is right, twice the difference is at most chi-square with 20 degrees of freedom.
     """
-    alone = cost(poses, fitted.chart, weak, rules, fitted.effective)
-    return 2.0 * (cost(poses, joint.chart, given, rules, fitted.effective) - alone) > BOUND
+    alone, with_given = (Problem(poses, prior, fitted.effective) for prior in (weak, given))
+    return 2.0 * (with_given.cost(joint.chart) - alone.cost(fitted.chart)) > BOUND
 
 
 def _mean_turn(poses: Poses) -> float:

@@ -29,14 +29,6 @@ _MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of t
 _LAGS = (5, 10, 20, 40)
 
 
-def weigh(chi2: Array, redescend: bool) -> tuple[Array, Array]:
-    """M-estimator weights and costs (n,) of chi2 (n,): quadratic up to GATE, beyond it Cauchy's, or else Huber's."""
-    over = np.maximum(chi2 / GATE, 1.0)
-    if redescend:
-        return 1.0 / over, np.where(over > 1.0, GATE * (1.0 + np.log(over)), chi2)
-    return 1.0 / np.sqrt(over), np.where(over > 1.0, GATE * (2.0 * np.sqrt(over) - 1.0), chi2)
-
-
 def integrated_autocorrelation(e: Array) -> float:
     """1 + 2 sum of the autocorrelations of rows e (n, 3), over the lags with the largest significant (3 sigma) sum."""
     n, e = len(e), np.ascontiguousarray(e).reshape(-1)

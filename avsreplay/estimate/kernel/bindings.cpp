@@ -5,8 +5,7 @@
 
 #include <cstring>
 
-#include "motion.hpp"
-#include "update.hpp"
+#include "fit.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -75,9 +74,6 @@ nb::tuple at(Path& path, const Times& times) {
   return nb::make_tuple(qs, ws);
 }
 
-using Square = double[DIM][DIM];
-using Rows = double[SEEN][DIM];
-
 // The numbers of an array as a matrix of fixed size.
 template <class Fixed>
 const Fixed& as(const double* data) {
@@ -101,26 +97,46 @@ Numpy made(const double (&from)[N][M]) {
   return out;
 }
 
-// All rows in turn, from y and P.
-nb::tuple filter(const Vector<DIM>& y0, const Matrix<DIM, DIM>& P0, const Matrix<-1, SEEN>& e,
-                 const Matrix<-1, SEEN, DIM>& H, const Matrix<-1, DIM, DIM>& Q) {
-  const size_t n = e.shape(0);
-  if (H.shape(0) != n || Q.shape(0) != n) throw std::invalid_argument("e, H and Q must be equally many");
-  double y[DIM];
-  Square P;
-  std::memcpy(y, y0.data(), sizeof y);
-  std::memcpy(P, P0.data(), sizeof P);
-  {
-    nb::gil_scoped_release release;
-    for (size_t k = 0; k < n; ++k)
-      pass(y, P, e.data() + SEEN * k, as<Rows>(H.data() + SEEN * DIM * k), as<Square>(Q.data() + DIM * DIM * k));
-  }
-  return nb::make_tuple(made(y), made(P));
-}
-
 template <size_t N>
 void put(const Vector<(int)N>& from, double (&to)[N]) {
   std::memcpy(to, from.data(), sizeof to);
+}
+
+State state_from(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v, const Vector<2>& sigma,
+                 const Vector<3>& c, const Vector<4>& q_bc) {
+  State x;
+  put<4>(q_ab, x.q_ab), put<3>(w, x.w_b), put<3>(r, x.r_a), put<3>(v, x.v_a);
+  put<2>(sigma, x.sigma), put<3>(c, x.c_b), put<4>(q_bc, x.q_bc);
+  return x;
+}
+
+// Per instant: variances of position, velocity and half-angle attitude; position, velocity and attitude q_ac.
+nb::tuple forecast_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
+                      const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Matrix<DIM, DIM>& P,
+                      const Three& torque, double force, const Times& times) {
+  const size_t n = times.shape(0);
+  double *variances, *motion;
+  Numpy first = array({n, 3}, &variances), second = array({n, 10}, &motion);
+  {
+    nb::gil_scoped_release release;
+    const State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
+    double join[3][2], t = 0;
+    Body body = body_of(x, join);
+    std::memcpy(body.push, torque.data(), sizeof body.push);
+    Flow flow = begin(turn_of(x));
+    for (size_t k = 0; k < n; ++k) {
+      advance(flow, body, times(k) - t);
+      t = times(k);
+      forecast(x, as<Square>(P.data()), force, t, flow, variances + 3 * k);
+      const Quad q = quad(flow.at.q), q_ac = q * quad(x.q_bc);
+      const V3 arm = vector(x.c_b), position = vector(x.r_a) + t * vector(x.v_a) + matrix(q) * arm;
+      const V3 velocity = vector(x.v_a) + matrix(q) * cross(vector(flow.at.w), arm);
+      std::memcpy(motion + 10 * k, &position, sizeof position);
+      std::memcpy(motion + 10 * k + 3, &velocity, sizeof velocity);
+      std::memcpy(motion + 10 * k + 6, &q_ac, sizeof q_ac);
+    }
+  }
+  return nb::make_tuple(first, second);
 }
 
 // The state's seven arrays and P, once a pose has been seen.
@@ -128,11 +144,10 @@ nb::tuple correct_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>&
                      const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Matrix<DIM, DIM>& P0,
                      const Matrix<SEEN, DIM>& H, const Vector<SEEN>& alpha, const Matrix<SEEN, SEEN>& S,
                      const Matrix<SEEN, SEEN>& R, const Two& colour) {
-  State x;
+  State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
   Pose seen;
   Square P;
-  put<4>(q_ab, x.q_ab), put<3>(w, x.w_b), put<3>(r, x.r_a), put<3>(v, x.v_a);
-  put<2>(sigma, x.sigma), put<3>(c, x.c_b), put<4>(q_bc, x.q_bc), put<SEEN>(alpha, seen.alpha);
+  put<SEEN>(alpha, seen.alpha);
   std::memcpy(P, P0.data(), sizeof P);
   std::memcpy(seen.H, H.data(), sizeof seen.H);
   std::memcpy(seen.S, S.data(), sizeof seen.S);
@@ -142,6 +157,124 @@ nb::tuple correct_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>&
                         made(P));
 }
 
+using Flat = Vector<CHART>;
+
+Chart chart(const Flat& from) {
+  Chart to;
+  std::memcpy(&to, from.data(), sizeof to);
+  return to;
+}
+
+Numpy flat(const Chart& from) {
+  double* to;
+  Numpy out = array({CHART}, &to);
+  std::memcpy(to, &from, sizeof from);
+  return out;
+}
+
+Numpy copied(const std::vector<double>& from, std::initializer_list<size_t> shape) {
+  double* to;
+  Numpy out = array(shape, &to);
+  std::memcpy(to, from.data(), from.size() * sizeof(double));
+  return out;
+}
+
+Numpy moved_by(const Flat& from, const Vector<DIM>& y) { return flat(moved(chart(from), y.data())); }
+
+Numpy minus_of(const Flat& c, const Flat& from) {
+  double y[DIM];
+  minus(chart(c), chart(from), y);
+  return made(y);
+}
+
+nb::tuple state(const Flat& from) {
+  const State x = state_of(chart(from));
+  return nb::make_tuple(made(x.q_ab), made(x.w_b), made(x.r_a), made(x.v_a), made(x.sigma), made(x.c_b), made(x.q_bc));
+}
+
+Numpy errors(const Flat& from) {
+  Square T;
+  errors_of(chart(from), T);
+  return made(T);
+}
+
+void create(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
+            const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info, const Flat& mean,
+            const Matrix<DIM, DIM>& prior_info) {
+  const size_t n = t.shape(0);
+  if (q.shape(0) != n || p.shape(0) != n || root.shape(0) != n || info.shape(0) != n)
+    throw std::invalid_argument("times, q, p, root and info must be equally many");
+  new (self) Problem();
+  self->poses.resize(n);
+  for (size_t k = 0; k < n; ++k) {
+    Measured& pose = self->poses[k];
+    pose.t = t(k);
+    std::memcpy(&pose.q, q.data() + 4 * k, sizeof pose.q);
+    std::memcpy(&pose.p, p.data() + 3 * k, sizeof pose.p);
+    std::memcpy(pose.root, root.data() + SEEN * SEEN * k, sizeof pose.root);
+    std::memcpy(pose.info, info.data() + 18 * k, sizeof pose.info);
+  }
+  self->mean = chart(mean);
+  std::memcpy(self->prior_info, prior_info.data(), sizeof self->prior_info);
+}
+
+void set_pin(Problem& self, const Flat& centre, const Vector<DIM>& row, double target, double one_sigma) {
+  self.pinned = true;
+  self.pin.centre = chart(centre);
+  std::memcpy(self.pin.row, row.data(), sizeof self.pin.row);
+  self.pin.target = target;
+  self.pin.one_sigma = one_sigma;
+}
+
+void set_noise(Problem& self, const Two& factors, bool redescend) {
+  std::memcpy(self.factors, factors.data(), sizeof self.factors);
+  self.redescend = redescend;
+  if (!self.weights.empty()) self.reweigh();
+}
+
+nb::tuple residuals(const Problem& self, const Flat& at) {
+  double* d;
+  Numpy out = array({self.poses.size(), SEEN}, &d);
+  double misfit;
+  const double cost = self.cost_at(chart(at), d, &misfit);
+  return nb::make_tuple(cost, misfit, out);
+}
+
+nb::tuple descend(Problem& self, int most, double gain_tol) {
+  int steps = 0;
+  bool done;
+  {
+    nb::gil_scoped_release release;
+    done = self.descend(most, gain_tol, steps);
+  }
+  return nb::make_tuple(steps, done);
+}
+
+nb::tuple normal(const Problem& self) {
+  Square A;
+  double b[DIM];
+  self.normal(A, b);
+  return nb::make_tuple(made(A), made(b));
+}
+
+Two size_of(const Problem& self, const Matrix<DIM, DIM>& P) {
+  Two out;
+  self.size(as<Square>(P.data()), out.data());
+  return out;
+}
+
+nb::tuple smooth(const Problem& self, const Vector<DIM>& y0, const Matrix<DIM, DIM>& P0, const Three& torque, double force) {
+  double y[DIM];
+  Square P;
+  std::memcpy(y, y0.data(), sizeof y);
+  std::memcpy(P, P0.data(), sizeof P);
+  {
+    nb::gil_scoped_release release;
+    self.smooth(y, P, torque.data(), force);
+  }
+  return nb::make_tuple(made(y), made(P));
+}
+
 }  // namespace
 
 NB_MODULE(_motion, m) {
@@ -149,7 +282,28 @@ NB_MODULE(_motion, m) {
   m.def("correct", &correct_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
         nb::arg("colour"));
-  m.def("filter", &filter, nb::arg("y"), nb::arg("P"), nb::arg("e"), nb::arg("H"), nb::arg("Q"));
+  m.def("forecast", &forecast_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
+        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("torque"), nb::arg("force"), nb::arg("times"));
+  m.def("moved", &moved_by, nb::arg("chart"), nb::arg("y"));
+  m.def("minus", &minus_of, nb::arg("chart"), nb::arg("other"));
+  m.def("state", &state, nb::arg("chart"));
+  m.def("errors", &errors, nb::arg("chart"));
+  nb::class_<Problem>(m, "Problem")
+      .def("__init__", &create, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),
+           nb::arg("mean"), nb::arg("prior_info"))
+      .def("pin", &set_pin, nb::arg("centre"), nb::arg("row"), nb::arg("target"), nb::arg("one_sigma"))
+      .def("unpin", [](Problem& self) { self.pinned = false; })
+      .def("noise", &set_noise, nb::arg("factors"), nb::arg("redescend"))
+      .def("linearise", [](Problem& self, const Flat& at) { self.linearise(chart(at)); }, nb::arg("chart"))
+      .def("residuals", &residuals, nb::arg("chart"))
+      .def("descend", &descend, nb::arg("most"), nb::arg("gain_tol"))
+      .def("normal", &normal)
+      .def("size", &size_of, nb::arg("P"))
+      .def("smooth", &smooth, nb::arg("y"), nb::arg("P"), nb::arg("torque"), nb::arg("force"))
+      .def_prop_ro("chart", [](const Problem& self) { return flat(self.at); }, nb::rv_policy::move)
+      .def_prop_ro("cost", [](const Problem& self) { return self.cost; })
+      .def_prop_ro("d", [](const Problem& self) { return copied(self.d, {self.poses.size(), SEEN}); }, nb::rv_policy::move)
+      .def_prop_ro("weights", [](const Problem& self) { return copied(self.weights, {self.poses.size()}); }, nb::rv_policy::move);
   nb::class_<Path>(m, "Path")
       .def("__init__", [](Path* self, const Vector<4>& q, const Vector<3>& w, const Three& sigma) {
         new (self) Path(turn(q, w), body(sigma, {0, 0, 0}));

@@ -1,0 +1,32 @@
+// The chart of the batch fit (chart.py): a state in {C} with the logarithm M of its second mass moments.
+#pragma once
+#include "small.hpp"
+#include "update.hpp"
+
+namespace avs {
+
+// Attitude of the fixture, rate in {C}, its position and velocity in {A}, M, arm from the centre of mass to it in {C},
+// and the principal axes R_cb. An array of 34 numbers in Python.
+struct Chart {
+  Quad q;
+  V3 w, t, u;
+  M3 M;
+  V3 arm;
+  M3 R_cb;
+};
+constexpr int CHART = 34;
+static_assert(sizeof(Chart) == CHART * sizeof(double), "a chart is copied as an array");
+
+// The chart displaced by a step y.
+Chart moved(const Chart& c, const double y[DIM]);
+
+// The step y from `from` to c.
+void minus(const Chart& c, const Chart& from, double y[DIM]);
+
+// The state of a chart.
+State state_of(const Chart& c);
+
+// Jacobian T of state_of: error states d = T y of a small step y.
+void errors_of(const Chart& c, double T[DIM][DIM]);
+
+}  // namespace avs

@@ -1,0 +1,325 @@
+#include "fit.hpp"
+
+#include <cstring>
+
+namespace avs {
+namespace {
+
+constexpr double GATE = 27.86;  // 99.99 % point of chi-square with 6 degrees of freedom, as in noise.py
+constexpr double LARGEST_RADPS = 0.5;  // a step that changes the rate by more than this plus the rate itself is not tried
+
+double dot(const double* a, const double* b, int n) {
+  double s = 0;
+  for (int i = 0; i < n; ++i) s += a[i] * b[i];
+  return s;
+}
+
+// x := A^-1 x for a symmetric positive definite A, by A = L D L'.
+void solve(const Square A, double x[DIM]) {
+  double L[DIM][DIM], D[DIM];
+  for (int r = 0; r < DIM; ++r) {
+    for (int c = 0; c <= r; ++c) {
+      double s = A[r][c];
+      for (int i = 0; i < c; ++i) s -= L[r][i] * D[i] * L[c][i];
+      if (c < r) L[r][c] = s / D[c];
+      else D[r] = s;
+    }
+    for (int i = 0; i < r; ++i) x[r] -= L[r][i] * x[i];
+  }
+  for (int r = DIM - 1; r >= 0; --r) {
+    x[r] /= D[r];
+    for (int i = r + 1; i < DIM; ++i) x[r] -= L[i][r] * x[i];
+  }
+}
+
+// Rows (3, 20) of the attitude's derivative B by (dq_v, w, sigma1..3), multiplied by A (3, 3) from the left.
+void turned(const M3& A, double f, const double S[6][9], const double join[3][2], double rows[3][DIM]) {
+  for (int r = 0; r < 3; ++r) {
+    double s[9];
+    for (int c = 0; c < 9; ++c) s[c] = f * (A.x[r][0] * S[0][c] + A.x[r][1] * S[1][c] + A.x[r][2] * S[2][c]);
+    for (int c = 0; c < 6; ++c) rows[r][c] = s[c];
+    for (int c = 0; c < 2; ++c) rows[r][12 + c] = s[6] * join[0][c] + s[7] * join[1][c] + s[8] * join[2][c];
+  }
+}
+
+void put(const M3& A, double f, int column, double rows[3][DIM]) {
+  for (int r = 0; r < 3; ++r)
+    for (int c = 0; c < 3; ++c) rows[r][column + c] = f * A.x[r][c];
+}
+
+// T' A T, symmetric.
+void congruent(const Square T, const Square A, Square out) {
+  Square AT = {};
+  for (int r = 0; r < DIM; ++r)
+    for (int i = 0; i < DIM; ++i)
+      for (int c = 0; c < DIM; ++c) AT[r][c] += A[r][i] * T[i][c];
+  for (int r = 0; r < DIM; ++r)
+    for (int c = 0; c < DIM; ++c) out[r][c] = 0;
+  for (int i = 0; i < DIM; ++i)
+    for (int r = 0; r < DIM; ++r)
+      for (int c = 0; c < DIM; ++c) out[r][c] += T[i][r] * AT[i][c];
+}
+
+M3 inverse(const double A[3][3]) {
+  M3 out;
+  for (int r = 0; r < 3; ++r)
+    for (int c = 0; c < 3; ++c)
+      out.x[c][r] = A[NEXT[r]][NEXT[c]] * A[LAST[r]][LAST[c]] - A[NEXT[r]][LAST[c]] * A[LAST[r]][NEXT[c]];
+  const double det = A[0][0] * out.x[0][0] + A[0][1] * out.x[1][0] + A[0][2] * out.x[2][0];
+  for (auto& row : out.x)
+    for (double& v : row) v /= det;
+  return out;
+}
+
+// S^-1 Q S^-T of a flow: its noise propagated back to the start. S = [A B; 0 D] with A orthogonal.
+void at_start(const Flow& flow, double out[6][6]) {
+  double D[3][3], back[6][6] = {};
+  for (int r = 0; r < 3; ++r) std::memcpy(D[r], &flow.S[3 + r][3], sizeof D[r]);
+  const M3 rate = inverse(D);
+  for (int r = 0; r < 3; ++r)
+    for (int c = 0; c < 3; ++c) {
+      back[r][c] = flow.S[c][r];
+      back[3 + r][3 + c] = rate.x[r][c];
+      for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) back[r][3 + c] -= flow.S[i][r] * flow.S[i][3 + j] * rate.x[j][c];
+    }
+  for (int r = 0; r < 6; ++r)
+    for (int c = 0; c < 6; ++c) {
+      out[r][c] = 0;
+      for (int i = 0; i < 6; ++i)
+        for (int j = 0; j < 6; ++j) out[r][c] += back[r][i] * flow.Q[i][j] * back[c][j];
+    }
+}
+
+}  // namespace
+
+Turn turn_of(const State& x) {
+  Turn turn;
+  std::memcpy(turn.q, x.q_ab, sizeof turn.q);
+  std::memcpy(turn.w, x.w_b, sizeof turn.w);
+  return turn;
+}
+
+Body body_of(const State& x, double join[3][2]) {
+  const double a = x.sigma[0], b = x.sigma[1], one = 1 + a * b;
+  const double slopes[3][2] = {{1, 0}, {0, 1}, {(b * b - 1) / (one * one), (a * a - 1) / (one * one)}};
+  std::memcpy(join, slopes, sizeof slopes);
+  return {{a, b, -(a + b) / one}, {0, 0, 0}};
+}
+
+// d = [theta; v] in {C}: estimated relative to measured pose. Returns chi-square.
+double Problem::residual(const Measured& pose, const State& x, const Turn& turn, double d[SEEN]) const {
+  const V3 theta = rotation_vector(conjugate(pose.q) * (quad(turn.q) * quad(x.q_bc)));
+  const V3 off = vector(x.r_a) + pose.t * vector(x.v_a) + matrix(quad(turn.q)) * vector(x.c_b) - pose.p;
+  const V3 v = transposed(matrix(pose.q)) * off;
+  std::memcpy(d, theta.x, sizeof theta.x);
+  std::memcpy(d + 3, v.x, sizeof v.x);
+  double chi2 = 0;
+  for (int r = 0; r < SEEN; ++r) {
+    double e = 0;
+    for (int c = 0; c <= r; ++c) e += pose.root[r][c] * (d[c] / factors[c >= 3]);
+    chi2 += e * e;
+  }
+  return chi2;
+}
+
+double Problem::robust(double chi2, double* weight) const {
+  const double over = chi2 / GATE;
+  *weight = 1;
+  if (!(over > 1)) return chi2;
+  *weight = redescend ? 1 / over : 1 / std::sqrt(over);
+  return redescend ? GATE * (1 + log_of(over)) : GATE * (2 * std::sqrt(over) - 1);
+}
+
+double Problem::penalty(const Chart& chart) const {
+  double off[DIM], s = 0;
+  minus(chart, mean, off);
+  for (int r = 0; r < DIM; ++r) s += off[r] * dot(prior_info[r], off, DIM);
+  if (!pinned) return 0.5 * s;
+  minus(chart, pin.centre, off);
+  const double miss = (dot(pin.row, off, DIM) - pin.target) / pin.one_sigma;
+  return 0.5 * (s + miss * miss);
+}
+
+double Problem::cost_at(const Chart& chart, double* residuals, double* misfit) const {
+  const State x = state_of(chart);
+  double join[3][2], own[SEEN], weight, sum = 0, t = 0;
+  const Body body = body_of(x, join);
+  Turn turn = turn_of(x);
+  for (size_t k = 0; k < poses.size(); ++k) {
+    avs::advance(turn, body, poses[k].t - t);
+    t = poses[k].t;
+    sum += robust(residual(poses[k], x, turn, residuals ? residuals + SEEN * k : own), &weight);
+  }
+  if (misfit) *misfit = 0.5 * sum;
+  return 0.5 * sum + penalty(chart);
+}
+
+void Problem::linearise(const Chart& chart) {
+  const size_t n = poses.size();
+  at = chart;
+  d.resize(SEEN * n), J.assign(SEEN * DIM * n, 0.0);
+  const State x = state_of(chart);
+  errors_of(chart, T);
+  double join[3][2], t = 0;
+  const Body body = body_of(x, join);
+  Flow flow = begin(turn_of(x));
+  const M3 A_cb = transposed(matrix(quad(x.q_bc))), arm = skew(vector(x.c_b));
+  for (size_t k = 0; k < n; ++k) {
+    const Measured& pose = poses[k];
+    avs::advance(flow, body, pose.t - t);
+    t = pose.t;
+    residual(pose, x, flow.at, &d[SEEN * k]);
+    const M3 R_ca = transposed(matrix(pose.q)), R_cb = R_ca * matrix(quad(flow.at.q));
+    auto* rows = reinterpret_cast<double(*)[DIM]>(&J[SEEN * DIM * k]);
+    turned(A_cb, 2, flow.S, join, rows);
+    put(A_cb, 2, 17, rows);
+    turned(R_cb * arm, -2, flow.S, join, rows + 3);
+    put(R_ca, 1, 6, rows + 3);
+    put(R_ca, t, 9, rows + 3);
+    put(R_cb, 1, 14, rows + 3);
+  }
+  reweigh();
+}
+
+void Problem::reweigh() {
+  const size_t n = poses.size();
+  weights.resize(n);
+  double sum = 0;
+  for (size_t k = 0; k < n; ++k) {
+    double chi2 = 0;
+    for (int r = 0; r < SEEN; ++r) {
+      double e = 0;
+      for (int c = 0; c <= r; ++c) e += poses[k].root[r][c] * (d[SEEN * k + c] / factors[c >= 3]);
+      chi2 += e * e;
+    }
+    sum += robust(chi2, &weights[k]);
+  }
+  cost = 0.5 * sum + penalty(at);
+}
+
+// Residual and Jacobian of a pose, of unit variance.
+void Problem::whitened(size_t k, double e[SEEN], Rows H) const {
+  const double w = std::sqrt(weights[k]);
+  const double* jacobian = &J[SEEN * DIM * k];
+  for (int r = 0; r < SEEN; ++r) {
+    e[r] = 0;
+    for (int c = 0; c < DIM; ++c) H[r][c] = 0;
+    for (int i = 0; i <= r; ++i) {
+      const double f = w * poses[k].root[r][i] / factors[i >= 3];
+      e[r] += f * d[SEEN * k + i];
+      for (int c = 0; c < DIM; ++c) H[r][c] += f * jacobian[DIM * i + c];
+    }
+  }
+}
+
+void Problem::normal(Square A, double b[DIM]) const {
+  Square B = {};
+  double g[DIM] = {}, e[SEEN];
+  Rows H;
+  for (size_t k = 0; k < poses.size(); ++k) {
+    whitened(k, e, H);
+    for (int i = 0; i < SEEN; ++i)
+      for (int r = 0; r < DIM; ++r) {
+        const double h = H[i][r];
+        for (int c = 0; c < DIM; ++c) B[r][c] += h * H[i][c];
+        g[r] -= h * e[i];
+      }
+  }
+  congruent(T, B, A);
+  double off[DIM];
+  minus(at, mean, off);
+  for (int r = 0; r < DIM; ++r) {
+    b[r] = -dot(prior_info[r], off, DIM);
+    for (int i = 0; i < DIM; ++i) b[r] += T[i][r] * g[i];
+    for (int c = 0; c < DIM; ++c) A[r][c] += prior_info[r][c];
+  }
+  if (!pinned) return;
+  minus(at, pin.centre, off);
+  const double miss = (dot(pin.row, off, DIM) - pin.target) / pin.one_sigma;
+  for (int r = 0; r < DIM; ++r) {
+    const double row = pin.row[r] / pin.one_sigma;
+    b[r] -= row * miss;
+    for (int c = 0; c < DIM; ++c) A[r][c] += row * pin.row[c] / pin.one_sigma;
+  }
+}
+
+bool Problem::descend(int most, double gain_tol, int& steps) {
+  double damping = 1e-3;
+  Square A, M;
+  double b[DIM], step[DIM];
+  normal(A, b);
+  for (int count = 1; count <= most; ++count) {
+    std::memcpy(M, A, sizeof M);
+    std::memcpy(step, b, sizeof step);
+    for (int k = 0; k < DIM; ++k) M[k][k] += damping * A[k][k];
+    solve(M, step);
+    double expected = dot(step, b, DIM);
+    for (int r = 0; r < DIM; ++r) expected -= 0.5 * step[r] * dot(A[r], step, DIM);
+    const double turning = std::sqrt(dot(at.w.x, at.w.x, 3)), change = std::sqrt(dot(step + 3, step + 3, 3));
+    const bool tried = change <= LARGEST_RADPS + turning;
+    const Chart there = tried ? moved(at, step) : at;
+    const double gain = tried ? cost - cost_at(there) : 0;
+    ++steps;
+    if (gain > 0) {
+      damping = std::max(damping * (gain > 0.5 * expected ? 0.1 : 0.5), 1e-9);
+      linearise(there);
+      normal(A, b);
+    } else {
+      damping *= 8;
+    }
+    if ((std::fabs(expected) < gain_tol && tried) || damping > 1e9) return true;
+  }
+  return false;
+}
+
+void Problem::size(const Square P, double out[2]) const {
+  Square Tt, Pe;
+  for (int r = 0; r < DIM; ++r)
+    for (int c = 0; c < DIM; ++c) Tt[r][c] = T[c][r];
+  congruent(Tt, P, Pe);
+  double sum[2] = {}, total = 0;
+  for (size_t k = 0; k < poses.size(); ++k) {
+    total += weights[k];
+    for (int block = 0; block < 2; ++block) {
+      const M3& info = poses[k].info[block];
+      const double *v = &d[SEEN * k + 3 * block], *rows = &J[DIM * (SEEN * k + 3 * block)];
+      double JP[3][DIM] = {}, s = 0;
+      for (int i = 0; i < 3; ++i)
+        for (int m = 0; m < DIM; ++m)
+          for (int c = 0; c < DIM; ++c) JP[i][c] += rows[DIM * i + m] * Pe[m][c];
+      for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) s += info.x[i][j] * (v[i] * v[j] + dot(JP[i], rows + DIM * j, DIM));
+      sum[block] += weights[k] * s;
+    }
+  }
+  for (int block = 0; block < 2; ++block) out[block] = sum[block] / (3 * total);
+}
+
+void Problem::smooth(double y[DIM], Square P, const double torque_density[3], double force_density) const {
+  const State x = state_of(at);
+  double join[3][2], before[6][6] = {}, now[6][6], e[SEEN], t = 0;
+  Body body = body_of(x, join);
+  std::memcpy(body.push, torque_density, sizeof body.push);
+  Flow flow = begin(turn_of(x));
+  Rows H;
+  for (size_t k = 0; k < poses.size(); ++k) {
+    const double last = t;
+    t = poses[k].t;
+    avs::advance(flow, body, t - last);
+    at_start(flow, now);
+    Square Q = {};
+    for (int r = 0; r < 6; ++r)
+      for (int c = 0; c < 6; ++c) Q[r][c] = now[r][c] - before[r][c];
+    std::memcpy(before, now, sizeof before);
+    for (int r = 0; r < 3; ++r) {
+      Q[6 + r][6 + r] = force_density * (t * t * t - last * last * last) / 3;
+      Q[9 + r][9 + r] = force_density * (t - last);
+      Q[6 + r][9 + r] = Q[9 + r][6 + r] = -force_density * (t * t - last * last) / 2;
+    }
+    whitened(k, e, H);
+    pass(y, P, e, H, Q);
+  }
+}
+
+}  // namespace avs

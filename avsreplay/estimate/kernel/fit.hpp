@@ -1,0 +1,75 @@
+// The cost of the batch fit over the initial values, its linearisation and its minimum (batch.py).
+#pragma once
+#include <vector>
+
+#include "chart.hpp"
+#include "motion.hpp"
+
+namespace avs {
+
+using Square = double[DIM][DIM];
+using Rows = double[SEEN][DIM];
+
+// A measured pose T_ac: time since the epoch, the inverse Cholesky factor of its covariance, and the information of its
+// attitude and of its position by themselves.
+struct Measured {
+  double t;
+  Quad q;
+  V3 p;
+  double root[SEEN][SEEN];
+  M3 info[2];
+};
+
+// A pseudo-measurement row . (chart - centre) = target that fixes one direction.
+struct Pin {
+  Chart centre;
+  double row[DIM], target, one_sigma;
+};
+
+class Problem {
+ public:
+  std::vector<Measured> poses;
+  Chart mean;
+  Square prior_info;
+  Pin pin;
+  bool pinned = false;
+  double factors[2] = {1, 1};  // on the noise of attitude and position
+  bool redescend = true;  // Cauchy's weights, else Huber's
+
+  // The linearisation at the present chart.
+  Chart at;
+  double cost;
+  std::vector<double> d, weights, chi2;  // residuals (n, 6), M-estimator weights (n)
+  std::vector<double> J;  // (n, 6, 20) by the error states at the epoch
+  Square T;  // error states by chart steps
+
+  void linearise(const Chart& chart);
+  // Cost at another chart, from the residuals alone; `misfit`: its part without the prior.
+  double cost_at(const Chart& chart, double* residuals = nullptr, double* misfit = nullptr) const;
+  // Weights and cost of the present residuals, with the present factors.
+  void reweigh();
+  // Normal equations A step = b in chart steps.
+  void normal(Square A, double b[DIM]) const;
+  // Levenberg-Marquardt from the present linearisation; returns whether the stopping rule was met within `most` steps.
+  bool descend(int most, double gain_tol, int& steps);
+  // Weighted mean of d' C^-1 d + tr C^-1 J P J', over three, of attitude and position; P in chart steps.
+  void size(const Square P, double out[2]) const;
+  // Kalman pass over the poses with process noise between them, from y and P (error states at the epoch).
+  void smooth(double y[DIM], Square P, const double torque_density[3], double force_density) const;
+
+ private:
+  double residual(const Measured& pose, const State& x, const Turn& turn, double d[SEEN]) const;
+  double robust(double chi2, double* weight) const;
+  double penalty(const Chart& chart) const;
+  void whitened(size_t k, double e[SEEN], Rows H) const;
+};
+
+// The rotation of a state, and its body with the derivative of sigma1..3 by the two that are states.
+Turn turn_of(const State& x);
+Body body_of(const State& x, double join[3][2]);
+
+// Variances of the grasp point's position, velocity and half-angle attitude t seconds after the state x with covariance
+// P, `flow` being the rotation since x.
+void forecast(const State& x, const Square P, double force_density, double t, const Flow& flow, double variances[3]);
+
+}  // namespace avs
