@@ -217,7 +217,7 @@ class Problem:
 
     def noise_factors(self) -> Array:
         """Noise factors (2,) from the residuals: mean of d' C^-1 d plus J P J', the part that the fit absorbed."""
-        return np.sqrt(np.array(self.core.size(self.covariance)))
+        return np.asarray(np.sqrt(self.core.size(self.covariance)))
 
 
 def _pair(factors: Array) -> tuple[float, float]:
