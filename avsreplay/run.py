@@ -12,7 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from avsreplay import pipeline, settings
+from avsreplay import arithmetic, pipeline, settings
 from avsreplay.build import first_state, stages
 from avsreplay.config import Against, RunConfig, load_config, pose_text
 from avsreplay.errors import UnreadableInput, UsageError
@@ -232,6 +232,7 @@ class Run:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""
         surface, losses = self.surface, self.source.losses
         return {
+            "arithmetic": arithmetic.state(),
             "log": {"name": self.job.source.name, "sha256": self.source.sha256, "scans": len(self.source)},
             "model": {"name": Path(surface.name).name, "sha256": surface.sha256, "extent_m": surface.extent},
             "clock": settings.dump(self.source.clock),

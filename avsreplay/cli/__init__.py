@@ -19,6 +19,7 @@ from pathlib import Path
 
 import click
 
+from avsreplay import arithmetic
 from avsreplay.errors import AvsError, UsageError
 
 __all__ = ["main"]
@@ -59,7 +60,8 @@ class _Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> object:
         """Run a command; an environment variable that belongs to no command is an error."""
-        unknown = sorted(name for name in os.environ if name.startswith("AVSREPLAY_"))
+        _check_arithmetic()
+        unknown = sorted(name for name in os.environ if name.startswith("AVSREPLAY_") and name != arithmetic.VARIABLE)
         if unknown:
             known = list(self._variables(ctx))
             unknown = [name for name in unknown if name not in known]
@@ -130,6 +132,14 @@ def group() -> None:
     Input: point clouds of a log. Output: poses and their errors, fault flags, observability, planned capture time.
     The same input gives the same bytes.
     """
+
+
+def _check_arithmetic() -> None:
+    """Raise UsageError if the variable that chooses the arithmetic has another value than those known."""
+    value = os.environ.get(arithmetic.VARIABLE, "pinned")
+    if value not in arithmetic.CHOICES:
+        known = " or ".join(arithmetic.CHOICES)
+        raise UsageError(f"{value[:40]!r} is unknown", where=f"environment {arithmetic.VARIABLE}", hint=f"use {known}")
 
 
 class StdoutClosed(BaseException):
