@@ -1,4 +1,4 @@
-"""Are the rows the same bytes on every processor? ``python tests/benchmarks/processors.py [--quick] [--qemu] [--native]``
+"""Are the rows the same bytes on every processor? ``python tests/benchmarks/processors.py [--quick] [--qemu]``
 
 Replays the fixtures with every installed back end, each run in a process of its own, on this processor and on emulated
 ones, and compares ``rows.jsonl`` byte for byte. For each environment that differs it prints the first differing
