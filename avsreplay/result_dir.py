@@ -1,11 +1,13 @@
 """The result directory of a run: written scan by scan, complete or not at all; beliefs are read back here.
 
 ``rows.jsonl``, ``estimate.tum``, ``registration.tum``, ``truth.tum``, ``beliefs.npz``, ``view.npz`` and ``result.mcap``
-depend on the input alone, byte for byte; ``run.json`` also names the versions.
+depend on the input alone, byte for byte; ``run.json`` also names the versions. An interrupted run also leaves its
+checkpoint, ``resume.bin``.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from itertools import pairwise
@@ -16,29 +18,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
-from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
-from avsreplay.estimate.measurement import measurement_jacobian
+from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import check_output, output_folder
 from avsreplay.geometry import Array, Pose
-from avsreplay.log.result_log import ResultFrame, ResultLog
 from avsreplay.numpy_archive import read_npz
-from avsreplay.pipeline import PipelineState, planned_segment
-from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief, State, Surface
 from avsreplay.register import Registrar
 from avsreplay.report.export import row_poses, write_layout, write_tum
 from avsreplay.report.jsonl import write_rows
-from avsreplay.report.result import write_manifest
+from avsreplay.report.result import load_result, write_manifest
 from avsreplay.report.view import CloudView, PathView, View, thin_cloud, thin_surface, write_view
 from avsreplay.rows import Row
-from avsreplay.run import Listener, ReplayedScan
+from avsreplay.run import Listener, ReplayedScan, Run
+from avsreplay.viewers import NewPaths, ResultLogWriter
 
-PATH_POINTS = 41
+CHECKPOINT = "resume.bin"  # of an interrupted run
 _MOST_BELIEF_BYTES, _LARGEST = 1 << 30, 1e15
 VIEW_REACH = 0.05  # of the model's extent: residuals in the view are cut off there
-_LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
-_STREAMED_COLUMNS = ("pos_err_m", "rot_err_deg", "rms_m", "nis", "sigma1", "sigma2", "t_go_s", "gamma")
 _BLOCKS = (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4))
 MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in _BLOCKS for k in range(size))
 
@@ -50,19 +46,6 @@ def mean_vector(x: State) -> Array:
         x: the mean of a belief.
     """
     return np.concatenate([getattr(x, name) for name, _ in _BLOCKS])
-
-
-def pose_covariance(belief: Belief) -> Array:
-    """Return the (6, 6) covariance of the pose of {C}: position in {A} [m], rotation vector in {A} [rad].
-
-    Args:
-        belief: mean and covariance of the estimator.
-    """
-    H = measurement_jacobian(belief.x)
-    to_a = np.zeros((6, 6))
-    to_a[:3, :3] = np.eye(3)
-    to_a[3:, 3:] = 2.0 * geometry.matrix(belief.x.q_ab)  # half angle in {B} -> full angle in {A}
-    return np.asarray(to_a @ H @ belief.P @ H.T @ to_a.T)
 
 
 def read_beliefs(path: Path) -> list[Belief]:
@@ -129,57 +112,11 @@ class Beliefs:
         np.savez(path, t_ns=np.array(self.t_ns, np.int64), x=np.array(self.x), P=np.array(self.P))
 
 
-class _NewPaths:
-    """Samples the flight of each capture plan once, at the scan at which it was made."""
-
-    def __init__(self) -> None:
-        self._known: Segment | None = None
-
-    def of(self, state: PipelineState) -> tuple[Array, Array] | None:
-        """Times (n,) [s] and positions (n, 3) [m] of a flight not seen before, None where there is none."""
-        segment = planned_segment(state)
-        if segment is None or segment is self._known or segment.path is None:
-            return None
-        self._known = segment
-        times = np.linspace(0.0, segment.path.t_go_s, PATH_POINTS)
-        return times, segment.path.at(times)[0]
-
-
-class ResultLogWriter:
-    """A listener that writes each scan's outcome to ``result.mcap``; ``close`` completes the file."""
-
-    def __init__(self, path: Path, surface: Surface) -> None:
-        self._log, self._paths = ResultLog(path, surface), _NewPaths()
-
-    def close(self) -> None:
-        """Complete the file."""
-        self._log.close()
-
-    def __call__(self, scan: ReplayedScan) -> None:
-        """Take one scan of a run."""
-        row, outcome = scan.row, scan.outcome
-        values = {name: value for name in _LOGGED_COLUMNS if (value := getattr(row, name)) is not None}
-        self._log.write(
-            ResultFrame(
-                t_ns=row.t_ns,
-                points=outcome.scan.points,
-                estimate=outcome.pose,
-                covariance=pose_covariance(outcome.belief),
-                registration=next((pose for _, pose in row_poses([row], "registration")), None),
-                truth=scan.truth.pose,
-                path=self._paths.of(scan.state),
-                healthy=row.gamma == 1,
-                message=row.reason,
-                values=values,
-            )
-        )
-
-
 class ViewWriter:
     """A listener that keeps a thinned model, thinned clouds and planned paths for the report page."""
 
     def __init__(self, surface: Surface, registrar: Registrar) -> None:
-        self._surface, self._registrar, self._paths = surface, registrar, _NewPaths()
+        self._surface, self._registrar, self._paths = surface, registrar, NewPaths()
         self._clouds: list[CloudView] = []
         self._plans: list[PathView] = []
 
@@ -259,13 +196,19 @@ class ResultWriter:
     The directory appears when the block ends without an error, after ``finish``, and not otherwise.
     """
 
-    def __init__(self, directory: ResultDirectory, surface: Surface, registrar: Registrar) -> None:
-        self._directory, self._surface = directory, surface
-        self._beliefs, self._view = Beliefs(), ViewWriter(surface, registrar)
+    def __init__(self, directory: ResultDirectory, run: Run) -> None:
+        """Start without results.
+
+        Args:
+            directory: where to write.
+            run: the open run.
+        """
+        self._directory, self._run = directory, run
+        self._beliefs, self._view = Beliefs(), ViewWriter(run.surface, run.registrar)
 
     def __enter__(self) -> ResultWriter:
         self._directory.__enter__()
-        self._log = ResultLogWriter(self._directory.file("result.mcap"), self._surface)
+        self._log = ResultLogWriter(self._directory.file("result.mcap"), self._run.surface)
         return self
 
     def __exit__(
@@ -280,68 +223,43 @@ class ResultWriter:
         """The listeners that must take every scan."""
         return self._beliefs, self._view, self._log
 
-    def finish(self, rows: Sequence[Row], record: Mapping[str, Any]) -> None:
+    def resume(self, facts: Mapping[str, Any]) -> list[Row]:
+        """Continue the interrupted run whose result the directory holds; return its rows.
+
+        Args:
+            facts: what ``run.json`` must state: the same log, model, settings and versions.
+
+        Raises:
+            UnreadableInput: the directory holds no interrupted run, or it is damaged.
+            UsageError: it was made from another input or with other settings.
+        """
+        folder = self._directory.path
+        if not (folder / CHECKPOINT).is_file():
+            hint = "leave out --resume; only a run that was interrupted can be resumed"
+            raise UsageError("no interrupted run", where=f"--resume {folder}", hint=hint)
+        record = load_result(folder).header
+        different = [name for name, value in facts.items() if record.get(name) != json.loads(json.dumps(value))]
+        if different:
+            hint = "give the same options as at first, or start anew with --overwrite"
+            what = f"the interrupted run differs in: {', '.join(different)}"
+            raise UsageError(what, where=f"--resume {folder}", hint=hint)
+        rows, self._beliefs, self._view, known = self._run.restore(folder / CHECKPOINT)
+        self._log.resume(folder / "result.mcap", known)
+        return list(rows)
+
+    def finish(self, rows: Sequence[Row], record: Mapping[str, Any], *, interrupted: bool = False) -> None:
         """Write what needs the whole run.
 
         Args:
             rows: one per scan.
             record: content of ``run.json``.
+            interrupted: write the checkpoint, too, from which ``resume`` continues.
         """
         self._log.close()
         self._directory.write(rows, self._beliefs)
         write_view(self._directory.file("view.npz"), self._view.view())
         write_layout(self._directory.file("result.layout.json"))
+        if interrupted:
+            more = (list(rows), self._beliefs, self._view, self._log.paths)
+            self._directory.file(CHECKPOINT).write_bytes(self._run.checkpoint(more))
         write_manifest(self._directory.file("run.json").parent, record, len(rows))
-
-
-class RerunStream:
-    """A listener that sends model, cloud, poses and scalars to a Rerun viewer (extra ``rerun``)."""
-
-    def __init__(self, surface: Surface, file: Path | None = None) -> None:
-        """Start the viewer or open the file, and send the model.
-
-        Args:
-            surface: model of the target.
-            file: .rrd file to write instead of opening a viewer.
-
-        Raises:
-            MissingBackend: rerun-sdk is not installed.
-        """
-        try:
-            import rerun
-        except ModuleNotFoundError:
-            hint = "install avsreplay[rerun]"
-            raise MissingBackend("rerun-sdk is not installed", where="--rerun", hint=hint) from None
-        self._rr: Any = rerun
-        rerun.init("avsreplay", spawn=file is None)
-        if file is not None:
-            rerun.save(str(file))
-        model = (
-            rerun.Mesh3D(vertex_positions=surface.vertices, triangle_indices=surface.faces)
-            if len(surface.faces)
-            else rerun.Points3D(surface.vertices)
-        )
-        for name in ("estimate", "truth"):
-            rerun.log(f"camera/{name}/model", model, static=True)
-
-    def __call__(self, scan: ReplayedScan) -> None:
-        """Take one scan of a run."""
-        rr, row = self._rr, scan.row
-        rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
-        rr.log("camera/scan", rr.Points3D(np.array(scan.outcome.scan.points, np.float32, order="C")))
-        self._place("camera/estimate", scan.outcome.pose)
-        if scan.truth.pose is not None:
-            self._place("camera/truth", scan.truth.pose)
-        for name in _STREAMED_COLUMNS:
-            value = getattr(row, name)
-            if value is not None:
-                rr.log(f"rows/{name}", rr.Scalars(float(value)))
-        if row.gamma == 0:
-            rr.log("rows/reason", rr.TextLog(row.reason))
-
-    def close(self) -> None:
-        """Send what is still buffered."""
-        self._rr.disconnect()
-
-    def _place(self, path: str, pose: Pose) -> None:
-        self._rr.log(path, self._rr.Transform3D(translation=pose.t, quaternion=pose.q))

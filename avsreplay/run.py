@@ -14,21 +14,22 @@ from typing import Any
 
 from avsreplay import arithmetic, pipeline, settings
 from avsreplay.build import first_state, stages
+from avsreplay.checkpoint import pack, unpack
 from avsreplay.config import Against, RunConfig, load_config, pose_text
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate.initialise import PoseFix
-from avsreplay.estimate.params import EstimatorParams
-from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
+from avsreplay.estimate.reference import Reference, reference_of
 from avsreplay.log import Source, SourceOptions, open_source
 from avsreplay.log.cloud_stream import ahead
 from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
+from avsreplay.plan import Motion
 from avsreplay.reconstruct import Reconstruction, at_grasp, reconstruct, surface_of
 from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.register import ModelCheck, Registrar
 from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
-from avsreplay.score import Scorer, matched_truth
+from avsreplay.score import HealthyPoses, Scorer, matched_truth
 
 RECONSTRUCTED = Path("auto")  # the model that is built from the log itself
 MOST_LOSSES = 100  # listed one by one in run.json
@@ -70,36 +71,6 @@ class Job:
     prefetch: int = 2
 
 
-class HealthyPoses:
-    """Collects the healthy poses of a run, for a fit to all of them. May serve as a listener."""
-
-    def __init__(self, params: EstimatorParams) -> None:
-        """Start without poses.
-
-        Args:
-            params: of the estimator, with auto values resolved.
-        """
-        self._params, self._fixes = params, list[PoseFix]()
-
-    def __call__(self, scan: ReplayedScan) -> None:
-        """Take one scan of a run."""
-        self.add(scan.state, scan.outcome)
-
-    def add(self, state: PipelineState, outcome: Outcome) -> None:
-        """Take the outcome of one scan; a pose that is not healthy is ignored.
-
-        Args:
-            state: state of the pipeline after the scan.
-            outcome: outcome of the scan.
-        """
-        if outcome.verdict.gamma and state.track is not None and state.last_pose is not None:
-            self._fixes.append(healthy_pose(state.track, outcome.scan.t_ns, state.last_pose, self._params))
-
-    def reference(self) -> Reference:
-        """Fit one motion to all of them. Raises UsageError where they are too few."""
-        return reference_of(self._fixes, self._params)
-
-
 class Run:
     """An open run; a context manager. ``rows`` may be iterated once.
 
@@ -109,6 +80,7 @@ class Run:
         surface: model of the target.
         registrar: registers scans against that model.
         model_check: check of the model by the rows processed so far.
+        done: number of scans processed so far.
     """
 
     def __init__(self, job: Job) -> None:
@@ -141,7 +113,10 @@ class Run:
         labelled = bool(header.labels) or header.seed is not None
         self._fold = SummaryFold(labels=header.labels if labelled else None, truth=header.truth)
         self._reference: Reference | None = None
+        self._fixes: list[PoseFix] = []  # poses of the reference motion
         self._reference_instants: list[int] = []
+        self._state, self.done = first_state(self._stages), 0
+        self._scored: Scorer | None = None
         self._end: tuple[Belief, State] | None = None
 
     def __enter__(self) -> Run:
@@ -172,16 +147,16 @@ class Run:
         """
         ready = self._new_stages()
         poses, instants = HealthyPoses(ready.estimator.params), set[int]()
-        for state, outcome in self._outcomes(ready, progress, "fitting"):
+        for state, outcome in self._outcomes(ready, progress, "fitting", first_state(ready)):
             poses.add(state, outcome)
             if outcome.scan.status is not ScanStatus.CLOCK:
                 instants.add(outcome.scan.t_ns)
-        self._reference = poses.reference()
+        self._reference, self._fixes = poses.reference(), poses.fixes
         self._reference_instants = sorted(instants)
         return self._reference
 
     def rows(self, listeners: Iterable[Listener] = (), progress: Progress | None = None) -> Iterator[Row]:
-        """Replay the log row by row.
+        """Replay the log row by row, after ``restore`` from the first scan that was not processed.
 
         Args:
             listeners: called with each scan, in this order, before its row is yielded.
@@ -199,21 +174,54 @@ class Run:
             raise UnreadableInput("no scan to replay", where=str(self.job.source), hint=hint)
         if self.config.reference is Against.FIT and self._reference is None:
             self.fit_reference(progress)
-        listeners, scorer = tuple(listeners), self._scorer()
-        outcomes = self._outcomes(self._stages, progress, "replaying")
+        listeners, self._scored = tuple(listeners), self._scored or self._scorer()
+        outcomes = self._outcomes(self._stages, progress, "replaying", self._state, self.done)
         if self.job.prefetch:  # the pipeline runs on a second thread; scoring and writing stay in this one
             outcomes = ahead(outcomes, self.job.prefetch)
         for state, outcome in outcomes:
             truth = self._truth_of(outcome.scan)
             self.model_check.add(outcome.scan.points, outcome.alignment)
-            row = Row.of(outcome, scorer.score(state, outcome, truth))
+            row = Row.of(outcome, self._scored.score(state, outcome, truth))
             self._fold.add(row)
             if truth.state is not None:
                 self._end = outcome.belief, truth.state
             scan = ReplayedScan(outcome, state, truth, row)
             for listener in listeners:
                 listener(scan)
+            self._state, self.done = state, self.done + 1
             yield row
+
+    def checkpoint(self, more: Any) -> bytes:
+        """Return the state after the last row, from which ``restore`` continues with the same bits.
+
+        Args:
+            more: further state to store with it, such as what listeners have collected.
+        """
+        own = (self._state, self.done, self._fold, self.model_check, self._end, self._scored)
+        motion = None if self._scored is None else self._scored.motion
+        return pack((*own, self._fixes, self._reference_instants, more), self._named(motion))
+
+    def restore(self, path: Path) -> Any:
+        """Continue from a checkpoint; returns what was stored with it.
+
+        Args:
+            path: file with the bytes of ``checkpoint``.
+
+        Raises:
+            UnreadableInput: the file is missing or damaged.
+        """
+        found = unpack(path, self._named(None))
+        self._state, self.done, self._fold, self.model_check, self._end, self._scored, *rest = found
+        self._fixes, self._reference_instants, more = rest
+        if self._fixes:
+            self._reference = reference_of(self._fixes, self._stages.estimator.params)
+        self._scored.motion = self._scorer().motion
+        return more
+
+    def _named(self, motion: Motion | None) -> dict[str, object]:
+        """Objects that a checkpoint refers to by name; the interpolation of the truth is made again."""
+        own = {"surface": self.surface, "registrar": self.registrar, "estimator": self._stages.estimator}
+        return {**own, "motion": motion}
 
     @property
     def truth(self) -> State | None:
@@ -244,12 +252,14 @@ class Run:
     def _new_stages(self) -> Stages:
         return stages(self.config, self.header, self.surface, self.registrar, self._true)
 
-    def _outcomes(self, ready: Stages, progress: Progress | None, what: str) -> Iterator[tuple[PipelineState, Outcome]]:
+    def _outcomes(
+        self, ready: Stages, progress: Progress | None, what: str, state: PipelineState, first: int = 0
+    ) -> Iterator[tuple[PipelineState, Outcome]]:
         """The pipeline over the scans, which are decoded ahead on a thread that ends with this generator."""
-        scans = self.source.scans(self.job.prefetch)
+        scans = self.source.scans(self.job.prefetch, first)
         try:
-            shown = progress(scans, len(self.source), what) if progress else scans
-            yield from pipeline.fold(ready, first_state(ready), shown)
+            shown = progress(scans, len(self.source) - first, what) if progress else scans
+            yield from pipeline.fold(ready, state, shown)
         finally:
             scans.close()
 

@@ -13,6 +13,9 @@ from avsreplay import geometry
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.chart import nearest_permutation, nees
 from avsreplay.estimate.error_state import boxminus
+from avsreplay.estimate.initialise import PoseFix
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
 from avsreplay.geometry import Pose
 from avsreplay.monitor.convergence import block_nees
 from avsreplay.outcome import CaptureError, Outcome, PoseError, Score
@@ -23,7 +26,11 @@ from avsreplay.records import Belief, State, Truth
 
 
 class Scorer:
-    """Scores the outcomes of a replay in their order."""
+    """Scores the outcomes of a replay in their order.
+
+    Attributes:
+        motion: interpolation of the true poses, None where plans cannot be scored.
+    """
 
     def __init__(self, estimator: Estimator, poses: Sequence[tuple[int, Pose]], reference: str) -> None:
         """Interpolate the true poses.
@@ -35,10 +42,10 @@ class Scorer:
         """
         self._estimator, self._reference = estimator, reference
         self._epoch_ns = poses[0][0] if poses else 0
-        self._motion: Motion | None = None
+        self.motion: Motion | None = None
         if len(poses) >= 4:
             times = np.array([(t_ns - self._epoch_ns) * 1e-9 for t_ns, _ in poses])
-            self._motion = interpolated(times, [pose for _, pose in poses])
+            self.motion = interpolated(times, [pose for _, pose in poses])
         self._segment: Segment | None = None
         self._planned: CaptureError | None = None
         self._captured_ns: int | None = None
@@ -77,13 +84,39 @@ class Scorer:
         return self._planned
 
     def _capture_error(self, state: PipelineState, segment: Segment) -> CaptureError | None:
-        if self._motion is None or segment.path is None or state.track is None:
+        if self.motion is None or segment.path is None or state.track is None:
             return None
         attitude = self._estimator.predict(state.track, segment.end_ns).belief.x.T_ac.q
-        found = miss(segment.path, (segment.t_ns - self._epoch_ns) * 1e-9, self._motion, attitude)
+        found = miss(segment.path, (segment.t_ns - self._epoch_ns) * 1e-9, self.motion, attitude)
         if not np.isfinite(found.distance_m):
             return None
         return CaptureError(found.distance_m, found.speed_mps, found.angle_deg)
+
+
+class HealthyPoses:
+    """Collects the healthy poses of a run, for a fit to all of them."""
+
+    def __init__(self, params: EstimatorParams) -> None:
+        """Start without poses.
+
+        Args:
+            params: of the estimator, with auto values resolved.
+        """
+        self._params, self.fixes = params, list[PoseFix]()
+
+    def add(self, state: PipelineState, outcome: Outcome) -> None:
+        """Take the outcome of one scan; a pose that is not healthy is ignored.
+
+        Args:
+            state: state of the pipeline after the scan.
+            outcome: outcome of the scan.
+        """
+        if outcome.verdict.gamma and state.track is not None and state.last_pose is not None:
+            self.fixes.append(healthy_pose(state.track, outcome.scan.t_ns, state.last_pose, self._params))
+
+    def reference(self) -> Reference:
+        """Fit one motion to all of them. Raises UsageError where they are too few."""
+        return reference_of(self.fixes, self._params)
 
 
 def pose_error(pose: Pose, truth: Pose) -> PoseError:

@@ -126,7 +126,7 @@ def test_result_log_opens_in_rosbags_with_every_message(result):
 
 
 def test_the_covariance_in_the_result_log_is_that_of_the_rows(result):
-    from avsreplay.result_dir import pose_covariance
+    from avsreplay.viewers import pose_covariance
 
     out, document = result
     for belief, row in zip(read_beliefs(out / "beliefs.npz"), document["rows"], strict=True):
@@ -137,8 +137,8 @@ def test_the_covariance_in_the_result_log_is_that_of_the_rows(result):
 
 def test_a_run_streams_to_rerun(fixtures_folder, tmp_path):
     pytest.importorskip("rerun", reason="the extra 'rerun' is not installed")
-    from avsreplay.result_dir import RerunStream
     from avsreplay.run import Job, Run
+    from avsreplay.viewers import RerunStream
 
     with Run(Job(source=fixtures_folder / "tumble.mcap")) as run:
         stream = RerunStream(run.surface, tmp_path / "x.rrd")

@@ -65,10 +65,10 @@ def _job(log: Path, flags: dict[str, Any]) -> Any:
 
 
 def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
-    from avsreplay.run import HealthyPoses
+    from avsreplay.score import HealthyPoses
 
     poses = HealthyPoses(run.config.estimator.resolved(run.surface.extent))
-    rows = list(run.rows([poses]))
+    rows = list(run.rows([lambda scan: poses.add(scan.state, scan.outcome)]))
     reference = poses.reference()
     inside = [row for row in rows if reference.epoch_ns <= row.t_ns <= reference.end_ns]
     lines, ends = _summed(inside, reference, run)

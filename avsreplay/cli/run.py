@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+import threading
 import time
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,12 +19,12 @@ from avsreplay.errors import CheckFailed, DataLost, UsageError
 from avsreplay.files import check_output
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from avsreplay.report.golden import GoldenResult
     from avsreplay.report.summary import Summary
     from avsreplay.report.verdict import RunVerdict
-    from avsreplay.result_dir import ResultDirectory
+    from avsreplay.result_dir import ResultDirectory, ResultWriter
     from avsreplay.rows import Row
     from avsreplay.run import Job, Listener, Run
 
@@ -33,6 +35,7 @@ Examples:
   avsreplay record scenario.toml -o - | avsreplay run -
   avsreplay run tumble.mcap --golden fixtures/tumble.rows.jsonl
   avsreplay run tumble.mcap --set faults.policy=all --set plan.a_max_mps2=0.02 --json
+  avsreplay run long.mcap -o results/ --resume          continue after Ctrl-C
 
 \b
 Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
@@ -71,6 +74,7 @@ class _Start(click.ParamType[str | float]):
 )
 @click.option("--report", "page", is_flag=True, help="Add the HTML page, report.html, to the result directory.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
+@click.option("--resume", is_flag=True, help="Continue the interrupted run in the result directory.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 @click.option(
     "--require",
@@ -93,10 +97,11 @@ def command(log: Path, **flags: Any) -> None:
 
     wanted = Wanted(**{field.name: flags.pop(field.name) for field in fields(Wanted)})
     wanted.check()
-    target = ResultDirectory(wanted.output, overwrite=wanted.overwrite) if wanted.output else None
+    replace = wanted.overwrite or wanted.resume
+    target = ResultDirectory(wanted.output, overwrite=replace) if wanted.output else None
     with log_file(log) as path, Run(_job(path, flags)) as run:
         advice = _checked(run)
-        done = _replayed(run, advice, target, wanted.to_rerun)
+        done = _replayed(run, advice, target, wanted)
         _print(wanted, done)
         if wanted.page and wanted.output:
             _page(wanted.output)
@@ -114,6 +119,7 @@ class Wanted:
     output: Path | None
     page: bool
     overwrite: bool
+    resume: bool
     as_json: bool
     table_every: int | None
     table_all: bool
@@ -127,6 +133,8 @@ class Wanted:
             raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
         if self.page and self.output is None:
             raise UsageError("--report needs a result directory", hint="add -o DIR")
+        if self.resume and self.output is None:
+            raise UsageError("--resume needs the result directory of the interrupted run", hint="add -o DIR")
         if self.update_golden:
             check_output(self.update_golden)
 
@@ -166,21 +174,23 @@ class _Finished:
     scans_per_s: float
 
 
-def _replayed(run: Run, advice: list[str], target: ResultDirectory | None, to_rerun: bool) -> _Finished:
+def _replayed(run: Run, advice: list[str], target: ResultDirectory | None, wanted: Wanted) -> _Finished:
     """Replay the log; ``target`` receives all results. An interrupt ends the replay and keeps what there is."""
     from avsreplay.cli.progress import tracked
     from avsreplay.report.verdict import verdict_of
-    from avsreplay.result_dir import RerunStream, ResultWriter
+    from avsreplay.result_dir import ResultWriter
+    from avsreplay.viewers import RerunStream
 
-    keeper = ResultWriter(target, run.surface, run.registrar) if target else None
-    viewer = RerunStream(run.surface) if to_rerun else None
+    keeper = ResultWriter(target, run) if target else None
+    viewer = RerunStream(run.surface) if wanted.to_rerun else None
     listeners: list[Listener] = [viewer] if viewer else []
     with keeper or nullcontext():
         begun = time.perf_counter()
+        rows = _resumed(run, keeper) if keeper and wanted.resume else []
+        kept = len(rows)
         listeners += keeper.listeners if keeper else ()
-        if run.config.reference.value == "fit":
+        if run.config.reference.value == "fit" and not kept:
             run.fit_reference(tracked)
-        rows: list[Row] = []
         interrupted = _collect(run.rows(listeners, tracked), rows)
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
@@ -190,10 +200,22 @@ def _replayed(run: Run, advice: list[str], target: ResultDirectory | None, to_re
         record["preflight"] = [*advice, *_model_notes(run)]
         if interrupted:
             record["interrupted_after"] = len(rows)
-            click.echo(f"avsreplay: interrupted; the results of {len(rows)} of {len(run)} scans are kept", err=True)
+            how = "; add --resume to continue" if target else ""
+            click.echo(
+                f"avsreplay: interrupted; the results of {len(rows)} of {len(run)} scans are kept{how}", err=True
+            )
         if keeper:
-            keeper.finish(rows, record)
-    return _Finished(rows, summary, record, verdict_of(rows, summary, record), len(rows) / seconds)
+            keeper.finish(rows, record, interrupted=interrupted)
+    return _Finished(rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds)
+
+
+def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
+    """The rows of the interrupted run, whose state the open run continues from."""
+    from avsreplay.cli.version import versions
+
+    rows = keeper.resume({**run.facts(), "versions": versions()})
+    click.echo(f"avsreplay: continuing after {len(rows)} of {len(run)} scans", err=True)
+    return rows
 
 
 def _model_notes(run: Run) -> tuple[str, ...]:
@@ -205,14 +227,41 @@ def _model_notes(run: Run) -> tuple[str, ...]:
 
 
 def _collect(found: Iterator[Row], rows: list[Row]) -> bool:
-    """Take all rows; True if the user interrupted the replay after at least one row."""
+    """Take all rows; True if the user interrupted the replay after at least one row.
+
+    An interrupt takes effect between two scans, so that all results hold the same scans; a second one at once.
+    """
     try:
-        rows.extend(found)
+        with _interruptible(rows) as stopped:
+            for row in found:
+                rows.append(row)
+                if stopped():
+                    return True
     except KeyboardInterrupt:
         if not rows:
             raise
         return True
     return False
+
+
+@contextmanager
+def _interruptible(rows: list[Row]) -> Iterator[Callable[[], bool]]:
+    """Yield a function that tells whether Ctrl-C was pressed; before the first row it interrupts at once."""
+    asked: list[int] = []
+
+    def ask(number: int, _frame: object) -> None:
+        asked.append(number)
+        if not rows or len(asked) > 1:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.signal(signal.SIGINT, ask)
+    try:
+        yield lambda: bool(asked)
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _page(result: Path) -> None:

@@ -118,6 +118,19 @@ class ResultLog:
             self._append("/plan", t, _path(t, *frame.path))
         self._append("/diagnostics", t, _status(frame))
 
+    def copy(self, written: Path) -> None:
+        """Append all messages of another log of this kind, so that this one continues it.
+
+        Args:
+            written: the other log.
+        """
+        from mcap.reader import NonSeekingReader
+
+        with written.open("rb") as stream:
+            for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
+                self._count = message.sequence
+                self._append(channel.topic, message.log_time, message.data)
+
     def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
         if topic not in self._channels:
             kind = _TOPICS[topic]

@@ -105,16 +105,17 @@ class Source:
                     digest.update(block)
         return digest.hexdigest()
 
-    def scans(self, prefetch: int = 0) -> Generator[Scan]:
+    def scans(self, prefetch: int = 0, first: int = 0) -> Generator[Scan]:
         """Yield the selected scans.
 
         Args:
             prefetch: number of scans decoded ahead on a second thread; 0 decodes each when it is requested.
+            first: number of the first scan among the selected ones.
 
         Returns:
             An iterator; a scan that cannot be decoded is yielded without points and with the status DAMAGED.
         """
-        scans = (self._scan(seq, i) for seq, i in enumerate(self._selected))
+        scans = (self._scan(seq, self._selected[seq]) for seq in range(first, len(self)))
         return ahead(scans, prefetch) if prefetch else scans
 
     def scan_at(self, seq: int) -> Scan:

@@ -1,0 +1,129 @@
+"""An interrupted run continues to the bytes of a run without an interruption; a foreign checkpoint runs no code."""
+
+from __future__ import annotations
+
+import pickle
+import signal
+from itertools import islice
+
+import numpy as np
+import pytest
+
+from avsreplay.checkpoint import pack, unpack
+from avsreplay.cli.run import _collect
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.geometry import Pose
+from avsreplay.log import SourceOptions
+from avsreplay.result_dir import CHECKPOINT, ResultDirectory, ResultWriter
+from avsreplay.run import Job, Run
+
+
+def job(log, *assignments, **options):
+    return Job(source=log, options=SourceOptions(**options), assignments=assignments)
+
+
+def replay(work, folder, count=None, resume=False):
+    """Replay ``count`` scans (None: all that are left) into a result directory; return the number of rows in it."""
+    with Run(work) as run, ResultWriter(ResultDirectory(folder, overwrite=resume), run) as writer:
+        rows = writer.resume({"config": run.facts()["config"]}) if resume else []
+        rows += islice(run.rows(writer.listeners), count)
+        writer.finish(rows, {**run.facts(), "rows so far": len(rows)}, interrupted=count is not None)
+    return len(rows)
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("assignments", "stops"),
+    [((), (1, 20)), (("reference=fit", "estimator.start=cold"), (12,)), (("init=auto",), (2,))],
+)
+def test_a_continued_run_has_the_bytes_of_a_run_without_interruption(fixtures_folder, tmp_path, assignments, stops):
+    work = job(fixtures_folder / "tumble.mcap", *assignments, n_scans=26)
+    assert replay(work, tmp_path / "whole") == 26
+    done = 0
+    for k, stop in enumerate(stops):
+        done += stop
+        assert replay(work, tmp_path / "parts", stop, resume=k > 0) == done
+        assert (tmp_path / "parts" / CHECKPOINT).is_file()
+    assert replay(work, tmp_path / "parts", resume=True) == 26
+    assert files(tmp_path / "parts") == files(tmp_path / "whole")
+
+
+def test_other_settings_are_refused(fixtures_folder, tmp_path):
+    replay(job(fixtures_folder / "tumble.mcap", n_scans=4), tmp_path / "r", 2)
+    before = files(tmp_path / "r")
+    with pytest.raises(UsageError, match="differs in: config"):
+        replay(job(fixtures_folder / "tumble.mcap", "faults.policy=all", n_scans=4), tmp_path / "r", resume=True)
+    assert files(tmp_path / "r") == before
+
+
+def test_a_finished_run_cannot_be_resumed(fixtures_folder, tmp_path):
+    work = job(fixtures_folder / "tumble.mcap", n_scans=2)
+    replay(work, tmp_path / "r")
+    with pytest.raises(UsageError, match="no interrupted run"):
+        replay(work, tmp_path / "r", resume=True)
+
+
+def test_ctrl_c_takes_effect_between_two_scans(make_rows):
+    finished = []
+
+    def rows():
+        for k, row in enumerate(make_rows(5)):
+            if k == 2:
+                signal.raise_signal(signal.SIGINT)
+                finished.append("the work of this scan")
+            yield row
+
+    kept = []
+    handler = signal.getsignal(signal.SIGINT)
+    assert _collect(rows(), kept)
+    assert (len(kept), finished) == (3, ["the work of this scan"])
+    assert signal.getsignal(signal.SIGINT) is handler
+
+
+def test_objects_of_the_run_are_named_and_not_stored(tmp_path):
+    owner, pose = object(), Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.arange(3.0))
+    path = tmp_path / "c"
+    path.write_bytes(pack((owner, pose, {"a": [1.5]}), {"owner": owner}))
+    replaced, again, rest = unpack(path, {"owner": 7})
+    assert (replaced, rest) == (7, {"a": [1.5]})
+    assert np.array_equal(again.matrix, pose.matrix)
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [("os", "unlink"), ("avsreplay.files", "sha256"), ("avsreplay.log.writer", "os.unlink"), ("builtins", "eval")],
+)
+def test_a_checkpoint_from_elsewhere_runs_no_code(tmp_path, module, name):
+    path, victim = tmp_path / "c", tmp_path / "victim"
+    victim.write_text("x")
+    path.write_bytes(f"c{module}\n{name}\n(V{victim}\ntR.".encode())  # protocol 0: call it with the path
+    with pytest.raises(UnreadableInput, match="cannot be read"):
+        unpack(path, {})
+    assert victim.exists()
+    head = pickle.PROTO + b"\x05"
+    words = [b"\x8c" + bytes([len(word)]) + word.encode() for word in (module, name, str(victim)[-200:])]
+    path.write_bytes(head + words[0] + words[1] + pickle.STACK_GLOBAL + words[2] + pickle.TUPLE1 + pickle.REDUCE + b".")
+    with pytest.raises(UnreadableInput, match="not allowed"):
+        unpack(path, {})
+    assert victim.exists()
+
+
+def test_classes_that_act_when_created_are_refused(tmp_path):
+    path, victim = tmp_path / "c", tmp_path / "victim"
+    victim.write_text("x")
+    path.write_bytes(f"cavsreplay.log.result_log\nResultLog\n(V{victim}\nNtR.".encode())
+    with pytest.raises(UnreadableInput, match="not allowed"):
+        unpack(path, {})
+    assert victim.read_text() == "x"
+
+
+@pytest.mark.parametrize("cut", [0, 1, 20, -1])
+def test_a_damaged_checkpoint_is_one_line(tmp_path, cut):
+    data = pack({"a": np.arange(10.0), "b": Pose.identity()}, {})
+    path = tmp_path / "c"
+    path.write_bytes(data[:cut])
+    with pytest.raises(UnreadableInput):
+        unpack(path, {})
