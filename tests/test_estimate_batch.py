@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.batch import FitParams, Pin, Poses, Prior, Problem, fit
+from avsreplay.estimate.batch import FitParams, Pin, Poses, Prior, Problem, fit, normal_points
 from avsreplay.estimate.batch_covariance import (
     BatchCovariance,
     covariance_of,
@@ -176,6 +176,35 @@ def test_a_pass_allows_for_the_disturbance_between_poses() -> None:
     scale = np.sqrt(np.diag(want_P))
     assert np.abs((onward @ y - want_y) / scale).max() < 1e-6
     assert np.abs((onward @ P @ onward.T - want_P) / np.outer(scale, scale)).max() < 1e-6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_fit_to_normal_points_is_the_fit_to_the_poses(seed: int) -> None:
+    """600 poses at 10 Hz with an outlier, a reference 1 sigma off: mean and covariance of both fits agree."""
+    world = tumbling.draw(seed, seconds=60.0, hz=10.0, sigma_max=0.85)
+    fixes = list(seen(world, seed, pos_m=0.005, rot_deg=0.3))
+    fixes[40] = replace(fixes[40], T_ac=fixes[40].T_ac @ Pose(geometry.exp([0.3, 0, 0]), np.array([0.2, 0, 0])))
+    poses = poses_of(tuple(fixes))
+    prior = weak_prior(poses, WHITE)
+    full = fit(poses, to_chart(world.states[0]), prior, FitParams(rescale=False))
+    root = np.linalg.cholesky(full.P_chart)
+    reference = full.chart.moved(root @ np.random.default_rng(seed).normal(size=20))
+    points = normal_points(poses, reference, np.ones(2))
+    assert len(points) < 200
+    assert points.counts is not None
+    assert points.counts.sum() == len(poses)
+    few = fit(points, reference, prior, FitParams(rescale=False))
+    off = np.linalg.solve(root, few.chart.minus(full.chart))
+    assert np.abs(off).max() < 0.2
+    there = [Problem(some, prior, np.ones(2), full.chart).covariance for some in (poses, points)]
+    ratios = np.linalg.eigvals(np.linalg.solve(*there)).real
+    assert 0.95 < ratios.min()
+    assert ratios.max() < 1.15
+
+
+def test_few_poses_are_their_own_normal_points() -> None:
+    poses = poses_of(seen(tumbling.draw(0, seconds=20.0), 0))
+    assert normal_points(poses, to_chart(tumbling.draw(0, seconds=1.0).states[0]), np.ones(2)) is poses
 
 
 def test_exact_poses_give_the_exact_motion() -> None:

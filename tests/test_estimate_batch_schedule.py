@@ -11,7 +11,7 @@ import tumbling
 from scipy.stats import chi2
 
 from avsreplay.estimate import Estimator, EstimatorParams, Track
-from avsreplay.estimate.batch import FitParams, fit
+from avsreplay.estimate.batch import FitParams, Problem, fit
 from avsreplay.estimate.batch_covariance import memory_s, process_noise_pass
 from avsreplay.estimate.batch_schedule import chart_at, contradicted
 from avsreplay.estimate.chart import nees, to_chart, to_errors
@@ -127,13 +127,15 @@ def test_process_noise_increases_the_covariance_and_zero_noise_gives_the_fit() -
     poses, params = poses_of(found), WHITE.resolved(2.0)
     prior = weak_prior(poses, params)
     fitted = fit(poses, to_chart(rough_state(found)), prior, FitParams())
-    y, calm = process_noise_pass(fitted.chart, None, poses, prior, FitParams(), fitted.effective, (0.0, 0.0))
-    scale = np.sqrt(np.outer(np.diag(fitted.P_chart), np.diag(fitted.P_chart)))
-    assert np.abs((calm - fitted.P_chart) / scale).max() < 1e-4
-    assert y @ np.linalg.solve(fitted.P_chart, y) < 0.01
+    problem = Problem(poses, prior, fitted.effective, fitted.chart)
+    curvature = problem.covariance
+    y, calm = process_noise_pass(fitted.chart, None, problem, (0.0, 0.0))
+    scale = np.sqrt(np.outer(np.diag(curvature), np.diag(curvature)))
+    assert np.abs((calm - curvature) / scale).max() < 1e-4
+    assert y @ np.linalg.solve(curvature, y) < 0.01
     for torque, force in ((1e-6, 0.0), (1e-5, 0.0), (0.0, 1e-4)):
-        _, wide = process_noise_pass(fitted.chart, None, poses, prior, FitParams(), fitted.effective, (torque, force))
-        least = np.linalg.eigvalsh((wide - fitted.P_chart) / scale)
+        _, wide = process_noise_pass(fitted.chart, None, problem, (torque, force))
+        least = np.linalg.eigvalsh((wide - curvature) / scale)
         assert least[0] > -1e-4
         assert least[-1] > 1e-3
 

@@ -17,14 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.noise import integrated_autocorrelation
+from avsreplay.estimate.dynamics import rotation_path
+from avsreplay.estimate.error_state import DIM
+from avsreplay.estimate.noise import GATE, integrated_autocorrelation
 from avsreplay.geometry import Array
 from avsreplay.records import State
 from avsreplay.settings import Settings, setting
 
 _FEWEST_FOR_FACTORS = 12
+_POINTS, _SPAN_RAD = 128, 0.25  # normal points, and least rotation over which poses are joined [rad]
 _PIN_TOL = 0.02  # half chi-square: tolerance of a fit with one direction fixed
 
 
@@ -55,6 +59,7 @@ class Poses:
     Attributes:
         times_s: (n,) since the fit's epoch [s].  q: (n, 4) q_ac.  t: (n, 3) [m].
         C: (n, 6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
+        counts: (n,) number of poses that each normal point stands for; None where they are measured poses.
         root: (n, 6, 6) lower triangular with root C root' = 1.
         info: (n, 2, 3, 3) inverse covariance of the attitude and of the position by itself.
     """
@@ -63,6 +68,7 @@ class Poses:
     q: Array
     t: Array
     C: Array
+    counts: Array | None = None
     root: Array = field(init=False)
     info: Array = field(init=False)
 
@@ -72,6 +78,13 @@ class Poses:
 
     def __len__(self) -> int:
         return len(self.times_s)
+
+    def residuals(self, problem: Problem, chart: Chart | None = None) -> Array:
+        """(n, 6) d = [theta; v] in {C} of these poses at a chart, by default where ``problem`` is linearised."""
+        if problem.poses is self and chart is None:
+            return problem.core.d
+        own = Problem(self, problem.prior, problem.factors)
+        return own.core.residuals((problem.chart if chart is None else chart).flat)[2]
 
     def upto(self, count: int) -> Poses:
         """The first ``count`` poses."""
@@ -209,16 +222,6 @@ class Problem:
         """(20, 20) inverse of the normal matrix, in chart coordinates."""
         return _inverse(self.core.normal()[0])
 
-    def inflation(self) -> Array:
-        """(2,) 1 + 2 sum of the residuals' autocorrelations, of attitude and position."""
-        d = self.core.d / np.repeat(self.factors, 3)
-        e = (self.poses.root @ d[:, :, None])[:, :, 0] * np.sqrt(self.core.weights)[:, None]
-        return np.array([integrated_autocorrelation(e[:, :3]), integrated_autocorrelation(e[:, 3:])])
-
-    def noise_factors(self) -> Array:
-        """Noise factors (2,) from the residuals: mean of d' C^-1 d plus J P J', the part that the fit absorbed."""
-        return np.asarray(np.sqrt(self.core.size(self.covariance)))
-
 
 def _pair(factors: Array) -> tuple[float, float]:
     return float(factors[0]), float(factors[1])
@@ -228,30 +231,104 @@ def _inverse(A: NDArray[Any]) -> Array:
     return np.asarray(np.linalg.inv(A), dtype=np.float64)
 
 
-def fit(poses: Poses, start: Chart, prior: Prior, params: FitParams, factors: Array | None = None) -> BatchFit:
+def fit(
+    poses: Poses,
+    start: Chart,
+    prior: Prior,
+    params: FitParams,
+    factors: Array | None = None,
+    every: Poses | None = None,
+) -> BatchFit:
     """Fit from ``start``. The noise factors begin at ``factors`` and are refined where ``params.rescale`` is set.
 
     The residuals' correlation in time can be estimated only once there are many; ``params.least_inflation`` bounds it.
+
+    Args:
+        poses: the measurements, or their normal points.
+        start: initial values of the descent.
+        prior: Gaussian prior of the initial values.
+        params: settings of the fit.
+        factors: (2,) noise factors of a fit that ended at ``start``. None begins at 1, with Huber's weights.
+        every: the poses that ``poses`` are normal points of; the noise is estimated from their residuals.
 
     Raises:
         ValueError: fewer than three poses.
     """
     if len(poses) < 3:
         raise ValueError(f"{len(poses)} poses, three at least are needed")
+    every = poses if every is None else every
     least = np.sqrt(np.full(2, params.least_inflation))
     problem = Problem(poses, prior, least if factors is None else factors, start)
-    problem.reweigh(problem.factors, redescend=False)
-    steps = problem.core.descend(params.max_steps, params.gain_tol)[0]
-    problem.reweigh(problem.factors)
-    more, done = problem.core.descend(params.max_steps, params.gain_tol)
+    core, steps = problem.core, 0
+    if factors is None:
+        problem.reweigh(problem.factors, redescend=False)
+        steps = core.descend(params.max_steps, params.gain_tol)[0]
+        problem.reweigh(problem.factors)
+    more, done = core.descend(params.max_steps, params.gain_tol)
     steps += more
     plain, inflation = problem.factors / least, least**2
-    if params.rescale and len(poses) >= _FEWEST_FOR_FACTORS:
+    if params.rescale and len(every) >= _FEWEST_FOR_FACTORS:
         for _ in range(2):
-            plain = problem.noise_factors()
-            inflation = np.maximum(problem.inflation(), params.least_inflation)
+            plain, found = _noise_of(problem, every)
+            inflation = np.maximum(found, params.least_inflation)
             problem.reweigh(plain * np.sqrt(inflation))
-            more, done = problem.core.descend(params.max_steps, params.gain_tol)
+            more, done = core.descend(params.max_steps, params.gain_tol)
             steps += more
-    core = problem.core
     return BatchFit(problem.chart, problem.covariance, core.cost, core.d, core.weights, plain, inflation, steps, done)
+
+
+def _noise_of(problem: Problem, every: Poses) -> tuple[Array, Array]:
+    """Noise factors (2,) and inflation (2,), of attitude and position, from the residuals of all poses.
+
+    The squared factor is the mean of d' C^-1 d plus J P J', the part that the fit absorbed; the inflation is 1 + 2 sum
+    of the residuals' autocorrelations.
+    """
+    d = every.residuals(problem)
+    white = (every.root @ (d / np.repeat(problem.factors, 3))[:, :, None])[:, :, 0]
+    weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
+    sizes = np.einsum(
+        "n,nbi,nbij,nbj->b", weights, d.reshape(-1, 2, 3), every.info, d.reshape(-1, 2, 3), optimize=False
+    )
+    factors = np.sqrt((sizes + problem.core.absorbed(problem.covariance)) / (3.0 * float(weights.sum())))
+    white *= np.sqrt(weights)[:, None]
+    return factors, np.array([integrated_autocorrelation(white[:, :3]), integrated_autocorrelation(white[:, 3:])])
+
+
+def normal_points(poses: Poses, reference: Chart, factors: Array) -> Poses:
+    """At most some hundred poses that carry the information of many: weighted means about a reference motion.
+
+    Neighbouring poses, while the body turns by a fraction of a radian, are replaced by the reference's pose at their
+    mean instant, corrected by the mean of their differences from it, with the inverse of the sum of their information
+    as covariance. The difference of two solutions of the motion changes little over such a turn, so the fit to the
+    normal points is the fit to the poses. Satellite laser ranging reduces its observations to normal points in the same
+    way.
+
+    Args:
+        poses: the measurements.
+        reference: initial values of a motion close to them.
+        factors: (2,) noise factors of attitude and position, for the weights of outliers.
+    """
+    n, rate = len(poses), float(np.linalg.norm(reference.w_c))
+    if n <= _POINTS:
+        return poses
+    since = poses.times_s - poses.times_s[0]
+    turned = np.floor(rate * since / max(_SPAN_RAD, rate * float(since[-1]) / _POINTS)).astype(int)
+    place = np.arange(n) - np.searchsorted(turned, turned)
+    first = np.flatnonzero(np.diff(turned, prepend=-1) | (place % -(-n // _POINTS) == 0))
+    d = poses.residuals(Problem(poses, Prior(reference, np.eye(DIM)), factors), reference)
+    white = (poses.root @ (d / np.repeat(factors, 3))[:, :, None])[:, :, 0]
+    weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
+    counts = np.diff(first, append=n)
+    shifted = np.add.reduceat(weights, first) < 0.5 * counts  # the reference is off, not the poses
+    weights = np.where(np.repeat(shifted, counts), 1.0, weights)
+    info = weights[:, None, None] * (np.swapaxes(poses.root, 1, 2) @ poses.root)
+    C = _inverse(np.add.reduceat(info, first))
+    mean = (C @ np.add.reduceat(info @ d[:, :, None], first))[:, :, 0]
+    times = np.add.reduceat(weights * poses.times_s, first) / np.add.reduceat(weights, first)
+    x = to_state(reference)
+    q_ab = rotation_path(x).at(times)[0]
+    q = geometry.multiply(geometry.multiply(q_ab, x.q_bc), geometry.exp(-mean[:, :3]))
+    t = x.r_a + times[:, None] * x.v_a + geometry.matrix(q_ab) @ x.c_b
+    return Poses(
+        times, q, t - (geometry.matrix(q) @ mean[:, 3:, None])[:, :, 0], 0.5 * (C + np.swapaxes(C, 1, 2)), counts
+    )

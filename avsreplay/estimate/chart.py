@@ -134,12 +134,7 @@ def inertia_matrices(y: Array) -> Array:
 
 def to_chart(x: State) -> Chart:
     """Chart coordinates of a state; |sigma| must be below 1."""
-    R_bc = geometry.matrix(x.q_bc)
-    a1, a2 = np.arctanh(x.sigma)
-    m = np.array([a1 + 2.0 * a2, -2.0 * a1 - a2, a1 - a2]) * (2.0 / 3.0)
-    M = R_bc.T @ np.diag(m) @ R_bc
-    q_ac = geometry.multiply(x.q_ab, x.q_bc)
-    return Chart(q_ac, R_bc.T @ x.w_b, x.T_ac.t, x.fixture_velocity, 0.5 * (M + M.T), R_bc.T @ x.c_b, R_bc.T)
+    return Chart.of(_motion.chart(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc))
 
 
 def to_state(c: Chart) -> State:

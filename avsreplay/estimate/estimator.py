@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import dynamics, ekf
 from avsreplay.estimate.anomalies import AnomalyTest
@@ -20,7 +21,6 @@ from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import to_state
 from avsreplay.estimate.initialise import given_prior, guessed_belief
 from avsreplay.estimate.measurement import (
-    in_camera,
     innovation_vector,
     measured_pose,
     measurement_jacobian,
@@ -141,12 +141,19 @@ class Estimator:
         """
         if track.mode != "fit" or track.batch is None or track.since or track.batch.count != len(track.fixes):
             return None
-        start, fixes = track.batch, track.fixes
+        start, points = track.batch, track.batch.points
+        if points is None:
+            return None
         x = to_state(start.chart)
-        times = np.array([(fix.t_ns - start.epoch_ns) * 1e-9 for fix in fixes])
-        R = np.array([in_camera(fix.C, fix.T_ac.q, x.q_bc) for fix in fixes])
+        J = np.zeros((len(points), 6, 6))  # from d = [theta; v] in {C}, as in ``measurement.to_camera``
+        J[:, :3, 3:], J[:, 3:, :3] = geometry.matrix(points.q), 0.5 * geometry.matrix(x.q_bc)
+        R = J @ points.C @ np.swapaxes(J, 1, 2)
         _, Phi = dynamics.propagate_state(x, (track.belief.t_ns - start.epoch_ns) * 1e-9)
-        return dynamics.pose_rows(x, times), R, Phi
+        rows = dynamics.pose_rows(x, points.times_s)
+        if points.counts is not None:  # each normal point stands for several poses
+            each = np.sqrt(points.counts)[:, None, None]
+            rows, R = each * rows, each**2 * R
+        return rows, R, Phi
 
     def residual_after(
         self, track: Track, prediction: Prediction, innovation: Innovation

@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit
+from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit, normal_points
 from avsreplay.estimate.batch_covariance import (
     LATEST,
     BatchCovariance,
@@ -73,6 +73,7 @@ class BatchResult:
         belief: at the last pose.  gaussian: the filter may start from it.
         components: the Gaussian mixture that ``belief`` has the moments of.
         prior_rejected: the poses contradict the given start, and it was left out.
+        points: the poses of the fit, or their normal points.
     """
 
     epoch_ns: int
@@ -84,6 +85,7 @@ class BatchResult:
     gaussian: bool
     components: tuple[Component, ...] = ()
     prior_rejected: bool = False
+    points: Poses | None = None
 
 
 def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
@@ -195,13 +197,14 @@ def batch_estimate(
     share = float(np.mean([f.correlated_share for f in fixes]))
     rules = replace(rules, least_inflation=params.colour(_mean_turn(poses), share))
     factors = None if last is None else last.factors * np.sqrt(last.inflation)
-    fitted = fit(poses, start, weak, rules, factors)
+    points = normal_points(poses, start, np.ones(2) if factors is None else factors)
+    fitted = fit(points, start, weak, rules, factors, poses)
     rejected = last is not None and last.prior_rejected
     if given is not None and not rejected:
-        joint = fit(poses, start, given, rules, factors)
-        rejected = _contradicts(poses, fitted, weak, joint, given)
+        joint = fit(points, start, given, rules, factors, poses)
+        rejected = _contradicts(points, fitted, weak, joint, given)
         fitted, prior = (fitted, weak) if rejected else (joint, given)
-    problem = Problem(poses, prior, fitted.effective)
+    problem = Problem(points, prior, fitted.effective)
     found = covariance_of(problem, fitted, rules)
     now_ns, noise = fixes[-1].scan_ns, (params.torque_noise_radps15, params.force)
     after_s = (now_ns - fixes[0].t_ns) * 1e-9
@@ -217,6 +220,7 @@ def batch_estimate(
         gaussian=gaussian,
         components=components,
         prior_rejected=rejected,
+        points=points,
     )
 
 

@@ -37,7 +37,7 @@ Turn turn(const Vector<4>& q, const Vector<3>& w) {
 }
 
 Body body(const Three& sigma, const Three& push) {
-  return {{sigma[0], sigma[1], sigma[2]}, {push[0], push[1], push[2]}};
+  return {{sigma[0], sigma[1], sigma[2]}, {push[0], push[1], push[2]}, 1e-12};
 }
 
 // One flow through all times in turn, each from the one before.
@@ -110,6 +110,18 @@ State state_from(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, 
   return x;
 }
 
+Numpy flat(const Chart& from) {
+  double* to;
+  Numpy out = array({CHART}, &to);
+  std::memcpy(to, &from, sizeof from);
+  return out;
+}
+
+Numpy chart_from(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
+                 const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc) {
+  return flat(chart_of(state_from(q_ab, w, r, v, sigma, c, q_bc)));
+}
+
 // Per instant: variances of position, velocity and half-angle attitude; position, velocity and attitude q_ac.
 nb::tuple forecast_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
                       const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Matrix<DIM, DIM>& P,
@@ -163,13 +175,6 @@ Chart chart(const Flat& from) {
   Chart to;
   std::memcpy(&to, from.data(), sizeof to);
   return to;
-}
-
-Numpy flat(const Chart& from) {
-  double* to;
-  Numpy out = array({CHART}, &to);
-  std::memcpy(to, &from, sizeof from);
-  return out;
 }
 
 Numpy copied(const std::vector<double>& from, std::initializer_list<size_t> shape) {
@@ -257,9 +262,9 @@ nb::tuple normal(const Problem& self) {
   return nb::make_tuple(made(A), made(b));
 }
 
-Two size_of(const Problem& self, const Matrix<DIM, DIM>& P) {
+Two absorbed(const Problem& self, const Matrix<DIM, DIM>& P) {
   Two out;
-  self.size(as<Square>(P.data()), out.data());
+  self.absorbed(as<Square>(P.data()), out.data());
   return out;
 }
 
@@ -284,6 +289,8 @@ NB_MODULE(_motion, m) {
         nb::arg("colour"));
   m.def("forecast", &forecast_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("torque"), nb::arg("force"), nb::arg("times"));
+  m.def("chart", &chart_from, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
+        nb::arg("c_b"), nb::arg("q_bc"));
   m.def("moved", &moved_by, nb::arg("chart"), nb::arg("y"));
   m.def("minus", &minus_of, nb::arg("chart"), nb::arg("other"));
   m.def("state", &state, nb::arg("chart"));
@@ -298,7 +305,7 @@ NB_MODULE(_motion, m) {
       .def("residuals", &residuals, nb::arg("chart"))
       .def("descend", &descend, nb::arg("most"), nb::arg("gain_tol"))
       .def("normal", &normal)
-      .def("size", &size_of, nb::arg("P"))
+      .def("absorbed", &absorbed, nb::arg("P"))
       .def("smooth", &smooth, nb::arg("y"), nb::arg("P"), nb::arg("torque"), nb::arg("force"))
       .def_prop_ro("chart", [](const Problem& self) { return flat(self.at); }, nb::rv_policy::move)
       .def_prop_ro("cost", [](const Problem& self) { return self.cost; })

@@ -56,6 +56,25 @@ void minus(const Chart& c, const Chart& from, double y[DIM]) {
   std::memcpy(y + ARM, arm.x, sizeof arm.x);
 }
 
+Chart chart_of(const State& x) {
+  const double a = atanh_of(x.sigma[0]), b = atanh_of(x.sigma[1]);
+  const double m[3] = {(a + 2 * b) * (2.0 / 3), (-2 * a - b) * (2.0 / 3), (a - b) * (2.0 / 3)};
+  Chart c;
+  c.q = quad(x.q_ab) * quad(x.q_bc);
+  c.R_cb = transposed(matrix(quad(x.q_bc)));
+  c.w = c.R_cb * vector(x.w_b);
+  c.arm = c.R_cb * vector(x.c_b);
+  const M3 R_ab = matrix(quad(x.q_ab));
+  c.t = vector(x.r_a) + R_ab * vector(x.c_b);
+  c.u = vector(x.v_a) + R_ab * cross(vector(x.w_b), vector(x.c_b));
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) {
+      c.M.x[i][j] = 0;
+      for (int k = 0; k < 3; ++k) c.M.x[i][j] += c.R_cb.x[i][k] * m[k] * c.R_cb.x[j][k];
+    }
+  return c;
+}
+
 State state_of(const Chart& c) {
   const M3 R_ac = matrix(c.q), A = transposed(c.R_cb);
   const Quad q_bc = quaternion(A), q_ab = c.q * conjugate(q_bc);

@@ -23,6 +23,9 @@ Chart moved(const Chart& c, const double y[DIM]);
 // The step y from `from` to c.
 void minus(const Chart& c, const Chart& from, double y[DIM]);
 
+// The chart of a state; |sigma| must be below 1.
+Chart chart_of(const State& x);
+
 // The state of a chart.
 State state_of(const Chart& c);
 

@@ -6,6 +6,7 @@ namespace avs {
 namespace {
 
 constexpr double GATE = 27.86;  // 99.99 % point of chi-square with 6 degrees of freedom, as in noise.py
+constexpr double DERIVATIVE_TAIL = 1e-7;  // relative error of the Jacobian by one piece of the flow
 constexpr double LARGEST_RADPS = 0.5;  // a step that changes the rate by more than this plus the rate itself is not tried
 
 double dot(const double* a, const double* b, int n) {
@@ -104,7 +105,7 @@ Body body_of(const State& x, double join[3][2]) {
   const double a = x.sigma[0], b = x.sigma[1], one = 1 + a * b;
   const double slopes[3][2] = {{1, 0}, {0, 1}, {(b * b - 1) / (one * one), (a * a - 1) / (one * one)}};
   std::memcpy(join, slopes, sizeof slopes);
-  return {{a, b, -(a + b) / one}, {0, 0, 0}};
+  return {{a, b, -(a + b) / one}, {0, 0, 0}, DERIVATIVE_TAIL};
 }
 
 // d = [theta; v] in {C}: estimated relative to measured pose. Returns chi-square.
@@ -248,6 +249,7 @@ bool Problem::descend(int most, double gain_tol, int& steps) {
   double damping = 1e-3;
   Square A, M;
   double b[DIM], step[DIM];
+  std::vector<double> trial(d.size());
   normal(A, b);
   for (int count = 1; count <= most; ++count) {
     std::memcpy(M, A, sizeof M);
@@ -259,8 +261,17 @@ bool Problem::descend(int most, double gain_tol, int& steps) {
     const double turning = std::sqrt(dot(at.w.x, at.w.x, 3)), change = std::sqrt(dot(step + 3, step + 3, 3));
     const bool tried = change <= LARGEST_RADPS + turning;
     const Chart there = tried ? moved(at, step) : at;
-    const double gain = tried ? cost - cost_at(there) : 0;
+    const bool last = std::fabs(expected) < gain_tol && tried;
+    const double gain = tried ? cost - cost_at(there, last ? trial.data() : nullptr) : 0;
     ++steps;
+    if (last) {  // so short a step that the Jacobian is kept
+      if (gain > 0) {
+        at = there;
+        d.swap(trial);
+        reweigh();
+      }
+      return true;
+    }
     if (gain > 0) {
       damping = std::max(damping * (gain > 0.5 * expected ? 0.1 : 0.5), 1e-9);
       linearise(there);
@@ -268,32 +279,29 @@ bool Problem::descend(int most, double gain_tol, int& steps) {
     } else {
       damping *= 8;
     }
-    if ((std::fabs(expected) < gain_tol && tried) || damping > 1e9) return true;
+    if (damping > 1e9) return true;
   }
   return false;
 }
 
-void Problem::size(const Square P, double out[2]) const {
+void Problem::absorbed(const Square P, double out[2]) const {
   Square Tt, Pe;
   for (int r = 0; r < DIM; ++r)
     for (int c = 0; c < DIM; ++c) Tt[r][c] = T[c][r];
   congruent(Tt, P, Pe);
-  double sum[2] = {}, total = 0;
-  for (size_t k = 0; k < poses.size(); ++k) {
-    total += weights[k];
+  out[0] = out[1] = 0;
+  for (size_t k = 0; k < poses.size(); ++k)
     for (int block = 0; block < 2; ++block) {
       const M3& info = poses[k].info[block];
-      const double *v = &d[SEEN * k + 3 * block], *rows = &J[DIM * (SEEN * k + 3 * block)];
+      const double* rows = &J[DIM * (SEEN * k + 3 * block)];
       double JP[3][DIM] = {}, s = 0;
       for (int i = 0; i < 3; ++i)
         for (int m = 0; m < DIM; ++m)
           for (int c = 0; c < DIM; ++c) JP[i][c] += rows[DIM * i + m] * Pe[m][c];
       for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) s += info.x[i][j] * (v[i] * v[j] + dot(JP[i], rows + DIM * j, DIM));
-      sum[block] += weights[k] * s;
+        for (int j = 0; j < 3; ++j) s += info.x[i][j] * dot(JP[i], rows + DIM * j, DIM);
+      out[block] += weights[k] * s;
     }
-  }
-  for (int block = 0; block < 2; ++block) out[block] = sum[block] / (3 * total);
 }
 
 void Problem::smooth(double y[DIM], Square P, const double torque_density[3], double force_density) const {

@@ -39,7 +39,7 @@ class Problem {
   // The linearisation at the present chart.
   Chart at;
   double cost;
-  std::vector<double> d, weights, chi2;  // residuals (n, 6), M-estimator weights (n)
+  std::vector<double> d, weights;  // residuals (n, 6), M-estimator weights (n)
   std::vector<double> J;  // (n, 6, 20) by the error states at the epoch
   Square T;  // error states by chart steps
 
@@ -52,8 +52,8 @@ class Problem {
   void normal(Square A, double b[DIM]) const;
   // Levenberg-Marquardt from the present linearisation; returns whether the stopping rule was met within `most` steps.
   bool descend(int most, double gain_tol, int& steps);
-  // Weighted mean of d' C^-1 d + tr C^-1 J P J', over three, of attitude and position; P in chart steps.
-  void size(const Square P, double out[2]) const;
+  // Weighted sum of tr C^-1 J P J' over the poses, of attitude and position; P in chart steps.
+  void absorbed(const Square P, double out[2]) const;
   // Kalman pass over the poses with process noise between them, from y and P (error states at the epoch).
   void smooth(double y[DIM], Square P, const double torque_density[3], double force_density) const;
 

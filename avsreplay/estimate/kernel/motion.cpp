@@ -25,11 +25,17 @@ int terms(double turn, double tail) {
   return n;
 }
 
-// State to 1e-12 of a radian; noise to 1e-10 of itself, and that of the attitude begins with the third power of time.
+// Orders of the state's series, to 1e-12 of a radian, and of that of derivatives and noise. The noise is exact to a
+// hundred times the tail, and that of the attitude begins with the third power of time.
+struct Orders {
+  int state, derivative;
+};
+
 template <int N>
-int order_for(double turn) {
-  const int state = std::max(3, terms(turn, 1e-12));
-  return N == 12 ? std::min(MOST_ORDER, std::max(state, 3 + terms(turn, 1e-10))) : state;
+Orders orders_for(double turn, double tail) {
+  const int derivative = std::max(3, terms(turn, tail));
+  const int all = N == 12 ? std::min(MOST_ORDER, std::max(derivative, 3 + terms(turn, 100 * tail))) : derivative;
+  return {std::max(all, std::max(3, terms(turn, 1e-12))), all};
 }
 
 // Taylor coefficients over a step of length 1. Rows of X: dq_v, then u. Its first six columns are the derivatives by u
@@ -105,10 +111,10 @@ void linear(Series<N>& y, int k, const Body& body, const double* p, const double
     for (int c = 0; c < N; ++c) M[r][c] *= scale;
 }
 
-// The whole series of a step of h seconds; returns its order.
+// The whole series of a step of h seconds; returns its orders.
 template <int N>
-int expand(Series<N>& y, const double* w, const Body& body, double h) {
-  const int order = order_for<N>(size(w) * std::fabs(h));
+Orders expand(Series<N>& y, const double* w, const Body& body, double h) {
+  const Orders orders = orders_for<N>(size(w) * std::fabs(h), body.tail);
   double push[3];
   for (int r = 0; r < 3; ++r) {
     y.u[0][r] = w[r] * h;
@@ -120,14 +126,15 @@ int expand(Series<N>& y, const double* w, const Body& body, double h) {
     std::memset(y.X[0], 0, sizeof y.X[0]);
     for (int r = 0; r < 3; ++r) y.X[0][3 + r][r] = 1;
   }
-  for (int k = 0; k < order; ++k) {
+  for (int k = 0; k < orders.state; ++k) {
     double p[3];
     products(y, k, p);
     for (int r = 0; r < 3; ++r) y.u[k + 1][r] = body.sigma[r] * p[r] / (k + 1);
     attitude(y, k);
-    if constexpr (N > 0) linear(y, k, body, p, push);
+    if constexpr (N > 0)
+      if (k < orders.derivative) linear(y, k, body, p, push);
   }
-  return order;
+  return orders;
 }
 
 // Value at the end of the step: the sum of n coefficients, smallest first.
@@ -202,9 +209,9 @@ template <int N>
 void piece(Flow& flow, const Body& body, double h) {
   Series<N> y;
   double q[4], X[6][N], M[6][6] = {}, drive[6][3];
-  const int order = expand(y, flow.at.w, body, h);
-  finish(y, order, h, flow.at, q);
-  sum<6 * N>(reinterpret_cast<const double(*)[6 * N]>(y.X), order, &X[0][0]);
+  const Orders orders = expand(y, flow.at.w, body, h);
+  finish(y, orders.state, h, flow.at, q);
+  sum<6 * N>(reinterpret_cast<const double(*)[6 * N]>(y.X), orders.derivative, &X[0][0]);
   transposed(q, M);
   for (int r = 0; r < 6; ++r)
     for (int c = 0; c < 3; ++c) {
@@ -243,7 +250,7 @@ void advance(Turn& at, const Body& body, double h) {
   cut(h, [&] { return at.w; }, [&](double length) {
     Series<0> y;
     double q[4];
-    finish(y, expand(y, at.w, body, length), length, at, q);
+    finish(y, expand(y, at.w, body, length).state, length, at, q);
   });
 }
 

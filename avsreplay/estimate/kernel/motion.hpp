@@ -4,10 +4,12 @@
 
 namespace avs {
 
-// A body: sigma1..3, and the variance its rate gets from the disturbance torque [rad2/s3], by axis of {B}.
+// A body: sigma1..3, the variance its rate gets from the disturbance torque [rad2/s3], by axis of {B}, and the largest
+// relative error of derivatives and noise in a piece of the flow; the state itself is always exact to 1e-12.
 struct Body {
   double sigma[3];
   double push[3];
+  double tail = 1e-12;
 };
 
 // Attitude [x y z w] of {B} and rate in {B} [rad/s].
