@@ -12,7 +12,6 @@ namespace {
 Vec3 operator-(const Vec3& a, const Vec3& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 Vec3 operator*(double s, const Vec3& a) { return {s * a.x, s * a.y, s * a.z}; }
 double dot(const Vec3& a, const Vec3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-Vec3 cross(const Vec3& a, const Vec3& b) { return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x}; }
 Vec3 unit(const Vec3& a) { return (1.0 / std::sqrt(dot(a, a))) * a; }
 double axis_of(const Vec3& a, int k) { return k == 0 ? a.x : k == 1 ? a.y : a.z; }
 
@@ -42,10 +41,7 @@ Triangle triangle(Corners t) {
   Vec3 w = ac - dot(ac, r.u) * r.u;
   w = unit(w - dot(w, r.u) * r.u);  // twice is enough
   r.w = w;
-  r.n = cross(r.u, r.w);
   r.cx = dot(ac, r.u), r.cy = dot(ac, r.w);
-  r.inv_ac2 = 1.0 / (r.cx * r.cx + r.cy * r.cy);
-  r.inv_bc2 = 1.0 / ((r.length - r.cx) * (r.length - r.cx) + r.cy * r.cy);
   return r;
 }
 
@@ -91,12 +87,10 @@ void add_point(Store& s, const Surface& from, size_t block, int lane, int32_t i)
 void add_triangle(Store& s, const Surface& from, size_t block, int lane, int32_t i) {
   const Triangle t = triangle(corners(from, from.kept[i]));
   s.triangles.push_back(t);
-  s.normals.push_back(t.n);
   s.id.push_back(from.kept[i]);
   TriangleBlock& b = s.triangle_blocks[block];
-  put(b.a, lane, t.a - s.centre), put(b.u, lane, t.u), put(b.w, lane, t.w), put(b.n, lane, t.n);
+  put(b.a, lane, t.a - s.centre), put(b.u, lane, t.u), put(b.w, lane, t.w);
   b.length[lane] = (float)t.length, b.cx[lane] = (float)t.cx, b.cy[lane] = (float)t.cy;
-  b.inv_ac2[lane] = (float)t.inv_ac2, b.inv_bc2[lane] = (float)t.inv_bc2;
 }
 
 void grow(Box& b, const Vec3& p, float slack) {
@@ -153,11 +147,12 @@ Bounds bounds_of(const Store& s, uint32_t block) {
   if (!s.mesh) return b;
   for (size_t lane = (size_t)LANES * block; lane < (size_t)LANES * (block + 1); ++lane) {
     const Triangle& t = s.triangles[lane];
+    const Vec3 normal = t.n();
     for (int k = 0; k < 3; ++k) {
-      const float n = (float)axis_of(t.n, k);
+      const float n = (float)axis_of(normal, k);
       b.n_lo[k] = std::min(b.n_lo[k], n), b.n_hi[k] = std::max(b.n_hi[k], n);
     }
-    const float h = (float)dot(t.n, t.a - s.centre);
+    const float h = (float)dot(normal, t.a - s.centre);
     b.h_lo = std::min(b.h_lo, h), b.h_hi = std::max(b.h_hi, h);
   }
   return b;
@@ -251,8 +246,11 @@ void build_blocks(Store& s, const Surface& from) {
   std::iota(order.begin(), order.end(), 0);
   split(order, at, 0, n);
   s.blocks = (uint32_t)((n + LANES - 1) / LANES);
+  const size_t lanes = (size_t)LANES * s.blocks;
+  s.id.reserve(lanes);
+  s.mesh ? s.triangles.reserve(lanes) : (s.points.reserve(lanes), s.normals.reserve(lanes));
   s.mesh ? s.triangle_blocks.resize(s.blocks) : s.point_blocks.resize(s.blocks);
-  for (size_t i = 0; i < (size_t)LANES * s.blocks; ++i) {
+  for (size_t i = 0; i < lanes; ++i) {
     const int32_t k = order[std::min(i, n - 1)];  // the last block is filled up with the last primitive
     s.mesh ? add_triangle(s, from, i / LANES, (int)(i % LANES), k) : add_point(s, from, i / LANES, (int)(i % LANES), k);
   }

@@ -21,18 +21,43 @@ struct CubeHash {
   }
 };
 
-void match(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, Team& team,
-           const Matches* matches, std::vector<Match>& out) {
-  const bool sided = rule.facing && s.mesh;
-  const Vec3 eye{T[3], T[7], T[11]};
-  const bool hold = matches && matches->hold(v.n, eye, rule.gate, sided);
-  Facing own;
-  if (!hold) code.face(s, sided ? &eye : nullptr, 0, own);
-  const Look look{T, rule.gate, 0.f, Pass::plane, sided, hold ? &matches->facing : &own};
-  const Kept* kept = hold ? matches->kept.data() : nullptr;
-  team.each((v.n + CHUNK - 1) / CHUNK, [&](int64_t k) {
-    code.match(s, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), look, kept, out.data());
-  });
+// The closest points of a scan at a pose, a chunk at a time.
+class Matcher {
+ public:
+  Matcher(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, const Matches* matches)
+      : s_(s), code_(code), v_(v), sided_(rule.facing && s.mesh) {
+    const Vec3 eye{T[3], T[7], T[11]};
+    const bool hold = matches && matches->hold(v.n, eye, rule.gate, sided_);
+    if (!hold) code.face(s, sided_ ? &eye : nullptr, 0, own_);
+    look_ = {T, rule.gate, 0.f, Pass::plane, sided_, hold ? &matches->facing : &own_};
+    kept_ = hold ? matches->kept.data() : nullptr;
+  }
+  Matcher(const Matcher&) = delete;
+  Matcher& operator=(const Matcher&) = delete;
+
+  int64_t chunks() const { return (v_.n + CHUNK - 1) / CHUNK; }
+
+  // The inliers of a chunk, in the order of the scan; returns how many.
+  int inliers(int64_t chunk, Match (&out)[CHUNK]) const {
+    const int64_t first = chunk * CHUNK, last = std::min(v_.n, first + CHUNK);
+    const View part{v_.data + first * v_.row, last - first, v_.row, v_.column, v_.single};
+    code_.match(s_, part, 0, part.n, look_, kept_ ? kept_ + first : nullptr, out);
+    return (int)(std::remove_if(out, out + part.n, [](const Match& m) { return !m.inlier; }) - out);
+  }
+
+ private:
+  const Store& s_;
+  const Code& code_;
+  const View v_;
+  const bool sided_;
+  Facing own_;
+  Look look_{};
+  const Kept* kept_ = nullptr;
+};
+
+Cube cube_of(const Match& m, double side) {
+  const auto cell = [&](double x) { return (int64_t)std::floor(std::min(std::max(x / side, -1e15), 1e15)); };
+  return {cell(m.p[0]), cell(m.p[1]), cell(m.p[2])};
 }
 
 void add(const Match& m, PatchSums& to) {
@@ -46,22 +71,40 @@ void add(const Match& m, PatchSums& to) {
   ++to.points;
 }
 
-// Number of the patch of each inlier; returns how many there are.
-size_t number(const std::vector<Match>& inliers, double side, int least, std::vector<size_t>& patch) {
-  std::unordered_map<Cube, size_t, CubeHash> cubes;
-  const auto cell = [&](double x) { return (int64_t)std::floor(std::min(std::max(x / side, -1e15), 1e15)); };
-  patch.resize(inliers.size());
-  Cube last{};
-  for (size_t k = 0; k < inliers.size(); ++k) {
-    const double* p = inliers[k].p;
-    const Cube cube{cell(p[0]), cell(p[1]), cell(p[2])};
-    patch[k] = k > 0 && cube == last ? patch[k - 1] : cubes.emplace(cube, cubes.size()).first->second;
-    last = cube;
-  }
-  if (cubes.size() > (size_t)least) return cubes.size();
-  for (size_t k = 0; k < patch.size(); ++k) patch[k] = k;
-  return patch.size();
+void add(const PatchSums& from, PatchSums& to) {
+  for (int k = 0; k < 21; ++k) to.normals[k] += from.normals[k];
+  for (int k = 0; k < 6; ++k) to.gradients[k] += from.gradients[k];
+  to.points += from.points;
 }
+
+// Sums by cube, in the order in which the cubes first came.
+class Patches {
+ public:
+  PatchSums& at(const Cube& cube) {
+    if (sums_.empty() || !(cube == cubes_[last_])) {
+      last_ = number_.emplace(cube, sums_.size()).first->second;
+      if (last_ == sums_.size()) cubes_.push_back(cube), sums_.emplace_back();
+    }
+    return sums_[last_];
+  }
+  void add(const Patches& o) {
+    for (size_t k = 0; k < o.sums_.size(); ++k) avs::add(o.sums_[k], at(o.cubes_[k]));
+  }
+  std::vector<PatchSums>& sums() { return sums_; }
+
+ private:
+  std::unordered_map<Cube, size_t, CubeHash> number_;
+  std::vector<Cube> cubes_;
+  std::vector<PatchSums> sums_;
+  size_t last_ = 0;
+};
+
+// What one chunk adds.
+struct Part {
+  Patches patches;
+  int64_t inliers = 0;
+  double sum_d2 = 0, sum[3] = {0, 0, 0}, errors[CHUNK];
+};
 
 double median(std::vector<double>& x) {
   if (x.empty()) return 0;
@@ -140,42 +183,55 @@ void solve(Matrix& A, double* x) {
 
 Evidence evidence(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, Team& team,
                   const Matches* matches) {
-  std::vector<Match> inliers((size_t)v.n);
-  match(s, code, v, T, rule, team, matches, inliers);
-  inliers.erase(std::remove_if(inliers.begin(), inliers.end(), [](const Match& m) { return !m.inlier; }), inliers.end());
+  const Matcher matcher(s, code, v, T, rule, matches);
+  std::vector<Part> parts((size_t)matcher.chunks());
+  team.each(matcher.chunks(), [&](int64_t k) {
+    Match found[CHUNK];
+    Part& part = parts[(size_t)k];
+    part.inliers = matcher.inliers(k, found);
+    for (int64_t i = 0; i < part.inliers; ++i) {
+      const Match& m = found[i];
+      part.sum_d2 += m.d2, part.errors[i] = std::fabs(m.e);
+      for (int a = 0; a < 3; ++a) part.sum[a] += m.p[a];
+      add(m, part.patches.at(cube_of(m, rule.side)));
+    }
+  });
   Evidence out;
-  out.points = v.n, out.inliers = (int64_t)inliers.size();
-  std::vector<size_t> patch;
-  out.patches.resize(number(inliers, rule.side, rule.least, patch));
-  std::vector<double> errors(inliers.size());
-  for (size_t k = 0; k < inliers.size(); ++k) {
-    const Match& m = inliers[k];
-    out.sum_d2 += m.d2;
-    for (int a = 0; a < 3; ++a) out.centre[a] += m.p[a];
-    errors[k] = std::fabs(m.e);
-    add(m, out.patches[patch[k]]);
+  out.points = v.n;
+  Patches all;
+  std::vector<double> errors;
+  for (const Part& part : parts) {
+    out.inliers += part.inliers, out.sum_d2 += part.sum_d2;
+    for (int a = 0; a < 3; ++a) out.centre[a] += part.sum[a];
+    errors.insert(errors.end(), part.errors, part.errors + part.inliers);
+    all.add(part.patches);
   }
-  for (double& x : out.centre) x = inliers.empty() ? 0 : x / (double)inliers.size();
+  for (double& x : out.centre) x = out.inliers ? x / (double)out.inliers : 0;
   out.median = median(errors);
+  out.patches = std::move(all.sums());
+  if (out.patches.size() > (size_t)rule.least) return out;
+  out.patches.clear();  // too few cubes: every point is a patch
+  for (int64_t k = 0; k < matcher.chunks(); ++k) {
+    Match found[CHUNK];
+    const int n = matcher.inliers(k, found);
+    for (int i = 0; i < n; ++i) add(found[i], out.patches.emplace_back());
+  }
   return out;
 }
 
 Looks looks(const Store& s, const Code& code, const View& v, const double* T, int64_t stride) {
   Looks found;
-  Facing facing;
-  code.face(s, nullptr, 0, facing);
   const View few{v.data, (v.n + stride - 1) / stride, v.row * stride, v.column, v.single};
-  std::vector<Match> matches((size_t)few.n);
-  for (int64_t first = 0; first < few.n; first += CHUNK) {
-    const Look look{T, s.reach, 0.f, Pass::plane, false, &facing};
-    code.match(s, few, first, std::min(few.n, first + CHUNK), look, nullptr, matches.data());
-  }
-  for (const Match& m : matches) {
-    if (!m.inlier) continue;
-    double height = m.e;  // n . (t - foot) = n . (t - p) + e: of the camera above the face
-    for (int k = 0; k < 3; ++k) height += m.n[k] * (T[4 * k + 3] - m.p[k]);
-    ++found.matched;
-    found.facing += height > 0;
+  const Matcher matcher(s, code, few, T, {s.reach, 1, 0, false}, nullptr);
+  for (int64_t k = 0; k < matcher.chunks(); ++k) {
+    Match matches[CHUNK];
+    const int n = matcher.inliers(k, matches);
+    found.matched += n;
+    for (int i = 0; i < n; ++i) {
+      double height = matches[i].e;  // n . (t - foot) = n . (t - p) + e: of the camera above the face
+      for (int a = 0; a < 3; ++a) height += matches[i].n[a] * (T[4 * a + 3] - matches[i].p[a]);
+      found.facing += height > 0;
+    }
   }
   return found;
 }

@@ -54,7 +54,8 @@ struct Classifier {
 
   bool lanes(uint32_t block) {
     const TriangleBlock& b = s.triangle_blocks[block];
-    const F8 v = (x - load8(b.a[0])) * load8(b.n[0]) + (y - load8(b.a[1])) * load8(b.n[1]) + (z - load8(b.a[2])) * load8(b.n[2]);
+    const Triangles::Normals n = Triangles::normals(b);
+    const F8 v = (x - load8(b.a[0])) * n.x + (y - load8(b.a[1])) * n.y + (z - load8(b.a[2])) * n.z;
     f.may[block] = (uint8_t)(~bits(v < f8(0.f) - error) & 255u);
     f.sure[block] = (uint8_t)bits(error < v);
     return f.may[block] != 0;

@@ -8,6 +8,8 @@
 #include <cstdint>
 #include <vector>
 
+#include "pages.hpp"
+
 namespace avs {
 
 constexpr int LANES = 8;
@@ -19,8 +21,10 @@ struct Vec3 {
 // A triangle in its own plane: corner a, unit u along the longest side ab, unit w towards c, unit n = u x w (winding).
 // There a = (0, 0), b = (length, 0), c = (cx, cy) with cy > 0; both angles at the longest side are acute.
 struct Triangle {
-  Vec3 a, u, w, n;
-  double length, cx, cy, inv_ac2, inv_bc2;
+  Vec3 a, u, w;
+  double length, cx, cy;
+
+  Vec3 n() const { return {u.y * w.z - u.z * w.y, u.z * w.x - u.x * w.z, u.x * w.y - u.y * w.x}; }
 };
 
 struct PointBlock {
@@ -28,8 +32,7 @@ struct PointBlock {
 };
 
 struct TriangleBlock {
-  float a[3][LANES], u[3][LANES], w[3][LANES], n[3][LANES];
-  float length[LANES], cx[LANES], cy[LANES], inv_ac2[LANES], inv_bc2[LANES];
+  float a[3][LANES], u[3][LANES], w[3][LANES], length[LANES], cx[LANES], cy[LANES];
 };
 
 struct Box {
@@ -67,23 +70,23 @@ struct Store {
 
   uint32_t blocks = 0;
   uint8_t last_valid = 0xff;        // lanes of the last block that are not padding
-  std::vector<int32_t> id;          // of the caller's faces or points, LANES a block
-  std::vector<Vec3> points;         // LANES a block, a cloud's
-  std::vector<Triangle> triangles;  // LANES a block, a mesh's
-  std::vector<Vec3> normals;        // LANES a block
-  std::vector<PointBlock> point_blocks;
-  std::vector<TriangleBlock> triangle_blocks;
-  std::vector<Box> boxes;        // of each block, relative to the centre
-  std::vector<Node> nodes;       // preorder
-  std::vector<NodeSides> sides;  // of each node, a mesh's
+  Many<int32_t> id;          // of the caller's faces or points, LANES a block
+  Many<Vec3> points;         // LANES a block, a cloud's
+  Many<Triangle> triangles;  // LANES a block, a mesh's
+  Many<Vec3> normals;        // LANES a block, a cloud's
+  Many<PointBlock> point_blocks;
+  Many<TriangleBlock> triangle_blocks;
+  Many<Box> boxes;        // of each block, relative to the centre
+  Many<Node> nodes;       // preorder
+  Many<NodeSides> sides;  // of each node, a mesh's
 
   Vec3 low{};       // corner of the grid
   double cell = 0;  // side of a cell [m]; 0: no grid
   float step = 0;   // unit of distances in the lists [m]
   int32_t size[3]{};             // bricks along each axis
-  std::vector<uint32_t> top;     // a word a brick: 0 or 1 + its number
-  std::vector<uint32_t> bricks;  // WORDS a brick
-  std::vector<uint32_t> lists;
+  Many<uint32_t> top;     // a word a brick: 0 or 1 + its number
+  Many<uint32_t> bricks;  // WORDS a brick
+  Many<uint32_t> lists;
 
   std::size_t bytes() const;
 };

@@ -20,9 +20,12 @@ class Memory {
   Kept* data() { return kept_.data(); }
   std::vector<Kept> take() { return std::move(kept_); }
 
-  // How much farther than the nearest primitive the others must be known for the neighbours to outlast the next steps.
-  float lead(double turn, double move) const {
-    const double wanted = STEPS * (move + 0.5 * turn * extent_);
+  // How much farther than the nearest primitive the others must be known for the neighbours to outlast the next steps,
+  // whose lengths are taken to fall as fast as the last two, or by two where the last was the first.
+  float lead(double turn, double move) {
+    const double length = move + 0.5 * turn * extent_, fall = std::min(std::max(length / last_, 0.1), 0.5);
+    const double wanted = STEPS * length * fall / (1 - fall);
+    last_ = length;
     return wanted < longest_ ? (float)std::max(wanted, LEAST_OF_GRAIN * grain_) : 0.f;
   }
 
@@ -32,7 +35,7 @@ class Memory {
 
  private:
   static constexpr double MOST_OF_GRAIN = 0.2, LEAST_OF_GRAIN = 0.02, STEPS = 4.0;
-  double extent_, grain_, longest_;
+  double extent_, grain_, longest_, last_ = 0;
   std::vector<Kept> kept_;
 };
 

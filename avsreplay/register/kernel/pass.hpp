@@ -76,7 +76,7 @@ static inline void enter(const Store& s, Chunk& c, int i, const Best& best, bool
   c.p[2][i] = inlier ? c.c[2][i] - s.centre.z : 0, c.f[2][i] = inlier ? f.z - s.centre.z : 0;
   if (kind == Pass::point) return;
   Stiffness k{{0, 0, 0}, 0, 0};
-  if (inlier) k = kind == Pass::plane ? Stiffness{s.normals[(size_t)best.lane], 1, 0} : Kind::stiffness(s, (uint32_t)best.lane, f.feature);
+  if (inlier) k = kind == Pass::plane ? Stiffness{Kind::normal(s, (uint32_t)best.lane), 1, 0} : Kind::stiffness(s, (uint32_t)best.lane, f.feature);
   c.n[0][i] = k.v.x, c.n[1][i] = k.v.y, c.n[2][i] = k.v.z, c.sign[i] = k.sign, c.whole[i] = k.whole;
 }
 
@@ -109,18 +109,21 @@ constexpr int AHEAD = 4;
 
 // What the search of a point will read first.
 template <class Kind>
-static inline void fetch_ahead(const Store& s, const uint32_t* list, const Kept* kept) {
-  if (kept && kept->lane >= 0) Kind::prefetch(s, (uint32_t)kept->lane);
+static inline void fetch_ahead(const Store& s, Treat treat, const uint32_t* list, const Kept* kept) {
+  if (kept && kept->lane >= 0) {
+    Kind::prefetch_exact(s, (uint32_t)kept->lane);
+    if (treat != KEPT) Kind::prefetch_block(s, (uint32_t)kept->lane / LANES);
+  }
   if (!list) return;
   const uint32_t n = *list & (MOST_BLOCKS - 1);
-  for (uint32_t k = 1; k <= n && k <= 2; ++k) Kind::prefetch(s, (list[k] & (MOST_BLOCKS - 1)) * LANES);
+  for (uint32_t k = 1; k <= n && k <= 2; ++k) Kind::prefetch_block(s, list[k] & (MOST_BLOCKS - 1));
 }
 
 template <class Kind>
 static void search(const Scope& o, int64_t first, int n, Pass kind, Kept* kept, Chunk& c, Sums& out) {
   int32_t last = -1;
   for (int i = 0; i < n; ++i) {
-    if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.list[i + AHEAD], kept ? kept + first + i + AHEAD : nullptr);
+    if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.search[i + AHEAD], c.list[i + AHEAD], kept ? kept + first + i + AHEAD : nullptr);
     if (c.search[i] == IGNORED) {
       enter<Kind>(o.s, c, i, none(), false, kind);
       continue;
@@ -232,7 +235,7 @@ static void match_kind(const Store& s, const View& v, int64_t first, int64_t las
   int32_t last_lane = -1;
   for (int i = 0; i < n; ++i) {
     const Kept* memory = kept ? kept + first + i : nullptr;
-    if (i + AHEAD < n) fetch_ahead<Kind>(s, c.list[i + AHEAD], memory ? memory + AHEAD : nullptr);
+    if (i + AHEAD < n) fetch_ahead<Kind>(s, c.search[i + AHEAD], c.list[i + AHEAD], memory ? memory + AHEAD : nullptr);
     Match& m = out[first + i];
     m.inlier = false;
     if (c.search[i] == IGNORED) continue;
@@ -243,7 +246,7 @@ static void match_kind(const Store& s, const View& v, int64_t first, int64_t las
                           : search_one<Kind>(o, q, c.list[i], own < 0 && !c.list[i] ? last_lane : own, nullptr);
     last_lane = best.lane;
     if (best.lane < 0 || !(best.foot.d2 < o.bound2)) continue;
-    const Vec3& normal = s.normals[(size_t)best.lane];
+    const Vec3 normal = Kind::normal(s, (uint32_t)best.lane);
     m = {{q.x, q.y, q.z}, {normal.x, normal.y, normal.z}, 0, best.foot.d2, true};
     m.e = normal.x * (q.x - best.foot.x) + normal.y * (q.y - best.foot.y) + normal.z * (q.z - best.foot.z);
   }
@@ -266,7 +269,7 @@ static void closest_kind(const Store& s, const View& v, int64_t first, int64_t l
     }
     seed = best.lane;
     const bool found = best.lane >= 0;
-    const Vec3 n = found ? s.normals[(size_t)best.lane] : Vec3{nan, nan, nan};
+    const Vec3 n = found ? Kind::normal(s, (uint32_t)best.lane) : Vec3{nan, nan, nan};
     const Vec3 f = found ? Vec3{best.foot.x, best.foot.y, best.foot.z} : Vec3{nan, nan, nan};
     out.id[i] = found ? s.id[(size_t)best.lane] : -1;
     out.d2[i] = found ? best.foot.d2 : std::numeric_limits<double>::infinity();

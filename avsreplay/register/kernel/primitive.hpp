@@ -32,6 +32,8 @@ struct Points {
     return dx * dx + dy * dy + dz * dz;
   }
 
+  static Vec3 normal(const Store& s, uint32_t lane) { return s.normals[lane]; }
+
   static Foot foot(const Store& s, uint32_t lane, const Query& q) {
     const Vec3& p = s.points[lane];
     const double dx = p.x - q.x, dy = p.y - q.y, dz = p.z - q.z;
@@ -46,13 +48,13 @@ struct Points {
 
   static bool faces(const Store&, uint32_t, const Vec3&) { return true; }  // a cloud has no sides
 
-  // The lane's block and its exact record.
-  static void prefetch(const Store& s, uint32_t lane) {
-    const char* p = reinterpret_cast<const char*>(s.point_blocks.data() + lane / LANES);
+  static void prefetch_block(const Store& s, uint32_t block) {
+    const char* p = reinterpret_cast<const char*>(s.point_blocks.data() + block);
     fetch(p);
     fetch(p + 64);
-    fetch(s.points.data() + lane);
   }
+
+  static void prefetch_exact(const Store& s, uint32_t lane) { fetch(s.points.data() + lane); }
 };
 
 struct Triangles {
@@ -60,12 +62,23 @@ struct Triangles {
     F8 x, y, z, fx, fy;  // the query and its foot in the triangles' own planes
   };
 
+  struct Normals {
+    F8 x, y, z;
+  };
+
+  static Normals normals(const TriangleBlock& b) {
+    const F8 ux = load8(b.u[0]), uy = load8(b.u[1]), uz = load8(b.u[2]);
+    const F8 wx = load8(b.w[0]), wy = load8(b.w[1]), wz = load8(b.w[2]);
+    return {uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx};
+  }
+
   static Local local(const TriangleBlock& b, const Query& q) {
     const F8 dx = q.qx - load8(b.a[0]), dy = q.qy - load8(b.a[1]), dz = q.qz - load8(b.a[2]);
     Local r;
     r.x = dx * load8(b.u[0]) + dy * load8(b.u[1]) + dz * load8(b.u[2]);
     r.y = dx * load8(b.w[0]) + dy * load8(b.w[1]) + dz * load8(b.w[2]);
-    r.z = dx * load8(b.n[0]) + dy * load8(b.n[1]) + dz * load8(b.n[2]);
+    const Normals n = normals(b);
+    r.z = dx * n.x + dy * n.y + dz * n.z;
     place(b, r);
     return r;
   }
@@ -74,8 +87,8 @@ struct Triangles {
   static void place(const TriangleBlock& b, Local& r) {
     const F8 zero = f8(0.f), one = f8(1.f), length = load8(b.length), cx = load8(b.cx), cy = load8(b.cy);
     const F8 bx = length - cx, rx = length - r.x;
-    const F8 t = clamp8((r.x * cx + r.y * cy) * load8(b.inv_ac2), zero, one);
-    const F8 s = clamp8((rx * bx + r.y * cy) * load8(b.inv_bc2), zero, one);
+    const F8 t = clamp8((r.x * cx + r.y * cy) / squared(cx, cy), zero, one);
+    const F8 s = clamp8((rx * bx + r.y * cy) / squared(bx, cy), zero, one);
     const F8 x1 = clamp8(r.x, zero, length), x2 = t * cx, y2 = t * cy, x3 = length - s * bx, y3 = s * cy;
     const F8 e1 = squared(r.x - x1, r.y), e2 = squared(r.x - x2, r.y - y2), e3 = squared(r.x - x3, r.y - y3);
     const F8::Mask out = either(either(r.y < zero, r.x * cy - r.y * cx < zero), rx * cy - r.y * bx < zero);
@@ -93,11 +106,14 @@ struct Triangles {
     return squared(r.x - r.fx, r.y - r.fy) + r.z * r.z;
   }
 
+  static Vec3 normal(const Store& s, uint32_t lane) { return s.triangles[lane].n(); }
+
   static Foot foot(const Store& s, uint32_t lane, const Query& q) {
     const Triangle& t = s.triangles[lane];
     const double dx = q.x - t.a.x, dy = q.y - t.a.y, dz = q.z - t.a.z;
     const double x = dx * t.u.x + dy * t.u.y + dz * t.u.z, y = dx * t.w.x + dy * t.w.y + dz * t.w.z;
-    const double z = dx * t.n.x + dy * t.n.y + dz * t.n.z;
+    const Vec3 n = t.n();
+    const double z = dx * n.x + dy * n.y + dz * n.z;
     double fx = x, fy = y, e = 0;
     Feature feature = FACE;
     const double bx = t.length - t.cx, rx = t.length - x;
@@ -111,7 +127,8 @@ struct Triangles {
 
   static bool faces(const Store& s, uint32_t lane, const Vec3& eye) {
     const Triangle& t = s.triangles[lane];
-    return (eye.x - t.a.x) * t.n.x + (eye.y - t.a.y) * t.n.y + (eye.z - t.a.z) * t.n.z > 0;
+    const Vec3 n = t.n();
+    return (eye.x - t.a.x) * n.x + (eye.y - t.a.y) * n.y + (eye.z - t.a.z) * n.z > 0;
   }
 
   static double unit(double t) { return t < 0 ? 0 : t > 1 ? 1 : t; }
@@ -121,7 +138,8 @@ struct Triangles {
     fx = x < 0 ? 0 : x > t.length ? t.length : x;
     fy = 0;
     double e = (x - fx) * (x - fx) + y * y;
-    const double p = unit((x * t.cx + y * t.cy) * t.inv_ac2), r = unit((rx * bx + y * t.cy) * t.inv_bc2);
+    const double p = unit((x * t.cx + y * t.cy) / (t.cx * t.cx + t.cy * t.cy));
+    const double r = unit((rx * bx + y * t.cy) / (bx * bx + t.cy * t.cy));
     const double side[2][2] = {{p * t.cx, p * t.cy}, {t.length - r * bx, r * t.cy}};
     double along = fx / t.length;
     feature = SIDE_AB;
@@ -136,17 +154,21 @@ struct Triangles {
 
   static Stiffness stiffness(const Store& s, uint32_t lane, Feature feature) {
     const Triangle& t = s.triangles[lane];
-    if (feature == FACE) return {t.n, 1, 0};
+    if (feature == FACE) return {t.n(), 1, 0};
     if (feature == CORNER) return {{0, 0, 0}, 0, 1};
     const double x = feature == SIDE_AB ? 1 : feature == SIDE_AC ? t.cx : t.length - t.cx;
     const double y = feature == SIDE_AB ? 0 : feature == SIDE_AC ? t.cy : -t.cy, inv = 1 / std::sqrt(x * x + y * y);
     return {{inv * (x * t.u.x + y * t.w.x), inv * (x * t.u.y + y * t.w.y), inv * (x * t.u.z + y * t.w.z)}, -1, 1};
   }
 
-  static void prefetch(const Store& s, uint32_t lane) {
-    const char* p = reinterpret_cast<const char*>(s.triangle_blocks.data() + lane / LANES);
+  static void prefetch_block(const Store& s, uint32_t block) {
+    const char* p = reinterpret_cast<const char*>(s.triangle_blocks.data() + block);
     for (size_t k = 0; k < sizeof(TriangleBlock); k += 64) fetch(p + k);
-    p = reinterpret_cast<const char*>(s.triangles.data() + lane);
-    for (size_t k = 0; k < sizeof(Triangle); k += 64) fetch(p + k);
+  }
+
+  static void prefetch_exact(const Store& s, uint32_t lane) {
+    const char* p = reinterpret_cast<const char*>(s.triangles.data() + lane);
+    fetch(p);
+    fetch(p + 64);
   }
 };

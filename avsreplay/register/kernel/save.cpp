@@ -12,7 +12,7 @@ class Writer {
     bytes_.append(reinterpret_cast<const char*>(&value), sizeof value);
   }
   template <class T>
-  void put(const std::vector<T>& values) {
+  void put(const Many<T>& values) {
     put((uint64_t)values.size());
     bytes_.append(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T));
   }
@@ -31,7 +31,7 @@ class Reader {
     copy(&value, sizeof value);
   }
   template <class T>
-  void get(std::vector<T>& values) {
+  void get(Many<T>& values) {
     uint64_t n = 0;
     get(n);
     if (!good_ || n > left_ / sizeof(T)) {
@@ -68,7 +68,7 @@ bool sound_sizes(const Store& s, int64_t primitives, int64_t ids) {
   const size_t lanes = (size_t)LANES * s.blocks, n = (size_t)primitives;
   if (s.blocks == 0 || s.blocks != (n + LANES - 1) / LANES) return false;
   if (s.last_valid != (uint8_t)(0xff >> (lanes - n))) return false;
-  if (s.id.size() != lanes || s.normals.size() != lanes) return false;
+  if (s.id.size() != lanes || s.normals.size() != (s.mesh ? 0 : lanes)) return false;
   if ((s.mesh ? s.triangles.size() : s.points.size()) != lanes) return false;
   if ((s.mesh ? s.triangle_blocks.size() : s.point_blocks.size()) != s.blocks) return false;
   if (s.boxes.size() != s.blocks) return false;

@@ -1,0 +1,39 @@
+// Memory of large arrays that are read at random: aligned to cache lines, and in huge pages where the system has them.
+#pragma once
+#include <cstddef>
+#include <new>
+#include <vector>
+#if defined(__linux__)
+#include <sys/mman.h>
+#endif
+
+namespace avs {
+
+template <class T>
+struct Pages {
+  using value_type = T;
+  static constexpr std::size_t LINE = 64, HUGE = std::size_t{1} << 21, LARGE = 2 * HUGE;
+
+  Pages() = default;
+  template <class U>
+  Pages(const Pages<U>&) {}
+
+  static std::size_t alignment(std::size_t n) { return n * sizeof(T) < LARGE ? LINE : HUGE; }
+
+  T* allocate(std::size_t n) {
+    void* p = ::operator new(n * sizeof(T), std::align_val_t(alignment(n)));
+#if defined(__linux__) && defined(MADV_HUGEPAGE)
+    if (alignment(n) == HUGE) ::madvise(p, n * sizeof(T), MADV_HUGEPAGE);
+#endif
+    return static_cast<T*>(p);
+  }
+  void deallocate(T* p, std::size_t n) { ::operator delete(p, std::align_val_t(alignment(n))); }
+
+  friend bool operator==(const Pages&, const Pages&) { return true; }
+  friend bool operator!=(const Pages&, const Pages&) { return false; }
+};
+
+template <class T>
+using Many = std::vector<T, Pages<T>>;
+
+}  // namespace avs
