@@ -16,7 +16,7 @@ from avsreplay.monitor.faults import FaultDetector
 from avsreplay.pipeline import Monitors, PipelineState, Stages
 from avsreplay.plan import Guidance, Supervisor, TargetGeometry, hull_vertices
 from avsreplay.records import LogHeader, Scan, Surface, Truth
-from avsreplay.register import Registrar
+from avsreplay.register import POSES, Registrar
 from avsreplay.register.surface_index import SurfaceIndex
 
 
@@ -99,6 +99,8 @@ def _initialise(
         return lambda scan: (_true_pose(truth_of(scan)), "truth")
     if config.init == "log" and start is not None:
         return lambda _scan: (start.x.T_ac, "start")
+    if config.init in ("log", "auto") and config.register.backend == POSES:
+        return lambda scan: (Pose.identity() if scan.pose is None else scan.pose.T_ac, "measured")
     if config.init in ("log", "auto"):
         return lambda _scan: (None, "acquired")
     pose = parse_pose(config.init)

@@ -322,3 +322,16 @@ class Pose:
             (..., 3) coordinates in a [m].
         """
         return np.asarray(points_b, dtype=np.float64) @ self.R.T + self.t
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredPose:
+    """A pose T_ac of {C} in {A} that a tracker measured (markers, motion capture), in place of a point cloud.
+
+    Attributes:
+        covariance: (6, 6) covariance of the error d = [theta; v], both in {C} [rad, m], where T_true = T_ac @ Exp(d);
+            None where the source states none.
+    """
+
+    T_ac: Pose
+    covariance: Array | None = None

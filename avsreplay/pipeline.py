@@ -29,7 +29,7 @@ from avsreplay.outcome import MonitorReport, Outcome
 from avsreplay.plan import Guidance, GuidanceState, PlannerInput, Scene, TargetGeometry
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
-from avsreplay.register import Registrar
+from avsreplay.register import Registrar, measured_alignment
 
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
 
@@ -40,7 +40,7 @@ class Measurement:
 
     Attributes:
         alignment: the graded pose.
-        guess: where its initial guess came from: start, truth, given, predicted, last or acquired.
+        guess: origin of its guess: start, truth, given, predicted, last, acquired; measured: a pose of the log.
         instants: (6, 6) mean instant of the measurement for each direction [s], see ``Registrar.instants``; None where
             all points count as measured at the scan's instant.
     """
@@ -165,12 +165,10 @@ class PipelineState:
     """What is carried from scan to scan.
 
     Attributes:
-        monitors: state of the monitors.
-        guidance: plan in force and robot, None before the first scan.
+        monitors: state of the monitors.  guidance: plan in force and robot, None before the first scan.
         track: the estimate, None before the first scan.
         last_pose: last healthy measured pose, None before one.
-        origin: where the first pose came from.
-        start_ns: instant of the first scan.
+        origin: where the first pose came from.  start_ns: instant of the first scan.
     """
 
     monitors: MonitorState
@@ -257,7 +255,7 @@ def planned_segment(state: PipelineState) -> Segment | None:
 
 def _track(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineState, Track, Measurement | None]:
     """The track so far, or a new one at the first scan. An acquired start is repeated until a scan is healthy."""
-    if state.track is not None and not (state.origin == "acquired" and state.last_pose is None):
+    if state.track is not None and not (state.origin in ("acquired", "measured") and state.last_pose is None):
         return state, state.track, None
     pose, origin = stages.initialise(scan)
     measurement = None
@@ -269,7 +267,9 @@ def _track(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineSt
 
 
 def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> Measurement:
-    """Register the scan from the guess that the configuration asks for."""
+    """Register the scan from the configured guess; a measured pose is taken as it is."""
+    if scan.pose is not None:
+        return Measurement(measured_alignment(scan.pose), "measured")
     points = _deskewed(stages, state, scan, predicted)
     guess, origin = predicted.belief.x.T_ac, "predicted"
     if state.last_pose is None:

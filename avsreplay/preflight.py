@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
-from avsreplay.log import LogInfo, Source
+from avsreplay.log import LogInfo, Source, SourceOptions
 from avsreplay.records import Surface
 from avsreplay.register import Registrar
 from avsreplay.report.table import Table, TableCell
 
 SCANS = 5
+_POSES = 200  # measured poses examined
 _LEAST, _MOST = 0.25, 1.3  # diameter of a scan over that of the model outside which something is wrong
 _ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
 _UNITS = {
@@ -71,6 +72,8 @@ def preflight(source: Source, surface: Surface | None, registrar: Registrar | No
         The findings in the order of the checks.
     """
     info = source.info()
+    if source.options.poses:
+        return [*_poses(source, surface), *_transforms(info), *_truth(info), *_clock(info)]
     clouds = _sampled_clouds(source)
     found = [*_sizes(clouds, surface), *_transforms(info), *_truth(info), *_clock(info)]
     share = None if registrar is None else _share_on_model(source, registrar)
@@ -85,6 +88,30 @@ def _sampled_clouds(source: Source) -> list[NDArray[Any]]:
     wanted = np.unique(np.linspace(0, len(source) - 1, SCANS).astype(int)).tolist() if len(source) else []
     clouds = [source.scan_at(seq).points for seq in wanted]
     return [cloud[np.isfinite(cloud).all(axis=1)] for cloud in clouds if len(cloud) >= 10]
+
+
+def _poses(source: Source, surface: Surface | None) -> list[Advice]:
+    """Measured poses: how many of a sample are valid, where their covariance comes from, and the size of the target."""
+    wanted = np.unique(np.linspace(0, len(source) - 1, _POSES).astype(int)).tolist() if len(source) else []
+    found = [source.scan_at(seq) for seq in wanted]
+    bad = [scan for scan in found if scan.pose is None]
+    out = [Advice("ok", "poses", f"{len(source)} measured poses")]
+    if bad:
+        text = f"{len(bad)} of {len(found)} examined poses are not valid, the first: {bad[0].note}"
+        out = [Advice("check", "poses", text)]
+    stated = any(scan.pose is not None and scan.pose.covariance is not None for scan in found)
+    if source.options.pose_sigma is not None:
+        out.append(Advice("ok", "covariance", "given by --pose-sigma"))
+    elif stated:
+        out.append(Advice("ok", "covariance", "stated by the messages"))
+    else:
+        text = "the source states none: R0 of the estimator, adapted to the residuals"
+        out.append(Advice("ok", "covariance", text, "--pose-sigma MM,DEG"))
+    if surface is not None and not surface.sha256:
+        text = f"no model: limits are those of a target of {surface.extent:.3g} m"
+        given = source.options.extent_m != SourceOptions().extent_m
+        out.append(Advice("ok" if given else "check", "size", text, "" if given else "--extent METRES or --model FILE"))
+    return out
 
 
 def _share_on_model(source: Source, registrar: Registrar) -> float | None:

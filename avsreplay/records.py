@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.geometry import Array, Pose, frozen
+from avsreplay.geometry import Array, MeasuredPose, Pose, frozen
 
 BLOCKS: Mapping[str, slice] = MappingProxyType(
     {
@@ -45,6 +45,7 @@ class AlignStatus(Enum):
     """What the quality check (register.quality) found of an alignment."""
 
     ALIGNED = "aligned"
+    MEASURED = "measured"  # a pose of the log itself (back end poses): nothing was registered
     NOT_CONVERGED = "not_converged"  # n_max iterations reached; the pose is still graded
     DEGENERATE = "degenerate"  # the view does not determine all six directions
     NO_OVERLAP = "no_overlap"  # too few inliers, whatever the back end reports
@@ -140,16 +141,16 @@ class Label:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
-    """One point cloud as the reader returns it.
+    """One point cloud, or one measured pose, as the reader returns it.
 
     Attributes:
         seq: index in the replay, from 0.  t_ns: instant on the selected clock.
         log_ns: time at which the recorder received it.
         points: (n, 3) finite, float32 or float64, possibly strided, in {A} [m].
         times_s: (n,) instant of each point relative to ``t_ns`` [s], or None.
-        dropped_points: number of non-finite points that were removed.
-        frame: coordinate frame that the message names, "" for none.
+        dropped_points: number of non-finite points that were removed.  frame: that the message names, "" for none.
         note: what was wrong with the message or its stamp.
+        pose: the measured pose where the source holds poses; there are no points then.
     """
 
     seq: int
@@ -161,6 +162,7 @@ class Scan:
     note: str | None = None
     log_ns: int = 0
     frame: str = ""
+    pose: MeasuredPose | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,6 +240,7 @@ class Alignment:
         """Return whether ``T_ac`` is a measurement and not only the initial guess."""
         return self.status in (
             AlignStatus.ALIGNED,
+            AlignStatus.MEASURED,
             AlignStatus.NOT_CONVERGED,
             AlignStatus.DEGENERATE,
             AlignStatus.AMBIGUOUS,

@@ -130,13 +130,13 @@ class Row:
         "1: the scan is healthy and updates the filter; 0: it is faulty and the filter only predicts.", table=True)
     reason: str = _exact(lambda o, s: o.verdict.reason.value, "Why gamma is 0; ok where gamma is 1.", table=True)
     guess: str = _exact(lambda o, s: o.guess, "Initial guess of the registration: predicted (by the filter), last"
-        " (healthy pose), acquired (search without a guess); until the first healthy scan the source of the first"
-        " pose: start (in the log), truth, given (on the command line) or acquired.")
+        " (healthy pose), acquired (search without a guess), measured (a pose of the log needs none); until the first"
+        " healthy scan the source of the first pose: start (in the log), truth, given (by an option) or acquired.")
     fault: str | None = _exact(lambda o, s: s.fault, "Label of the fault that was injected into this scan.", table=True)
     message: str | None = _exact(lambda o, s: o.alignment.message or o.scan.note or None,
         "Error of the back end, or what was wrong with the recorded message or its stamp.")
 
-    points: int = _exact(lambda o, s: len(o.scan.points), "Number of finite points in the scan.")
+    points: int | None = _exact(lambda o, s: None if o.scan.pose else len(o.scan.points), "Finite points in the scan.")
     iterations: int | None = _exact(if_points(lambda o: o.alignment.iterations), "Iterations of the registration.",
         table=True)
     inliers: int | None = column(if_points(lambda o: o.alignment.inliers),

@@ -26,7 +26,7 @@ from avsreplay.pipeline import PipelineState, Stages
 from avsreplay.plan import Motion
 from avsreplay.reconstruct import Reconstruction, at_grasp, reconstruct, surface_of
 from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surface, Truth
-from avsreplay.register import ModelCheck, Registrar
+from avsreplay.register import POSES, ModelCheck, Registrar
 from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
 from avsreplay.score import HealthyPoses, Scorer, matched_truth
@@ -96,11 +96,18 @@ class Run:
         """
         self.job = job
         unknown = job.options.model == RECONSTRUCTED
-        self.source: Source = open_source(job.source, replace(job.options, model=None) if unknown else job.options)
+        options = replace(job.options, model=None) if unknown else job.options
+        poses = load_config(job.config_file, {}, job.assignments).register.backend == POSES
+        if poses and unknown:
+            raise UsageError("poses contain no model", where="--model auto", hint="leave out --model, or name a file")
+        self.source: Source = open_source(job.source, replace(options, poses=poses))
         self._made: Reconstruction | None = None
         try:
             header = self.header = self._without_model() if unknown else self.source.header
             self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
+            if (self.config.register.backend == POSES) is not poses:
+                hint = "choose it with --backend poses or in --config"
+                raise UsageError("the log's own [run] table asks for the back end poses", where="register", hint=hint)
             if self._made is not None and self.config.init == "log" and self._made.poses[0][0] == self._first_ns:
                 self.config = replace(self.config, init=pose_text(self._made.poses[0][1]))
             self.surface: Surface = self._model()

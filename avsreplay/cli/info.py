@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import read_options, source_options
+from avsreplay.cli.options import pose_options, read_options, source_options
+from avsreplay.cli.setting_options import source_setting
 
 if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss
@@ -30,6 +31,8 @@ Examples:
 @click.command(name="info", epilog=EPILOG)
 @click.argument("source", type=click.Path(path_type=Path))
 @source_options
+@pose_options
+@source_setting("--poses", is_flag=True)
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
 def command(source: Path, as_json: bool, **reading: Any) -> None:
     """Show topics, types, counts, rates, time span, model, scenario and injected faults of SOURCE.

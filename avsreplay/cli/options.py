@@ -79,6 +79,12 @@ source_options = added(
     source_setting("--strict", is_flag=True),
 )
 """Options for reading a log; each has the name of its field in ``log.SourceOptions`` and is None by default."""
+pose_options = added(
+    source_setting("--pose-sigma", type=Numbers(2), metavar="MM,DEG"),
+    source_setting("--grasp", type=Numbers(3), metavar="X,Y,Z"),
+    source_setting("--extent", "extent_m", type=float),
+)
+"""Options for reading measured poses (``--backend poses``)."""
 
 
 def read_options(flags: Mapping[str, Any]) -> SourceOptions:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, log_file, read_options, source_options
+from avsreplay.cli.options import PATH, log_file, pose_options, read_options, source_options
 from avsreplay.cli.setting_options import run_settings, take_run_settings
 from avsreplay.errors import CheckFailed, DataLost, UsageError
 from avsreplay.files import check_output
@@ -64,6 +64,7 @@ class _Start(click.ParamType[str | float]):
 )
 @click.option("--paper", is_flag=True, help="The method as printed in the paper, without any addition (docs/paper.md).")
 @source_options
+@pose_options
 @click.option("--golden", type=PATH, help="Compare with these rows; exit code 1 if they differ.")
 @click.option("--update-golden", type=PATH, help="Write the rows to this golden file.")
 @click.option(

@@ -1,4 +1,4 @@
-"""The clouds of a source in order, from a log or a folder, decoded ahead on a second thread if asked."""
+"""The clouds or measured poses of a source in order; decoded ahead on a second thread if asked."""
 
 from __future__ import annotations
 
@@ -8,15 +8,20 @@ from pathlib import Path
 from queue import Empty, Full, Queue
 from typing import TypeVar
 
+import numpy as np
+
 from avsreplay.files import BadFile
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.index import Recording
 from avsreplay.log.options import Loss, TopicInfo
 from avsreplay.log.point_cloud2 import Cloud, decode_cloud, usable
+from avsreplay.log.pose_files import read_measured
+from avsreplay.log.pose_messages import decode_measured
 from avsreplay.log.scan_files import read_points
 
 T = TypeVar("T")
 _WAIT_S = 0.1
+_NO_POINTS = np.zeros((0, 3), np.float32)
 EPOCH_NS = 1_000_000_000  # stamp of the first scan of a folder: a stamp of zero means "unset"
 
 
@@ -58,6 +63,59 @@ class MessageClouds:
     def close(self) -> None:
         """Close the recording."""
         self._recording.close()
+
+
+class PoseMessages(MessageClouds):
+    """The measured poses of one topic; same interface as MessageClouds, with poses in place of points.
+
+    Attributes:
+        type: message type of the topic.
+    """
+
+    def __init__(self, recording: Recording, topic: str | None) -> None:
+        super().__init__(recording, topic)
+        self.type = next((t.type for t in recording.topics() if t.name == topic), "")
+
+    def load(self, place: int) -> Cloud:
+        """Return the decoded pose. Raises BadMessage if it cannot be decoded or is not valid."""
+        stamp_ns, frame, pose = decode_measured(self.type, *self.payload(place))
+        return Cloud(stamp_ns, frame, _NO_POINTS, None, 0, pose)
+
+
+class PoseFile:
+    """The measured poses of a file; same interface as MessageClouds.
+
+    Args:
+        path: the file.
+        rate_hz: poses per second, used if the file has no times.
+    """
+
+    kind = "pose file"
+    topic: str | None = None
+    losses: Sequence[Loss] = ()
+
+    def __init__(self, path: Path, rate_hz: float) -> None:
+        found = read_measured(path)
+        self._poses = found.poses
+        steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(found.poses))]
+        self.log_ns = self.publish_ns = self.header_ns = steady if found.t_ns is None else list(found.t_ns)
+
+    def load(self, place: int) -> Cloud:
+        """Return one pose. Raises BadMessage if its line has no valid pose."""
+        pose = self._poses[place]
+        if isinstance(pose, str):
+            raise BadMessage(pose)
+        return Cloud(self.header_ns[place], "", _NO_POINTS, None, 0, pose)
+
+    def payload(self, place: int) -> None:
+        """Return None: the file has lines, not messages."""
+
+    def topics(self) -> list[TopicInfo]:
+        """Return no topics: it is a single file."""
+        return []
+
+    def close(self) -> None:
+        """Do nothing: the file is not held open."""
 
 
 class FolderClouds:
@@ -106,7 +164,7 @@ class FolderClouds:
         """Do nothing: no file is held open."""
 
 
-CloudStream = MessageClouds | FolderClouds
+CloudStream = MessageClouds | FolderClouds | PoseFile
 
 
 def ahead(items: Iterator[T], count: int) -> Generator[T]:

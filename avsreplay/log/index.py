@@ -1,4 +1,4 @@
-"""The index of a log: its topics, the places of its cloud messages, and the base class of the log readers."""
+"""The index of a log: its topics, the places of its cloud and pose messages, and the base class of the log readers."""
 
 from __future__ import annotations
 
@@ -14,6 +14,14 @@ from avsreplay.log.options import Loss, TopicInfo
 
 MAX_NS = (2**31 - 2) * 1_000_000_000  # a ROS 2 time has 31 bits of seconds; a later one is cut to this
 CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2",)
+POSE_NAMES = (
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "nav_msgs/msg/Odometry",
+    "geometry_msgs/msg/TransformStamped",
+)
+"""Types that hold one stamped pose."""
+_INDEXED = (*CLOUD_TYPES, *POSE_NAMES)
 Sink = Callable[[str, str, int, bytes | memoryview], None]
 """Receives (type, encoding, log time [ns], payload) of each message of a topic, in file order."""
 
@@ -24,7 +32,7 @@ def _column() -> array[int]:
 
 @dataclass(slots=True)
 class CloudIndex:
-    """The messages of one cloud topic in file order; one entry for each message in every array.
+    """The messages of one cloud or pose topic in file order; one entry for each message in every array.
 
     Attributes:
         log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header [ns].
@@ -71,7 +79,7 @@ class _TopicCount:
 
 
 class MessageTable:
-    """Topics with their message counts and the index of every cloud topic, filled by one pass over the log.
+    """Topics with their message counts and the index of every cloud and pose topic, filled by one pass over the log.
 
     Args:
         sinks: called with every message of a topic during the pass.
@@ -91,7 +99,7 @@ class MessageTable:
         known = self._topics[topic]
         log_ns = max(-MAX_NS, min(times[0], MAX_NS))
         known.add(log_ns)
-        if known.type in CLOUD_TYPES:
+        if known.type in _INDEXED:
             clocks = (log_ns, times[1], _stamp(payload, known.encoding))
             self._clouds.setdefault(topic, CloudIndex()).add(clocks, *place, len(payload))
         if topic in self._sinks:

@@ -1,4 +1,4 @@
-"""Opening of a source: detects the format, selects the cloud topic, attaches ground truth and model."""
+"""Opening of a source: detects the format, selects the topic of clouds or poses, attaches ground truth and model."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage, shown
-from avsreplay.log.cloud_stream import FolderClouds, MessageClouds
+from avsreplay.log.cloud_stream import FolderClouds, MessageClouds, PoseFile, PoseMessages
 from avsreplay.log.db3_file import SQLITE_MAGIC, Db3File
 from avsreplay.log.ground_truth import GroundTruth, TruthCollector, file_truth
 from avsreplay.log.header import HEADER_RECORD, decode_header
-from avsreplay.log.index import CLOUD_TYPES, Merged, Recording, Sink
+from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import MAGIC
 from avsreplay.log.options import Loss, SourceOptions, TopicInfo
@@ -22,7 +24,8 @@ from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_tim
 from avsreplay.log.ros1_bag import ROS1_MAGIC, Ros1Bag
 from avsreplay.log.scan_files import by_number, scan_files
 from avsreplay.log.source import Source, refuse_losses
-from avsreplay.log.surface import parse_surface, read_surface, scaled
+from avsreplay.log.surface import octahedron, parse_surface, read_surface, scaled
+from avsreplay.log.writer import TRUTH_TOPIC
 from avsreplay.records import LogHeader, Surface
 
 
@@ -58,6 +61,8 @@ def open_source(path: str | Path, options: SourceOptions | None = None, *, inspe
 def _opened(path: Path, options: SourceOptions, inspect: bool) -> Source:
     if not path.exists():
         raise UnreadableInput("no such file", where=shown(path), hint="check the path")
+    if options.poses and path.is_file() and not _is_log(path):
+        return _open_pose_file(path, options)
     if path.is_dir() and not _is_bag_folder(path):
         return _open_folder(path, options)
     if not path.is_dir() and not path.is_file():
@@ -74,7 +79,13 @@ def _messages(path: Path, options: SourceOptions, inspect: bool) -> Source:
         topic = _optional_topic(recording, options, path) if inspect else _cloud_topic(recording, options, path)
         header, lost = _header(recording, options)
         ground_truth = collector.ground_truth()
-        clouds = MessageClouds(recording, topic)
+        if options.poses:
+            clouds: MessageClouds = PoseMessages(recording, topic)
+            header = _pose_header(header, options)
+            if topic == (options.truth_topic or TRUTH_TOPIC):  # a measurement is not its own truth
+                ground_truth = replace(ground_truth, truth=None, track=None)
+        else:
+            clouds = MessageClouds(recording, topic)
     except BaseException:
         recording.close()
         raise
@@ -89,21 +100,22 @@ def _named(topics: Sequence[TopicInfo], types: Sequence[str] = ()) -> str:
 
 
 def _optional_topic(recording: Recording, options: SourceOptions, path: Path) -> str | None:
-    clouds = [t for t in recording.topics() if t.type in CLOUD_TYPES and t.count]
+    clouds = [t for t in recording.topics() if t.type in _kinds(options) and t.count]
     return _cloud_topic(recording, options, path) if options.topic is not None or len(clouds) == 1 else None
 
 
 def _cloud_topic(recording: Recording, options: SourceOptions, path: Path) -> str:
     wanted, topics = options.topic, recording.topics()
-    clouds = [t for t in topics if t.type in CLOUD_TYPES and (t.count or t.name == wanted)]
+    what = "pose" if options.poses else "PointCloud2"
+    clouds = [t for t in topics if t.type in _kinds(options) and (t.count or t.name == wanted)]
     if wanted is not None and not any(t.name == wanted for t in clouds):
         hint = f"topics here: {_named(topics) or 'none'}"
-        raise UsageError(f"no PointCloud2 topic '{shown(wanted)}'", where=shown(path), hint=hint)
+        raise UsageError(f"no {what} topic '{shown(wanted)}'", where=shown(path), hint=hint)
     if not clouds:
-        raise _no_clouds(recording, path)
+        raise _no_clouds(recording, path, what)
     if wanted is None and len(clouds) > 1:
         hint = f"choose one with --topic: {_named(clouds)}"
-        raise UsageError(f"{len(clouds)} PointCloud2 topics", where=shown(path), hint=hint)
+        raise UsageError(f"{len(clouds)} {what} topics", where=shown(path), hint=hint)
     chosen = next(t for t in clouds if wanted in (None, t.name))
     if chosen.encoding not in ("cdr", "ros1"):
         what = f"topic '{shown(chosen.name)}' has the unknown encoding '{shown(chosen.encoding)}'"
@@ -111,14 +123,21 @@ def _cloud_topic(recording: Recording, options: SourceOptions, path: Path) -> st
     return chosen.name
 
 
-def _no_clouds(recording: Recording, path: Path) -> UnreadableInput:
+def _kinds(options: SourceOptions) -> tuple[str, ...]:
+    """The types of the messages that are measurements."""
+    return POSE_NAMES if options.poses else CLOUD_TYPES
+
+
+def _no_clouds(recording: Recording, path: Path, what: str) -> UnreadableInput:
     topics, advice = recording.topics(), ""
-    if any("packet" in t.type.lower() for t in topics):
+    if what == "PointCloud2" and any(t.type in POSE_NAMES and t.count for t in topics):
+        advice = "to use its poses as the measurement add --backend poses; "
+    elif what == "PointCloud2" and any("packet" in t.type.lower() for t in topics):
         advice = "these are raw sensor packets: convert them with the sensor's own driver first; "
     elif recording.losses:
         advice = f"{len(recording.losses)} part(s) of it could not be read, 'avsreplay doctor' says which; "
     hint = f"{advice}topics here: {_named(topics) or 'none'}"
-    return UnreadableInput("no PointCloud2 topic with a message", where=shown(path), hint=hint)
+    return UnreadableInput(f"no {what} topic with a message", where=shown(path), hint=hint)
 
 
 def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tuple[Loss, ...]]:
@@ -143,6 +162,51 @@ def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
         return (None if found is None else parse_surface(found[1], found[0])), []
     except (UnreadableInput, BadMessage) as error:
         return None, [Loss(f"the model in the log cannot be read: {shown(error)}", 0, 0)]
+
+
+def _pose_header(header: LogHeader, options: SourceOptions) -> LogHeader:
+    """The header of a source of measured poses: its model in the frame of the grasp point, or one of the given size.
+
+    Without a model an octahedron of the stated extent stands for the target. Start and true state of the log refer to
+    the original frame {C} and are dropped where the grasp point is another.
+    """
+    surface = header.surface
+    if surface is None:
+        surface = octahedron(options.extent_m)
+    elif options.grasp is not None:
+        surface = replace(surface, vertices=surface.vertices - np.array(options.grasp))
+    if options.grasp is not None:
+        header = replace(header, start=None, truth=None)
+    return replace(header, surface=surface)
+
+
+def _is_log(path: Path) -> bool:
+    """Return whether a file starts like a log."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(16)
+    except OSError as error:
+        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+    return head.startswith((MAGIC, b"#ROSBAG", b"\x28\xb5\x2f\xfd")) or head == SQLITE_MAGIC
+
+
+def _open_pose_file(path: Path, options: SourceOptions) -> Source:
+    """Open a file of measured poses.
+
+    Raises:
+        UnreadableInput: it is not a pose file, or has no valid pose.
+        UsageError: a topic was requested.
+    """
+    for flag, value in (("--topic", options.topic), ("--truth-topic", options.truth_topic)):
+        if value is not None:
+            raise UsageError("a pose file has no topics", where=f"{shown(path)}, {flag}", hint="leave it out")
+    poses = PoseFile(path, options.rate_hz)
+    surface = None if options.model is None else read_surface(options.model, options.cloud_model)
+    header = LogHeader(surface=surface and scaled(surface, options.model_scale), notes={"source": "pose file"})
+    truth = GroundTruth()
+    if options.truth_file is not None:
+        truth = GroundTruth(*file_truth(read_poses(options.truth_file), options.truth_gap_s))
+    return Source(path, poses, _pose_header(header, options), options, truth, files=[path])
 
 
 _STORAGE = (".mcap", ".db3")

@@ -21,7 +21,24 @@ class ClockChoice(Enum):
 class SourceOptions(Settings):
     """How to read a source: topics, frames, the part that is replayed, and clock."""
 
-    topic: str | None = setting(None, "Topic of the clouds.", unset="the only one")
+    topic: str | None = setting(None, "Topic of the clouds, or of the measured poses.", unset="the only one")
+    poses: bool = setting(False, "The source holds measured poses in place of clouds; '--backend poses' sets this.")
+    pose_sigma: tuple[float, float] | None = setting(
+        None,
+        "1 sigma of a measured pose: position along each axis [mm] and attitude about each axis [deg]; it replaces what"
+        " messages state.",
+        above=0.0,
+        unset="the covariance of the message, else estimator.r0_pos_m and r0_rot_deg, adapted to the residuals",
+    )
+    grasp: tuple[float, float, float] | None = setting(
+        None, "Grasp point in the frame of the measured poses, the origin of {C}.", unit="m", unset="their origin"
+    )
+    extent_m: float = setting(
+        1.0,
+        "Size of the target (bounding diagonal) for measured poses without a model.",
+        unit="m",
+        above=0.0,
+    )
     truth_topic: str | None = setting(
         None,
         "Topic of the true poses: PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped.",

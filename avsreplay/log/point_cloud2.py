@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.geometry import MeasuredPose
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import Cursor
 
@@ -62,13 +63,17 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """A decoded cloud: finite points (n, 3) [m] in ``frame``, times (n,) [s] after the stamp or None."""
+    """A decoded cloud: finite points (n, 3) [m] in ``frame``, times (n,) [s] after the stamp or None.
+
+    ``pose`` is set instead of the points where the source holds measured poses.
+    """
 
     stamp_ns: int
     frame: str
     points: NDArray[Any]
     times_s: NDArray[np.float32] | None
     dropped: int
+    pose: MeasuredPose | None = None
 
 
 def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:

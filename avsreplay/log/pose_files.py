@@ -1,4 +1,4 @@
-"""Pose files: TUM, KITTI, EuRoC and the ``.conf`` of the Stanford scans; each pose is T_ac, the model in the camera.
+"""Pose files: TUM, KITTI, EuRoC, CSV with a header, and the ``.conf`` of the Stanford scans; each pose is T_ac.
 
 TUM: ``t tx ty tz qx qy qz qw`` with t in seconds.  KITTI: the twelve numbers of [R | t] by row, without times.
 EuRoC: ``t[ns],px,py,pz,qw,qx,qy,qz,...``, scalar first.  ``.conf``: ``bmesh name tx ty tz qx qy qz qw`` where the
@@ -8,6 +8,7 @@ quaternion is conjugate to the usual convention, p_model = R(q)' p_scan + t, so 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -16,12 +17,14 @@ from pathlib import Path
 import numpy as np
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.geometry import Pose, matrix, normalise
-from avsreplay.log.bytes_io import shown
+from avsreplay.geometry import MeasuredPose, Pose, matrix, normalise
+from avsreplay.log.bytes_io import BadMessage, shown
+from avsreplay.log.pose_messages import measured_pose
 
 _MAX_BYTES = 256 << 20
 _MAX_SECONDS = 2**31 - 2  # a ROS 2 time has 31 bits of seconds
 _MAX_METRES = 1e9
+_SEPARATOR = re.compile(r"\s*,\s*|\s+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +81,7 @@ def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
         if stripped and not stripped.startswith("#"):
-            yield f"{shown(path)}:{number}", stripped.replace(",", " ").split(), "," in stripped
+            yield f"{shown(path)}:{number}", _SEPARATOR.split(stripped), "," in stripped
 
 
 def _line(words: list[str], commas: bool, where: str) -> tuple[int | None, Pose]:
@@ -143,3 +146,135 @@ def _bmesh_pose(words: list[str], where: str) -> Pose:
         raise UnreadableInput("not a bmesh line", where=where, hint=hint)
     q_ac = normalise(values[3:])
     return Pose(q_ac, -matrix(q_ac) @ values[:3])
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredFile:
+    """The measured poses of a file, in its order.
+
+    Attributes:
+        poses: the pose of each line, or the text that says why it has none.
+        t_ns: times [ns], None where the format has no times.
+    """
+
+    poses: tuple[MeasuredPose | str, ...]
+    t_ns: tuple[int, ...] | None
+
+
+_NOT_A_NAME = re.compile(r"[^a-z0-9]+")
+_TIME = re.compile(r"(?:t|time|timestamp|stamp|secs?|seconds)(?:_?(s|sec|ns|nsec))?$")
+_POSITION = re.compile(r"(?:p|t|pos|position|translation)?_?([xyz])(?:_?(m|mm))?$")
+_QUATERNION = re.compile(r"(?:q|quat|quaternion|orientation|rot|rotation)_?([xyzw])$")
+_POSE_COLUMNS = ("px", "py", "pz", "qx", "qy", "qz", "qw")
+_FORMATS = (
+    "TUM: t tx ty tz qx qy qz qw; KITTI: twelve numbers; EuRoC: t[ns],x,y,z,qw,qx,qy,qz;"
+    " CSV with a header: t_s (or t_ns), x, y, z, qx, qy, qz, qw in any order"
+)
+
+
+def read_measured(path: Path) -> MeasuredFile:
+    """Read a file of measured poses: TUM, KITTI, EuRoC, or CSV whose first line names the columns.
+
+    A pose with a missing or invalid value stays in its place with the reason, because trackers write such lines while
+    they see too few markers.
+
+    Args:
+        path: the file.
+
+    Raises:
+        UnreadableInput: the file cannot be read, a line has another form, or no pose is valid; with file and line.
+    """
+    poses, times, first = list[MeasuredPose | str](), list[int](), ""
+    columns: _Columns | None = None
+    for where, words, commas in _lines(path):
+        if columns is None and not poses and commas and not _is_number(words[0]):
+            columns = _columns(words, where)
+            continue
+        t_ns, pose = columns.read(words, where) if columns else _measured_line(words, commas, where)
+        if isinstance(pose, str) and not first:
+            first = f"; the first: {pose} ({where})"
+        poses.append(pose)
+        if t_ns is not None:
+            times.append(t_ns)
+    if not any(isinstance(pose, MeasuredPose) for pose in poses):
+        raise UnreadableInput(f"no valid pose in this file{first}", where=shown(path), hint=_FORMATS)
+    if times and len(times) != len(poses):
+        raise UnreadableInput("some lines have a time and others do not", where=shown(path), hint="check the file")
+    return MeasuredFile(tuple(poses), tuple(times) or None)
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """Where a CSV with a header has time and pose, and the factor from its unit of length to metres."""
+
+    time: int
+    nanoseconds: bool
+    pose: tuple[int, ...]
+    metres: float
+
+    def read(self, words: list[str], where: str) -> tuple[int, MeasuredPose | str]:
+        """Time [ns] and pose of a line. Raises UnreadableInput if it has no time or too few columns."""
+        if len(words) <= max(self.time, *self.pose):
+            raise UnreadableInput(f"only {len(words)} columns", where=where, hint="one value for each named column")
+        text = words[self.time]
+        t_ns = seconds_to_ns(f"{text}e-9" if self.nanoseconds else text)
+        if t_ns is None:
+            hint = "a column t_s is in seconds, t_ns in nanoseconds"
+            raise UnreadableInput(f"'{shown(text)}' is not a time", where=where, hint=hint)
+        values = [_number(words[k]) for k in self.pose]
+        return t_ns, _checked([*(self.metres * v for v in values[:3]), *values[3:]])
+
+
+def _columns(names: list[str], where: str) -> _Columns:
+    """The columns that a header line names. Raises UnreadableInput if one of the eight is missing or named twice."""
+    found: dict[str, tuple[int, str]] = {}  # place and unit of each
+    for place, name in enumerate(_NOT_A_NAME.sub("_", n.lower()).strip("_") for n in names):
+        if time := _TIME.match(name):
+            found.setdefault("t", (place, time[1] or "s"))
+        elif position := _POSITION.match(name):
+            found.setdefault(f"p{position[1]}", (place, position[2] or "m"))
+        elif turn := _QUATERNION.match(name):
+            found.setdefault(f"q{turn[1]}", (place, ""))
+    missing = [key for key in ("t", *_POSE_COLUMNS) if key not in found]
+    if missing:
+        raise UnreadableInput(f"no column for {', '.join(missing)}", where=where, hint=_FORMATS)
+    nanoseconds, metres = found["t"][1].startswith("n"), 0.001 if found["px"][1] == "mm" else 1.0
+    return _Columns(found["t"][0], nanoseconds, tuple(found[key][0] for key in _POSE_COLUMNS), metres)
+
+
+def _measured_line(words: list[str], commas: bool, where: str) -> tuple[int | None, MeasuredPose | str]:
+    """A line without named columns; its number of columns determines the format."""
+    try:
+        if commas:
+            x, y, z, qw, *q = (_number(w) for w in words[1:8])
+            return int(words[0]), _checked([x, y, z, *q, qw])
+        if len(words) == 12:
+            return None, MeasuredPose(_from_rows([float(w) for w in words]))
+        t_ns = seconds_to_ns(words[0])
+        if t_ns is None or len(words) != 8:
+            raise ValueError
+        return t_ns, _checked([_number(w) for w in words[1:]])
+    except (ValueError, OverflowError):
+        raise UnreadableInput("not a pose line", where=where, hint=_FORMATS) from None
+
+
+def _checked(values: list[float]) -> MeasuredPose | str:
+    if len(values) != 7:
+        raise ValueError
+    try:
+        return measured_pose(values)
+    except BadMessage as error:
+        return str(error)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _number(word: str) -> float:
+    """A number; NaN for an empty field. Raises ValueError for other text."""
+    return float(word) if word else math.nan

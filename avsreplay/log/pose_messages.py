@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from array import array
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.geometry import Array, Pose
+from avsreplay.geometry import Array, MeasuredPose, Pose, frozen
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import Cursor
-from avsreplay.log.index import Sink
+from avsreplay.log.index import POSE_NAMES, Sink
 from avsreplay.records import State
 
 _MAX_TRANSFORMS, _MAX_VALUE = 4096, 1e9
@@ -22,13 +22,17 @@ _MAX_TRANSFORMS, _MAX_VALUE = 4096, 1e9
 
 @dataclass(frozen=True, slots=True)
 class Transform:
-    """A stamped pose of ``child`` in ``parent``: x y z [m] qx qy qz qw, and the twist of an Odometry message."""
+    """A stamped pose of ``child`` in ``parent``: x y z [m] qx qy qz qw, and the twist of an Odometry message.
+
+    ``covariance`` holds 36 numbers by row, of position in ``parent`` [m] and rotation about its axes [rad].
+    """
 
     t_ns: int
     parent: str
     child: str
     pose: tuple[float, ...]
     twist: tuple[float, ...] | None = None
+    covariance: tuple[float, ...] | None = None
 
 
 def read_pose(kind: str, payload: bytes | memoryview, encoding: str = "cdr") -> Transform:
@@ -57,12 +61,17 @@ def _pose(cursor: Cursor) -> Transform:
     return Transform(t_ns, frame, "", cursor.f64s(7))
 
 
+def _with_covariance(cursor: Cursor) -> Transform:
+    t_ns, frame = cursor.header()
+    return Transform(t_ns, frame, "", cursor.f64s(7), None, cursor.f64s(36))
+
+
 def _odometry(cursor: Cursor) -> Transform:
     t_ns, frame = cursor.header()
     child = cursor.string()
     pose = cursor.f64s(7)
-    cursor.f64s(36)
-    return Transform(t_ns, frame, child, pose, cursor.f64s(6))
+    covariance = cursor.f64s(36)
+    return Transform(t_ns, frame, child, pose, cursor.f64s(6), covariance)
 
 
 def _transform(cursor: Cursor) -> Transform:
@@ -71,12 +80,61 @@ def _transform(cursor: Cursor) -> Transform:
     return Transform(t_ns, frame, child, cursor.f64s(7))
 
 
-POSE_TYPES: dict[str, Callable[[Cursor], Transform]] = {
-    "geometry_msgs/msg/PoseStamped": _pose,
-    "geometry_msgs/msg/PoseWithCovarianceStamped": _pose,
-    "nav_msgs/msg/Odometry": _odometry,
-    "geometry_msgs/msg/TransformStamped": _transform,
-}
+POSE_TYPES: dict[str, Callable[[Cursor], Transform]] = dict(
+    zip(POSE_NAMES, (_pose, _with_covariance, _odometry, _transform), strict=True)
+)
+_UNIT_WITHIN = 0.01  # a measured quaternion whose length is off by more is not a rounded unit quaternion
+
+
+def decode_measured(kind: str, payload: bytes | memoryview, encoding: str = "cdr") -> tuple[int, str, MeasuredPose]:
+    """Decode a pose message as a measurement.
+
+    Args:
+        kind: its type, of ``POSE_TYPES``.
+        payload: the serialised message.
+        encoding: ``cdr`` or ``ros1``.
+
+    Returns:
+        Header stamp [ns], header frame, and the pose with the covariance of the message; a covariance that is zero,
+        negative or not positive definite states nothing, as is usual in ROS.
+
+    Raises:
+        BadMessage: the message is cut, or its pose is not finite or has no unit quaternion.
+    """
+    found = POSE_TYPES[kind](Cursor(payload, encoding))
+    pose = measured_pose(found.pose)
+    if found.covariance is None:
+        return found.t_ns, found.parent, pose
+    return found.t_ns, found.parent, MeasuredPose(pose.T_ac, _in_fixture(found.covariance, pose.T_ac))
+
+
+def measured_pose(values: Sequence[float]) -> MeasuredPose:
+    """Return a measured pose from x y z [m] qx qy qz qw.
+
+    Raises:
+        BadMessage: a value is not finite, or the quaternion is not of unit length within 1 %.
+    """
+    if not all(abs(v) < _MAX_VALUE for v in values):
+        raise BadMessage("a pose that is not finite")
+    length = math.hypot(*values[3:])
+    if abs(length - 1.0) > _UNIT_WITHIN:
+        raise BadMessage(f"a quaternion of length {length:.4g}, not 1")
+    return MeasuredPose(Pose(np.array(values[3:]) / length, np.array(values[:3])))
+
+
+def _in_fixture(covariance: tuple[float, ...], T_ac: Pose) -> Array | None:
+    """Covariance of d = [theta; v] in {C} from that of (position, rotation vector) in {A}; None where it is not one."""
+    given = np.array(covariance).reshape(6, 6)
+    if not np.isfinite(given).all():
+        return None
+    turn, J = T_ac.R.T, np.zeros((6, 6))
+    J[:3, 3:], J[3:, :3] = turn, turn  # theta = R' theta_a, v = R' dt_a
+    C = J @ (0.5 * (given + given.T)) @ J.T
+    try:
+        np.linalg.cholesky(C)
+    except np.linalg.LinAlgError:
+        return None
+    return frozen(C, 6, 6)
 
 
 class PoseTrack:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Generator, Iterator, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 
+from avsreplay import geometry
 from avsreplay.errors import UnreadableInput
-from avsreplay.geometry import Pose
+from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.clock import Placed, place
 from avsreplay.log.cloud_stream import CloudStream, ahead
@@ -221,6 +224,7 @@ class Source:
             note=note,
             log_ns=log_ns,
             frame="" if cloud is None else cloud.frame,
+            pose=None if cloud is None else cloud.pose,
         )
 
     def _body_at(self, t_ns: int) -> State | None:
@@ -234,19 +238,41 @@ class Source:
 
     def _taken(self, cloud: Cloud, t_ns: int) -> Cloud:
         """Crop a cloud and transform it to the fixed frame. Raises BadMessage if the pose of the sensor is unknown."""
+        if cloud.pose is not None:
+            return replace(cloud, pose=self._measured(cloud.pose, t_ns, cloud.frame))
         cloud = _cropped(cloud, self.options)
         if self._ground_truth.sensor is None:
             return cloud
-        pose = self._ground_truth.sensor(t_ns, cloud.frame)
+        pose = self._sensor(t_ns, cloud.frame)
+        return Cloud(cloud.stamp_ns, cloud.frame, pose.apply(cloud.points), cloud.times_s, cloud.dropped)
+
+    def _sensor(self, t_ns: int, frame: str) -> Pose:
+        """Return the pose of the sensor in the fixed frame. Raises BadMessage if it is unknown."""
+        lookup = self._ground_truth.sensor
+        pose = Pose.identity() if lookup is None else lookup(t_ns, frame)
         if pose is None:
             raise BadMessage("the pose of the sensor is unknown at the time of the scan")
-        return Cloud(cloud.stamp_ns, cloud.frame, pose.apply(cloud.points), cloud.times_s, cloud.dropped)
+        return pose
+
+    def _measured(self, found: MeasuredPose, t_ns: int, frame: str) -> MeasuredPose:
+        """Return a measured pose in the fixed frame, of the grasp point, with the covariance that applies."""
+        options, C = self.options, found.covariance
+        offset = np.zeros(3) if options.grasp is None else np.array(options.grasp)
+        if C is not None and options.grasp is not None:  # of the new origin: v' = v + theta x offset
+            J = np.eye(6)
+            J[3:, :3] = -geometry.skew(offset)
+            C = J @ C @ J.T
+        if options.pose_sigma is not None:
+            sigma = math.radians(options.pose_sigma[1]), 1e-3 * options.pose_sigma[0]
+            C = np.diag(np.repeat(sigma, 3) ** 2)
+        T_ac = self._sensor(t_ns, frame) @ found.T_ac @ Pose(geometry.IDENTITY_QUAT, offset)
+        return MeasuredPose(T_ac, C)
 
 
 def _status(cloud: Cloud | None, placed: Placed) -> ScanStatus:
     if cloud is None:
         return ScanStatus.DAMAGED
-    if not len(cloud.points):
+    if not len(cloud.points) and cloud.pose is None:
         return ScanStatus.EMPTY
     return ScanStatus.CLOCK if placed.note else ScanStatus.OK
 

@@ -182,3 +182,18 @@ def _with_area(vertices: Array, faces: NDArray[Any]) -> NDArray[np.int32]:
         flat = ~(np.linalg.norm(normals, axis=1) > 0.0)
     kept: NDArray[np.int32] = np.ascontiguousarray(faces.reshape(-1, 3)[~flat], np.int32)
     return kept
+
+
+_OCTAHEDRON = np.array(
+    [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]], dtype=np.int32
+)
+
+
+def octahedron(extent_m: float) -> Surface:
+    """Return an octahedron about the origin of {C} that stands for a target without a model.
+
+    Args:
+        extent_m: diagonal of its bounding box [m].
+    """
+    corners = 0.5 * extent_m / np.sqrt(3.0) * np.concatenate([np.eye(3), -np.eye(3)])
+    return Surface(corners, _OCTAHEDRON, "none", "")

@@ -107,6 +107,8 @@ class FaultDetector:
         p = self.params
         poor_fit = not alignment.rms_m < self._rms
         jump = weighted_norm(seen, self._length) >= pose_limit(seen, self._alpha, self._length, p.sigmas)
+        if alignment.status is AlignStatus.MEASURED:  # nothing was fitted: the pose test alone decides
+            return Reason.POSE_JUMP if jump else None
         if p.policy is Policy.ALL:
             return Reason.FIT_ERROR if poor_fit and jump else None
         if not alignment.converged or alignment.status is AlignStatus.NOT_CONVERGED:

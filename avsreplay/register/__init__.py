@@ -5,9 +5,11 @@ from __future__ import annotations
 from avsreplay.register.backend import Availability, Backend, Target, available
 from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.params import RegisterParams, RegistrationLimits
+from avsreplay.register.poses import POSES, measured_alignment
 from avsreplay.register.registrar import Registrar
 
 __all__ = [
+    "POSES",
     "Availability",
     "Backend",
     "ModelCheck",
@@ -16,4 +18,5 @@ __all__ = [
     "RegistrationLimits",
     "Target",
     "available",
+    "measured_alignment",
 ]

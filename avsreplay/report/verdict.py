@@ -267,6 +267,7 @@ def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
         "start": "the log's initial state",
         "truth": "the ground truth of the log",
         "given": f"the option --init {config.get('init', '')}".rstrip(),
+        "measured": "the first measured pose",
         "acquired": "a global search without any prior knowledge",
     }.get(rows[0].guess, _plain(rows[0].guess))
     return said + (f"; initialisation '{mode}'" if mode else "")
