@@ -26,6 +26,7 @@ def stages(
     surface: Surface,
     registrar: Registrar,
     truth_of: Callable[[Scan], Truth],
+    epoch_ns: int = 0,
 ) -> Stages:
     """Create the chain for one log.
 
@@ -35,6 +36,7 @@ def stages(
         surface: model of the target.
         registrar: of that model; one may serve several chains.
         truth_of: truth at a scan; used for the first pose alone, where the configuration starts from the truth.
+        epoch_ns: instant of the first scan, from which a known acceleration is counted.
 
     Raises:
         UsageError: the configuration requires the start of the log, and the log contains none.
@@ -44,7 +46,7 @@ def stages(
     supervision = config.supervisor.resolved(surface.extent)
     return Stages(
         registrar=registrar,
-        estimator=Estimator(config.estimator, start, surface.extent),
+        estimator=Estimator(config.estimator, start, surface.extent, epoch_ns),
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
         guidance=Guidance(config.robot.applied(config.plan), Supervisor(supervision), limits, surface.extent),

@@ -39,8 +39,7 @@ class Measurement:
     """A registered scan.
 
     Attributes:
-        alignment: the graded pose.
-        guess: origin of its guess: start, truth, given, predicted, last, acquired; measured: a pose of the log.
+        alignment: the graded pose.  guess: start, truth, given, predicted, last, acquired; measured: pose of the log.
         instants: (6, 6) mean instant of the measurement for each direction [s], see ``Registrar.instants``; None where
             all points count as measured at the scan's instant.
     """
@@ -207,7 +206,8 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     gamma = verdict.gamma
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, innovation, gamma, track)
     forecast = partial(stages.estimator.track_forecast, track)
-    known = planner_input(stages.estimator, track.belief, stages.target, gamma, report.converged, forecast)
+    belief = stages.estimator.in_camera(track.belief)
+    known = planner_input(stages.estimator, belief, stages.target, gamma, report.converged, forecast)
     guidance = stages.guidance.step(state.guidance or stages.guidance.initial(scan.t_ns), known)
     outcome = Outcome(
         scan=scan,
@@ -216,10 +216,10 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         alignment=measurement.alignment,
         innovation=innovation,
         verdict=verdict,
-        belief=track.belief,
-        pose=track.belief.x.T_ac,
-        pose_covariance=stages.estimator.pose_covariance(track.belief),
-        body=body_parameters(track.belief),
+        belief=belief,
+        pose=belief.x.T_ac,
+        pose_covariance=stages.estimator.pose_covariance(belief),
+        body=body_parameters(belief),
         estimator=track.mode,
         sigma_hits=track.sigma_hits,
         r_floors=track.r_floors,
@@ -271,7 +271,7 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
     if scan.pose is not None:
         return Measurement(measured_alignment(scan.pose), "measured")
     points = _deskewed(stages, state, scan, predicted)
-    guess, origin = predicted.belief.x.T_ac, "predicted"
+    guess, origin = stages.estimator.in_camera(predicted.belief).x.T_ac, "predicted"
     if state.last_pose is None:
         origin = state.origin
     elif stages.guess is Guess.LAST:
@@ -313,10 +313,10 @@ def _prediction_lost(stages: Stages, scan: Scan, predicted: Prediction) -> bool:
 
 def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> NDArray[Any]:
     """The points at the scan's instant: moved by the predicted motion where they have times and a motion is known."""
-    motion_known = state.last_pose is not None or stages.estimator.start is not None
-    if scan.times_s is None or not (stages.deskew and motion_known):
+    known = state.last_pose is not None or stages.estimator.start is not None
+    if scan.times_s is None or not (stages.deskew and known):
         return scan.points
-    return deskew(scan.points, scan.times_s, predicted)
+    return deskew(scan.points, scan.times_s, replace(predicted, belief=stages.estimator.in_camera(predicted.belief)))
 
 
 Forecaster = Callable[[Array], Forecast]

@@ -17,6 +17,7 @@ from avsreplay.build import first_state, stages
 from avsreplay.checkpoint import pack, unpack
 from avsreplay.config import Against, RunConfig, load_config, pose_text
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.estimate.acceleration import AccelerationFit, fit_acceleration
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.reference import Reference, reference_of
 from avsreplay.log import Source, SourceOptions, open_source
@@ -80,6 +81,7 @@ class Run:
         surface: model of the target.
         registrar: registers scans against that model.
         model_check: check of the model by the rows processed so far.
+        acceleration: the fitted acceleration of the target, None where it is given.
         done: number of scans processed so far.
     """
 
@@ -113,6 +115,7 @@ class Run:
             self.surface: Surface = self._model()
             self.registrar = Registrar(self.surface, self.config.register)
             self.model_check = ModelCheck(self.registrar, self.surface)
+            self.acceleration = self._fitted_acceleration()
             self._stages = self._new_stages()
         except BaseException:
             self.source.close()
@@ -153,7 +156,7 @@ class Run:
             UsageError: there are fewer than four healthy poses.
         """
         ready = self._new_stages()
-        poses, instants = HealthyPoses(ready.estimator.params), set[int]()
+        poses, instants = HealthyPoses(ready.estimator.params, ready.estimator.fall), set[int]()
         for state, outcome in self._outcomes(ready, progress, "fitting", first_state(ready)):
             poses.add(state, outcome)
             if outcome.scan.status is not ScanStatus.CLOCK:
@@ -241,7 +244,7 @@ class Run:
         counts = {"losses": len(losses), "lost_messages": sum(loss.messages or 0 for loss in losses)}
         counts |= {"stamps_unset": clock.unset, "stamps_jumped": clock.jumps}
         counts |= {"stamps_equal": clock.equal, "stamps_back": clock.back}
-        return replace(self._fold.result(self.truth), counts=counts)
+        return replace(self._fold.result(self.truth), counts=counts, acceleration=self._acceleration_text())
 
     def facts(self) -> dict[str, Any]:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""
@@ -251,13 +254,34 @@ class Run:
             "log": {"name": self.job.source.name, "sha256": self.source.sha256, "scans": len(self.source)},
             "model": {"name": Path(surface.name).name, "sha256": surface.sha256, "extent_m": surface.extent},
             "clock": settings.dump(self.source.clock),
+            "acceleration": None if self.acceleration is None else self.acceleration.record(),
             "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
             "selection": settings.dump(self.job.options),
             "config": settings.dump(self.config),
         }
 
     def _new_stages(self) -> Stages:
-        return stages(self.config, self.header, self.surface, self.registrar, self._true)
+        config = self.config
+        if self.source.options.poses:
+            period_s = self.source.clock.period_s * self.source.options.every
+            config = replace(config, estimator=config.estimator.at_interval(period_s, self.surface.extent))
+        return stages(config, self.header, self.surface, self.registrar, self._true, self.source.first_ns)
+
+    def _fitted_acceleration(self) -> AccelerationFit | None:
+        """Fit the acceleration to the measured poses of a first pass where it is asked for, and set it."""
+        if not self.config.estimator.fit_acceleration:
+            return None
+        plain = replace(self.config.estimator, acceleration_mps2=(0.0, 0.0, 0.0))
+        self.config = replace(self.config, estimator=plain)
+        ready = self._new_stages()
+        fixes = [
+            (outcome.scan.t_ns, outcome.alignment)
+            for _, outcome in self._outcomes(ready, None, "fitting", first_state(ready))
+            if outcome.alignment.measured and outcome.scan.status is ScanStatus.OK
+        ]
+        found = fit_acceleration(fixes, plain.resolved(self.surface.extent))
+        self.config = replace(self.config, estimator=replace(plain, acceleration_mps2=tuple(found.mean.tolist())))
+        return found
 
     def _outcomes(
         self, ready: Stages, progress: Progress | None, what: str, state: PipelineState, first: int = 0
@@ -269,6 +293,12 @@ class Run:
             yield from pipeline.fold(ready, state, shown)
         finally:
             scans.close()
+
+    def _acceleration_text(self) -> str | None:
+        known = self.config.estimator.acceleration_mps2
+        if self.acceleration is not None:
+            return self.acceleration.text
+        return "({:.4g}, {:.4g}, {:.4g}) m/s2, given".format(*known) if any(known) else None
 
     def _scorer(self) -> Scorer:
         """Against the truth of the log, or against the reference within its span."""

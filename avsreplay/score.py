@@ -6,11 +6,13 @@ The reference is the truth in the log, or a motion fitted to all healthy poses o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator
+from avsreplay.estimate.acceleration import FreeFall
 from avsreplay.estimate.chart import nearest_permutation, nees
 from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.initialise import PoseFix
@@ -96,13 +98,14 @@ class Scorer:
 class HealthyPoses:
     """Collects the healthy poses of a run, for a fit to all of them."""
 
-    def __init__(self, params: EstimatorParams) -> None:
+    def __init__(self, params: EstimatorParams, fall: FreeFall | None = None) -> None:
         """Start without poses.
 
         Args:
             params: of the estimator, with auto values resolved.
+            fall: the estimator's falling frame, None without a known acceleration.
         """
-        self._params, self.fixes = params, list[PoseFix]()
+        self._params, self._fall, self.fixes = params, fall, list[PoseFix]()
 
     def add(self, state: PipelineState, outcome: Outcome) -> None:
         """Take the outcome of one scan; a pose that is not healthy is ignored.
@@ -112,11 +115,14 @@ class HealthyPoses:
             outcome: outcome of the scan.
         """
         if outcome.verdict.gamma and state.track is not None and state.last_pose is not None:
-            self.fixes.append(healthy_pose(state.track, outcome.scan.t_ns, state.last_pose, self._params))
+            t_ns, T_ac = outcome.scan.t_ns, state.last_pose
+            T_ac = T_ac if self._fall is None else self._fall.pose_into(T_ac, t_ns)
+            self.fixes.append(healthy_pose(state.track, t_ns, T_ac, self._params))
 
     def reference(self) -> Reference:
         """Fit one motion to all of them. Raises UsageError where they are too few."""
-        return reference_of(self.fixes, self._params)
+        found, fall = reference_of(self.fixes, self._params), self._fall
+        return found if fall is None else replace(found, at=lambda t_ns: fall.state_out(found.at(t_ns), t_ns))
 
 
 def pose_error(pose: Pose, truth: Pose) -> PoseError:

@@ -17,7 +17,7 @@ import numpy as np
 
 from avsreplay.estimate.batch import FitParams, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import LATEST, BatchCovariance, final_mixture, moments
-from avsreplay.estimate.batch_schedule import BatchSchedule
+from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.dynamics import propagate
 from avsreplay.estimate.error_state import VEL, W
@@ -63,8 +63,7 @@ class AnomalyTest:
         nis = epoch.innovation.nis
         suspicious = verdict.reason is Reason.POSE_JUMP or (verdict.gamma == 1 and nis > GATE * _nis_scale(track))
         if not self.enabled or verdict.reason not in _TESTED or not _ready(track):
-            after = update(track)
-            return (_with_nis(after, track, nis) if verdict.gamma else after), verdict
+            return (self._accepted(track, epoch, update) if verdict.gamma else update(track)), verdict
         if not suspicious:
             return self._accepted(track, epoch, update), verdict
         if track.bias is not None and self._still_biased(track.bias, epoch.innovation):
@@ -92,7 +91,10 @@ class AnomalyTest:
         if best.hypothesis is Hypothesis.FREE_MOTION:
             return self._replayed(track), Verdict(1, Reason.OK)
         if best.hypothesis is Hypothesis.MANOEUVRE and explained:
-            return self._manoeuvred(track, window, best), Verdict(1, Reason.OK)
+            if _after(window, best) >= FEWEST_TO_FIT:
+                return self._manoeuvred(track, window, best), Verdict(1, Reason.OK)
+            if len(track.doubtful) < 2 * _MOST:  # the motion after it is not determined yet
+                return track, Verdict(0, Reason.DOUBTFUL)
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and established:
             return replace(track, doubtful=(), bias=SensorBias(best.size, best.P)), Verdict(0, Reason.SENSOR_BIAS)
         if best.hypothesis is not Hypothesis.FROZEN or not explained:
@@ -176,6 +178,12 @@ class AnomalyTest:
         return replace(out, reinitialised=track.reinitialised + 1, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
 
 
+def _after(window: tuple[Epoch, ...], found: Explanation) -> int:
+    """Number of scans of the window after a manoeuvre."""
+    t_ns = window[0].track.belief.t_ns + round(found.after_s * 1e9)
+    return sum(e.prediction.belief.t_ns > t_ns for e in window)
+
+
 def _nis_scale(track: Track) -> float:
     """How many times larger than chi-square the NIS of the accepted scans is: their median over that of chi-square.
 
@@ -193,5 +201,9 @@ def _with_nis(after: Track, before: Track, nis: float) -> Track:
 
 
 def _ready(track: Track) -> bool:
-    """Return whether the estimate is based on enough poses for its prediction to be tested."""
-    return track.mode == "filter" or (track.mode == "fit" and track.batch is not None and track.batch.count >= _READY)
+    """Return whether the estimate is based on enough poses for its prediction to be tested.
+
+    After a manoeuvre the prior keeps all but the velocities, so that few poses determine the motion.
+    """
+    least = FEWEST_TO_FIT if track.manoeuvres else _READY
+    return track.mode == "filter" or (track.mode == "fit" and track.batch is not None and track.batch.count >= least)

@@ -15,6 +15,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import dynamics, ekf
+from avsreplay.estimate.acceleration import FreeFall, accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_covariance import mixture_forecast
 from avsreplay.estimate.batch_schedule import BatchSchedule
@@ -36,13 +37,14 @@ from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajector
 class Estimator:
     """The 20-state noise-adaptive constrained Kalman filter and the batch fit that initialises and checks it."""
 
-    def __init__(self, params: EstimatorParams, start: Belief | None, extent_m: float) -> None:
+    def __init__(self, params: EstimatorParams, start: Belief | None, extent_m: float, epoch_ns: int = 0) -> None:
         """Create the estimator of one run.
 
         Args:
             params: settings; lengths left out are taken from ``extent_m``.
             start: the first belief where one is given.
             extent_m: the target's bounding diagonal [m].
+            epoch_ns: instant near the scans at which the falling frame of a known acceleration coincides with {A}.
 
         Raises:
             UsageError: a near start is requested and none is given.
@@ -51,7 +53,9 @@ class Estimator:
         if params.start is Start.NEAR and start is None:
             hint = "use start = cold, or a log whose scenario has a [start] table"
             raise UsageError("a near start is asked for and the log gives none", where="estimator.start", hint=hint)
-        self.start = start if params.start in (Start.AUTO, Start.NEAR) else None
+        known = np.array(params.acceleration_mps2)
+        self.fall = FreeFall(known, epoch_ns) if known.any() else None
+        self.start = self._into(start) if start is not None and params.start in (Start.AUTO, Start.NEAR) else None
         self.noise = Noise(self.params, extent_m)
         self.batch = BatchSchedule(self.params, self.noise, self.start)
         self.anomalies = AnomalyTest(self.params, extent_m, self.batch, self._replayed)
@@ -69,6 +73,7 @@ class Estimator:
         """
         if self.start is not None:
             return Track(self.start, "near", prior=self._prior, prior_ns=self.start.t_ns)
+        T_ac = T_ac if self.fall is None else self.fall.pose_into(T_ac, t_ns)
         mode = "filter" if self.params.start is Start.PAPER else "start"
         return Track(guessed_belief(t_ns, T_ac, self.params), mode)
 
@@ -94,7 +99,8 @@ class Estimator:
         """
         x = prediction.belief.x
         R = self.noise.of(alignment, x, prediction.window)
-        alpha, share = innovation_vector(x, alignment.T_ac), self.noise.correlated_share(alignment)
+        T_ac = alignment.T_ac if self.fall is None else self.fall.pose_into(alignment.T_ac, prediction.belief.t_ns)
+        alpha, share = innovation_vector(x, T_ac), self.noise.correlated_share(alignment)
         return ekf.innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
 
     def step(
@@ -203,17 +209,30 @@ class Estimator:
             return self.batch.initialised(track, prediction, innovation, converged)
         return self.batch.check_against_batch(self._filtered(track, prediction, innovation))
 
+    def in_camera(self, belief: Belief) -> Belief:
+        """The belief of a track or a prediction in {A}; it differs only where an acceleration is known.
+
+        Args:
+            belief: as the estimator carries it, in the frame that falls with the target.
+        """
+        return belief if self.fall is None else self.fall.belief_out(belief)
+
+    def _into(self, belief: Belief) -> Belief:
+        """The inverse of ``in_camera``."""
+        return belief if self.fall is None else self.fall.belief_into(belief)
+
     def motion(self, belief: Belief) -> Trajectory:
         """The predicted path of the grasp point without disturbances.
 
         Args:
-            belief: mean and covariance now; only the mean is used.
+            belief: mean and covariance now, in {A}; only the mean is used.
 
         Returns:
             Function of times (n,) >= 0 [s after the belief's instant]: positions (n, 3) [m] and velocities (n, 3) [m/s]
             in {A}. It raises ValueError for a time that is negative or not finite.
         """
-        return dynamics.grasp_trajectory(belief.x)
+        free = dynamics.grasp_trajectory(belief.x)
+        return free if self.fall is None else accelerated(free, self.fall.acceleration)
 
     def attitude(self, belief: Belief) -> Callable[[Array], Array]:
         """The predicted attitudes of the fixture without disturbances.

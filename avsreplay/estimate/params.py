@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
@@ -14,6 +14,7 @@ from avsreplay.settings import Settings, given, setting
 __all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
 _MOST_ALIKE = 50.0  # largest number of scans with correlated errors, reached where the view does not turn
+_PER_POSE = 0.25  # largest motion expected between two poses of a tracker: radian, or part of the extent
 _EDGE_LEAN = 20.0  # from tests/benchmarks/estimate_noise.py, which gives 9 to 33 on five meshes
 
 
@@ -61,6 +62,14 @@ class EstimatorParams(Settings):
         unit="m/s^1.5",
         above=0.0,
         of_extent=1e-6,
+    )
+    acceleration_mps2: tuple[float, float, float] = setting(
+        (0.0, 0.0, 0.0), "Constant acceleration of the centre of mass in {A}, known: gravity, thrust.", unit="m/s2"
+    )
+    fit_acceleration: bool = setting(
+        False,
+        "Fit that acceleration in a first pass to the poses up to the first manoeuvre; acceleration_mps2 is then not"
+        " used.",
     )
     noise: NoiseSource = setting(
         NoiseSource.REGISTRATION,
@@ -170,6 +179,26 @@ class EstimatorParams(Settings):
         """
         scans = self.correlated_rad / max(turn_rad, self.correlated_rad / _MOST_ALIKE)
         return 1.0 + 2.0 * share * scans
+
+    def at_interval(self, period_s: float, extent_m: float) -> EstimatorParams:
+        """Return the settings with start and changes of the motion that fit to poses at short intervals.
+
+        Poses need no initial guess, so that any motion may be tracked: the rate and velocity expected at the start, and
+        with them the expected size of a manoeuvre, are at least those that turn the target by a quarter of a radian or
+        move it by a quarter of its extent between two poses. Settings that differ from their defaults are kept.
+
+        Args:
+            period_s: interval between poses [s]; 0 if it is not known.
+            extent_m: bounding diagonal of the target [m].
+        """
+        if period_s <= 0.0:
+            return self
+        plain, rate, speed = EstimatorParams(), self.start_rate_1s_radps, self.start_vel_1s_mps
+        if rate == plain.start_rate_1s_radps:
+            rate = max(rate, _PER_POSE / period_s)
+        if speed is None:
+            speed = max(given(plain.resolved(extent_m).start_vel_1s_mps), _PER_POSE * extent_m / period_s)
+        return replace(self, start_rate_1s_radps=rate, start_vel_1s_mps=speed)
 
     @property
     def R0(self) -> Array:

@@ -56,7 +56,7 @@ def reference_fit(
         UsageError: fewer than four poses.
     """
     settings = (params or EstimatorParams()).resolved(extent_m)
-    given = covariances or [_r0_covariance(settings)] * len(poses)
+    given = covariances or [r0_covariance(settings)] * len(poses)
     return reference_of([PoseFix(t, pose, C) for t, pose, C in zip(t_ns, poses, given, strict=True)], settings)
 
 
@@ -77,11 +77,15 @@ def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference
 
 def healthy_pose(track: Track, t_ns: int, T_ac: Pose, params: EstimatorParams) -> PoseFix:
     """The pose of a healthy scan, at its own instant and with its covariance where the track remembers it."""
-    return track.fixes[-1] if track.fixes else PoseFix(t_ns, T_ac, _r0_covariance(params))
+    return track.fixes[-1] if track.fixes else PoseFix(t_ns, T_ac, r0_covariance(params))
 
 
-def _r0_covariance(params: EstimatorParams) -> Array:
-    """R0 as a covariance of d = [theta; v]."""
+def r0_covariance(params: EstimatorParams) -> Array:
+    """Return R0 as a covariance (6, 6) of d = [theta; v] in {C} [rad, m].
+
+    Args:
+        params: with auto values resolved.
+    """
     variances = np.diagonal(params.R0)
     return np.diag(np.concatenate([4.0 * variances[3:], variances[:3]]))
 

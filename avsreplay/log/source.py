@@ -108,6 +108,11 @@ class Source:
                     digest.update(block)
         return digest.hexdigest()
 
+    @property
+    def first_ns(self) -> int:
+        """Return the instant of the first selected scan [ns], 0 without one."""
+        return self._placed[self._selected[0]].t_ns if self._selected else 0
+
     def scans(self, prefetch: int = 0, first: int = 0) -> Generator[Scan]:
         """Yield the selected scans.
 

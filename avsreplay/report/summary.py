@@ -68,7 +68,7 @@ class Summary:
         pose_all, pose_healthy, pose_coasting: errors of the estimate.
         registration_healthy, registration_flagged: errors of the measured poses.
         reasons: why scans were flagged.  status: scans by the status of their registration.
-        counts: losses and clock problems, given by the caller.
+        counts: losses and clock problems.  acceleration: of the target, in words.  Both are given by the caller.
         manoeuvres: of the target.  violations: consistency checks that the estimate failed.
         weighed_down: healthy poses with a Cauchy weight below 1.  reinitialised: reinitialisations of the estimate.
         coasts: intervals of prediction without measurement.  interval_s: median between scans.
@@ -107,6 +107,7 @@ class Summary:
     convergence: ConvergenceSummary
     capture: Capture
     counts: Mapping[str, int] = field(default_factory=dict)
+    acceleration: str | None = None
 
     @classmethod
     def fold(

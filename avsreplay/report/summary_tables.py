@@ -226,6 +226,8 @@ def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
         yield "outliers", f"{taken}; estimate reinitialised {summary.reinitialised} times"
     if summary.manoeuvres is not None:
         yield "manoeuvres", f"{summary.manoeuvres} found; {summary.violations or 0} consistency checks failed"
+    if summary.acceleration is not None:
+        yield "acceleration", summary.acceleration
     seen = summary.observability
     if seen.rank is not None:
         full = "never full" if seen.full_rank_s is None else f"full from {seen.full_rank_s:.2f} s"

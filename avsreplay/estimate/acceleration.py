@@ -1,0 +1,204 @@
+"""A constant acceleration of the centre of mass in {A} (gravity, thrust): known, or fitted to measured poses.
+
+Known. The estimator works in a frame that falls with the target: r' = r - a tau^2 / 2, v' = v - a tau with tau the time
+since the first scan. In that frame the motion is free, and the error states, their covariance and the innovations are
+the same as in {A}. ``FreeFall`` converts what enters and leaves the estimator; nothing else knows of it.
+
+Fitted. With measured attitudes R_k the position of the origin of {C} is linear in the unknowns,
+
+    t_k = c0 + v tau_k + a tau_k^2 / 2 + R_k arm,
+
+with arm the vector from the centre of mass to that origin, in {C}. Generalised least squares give a and its covariance
+(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 3.4). The fit grows
+pose by pose and ends before the first poses that contradict it, so that an impact after a free flight has no effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from avsreplay.errors import UsageError
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.reference import r0_covariance
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Alignment, Belief, State, Trajectory
+
+_FEWEST = 8  # poses of the first fit; the noise is estimated from its residuals
+_CONFIRM = 3  # successive poses that contradict the fit end it
+_GATE = 21.1  # 99.99 % point of chi-square with 3 degrees of freedom
+_FEW = 12.0  # the gate is wider with few degrees of freedom of the noise, as the F distribution is
+_UNKNOWN = 1e3  # 1 sigma of the prior of all but the arm, in lengths of the arm over the duration of the poses
+_PASSES = 4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FreeFall:
+    """The frame in which a target with a constant acceleration moves freely.
+
+    Attributes:
+        acceleration: (3,) in {A} [m/s2].  epoch_ns: instant at which the frame coincides with {A}.
+    """
+
+    acceleration: Array
+    epoch_ns: int
+
+    def belief_into(self, belief: Belief) -> Belief:
+        """Return a belief in {A} as it is in the falling frame."""
+        return self._moved(belief, -1.0)
+
+    def belief_out(self, belief: Belief) -> Belief:
+        """Return a belief in the falling frame as it is in {A}."""
+        return self._moved(belief, 1.0)
+
+    def state_out(self, x: State, t_ns: int) -> State:
+        """Return a state at an instant [ns] in the falling frame as it is in {A}."""
+        away, speed = self._fallen(t_ns)
+        return replace(x, r_a=x.r_a + away, v_a=x.v_a + speed)
+
+    def pose_into(self, T_ac: Pose, t_ns: int) -> Pose:
+        """Return a pose at an instant [ns] in {A} as it is in the falling frame."""
+        return Pose(T_ac.q, T_ac.t - self._fallen(t_ns)[0])
+
+    def _moved(self, belief: Belief, sign: float) -> Belief:
+        away, speed = self._fallen(belief.t_ns)
+        x = belief.x
+        return replace(belief, x=replace(x, r_a=x.r_a + sign * away, v_a=x.v_a + sign * speed))
+
+    def _fallen(self, t_ns: int) -> tuple[Array, Array]:
+        """Displacement and velocity of the frame in {A} at an instant."""
+        tau = (t_ns - self.epoch_ns) * 1e-9
+        return 0.5 * tau * tau * self.acceleration, tau * self.acceleration
+
+
+def accelerated(free: Trajectory, acceleration: Array) -> Trajectory:
+    """Return a free trajectory with a constant acceleration (3,) [m/s2] in {A} added from its beginning."""
+
+    def at(times: Array) -> tuple[Array, Array]:
+        position, velocity = free(times)
+        tau = np.asarray(times, dtype=np.float64)[:, None]
+        return position + 0.5 * tau * tau * acceleration, velocity + tau * acceleration
+
+    return at
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AccelerationFit:
+    """A fitted acceleration.
+
+    Attributes:
+        mean: (3,) in {A} [m/s2].  P: (3, 3) its covariance.
+        poses: number of poses from the first on.  span_s: their duration [s].
+        noise: factor on the stated standard deviations of the positions, estimated from the residuals.
+    """
+
+    mean: Array
+    P: Array
+    poses: int
+    span_s: float
+    noise: float
+
+    def record(self) -> dict[str, Any]:
+        """Plain values for JSON."""
+        sigma = np.sqrt(np.diagonal(self.P)).tolist()
+        values = {"mean_mps2": self.mean.tolist(), "one_sigma_mps2": sigma, "covariance": self.P.tolist()}
+        return {**values, "poses": self.poses, "span_s": self.span_s, "noise_factor": self.noise}
+
+    @property
+    def text(self) -> str:
+        """Value with 1 sigma and the data it comes from, in words."""
+        values = ", ".join(f"{v:.4g}" for v in self.mean)
+        sigma = ", ".join(f"{v:.2g}" for v in np.sqrt(np.diagonal(self.P)))
+        return f"({values}) m/s2, 1 sigma ({sigma}), fitted to the first {self.poses} poses ({self.span_s:.3g} s)"
+
+
+def fit_acceleration(measured: Sequence[tuple[int, Alignment]], params: EstimatorParams) -> AccelerationFit:
+    """Fit a constant acceleration to the first poses of a free motion.
+
+    Args:
+        measured: instants [ns], ascending, with their measured poses; R0 applies to a pose without covariance.
+        params: of the estimator, with auto values resolved.
+
+    Returns:
+        The acceleration over the first poses up to a contradiction.
+
+    Raises:
+        UsageError: fewer than eight poses.
+    """
+    if len(measured) < _FEWEST:
+        what = f"only {len(measured)} poses to fit an acceleration to"
+        raise UsageError(what, where="estimator.fit_acceleration", hint=f"{_FEWEST} poses at least are needed")
+    times = np.array([(t_ns - measured[0][0]) * 1e-9 for t_ns, _ in measured])
+    poses = [found.T_ac for _, found in measured]
+    covariances = [r0_covariance(params) if found.covariance is None else found.covariance for _, found in measured]
+    arm_1s_m = params.length("start_varrho_1s_m")
+    count = _consistent(times, poses, covariances, arm_1s_m)
+    mean, P, noise = _System(times[:count], poses[:count], covariances[:count], arm_1s_m).solved()
+    return AccelerationFit(mean[6:9], P[6:9, 6:9], count, float(times[count - 1]), noise)
+
+
+def _consistent(times: Array, poses: Sequence[Pose], covariances: Sequence[Array], arm_1s_m: float) -> int:
+    """How many poses from the first on agree with one acceleration: sequential least squares with a gate."""
+    first = _System(times[:_FEWEST], poses[:_FEWEST], covariances[:_FEWEST], arm_1s_m)
+    mean, P, noise = first.solved()
+    square, freedom = noise**2 * first.freedom, first.freedom
+    outside = 0
+    for k in range(_FEWEST, len(poses)):
+        H, C = _row(times[k] - times[0], poses[k]), _position_noise(poses[k], covariances[k], mean[9:])
+        scale = square / freedom
+        error = poses[k].t - H @ mean
+        S = H @ P @ H.T + scale * C
+        nis = float(error @ np.linalg.solve(S, error))
+        outside = outside + 1 if nis > _GATE * (1.0 + _FEW / freedom) else 0
+        if outside == _CONFIRM:
+            return k + 1 - _CONFIRM
+        if outside:
+            continue
+        gain = np.linalg.solve(S, H @ P).T
+        mean, P = mean + gain @ error, P - gain @ H @ P
+        square, freedom = square + scale * nis, freedom + 3.0
+    return len(poses) - outside
+
+
+class _System:
+    """The linear equations of some poses, with a prior that leaves all but the arm free."""
+
+    def __init__(self, times: Array, poses: Sequence[Pose], covariances: Sequence[Array], arm_1s_m: float) -> None:
+        self.t0, span = times[0], float(times[-1] - times[0])
+        self.poses, self.covariances = poses, covariances
+        self.H = np.array([_row(t - self.t0, pose) for t, pose in zip(times, poses, strict=True)])
+        self.centre = poses[0].t  # reduces cancellation; added to c0 again
+        wide = _UNKNOWN * arm_1s_m
+        widths = [wide, wide / span, wide / span**2, arm_1s_m]
+        self.prior = np.repeat(widths, 3) ** -2.0
+        self.freedom = max(3.0 * len(poses) - 12.0, 3.0)
+
+    def solved(self) -> tuple[Array, Array, float]:
+        """Unknowns (12,), covariance (12, 12), and the factor on the stated noise by the residuals."""
+        y = np.array([pose.t for pose in self.poses]) - self.centre
+        mean, scale = np.zeros(12), 1.0
+        for _ in range(_PASSES):  # the effect of the attitude's noise depends on the arm
+            C = [_position_noise(p, c, mean[9:]) for p, c in zip(self.poses, self.covariances, strict=True)]
+            W = np.linalg.inv(np.array(C))
+            info = np.einsum("nij,nik,nkl->jl", self.H, W, self.H) / scale + np.diag(self.prior)
+            P = np.linalg.inv(info)
+            mean = P @ np.einsum("nij,nik,nk->j", self.H, W, y) / scale
+            left = y - self.H @ mean
+            scale = max(float(np.einsum("ni,nij,nj->", left, W, left)) / self.freedom, 1e-12)
+        mean[:3] += self.centre
+        return mean, 0.5 * (P + P.T), float(np.sqrt(scale))
+
+
+def _row(tau: float, pose: Pose) -> Array:
+    """(3, 12) derivative of a position with respect to (c0, v, a, arm)."""
+    return np.hstack([np.eye(3), tau * np.eye(3), 0.5 * tau * tau * np.eye(3), pose.R])
+
+
+def _position_noise(pose: Pose, C: Array, arm: Array) -> Array:
+    """(3, 3) noise of t - R arm in {A}: with d = [theta; v], R (v - theta x arm)."""
+    J = np.hstack([np.array([[0, -arm[2], arm[1]], [arm[2], 0, -arm[0]], [-arm[1], arm[0], 0]]), np.eye(3)])
+    N = pose.R @ J @ C @ J.T @ pose.R.T
+    return np.asarray(0.5 * (N + N.T))
