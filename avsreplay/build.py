@@ -26,7 +26,7 @@ def stages(
     surface: Surface,
     registrar: Registrar,
     truth_of: Callable[[Scan], Truth],
-    epoch_ns: int = 0,
+    clock: tuple[int, float] = (0, 0.0),
 ) -> Stages:
     """Create the chain for one log.
 
@@ -36,17 +36,20 @@ def stages(
         surface: model of the target.
         registrar: of that model; one may serve several chains.
         truth_of: truth at a scan; used for the first pose alone, where the configuration starts from the truth.
-        epoch_ns: instant of the first scan, from which a known acceleration is counted.
+        clock: instant of the first scan [ns], where a known acceleration begins, and interval of the scans [s].
 
     Raises:
         UsageError: the configuration requires the start of the log, and the log contains none.
     """
     start = header.start if config.init == "log" or config.estimator.start is Start.NEAR else None
+    estimator = config.estimator
+    if config.register.backend == POSES:
+        estimator = estimator.at_interval(clock[1], surface.extent)
     limits = config.limits.widened(config.robot.radius_m)
     supervision = config.supervisor.resolved(surface.extent)
     return Stages(
         registrar=registrar,
-        estimator=Estimator(config.estimator, start, surface.extent, epoch_ns),
+        estimator=Estimator(estimator, start, surface.extent, clock[0]),
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
         guidance=Guidance(config.robot.applied(config.plan), Supervisor(supervision), limits, surface.extent),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -116,6 +116,17 @@ def parse_pose(text: str) -> Pose:
     if abs(sum(v * v for v in values[3:]) - 1.0) > 1e-2:
         raise ValueError(f"init is '{text}', its quaternion (last four numbers) is not of unit length")
     return Pose(values[3:], values[:3])  # type: ignore[arg-type]
+
+
+def with_acceleration(config: RunConfig, acceleration: Sequence[float]) -> RunConfig:
+    """Return a configuration with a known acceleration (3,) of the target [m/s2] in {A}.
+
+    Args:
+        config: the configuration.
+        acceleration: of the centre of mass.
+    """
+    x, y, z = (float(v) for v in acceleration)
+    return replace(config, estimator=replace(config.estimator, acceleration_mps2=(x, y, z)))
 
 
 def pose_text(pose: Pose) -> str:

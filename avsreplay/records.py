@@ -144,13 +144,11 @@ class Scan:
     """One point cloud, or one measured pose, as the reader returns it.
 
     Attributes:
-        seq: index in the replay, from 0.  t_ns: instant on the selected clock.
-        log_ns: time at which the recorder received it.
+        seq: index in the replay, from 0.  t_ns: instant on the selected clock.  log_ns: time of reception.
         points: (n, 3) finite, float32 or float64, possibly strided, in {A} [m].
         times_s: (n,) instant of each point relative to ``t_ns`` [s], or None.
         dropped_points: number of non-finite points that were removed.  frame: that the message names, "" for none.
-        note: what was wrong with the message or its stamp.
-        pose: the measured pose where the source holds poses; there are no points then.
+        note: what was wrong with the message or its stamp.  pose: of a source of poses, which has no points.
     """
 
     seq: int
@@ -238,13 +236,8 @@ class Alignment:
     @property
     def measured(self) -> bool:
         """Return whether ``T_ac`` is a measurement and not only the initial guess."""
-        return self.status in (
-            AlignStatus.ALIGNED,
-            AlignStatus.MEASURED,
-            AlignStatus.NOT_CONVERGED,
-            AlignStatus.DEGENERATE,
-            AlignStatus.AMBIGUOUS,
-        )
+        s = AlignStatus
+        return self.status in (s.ALIGNED, s.MEASURED, s.NOT_CONVERGED, s.DEGENERATE, s.AMBIGUOUS)
 
     @property
     def inlier_ratio(self) -> float:

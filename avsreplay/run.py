@@ -1,7 +1,4 @@
-"""One run: opens the log, builds the stages, folds the scans, scores and summarises them.
-
-The command line, the Python API and a sweep all use this module.
-"""
+"""One run, for command line, API and sweeps: opens the log, builds the stages, folds the scans and scores them."""
 
 from __future__ import annotations
 
@@ -15,11 +12,11 @@ from typing import Any
 from avsreplay import arithmetic, pipeline, settings
 from avsreplay.build import first_state, stages
 from avsreplay.checkpoint import pack, unpack
-from avsreplay.config import Against, RunConfig, load_config, pose_text
+from avsreplay.config import Against, RunConfig, load_config, pose_text, with_acceleration
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.estimate.acceleration import AccelerationFit, fit_acceleration
+from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
 from avsreplay.estimate.initialise import PoseFix
-from avsreplay.estimate.reference import Reference, reference_of
+from avsreplay.estimate.reference import Reference
 from avsreplay.log import Source, SourceOptions, open_source
 from avsreplay.log.cloud_stream import ahead
 from avsreplay.outcome import Outcome
@@ -30,10 +27,9 @@ from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surfac
 from avsreplay.register import POSES, ModelCheck, Registrar
 from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
-from avsreplay.score import HealthyPoses, Scorer, matched_truth
+from avsreplay.score import HealthyPoses, Scorer, matched_truth, reference_motion
 
-RECONSTRUCTED = Path("auto")  # the model that is built from the log itself
-MOST_LOSSES = 100  # listed one by one in run.json
+RECONSTRUCTED, MOST_LOSSES = Path("auto"), 100  # a model built from the log; losses listed one by one in run.json
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,8 +54,7 @@ class Job:
     """What to run.
 
     Attributes:
-        source: log, bag or folder of scans.
-        options: how to read it.
+        source: log, bag or folder of scans.  options: how to read it.
         config_file: TOML file with settings, see docs/settings.md.
         assignments: settings ``a.b=value`` that replace those of the file.
         prefetch: number of scans decoded ahead on a second thread; does not change the result.
@@ -76,13 +71,10 @@ class Run:
     """An open run; a context manager. ``rows`` may be iterated once.
 
     Attributes:
-        source: the open log.
-        config: effective configuration.
-        surface: model of the target.
-        registrar: registers scans against that model.
-        model_check: check of the model by the rows processed so far.
-        acceleration: the fitted acceleration of the target, None where it is given.
-        done: number of scans processed so far.
+        source: the open log.  config: effective configuration.
+        surface: model of the target.  registrar: registers scans against that model.
+        model_check: check of the model by the rows so far.  done: number of scans processed so far.
+        acceleration: fitted to the poses, None where it is given.
     """
 
     def __init__(self, job: Job) -> None:
@@ -98,18 +90,15 @@ class Run:
         """
         self.job = job
         unknown = job.options.model == RECONSTRUCTED
-        options = replace(job.options, model=None) if unknown else job.options
         poses = load_config(job.config_file, {}, job.assignments).register.backend == POSES
         if poses and unknown:
             raise UsageError("poses contain no model", where="--model auto", hint="leave out --model, or name a file")
-        self.source: Source = open_source(job.source, replace(options, poses=poses))
+        options = replace(job.options, poses=poses, model=None if unknown else job.options.model)
+        self.source: Source = open_source(job.source, options)
         self._made: Reconstruction | None = None
         try:
             header = self.header = self._without_model() if unknown else self.source.header
             self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
-            if (self.config.register.backend == POSES) is not poses:
-                hint = "choose it with --backend poses or in --config"
-                raise UsageError("the log's own [run] table asks for the back end poses", where="register", hint=hint)
             if self._made is not None and self.config.init == "log" and self._made.poses[0][0] == self._first_ns:
                 self.config = replace(self.config, init=pose_text(self._made.poses[0][1]))
             self.surface: Surface = self._model()
@@ -117,6 +106,7 @@ class Run:
             self.model_check = ModelCheck(self.registrar, self.surface)
             self.acceleration = self._fitted_acceleration()
             self._stages = self._new_stages()
+            self.estimator = self._stages.estimator
         except BaseException:
             self.source.close()
             raise
@@ -156,7 +146,7 @@ class Run:
             UsageError: there are fewer than four healthy poses.
         """
         ready = self._new_stages()
-        poses, instants = HealthyPoses(ready.estimator.params, ready.estimator.fall), set[int]()
+        poses, instants = HealthyPoses(ready.estimator), set[int]()
         for state, outcome in self._outcomes(ready, progress, "fitting", first_state(ready)):
             poses.add(state, outcome)
             if outcome.scan.status is not ScanStatus.CLOCK:
@@ -224,7 +214,7 @@ class Run:
         self._state, self.done, self._fold, self.model_check, self._end, self._scored, *rest = found
         self._fixes, self._reference_instants, more = rest
         if self._fixes:
-            self._reference = reference_of(self._fixes, self._stages.estimator.params)
+            self._reference = reference_motion(self._fixes, self.estimator)
         self._scored.motion = self._scorer().motion
         return more
 
@@ -242,9 +232,10 @@ class Run:
         """Summarise the rows taken so far."""
         clock, losses = self.source.clock, self.source.losses
         counts = {"losses": len(losses), "lost_messages": sum(loss.messages or 0 for loss in losses)}
-        counts |= {"stamps_unset": clock.unset, "stamps_jumped": clock.jumps}
-        counts |= {"stamps_equal": clock.equal, "stamps_back": clock.back}
-        return replace(self._fold.result(self.truth), counts=counts, acceleration=self._acceleration_text())
+        stamps = {"unset": clock.unset, "jumped": clock.jumps, "equal": clock.equal, "back": clock.back}
+        counts |= {f"stamps_{name}": count for name, count in stamps.items()}
+        found = replace(self._fold.result(self.truth), counts=counts)
+        return replace(found, acceleration=acceleration_text(self.config.estimator, self.acceleration))
 
     def facts(self) -> dict[str, Any]:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""
@@ -261,26 +252,19 @@ class Run:
         }
 
     def _new_stages(self) -> Stages:
-        config = self.config
-        if self.source.options.poses:
-            period_s = self.source.clock.period_s * self.source.options.every
-            config = replace(config, estimator=config.estimator.at_interval(period_s, self.surface.extent))
-        return stages(config, self.header, self.surface, self.registrar, self._true, self.source.first_ns)
+        clock = self.source.first_ns, self.source.clock.period_s * self.source.options.every
+        return stages(self.config, self.header, self.surface, self.registrar, self._true, clock)
 
     def _fitted_acceleration(self) -> AccelerationFit | None:
         """Fit the acceleration to the measured poses of a first pass where it is asked for, and set it."""
         if not self.config.estimator.fit_acceleration:
             return None
-        plain = replace(self.config.estimator, acceleration_mps2=(0.0, 0.0, 0.0))
-        self.config = replace(self.config, estimator=plain)
+        self.config = with_acceleration(self.config, (0.0, 0.0, 0.0))
         ready = self._new_stages()
-        fixes = [
-            (outcome.scan.t_ns, outcome.alignment)
-            for _, outcome in self._outcomes(ready, None, "fitting", first_state(ready))
-            if outcome.alignment.measured and outcome.scan.status is ScanStatus.OK
-        ]
-        found = fit_acceleration(fixes, plain.resolved(self.surface.extent))
-        self.config = replace(self.config, estimator=replace(plain, acceleration_mps2=tuple(found.mean.tolist())))
+        outcomes = [outcome for _, outcome in self._outcomes(ready, None, "fitting", first_state(ready))]
+        measured = [(o.scan.t_ns, o.alignment) for o in outcomes if o.scan.status is ScanStatus.OK]
+        found = fit_acceleration(measured, ready.estimator.params)
+        self.config = with_acceleration(self.config, found.mean.tolist())
         return found
 
     def _outcomes(
@@ -294,12 +278,6 @@ class Run:
         finally:
             scans.close()
 
-    def _acceleration_text(self) -> str | None:
-        known = self.config.estimator.acceleration_mps2
-        if self.acceleration is not None:
-            return self.acceleration.text
-        return "({:.4g}, {:.4g}, {:.4g}) m/s2, given".format(*known) if any(known) else None
-
     def _scorer(self) -> Scorer:
         """Against the truth of the log, or against the reference within its span."""
         reference, poses = self._reference, self.source.truth_poses()
@@ -308,7 +286,7 @@ class Run:
         if reference is not None:
             inside = [t for t in self._reference_instants if reference.epoch_ns <= t <= reference.end_ns]
             poses = [(t_ns, reference.at(t_ns).T_ac) for t_ns in inside]
-        return Scorer(self._stages.estimator, poses, self.config.reference.value)
+        return Scorer(self.estimator, poses, self.config.reference.value)
 
     def _truth_of(self, scan: Scan) -> Truth:
         """Return the truth at a scan; the pose is that of the reference motion if one was fitted."""
@@ -349,8 +327,7 @@ class Run:
 
 def _run_table(scenario: str) -> Mapping[str, Any]:
     """The ``[run]`` table of the log's own scenario."""
-    table: Mapping[str, Any] = tomllib.loads(scenario).get("run", {}) if scenario else {}
-    return table
+    return dict(tomllib.loads(scenario).get("run", {})) if scenario else {}
 
 
 def replay(source: str | Path, *assignments: str, **options: Any) -> Iterator[Row]:

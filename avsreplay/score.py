@@ -12,11 +12,9 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator
-from avsreplay.estimate.acceleration import FreeFall
 from avsreplay.estimate.chart import nearest_permutation, nees
 from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.initialise import PoseFix
-from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
 from avsreplay.geometry import Pose
 from avsreplay.monitor.convergence import block_nees
@@ -98,14 +96,13 @@ class Scorer:
 class HealthyPoses:
     """Collects the healthy poses of a run, for a fit to all of them."""
 
-    def __init__(self, params: EstimatorParams, fall: FreeFall | None = None) -> None:
+    def __init__(self, estimator: Estimator) -> None:
         """Start without poses.
 
         Args:
-            params: of the estimator, with auto values resolved.
-            fall: the estimator's falling frame, None without a known acceleration.
+            estimator: that of the run.
         """
-        self._params, self._fall, self.fixes = params, fall, list[PoseFix]()
+        self._estimator, self.fixes = estimator, list[PoseFix]()
 
     def add(self, state: PipelineState, outcome: Outcome) -> None:
         """Take the outcome of one scan; a pose that is not healthy is ignored.
@@ -116,13 +113,24 @@ class HealthyPoses:
         """
         if outcome.verdict.gamma and state.track is not None and state.last_pose is not None:
             t_ns, T_ac = outcome.scan.t_ns, state.last_pose
-            T_ac = T_ac if self._fall is None else self._fall.pose_into(T_ac, t_ns)
-            self.fixes.append(healthy_pose(state.track, t_ns, T_ac, self._params))
+            fall = self._estimator.fall
+            T_ac = T_ac if fall is None else fall.pose_into(T_ac, t_ns)
+            self.fixes.append(healthy_pose(state.track, t_ns, T_ac, self._estimator.params))
 
     def reference(self) -> Reference:
         """Fit one motion to all of them. Raises UsageError where they are too few."""
-        found, fall = reference_of(self.fixes, self._params), self._fall
-        return found if fall is None else replace(found, at=lambda t_ns: fall.state_out(found.at(t_ns), t_ns))
+        return reference_motion(self.fixes, self._estimator)
+
+
+def reference_motion(fixes: Sequence[PoseFix], estimator: Estimator) -> Reference:
+    """Return one motion fitted to healthy poses, in {A}. Raises UsageError where they are too few.
+
+    Args:
+        fixes: healthy poses as the estimator keeps them.
+        estimator: that of the run.
+    """
+    found, fall = reference_of(fixes, estimator.params), estimator.fall
+    return found if fall is None else replace(found, at=lambda t_ns: fall.state_out(found.at(t_ns), t_ns))
 
 
 def pose_error(pose: Pose, truth: Pose) -> PoseError:

@@ -10,7 +10,7 @@ import pytest
 
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
-from avsreplay.log.options import LogInfo, TopicInfo
+from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo
 from avsreplay.log.surface import parse_surface, scaled, surface_bytes
 from avsreplay.preflight import diameter, preflight
 from avsreplay.records import Scan, ScanStatus
@@ -24,6 +24,7 @@ class Log:
     clouds: list
     topics: tuple = ()
     truth: bool = False
+    options: SourceOptions = dataclasses.field(default_factory=SourceOptions)
 
     def __len__(self):
         return len(self.clouds)

@@ -67,7 +67,7 @@ def _job(log: Path, flags: dict[str, Any]) -> Any:
 def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
     from avsreplay.score import HealthyPoses
 
-    poses = HealthyPoses(run.config.estimator.resolved(run.surface.extent))
+    poses = HealthyPoses(run.estimator)
     rows = list(run.rows([lambda scan: poses.add(scan.state, scan.outcome)]))
     reference = poses.reference()
     inside = [row for row in rows if reference.epoch_ns <= row.t_ns <= reference.end_ns]

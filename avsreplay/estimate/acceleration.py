@@ -9,7 +9,9 @@ Fitted. With measured attitudes R_k the position of the origin of {C} is linear 
     t_k = c0 + v tau_k + a tau_k^2 / 2 + R_k arm,
 
 with arm the vector from the centre of mass to that origin, in {C}. Generalised least squares give a and its covariance
-(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 3.4). The fit grows
+(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 3.4). The errors of
+the attitudes enter the noise of the equations, times the arm; that they also draw the arm towards zero is neglected,
+which is right as long as this part is not larger than the noise of the positions. The fit grows
 pose by pose and ends before the first poses that contradict it, so that an impact after a free flight has no effect.
 """
 
@@ -115,11 +117,24 @@ class AccelerationFit:
         return f"({values}) m/s2, 1 sigma ({sigma}), fitted to the first {self.poses} poses ({self.span_s:.3g} s)"
 
 
+def acceleration_text(params: EstimatorParams, fitted: AccelerationFit | None) -> str | None:
+    """Return the acceleration in words; None where there is none.
+
+    Args:
+        params: of the estimator.
+        fitted: the fit that gave it, None where it is given.
+    """
+    known = params.acceleration_mps2
+    if fitted is not None:
+        return fitted.text
+    return "({:.4g}, {:.4g}, {:.4g}) m/s2, given".format(*known) if any(known) else None
+
+
 def fit_acceleration(measured: Sequence[tuple[int, Alignment]], params: EstimatorParams) -> AccelerationFit:
     """Fit a constant acceleration to the first poses of a free motion.
 
     Args:
-        measured: instants [ns], ascending, with their measured poses; R0 applies to a pose without covariance.
+        measured: instants [ns], ascending, with their poses; R0 applies to a pose without covariance.
         params: of the estimator, with auto values resolved.
 
     Returns:
@@ -128,6 +143,7 @@ def fit_acceleration(measured: Sequence[tuple[int, Alignment]], params: Estimato
     Raises:
         UsageError: fewer than eight poses.
     """
+    measured = [(t_ns, found) for t_ns, found in measured if found.measured]
     if len(measured) < _FEWEST:
         what = f"only {len(measured)} poses to fit an acceleration to"
         raise UsageError(what, where="estimator.fit_acceleration", hint=f"{_FEWEST} poses at least are needed")

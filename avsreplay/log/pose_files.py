@@ -24,7 +24,6 @@ from avsreplay.log.pose_messages import measured_pose
 _MAX_BYTES = 256 << 20
 _MAX_SECONDS = 2**31 - 2  # a ROS 2 time has 31 bits of seconds
 _MAX_METRES = 1e9
-_SEPARATOR = re.compile(r"\s*,\s*|\s+")
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +80,9 @@ def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
         if stripped and not stripped.startswith("#"):
-            yield f"{shown(path)}:{number}", _SEPARATOR.split(stripped), "," in stripped
+            commas = "," in stripped
+            words = [word.strip() for word in stripped.split(",")] if commas else stripped.split()
+            yield f"{shown(path)}:{number}", words, commas
 
 
 def _line(words: list[str], commas: bool, where: str) -> tuple[int | None, Pose]:
