@@ -207,7 +207,8 @@ def robust_noise(distance: Array) -> float:
     First the least of the estimates from the 30 % to the 90 % quantile: outliers only raise them, by a factor of three
     if they are 60 %. Then the median of the magnitudes within three standard deviations.
     """
-    noise = float(np.min(np.quantile(distance, LEVELS) / NORMAL_QUANTILES))
+    ordered = np.sort(distance)
+    noise = float(np.min(np.interp(LEVELS * (len(ordered) - 1), np.arange(len(ordered)), ordered) / NORMAL_QUANTILES))
     for _ in range(REFINEMENTS):
         near = distance[distance < 3.0 * noise]
         noise = min(noise, float(np.median(near)) / NORMAL_QUANTILES[2]) if len(near) else noise

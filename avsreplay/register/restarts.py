@@ -9,7 +9,7 @@ result, then rotations about them. The best pose is found by truncated squared d
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -71,6 +71,20 @@ class Restarter:
     def __init__(self, target: Target, test: PlausibilityTest) -> None:
         self._target, self._test = target, test
         self._extent = target.surface.extent
+        vertices = target.surface.vertices
+        self._middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        narrow, wide = START_OF_EXTENT * self._extent, target.limits.reach_m
+        self._narrow, self._wide = narrow, max(wide, narrow)
+        self._stages = {start: self._stages_from(start) for start in (self._narrow, self._wide)}
+
+    def _stages_from(self, start_m: float) -> list[dict[bool, IcpParams]]:
+        """The rules of the stages with falling rejection distance, without and with the facing test."""
+        gates, gate = [], start_m
+        while gate > STOP_OF_EXTENT * self._extent:
+            gates.append(gate)
+            gate *= FALL
+        rule = IcpParams(n_max=PASSES, n_plane=PASSES, tighten=0.0, eps_rad=1e-4, eps_m=1e-4 * self._extent)
+        return [{facing: replace(rule, gate_m=gate, facing=facing) for facing in (False, True)} for gate in gates]
 
     def part(self, points: NDArray[Any]) -> NDArray[Any]:
         """Return about ``POINTS`` points of the scan (n, 3), evenly over its order."""
@@ -84,22 +98,12 @@ class Restarter:
 
     def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
         """Return the pose after passes with a falling rejection distance, from ``start_m`` [m] on."""
-        index, gate = self._target.index, start_m
-        while gate > STOP_OF_EXTENT * self._extent:
+        index = self._target.index
+        for rules in self._stages[start_m]:
             facing = self._target.visibility.camera_c(index, points, T_ca) is not None
-            rule = IcpParams(
-                n_max=PASSES,
-                n_plane=PASSES,
-                gate_m=gate,
-                tighten=0.0,
-                eps_rad=1e-4,
-                eps_m=1e-4 * self._extent,
-                facing=facing,
-            )
-            found = index.icp(points, T_ca, rule)
+            found = index.icp(points, T_ca, rules[facing])
             T_ca = Pose.from_matrix(found.T_ca)
             budget.spend(found.iterations * len(points))
-            gate *= FALL
         return self.measure(points, T_ca)
 
     def best(self, points: NDArray[Any], guess: Pose, result: Pose, budget: Budget) -> Restart:
@@ -112,23 +116,27 @@ class Restarter:
             budget: work that is left.
         """
         found = [self.measure(points, result)]
+        tested: Restart | None = None  # the last pose that was tested, and is not plausible
         for T_ca, start in self._starts(guess, result, points.mean(axis=0)):
             if not budget.allows(self.work(start) * len(points)):
                 break
             found.append(self.graduated(points, T_ca, start, budget))
-            if self._convincing(points, found):
+            best = self._least(found)
+            if best is tested or not self._confirmed(best, found):
+                continue
+            if not self._test.check(points, best.T_ca).reason:
                 break
+            tested = best
         return self._least(found)
 
     def work(self, start_m: float) -> int:
         """Return the largest number of passes of one graduated registration."""
-        return PASSES * int(np.ceil(np.log(start_m / (STOP_OF_EXTENT * self._extent)) / -np.log(FALL)))
+        return PASSES * len(self._stages[start_m])
 
-    def _convincing(self, points: NDArray[Any], found: list[Restart]) -> bool:
-        """Two starts led to the best pose and it is plausible."""
-        best = self._least(found)
-        same = sum(self._same(best.T_ca, other.T_ca) for other in found)
-        return same >= 2 and not self._test.check(points, best.T_ca).reason
+    def _confirmed(self, best: Restart, found: list[Restart]) -> bool:
+        """Whether two starts led to the best pose."""
+        same = (self._same(best.T_ca, other.T_ca) for other in found if other is not best)
+        return any(same)
 
     def _least(self, found: list[Restart]) -> Restart:
         width = max(self._target.limits.gate_m, 3.0 * min(each.noise_m for each in found))
@@ -137,15 +145,17 @@ class Restarter:
 
     def _same(self, T_a: Pose, T_b: Pose) -> bool:
         step = T_a @ T_b.inverse()  # in {C}
-        middle = 0.5 * (self._target.surface.vertices.min(axis=0) + self._target.surface.vertices.max(axis=0))
-        shift = float(np.linalg.norm(step.apply(middle) - middle))
-        return float(geometry.angle(step.q)) < np.radians(1.0) and shift < 0.01 * self._extent
+        if float(geometry.angle(step.q)) >= np.radians(1.0):
+            return False
+        return float(np.linalg.norm(step.apply(self._middle) - self._middle)) < 0.01 * self._extent
 
     def _starts(self, guess: Pose, result: Pose, centre_a: Array) -> Iterator[tuple[Pose, float]]:
         """Guess and result with a narrow and a wide start, then both rotated by TURN_RAD about each axis of {C}."""
-        narrow, wide = START_OF_EXTENT * self._extent, self._target.limits.reach_m
-        yield from ((guess, narrow), (result, narrow), (guess, max(wide, narrow)))
-        for base in (guess, result):
+        narrow = self._narrow
+        bases = (guess, result) if guess.matrix.tobytes() != result.matrix.tobytes() else (guess,)
+        yield from ((base, narrow) for base in bases)
+        yield guess, self._wide
+        for base in bases:
             centre = base.apply(centre_a)
             for axis in np.eye(3):
                 for sign in (1.0, -1.0):
