@@ -26,7 +26,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.fusion import all_poses, fused, refined, turn_and_coverage
 from avsreplay.reconstruct.tracking import ReconstructionParams, track
-from avsreplay.reconstruct.views import thinned_views
+from avsreplay.reconstruct.views import extent_of, thinned_views
 from avsreplay.records import Scan, Surface
 
 __all__ = [
@@ -93,7 +93,7 @@ def reconstruct(scans: Iterable[Scan], params: ReconstructionParams | None = Non
         raise UnreadableInput(
             f"only {len(usable)} scans with {p.fewest_points} points or more", hint="a model needs three at least"
         )
-    extent = float(np.linalg.norm(np.ptp(np.asarray(usable[0].points, dtype=np.float64), axis=0)))
+    extent = float(np.median([extent_of(np.asarray(s.points[:: max(1, len(s.points) // 3000)], dtype=np.float64)) for s in usable]))
     views = thinned_views(usable, p.thin * extent)
     tracked = track(views, p, extent)
     if len(tracked.poses) < 3:

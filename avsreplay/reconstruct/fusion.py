@@ -15,6 +15,7 @@ from avsreplay.reconstruct.tracking import (
     SAME_SIDE,
     ReconstructionParams,
     Tracked,
+    between,
     moved,
     patchwork,
     registered,
@@ -75,8 +76,9 @@ def _pair_terms(
     near = np.isfinite(d)
     index = np.where(near, index, 0)
     n_c = b.normals[index] @ poses[j].R.T
-    near &= np.einsum("ni,ni->n", a.normals @ poses[i].R.T, n_c) > SAME_SIDE
-    p, n = p_c[near], n_c[near]
+    n_a = a.normals @ poses[i].R.T
+    near &= np.einsum("ni,ni->n", n_a, n_c) > SAME_SIDE
+    p, n = p_c[near], between(n_a[near], n_c[near])
     q = poses[j].apply(b.points[index[near]])
     e = np.einsum("ni,ni->n", n, q - p)
     if len(e) < 30:

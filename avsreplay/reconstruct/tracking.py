@@ -16,6 +16,7 @@ from avsreplay.register import global_search
 SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
 KEEP_RATIO = 0.4  # share of the points of a scan that must lie on the model so far
 MOST_VIOLATING = 0.12  # share of points that may lie in the free space in front of what another view has measured
+GRAZING = np.cos(np.radians(70.0))  # least cosine of the inclination to a line of sight for a test of free space
 SEARCH_EVERY = 6  # while the target is lost, all attitudes are searched for two scans of this many
 KEY_TURN_RAD = np.radians(7.0)  # a scan seen from a direction that differs by this from all key scans becomes one
 
@@ -111,12 +112,19 @@ def _accepted(match: Match, views: Sequence[ScanView], found: Tracked, k: int, e
 
 
 def _violation(views: Sequence[ScanView], T_j: Pose, T_k: Pose, j: int, k: int, extent: float) -> float:
-    """Share of the points of each of two views that lie in front of the surface which the other has measured."""
+    """Share of the points of each of two views that lie in front of the surface which the other has measured.
+
+    Points whose surface is inclined to the other line of sight by more than 70 degrees are left out: the depth of such a
+    surface changes by more than the tolerance between neighbouring rays.
+    """
     shares = []
     for a, T_a, b, T_b in ((views[k], T_k, views[j], T_j), (views[j], T_j, views[k], T_k)):
-        p = (T_b @ T_a.inverse()).apply(a.points)  # in {A} at the instant of b
-        in_front = depth_behind(p, b.points, b.camera, 0.03 * extent) > 0.03 * extent
-        shares.append(float(in_front.mean()))
+        T_ba = T_b @ T_a.inverse()
+        p, n = T_ba.apply(a.points), a.normals @ T_ba.R.T  # in {A} at the instant of b
+        lines = b.camera - p
+        facing = np.einsum("ni,ni->n", n, lines) > GRAZING * np.linalg.norm(lines, axis=1)
+        in_front = depth_behind(p[facing], b.points, b.camera, 0.03 * extent) > 0.03 * extent
+        shares.append(float(in_front.sum()) / max(len(p), 1))
     return max(shares)
 
 
@@ -222,11 +230,21 @@ def _normal_equations(view: ScanView, model: Patchwork, T_ca: Pose, gate: float)
     near = np.isfinite(d)
     index = np.where(near, index, 0)
     near &= np.einsum("ni,ni->n", n_view, model.normals[index]) > SAME_SIDE
-    p, q, n = p[near], model.points[index[near]], model.normals[index[near]]
+    p, q, n = p[near], model.points[index[near]], between(n_view[near], model.normals[index[near]])
     e = np.einsum("ni,ni->n", n, q - p)
     w = np.maximum(1.0 - (e / gate) ** 2, 0.0) ** 2
     J = np.hstack([np.cross(p, n), n])
     return (J * w[:, None]).T @ J, J.T @ (w * e), e, float(near.mean())
+
+
+def between(a: Array, b: Array) -> Array:
+    """Unit vectors halfway between unit normals a and b (n, 3).
+
+    The distance along them is zero for two points of one circle, so that the curvature of a surface gives no bias
+    (S. Rusinkiewicz, A symmetric objective function for ICP, ACM Transactions on Graphics 38(4), 2019).
+    """
+    both = a + b
+    return np.asarray(both / np.linalg.norm(both, axis=1, keepdims=True))
 
 
 def _solved(N: Array, g: Array, extent: float) -> tuple[Array, float]:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from avsreplay import geometry
@@ -15,6 +17,8 @@ from avsreplay.records import Scan
 
 NEIGHBOURS = 12  # nearest points from which a normal is estimated
 ISOLATED = 4.0  # a point is isolated if its fourth neighbour is farther than this many times the median
+LINK = 2.0  # points closer than this many times the typical distance of the fourth neighbour belong together
+SMALL_GROUP = 0.02  # a group with a smaller share of the points does not count for the extent
 FAR_OF_EXTENT = 0.6  # a scan whose centroid is farther than this from the origin of {A} was taken from the origin
 
 
@@ -56,6 +60,20 @@ def _connected(points: Array) -> Array:
     return np.asarray(points[distance < ISOLATED * np.median(distance)])
 
 
+def extent_of(points: Array) -> float:
+    """Return the diagonal [m] of the box around a target, from one scan of it that may contain scattered outliers.
+
+    Points are grouped where they lie closer together than LINK times the typical spacing; groups of less than
+    SMALL_GROUP of all points are left out. A box around all points would grow to the range limits of the scanner.
+    """
+    spacing = float(np.median(np.asarray(cKDTree(points).query(points, k=5)[0])[:, 4]))
+    pairs = cKDTree(points).query_pairs(LINK * max(spacing, 1e-9), output_type="ndarray")
+    n = len(points)
+    _, group = connected_components(coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n)))
+    large = np.bincount(group)[group] >= SMALL_GROUP * n
+    return float(np.linalg.norm(np.ptp(points[large] if large.any() else points, axis=0)))
+
+
 def _camera(clouds: Sequence[Array]) -> Array:
     """Position of the camera in {A} [m]: the origin, unless the scans surround it or lie close to it.
 
@@ -64,7 +82,7 @@ def _camera(clouds: Sequence[Array]) -> Array:
     its inclination to that line, so the mean square of the cosine is largest along it. Of the two ends of the line the
     one is chosen from which the surfaces are convex on average, because a camera sees the outside of the target.
     """
-    extents = [float(np.linalg.norm(np.ptp(points, axis=0))) for points in clouds]
+    extents = [extent_of(points) for points in clouds]
     distances = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds]
     if np.median(distances) > FAR_OF_EXTENT * np.median(extents):
         return np.zeros(3)
@@ -133,6 +151,8 @@ def turn(a: Pose, b: Pose) -> float:
 
 def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float) -> Array:
     """How far the surface that was measured in the direction of each point p lies behind it [m]; 0 where none was."""
+    if not len(p):
+        return np.zeros(0)
     rays, own = measured - camera, p - camera
     far, r = np.linalg.norm(rays, axis=1), np.linalg.norm(own, axis=1)
     distances, nearest = cKDTree(rays / far[:, None]).query(own / r[:, None], k=3)
