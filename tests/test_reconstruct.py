@@ -59,7 +59,7 @@ def errors(made, truth):
 @pytest.fixture(scope="module")
 def full_turn():
     scans, truth = turning(25, 15.0, noise_m=0.003)
-    return scans, truth, reconstruct(scans)
+    return scans, truth, reconstruct(lambda: scans)
 
 
 @pytest.mark.slow
@@ -90,7 +90,7 @@ def test_points_lie_on_the_body_and_normals_point_outward(full_turn):
 
 def test_the_result_is_the_same_for_the_same_scans():
     scans, _ = turning(6, 15.0, noise_m=0.003)
-    made, again = reconstruct(scans), reconstruct(scans)
+    made, again = reconstruct(lambda: scans), reconstruct(lambda: scans)
     np.testing.assert_array_equal(made.points, again.points)
     np.testing.assert_array_equal(made.one_sigma_m, again.one_sigma_m)
 
@@ -105,7 +105,7 @@ def test_a_moving_occluder_is_left_out(full_turn):
         plate = np.column_stack([rng.uniform(-0.1, 0.1, (200, 2)) + 0.03 * (scan.seq % 12) - 0.2, np.full(200, 2.9)])
         points = np.vstack([scan.points, plate]) if scan.seq % 3 == 1 else scan.points
         mixed.append(Scan(seq=scan.seq, t_ns=scan.t_ns, points=points))
-    again = reconstruct(mixed)
+    again = reconstruct(lambda: mixed)
     far, _ = cKDTree(made.points).query(again.points)
     assert (far > 0.1).mean() < 0.03
 
@@ -115,7 +115,7 @@ def test_a_target_at_rest_is_refused():
     pose = Pose(geometry.exp(np.array([0.4, 0.2, 0.1])), np.array([0.0, 0.0, 4.0]))
     scans = [Scan(seq=k, t_ns=k * 500_000_000, points=hull_scan(rng, pose)) for k in range(6)]
     with pytest.raises(UnreadableInput, match=r"a turn of 0\.\d deg only: the target is at rest"):
-        reconstruct(scans)
+        reconstruct(lambda: scans)
 
 
 def test_a_sphere_is_refused():
@@ -126,13 +126,13 @@ def test_a_sphere_is_refused():
         p = 0.5 * p / np.linalg.norm(p, axis=1, keepdims=True) + [0.01 * k, 0.0, 4.0]
         scans.append(Scan(seq=k, t_ns=k * 500_000_000, points=p[p[:, 2] < 3.9]))
     with pytest.raises(UnreadableInput, match="does not determine its attitude"):
-        reconstruct(scans)
+        reconstruct(lambda: scans)
 
 
 def test_too_few_scans_are_refused():
     scans, _ = turning(2, 10.0)
     with pytest.raises(UnreadableInput, match="only 2 scans"):
-        reconstruct(scans)
+        reconstruct(lambda: scans)
 
 
 @pytest.mark.slow
@@ -151,7 +151,7 @@ def test_the_command_writes_a_model_that_run_accepts(cli, fixtures_folder, tmp_p
 def test_the_dragon_is_rebuilt_from_fifteen_scans(shared_data):
     folder = shared_data / "stanford-dragon"
     with open_source(folder, SourceOptions(model=folder / "dragon_vrip_res3.ply")) as source:
-        made = reconstruct(source.scans())
+        made = reconstruct(source.scans)
     assert made.used == 15
     assert made.rms_m < 0.4e-3
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import asdict
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,6 +13,7 @@ import click
 
 from avsreplay.cli.options import PATH, Numbers, read_options, source_options
 from avsreplay.cli.progress import tracked
+from avsreplay.errors import MissingBackend
 
 if TYPE_CHECKING:
     from avsreplay.reconstruct import Deviations, Reconstruction
@@ -32,6 +36,9 @@ Examples:
     metavar="X,Y,Z",
     help="Grasp point in the frame that the same command without this option writes [m]; default: the flattest patch.",
 )
+@click.option(
+    "--mesh", type=PATH, help="Also write a triangle mesh (.ply); needs Open3D: pip install 'avsreplay[open3d]'."
+)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
 @source_options
@@ -40,6 +47,7 @@ def command(
     output: Path,
     against: Path | None,
     grasp: tuple[float, ...] | None,
+    mesh: Path | None,
     overwrite: bool,
     as_json: bool,
     **reading: Any,
@@ -54,17 +62,29 @@ def command(
 
     from avsreplay.files import check_output, output_path
     from avsreplay.log import open_source, read_surface
-    from avsreplay.reconstruct import at_grasp, deviations, reconstruct, reconstruction_ply
+    from avsreplay.log.surface import surface_bytes
+    from avsreplay.reconstruct import at_grasp, deviations, meshed, reconstruct, reconstruction_ply
 
-    check_output(output, overwrite=overwrite)
+    for each in (output, mesh):
+        if each is not None:
+            check_output(each, overwrite=overwrite)
+    if mesh is not None and find_spec("open3d") is None:
+        hint = "pip install 'avsreplay[open3d]'"
+        raise MissingBackend("a mesh needs Open3D, which is not installed", where="--mesh", hint=hint)
     cad = read_surface(against) if against else None
     with open_source(log, read_options(reading)) as source:
-        made = at_grasp(reconstruct(tracked(source.scans(), len(source), "reading")))
+        made = at_grasp(reconstruct(lambda: tracked(source.scans(), len(source), "reading")))
     made = made if grasp is None else at_grasp(made, np.array(grasp))
     found = deviations(made, cad) if cad else None
     with output_path(output, overwrite=overwrite) as path:
         path.write_bytes(reconstruction_ply(made, found))
-    click.echo(json.dumps(_document(made, found), indent=2) if as_json else _text(made, found))
+    said = _document(made, found)
+    if mesh is not None:
+        surface, said["mesh_interpolated"] = meshed(made)
+        said["mesh_faces"] = len(surface.faces)
+        with output_path(mesh, overwrite=overwrite) as path:
+            path.write_bytes(surface_bytes(surface))
+    click.echo(json.dumps(said, indent=2) if as_json else _text(said))
 
 
 def _document(made: Reconstruction, found: Deviations | None) -> dict[str, Any]:
@@ -75,30 +95,77 @@ def _document(made: Reconstruction, found: Deviations | None) -> dict[str, Any]:
         "searches": made.searches,
         "points": len(made.points),
         "median_one_sigma_m": float(sorted(made.one_sigma_m)[len(made.one_sigma_m) // 2]),
+        "extent_m": made.extent,
         "coverage": made.coverage,
         "turn_deg": made.turn_deg,
         "rms_m": made.rms_m,
+        "frame": made.frame,
+        "motion": None,
         "notes": list(made.notes),
     }
+    if made.motion and made.mass_centre and made.principal_axes:
+        (centre, centre_1s), (axes, axes_1s) = made.mass_centre, made.principal_axes
+        out["motion"] = {
+            "angle_rms_deg": math.degrees(made.motion.rms[0]),
+            "distance_rms_m": made.motion.rms[1],
+            "mass_centre_m": centre.tolist(),
+            "mass_centre_1s_m": centre_1s,
+            "principal_axes_xyzw": axes.tolist(),
+            "principal_axes_1s_deg": min(math.degrees(axes_1s), 180.0),
+        }
     if found:
         out["against"] = {
             "median_m": found.median_m,
             "p95_m": found.p95_m,
             "points_within": found.inlier_ratio,
             "within_m": found.most_m,
+            "regions": [asdict(region) for region in found.regions],
         }
     return out
 
 
-def _text(made: Reconstruction, found: Deviations | None) -> str:
-    said = _document(made, found)
+def _text(said: dict[str, Any]) -> str:
+    """Return the lines that a person reads."""
     lines = [
-        f"scans used:     {made.used} of {made.offered}, {made.searches} of them needed a search",
-        f"surface:        {said['points']} points, median 1 sigma {1e3 * said['median_one_sigma_m']:.2f} mm",
-        f"seen from:      {100.0 * made.coverage:.0f} % of all directions; the target turned {made.turn_deg:.0f} deg",
-        f"consistency:    {1e3 * made.rms_m:.2f} mm rms between overlapping scans",
+        f"scans used:     {said['scans_used']} of {said['scans_in_log']}, {said['searches']} of them needed a search",
+        f"surface:        {said['points']} points, median 1 sigma {1e3 * said['median_one_sigma_m']:.2f} mm,"
+        f" extent {said['extent_m']:.3f} m",
+        f"seen from:      {100.0 * said['coverage']:.0f} % of all directions; the target turned"
+        f" {said['turn_deg']:.0f} deg",
+        f"consistency:    {1e3 * said['rms_m']:.2f} mm rms between overlapping scans",
+        f"frame {{C}}:      {said['frame']}",
     ]
-    if found:
-        far = f"{1e3 * found.median_m:.2f} mm median, {1e3 * found.p95_m:.2f} mm 95 % quantile"
-        lines.append(f"from CAD model: {far}, {100.0 * found.inlier_ratio:.1f} % within {1e3 * found.most_m:.0f} mm")
-    return "\n".join([*lines, *(f"note: {note}" for note in made.notes)])
+    motion, against = said["motion"], said.get("against")
+    if motion:
+        centre = ", ".join(f"{x:.3f}" for x in motion["mass_centre_m"])
+        lines += [
+            f"free motion:    explains the poses to {motion['angle_rms_deg']:.2f} deg and"
+            f" {1e3 * motion['distance_rms_m']:.2f} mm rms",
+            f"mass centre:    ({centre}) m in {{C}}, 1 sigma {1e3 * motion['mass_centre_1s_m']:.1f} mm;"
+            f" principal axes to {motion['principal_axes_1s_deg']:.1f} deg",
+        ]
+    else:
+        lines.append("free motion:    the poses do not follow one; mass centre and principal axes are not known")
+    if "mesh_faces" in said:
+        lines.append(
+            f"mesh:           {said['mesh_faces']} triangles, {100.0 * said['mesh_interpolated']:.1f} % of the area"
+            " interpolated"
+        )
+    if against:
+        far = f"{1e3 * against['median_m']:.2f} mm median, {1e3 * against['p95_m']:.2f} mm 95 % quantile"
+        share = f"{100.0 * against['points_within']:.1f} % within {1e3 * against['within_m']:.0f} mm"
+        lines.append(f"from CAD model: {far}, {share}")
+        lines += _table(against["regions"])
+    return "\n".join([*lines, *(f"note: {note}" for note in said["notes"])])
+
+
+def _table(regions: list[dict[str, Any]]) -> list[str]:
+    """Return the lines of the table of deviating regions."""
+    if not regions:
+        return ["                no region differs from the CAD model"]
+    lines = ["  region    points   size [m]   deviation [m]   centre in the CAD frame [m]"]
+    for region in regions:
+        centre = ", ".join(f"{x:.3f}" for x in region["centre_m"])
+        deviation = "beyond" if math.isnan(region["deviation_m"]) else f"{region['deviation_m']:+.3f}"
+        lines.append(f"  {region['kind']:<8}{region['points']:>8}{region['size_m']:>11.3f}{deviation:>16}   ({centre})")
+    return lines

@@ -10,14 +10,18 @@ from scipy.spatial import cKDTree
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
+from avsreplay.reconstruct.free_motion import free_motion
 from avsreplay.reconstruct.views import ScanView, averaged, depth_behind, turn
 from avsreplay.register import global_search
 
 SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
 KEEP_RATIO = 0.4  # share of the points of a scan that must lie on the model so far
+LEAST_EXPLAINED = 0.15  # share of the model's visible side that a scan must show
 MOST_VIOLATING = 0.12  # share of points that may lie in the free space in front of what another view has measured
 GRAZING = np.cos(np.radians(70.0))  # least cosine of the inclination to a line of sight for a test of free space
+MOST_POINTS = 1500  # of a scan in one registration
 SEARCH_EVERY = 6  # while the target is lost, all attitudes are searched for two scans of this many
+MOST_RETRIES = 20  # lost scans that are tried again at the end
 KEY_TURN_RAD = np.radians(7.0)  # a scan seen from a direction that differs by this from all key scans becomes one
 
 
@@ -81,41 +85,67 @@ class Tracked:
 
 
 def track(views: Sequence[ScanView], p: ReconstructionParams, extent: float) -> Tracked:
-    """Register every view against the model that the key views before it give."""
+    """Register every view against the model that the key views before it give; then try the lost ones once more."""
     origin = views[0].points.mean(axis=0)
     found = Tracked({0: Pose(geometry.IDENTITY_QUAT, origin)}, [0], 0, 0, [])
     model = patchwork(views, found, p.thin * extent)
     for k in range(1, len(views)):
-        guess = _predicted(views, found, k)
-        match = registered(views[k], model, guess, p.reach * extent, extent)
-        if not _accepted(match, views, found, k, extent):
-            found.searches += 1
-            match = _searched(views, found, k, model, guess, p, extent)
-        if not _accepted(match, views, found, k, extent):
-            found.lost += 1
-            continue
-        found.lost = 0
-        found.poses[k] = match.T_ac
-        found.weakest.append(match.weakest)
-        if _new_side([found.poses[j] for j in found.keys], match.T_ac):
-            found.keys.append(k)
-            model = patchwork(views, found, p.thin * extent)
+        model = _tracked(views, found, k, model, p, extent)
+    lost = [k for k in range(len(views)) if k not in found.poses]
+    found.lost = 0
+    for k in lost[:: max(1, -(-len(lost) // MOST_RETRIES))]:
+        model = _tracked(views, found, k, model, p, extent)
     return found
 
 
-def _accepted(match: Match, views: Sequence[ScanView], found: Tracked, k: int, extent: float) -> bool:
-    """Whether enough of the scan lies on the model and no measured ray passes through a surface of the other."""
+def _tracked(
+    views: Sequence[ScanView], found: Tracked, k: int, model: Patchwork, p: ReconstructionParams, extent: float
+) -> Patchwork:
+    """Register view k from its prediction, else by a search, note the result, and return the model that it gives."""
+    guess = _predicted(views, found, k, extent)
+    match = registered(views[k], model, guess, p.reach * extent, extent)
+    if not _accepted(match, views, found, k, model, extent):
+        found.searches += 1
+        match = _searched(views, found, k, model, guess, p, extent)
+    if not _accepted(match, views, found, k, model, extent):
+        found.lost += 1
+        return model
+    found.lost = 0
+    found.poses[k] = match.T_ac
+    found.weakest.append(match.weakest)
+    if not _new_side([found.poses[j] for j in found.keys], match.T_ac):
+        return model
+    found.keys.append(k)
+    return patchwork(views, found, p.thin * extent)
+
+
+def _accepted(match: Match, views: Sequence[ScanView], found: Tracked, k: int, model: Patchwork, extent: float) -> bool:
+    """Whether scan and model explain each other and no measured ray passes through a surface of the other."""
     if match.ratio < KEEP_RATIO or match.rms_m > 0.01 * extent:
+        return False
+    if _explained(views[k], model, match.T_ac, extent) < LEAST_EXPLAINED:
         return False
     near = sorted(found.keys, key=lambda j: turn(found.poses[j], match.T_ac))[:3]
     return all(_violation(views, found.poses[j], match.T_ac, j, k, extent) < MOST_VIOLATING for j in near)
 
 
+def _explained(view: ScanView, model: Patchwork, T_ac: Pose, extent: float) -> float:
+    """Share of the model's side toward the camera that a scan shows; small for a scan of something else."""
+    every = max(1, len(model.points) // 1500)
+    p, n = T_ac.apply(model.points[::every]), model.normals[::every] @ T_ac.R.T
+    lines = view.camera - p
+    facing = np.einsum("ni,ni->n", n, lines) > GRAZING * np.linalg.norm(lines, axis=1)
+    if not facing.any():
+        return 0.0
+    near, _ = cKDTree(view.points).query(p[facing], distance_upper_bound=0.03 * extent)
+    return float(np.isfinite(near).mean())
+
+
 def _violation(views: Sequence[ScanView], T_j: Pose, T_k: Pose, j: int, k: int, extent: float) -> float:
     """Share of the points of each of two views that lie in front of the surface which the other has measured.
 
-    Points whose surface is inclined to the other line of sight by more than 70 degrees are left out: the depth of such a
-    surface changes by more than the tolerance between neighbouring rays.
+    Points whose surface is inclined to the other line of sight by more than 70 degrees are left out: the depth of such
+    a surface changes by more than the tolerance between neighbouring rays.
     """
     shares = []
     for a, T_a, b, T_b in ((views[k], T_k, views[j], T_j), (views[j], T_j, views[k], T_k)):
@@ -149,7 +179,7 @@ def _searched(
             tried.append((match.ratio, len(tried), match))
         for _, _, match in sorted(tried, key=lambda t: (-t[0], t[1]))[:6]:
             fine = registered(views[k], model, match.T_ac, p.reach * extent, extent)
-            if _accepted(fine, views, found, k, extent):
+            if _accepted(fine, views, found, k, model, extent):
                 return fine
     return Match(guess, 0.0, float("inf"), 0.0)
 
@@ -190,16 +220,22 @@ def patchwork(views: Sequence[ScanView], found: Tracked, size_m: float) -> Patch
     return Patchwork(mean, normal, cKDTree(mean))
 
 
-def _predicted(views: Sequence[ScanView], found: Tracked, k: int) -> Pose:
-    """The pose at view k by the constant twist, in {C}, of the last poses."""
-    known = sorted(j for j in found.poses if j < k)
-    last = known[-1]
-    if len(known) < 2:
+def _predicted(views: Sequence[ScanView], found: Tracked, k: int, extent: float) -> Pose:
+    """The pose at view k by the constant twist, in {C}, of the last poses; after a gap by free motion if it fits."""
+    known = sorted(found.poses)
+    before = [j for j in known if j < k] or known[:1]
+    last = before[-1]
+    intervals = np.diff([views[j].t_ns for j in known])
+    if k - last > 1 and len(intervals) and views[k].t_ns - views[last].t_ns > 2.0 * np.median(intervals):
+        motion = free_motion([views[j].t_ns for j in known], [found.poses[j] for j in known], extent)
+        if motion is not None:
+            return motion.at(views[k].t_ns)
+    if len(before) < 2:
         return found.poses[last]
-    before = known[max(-4, -len(known))]
-    span = (views[last].t_ns - views[before].t_ns) * 1e-9
+    first = before[max(-4, -len(before))]
+    span = (views[last].t_ns - views[first].t_ns) * 1e-9
     ahead = (views[k].t_ns - views[last].t_ns) * 1e-9
-    a, b = found.poses[before], found.poses[last]
+    a, b = found.poses[first], found.poses[last]
     turn = geometry.log(geometry.multiply(geometry.conjugate(a.q), b.q)) * (ahead / span)
     return Pose(geometry.multiply(b.q, geometry.exp(turn)), b.t + (b.t - a.t) * (ahead / span))
 
@@ -225,7 +261,8 @@ def registered(view: ScanView, model: Patchwork, guess: Pose, reach_m: float, ex
 
 def _normal_equations(view: ScanView, model: Patchwork, T_ca: Pose, gate: float) -> tuple[Array, Array, Array, float]:
     """Sums J'WJ (6, 6) and J'We (6,) over corresponding points, their distances to the planes [m], and their share."""
-    p, n_view = T_ca.apply(view.points), view.normals @ T_ca.R.T
+    every = max(1, len(view.points) // MOST_POINTS)
+    p, n_view = T_ca.apply(view.points[::every]), view.normals[::every] @ T_ca.R.T
     d, index = model.tree.query(p, distance_upper_bound=gate)
     near = np.isfinite(d)
     index = np.where(near, index, 0)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Scan
 
+SAMPLE = 24  # most scans from which extent and position of the camera are determined
 NEIGHBOURS = 12  # nearest points from which a normal is estimated
 ISOLATED = 4.0  # a point is isolated if its fourth neighbour is farther than this many times the median
 LINK = 2.0  # points closer than this many times the typical distance of the fourth neighbour belong together
@@ -30,7 +32,6 @@ class ScanView:
         t_ns: instant.  camera: (3,) position of the camera in {A} [m].
         points: (n, 3) thinned points in {A} [m].  normals: (n, 3) unit normals toward the camera.
         weight: (n,) cosine of the inclination to the line of sight: grazing points are the least accurate.
-        full: (m, 3) all points in {A} [m].
     """
 
     t_ns: int
@@ -38,20 +39,96 @@ class ScanView:
     points: Array
     normals: Array
     weight: Array
-    full: NDArray[np.float32]
 
 
-def thinned_views(scans: Sequence[Scan], size_m: float) -> list[ScanView]:
-    """The scans without isolated points, thinned to voxels of the given size, with normals and weights."""
-    clouds = [_connected(np.asarray(scan.points, dtype=np.float64)) for scan in scans]
-    camera = _camera(clouds)
-    views = []
-    for scan, full in zip(scans, clouds, strict=True):
-        points = thinned(full, size_m)
-        normals, lines = normals_of(points, full, camera), camera - points
-        weight = np.einsum("ni,ni->n", normals, lines) / np.linalg.norm(lines, axis=1)
-        views.append(ScanView(scan.t_ns, camera, points, normals, weight, full.astype(np.float32)))
-    return views
+@dataclass(frozen=True, slots=True, eq=False)
+class Survey:
+    """What one pass over a log finds.
+
+    Attributes:
+        chosen: positions in the log of the scans that are used.  offered: number of scans in the log.
+        extent: typical diagonal of the box around the target in one scan [m].
+        camera: (3,) position of the camera in {A} [m].  timed: the points of the scans have times of their own.
+    """
+
+    chosen: tuple[int, ...]
+    offered: int
+    extent: float
+    camera: Array
+    timed: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Twist:
+    """Motion of the target during a scan: pose at the stamp, rate w_c (3,) [rad/s], velocity v_a (3,) [m/s] of {C}."""
+
+    T_ac: Pose
+    w_c: Array
+    v_a: Array
+
+
+def surveyed(scans: Callable[[], Iterable[Scan]], fewest_points: int, n_scans: int) -> Survey:
+    """Read all scans once; at most SAMPLE of them are in memory at a time.
+
+    Args:
+        scans: gives the scans of the log from its begin each time it is called.
+        fewest_points: scans with fewer points are not used.
+        n_scans: most scans that are used; more are thinned evenly.
+    """
+    usable: list[int] = []
+    kept: list[Scan] = []
+    stride, offered = 1, 0
+    for scan in scans():
+        offered += 1
+        if len(scan.points) < fewest_points:
+            continue
+        if len(usable) % stride == 0:
+            kept.append(scan)
+        if len(kept) > SAMPLE:
+            kept, stride = kept[::2], 2 * stride
+        usable.append(offered - 1)
+    chosen = tuple(usable[:: max(1, -(-len(usable) // n_scans))])
+    if not kept:
+        return Survey(chosen, offered, 0.0, np.zeros(3), False)
+    clouds = [_connected(np.asarray(scan.points, dtype=np.float64)) for scan in kept]
+    extent = float(np.median([extent_of(points[:: max(1, len(points) // 3000)]) for points in clouds]))
+    return Survey(chosen, offered, extent, _camera(clouds), any(scan.times_s is not None for scan in kept))
+
+
+def selected(scans: Callable[[], Iterable[Scan]], survey: Survey) -> Iterator[Scan]:
+    """The scans that are used, in order."""
+    chosen = frozenset(survey.chosen)
+    return (scan for place, scan in enumerate(scans()) if place in chosen)
+
+
+def full_cloud(scan: Scan, twist: Twist | None) -> Array:
+    """All points (n, 3) in {A} [m] of a scan without isolated ones, as if measured at its stamp."""
+    points = np.asarray(scan.points, dtype=np.float64)
+    return _connected(points if twist is None or scan.times_s is None else _deskewed(points, scan.times_s, twist))
+
+
+def thinned_view(scan: Scan, survey: Survey, size_m: float, twist: Twist | None = None) -> ScanView:
+    """A scan thinned to voxels of the given size, with normals and weights.
+
+    Args:
+        scan: as read.
+        survey: of the log.
+        size_m: edge of the voxels [m].
+        twist: motion of the target during the scan; None does not correct for it.
+    """
+    full = full_cloud(scan, twist)
+    points = thinned(full, size_m)
+    normals, lines = normals_of(points, full, survey.camera), survey.camera - points
+    weight = np.einsum("ni,ni->n", normals, lines) / np.linalg.norm(lines, axis=1)
+    return ScanView(scan.t_ns, survey.camera, points, normals, weight)
+
+
+def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
+    """Points (n, 3) in {A} moved to the stamp: p(0) = T_ac(0) T_ac(t)^-1 p(t), with constant rate and velocity."""
+    times = np.asarray(times_s, dtype=np.float64)[:, None]
+    R = geometry.matrix(geometry.exp(times * twist.w_c))  # T_ac(t) has the rotation R_ac exp(w t)
+    p_c = (points - twist.T_ac.t - times * twist.v_a) @ twist.T_ac.R
+    return np.asarray(twist.T_ac.apply(np.einsum("nji,nj->ni", R, p_c)))
 
 
 def _connected(points: Array) -> Array:

@@ -56,7 +56,7 @@ def report(log: Path, options: SourceOptions) -> None:
         truth = {scan.t_ns: source.truth_of(scan).pose for scan in scans}
     begun = time.process_time()
     try:
-        made = reconstruct(scans)
+        made = reconstruct(lambda: scans)
     except AvsError as error:
         print(f"{log.name}: {error}")
         return
