@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import json
+import weakref
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.spatial import ConvexHull, cKDTree
 
 from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
-from avsreplay.reconstruct import at_grasp, reconstruct
-from avsreplay.records import Scan
+from avsreplay.reconstruct import at_grasp, deviations, reconstruct
+from avsreplay.reconstruct.free_motion import free_motion
+from avsreplay.reconstruct.tracking import between
+from avsreplay.reconstruct.views import SAMPLE, Twist, extent_of, full_cloud, surveyed
+from avsreplay.records import Scan, Surface
 
 CORNERS = np.random.default_rng(11).normal(size=(14, 3)) * [0.5, 0.35, 0.25]
 HULL = ConvexHull(CORNERS)
@@ -131,7 +137,7 @@ def test_a_sphere_is_refused():
 
 def test_too_few_scans_are_refused():
     scans, _ = turning(2, 10.0)
-    with pytest.raises(UnreadableInput, match="only 2 scans"):
+    with pytest.raises(UnreadableInput, match="only 2 of 2 scans"):
         reconstruct(lambda: scans)
 
 
@@ -180,3 +186,141 @@ def test_the_frame_is_moved_to_a_grasp_point_with_x_along_the_normal(full_turn):
     np.testing.assert_allclose(moved.apply(at.points), made.points, atol=1e-9)
     with pytest.raises(UsageError, match="from the surface"):
         at_grasp(made, np.array([9.0, 0.0, 0.0]))
+
+
+def with_outliers(scans, share=0.03, seed=5):
+    """The scans with outliers at ranges of 0.5 to 12 m along the rays, as a scanner gives them."""
+    rng, out = np.random.default_rng(seed), []
+    for scan in scans:
+        points = scan.points.copy()
+        wrong = rng.random(len(points)) < share
+        rays = points[wrong] / np.linalg.norm(points[wrong], axis=1, keepdims=True)
+        points[wrong] = rays * rng.uniform(0.5, 12.0, size=(int(wrong.sum()), 1))
+        out.append(Scan(seq=scan.seq, t_ns=scan.t_ns, points=points))
+    return out
+
+
+def test_scattered_outliers_do_not_change_the_extent():
+    scans, _ = turning(3, 15.0, noise_m=0.003)
+    clean = [extent_of(scan.points) for scan in scans]
+    dirty = [extent_of(scan.points) for scan in with_outliers(scans)]
+    np.testing.assert_allclose(dirty, clean, rtol=0.1)  # a box around all points is ten times as large
+
+
+def test_the_distance_along_the_mean_normal_is_zero_for_two_points_of_a_circle():
+    angles = np.random.default_rng(4).uniform(0.0, 0.8, size=(50, 2))
+    a, b = (np.column_stack([np.cos(x), np.sin(x), np.zeros(50)]) for x in angles.T)
+    distance = np.einsum("ni,ni->n", between(a, b), b - a)  # normals of a unit circle are its points
+    np.testing.assert_allclose(distance, 0.0, atol=1e-14)
+    assert np.abs(np.einsum("ni,ni->n", b, b - a)).max() > 0.1  # point-to-plane
+
+
+def tumble(count=24, dt_s=0.5, noise_deg=0.0, noise_m=0.0, seed=1):
+    """Poses of a tumbling body by an independent integrator, its mass centre in {C}, and instants."""
+    inertia, centre_c, rng = np.diag([1.0, 1.4, 2.0]), np.array([0.1, -0.05, 0.08]), np.random.default_rng(seed)
+
+    def rates(_, y):
+        q, w = y[:4], y[4:]
+        turn = geometry.multiply(q, np.array([*w, 0.0]))
+        return np.concatenate([0.5 * turn, np.linalg.solve(inertia, -np.cross(w, inertia @ w))])
+
+    times = dt_s * np.arange(count)
+    start = np.concatenate([geometry.IDENTITY_QUAT, [0.2, 0.35, 0.1]])
+    found = solve_ivp(rates, (0.0, times[-1]), start, t_eval=times, rtol=1e-11, atol=1e-12).y
+    poses = []
+    for t, q in zip(times, found[:4].T, strict=True):
+        q = geometry.multiply(geometry.normalise(q), geometry.exp(np.radians(noise_deg) * rng.normal(size=3)))
+        mass = np.array([0.01 * t, 0.0, 4.0])
+        poses.append(Pose(q, mass - geometry.matrix(q) @ centre_c + noise_m * rng.normal(size=3)))
+    return [round(1e9 * t) for t in times], poses, centre_c
+
+
+def test_free_motion_gives_mass_centre_and_smooths_poses():
+    t_ns, exact, centre_c = tumble()
+    _, noisy, _ = tumble(noise_deg=0.5, noise_m=0.01)
+    motion = free_motion(t_ns, noisy, 1.0)
+    assert motion is not None
+    centre, spread = motion.mass_centre_c
+    assert np.linalg.norm(centre - centre_c) < 4.0 * spread
+    assert spread < 0.05
+    off = [float(geometry.angle(geometry.multiply(geometry.conjugate(T.q), motion.at(t).q)))
+           for t, T in zip(t_ns, exact, strict=True)]  # fmt: skip
+    raw = [float(geometry.angle(geometry.multiply(geometry.conjugate(T.q), N.q)))
+           for T, N in zip(exact, noisy, strict=True)]  # fmt: skip
+    assert np.sqrt(np.mean(np.square(off))) < 0.7 * np.sqrt(np.mean(np.square(raw)))
+
+
+def test_poses_without_a_common_free_motion_are_not_smoothed():
+    t_ns, poses, _ = tumble()
+    rng = np.random.default_rng(2)
+    by_hand = [Pose(geometry.multiply(T.q, geometry.exp(0.3 * rng.normal(size=3))), T.t) for T in poses]
+    assert free_motion(t_ns, by_hand, 1.0) is None
+    assert free_motion(t_ns[:5], poses[:5], 1.0) is None  # too few
+    assert free_motion([0] * len(poses), poses, 1.0) is None  # no instants
+
+
+def test_a_scan_is_deskewed_exactly_for_constant_rate_and_velocity():
+    rng = np.random.default_rng(6)
+    p_c, times = rng.normal(size=(200, 3)), rng.uniform(0.0, 1.0, 200)
+    T, w, v = Pose(geometry.exp(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.2, 4.0])), np.array([0.2, -0.1, 0.3]), [0.1, 0.0, -0.2]  # fmt: skip
+    shown = [
+        Pose(geometry.multiply(T.q, geometry.exp(w * s)), T.t + np.array(v) * s).apply(x)
+        for s, x in zip(times, p_c, strict=True)
+    ]
+    scan = Scan(seq=0, t_ns=0, points=np.array(shown), times_s=times)
+    found = cKDTree(T.apply(p_c)).query(full_cloud(scan, Twist(T, w, np.array(v))))[0]
+    np.testing.assert_allclose(found, 0.0, atol=1e-12)
+
+
+def test_regions_that_are_added_or_missing_are_reported(full_turn_small):
+    """A second body beside the CAD model is 'added'; a spike of the CAD model that scans look through is 'missing'."""
+    made = full_turn_small
+    hull = Surface(CORNERS, HULL.simplices.astype(np.int32), "hull.ply", "")
+    assert not [r for r in deviations(made, hull).regions if r.size_m > 0.15]
+    grown = replace(
+        made,
+        points=np.vstack([made.points, made.points[:1] + np.random.default_rng(1).uniform(1.0, 1.2, (200, 3))]),
+        normals=np.vstack([made.normals, np.tile([0.0, 0.0, 1.0], (200, 1))]),
+        one_sigma_m=np.ones(len(made.points) + 200),
+        scans=np.ones(len(made.points) + 200, dtype=np.int64),
+    )
+    assert deviations(grown, hull).regions[0].kind == "added"
+    top = CORNERS[np.argmax(CORNERS[:, 0])]
+    spike = np.array([top, top + [0.0, 0.1, 0.0], top + [0.3, 0.0, 0.0], top + [0.0, 0.0, 0.1]])
+    faces = np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]) + len(CORNERS)
+    cad = Surface(np.vstack([CORNERS, spike]), np.vstack([HULL.simplices, faces]).astype(np.int32), "spike.ply", "")
+    missing = [r for r in deviations(made, cad).regions if r.kind == "missing"]
+    assert missing
+    assert np.linalg.norm(np.array(missing[0].centre_m) - spike.mean(axis=0)) < 0.15
+
+
+@pytest.fixture(scope="module")
+def full_turn_small():
+    scans, _ = turning(10, 15.0, noise_m=0.003)
+    return reconstruct(lambda: scans)
+
+
+def test_a_grasp_point_can_be_approached(full_turn_small):
+    at = at_grasp(full_turn_small)
+    distance = np.linalg.norm(at.points, axis=1)
+    inside = (distance > 0.04 * at.extent) & (distance < 0.5 * at.extent)
+    assert not np.any(at.points[inside, 0] > np.cos(np.radians(20.0)) * distance[inside])
+    assert "flattest reachable patch" in at.frame
+
+
+def test_a_survey_keeps_few_scans_of_a_long_log():
+    points = turning(1, 10.0)[0][0].points[::40]
+    refs = []
+
+    def given():
+        for k in range(200):
+            scan = Scan(seq=k, t_ns=k, points=points.copy())
+            refs.append(weakref.ref(scan.points))
+            if k % 20 == 19:
+                assert sum(ref() is not None for ref in refs) <= SAMPLE + 3
+            yield scan
+
+    survey = surveyed(given, 100, 50)
+    assert survey.offered == 200
+    assert len(survey.chosen) == 50
+    assert survey.chosen == tuple(range(0, 200, 4))
