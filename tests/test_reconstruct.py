@@ -262,13 +262,13 @@ def test_poses_without_a_common_free_motion_are_not_smoothed():
 def test_a_scan_is_deskewed_exactly_for_constant_rate_and_velocity():
     rng = np.random.default_rng(6)
     p_c, times = rng.normal(size=(200, 3)), rng.uniform(0.0, 1.0, 200)
-    T, w, v = Pose(geometry.exp(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.2, 4.0])), np.array([0.2, -0.1, 0.3]), [0.1, 0.0, -0.2]  # fmt: skip
+    T = Pose(geometry.exp(np.array([0.3, -0.2, 0.5])), np.array([0.1, 0.2, 4.0]))
+    w, v = np.array([0.2, -0.1, 0.3]), np.array([0.1, 0.0, -0.2])
     shown = [
-        Pose(geometry.multiply(T.q, geometry.exp(w * s)), T.t + np.array(v) * s).apply(x)
-        for s, x in zip(times, p_c, strict=True)
+        Pose(geometry.multiply(T.q, geometry.exp(w * s)), T.t + v * s).apply(x) for s, x in zip(times, p_c, strict=True)
     ]
     scan = Scan(seq=0, t_ns=0, points=np.array(shown), times_s=times)
-    found = cKDTree(T.apply(p_c)).query(full_cloud(scan, Twist(T, w, np.array(v))))[0]
+    found = cKDTree(T.apply(p_c)).query(full_cloud(scan, Twist(T, w, v)))[0]
     np.testing.assert_allclose(found, 0.0, atol=1e-12)
 
 
@@ -286,7 +286,7 @@ def test_regions_that_are_added_or_missing_are_reported(full_turn_small):
     )
     assert deviations(grown, hull).regions[0].kind == "added"
     top = CORNERS[np.argmax(CORNERS[:, 0])]
-    spike = np.array([top, top + [0.0, 0.1, 0.0], top + [0.3, 0.0, 0.0], top + [0.0, 0.0, 0.1]])
+    spike = top + np.array([[0.0, 0.0, 0.0], [0.0, 0.1, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 0.1]])
     faces = np.array([[0, 1, 2], [0, 2, 3], [1, 2, 3]]) + len(CORNERS)
     cad = Surface(np.vstack([CORNERS, spike]), np.vstack([HULL.simplices, faces]).astype(np.int32), "spike.ply", "")
     missing = [r for r in deviations(made, cad).regions if r.kind == "missing"]
