@@ -237,7 +237,7 @@ def tumble(count=24, dt_s=0.5, noise_deg=0.0, noise_m=0.0, seed=1):
 
 def test_free_motion_gives_mass_centre_and_smooths_poses():
     t_ns, exact, centre_c = tumble()
-    _, noisy, _ = tumble(noise_deg=0.5, noise_m=0.01)
+    _, noisy, _ = tumble(noise_deg=0.2, noise_m=0.003)
     motion = free_motion(t_ns, noisy, 1.0)
     assert motion is not None
     centre, spread = motion.mass_centre_c
