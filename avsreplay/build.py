@@ -45,7 +45,7 @@ def stages(
     estimator = config.estimator
     if config.register.backend == POSES:
         estimator = estimator.at_interval(clock[1], surface.extent)
-    limits = config.limits.widened(config.robot.radius_m)
+    limits = config.robot.limited(config.limits)
     supervision = config.supervisor.resolved(surface.extent)
     return Stages(
         registrar=registrar,

@@ -20,7 +20,7 @@ from avsreplay.monitor.faults import FaultParams
 from avsreplay.plan import Limits, PlanParams, RobotParams, SupervisorParams
 from avsreplay.register import RegisterParams
 from avsreplay.settings import Settings, setting
-from avsreplay.toml_document import Document, build, load, override
+from avsreplay.toml_document import Document, build, load, override, toml_value
 
 
 class Guess(Enum):
@@ -73,6 +73,11 @@ class RunConfig(Settings):
     fixture_axis_c: tuple[float, float, float] = setting(
         (1.0, 0.0, 0.0), "Unit vector of the fixture's outward axis in {C}, along which the robot approaches."
     )
+
+    @property
+    def robot_line(self) -> str:
+        """The assumed robot in one line."""
+        return self.robot.described(self.plan, self.limits)
 
     def check(self) -> None:
         """Raise ValueError for an invalid initial pose, or an axis that is not a unit vector."""
@@ -156,6 +161,28 @@ def load_config(file: Path | None, log_table: Mapping[str, Any], assignments: Se
     build(RunConfig, of_file)
     merged = Document(of_file.name, _over(log_table, of_file.table), of_file.text)
     return build(RunConfig, override(merged, assignments))
+
+
+@dataclass(frozen=True, slots=True)
+class RobotFile(Settings):
+    """A file that describes a robot."""
+
+    robot: RobotParams = setting(doc="The robot.")
+
+
+def robot_settings(file: Path) -> tuple[str, ...]:
+    """Return the assignments ``robot.key=value`` that a file states in its table ``[robot]``.
+
+    Args:
+        file: TOML file.
+
+    Raises:
+        UnreadableInput: The file cannot be read.
+        UsageError: A key or value is wrong; the message names file and line.
+    """
+    document = load(file)
+    build(RobotFile, document)
+    return tuple(f"robot.{key}={toml_value(value)}" for key, value in document.table["robot"].items())
 
 
 def _over(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:

@@ -217,8 +217,9 @@ class Replanning:
         """
         self.saved, self.supervisor, self.robot = saved, supervisor, robot or saved.robot
         self.params = self.robot.applied(params)
+        self.robot_line = self.robot.described(params, limits)
         self._radius = self.robot.radius_m
-        limits = limits.widened(self.robot.radius_m)
+        limits = self.robot.limited(limits)
         self.limits = limits.resolved(saved.extent_m)
         if saved.surface is not None:
             self._target = target_geometry(saved.surface, saved.axis_c, limits.clearance_m is not None)

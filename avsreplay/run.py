@@ -235,7 +235,8 @@ class Run:
         stamps = {"unset": clock.unset, "jumped": clock.jumps, "equal": clock.equal, "back": clock.back}
         counts |= {f"stamps_{name}": count for name, count in stamps.items()}
         found = replace(self._fold.result(self.truth), counts=counts)
-        return replace(found, acceleration=acceleration_text(self.config.estimator, self.acceleration))
+        text = acceleration_text(self.config.estimator, self.acceleration)
+        return replace(found, acceleration=text, robot=self.config.robot_line)
 
     def facts(self) -> dict[str, Any]:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""
@@ -248,6 +249,7 @@ class Run:
             "acceleration": None if self.acceleration is None else self.acceleration.record(),
             "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
             "selection": settings.dump(self.job.options),
+            "robot": self.config.robot_line,
             "config": settings.dump(self.config),
         }
 

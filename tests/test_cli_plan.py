@@ -156,7 +156,6 @@ def test_export_is_the_plan(result, tmp_path):
         (("--cone-deg", 120), "cone_deg is 120"),
         (("--horizon", 0), "horizon_s is 0"),
         (("--at", 500), "outside the result"),
-        (("--from", "1,2"), "not three numbers"),
         (("--every", 0), "not above 0"),
         (("--keepout", 3.0), "keepout_m is 3.0"),
         (("--clearance", 0.1), "contains no model"),

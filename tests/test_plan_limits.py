@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from avsreplay import replay
+from avsreplay import geometry, replay
 from avsreplay.build import target_geometry
 from avsreplay.plan import Limits, PlanParams, RobotParams, Scene, constrained, path_of
 from avsreplay.plan.limits import margins
@@ -68,12 +68,56 @@ def test_the_workspace_is_a_shell_about_the_base():
 def test_thrust_and_size_of_the_robot():
     robot = RobotParams(mass_kg=80.0, thrust_max_n=2.0, radius_m=0.15)
     assert robot.applied(PlanParams()).a_max_mps2 == pytest.approx(0.025)
-    assert Limits(final_deg=10.0, clearance_m=0.1).widened(0.15).clearance_m == pytest.approx(0.25)
-    assert Limits(final_deg=10.0).widened(0.15).clearance_m == pytest.approx(0.15)
-    assert Limits().widened(0.15) == Limits()
-    assert "80 kg, at most 0.025 m/s2, radius 0.15 m" in robot.described(PlanParams())
+    assert robot.limited(Limits(final_deg=10.0, clearance_m=0.1)).clearance_m == pytest.approx(0.25)
+    assert robot.limited(Limits(final_deg=10.0)).clearance_m == pytest.approx(0.15)
+    assert robot.limited(Limits()) == Limits()
+    assert "80 kg, at most 0.025 m/s2, attitude not planned, radius 0.15 m" in robot.described(PlanParams(), Limits())
     with pytest.raises(ValueError, match="together"):
         RobotParams(mass_kg=80.0)
+
+
+def test_a_robot_takes_precedence_over_plan_and_limits():
+    robot = RobotParams(
+        accel_axes_mps2=(0.04, 0.02, 0.03),
+        start_position_m=(1.0, 0.0, 0.0),
+        start_velocity_mps=(0.0, 0.1, 0.0),
+        base_position_m=(0.0, 2.0, 0.0),
+        reach_min_m=0.5,
+        reach_max_m=7.0,
+        delay_s=0.3,
+    )
+    params, limits = robot.applied(PlanParams()), robot.limited(Limits(reach_max_m=9.0, base_m=(5.0, 0.0, 0.0)))
+    assert (params.a_max_mps2, params.latency_s) == (0.02, 0.3)
+    assert (params.robot_position_m, params.robot_velocity_mps) == ((1.0, 0.0, 0.0), (0.0, 0.1, 0.0))
+    assert (limits.base_m, limits.reach_min_m, limits.reach_max_m) == ((0.0, 2.0, 0.0), 0.5, 7.0)
+    line = robot.described(PlanParams(), Limits())
+    for part in ("(0.04, 0.02, 0.03) m/s2 per axis", "from (1, 0, 0) m", "0.5 to 7 m from the base", "delay 0.3 s"):
+        assert part in line
+    assert RobotParams().applied(PlanParams()) == PlanParams()
+    with pytest.raises(ValueError, match="exclude"):
+        RobotParams(accel_max_mps2=0.1, accel_axes_mps2=(0.1, 0.1, 0.1))
+    with pytest.raises(ValueError, match="unit length"):
+        RobotParams(base_attitude_xyzw=(0.0, 0.0, 0.0, 2.0))
+    with pytest.raises(ValueError, match="reach_min_m"):
+        RobotParams(reach_min_m=2.0, reach_max_m=1.0)
+
+
+def test_bounds_per_axis_from_rest_to_rest_in_closed_form():
+    """Each axis is independent; the slowest one, 4 m at 0.02 m/s2, determines the time."""
+    half = math.radians(45.0)
+    turn = (0.0, 0.0, math.sin(half / 2.0), math.cos(half / 2.0))  # of the base about z
+    e = geometry.matrix(np.array(turn))
+    goal = e @ np.array([3.0, 4.0, 1.0])
+    scene = Scene(lambda t: (np.tile(goal, (len(t), 1)), np.zeros((len(t), 3))))
+    bounds = np.array([0.04, 0.02, 0.03])
+    limits = Limits(accel_axes_mps2=tuple(bounds), base_attitude_xyzw=turn, nodes=60)
+    plan = constrained(scene, np.zeros(3), np.zeros(3), PlanParams(a_max_mps2=0.02), limits)
+    exact = 2.0 * math.sqrt(4.0 / 0.02)
+    assert exact - 1e-6 <= plan.t_go_s <= exact + 0.01
+    assert plan.lower_bound_s <= exact
+    u = path_of(plan, np.zeros(3), np.zeros(3)).thrust(np.linspace(0.0, plan.t_go_s, 1001))
+    assert np.all(np.abs(u @ e) <= bounds)
+    assert plan.position_error_m < 1e-8
 
 
 def test_every_plan_of_a_run_obeys_the_limits():

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.setting_options import setting_option
+from avsreplay.cli.options import Numbers
+from avsreplay.cli.setting_options import robot_option, setting_option
 
 if TYPE_CHECKING:
     from avsreplay.outcome import Plan
@@ -22,6 +23,7 @@ Examples:
   avsreplay plan results/ --at 40 --a-max 0.02
   avsreplay plan results/ --cone-deg 30 --final-deg 8 --speed-max 0.4
   avsreplay plan results/ --final-deg 15 --clearance 0.1 --set supervisor.sigmas=2 --set robot.thrust_noise=0.02
+  avsreplay plan results/ --robot robot.toml
   avsreplay plan results/ --export plan.csv --json
 
 \b
@@ -36,7 +38,7 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
 @setting_option("--horizon", "horizon_s", type=float, owner=PLAN)
 @setting_option("--latency", "latency_s", type=float, owner=PLAN)
 @setting_option("--period", "replan_period_s", type=float, owner=PLAN)
-@setting_option("--from", "robot_position_m", metavar="X,Y,Z", owner=PLAN)
+@setting_option("--from", "robot_position_m", type=Numbers(3), metavar="X,Y,Z", owner=PLAN)
 @setting_option("--cone-deg", type=float, owner=LIMITS)
 @setting_option("--cone-range", "cone_range_m", type=float, owner=LIMITS)
 @setting_option("--final-deg", type=float, owner=LIMITS)
@@ -46,6 +48,7 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
 @setting_option("--keepout", "keepout_m", type=float, owner=LIMITS)
 @setting_option("--keepout-release", "keepout_release_m", type=float, owner=LIMITS)
 @setting_option("--clearance", "clearance_m", type=float, owner=LIMITS)
+@robot_option()
 @click.option(
     "--set",
     "assignments",
@@ -71,6 +74,7 @@ def command(
     samples: int,
     seed: int,
     every_s: float | None,
+    robot_file: Path | None,
     assignments: tuple[str, ...],
     extent_m: float | None,
     export: Path | None,
@@ -86,6 +90,7 @@ def command(
     Raises:
         UsageError: an option or setting is invalid, or --export has no plan.  UnreadableInput: RESULT cannot be read.
     """  # noqa: D301
+    from avsreplay.config import robot_settings
     from avsreplay.errors import UsageError
     from avsreplay.files import check_output
     from avsreplay.replan import load_saved, with_settings
@@ -95,7 +100,8 @@ def command(
             raise UsageError(f"{value} is not above 0", where=name, hint="give a finite number above 0")
     if export:
         check_output(export, overwrite=overwrite)
-    saved = with_settings(load_saved(result, extent_m), assignments)
+    of_robot = () if robot_file is None else robot_settings(robot_file)
+    saved = with_settings(load_saved(result, extent_m), (*of_robot, *assignments))
     for line in saved.warnings:
         click.echo(f"avsreplay: warning: {line}", err=True)
     planning = _planning(saved, flags)
@@ -131,25 +137,11 @@ def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
     from avsreplay.replan import Replanning
 
     given = {name: value for name, value in flags.items() if value is not None}
-    if "robot_position_m" in given:
-        given["robot_position_m"] = _point(given["robot_position_m"])
     of_plan = {f.name for f in fields(PlanParams)}
     params: PlanParams = _usable(lambda: replace(saved.plan, **{k: v for k, v in given.items() if k in of_plan}))
     changed = {k: v for k, v in given.items() if k not in of_plan}
     limits: Limits = _usable(lambda: replace(saved.limits, **changed))
     return Replanning(saved, params, limits, saved.supervisor)
-
-
-def _point(text: str) -> tuple[float, ...]:
-    from avsreplay.errors import UsageError
-
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
-    if len(values) != 3:
-        raise UsageError(f"'{text}' is not three numbers", where="--from", hint="for example --from 0,0,1.5")
-    return values
 
 
 def _document(
@@ -172,6 +164,7 @@ def _document(
         "limits": settings.dump(planning.limits),
         "params": settings.dump(planning.params),
         "robot": settings.dump(planning.robot),
+        "robot_line": planning.robot_line,
         "tolerance": settings.dump(planning.tolerance),
         "spread": settings.dump(spread) if spread else None,
         "hindsight": [
@@ -236,7 +229,7 @@ def _print(
 
 
 def _plan_facts(planning: Replanning, at_s: float, made: Plan, spread: Spread | None) -> list[tuple[str, str]]:
-    facts = [("robot", planning.robot.described(planning.params)), ("status", _status(made))]
+    facts = [("robot", planning.robot_line), ("status", _status(made))]
     if made.found:
         facts += [
             ("capture", f"at {at_s + made.t_go_s:.3f} s, {made.t_go_s:.4f} s after planning"),

@@ -94,6 +94,12 @@ def _variable(name: str) -> str:
     return f"AVSREPLAY_RUN_{name.upper()}"
 
 
+def robot_option(**more: Any) -> Callable[[F], F]:
+    """Decorator: the option for a robot file."""
+    file = click.Path(path_type=Path)
+    return click.option("--robot", "robot_file", type=file, help="TOML file with a table [robot].", **more)
+
+
 def run_settings(command: F) -> F:
     """Add the settings of a run to a command: one option each for the frequent ones, ``--config`` and ``--set``."""
     options = [
@@ -112,6 +118,7 @@ def run_settings(command: F) -> F:
             envvar=_variable("config"),
             help="TOML file as 'avsreplay config' prints.",
         ),
+        robot_option(envvar=_variable("robot")),
         click.option(
             "--set",
             "assignments",
@@ -137,6 +144,11 @@ def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ..
     def put(name: str, assignments: list[str]) -> None:
         by_source[context.get_parameter_source(name) is ParameterSource.COMMANDLINE].extend(assignments)
 
+    robot_file = flags.pop("robot_file")
+    if robot_file is not None:
+        from avsreplay.config import robot_settings
+
+        put("robot_file", list(robot_settings(robot_file)))
     put("assignments", list(flags.pop("assignments")))
     put("no_deskew", ["deskew=false"] if flags.pop("no_deskew") else [])
     for name, key in ASSIGNED.items():

@@ -3,9 +3,10 @@
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.evaluation import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
-from avsreplay.plan.limits import Limits, Scene, TargetGeometry, hull_vertices
+from avsreplay.plan.limits import Scene, TargetGeometry, hull_vertices
 from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of
-from avsreplay.plan.rendezvous import PlanParams, RobotParams, rendezvous
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.robot import Limits, RobotParams
 from avsreplay.plan.supervisor import (
     RULES,
     Action,

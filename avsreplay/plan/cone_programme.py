@@ -55,6 +55,7 @@ class Subproblem:
         weight: Cost of the slack, in relative end time per length scale.
         speed: Bound on the speed.
         contact: Bound on |u - acceleration| in the last interval.
+        axes: (3, 3) rows e with |e.u| <= 1; None without bounds per axis.
         planes: Rows that must be at least 0.
         cones: Rows in groups of ``size``; in each group the first row bounds the norm of the others.
     """
@@ -71,6 +72,7 @@ class Subproblem:
     weight: float = 1000.0
     speed: float | None = None
     contact: float | None = None
+    axes: Array | None = None
     planes: tuple[PointRows, ...] = ()
     cones: tuple[tuple[int, PointRows], ...] = ()
 
@@ -118,7 +120,7 @@ def solve(p: Subproblem) -> Solution | None:
     _dynamics(rows, p, scale)
     cones = [clarabel.ZeroConeT(rows.count)]
     start = rows.count
-    _bounds(rows, p)
+    _bounds(rows, p, scale)
     for plane in p.planes:
         _point_rows(rows, p, plane, scale)
     cones.append(clarabel.NonnegativeConeT(rows.count - start))
@@ -174,11 +176,18 @@ def _dynamics(rows: _Rows, p: Subproblem, scale: float) -> None:
     rows.close(np.zeros(3))
 
 
-def _bounds(rows: _Rows, p: Subproblem) -> None:
-    """1 - change <= h/h_ref <= 1 + change and slack >= 0."""
+def _bounds(rows: _Rows, p: Subproblem, scale: float) -> None:
+    """1 - change <= h/h_ref <= 1 + change, slack >= 0, and |e.w| <= h^2 (tangent) for bounds per axis."""
     rows.put(np.array([0, 1]), 9 * p.n + 6, np.array([-1.0, 1.0]))
     rows.put(np.array([2]), 9 * p.n + 7, -1.0)
     rows.close(np.array([p.change - 1.0, 1.0 + p.change, 0.0]))
+    if p.axes is not None:
+        both, n, bound = np.concatenate([p.axes, -p.axes]), p.n, p.h**2 / scale
+        row = np.arange(6 * n)
+        for c in range(3):
+            rows.put(row, 6 * (n + 1) + 3 * (row // 6) + c, both[row % 6, c])
+        rows.put(row, 9 * n + 6, -2.0 * bound)
+        rows.close(np.full(6 * n, -bound))
 
 
 def _norms(rows: _Rows, p: Subproblem, scale: float) -> int:

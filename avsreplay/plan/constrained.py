@@ -28,13 +28,15 @@ from avsreplay.plan.convexification import (
     excess,
     initial_references,
     interval_fractions,
+    largest_acceleration,
     shortened,
     turn_rate,
     warm_reference,
 )
-from avsreplay.plan.limits import CONSTRAINTS, Limits, SampledScene, Scene
+from avsreplay.plan.limits import CONSTRAINTS, SampledScene, Scene
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.robot import Limits
 
 ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
@@ -77,7 +79,8 @@ def constrained(
     """
     limits = limits.resolved(extent_m)
     scene.check(limits)
-    free = rendezvous(scene.goal, r0, v0, params, t_ns)
+    strongest = replace(params, a_max_mps2=largest_acceleration(limits, params))
+    free = rendezvous(scene.goal, r0, v0, strongest, t_ns)
     if not free.found or not limits.any or free.t_go_s <= params.latency_s:
         return free
     free = _necessary(scene, free, np.asarray(r0, float), params, limits)
@@ -136,6 +139,8 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
     """Return the plan without constraints where it satisfies all of them; None where it does not."""
     path, limits = path_of(free, case.r0, case.v0), case.limits
     times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * limits.nodes + 1)
+    if not _within_axes(case, path.thrust(times)):
+        return None
     if limits.speed_max_mps is not None:
         speed = np.linalg.norm(path.at(times)[1], axis=1)
         if speed.max() > limits.speed_max_mps:
@@ -283,8 +288,14 @@ def _trust(case: Case, reference: ReferencePath) -> float:
 def _feasible(case: Case, path: StepPath, over: Array, allowed: float) -> bool:
     position, velocity = path.terminal_errors(case.scene.goal)
     short = path.t_go_s <= case.params.horizon_s
-    exact = position <= 1e-8 and velocity <= 1e-8 and path.u_max() <= case.params.a_max_mps2
+    exact = position <= 1e-8 and velocity <= 1e-8 and path.u_max() <= case.a_max and _within_axes(case, path.u)
     return bool(short and exact and over.max() <= allowed)
+
+
+def _within_axes(case: Case, u: Array) -> bool:
+    """Return whether accelerations (n, 3) in {A} are within the bounds of every axis of the base."""
+    bounds = case.limits.accel_axes_mps2
+    return bounds is None or bool(np.all(np.abs(u @ case.limits.base_axes) <= bounds))
 
 
 def _exact_end(case: Case, path: StepPath) -> StepPath:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
-from avsreplay.plan.limits import CONSTRAINTS, Limits, Margins, SampledScene, Scene, margins
+from avsreplay.plan.limits import CONSTRAINTS, Margins, SampledScene, Scene, margins
 from avsreplay.plan.path import RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams
+from avsreplay.plan.robot import Limits
 
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
 THRUST_SHARE = 1.0 - 1e-5  # share of a_max used by the programme; the rest corrects the terminal errors
@@ -42,6 +43,17 @@ class Case:
         return self.params.latency_s
 
     @property
+    def a_max(self) -> float:
+        """Largest acceleration in any direction [m/s2]."""
+        return largest_acceleration(self.limits, self.params)
+
+    @property
+    def axes(self) -> Array | None:
+        """Rows (3, 3) whose product with the acceleration in {A} lies within 1 in each component; None without."""
+        bounds = self.limits.accel_axes_mps2
+        return None if bounds is None else self.limits.base_axes.T / (THRUST_SHARE * np.array(bounds))[:, None]
+
+    @property
     def scene(self) -> Scene:
         """The target."""
         return self.sampled.scene
@@ -53,6 +65,12 @@ class ReferencePath:
 
     t: float
     r: Array
+
+
+def largest_acceleration(limits: Limits, params: PlanParams) -> float:
+    """Return the largest acceleration in any direction [m/s2]: the corner of the box where each axis is bounded."""
+    bounds = limits.accel_axes_mps2
+    return params.a_max_mps2 if bounds is None else math.hypot(*bounds)
 
 
 def interval_fractions(n: int) -> Array:
@@ -106,10 +124,11 @@ def convex_subproblem(case: Case, reference: ReferencePath, off: Array, change: 
         rho=rho[0],
         rate=rate[0],
         acceleration=(rate[0] - rate[1]) / 1e-4,
-        a_max=case.params.a_max_mps2 * THRUST_SHARE,
+        a_max=case.a_max * THRUST_SHARE,
         change=change,
         speed=case.limits.speed_max_mps,
         contact=case.limits.contact_accel_mps2,
+        axes=case.axes,
     )
     if not case.limits.geometric:
         return problem

@@ -15,9 +15,10 @@ import numpy as np
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.constrained import constrained
-from avsreplay.plan.limits import Limits, Scene, margin
+from avsreplay.plan.limits import Scene, margin
 from avsreplay.plan.path import RobotPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.robot import Limits
 from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
 from avsreplay.records import Forecast
 

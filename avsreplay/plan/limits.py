@@ -15,85 +15,10 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
+from avsreplay.plan.robot import Limits
 from avsreplay.records import Trajectory
-from avsreplay.settings import Settings, setting
 
 CONSTRAINTS = ("cone", "corridor", "sphere", "body", "workspace")  # in the order of the columns of ``margins``
-
-
-@dataclass(frozen=True, slots=True)
-class Limits(Settings):
-    """Constraints of a plan besides thrust; one that is not set is switched off, unless it scales with the target."""
-
-    cone_deg: float | None = setting(
-        None, "Half-angle of the approach cone at the grasp point.", unit="deg", above=0.0, below=90.0
-    )
-    cone_range_m: float | None = setting(
-        None, "Distance to the grasp point within which the cone holds.", unit="m", above=0.0, of_extent=0.25
-    )
-    final_deg: float | None = setting(
-        None,
-        "Half-angle of the cone along the fixture's axis in the final approach.",
-        unit="deg",
-        above=0.0,
-        below=90.0,
-    )
-    final_range_m: float | None = setting(None, "Length of the final approach.", unit="m", above=0.0, of_extent=0.06)
-    mouth_m: float | None = setting(
-        None, "Radius of both cones at the grasp point.", unit="m", above=0.0, of_extent=0.00125
-    )
-    speed_max_mps: float | None = setting(None, "Largest speed of the robot in {A}.", unit="m/s", above=0.0)
-    contact_accel_mps2: float | None = setting(
-        None, "Largest acceleration relative to the grasp point at contact.", unit="m/s2", above=0.0
-    )
-    keepout_m: float | None = setting(None, "Radius of the keep-out sphere about the mass centre.", unit="m", above=0.0)
-    keepout_release_m: float | None = setting(
-        None,
-        "Distance to the grasp point within which the keep-out sphere does not hold.",
-        unit="m",
-        above=0.0,
-        of_extent=0.06,
-    )
-    clearance_m: float | None = setting(
-        None,
-        "Smallest distance of the end-effector's centre to the target's surface outside the final approach cone.",
-        unit="m",
-        above=0.0,
-    )
-    clearance_sigmas: float = setting(
-        3.0, "Predicted standard deviations of the surface's position added to the clearance.", low=0.0
-    )
-    base_m: tuple[float, float, float] = setting(
-        (0.0, 0.0, 0.0), "Position of the robot's base in {A}, the centre of its workspace.", unit="m"
-    )
-    reach_max_m: float | None = setting(
-        None, "Largest distance of the end-effector from the base.", unit="m", above=0.0
-    )
-    reach_min_m: float | None = setting(
-        None, "Smallest distance of the end-effector from the base.", unit="m", above=0.0
-    )
-    nodes: int = setting(40, "Thrust intervals of a constrained plan.", low=8)
-
-    def widened(self, radius_m: float) -> Limits:
-        """Return the limits for an end-effector of a given size.
-
-        Args:
-            radius_m: Its radius [m], added to the clearance; without clearance and corridor the limits do not change.
-        """
-        if radius_m <= 0.0 or (self.clearance_m is None and self.final_deg is None):
-            return self
-        return replace(self, clearance_m=(self.clearance_m or 0.0) + radius_m)
-
-    @property
-    def any(self) -> bool:
-        """Whether there is a constraint besides the thrust."""
-        return self.geometric or self.speed_max_mps is not None or self.contact_accel_mps2 is not None
-
-    @property
-    def geometric(self) -> bool:
-        """Whether there is a constraint on the position relative to the target."""
-        named = (self.cone_deg, self.final_deg, self.keepout_m, self.clearance_m, self.reach_max_m, self.reach_min_m)
-        return any(value is not None for value in named)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -54,52 +54,6 @@ class PlanParams(Settings):
             raise ValueError(f"latency_s is {self.latency_s}, must be below horizon_s = {self.horizon_s}")
 
 
-@dataclass(frozen=True, slots=True)
-class RobotParams(Settings):
-    """The robot that carries the end-effector; its thrust and size take precedence over the planner's settings."""
-
-    name: str = setting("point", "Name of the robot, printed with every plan.")
-    mass_kg: float | None = setting(None, "Mass.", unit="kg", above=0.0)
-    thrust_max_n: float | None = setting(
-        None, "Largest thrust; divided by the mass it replaces plan.a_max_mps2.", unit="N", above=0.0
-    )
-    radius_m: float = setting(
-        0.0, "Radius of the end-effector, added to limits.clearance_m; alone it is the clearance.", unit="m", low=0.0
-    )
-    thrust_noise: float = setting(
-        0.0, "1 sigma of the thrust error of each axis, as a fraction of the largest thrust, over 1 s.", low=0.0
-    )
-
-    def check(self) -> None:
-        """Raise ValueError where only one of mass and thrust is given."""
-        if (self.mass_kg is None) != (self.thrust_max_n is None):
-            raise ValueError("mass_kg and thrust_max_n must be given together")
-
-    def applied(self, params: PlanParams) -> PlanParams:
-        """Return the planner's parameters with the acceleration that thrust and mass allow.
-
-        Args:
-            params: The planner's parameters; returned unchanged where the robot has no mass and thrust.
-        """
-        if self.mass_kg is None or self.thrust_max_n is None:
-            return params
-        return replace(params, a_max_mps2=self.thrust_max_n / self.mass_kg)
-
-    def described(self, params: PlanParams) -> str:
-        """Return the assumed robot in one line.
-
-        Args:
-            params: The planner's parameters, for the position of the robot, the latency and the acceleration.
-        """
-        a_max = self.applied(params).a_max_mps2
-        mass = "" if self.mass_kg is None else f", {self.mass_kg:g} kg"
-        at = ", ".join(f"{x:g}" for x in params.robot_position_m)
-        return (
-            f"{self.name}{mass}, at most {a_max:g} m/s2, radius {self.radius_m:g} m, from ({at}) m in {{A}}, "
-            f"delay {params.latency_s:g} s, thrust noise {self.thrust_noise:g}"
-        )
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class _Search:
     """End of the certified steps: no capture before ``t``; if ``reached``, a capture at ``t`` to rounding."""

@@ -16,8 +16,9 @@ from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.evaluation import Tolerance
-from avsreplay.plan.limits import Limits, Scene, margins
+from avsreplay.plan.limits import Scene, margins
 from avsreplay.plan.path import RobotPath
+from avsreplay.plan.robot import Limits
 
 CONTACT_INSTANTS = 401  # instants of a plan at which contact is checked
 

@@ -73,6 +73,7 @@ class Summary:
         weighed_down: healthy poses with a Cauchy weight below 1.  reinitialised: reinitialisations of the estimate.
         coasts: intervals of prediction without measurement.  interval_s: median between scans.
         gaps: intervals between scans longer than 1.5 times the median.
+        robot: the assumed robot in one line, "" where it is not known.
     """
 
     scans: int
@@ -108,6 +109,7 @@ class Summary:
     capture: Capture
     counts: Mapping[str, int] = field(default_factory=dict)
     acceleration: str | None = None
+    robot: str = ""
 
     @classmethod
     def fold(

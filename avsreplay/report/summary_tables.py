@@ -246,6 +246,8 @@ def _plan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
         spread = f"std {capture.std_s:.3f} s, range {capture.range_s:.3f} s"
         yield "capture", f"planned at {capture.last_s:.2f} s; {spread} over {capture.replans} plans"
     yield from _flight_facts(capture)
+    if summary.robot:
+        yield "robot", summary.robot
 
 
 def _flight_facts(capture: Capture) -> Iterable[tuple[str, str]]:
@@ -257,7 +259,7 @@ def _flight_facts(capture: Capture) -> Iterable[tuple[str, str]]:
         turn = "" if capture.miss.rotation_deg is None else f", {capture.miss.rotation_deg:.3g} deg"
         yield "gripper", f"closed {_mm(capture.miss.position_m)}{speed}{turn} from the true grasp point"
     if capture.actions:
-        yield "robot", ", ".join(f"{action} {count} scans" for action, count in capture.actions.items())
+        yield "actions", ", ".join(f"{action} {count} scans" for action, count in capture.actions.items())
 
 
 def _mm(metres: float) -> str:
