@@ -134,6 +134,12 @@ def test_settings_of_supervisor_and_robot_can_be_changed(result):
     assert strict["execution"]["outcome"] != "captured"
 
 
+def test_a_start_of_two_numbers_is_refused(result):
+    done = run(result, "--from", "1,2")
+    assert done.exit_code == 2
+    assert "'1,2' is not 3 numbers" in done.output
+
+
 def test_export_is_the_plan(result, tmp_path):
     path = tmp_path / "plan.csv"
     assert run(result, "--samples", 2, "--every", 99, "--export", path).exit_code == 0
