@@ -69,9 +69,9 @@ class AnomalyTest:
         if track.bias is not None and self._still_biased(track.bias, epoch.innovation):
             return replace(track, belief=epoch.prediction.belief), Verdict(0, Reason.SENSOR_BIAS)
         track = replace(track, belief=epoch.prediction.belief, doubtful=(*track.doubtful, epoch), bias=None)
-        if len(track.doubtful) < _FEWEST or not track.recent:
+        if len(track.doubtful) < (_FEWEST if track.recent else _MOST):
             return track, Verdict(0, Reason.DOUBTFUL)
-        return self._decided(track)
+        return self._decided(track) if track.recent else self._by_agreement(track)
 
     def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:
         """A scan that agrees with the prediction: the doubtful scans before it were bad."""
@@ -98,9 +98,14 @@ class AnomalyTest:
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and established:
             return replace(track, doubtful=(), bias=SensorBias(best.size, best.P)), Verdict(0, Reason.SENSOR_BIAS)
         if best.hypothesis is not Hypothesis.FROZEN or not explained:
-            anew = self._initialised_anew(track)
-            if anew is not None:
-                return anew, Verdict(1, Reason.OK)
+            return self._by_agreement(track)
+        return replace(track, doubtful=()), Verdict(0, Reason.POSE_JUMP)
+
+    def _by_agreement(self, track: Track) -> tuple[Track, Verdict]:
+        """The track initialised anew from the doubtful poses if they agree with one another; else they are bad."""
+        anew = self._initialised_anew(track)
+        if anew is not None:
+            return anew, Verdict(1, Reason.OK)
         return replace(track, doubtful=()), Verdict(0, Reason.POSE_JUMP)
 
     def _still_biased(self, bias: SensorBias, innovation: Innovation) -> bool:
@@ -118,12 +123,15 @@ class AnomalyTest:
 
     def _manoeuvred(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
         """Rate and velocity fitted anew from the manoeuvre on; everything else is continuous."""
-        before = window[0].track
-        t_ns = before.belief.t_ns + round(best.after_s * 1e9)
-        at, _ = propagate(before.belief, t_ns, self.params.torque_noise_radps15, self.params.force)
-        P = at.P.copy()
-        P[W, W] += self._priors.rate_radps**2 * np.eye(3)
-        P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
+        at = window[0].track.belief
+        start_ns, t_ns = at.t_ns, _last_change_ns(window, best)
+        for after_s in best.changes_s:
+            then_ns = start_ns + round(after_s * 1e9)
+            at, _ = propagate(at, then_ns, self.params.torque_noise_radps15, self.params.force)
+            P = at.P.copy()
+            P[W, W] += self._priors.rate_radps**2 * np.eye(3)
+            P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
+            at = replace(at, P=P)
         chart = to_chart(at.x)
         T = to_errors(chart)
         half = np.linalg.solve(T, P)
@@ -132,7 +140,8 @@ class AnomalyTest:
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
         now_ns = window[-1].prediction.belief.t_ns
-        found = Manoeuvre(t_ns, best.after_1s_s, best.size[3:], best.size[:3], best.P, now_ns)
+        middle_ns = start_ns + round(best.after_s * 1e9)
+        found = Manoeuvre(middle_ns, best.after_1s_s, best.size[3:], best.size[:3], best.P, now_ns)
         return replace(
             track,
             belief=result.belief,
@@ -164,8 +173,15 @@ class AnomalyTest:
         return BatchResult(t_ns, fitted.chart, len(fixes), plain, inflation, moments(components), True, components)
 
     def _initialised_anew(self, track: Track) -> Track | None:
-        """A new track from the doubtful poses alone, if they agree with one another through free motion."""
-        epochs = track.doubtful
+        """A new track from the doubtful poses alone, all or the last of them, that agree through free motion."""
+        for first in range(max(1, len(track.doubtful) - _FEWEST)):
+            anew = self._from_poses(track, track.doubtful[first:])
+            if anew is not None:
+                return anew
+        return None
+
+    def _from_poses(self, track: Track, epochs: tuple[Epoch, ...]) -> Track | None:
+        """A new track from some poses; None where they contradict one another."""
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in epochs)
         poses = poses_of(fixes)
         fitted = fit(poses, to_chart(rough_state(fixes)), weak_prior(poses, self.params), FitParams(rescale=False))
@@ -180,8 +196,13 @@ class AnomalyTest:
 
 def _after(window: tuple[Epoch, ...], found: Explanation) -> int:
     """Number of scans of the window after a manoeuvre."""
-    t_ns = window[0].track.belief.t_ns + round(found.after_s * 1e9)
+    t_ns = _last_change_ns(window, found)
     return sum(e.prediction.belief.t_ns > t_ns for e in window)
+
+
+def _last_change_ns(window: tuple[Epoch, ...], found: Explanation) -> int:
+    """Instant at which a manoeuvre ends [ns]."""
+    return window[0].track.belief.t_ns + round(found.changes_s[-1] * 1e9)
 
 
 def _nis_scale(track: Track) -> float:

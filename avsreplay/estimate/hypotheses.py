@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
@@ -27,6 +27,8 @@ from avsreplay.records import Belief
 _PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _PER_BAD_SCAN = math.log(1e-2)
 _INSTANTS = 8  # number of instants tried for a manoeuvre between two scans
+_TWO = (1, 6)  # of these instants, those of the two changes in each interval over which a long manoeuvre extends
+_SPREAD = (0.7, 0.1, 0.1, 0.1)  # prior share of manoeuvres at one instant, and over one, two and three intervals
 _ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
 
 
@@ -60,6 +62,7 @@ class Explanation:
         onset: index of the first affected scan.
         after_s: instant of a manoeuvre after the first scan's prior belief [s], with its standard deviation.
         size, P: (6,) (rate, velocity) of a manoeuvre or the offset of a sensor bias, with its covariance (6, 6).
+        changes_s: the instants at which a manoeuvre changes the velocity: one, or two in each interval of a long one.
     """
 
     hypothesis: Hypothesis
@@ -71,6 +74,7 @@ class Explanation:
     after_1s_s: float = 0.0
     size: Array = field(default_factory=lambda: _ZERO)
     P: Array = field(default_factory=lambda: _NO_COVARIANCE)
+    changes_s: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,32 +195,77 @@ def _evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float,
 def _manoeuvre(
     window: _Window, start: Belief, root: Array, white: Array, free: float, priors: ChangePriors, n: int
 ) -> Explanation:
-    """A change of rate and velocity at the most likely of several instants, all marginalised for the evidence."""
-    scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)
+    """A change of rate and velocity: at one instant, or spread over one to three intervals between scans.
+
+    A thrust or an impact that is not instantaneous is a sum of changes, two in each interval, so that both the velocity
+    and the pose at the end of the interval are free. All instants are marginalised for the evidence; the explanation is
+    the most likely.
+    """
     edges = np.concatenate([[0.0], window.times_s[: n - 1]])
-    instants = (edges[:, None] + np.diff(np.append(edges, window.times_s[-1]))[:, None] * _fractions()).reshape(-1)
-    found = []
-    for tau in instants:
-        _, Phi = propagate_state(start.x, float(tau))
-        columns = np.linalg.inv(Phi)[:, [*range(W.start, W.stop), *range(VEL.start, VEL.stop)]]
-        M = (window.rows @ columns) * (window.times_s > tau)[:, None, None]
-        whitened = np.asarray(np.linalg.solve(root, M.reshape(-1, 6)), dtype=np.float64)
-        value, u, P = _evidence(white, free, whitened, scale)
-        left = white - whitened @ u
-        found.append((value, u, P, float(left @ left)))
-    values = np.array([f[0] for f in found])
-    best = int(np.argmax(values))
-    weight = np.exp(values - values[best])
-    evidence = float(values[best] + np.log(weight.mean()))
-    mean = float(weight @ instants / weight.sum())
-    spread = math.sqrt(max(float(weight @ (instants - mean) ** 2 / weight.sum()), 0.0))
-    step = float(np.diff(np.append(edges, window.times_s[-1])).max()) / _INSTANTS
-    spread = math.hypot(spread, step / math.sqrt(12.0))
-    onset = int(np.searchsorted(window.times_s, instants[best], side="right"))
-    _, u, P, chi2 = found[best]
+    lengths = np.diff(np.append(edges, window.times_s[-1]))
+    instants = (edges[:, None] + lengths[:, None] * _fractions()).reshape(-1)
+    columns = [_after_change(window, start, root, float(tau)) for tau in instants]
+    pairs = (_INSTANTS * np.arange(n)[:, None] + np.array(_TWO)).reshape(-1)
+    choices = [[[k] for k in range(len(instants))]]
+    choices += [[pairs[2 * k : 2 * (k + m)].tolist() for k in range(n + 1 - m)] for m in range(1, len(_SPREAD))]
+    kinds = [
+        [_changes(instants[k], [columns[j] for j in k], white, free, priors) for k in chosen] for chosen in choices
+    ]
+    evidence = [_log_mean([f.log_evidence for f in found]) for found in kinds]
+    total = _log_sum([math.log(share) + value for share, value in zip(_SPREAD, evidence, strict=True)])
+    best = max((f for found in kinds for f in found), key=lambda f: f.log_evidence)
+    single = [f.log_evidence for f in kinds[0]]
+    weight = np.exp(np.array(single) - max(single))
+    after_s, step = best.after_s, float(lengths.max())
+    spread = math.hypot(best.after_1s_s, step / math.sqrt(12.0))
+    if len(best.changes_s) == 1:
+        after_s = float(weight @ instants / weight.sum())
+        variance = float(weight @ (instants - after_s) ** 2 / weight.sum())
+        spread = math.hypot(math.sqrt(max(variance, 0.0)), step / _INSTANTS / math.sqrt(12.0))
+    onset = int(np.searchsorted(window.times_s, best.changes_s[0], side="right"))
+    value = total + _PRIOR_ODDS
+    return replace(best, log_evidence=value, onset=onset, after_s=after_s, after_1s_s=spread)
+
+
+def _after_change(window: _Window, start: Belief, root: Array, tau: float) -> Array:
+    """Derivative (6n, 6) of the whitened innovations by a change of (rate, velocity) at an instant [s]."""
+    _, Phi = propagate_state(start.x, tau)
+    columns = np.linalg.inv(Phi)[:, [*range(W.start, W.stop), *range(VEL.start, VEL.stop)]]
+    M = (window.rows @ columns) * (window.times_s > tau)[:, None, None]
+    return np.asarray(np.linalg.solve(root, M.reshape(-1, 6)), dtype=np.float64)
+
+
+def _changes(instants: Array, columns: list[Array], white: Array, free: float, priors: ChangePriors) -> Explanation:
+    """Changes at given instants; size and P are those of their sum, ``after_s`` their mean weighted by size."""
+    m, scale = len(columns), np.repeat([priors.rate_radps, priors.velocity_mps], 3)
+    M = np.hstack(columns)
+    value, u, P = _evidence(white, free, M, np.tile(scale, m))
+    left = white - M @ u
+    joined = np.tile(np.eye(6), m)
+    share = np.linalg.norm(u.reshape(m, 6) / scale, axis=1)
+    share = share / max(float(share.sum()), 1e-300)
+    after_s = float(share @ instants)
     return Explanation(
-        Hypothesis.MANOEUVRE, evidence + _PRIOR_ODDS, chi2, 6 * n - 6, onset, float(instants[best]), spread, u, P
+        Hypothesis.MANOEUVRE,
+        value,
+        float(left @ left),
+        len(white) - 6 * m,
+        0,
+        after_s,
+        math.sqrt(float(share @ (instants - after_s) ** 2)),
+        joined @ u,
+        joined @ P @ joined.T,
+        tuple(instants.tolist()),
     )
+
+
+def _log_sum(values: Sequence[float]) -> float:
+    top = max(values)
+    return top + math.log(sum(math.exp(v - top) for v in values))
+
+
+def _log_mean(values: Sequence[float]) -> float:
+    return _log_sum(values) - math.log(len(values))
 
 
 def _fractions() -> Array:
