@@ -13,22 +13,15 @@ import argparse
 import contextlib
 import io
 import json
-import multiprocessing
-import os
-import resource
 import shutil
-import signal
 import tempfile
-import time
-import traceback
 import warnings
-from collections import Counter
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 import click
 import numpy as np
 from fuzz_inputs import mutate
+from fuzz_workers import Campaign, Check, report, run_campaign
 
 from avsreplay.cli import SUMMARIES, group
 from avsreplay.errors import AvsError
@@ -108,10 +101,6 @@ SEEDS: dict[str, tuple[str, ...]] = {
     "result": ("result",), "results": ("result",), "gate": ("rules.toml",), "campaign": ("campaign.toml",),
     "output": ("sweep",),
 }  # fmt: skip
-
-
-class Hang(BaseException):
-    """Raised by the alarm: no handler of the package may catch it."""
 
 
 def listed() -> list[tuple[str, str]]:
@@ -234,73 +223,14 @@ def _line(text: str) -> str:
     return text + "\n"
 
 
-def work(campaign: int, numbers: list[int], pipe: Connection, seeds: Path, cases: list[tuple[str, str]]) -> None:
-    """A worker process: announces each mutation and its outcome."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    signal.signal(signal.SIGALRM, _alarm)
-    signal.signal(signal.SIGPROF, _alarm)
-    for number in numbers:
-        rng = np.random.default_rng([campaign, number])
-        case = cases[number % len(cases)]
-        pipe.send(("begin", number, " ".join(case)))
-        with tempfile.TemporaryDirectory() as root:
-            place = Path(root) / "work"
-            place.mkdir()
-            os.chdir(place)
-            signal.alarm(20 * LIMIT_S)  # on a loaded machine the processor time counts
-            signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
-            try:
-                found = check(case, seeds, place, rng)
-            except (Exception, Hang):
-                found = "FINDING\n" + traceback.format_exc()
-            signal.alarm(0)
-            signal.setitimer(signal.ITIMER_PROF, 0)
-            if [p.name for p in Path(root).iterdir()] != ["work"]:
-                found = "FINDING a file was written outside"
-            os.chdir("/")
-        pipe.send(("end", number, found))
-    pipe.send(("peak", 0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024))
-    pipe.close()
+def campaign(number: int, inputs: list[int], seeds: Path, cases: list[tuple[str, str]], batch: int = 200) -> Campaign:
+    """Run the mutations of a campaign in batches."""
 
+    def task(at: int) -> tuple[str, Check]:
+        rng, which = np.random.default_rng([number, at]), cases[at % len(cases)]
+        return " ".join(which), lambda folder: check(which, seeds, folder, rng)
 
-def _alarm(_signal: int, _frame: object) -> None:
-    raise Hang
-
-
-def campaign(
-    number: int, inputs: list[int], seeds: Path, cases: list[tuple[str, str]], batch: int = 200
-) -> tuple[Counter[str], list[dict[str, object]], int]:
-    """Run the mutations in batches, each in its own process; outcomes, findings and the largest process in MiB."""
-    tally: Counter[str] = Counter()
-    findings: list[dict[str, object]] = []
-    peak, queue = 0, [inputs[i : i + batch] for i in range(0, len(inputs), batch)]
-    while queue:
-        todo = queue.pop(0)
-        here, there = multiprocessing.Pipe(False)
-        process = multiprocessing.get_context("fork").Process(target=work, args=(number, todo, there, seeds, cases))
-        process.start()
-        there.close()
-        last: tuple[int, str] | None = None
-        while True:
-            try:
-                what, at, value = here.recv()
-            except EOFError:
-                break
-            if what == "begin":
-                last = (at, str(value))
-            elif what == "peak":
-                peak = max(peak, int(value))
-            else:
-                bad = str(value).startswith("FINDING")
-                tally["finding" if bad else str(value)] += 1
-                findings += [{"input": at, "case": last[1] if last else "", "what": value}] if bad else []
-                last = None
-        process.join()
-        if last is not None:
-            tally["finding"] += 1
-            findings.append({"input": last[0], "case": last[1], "what": f"crash, exit code {process.exitcode}"})
-            queue.insert(0, todo[todo.index(last[0]) + 1 :])
-    return tally, findings, peak
+    return run_campaign(inputs, task, LIMIT_S, LIMIT_MIB, batch)
 
 
 def main() -> int:
@@ -316,19 +246,9 @@ def main() -> int:
     cases = [case for case in listed() if case[0] in asked.commands]
     count = 500 if asked.quick else asked.inputs
     inputs = [asked.only] if asked.only is not None else list(range(asked.first, asked.first + count))
-    start = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
         build(Path(folder))
-        tally, findings, peak = campaign(asked.campaign, inputs, Path(folder), cases)
-    if peak > LIMIT_MIB:
-        findings.append({"what": f"a process of {peak} MiB, over {LIMIT_MIB}"})
-    spent = time.process_time() - start + resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-    result = {"campaign": asked.campaign, "inputs": len(inputs), "cases": len(cases),
-              "outcomes": dict(sorted(tally.items())),
-              "largest_process_mib": peak, "processor_s": round(spent, 1), "findings": findings[:40],
-              "count_of_findings": len(findings)}  # fmt: skip
-    print(json.dumps(result, indent=1))
-    return 1 if findings else 0
+        return report(asked.campaign, len(inputs), campaign(asked.campaign, inputs, Path(folder), cases))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Seeds and mutations for the fuzz campaigns of the door: input i of a campaign is told by (campaign, i) alone."""
+"""Seeds and mutations of the fuzz campaigns: input i of a campaign depends only on (campaign, i)."""
 
 from __future__ import annotations
 

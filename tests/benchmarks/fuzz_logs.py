@@ -1,26 +1,17 @@
 """Fuzz campaign on everything that reads bytes: ``python tests/benchmarks/fuzz_logs.py [--quick] [--inputs N]``.
 
-Input i is told by (campaign, i) alone, so a finding is repeated with ``--only i``. Every input must end in scans or in
+Input i depends only on (campaign, i), so a finding is repeated with ``--only i``. Every input must end in scans or in
 one AvsError: a traceback, more than 10 s, more than the stated memory, a crash of the interpreter or a file written
-anywhere is a finding. Workers run in processes of their own, so that a crash costs one worker and names its input.
+anywhere is a finding.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import multiprocessing
-import os
-import resource
-import signal
-import tempfile
-import time
-import traceback
-from collections import Counter
-from multiprocessing.connection import Connection
 from pathlib import Path
 
 from fuzz_inputs import case, seeds
+from fuzz_workers import Campaign, Check, report, run_campaign
 
 from avsreplay import toml_document
 from avsreplay.errors import AvsError
@@ -31,13 +22,9 @@ from avsreplay.log.point_cloud2 import decode_cloud
 from avsreplay.log.pose_files import read_conf, read_poses
 from avsreplay.log.repair import repair
 
-LIMIT_S, LIMIT_MIB, MESSAGE_MIB = 10, 700, 16
+LIMIT_S, LIMIT_MIB, MESSAGE_MIB = 10, 512, 16
 MAX_SEED = 512 << 10
 LOGS, POSES = ("mcap", "bag", "db3"), ("tum", "kitti", "euroc")
-
-
-class Hang(BaseException):
-    """Raised by the alarm: no handler of the package may swallow it."""
 
 
 def check(name: str, data: bytes, folder: Path, deep: bool) -> str:
@@ -110,69 +97,15 @@ def corpus_of(folders: list[Path]) -> dict[str, bytes]:
     return named if folders else seeds()
 
 
-def work(campaign: int, numbers: list[int], pipe: Connection, folders: list[Path]) -> None:
-    """A worker: says which input it begins, and what came of it."""
-    os.environ["OMP_NUM_THREADS"] = "1"
-    corpus = corpus_of(folders)
-    signal.signal(signal.SIGALRM, _alarm)
-    with tempfile.TemporaryDirectory() as root:
-        folder = Path(root) / "in"
-        folder.mkdir()
-        for number in numbers:
-            name, data = case(campaign, number, corpus)
-            pipe.send(("begin", number, name))
-            signal.alarm(LIMIT_S)
-            try:
-                found = check(name, data, folder, deep=number % 5 == 0)
-            except (Exception, Hang):
-                found = "FINDING\n" + traceback.format_exc()
-            signal.alarm(0)
-            if [p.name for p in Path(root).iterdir()] != ["in"]:
-                found = "FINDING a file was written outside"
-            pipe.send(("end", number, found))
-        pipe.send(("peak", 0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024))
-    pipe.close()
+def campaign(number: int, inputs: list[int], batch: int, folders: list[Path] | None = None) -> Campaign:
+    """Run the inputs of a campaign in batches."""
+    corpus = corpus_of(folders or [])
 
+    def task(at: int) -> tuple[str, Check]:
+        name, data = case(number, at, corpus)
+        return name, lambda folder: check(name, data, folder, deep=at % 5 == 0)
 
-def _alarm(_signal: int, _frame: object) -> None:
-    raise Hang
-
-
-def campaign(
-    number: int, inputs: list[int], batch: int, folders: list[Path] | None = None
-) -> tuple[Counter[str], list[dict[str, object]], int]:
-    """Run the inputs in batches; what came of them, the findings, and the largest worker in MiB."""
-    tally: Counter[str] = Counter()
-    findings: list[dict[str, object]] = []
-    peak = 0
-    queue = [inputs[i : i + batch] for i in range(0, len(inputs), batch)]
-    while queue:
-        todo = queue.pop(0)
-        here, there = multiprocessing.Pipe(False)
-        worker = multiprocessing.get_context("fork").Process(target=work, args=(number, todo, there, folders or []))
-        worker.start()
-        there.close()
-        last: tuple[int, str] | None = None
-        while True:
-            try:
-                what, at, value = here.recv()
-            except EOFError:
-                break
-            if what == "begin":
-                last = (at, str(value))
-            elif what == "end":
-                tally["finding" if str(value).startswith("FINDING") else str(value)] += 1
-                if str(value).startswith("FINDING"):
-                    findings.append({"input": at, "seed": last[1] if last else "", "what": value})
-                last = None
-            else:
-                peak = max(peak, int(value))
-        worker.join()
-        if last is not None:
-            tally["finding"] += 1
-            findings.append({"input": last[0], "seed": last[1], "what": f"crash, exit code {worker.exitcode}"})
-            queue.insert(0, todo[todo.index(last[0]) + 1 :])
-    return tally, findings, peak
+    return run_campaign(inputs, task, LIMIT_S, LIMIT_MIB, batch)
 
 
 def main() -> int:
@@ -187,15 +120,7 @@ def main() -> int:
     asked = parser.parse_args()
     count = 1000 if asked.quick else asked.inputs
     inputs = [asked.only] if asked.only is not None else list(range(asked.first, asked.first + count))
-    start = time.monotonic()
-    tally, findings, peak = campaign(asked.campaign, inputs, 2500, asked.seeds)
-    if peak > LIMIT_MIB:
-        findings.append({"what": f"a worker of {peak} MiB, over {LIMIT_MIB}"})
-    result = {"campaign": asked.campaign, "inputs": len(inputs), "outcomes": dict(sorted(tally.items())),
-              "largest_worker_mib": peak, "seconds": round(time.monotonic() - start, 1), "findings": findings[:40],
-              "count_of_findings": len(findings)}  # fmt: skip
-    print(json.dumps(result, indent=1))
-    return 1 if findings else 0
+    return report(asked.campaign, len(inputs), campaign(asked.campaign, inputs, 2500, asked.seeds))
 
 
 if __name__ == "__main__":
