@@ -1,8 +1,8 @@
-"""Outputs of every command: every kind of file node, and kill -9 at random moments.
+"""Outputs of every command: every kind of file node, full disks, two writers at once, and kill -9 at random moments.
 
-``python tests/benchmarks/outputs.py [--quick] [--kills N] [--seed S]``. The outputs are listed from the options of the
-commands: a new one without a case here ends the campaign. A node must keep its kind, an output must be complete, old or
-absent, nothing else may be left behind, and the same command must succeed afterwards.
+``python tests/benchmarks/outputs.py [--quick] [--kills N] [--seed S] [--only COMMAND]``. The outputs are listed from
+the options of the commands: a new one without a case here ends the campaign. A node must keep its kind, an output must
+be complete, old or absent, nothing else may be left behind, and the same command must succeed afterwards.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import signal
 import socket
 import stat
@@ -19,6 +20,7 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
@@ -126,6 +128,8 @@ def try_node(case: tuple[str, str], kind: str, seeds: Path, root: Path) -> str:
 def is_complete(case: tuple[str, str], path: Path) -> bool:
     """Whether an output is what its command writes when it is not disturbed."""
     try:
+        if case == ("sweep", "output"):
+            return (path / "summary.json").read_text(encoding="utf-8").endswith("}\n")
         if case == ("run", "output"):
             return not load_result(path).unverified
         if path.suffix == ".mcap":
@@ -141,27 +145,88 @@ def is_complete(case: tuple[str, str], path: Path) -> bool:
 SUFFIX = {"record": ".mcap", "doctor": ".mcap", "report": ".html", "export": ".csv", "plan": ".csv", "model": ".ply"}
 
 
-def kill_one(case: tuple[str, str], seeds: Path, root: Path, fraction: float, seconds: float) -> str:
-    """Write an output twice and kill the second writer; then write it again."""
-    place = Path(tempfile.mkdtemp(dir=root))
+def output_of(case: tuple[str, str], place: Path) -> Path:
+    """Name of an output in a folder."""
     suffixes = {("compare", "output"): ".html", ("compare", "junit"): ".xml", ("run", "update_golden"): ".jsonl"}
-    path = place / f"out{'' if case in FOLDERS else suffixes.get(case) or SUFFIX[case[0]]}"
+    return place / f"out{'' if case in FOLDERS else suffixes.get(case) or SUFFIX[case[0]]}"
+
+
+def finished(line: list[str], place: Path, file_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end; with ``file_bytes`` no file may become larger, as on a full disk."""
+    limits = None if file_bytes is None else lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
+    return subprocess.run(line, cwd=place, capture_output=True, text=True, timeout=600, check=False, preexec_fn=limits)
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    """The bytes of a file, or of every file of a folder."""
+    files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
+    return {str(p.relative_to(path.parent)): p.read_bytes() for p in files}
+
+
+def full_disk(case: tuple[str, str], seeds: Path, root: Path) -> Iterator[str]:
+    """Write an output where no file may become larger than it, in steps; the old output must stay as it is."""
+    place = Path(tempfile.mkdtemp(dir=root))
+    path = output_of(case, place)
     line = command_line(case, seeds, str(path))
-    subprocess.run(line, cwd=place, capture_output=True, timeout=120, check=False)
-    writer = subprocess.Popen(line, cwd=place, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    time.sleep(fraction * seconds)
-    writer.send_signal(signal.SIGKILL)
-    writer.wait()
-    killed = writer.returncode == -signal.SIGKILL
-    if case != ("sweep", "output") and not is_complete(case, path):
-        return f"FINDING {case}: after kill -9 the output is neither the old nor the new one"
-    left = sorted(p.name for p in place.iterdir())
-    again = subprocess.run(line, cwd=place, capture_output=True, text=True, timeout=120, check=False)
+    finished(line, place)
+    old, partial = contents(path), path.with_name(f"{path.name}.partial")
+    largest = max(len(data) for data in old.values())
+    for share in (0.0, 0.02, 0.5, 0.97):
+        done = finished(line, place, int(share * largest))
+        lines = [text for text in done.stderr.splitlines() if text.startswith("avsreplay: ") and "warning" not in text]
+        if done.returncode != 3 or len(lines) != 1 or "Traceback" in done.stderr:
+            yield f"FINDING {case} full disk: exit {done.returncode}: {done.stderr[-300:]}"
+        elif case != ("sweep", "output") and contents(path) != old:
+            yield f"FINDING {case} full disk: the old output has changed"
+        elif extra := [p.name for p in place.iterdir() if p not in (path, partial)]:
+            yield f"FINDING {case} full disk: left {extra}"
+        else:
+            yield "full disk"
+        partial.unlink(missing_ok=True)
+
+
+def two_writers(case: tuple[str, str], seeds: Path, root: Path) -> str:
+    """Two processes write the same output at the same time; it must be complete, and nothing else may be left."""
+    place = Path(tempfile.mkdtemp(dir=root))
+    path = output_of(case, place)
+    line = command_line(case, seeds, str(path))
+    both = [subprocess.Popen(line, cwd=place, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) for _ in range(2)]
+    errors = [writer.communicate(timeout=600)[1].decode() for writer in both]
+    codes = sorted(writer.returncode for writer in both)
+    if codes[0] or codes[1] not in (0, 2, 3) or any("Traceback" in text for text in errors):
+        return f"FINDING {case} two writers: exits {codes}: {errors}"
+    if not is_complete(case, path) or [p.name for p in place.iterdir()] != [path.name]:
+        return f"FINDING {case} two writers: left {sorted(p.name for p in place.iterdir())}"
+    return "two writers"
+
+
+def kill(case: tuple[str, str], seeds: Path, root: Path, kills: int, rng: np.random.Generator) -> Iterator[str]:
+    """Write an output, then kill further writers of it at random moments; every fifth time one may finish."""
+    place = Path(tempfile.mkdtemp(dir=root))
+    path = output_of(case, place)
+    line = command_line(case, seeds, str(path))
+    start = time.monotonic()
+    finished(line, place)
+    seconds = time.monotonic() - start
+    for number in range(kills):
+        writer = subprocess.Popen(line, cwd=place, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(float(rng.uniform(0.4, 1.0)) * seconds)
+        writer.send_signal(signal.SIGKILL)
+        killed = writer.wait() == -signal.SIGKILL
+        if case != ("sweep", "output") and not is_complete(case, path):
+            yield f"FINDING {case}: after kill -9 the output is neither the old nor the new one"
+        elif number % 5 == 4 and (problem := _again(case, line, place, path)):
+            yield problem
+        else:
+            yield "killed" if killed else "finished before"
+
+
+def _again(case: tuple[str, str], line: list[str], place: Path, path: Path) -> str:
+    again = finished(line, place)
     if again.returncode:
         return f"FINDING {case}: after kill -9 the command fails: {again.stderr[-200:]}"
-    if sorted(p.name for p in place.iterdir()) != [path.name]:
-        return f"FINDING {case}: left behind: {left}"
-    return "killed" if killed else "finished before"
+    left = sorted(p.name for p in place.iterdir() if p != path)
+    return f"FINDING {case}: left behind: {left}" if left else ""
 
 
 def main() -> int:
@@ -179,17 +244,17 @@ def main() -> int:
     with tempfile.TemporaryDirectory() as seeds, tempfile.TemporaryDirectory() as root:
         build(Path(seeds))
         for case in cases:
-            for kind in NODES[:2] if asked.quick else NODES:
-                found.append(try_node(case, kind, Path(seeds), Path(root)))
-            start = time.monotonic()
-            subprocess.run(command_line(case, Path(seeds), str(Path(root) / f"first-{case}")), capture_output=True,
-                           timeout=120, check=False)  # fmt: skip
-            seconds = time.monotonic() - start
-            for _ in range(0 if asked.quick else asked.kills):
-                killed.append(kill_one(case, Path(seeds), Path(root), float(rng.uniform(0.5, 1.05)), seconds))
+            kept = contents(Path(seeds))
+            found += [try_node(case, kind, Path(seeds), Path(root)) for kind in NODES[: 2 if asked.quick else None]]
+            if not asked.quick:
+                found += [*full_disk(case, Path(seeds), Path(root)), two_writers(case, Path(seeds), Path(root))]
+                killed += kill(case, Path(seeds), Path(root), asked.kills, rng)
+            if contents(Path(seeds)) != kept:
+                found.append(f"FINDING {case}: an input has changed")
+            print(case, dict(Counter(text[:15] for text in (*found, *killed))), file=sys.stderr, flush=True)
     findings = [text for text in (*found, *killed) if text.startswith("FINDING")]
     outcomes = {
-        "nodes": dict(Counter(t.split(":")[0][:7] for t in found)),
+        "nodes, full disks, two writers": dict(Counter(t.split(":")[0][:11] for t in found)),
         "kills": dict(Counter(t[:15] for t in killed)),
     }
     print(json.dumps({"outputs": len(cases), **outcomes, "findings": findings}, indent=1))
