@@ -100,6 +100,7 @@ def test_a_scenario_with_a_wrong_key(text, line, word, cli, tmp_path):
         (("--set", "faults.polcy=any"), "did you mean"),
         (("--set", "plan.a_max_mps2=-1"), "a_max_mps2"),
         (("--topic", "/nothing"), "/points"),
+        (("--truth-gap", "nan"), "truth_gap_s"),
         (("--golden", "a", "--update-golden", "b"), "exclude"),
     ],
 )

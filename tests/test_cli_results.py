@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import shutil
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -207,6 +209,29 @@ def test_an_unusable_result_directory_is_refused_before_the_replay(
     done = run("run", fixtures_folder / "tumble.mcap", "-o", name, "--overwrite")
     assert isinstance(done.exception, UsageError)
     assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="the limit is that of POSIX")
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.95])
+def test_a_disk_that_is_full_during_a_run_keeps_the_old_result(
+    share: float, result: Path, fixtures_folder: Path
+) -> None:
+    import resource
+
+    before = {path.name: path.read_bytes() for path in result.iterdir()}
+    limit = int(share * max(map(len, before.values())))
+    words = ["run", fixtures_folder / "tumble.mcap", "--n-scans", 12, "-o", result, "--overwrite"]
+    done = subprocess.run(
+        [sys.executable, "-m", "avsreplay", *map(str, words)],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 3
+    assert [line for line in done.stderr.splitlines() if line.startswith("avsreplay: ")] == [
+        done.stderr.splitlines()[-1]
+    ]
+    assert {path.name: path.read_bytes() for path in result.iterdir()} == before
+    assert [path.name for path in result.parent.iterdir()] == ["result"]
 
 
 def test_a_belief_of_another_size_is_one_line(result: Path) -> None:

@@ -1,9 +1,9 @@
 """Many runs in one process through the Python API: ``python tests/benchmarks/many_runs.py [--quick] [--runs N]``.
 
 Replays a scan of a small log again and again; every 50th run has a blackout and a global search, every tenth is closed
-after its first row, and every hundredth is given a damaged log. Memory, open files and threads must not grow: they are sampled twenty times, and the largest value of
-second half must not exceed that of the first half by more than the stated margin. Prints one JSON document; exit code 1
-if anything grows.
+after its first row, and every hundredth is given a damaged log. Memory, open files and threads must not grow: they are
+sampled twenty times, and the largest value of the second half must not exceed that of the first half by more than the
+stated margin. Prints one JSON document; exit code 1 if anything grows.
 """
 
 from __future__ import annotations
