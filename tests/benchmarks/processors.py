@@ -1,8 +1,8 @@
-"""Are the rows the same bytes on every processor? ``python tests/benchmarks/processors.py [--quick] [--qemu]``
+"""Are the results the same bytes on every processor? ``python tests/benchmarks/processors.py [--quick] [--qemu]``
 
-Replays the fixtures with every installed back end, each run in a process of its own, on this processor and on emulated
-ones, and compares ``rows.jsonl`` byte for byte. For each environment that differs it prints the first differing
-cells and the columns with the largest differences.
+Replays the fixtures with every installed back end and records a scenario, each run in a process of its own, on this
+processor and on emulated ones, and compares ``rows.jsonl`` and the recorded log byte for byte. For each environment
+that differs it prints the first differing cells and the columns with the largest differences.
 
 Two kinds of emulation. Environment variables choose the kernel of OpenBLAS, numpy's SIMD variants and the variants of
 glibc: quick, but the command itself sets these variables unless ``AVSREPLAY_ARITHMETIC=native`` (``--native``) asks it
@@ -36,8 +36,9 @@ CASES = {
     "kiss": ("tumble.mcap", "--backend", "kiss"),
     "small_gicp": ("tumble.mcap", "--backend", "small_gicp"),
     "open3d": ("tumble.mcap", "--backend", "open3d"),
+    "record": ("tumble.toml",),
 }
-EXACT = ("tumble", "spin-raster", "auto start", "batch fit", "reference")
+EXACT = ("tumble", "spin-raster", "auto start", "batch fit", "reference", "record")
 AVX512 = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX512_SPR X86_V4"
 AVX2 = f"AVX F16C FMA3 AVX2 X86_V3 {AVX512}"
 NO_FMA = "glibc.cpu.hwcaps=-AVX2_Usable,-FMA_Usable,-FMA4_Usable,-AVX2,-FMA,-FMA4"
@@ -57,18 +58,22 @@ OVERRIDDEN = (*arithmetic.PINS, arithmetic.VARIABLE)
 
 
 def replay(python: list[str], case: str, out: Path, extra: dict[str, str]) -> bytes:
-    """``rows.jsonl`` of one run. Raises SystemExit if the command fails."""
-    log, *flags = CASES[case]
-    words = [*python, "-m", "avsreplay", "run", str(ROOT / "fixtures" / log), "-o", str(out), "--overwrite", *flags]
+    """``rows.jsonl`` of one run, or the log that a scenario gives. Raises SystemExit if the command fails."""
+    name, *flags = CASES[case]
+    command = "record" if name.endswith(".toml") else "run"
+    out = out / f"{command}.mcap" if command == "record" else out / command
+    words = [*python, "-m", "avsreplay", command, str(ROOT / "fixtures" / name), "-o", str(out), "--overwrite", *flags]
     env = {k: v for k, v in os.environ.items() if k not in OVERRIDDEN}
     done = subprocess.run(words, cwd=ROOT, env={**env, **extra}, capture_output=True, text=True, check=False)
     if done.returncode not in (0, 4):
         raise SystemExit(f"{shlex.join(words)}\nended with {done.returncode}:\n{done.stderr[-2000:]}")
-    return (out / "rows.jsonl").read_bytes()
+    return out.read_bytes() if command == "record" else (out / "rows.jsonl").read_bytes()
 
 
 def difference(one: bytes, other: bytes) -> dict[str, object]:
-    """What differs between two files of rows."""
+    """What differs between two files of rows, or between two logs."""
+    if not one.startswith(b"{"):
+        return {"bytes": sum(x != y for x, y in zip(one, other, strict=False)), "lengths": [len(one), len(other)]}
     a, b = ([json.loads(line) for line in text.splitlines()] for text in (one, other))
     cells = [(i, name) for i, (x, y) in enumerate(zip(a, b, strict=True)) for name in x if x[name] != y.get(name)]
     largest: dict[str, float] = {}
@@ -117,7 +122,7 @@ def main() -> int:
         for case in asked.cases:
             first = None
             for name, (python, extra) in environments(asked).items():
-                rows = replay(python, case, Path(folder) / "r", extra)
+                rows = replay(python, case, Path(folder), extra)
                 first = rows if first is None else first
                 what = "same" if rows == first else difference(first, rows)
                 wrong += case in asked.exact and rows != first
