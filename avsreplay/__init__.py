@@ -27,15 +27,18 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
     from avsreplay.config import RunConfig
     from avsreplay.errors import AvsError
     from avsreplay.rows import Row
-    from avsreplay.run import Job, Run, replay
+    from avsreplay.run import Job, Run
 
 __version__ = "0.1.0"
 __all__ = ["AvsError", "Job", "Row", "Run", "RunConfig", "__version__", "replay"]
 
-_HOME = {"AvsError": "errors", "Job": "run", "Row": "rows", "Run": "run", "RunConfig": "config", "replay": "run"}
+_HOME = {"AvsError": "errors", "Job": "run", "Row": "rows", "Run": "run", "RunConfig": "config"}
 
 
 def __getattr__(name: str) -> Any:
@@ -44,3 +47,26 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+
+
+def replay(source: str | Path, *assignments: str, **options: Any) -> Iterator[Row]:
+    """Replay a log, row by row: ``for row in avsreplay.replay("log.mcap", "faults.policy=all", n_scans=100)``.
+
+    Args:
+        source: log, bag or folder of scans.
+        *assignments: settings ``a.b=c`` as for ``--set``.
+        **options: how to read the log, see log.SourceOptions.
+
+    Yields:
+        One row for every scan.
+
+    Raises:
+        AvsError: where the log, the model or a setting cannot be used; its ``str`` is one line.
+    """
+    from pathlib import Path
+
+    from avsreplay.log import SourceOptions
+    from avsreplay.run import Job, Run
+
+    with Run(Job(source=Path(source), options=SourceOptions(**options), assignments=assignments)) as run:
+        yield from run.rows()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avsreplay.errors import UsageError
+from avsreplay.files import STDOUT
 from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
 from avsreplay.simulate import (
@@ -142,7 +143,7 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
         tally = _fold(pairs, simulation.truth_of, writer, true_clock=True)
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
     slow = "embreex is not installed: rays were cast by the exact engine, which is slower"
-    done = tally.recorded(output, header)
+    done = tally.recorded(output, writer.bytes, header)
     return replace(done, note=slow if by_hand else done.note)
 
 
@@ -162,7 +163,7 @@ def record_source(
         UsageError: the output is the source or cannot be written, or an option is invalid.
         UnreadableInput: the source or the model cannot be read, or the output cannot be written.
     """
-    if output.exists() and source.exists() and output.samefile(source):
+    if output != STDOUT and output.exists() and source.exists() and output.samefile(source):
         raise UsageError("the output is the source", where=str(output), hint="name another output")
     reading = replace(
         reading, model=options.model or reading.model, cloud_model=options.cloud_model or reading.cloud_model
@@ -173,7 +174,7 @@ def record_source(
         with _writer(output, header, options) as writer, _ticked(ticker, opened.scans(), due) as scans:
             pairs = _with_faults(scans, header, options, epoch_ns)
             tally = _fold(pairs, opened.truth_of, writer, true_clock=False)
-        return tally.recorded(output, header, tuple(opened.losses))
+        return tally.recorded(output, writer.bytes, header, tuple(opened.losses))
 
 
 @dataclass(slots=True)
@@ -195,7 +196,7 @@ class _Tally:
         self.points += len(scan.points)
         self.empty += not len(scan.points)
 
-    def recorded(self, output: Path, header: LogHeader, losses: tuple[Loss, ...] = ()) -> Recorded:
+    def recorded(self, output: Path, size: int, header: LogHeader, losses: tuple[Loss, ...] = ()) -> Recorded:
         return Recorded(
             path=str(output),
             scans=self.scans,
@@ -203,7 +204,7 @@ class _Tally:
             empty=self.empty,
             damaged=self.damaged,
             span_s=(self.last_ns - self.first_ns) * 1e-9,
-            bytes=output.stat().st_size,
+            bytes=size,
             model=header.surface.name if header.surface else None,
             seed=header.seed,
             faults=tuple(self._fault(label) for label in header.labels),

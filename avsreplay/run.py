@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
@@ -17,7 +17,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.reference import Reference
-from avsreplay.log import Source, SourceOptions, open_source
+from avsreplay.log import GrowingLog, Source, SourceOptions, open_source
 from avsreplay.log.cloud_stream import ahead
 from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
@@ -58,6 +58,7 @@ class Job:
         config_file: TOML file with settings, see docs/settings.md.
         assignments: settings ``a.b=value`` that replace those of the file.
         prefetch: number of scans decoded ahead on a second thread; does not change the result.
+        growing: the log, if it is still written; a scan is replayed when it is there.
     """
 
     source: Path
@@ -65,14 +66,14 @@ class Job:
     config_file: Path | None = None
     assignments: tuple[str, ...] = ()
     prefetch: int = 2
+    growing: GrowingLog | None = None
 
 
 class Run:
     """An open run; a context manager. ``rows`` may be iterated once.
 
     Attributes:
-        source: the open log.  config: effective configuration.
-        surface: model of the target.  registrar: registers scans against that model.
+        config: effective configuration.  surface: model of the target.  registrar: registers scans against that model.
         model_check: check of the model by the rows so far.  done: number of scans processed so far.
         acceleration: fitted to the poses, None where it is given.
     """
@@ -94,7 +95,7 @@ class Run:
         if poses and unknown:
             raise UsageError("poses contain no model", where="--model auto", hint="leave out --model, or name a file")
         options = replace(job.options, poses=poses, model=None if unknown else job.options.model)
-        self.source: Source = open_source(job.source, options)
+        self._opened = job.growing.open(options) if job.growing else open_source(job.source, options)
         self._made: Reconstruction | None = None
         try:
             header = self.header = self._without_model() if unknown else self.source.header
@@ -127,6 +128,11 @@ class Run:
     ) -> None:
         self.source.close()
 
+    @property
+    def source(self) -> Source:
+        """The open log; of one that grows, as it was opened last."""
+        return self.job.growing.source if self.job.growing else self._opened
+
     def __len__(self) -> int:
         """Return the number of selected scans."""
         return len(self.source)
@@ -155,7 +161,7 @@ class Run:
         self._reference_instants = sorted(instants)
         return self._reference
 
-    def rows(self, listeners: Iterable[Listener] = (), progress: Progress | None = None) -> Iterator[Row]:
+    def rows(self, listeners: Iterable[Listener] = (), progress: Progress | None = None) -> Generator[Row]:
         """Replay the log row by row, after ``restore`` from the first scan that was not processed.
 
         Args:
@@ -180,6 +186,8 @@ class Run:
             outcomes = ahead(outcomes, self.job.prefetch)
         for state, outcome in outcomes:
             truth = self._truth_of(outcome.scan)
+            if self.job.growing:
+                self.job.growing.take(outcome.scan, self._true(outcome.scan))
             self.model_check.add(outcome.scan.points, outcome.alignment)
             row = Row.of(outcome, self._scored.score(state, outcome, truth))
             self._fold.add(row)
@@ -190,6 +198,12 @@ class Run:
                 listener(scan)
             self._state, self.done = state, self.done + 1
             yield row
+
+    @property
+    def outdated(self) -> bool:
+        """Whether a log that has grown must be replayed again, because what came later changes rows before it."""
+        planned = self._scored is not None and self._scored.planned
+        return self.job.growing is not None and self.job.growing.outdated(planned=planned)
 
     def checkpoint(self, more: Any) -> bytes:
         """Return the state after the last row, from which ``restore`` continues with the same bits.
@@ -273,9 +287,10 @@ class Run:
         self, ready: Stages, progress: Progress | None, what: str, state: PipelineState, first: int = 0
     ) -> Iterator[tuple[PipelineState, Outcome]]:
         """The pipeline over the scans, which are decoded ahead on a thread that ends with this generator."""
-        scans = self.source.scans(self.job.prefetch, first)
+        growing, prefetch = self.job.growing, self.job.prefetch
+        scans = ahead(growing.scans(), prefetch or 1) if growing else self.source.scans(prefetch, first)
         try:
-            shown = progress(scans, len(self.source) - first, what) if progress else scans
+            shown = progress(scans, 0 if growing else len(self.source) - first, what) if progress else scans
             yield from pipeline.fold(ready, state, shown)
         finally:
             scans.close()
@@ -329,21 +344,3 @@ class Run:
 def _run_table(scenario: str) -> Mapping[str, Any]:
     """The ``[run]`` table of the log's own scenario."""
     return dict(tomllib.loads(scenario).get("run", {})) if scenario else {}
-
-
-def replay(source: str | Path, *assignments: str, **options: Any) -> Iterator[Row]:
-    """Replay a log, row by row: ``for row in avsreplay.replay("log.mcap", "faults.policy=all", n_scans=100)``.
-
-    Args:
-        source: log, bag or folder of scans.
-        *assignments: settings ``a.b=c`` as for ``--set``.
-        **options: how to read the log, see log.SourceOptions.
-
-    Yields:
-        One row for every scan.
-
-    Raises:
-        AvsError: where the log, the model or a setting cannot be used; its ``str`` is one line.
-    """
-    with Run(Job(source=Path(source), options=SourceOptions(**options), assignments=assignments)) as run:
-        yield from run.rows()

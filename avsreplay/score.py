@@ -50,6 +50,11 @@ class Scorer:
         self._planned: CaptureError | None = None
         self._captured_ns: int | None = None
 
+    @property
+    def planned(self) -> bool:
+        """Whether a capture was planned so far."""
+        return self._segment is not None
+
     def score(self, state: PipelineState, outcome: Outcome, truth: Truth) -> Score:
         """Compare an outcome with the truth at its scan.
 

@@ -67,9 +67,9 @@ def test_a_log_goes_through_a_pipe(fixtures_folder, tmp_path, cli):
 def test_a_terminal_gets_no_binary_log(monkeypatch):
     from pathlib import Path
 
-    from avsreplay.cli.options import output_file
+    from avsreplay.cli.options import check_binary_output
     from avsreplay.errors import UsageError
 
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-    with pytest.raises(UsageError, match="binary"), output_file(Path("-")):
-        pass
+    with pytest.raises(UsageError, match="binary"):
+        check_binary_output(Path("-"))

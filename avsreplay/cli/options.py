@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -16,7 +15,7 @@ from avsreplay.cli.setting_options import source_setting
 from avsreplay.errors import UsageError
 
 if TYPE_CHECKING:
-    from avsreplay.log import SourceOptions
+    from avsreplay.log import GrowingLog, SourceOptions
     from avsreplay.report.result import Result
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -42,6 +41,21 @@ class Numbers(click.ParamType[tuple[float, ...]]):
         if len(numbers) != self.count:
             self.fail(f"'{value}' is not {self.count} numbers separated by commas", param, ctx)
         return numbers
+
+
+class StartMode(click.ParamType[str | float]):
+    """``cold``, ``near``, ``paper`` (initialisation of the estimate) or a number (seconds after the first scan)."""
+
+    name = "mode|seconds"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The mode or the number; anything else is a usage error."""
+        if value in ("cold", "near", "paper"):
+            return value
+        try:
+            return float(value)
+        except ValueError:
+            self.fail(f"'{value}' is neither cold, near, paper nor a number of seconds", param, ctx)
 
 
 def added(*options: Callable[[F], F]) -> Callable[[F], F]:
@@ -115,33 +129,24 @@ def read_result(path: Path) -> Result:
 
 
 @contextmanager
-def log_file(log: Path) -> Iterator[Path]:
-    """Yield the log; for "-" a temporary file with all bytes of standard input."""
+def log_file(log: Path, *, follow: bool = False) -> Iterator[tuple[Path, GrowingLog | None]]:
+    """Yield the log, and where it is still written the reader that follows it.
+
+    Args:
+        log: the log; "-" is standard input, which is copied to a temporary file while it is read.
+        follow: whether the log is a file that is still written.
+    """
+    from avsreplay.log import GrowingLog
+
     if str(log) != "-":
-        yield log
+        yield log, GrowingLog(log) if follow else None
         return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "stdin"
-        with path.open("wb") as file:
-            shutil.copyfileobj(sys.stdin.buffer, file)
-        yield path
+        yield path, GrowingLog(path, sys.stdin.buffer)
 
 
-@contextmanager
-def output_file(output: Path) -> Iterator[Path]:
-    """Yield the path to write to; for "-" a temporary file that goes to standard output after the block.
-
-    Raises:
-        UsageError: standard output is a terminal.
-    """
-    if str(output) != "-":
-        yield output
-        return
-    if sys.stdout.isatty():
+def check_binary_output(output: Path) -> None:
+    """Raise UsageError if ``output`` is "-" and standard output is a terminal."""
+    if str(output) == "-" and sys.stdout.isatty():
         raise UsageError("a log is binary", where="-o -", hint="redirect the output to a file or a pipe")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "stdout.mcap"
-        yield path
-        with path.open("rb") as file:
-            shutil.copyfileobj(file, sys.stdout.buffer)
-        sys.stdout.buffer.flush()

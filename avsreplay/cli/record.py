@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, output_file, read_options, source_options
+from avsreplay.cli.options import PATH, check_binary_output, read_options, source_options
 from avsreplay.cli.progress import tracked
 from avsreplay.cli.setting_options import source_setting
 from avsreplay.errors import DataLost
@@ -97,9 +97,8 @@ def command(
         faults=faults,
         fault_seed=seed or 0,
     )
-    with output_file(output) as path:
-        done = record(source, path, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
-    done = dataclasses.replace(done, path=str(output))
+    check_binary_output(output)
+    done = record(source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
     text = json.dumps(dataclasses.asdict(done), indent=2) if as_json else _sentence(done)
     click.echo(text, err=str(output) == "-")
     if done.losses or done.damaged:

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
 import time
-from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, fields
+from contextlib import closing, nullcontext
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, log_file, pose_options, read_options, source_options
+from avsreplay.cli.options import PATH, StartMode, log_file, pose_options, read_options, source_options
 from avsreplay.cli.setting_options import run_settings, take_run_settings
 from avsreplay.errors import CheckFailed, DataLost, UsageError
 from avsreplay.files import check_output
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Generator, Sequence
 
+    from avsreplay.log import GrowingLog
     from avsreplay.report.golden import GoldenResult
     from avsreplay.report.summary import Summary
     from avsreplay.report.verdict import RunVerdict
@@ -42,25 +41,11 @@ Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
             3 unreadable input, 4 finished but data was lost."""
 
 
-class _Start(click.ParamType[str | float]):
-    """``cold``, ``near``, ``paper`` (initialisation of the estimate) or a number (seconds after the first scan)."""
-
-    name = "mode|seconds"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        if value in ("cold", "near", "paper"):
-            return value
-        try:
-            return float(value)
-        except ValueError:
-            self.fail(f"'{value}' is neither cold, near, paper nor a number of seconds", param, ctx)
-
-
 @click.command("run", epilog=EPILOG)
 @click.argument("log", type=PATH)
 @run_settings
 @click.option(
-    "--start", "starts", type=_Start(), multiple=True, help="Initialisation of the estimate, or start time [s]."
+    "--start", "starts", type=StartMode(), multiple=True, help="Initialisation of the estimate, or start time [s]."
 )
 @click.option("--paper", is_flag=True, help="The method as printed in the paper, without any addition (docs/paper.md).")
 @source_options
@@ -76,6 +61,7 @@ class _Start(click.ParamType[str | float]):
 @click.option("--report", "page", is_flag=True, help="Add the HTML page, report.html, to the result directory.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
 @click.option("--resume", is_flag=True, help="Continue the interrupted run in the result directory.")
+@click.option("--follow", is_flag=True, help="LOG is still written: replay each scan when it is there, to the end.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 @click.option(
     "--require",
@@ -91,16 +77,33 @@ def command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
     LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs no option. With - as
-    LOG the log is read from standard input to its end, and then replayed.
+    LOG an MCAP file is read from standard input, and each scan is replayed when it is there; --follow does the same
+    with a file that is still written. The results are those of a replay of the complete log.
     """
     from avsreplay.result_dir import ResultDirectory
-    from avsreplay.run import Run
 
     wanted = Wanted(**{field.name: flags.pop(field.name) for field in fields(Wanted)})
     wanted.check()
-    replace = wanted.overwrite or wanted.resume
-    target = ResultDirectory(wanted.output, overwrite=replace) if wanted.output else None
-    with log_file(log) as path, Run(_job(path, flags)) as run:
+    again = wanted.overwrite or wanted.resume
+    target = ResultDirectory(wanted.output, overwrite=again) if wanted.output else None
+    with log_file(log, follow=wanted.follow) as (path, growing):
+        job = _job(path, flags)
+        streamed = growing is not None and job.options.model != Path("auto") and not wanted.resume
+        if wanted.follow and not streamed:
+            raise UsageError("--follow excludes --resume and --model auto", hint="leave out --follow")
+        try:
+            _whole(replace(job, growing=growing if streamed else None), target, wanted)
+        except Outdated:
+            why = "the end of the log changes rows before it (true poses, clock)"
+            click.echo(f"avsreplay: {why}: it is replayed once more", err=True)
+            _whole(job, target, wanted)
+
+
+def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
+    """Replay a log and print and check the result."""
+    from avsreplay.run import Run
+
+    with Run(job) as run:
         advice = _checked(run)
         done = _replayed(run, advice, target, wanted)
         _print(wanted, done)
@@ -121,6 +124,7 @@ class Wanted:
     page: bool
     overwrite: bool
     resume: bool
+    follow: bool
     as_json: bool
     table_every: int | None
     table_all: bool
@@ -164,6 +168,10 @@ def _checked(run: Run) -> list[str]:
     return [advice.sentence for advice in found]
 
 
+class Outdated(Exception):
+    """What was recorded later changes rows of a log that has grown: it is replayed again."""
+
+
 @dataclass(frozen=True, slots=True)
 class _Finished:
     """What a replay gave; ``record`` is ``run.json``."""
@@ -192,7 +200,11 @@ def _replayed(run: Run, advice: list[str], target: ResultDirectory | None, wante
         listeners += keeper.listeners if keeper else ()
         if run.config.reference.value == "fit" and not kept:
             run.fit_reference(tracked)
-        interrupted = _collect(run.rows(listeners, tracked), rows)
+        growing = run.job.growing
+        live = growing is not None and not wanted.as_json
+        interrupted = _collect(run.rows(listeners, None if live else tracked), rows, growing, live=live)
+        if run.outdated:
+            raise Outdated
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
             viewer.close()
@@ -227,42 +239,27 @@ def _model_notes(run: Run) -> tuple[str, ...]:
     return notes
 
 
-def _collect(found: Iterator[Row], rows: list[Row]) -> bool:
+def _collect(found: Generator[Row], rows: list[Row], growing: GrowingLog | None = None, *, live: bool = False) -> bool:
     """Take all rows; True if the user interrupted the replay after at least one row.
 
-    An interrupt takes effect between two scans, so that all results hold the same scans; a second one at once.
+    An interrupt takes effect between two scans, so that all results hold the same scans; a second one at once. With
+    ``live`` a line is printed for each row.
     """
+    from avsreplay.cli.progress import interruptible, say_live
+
     try:
-        with _interruptible(rows) as stopped:
+        with closing(found), interruptible(rows, growing.stop if growing else lambda: None) as stopped:
             for row in found:
+                if live:
+                    live = say_live(row)
                 rows.append(row)
-                if stopped():
+                if stopped() and not growing:
                     return True
+            return stopped()
     except KeyboardInterrupt:
         if not rows:
             raise
         return True
-    return False
-
-
-@contextmanager
-def _interruptible(rows: list[Row]) -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether Ctrl-C was pressed; before the first row it interrupts at once."""
-    asked: list[int] = []
-
-    def ask(number: int, _frame: object) -> None:
-        asked.append(number)
-        if not rows or len(asked) > 1:
-            raise KeyboardInterrupt
-
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    before = signal.signal(signal.SIGINT, ask)
-    try:
-        yield lambda: bool(asked)
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 def _page(result: Path) -> None:

@@ -1,5 +1,6 @@
 """Reading of logs, bags and folders of scans; writing of logs as MCAP."""
 
+from avsreplay.log.growing import GrowingLog
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions, TopicInfo
 from avsreplay.log.source import Source
@@ -9,6 +10,7 @@ from avsreplay.log.writer import LogWriter
 __all__ = [
     "ClockChoice",
     "ClockSummary",
+    "GrowingLog",
     "LogInfo",
     "LogWriter",
     "Loss",

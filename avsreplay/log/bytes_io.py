@@ -31,15 +31,20 @@ class ByteFile:
         size: size in bytes at the time of opening.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, upto: int | None = None) -> None:
         """Open the file.
+
+        Args:
+            path: the file.
+            upto: number of bytes that are read of a file that still grows.
 
         Raises:
             UnreadableInput: the file does not exist or cannot be opened.
         """
         try:
             self._file = path.open("rb", buffering=0)
-            self.size = path.stat().st_size
+            size = path.stat().st_size
+            self.size = size if upto is None else min(size, upto)
         except OSError as error:
             what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
             raise UnreadableInput(what, where=shown(path), hint="check the path") from None

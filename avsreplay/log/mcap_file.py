@@ -41,7 +41,12 @@ class McapFile(Recording):
     kind = "mcap"
 
     def __init__(
-        self, path: Path, limit: int, sinks: dict[str, Sink] | None = None, copy_to: RecordSink | None = None
+        self,
+        path: Path,
+        limit: int,
+        sinks: dict[str, Sink] | None = None,
+        copy_to: RecordSink | None = None,
+        upto: int | None = None,
     ) -> None:
         """Open and index the file.
 
@@ -50,6 +55,7 @@ class McapFile(Recording):
             limit: largest message, chunk or attachment that is read [bytes].
             sinks: called with every message of a topic during the pass.
             copy_to: receives every intact record (for a repair).
+            upto: number of bytes that are read of a file that still grows.
 
         Raises:
             UnreadableInput: the file does not exist, is empty or is not MCAP.
@@ -64,7 +70,7 @@ class McapFile(Recording):
         self._resume: int | None = None
         self._trusted = 8  # everything before this offset is confirmed by a checksum
         self._orphans = self._seen = 0
-        self._file = ByteFile(path)
+        self._file = ByteFile(path, upto)
         self._size = self._file.size
         self._chunks = ChunkStore(self._file, limit)
         try:

@@ -29,12 +29,15 @@ from avsreplay.log.writer import TRUTH_TOPIC
 from avsreplay.records import LogHeader, Surface
 
 
-def open_source(path: str | Path, options: SourceOptions | None = None, *, inspect: bool = False) -> Source:
+def open_source(
+    path: str | Path, options: SourceOptions | None = None, *, inspect: bool = False, upto: int | None = None
+) -> Source:
     """Open an MCAP file, a ROS 1 or 2 bag or a folder of scans.
 
     Args:
         path: the file or folder.
         options: how it is read.
+        upto: number of bytes that are read of an MCAP file that still grows.
         inspect: also open a log without a cloud topic, or with several of which none was chosen; it has no scans then.
 
     Returns:
@@ -46,7 +49,7 @@ def open_source(path: str | Path, options: SourceOptions | None = None, *, inspe
     """
     path, options = Path(path), options or SourceOptions()
     try:
-        source = _opened(path, options, inspect)
+        source = _opened(path, options, inspect, upto)
     except OSError as error:
         raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
     try:
@@ -58,7 +61,7 @@ def open_source(path: str | Path, options: SourceOptions | None = None, *, inspe
     return source
 
 
-def _opened(path: Path, options: SourceOptions, inspect: bool) -> Source:
+def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None) -> Source:
     if not path.exists():
         raise UnreadableInput("no such file", where=shown(path), hint="check the path")
     if options.poses and path.is_file() and not _is_log(path):
@@ -67,12 +70,12 @@ def _opened(path: Path, options: SourceOptions, inspect: bool) -> Source:
         return _open_folder(path, options)
     if not path.is_dir() and not path.is_file():
         raise UnreadableInput("neither a file nor a folder", where=shown(path), hint="give a log or a folder of scans")
-    return _messages(path, options, inspect)
+    return _messages(path, options, inspect, upto)
 
 
-def _messages(path: Path, options: SourceOptions, inspect: bool) -> Source:
+def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | None) -> Source:
     collector = TruthCollector(options)
-    recording = _open_recording(path, options.max_message_mib << 20, collector.sinks())
+    recording = _open_recording(path, options.max_message_mib << 20, collector.sinks(), upto)
     try:
         topics = recording.topics()
         collector.check(topics, shown(path))
@@ -219,15 +222,15 @@ def _is_bag_folder(path: Path) -> bool:
     return path.is_dir() and any(p.suffix in (*_STORAGE, ".zstd") for p in path.iterdir())
 
 
-def _open_recording(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
+def _open_recording(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = None) -> Recording:
     """Open a log file, whose first bytes tell the format, or all files of the folder of a bag.
 
     Raises UnreadableInput if it does not exist, is empty or is not a log.
     """
-    return _folder(path, limit, sinks) if path.is_dir() else _file(path, limit, sinks)
+    return _folder(path, limit, sinks) if path.is_dir() else _file(path, limit, sinks, upto)
 
 
-def _file(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
+def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = None) -> Recording:
     try:
         with path.open("rb") as file:
             head = file.read(16)
@@ -243,7 +246,7 @@ def _file(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:
         raise UnreadableInput("a zstd-compressed file", where=shown(path), hint="unpack it first: zstd -d")
     if not head.startswith(MAGIC) and path.suffix.lower() in (".ply", ".pcd", ".bin", ".npy", ".npz"):
         raise UnreadableInput("a single scan, not a log", where=shown(path), hint="give the folder it is in")
-    return McapFile(path, limit, sinks)
+    return McapFile(path, limit, sinks, upto=upto)
 
 
 def _folder(path: Path, limit: int, sinks: dict[str, Sink]) -> Recording:

@@ -6,12 +6,13 @@ The bytes depend only on what is written: no clock, path or library version is i
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, cast
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import STDOUT, check_output, is_stream
@@ -38,11 +39,42 @@ _LATCHED = (  # keep last, reliable, transient local; complete, because readers 
 )
 
 
+class _Pipe(io.BufferedIOBase):
+    """A pipe, FIFO or device, which cannot tell its position; each write passes through at once."""
+
+    def __init__(self, raw: BinaryIO) -> None:
+        self._raw, self._at = raw, 0
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self._raw.write(data)
+        self._at += len(data)
+        return len(data)
+
+    def tell(self) -> int:
+        return self._at
+
+    def flush(self) -> None:
+        if not self.closed:
+            self._raw.flush()
+
+    def close(self) -> None:
+        if not self.closed:
+            super().close()
+            self._raw.close()
+
+
 class LogWriter:
     """Writer of one log; a context manager.
 
     The file is written under ``<name>.partial`` and renamed when it is complete. An exception inside the ``with``
-    removes it. If the disk is full, the complete chunks are kept under the partial name and the error states this.
+    removes it. If the disk is full, the complete chunks are kept under the partial name and the error states this. A
+    pipe receives each chunk when it is complete.
+
+    Attributes:
+        bytes: number of bytes written so far.
     """
 
     def __init__(
@@ -60,7 +92,7 @@ class LogWriter:
         """Open the output and write the header.
 
         Args:
-            path: the output.
+            path: the output; ``-`` is standard output.
             header: scenario, seed, labels and model; the model is attached.
             overwrite: replace an existing output.
             compression: ``zstd``, ``lz4`` or ``none``.
@@ -79,17 +111,18 @@ class LogWriter:
         if chunk_bytes < 1 or chunk_s <= 0.0:
             raise ValueError(f"chunk_bytes {chunk_bytes} and chunk_s {chunk_s} must be positive")
         check_output(Path(path), overwrite=overwrite)
-        if Path(path) == STDOUT:
-            raise UsageError("a log cannot be written to standard output", where="-", hint="name a file")
-        self._path, self._overwrite = Path(path).resolve(), overwrite  # a symbolic link is followed, never replaced
-        self._direct = streaming or is_stream(self._path)
+        self._stdout = Path(path) == STDOUT
+        # a symbolic link is followed, never replaced
+        self._path, self._overwrite = STDOUT if self._stdout else Path(path).resolve(), overwrite
+        self._pipe = is_stream(self._path)
+        self._direct = streaming or self._pipe
         self._partial = self._path if self._direct else self._path.with_name(self._path.name + ".partial")
         self._point_type, self._chunk_bytes, self._chunk_ns = point_type, chunk_bytes, round(chunk_s * 1e9)
         self._labels = sorted(_edges(header.labels), key=lambda edge: (edge[0], edge[1]))
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self._chunk_start_ns: int | None = None
-        self._pending_bytes = self._complete = self._last_ns = 0
+        self._pending_bytes = self._complete = self._last_ns = self.bytes = 0
         self._stream = self._create()
         self._begin(header, compression)
 
@@ -151,6 +184,8 @@ class LogWriter:
         if not self._direct and self._partial.exists() and not self._overwrite:
             raise UsageError("already exists", where=str(self._partial), hint="choose another name, or add --overwrite")
         try:
+            if self._pipe:
+                return cast(BinaryIO, _Pipe(os.fdopen(os.dup(1), "wb") if self._stdout else self._partial.open("wb")))
             return self._partial.open("wb")
         except OSError as error:
             raise UnreadableInput(
@@ -218,7 +253,9 @@ class LogWriter:
 
     def _flush(self) -> None:
         self._writer.flush()
-        self._complete = self._stream.tell()
+        if self._direct:
+            self._stream.flush()
+        self._complete = self.bytes = self._stream.tell()
         self._chunk_start_ns, self._pending_bytes = None, 0
 
     def _channel(self, topic: str) -> int:
@@ -232,17 +269,26 @@ class LogWriter:
     def _finish(self) -> None:
         self._writer.finish()
         self._stream.flush()
-        if self._path.is_file() or not self._direct:
+        self.bytes = self._stream.tell()
+        if not self._pipe:
             os.fsync(self._stream.fileno())
         self._stream.close()
 
     def _guarded(self, action: Callable[[], None]) -> None:
         try:
             action()
+        except BrokenPipeError:
+            if self._stdout:  # the reader of standard output has ended
+                raise
+            self._broken("Broken pipe")
         except OSError as error:
-            self._keep_complete()
-            hint = f"{self._complete} complete bytes are kept in {self._partial}"
-            raise UnreadableInput(f"cannot be written: {error.strerror}", where=str(self._path), hint=hint) from None
+            self._broken(error.strerror or "the output failed")
+
+    def _broken(self, why: str) -> None:
+        self._keep_complete()
+        place = "" if self._pipe else f"{self._complete} complete bytes are kept in {self._partial}"
+        hint = place or "check its reader"
+        raise UnreadableInput(f"cannot be written: {why}", where=str(self._path), hint=hint) from None
 
     def _keep_complete(self) -> None:
         """Keep the file up to its last complete chunk."""
@@ -250,12 +296,13 @@ class LogWriter:
             OSError
         ):  # the buffered bytes cannot be written either; the file is closed nevertheless
             self._stream.close()
-        if self._partial.is_file():
+        if not self._pipe and self._partial.is_file():
             os.truncate(self._partial, min(self._complete, self._partial.stat().st_size))
 
     def _discard(self) -> None:
-        self._stream.close()
-        if self._partial.is_file():
+        with contextlib.suppress(OSError):
+            self._stream.close()
+        if not self._pipe and self._partial.is_file():
             self._partial.unlink()
 
 

@@ -1,0 +1,151 @@
+"""A log that grows: scans come when they are complete, and the rows are those of the whole log."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import os
+import threading
+
+import numpy as np
+import pytest
+
+from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.log import GrowingLog, LogWriter, SourceOptions, open_source
+from avsreplay.records import LogHeader, Scan
+from avsreplay.run import Job, Run
+
+OPTIONS = SourceOptions(n_scans=9)
+
+
+class Pieces(io.RawIOBase):
+    """A stream that gives its bytes in pieces."""
+
+    def __init__(self, data, sizes):
+        self.data, self.sizes, self.at = data, sizes, 0
+
+    def read1(self, _most):
+        size = next(self.sizes)
+        piece, self.at = self.data[self.at : self.at + size], self.at + size
+        return piece
+
+
+def sizes(seed, most):
+    rng = np.random.default_rng(seed)
+    while True:
+        yield int(rng.integers(1, most))
+
+
+def grown(log, tmp_path, step):
+    return GrowingLog(tmp_path / "stream", Pieces(log.read_bytes(), sizes(step, step)))
+
+
+@pytest.fixture
+def log(tmp_path, fixtures_folder):
+    """Nine scans of the short recording, in small chunks."""
+    path = tmp_path / "log.mcap"
+    with open_source(fixtures_folder / "tumble.mcap", OPTIONS) as source:
+        header = dataclasses.replace(source.header, labels=())
+        with LogWriter(path, header, chunk_bytes=1) as writer:
+            for scan in source.scans():
+                writer.write(scan)
+                truth = source.truth_of(scan)
+                writer.write_truth(scan.log_ns, scan.t_ns, truth.pose, truth.state)
+    return path
+
+
+@pytest.mark.parametrize("step", [700, 20_000, 10_000_000])
+def test_a_stream_gives_the_rows_of_the_whole_log(log, tmp_path, step):
+    with Run(Job(source=log)) as run:
+        expected, record = list(run.rows()), run.facts()
+    growing = grown(log, tmp_path, step)
+    with Run(Job(source=growing.path, growing=growing)) as run:
+        rows = list(run.rows())
+        assert not run.outdated
+        facts = run.facts()
+    assert rows == expected
+    assert facts["log"]["sha256"] == record["log"]["sha256"]
+    assert facts["losses"]["count"] == 0
+
+
+def test_a_scan_is_given_while_the_file_is_still_written(log, tmp_path):
+    data, path = log.read_bytes(), tmp_path / "growing.mcap"
+    there = data.rindex(b"/truth/pose") - 40_000  # several scans before the summary
+    path.write_bytes(data[:there])
+    growing = GrowingLog(path)
+    growing.open(SourceOptions())
+    scans = growing.scans()
+    count = len(growing.source) - 1
+    assert count >= 1
+    first = [next(scans) for _ in range(count)]
+    assert [scan.seq for scan in first] == list(range(count))
+    assert not growing.finished
+    with path.open("ab") as file:
+        file.write(data[there:])
+    rest = list(scans)
+    assert growing.finished
+    with open_source(log) as source:
+        for scan, whole in zip([*first, *rest], source.scans(), strict=True):
+            assert (scan.t_ns, scan.points.tobytes()) == (whole.t_ns, whole.points.tobytes())
+
+
+def test_stop_ends_a_file_that_is_never_closed(log, tmp_path):
+    path = tmp_path / "open.mcap"
+    path.write_bytes(log.read_bytes()[:-2000])
+    growing = GrowingLog(path)
+    growing.open(SourceOptions())
+    threading.Timer(0.2, growing.stop).start()
+    count = len(list(growing.scans()))
+    assert count == len(growing.source) >= 1
+
+
+def test_a_clock_that_steps_later_makes_the_rows_outdated(tmp_path):
+    def stamp(k):
+        return (10 + k) * 10**9 + (40 * 10**9 if k >= 9 else 0)
+
+    path = tmp_path / "steps.mcap"
+    rng = np.random.default_rng(1)
+    with LogWriter(path, LogHeader(), chunk_bytes=1) as writer:
+        for k in range(12):
+            points = rng.standard_normal((50, 3)).astype(np.float32)
+            writer.write(Scan(k, 0 if k < 3 else stamp(k), points, log_ns=(10 + k) * 10**9))
+    growing = grown(path, tmp_path, 300)
+    growing.open(SourceOptions())
+    for scan in growing.scans():
+        growing.take(scan, growing.source.truth_of(scan))
+    outdated = growing.outdated(planned=False)
+    with open_source(path) as whole:
+        same = [scan.t_ns for scan in whole.scans()] == [used.t_ns for used, _ in growing._used]
+    assert outdated != same
+
+
+@pytest.mark.parametrize("content", [b"", b"not a log at all, but long enough"])
+def test_a_stream_that_is_no_log_is_one_line(tmp_path, content):
+    growing = GrowingLog(tmp_path / "stream", io.BytesIO(content))
+    with pytest.raises(UnreadableInput):
+        growing.open(SourceOptions())
+
+
+def test_only_an_mcap_file_can_be_followed(tmp_path):
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n")
+    for name in ("a.bag", "none.mcap", "."):
+        with pytest.raises(UsageError, match="--follow"):
+            GrowingLog(tmp_path / name)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs FIFOs")
+def test_a_log_written_to_a_pipe_has_the_bytes_of_a_file(tmp_path):
+    def write(path):
+        with LogWriter(path, LogHeader()) as writer:
+            for k in range(5):
+                writer.write(Scan(k, (k + 1) * 10**9, np.ones((9, 3), np.float32), log_ns=(k + 1) * 10**9))
+        return writer.bytes
+
+    fifo, got = tmp_path / "fifo", []
+    os.mkfifo(fifo)
+    reader = threading.Thread(target=lambda: got.append(fifo.read_bytes()))
+    reader.start()
+    size = write(fifo)
+    reader.join()
+    assert write(tmp_path / "file") == size == len(got[0])
+    assert got[0] == (tmp_path / "file").read_bytes()
