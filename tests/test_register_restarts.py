@@ -50,3 +50,17 @@ def test_a_close_guess_is_registered_once(scans, monkeypatch):
     for scan in scans:
         registrar.register(scan.points, scan.truth)
     assert len(calls) == len(scans)
+
+
+def test_a_scan_of_scattered_points_costs_few_restarts():
+    """A few stray returns are worth at most eight restarts: a result equal to the guess is not a second start."""
+    registrar, rng = Registrar(builtin_surface()), np.random.default_rng(4)
+    restarter = registrar._restarter
+    calls, graduated = [], restarter.graduated
+    restarter.graduated = lambda *args: calls.append(args[1]) or graduated(*args)
+    stray = rng.uniform([-3.0, -3.0, 2.0], [3.0, 3.0, 8.0], (120, 3))
+    found = registrar.register(stray, Pose.identity() @ Pose([0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 5.0]))
+    assert not found.measured
+    assert 0 < len(calls) <= 8
+    poses = {np.round(pose.matrix, 6).tobytes() for pose in calls}
+    assert len(poses) >= len(calls) - 1  # the guess begins narrow and wide

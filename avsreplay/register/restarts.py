@@ -26,6 +26,8 @@ START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
 BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
+PASS_WORK = 300  # what a pass of a restart costs besides its points, in point searches
+SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 HEALTHY_PASSES = 12  # passes of an ordinary registration, over all points of the scan
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
@@ -103,7 +105,7 @@ class Restarter:
             facing = self._target.visibility.camera_c(index, points, T_ca) is not None
             found = index.icp(points, T_ca, rules[facing])
             T_ca = Pose.from_matrix(found.T_ca)
-            budget.spend(found.iterations * len(points))
+            budget.spend(found.iterations * (len(points) + PASS_WORK))
         return self.measure(points, T_ca)
 
     def best(self, points: NDArray[Any], guess: Pose, result: Pose, budget: Budget) -> Restart:
@@ -118,7 +120,7 @@ class Restarter:
         found = [self.measure(points, result)]
         tested: Restart | None = None  # the last pose that was tested, and is not plausible
         for T_ca, start in self._starts(guess, result, points.mean(axis=0)):
-            if not budget.allows(self.work(start) * len(points)):
+            if not budget.allows(self.work(start) * (len(points) + PASS_WORK)):
                 break
             found.append(self.graduated(points, T_ca, start, budget))
             best = self._least(found)
@@ -152,7 +154,8 @@ class Restarter:
     def _starts(self, guess: Pose, result: Pose, centre_a: Array) -> Iterator[tuple[Pose, float]]:
         """Guess and result with a narrow and a wide start, then both rotated by TURN_RAD about each axis of {C}."""
         narrow = self._narrow
-        bases = (guess, result) if guess.matrix.tobytes() != result.matrix.tobytes() else (guess,)
+        apart = np.abs(guess.matrix - result.matrix) / np.array([1.0, 1.0, 1.0, self._extent])
+        bases = (guess, result) if apart.max() > SAME_POSE else (guess,)
         yield from ((base, narrow) for base in bases)
         yield guess, self._wide
         for base in bases:
