@@ -219,6 +219,7 @@ class Alignment:
         covariance: (6, 6) calibrated covariance of the same d, None if the view is degenerate.
         message: why the back end failed or the pose is not accepted, else empty.
         free_directions: directions that the view does not determine ("slides along x"), empty if none.
+        split_nis: normalised squared difference of the poses from two halves of the scan, the larger of two splits.
     """
 
     T_ac: Pose
@@ -232,6 +233,7 @@ class Alignment:
     covariance: Array | None = None
     free_directions: str = ""
     message: str = ""
+    split_nis: float | None = None
 
     @property
     def measured(self) -> bool:

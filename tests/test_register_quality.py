@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from oracles.residuals import summed
 
-from avsreplay.register.quality import jackknife_covariance, unbounded_directions, without_dominant_patches
+from avsreplay.register.covariance import Evidence, jackknife_covariance, without_dominant_patches
+from avsreplay.register.quality import unbounded_directions
 
 
 def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:
@@ -13,12 +14,16 @@ def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:
     rng = np.random.default_rng(11)
     J = rng.normal(size=(20000, 6))
     e = rng.normal(0.0, 0.3, 20000)
-    P = jackknife_covariance(summed(J, e, np.arange(20000)))
+    P = _jackknife(summed(J, e, np.arange(20000)))
     oracle = 0.09 * np.linalg.inv(J.T @ J)
     np.testing.assert_allclose(P, oracle, atol=0.1 * oracle[0, 0])
 
 
 PATCH = np.arange(600) // 20
+
+
+def _jackknife(found: Evidence) -> np.ndarray:
+    return jackknife_covariance(found.normals, found.gradients)
 
 
 def _rows(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -32,7 +37,7 @@ def test_covariance_is_the_jackknife_over_patches() -> None:
     e = e - J @ np.linalg.lstsq(J, e, rcond=None)[0]
     moves = [np.linalg.lstsq(J[k != PATCH], e[k != PATCH], rcond=None)[0] for k in range(30)]
     oracle = np.array(moves).T @ np.array(moves)
-    np.testing.assert_allclose(jackknife_covariance(summed(J, e, PATCH)), oracle, rtol=1e-6, atol=1e-9 * oracle.max())
+    np.testing.assert_allclose(_jackknife(summed(J, e, PATCH)), oracle, rtol=1e-6, atol=1e-9 * oracle.max())
 
 
 def test_a_motion_that_one_patch_alone_determines_is_not_counted() -> None:

@@ -6,7 +6,6 @@ appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,47 +14,24 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
+from avsreplay.register.covariance import (
+    Evidence,
+    pose_covariance,
+    split_nis,
+    systematic_errors,
+    without_dominant_patches,
+)
 from avsreplay.register.params import RegisterParams, RegistrationLimits
-from avsreplay.register.surface_index import Closest, SurfaceIndex, kernel_module
+from avsreplay.register.surface_index import Closest, SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
 LEAST_PATCHES = 24
-# Covariance that the jackknife misses (closest points near edges are biased), by tests/benchmarks/estimate_noise.py.
-COVARIANCE_FACTOR = 1.1
-DOMINANT = 0.5  # a patch that contributes more than this share of the information on some motion is left out
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
-MIN_POINTS = 6  # no patch is left out where fewer points would remain
-ALONE = 1e-9  # keeps a motion finite that only one patch determines
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
 LEAST_RESIDUALS = 50
 AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Evidence:
-    """Sums over the inliers at a pose, by patches of the model; all in {C}.
-
-    Attributes:
-        points: points of the scan.
-        inliers: points nearer than the gate to the model, or to its faces that face the camera if that is known.
-        rms_m: rms of their distances.
-        centre: (3,) centroid of the inliers.
-        noise_m: robust standard deviation of e = n . (p - closest point).
-        counts: (m,) inliers of each patch.
-        normals: (m, 6, 6) sums of J'J over each patch.
-        gradients: (m, 6) sums of e J over each patch.
-    """
-
-    points: int
-    inliers: int
-    rms_m: float
-    centre: Array
-    noise_m: float
-    counts: NDArray[np.int64]
-    normals: Array
-    gradients: Array
 
 
 def evidence(
@@ -76,7 +52,7 @@ def evidence(
     found = index.evidence(points, T_ca, gate_m, size, LEAST_PATCHES, facing=facing, matches=matches)
     rms = float(np.sqrt(found.sum_d2 / found.inliers)) if found.inliers else float("nan")
     noise = noise_m or max(SIGMA_PER_MEDIAN * found.median_m, NOISE_FLOOR_OF_GATE * gate_m)
-    sums = (found.counts, found.normals, found.gradients)
+    sums = (found.counts, found.normals, found.gradients, found.offsets, found.errors, found.places)
     return Evidence(len(points), found.inliers, rms, found.centre, noise, *sums)
 
 
@@ -115,34 +91,6 @@ def _jacobian(p: Array, n: Array) -> Array:
     return np.hstack([np.cross(p, n), n])
 
 
-def jackknife_covariance(found: Evidence) -> Array:
-    """Return the delete-a-block jackknife covariance (6, 6) of d = [theta; v], with patches of the model as blocks.
-
-    Errors within a patch may be correlated (the model is wrong there, a range error at grazing incidence, outliers near
-    the surface); patches are taken as independent. Without patch p, with sums N_p = J'J and g_p = sum of e J, d moves
-    by (N - N_p)^-1 g_p = N^-1 (I - N_p N^-1)^-1 g_p: a patch with high leverage moves it by more than its residuals.
-    """
-    P: Array = kernel_module().jackknife(*_contiguous(found.normals, found.gradients), ALONE)
-    return P
-
-
-def without_dominant_patches(found: Evidence) -> Evidence:
-    """Return the evidence without the patches that give more than ``DOMINANT`` of the information on some motion.
-
-    Example: the barely visible side of a box is determined by a few points next to its edge, which may belong to the
-    neighbouring side.
-    """
-    keep = kernel_module().keep_patches(*_contiguous(found.normals), found.counts, DOMINANT, MIN_POINTS)
-    if keep.all():
-        return found
-    sums = {"normals": found.normals[keep], "gradients": found.gradients[keep]}
-    return replace(found, counts=found.counts[keep], **sums)
-
-
-def _contiguous(*arrays: Array) -> tuple[Array, ...]:
-    return tuple(np.ascontiguousarray(each, dtype=np.float64) for each in arrays)
-
-
 def grade(
     index: SurfaceIndex,
     visibility: Visibility,
@@ -163,7 +111,7 @@ def grade(
     total = found.normals.sum(axis=0)
     info = frozen(total / found.noise_m**2)
     weakest = unobservable_directions(total, int(found.counts.sum()), found.centre) if overlap else ()
-    P: Array | None = COVARIANCE_FACTOR * jackknife_covariance(found) if overlap and not weakest else None
+    P, split = _covariance(found, fit.T_ca, index.extent_m) if overlap and not weakest else (None, None)
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
         info, P, weakest = frozen(np.linalg.pinv(P, hermitian=True)), None, unbounded
@@ -178,7 +126,14 @@ def grade(
         status=_status(overlap, fit.converged, bool(weakest)),
         covariance=None if P is None else frozen(P),
         free_directions=", ".join(weakest),
+        split_nis=split,
     )
+
+
+def _covariance(found: Evidence, T_ca: Pose, extent_m: float) -> tuple[Array, float | None]:
+    """Covariance of the pose, and the test of halves: left against right and top against bottom of the scan."""
+    errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
+    return pose_covariance(found, errors), split_nis(found, errors, T_ca.R[:, :2].T)
 
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:

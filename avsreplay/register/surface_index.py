@@ -145,6 +145,7 @@ class PatchSums:
         counts: (m,) inliers of each patch.
         normals: (m, 6, 6) sums of J'J.
         gradients: (m, 6) sums of e J with e = n . (p_c - foot).
+        offsets, errors, places: sums of J (m, 6) and of e (m,), and the centroid (m, 3) of each patch.
     """
 
     points: int
@@ -155,6 +156,9 @@ class PatchSums:
     counts: NDArray[np.int64]
     normals: Array
     gradients: Array
+    offsets: Array
+    errors: Array
+    places: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.geometry import Array, Pose
-from avsreplay.register.quality import LEAST_PATCHES, PATCH_OF_EXTENT, Evidence
+from avsreplay.register.covariance import Evidence
+from avsreplay.register.quality import LEAST_PATCHES, PATCH_OF_EXTENT
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
@@ -42,10 +43,16 @@ def residuals(
     return Residuals(np.hstack([np.cross(p, n), n]), e, patch, p, found.d2[near])
 
 
-def summed(J: Array, e: Array, patch: NDArray[np.intp], noise_m: float = 0.3) -> Evidence:
-    """The evidence of given residuals; patch (k,) numbers from 0."""
+def summed(J: Array, e: Array, patch: NDArray[np.intp], noise_m: float = 0.3, p: Array | None = None) -> Evidence:
+    """The evidence of given residuals; patch (k,) numbers from 0; points p (k, 3), all at the origin if None."""
     counts = np.bincount(patch)
     normals, gradients = np.zeros((len(counts), 6, 6)), np.zeros((len(counts), 6))
     np.add.at(normals, patch, J[:, :, None] * J[:, None, :])
     np.add.at(gradients, patch, J * e[:, None])
-    return Evidence(len(e), len(e), float(np.sqrt(np.mean(e**2))), np.zeros(3), noise_m, counts, normals, gradients)
+    offsets, errors, places = np.zeros((len(counts), 6)), np.zeros(len(counts)), np.zeros((len(counts), 3))
+    np.add.at(offsets, patch, J)
+    np.add.at(errors, patch, e)
+    np.add.at(places, patch, np.zeros((len(e), 3)) if p is None else p)
+    places /= counts[:, None]
+    rms, centre = float(np.sqrt(np.mean(e**2))), places.mean(axis=0)
+    return Evidence(len(e), len(e), rms, centre, noise_m, counts, normals, gradients, offsets, errors, places)

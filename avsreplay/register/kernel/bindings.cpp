@@ -195,19 +195,22 @@ class Index {
       e = avs::evidence(store_, code(), v, T.v, {gate, side, least, facing}, team, matches);
     }
     const size_t m = e.patches.size();
-    double *N, *g, *c;
+    double *N, *g, *c, *J, *errors, *places;
     int64_t* count;
     auto normals = array<double>({m, 6, 6}, &N), gradients = array<double>({m, 6}, &g), centre = array<double>({3}, &c);
     auto counts = array<int64_t>({m}, &count);
+    auto offsets = array<double>({m, 6}, &J), sums = array<double>({m}, &errors), middles = array<double>({m, 3}, &places);
     for (size_t k = 0; k < m; ++k) {
       const PatchSums& from = e.patches[k];
       for (int r = 0, t = 0; r < 6; ++r)
         for (int q = 0; q <= r; ++q, ++t) N[36 * k + 6 * r + q] = N[36 * k + 6 * q + r] = from.normals[t];
       std::memcpy(g + 6 * k, from.gradients, sizeof from.gradients);
-      count[k] = from.points;
+      std::memcpy(J + 6 * k, from.offsets, sizeof from.offsets);
+      for (size_t a = 0; a < 3; ++a) places[3 * k + a] = from.places[a] / (double)from.points;
+      errors[k] = from.errors, count[k] = from.points;
     }
     std::memcpy(c, e.centre, sizeof e.centre);
-    return nb::make_tuple(e.points, e.inliers, e.sum_d2, e.median, centre, counts, normals, gradients);
+    return nb::make_tuple(e.points, e.inliers, e.sum_d2, e.median, centre, counts, normals, gradients, offsets, sums, middles);
   }
 
   nb::tuple looks(nb::handle points, const Doubles& T_ca, int64_t stride) const {

@@ -66,15 +66,17 @@ void add(const Match& m, PatchSums& to) {
   int t = 0;
   for (int r = 0; r < 6; ++r) {
     for (int c = 0; c <= r; ++c) to.normals[t++] += J[r] * J[c];
-    to.gradients[r] += m.e * J[r];
+    to.gradients[r] += m.e * J[r], to.offsets[r] += J[r];
   }
-  ++to.points;
+  for (int a = 0; a < 3; ++a) to.places[a] += p[a];
+  to.errors += m.e, ++to.points;
 }
 
 void add(const PatchSums& from, PatchSums& to) {
   for (int k = 0; k < 21; ++k) to.normals[k] += from.normals[k];
-  for (int k = 0; k < 6; ++k) to.gradients[k] += from.gradients[k];
-  to.points += from.points;
+  for (int k = 0; k < 6; ++k) to.gradients[k] += from.gradients[k], to.offsets[k] += from.offsets[k];
+  for (int k = 0; k < 3; ++k) to.places[k] += from.places[k];
+  to.errors += from.errors, to.points += from.points;
 }
 
 // Sums by cube, in the order in which the cubes first came.

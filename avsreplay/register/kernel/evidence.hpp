@@ -9,6 +9,9 @@ struct PatchSums {
   int64_t points = 0;
   double normals[21] = {};   // lower triangle of J'J, row by row
   double gradients[6] = {};  // e J
+  double offsets[6] = {};    // J
+  double errors = 0;         // e
+  double places[3] = {};     // p
 };
 
 struct Evidence {

@@ -1,0 +1,346 @@
+"""Covariance of a registered pose from its residuals: random errors by patches, and systematic errors.
+
+With J = [p x n, n] and e = n . (p - closest point), the pose error d = [theta; v] in {C} appears as e = J d + noise.
+Two kinds of errors correlate the noise of points:
+
+Random errors
+    Alike within a patch (a detail that the model lacks, a stripe of a range image): the delete-a-block jackknife with
+    patches as blocks. Displacements that neighbouring patches share, independent from one block of ``BLOCK`` patches a
+    side to the next, add a variance; it is estimated from the products of residuals of different patches of a block.
+Systematic errors
+    Errors of the model or of the ranges that vary slowly over the target: a symmetric strain and an offset of the
+    surface (size, aspect, shear, calibration of the scanner, thickness of paint or of the mesh). They are fitted with
+    the pose; the seven amplitudes are taken as draws of one normal distribution, whose variance is their maximum
+    likelihood estimate (empirical Bayes). A fitted amplitude within its statistical error gives no variance.
+
+``split_nis`` tests the result: pose from one half of the patches against the other half, normalised with the covariance
+of their difference, in which errors common to both halves cancel. Where errors are normal it is chi-square with 6
+degrees of freedom.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Array
+from avsreplay.register.surface_index import kernel_module
+
+DOMINANT = 0.5  # a patch that contributes more than this share of the information on some motion is left out
+MIN_POINTS = 6  # no patch is left out where fewer points would remain
+ALONE = 1e-9  # keeps a motion finite that only one patch determines
+BLOCK = 4  # patches along a side of a block
+LEAST_HALF = 12  # patches that each half of a split needs
+WORST_CONDITION = 1e8  # of the scaled information of a half
+OBSERVABLE = 1e-4  # an amplitude whose mean squared residual per unit is less is not fitted
+MOST_DENSE = 200  # sums by number are matrix products up to this many numbers
+ROUNDS = 8  # of the maximum likelihood estimate; the last ones change nothing
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Evidence:
+    """Sums over the inliers at a pose, by patches of the model; all in {C}.
+
+    Attributes:
+        points: points of the scan.
+        inliers: points nearer than the gate to the model, or to its faces that face the camera if that is known.
+        rms_m: rms of their distances.
+        centre: (3,) centroid of the inliers.
+        noise_m: robust standard deviation of e = n . (p - closest point).
+        counts: (m,) inliers of each patch.
+        normals: (m, 6, 6) sums of J'J over each patch.
+        gradients: (m, 6) sums of e J over each patch.
+        offsets: (m, 6) sums of J over each patch.
+        errors: (m,) sums of e.
+        places: (m, 3) centroid of each patch.
+    """
+
+    points: int
+    inliers: int
+    rms_m: float
+    centre: Array
+    noise_m: float
+    counts: NDArray[np.int64]
+    normals: Array
+    gradients: Array
+    offsets: Array
+    errors: Array
+    places: Array
+
+    def only(self, keep: NDArray[np.bool_]) -> Evidence:
+        """Return the evidence of the patches with ``keep`` (m,) true."""
+        patches = ("counts", "normals", "gradients", "offsets", "errors", "places")
+        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name in patches})
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Systematic:
+    """Errors of a scan that the jackknife over patches does not contain.
+
+    Attributes:
+        extent_m: diagonal of the model's bounding box; strains are in units of this length.
+        patch_m: side of a patch.
+        block_m2: variance of the displacement of a block, each axis [m^2].
+        smooth_m2: variance of the amplitudes: six of the strain times the extent, and the offset [m^2].
+        amplitudes: (7,) their fitted values [m].
+        fit: (6,) pose part of the common fit of pose and amplitudes.
+        centre: (3,) about which the strain was fitted.
+    """
+
+    extent_m: float
+    patch_m: float
+    block_m2: float
+    smooth_m2: float
+    amplitudes: Array
+    fit: Array
+    centre: Array
+
+    def unexplained(self, found: Evidence) -> Array:
+        """Return the gradients (m, 6) without what pose and amplitudes explain."""
+        return found.gradients - found.normals @ self.fit - _coupling(found, self) @ self.amplitudes
+
+
+def without_dominant_patches(found: Evidence) -> Evidence:
+    """Return the evidence without the patches that give more than ``DOMINANT`` of the information on some motion.
+
+    Example: the barely visible side of a box is determined by a few points next to its edge, which may belong to the
+    neighbouring side.
+    """
+    keep = kernel_module().keep_patches(*_contiguous(found.normals), found.counts, DOMINANT, MIN_POINTS)
+    return found if keep.all() else found.only(keep)
+
+
+def jackknife_covariance(normals: Array, gradients: Array) -> Array:
+    """Return the delete-a-block jackknife covariance (6, 6) of d = [theta; v], with patches of the model as blocks.
+
+    Errors within a patch may be correlated (the model is wrong there, a range error at grazing incidence, outliers near
+    the surface); patches are taken as independent. Without patch p, with sums N_p = J'J and g_p = sum of e J, d moves
+    by (N - N_p)^-1 g_p = N^-1 (I - N_p N^-1)^-1 g_p: a patch with high leverage moves it by more than its residuals.
+
+    Args:
+        normals: (m, 6, 6) sums of J'J.
+        gradients: (m, 6) sums of e J.
+    """
+    P: Array = kernel_module().jackknife(*_contiguous(normals, gradients), ALONE)
+    return P
+
+
+def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Systematic:
+    """Estimate the systematic errors of a scan from the structure of its residuals.
+
+    Args:
+        found: sums at the registered pose.
+        extent_m: diagonal of the model's bounding box.
+        patch_m: side of a patch.
+
+    Returns:
+        The variances; zero where every patch is a single point, or there are fewer than 24 patches.
+    """
+    none = Systematic(extent_m, patch_m, 0.0, 0.0, np.zeros(7), np.zeros(6), found.centre)
+    if len(found.counts) < 2 * LEAST_HALF or found.counts.max() == 1:
+        return none
+    N, g, basis = _joined(found, none)
+    inverse = np.linalg.pinv(N.sum(axis=0), hermitian=True)
+    fit = inverse @ g.sum(axis=0)
+    g = g - N @ fit
+    leverage = np.trace(N @ inverse, axis1=1, axis2=2) / len(fit)
+    S = g[:, :, None] * g[:, None, :] / np.maximum(1.0 - leverage, 0.5)[:, None, None]
+    block, M = _block_variance(N, g, S, inverse, found.counts, _numbers(found.places, BLOCK * patch_m))
+    P = inverse @ (S.sum(axis=0) + block * M) @ inverse
+    smooth = _common_variance(fit[6:], P[6:, 6:])
+    return replace(none, block_m2=block, smooth_m2=smooth, amplitudes=basis @ fit[6:], fit=fit[:6])
+
+
+def pose_covariance(found: Evidence, errors: Systematic) -> Array:
+    """Return the covariance (6, 6) of the registered pose, systematic errors included.
+
+    Args:
+        found: sums at the registered pose.
+        errors: its systematic errors.
+    """
+    P = jackknife_covariance(found.normals, errors.unexplained(found))
+    inverse = np.linalg.pinv(found.normals.sum(axis=0), hermitian=True)
+    blocks = _numbers(found.places, BLOCK * errors.patch_m)
+    X = inverse @ _summed(found.normals[:, :, 3:], blocks)
+    Y = inverse @ _coupling(found, errors).sum(axis=0)
+    P = P + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + errors.smooth_m2 * Y @ Y.T
+    return np.asarray(0.5 * (P + P.T))
+
+
+def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | None:
+    """Return the larger normalised squared difference of the poses from two halves of the patches, for two splits.
+
+    Args:
+        found: sums at the registered pose.
+        errors: its systematic errors.
+        across: (2, 3) directions in {C}: the patches are split at their medians along each.
+
+    Returns:
+        The larger of the two, each chi-square with 6 degrees of freedom; None if a half does not determine a pose.
+    """
+    if found.counts.max(initial=1) == 1:
+        return None
+    unexplained, coupling = errors.unexplained(found), _coupling(found, errors)
+    blocks = _numbers(found.places, BLOCK * errors.patch_m)
+    values = []
+    for along in across @ found.places.T:
+        low = along < np.median(along)
+        D, C = np.zeros(6), np.zeros((6, 6))
+        X, Y = np.zeros((blocks.max() + 1, 6, 3)), np.zeros((6, 7))
+        for half, sign in ((low, -1.0), (~low, 1.0)):
+            normals = found.normals[half]
+            inverse = _inverse(normals.sum(axis=0)) if len(normals) >= LEAST_HALF else None
+            if inverse is None:
+                return None
+            D += sign * (inverse @ found.gradients[half].sum(axis=0))
+            C += jackknife_covariance(normals, unexplained[half])
+            X += sign * (inverse @ _summed(normals[:, :, 3:], blocks[half], len(X)))
+            Y += sign * (inverse @ coupling[half].sum(axis=0))
+        C += errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + errors.smooth_m2 * Y @ Y.T
+        values.append(float(D @ np.linalg.pinv(C, hermitian=True) @ D))
+    return max(values)
+
+
+def difference_covariance(first: Evidence, second: Evidence, errors: Systematic) -> Array:
+    """Return the covariance (6, 6) of the difference of the poses from two parts of one scan.
+
+    Errors that both parts have in common cancel: those of patches and blocks in which both have points, and the
+    systematic errors as far as they move both poses alike.
+
+    Args:
+        first: sums of the points of one part, at the pose registered from all points.
+        second: the same of the other part.
+        errors: systematic errors of the whole scan.
+    """
+    parts = ((first, -1.0), (second, 1.0))
+    places = np.vstack([first.places, second.places])
+    which = np.split(np.arange(len(places)), [len(first.places)])
+    patches, blocks = (_numbers(places, size * errors.patch_m) for size in (1, BLOCK))
+    moves, X, Y = np.zeros((patches.max() + 1, 6)), np.zeros((blocks.max() + 1, 6, 3)), np.zeros((6, 7))
+    for (part, sign), k in zip(parts, which, strict=True):
+        inverse = np.linalg.pinv(part.normals.sum(axis=0), hermitian=True)
+        left = (1.0 + ALONE) * np.eye(6) - part.normals @ inverse
+        moved = np.linalg.solve(left, errors.unexplained(part)[:, :, None])[:, :, 0] @ inverse
+        moves = moves + sign * _summed(np.asarray(moved), patches[k], len(moves))
+        X = X + sign * (inverse @ _summed(part.normals[:, :, 3:], blocks[k], len(X)))
+        Y = Y + sign * (inverse @ _coupling(part, errors).sum(axis=0))
+    C = moves.T @ moves + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + errors.smooth_m2 * Y @ Y.T
+    return np.asarray(0.5 * (C + C.T))
+
+
+def _inverse(N: Array) -> Array | None:
+    """Inverse of the information of a half; None if it does not determine a pose."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
+    if values[0] * WORST_CONDITION < values[-1]:
+        return None
+    return np.asarray((vectors / values) @ vectors.T * np.outer(scale, scale))
+
+
+def _strains(found: Evidence, errors: Systematic) -> Array:
+    """T (m, 3, 6): displacement of the middle of each patch per amplitude of the strain."""
+    q = (found.places - errors.centre) / errors.extent_m
+    T = np.zeros((len(q), 3, 6))
+    for k, (i, j) in enumerate(PAIRS):
+        T[:, i, k] += q[:, j]
+        if i != j:
+            T[:, j, k] += q[:, i]
+    return T
+
+
+def _coupling(found: Evidence, errors: Systematic) -> Array:
+    """A (m, 6, 7): sums over each patch of J times the residual per amplitude of strain and offset."""
+    return np.concatenate([found.normals[:, :, 3:] @ _strains(found, errors), found.offsets[:, :, None]], axis=2)
+
+
+def _joined(found: Evidence, errors: Systematic) -> tuple[Array, Array, Array]:
+    """Normal equations of pose and observable amplitudes by patch, N (m, k, k) and g (m, k), and their basis (7, k-6).
+
+    Amplitudes are observable as far as pose and the other amplitudes do not explain their residuals.
+    """
+    T, A = _strains(found, errors), _coupling(found, errors)
+    m, turned = len(T), T.transpose(0, 2, 1)
+    F = np.zeros((m, 7, 7))
+    F[:, :6, :6] = turned @ found.normals[:, 3:, 3:] @ T
+    F[:, :6, 6] = F[:, 6, :6] = (turned @ found.offsets[:, 3:, None])[:, :, 0]
+    F[:, 6, 6] = found.counts
+    e = np.column_stack([(turned @ found.gradients[:, 3:, None])[:, :, 0], found.errors])
+    coupling, total = A.sum(axis=0), found.normals.sum(axis=0)
+    free = F.sum(axis=0) - coupling.T @ np.linalg.pinv(total, hermitian=True) @ coupling
+    values, vectors = np.linalg.eigh(0.5 * (free + free.T))
+    basis = vectors[:, values > OBSERVABLE * found.counts.sum()]
+    size = 6 + basis.shape[1]
+    N, g = np.empty((m, size, size)), np.hstack([found.gradients, e @ basis])
+    N[:, :6, :6], N[:, :6, 6:] = found.normals, A @ basis
+    N[:, 6:, :6], N[:, 6:, 6:] = N[:, :6, 6:].transpose(0, 2, 1), basis.T @ F @ basis
+    return N, g, basis
+
+
+def _block_variance(
+    N: Array, g: Array, S: Array, inverse: Array, counts: NDArray[np.int64], blocks: NDArray[np.intp]
+) -> tuple[float, Array]:
+    """Variance of the displacements of blocks by the method of moments, and its effect M (k, k) on the gradients.
+
+    The products of the gradients of different patches of a block, summed, have no contribution of errors within
+    patches. S (m, k, k) are the covariances of the gradients of the patches; the fit correlates them.
+    """
+    K, B = (N @ inverse)[:, 3:6], N[:, :, 3:6]
+    whole, moved = _summed(N, blocks), _summed(B, blocks)
+    Kb, M = (whole @ inverse)[:, 3:6], np.tensordot(moved, moved, ((0, 2), (0, 2)))
+    weight = 1.0 / np.bincount(blocks, counts)
+    own, total = weight[blocks], S.sum(axis=0)
+
+    def fitted(K: Array, S: Array, total: Array, weight: Array) -> float:
+        """What the fit of pose and amplitudes adds to the sum of squares of independent gradients."""
+        crossed = np.einsum("cij,cij->c", K, S[:, 3:6])
+        return float(weight @ (np.einsum("cij,cij->c", K @ total, K) - 2.0 * crossed))
+
+    found = weight @ np.sum(_summed(g, blocks)[:, 3:6] ** 2, axis=1) - own @ np.sum(g[:, 3:6] ** 2, axis=1)
+    found -= fitted(Kb, _summed(S, blocks), total, weight) - fitted(K, S, total, own)
+    expected = weight @ np.sum(moved[:, 3:6] ** 2, axis=(1, 2)) - own @ np.sum(B[:, 3:6] ** 2, axis=(1, 2))
+    of_blocks = moved @ moved.transpose(0, 2, 1)
+    of_patches = moved[blocks] @ B.transpose(0, 2, 1)
+    of_patches = of_patches.transpose(0, 2, 1)
+    expected += fitted(Kb, of_blocks.transpose(0, 2, 1), M, weight) - fitted(K, of_patches, M, own)
+    return (max(0.0, float(found / expected)) if expected > 0.0 else 0.0), M
+
+
+def _common_variance(values: Array, P: Array) -> float:
+    """Variance t of values ~ N(0, t I + P) by weighted moments, iterated to the maximum of the likelihood."""
+    if not len(values):
+        return 0.0
+    variances, axes = np.linalg.eigh(P)
+    squares, variances = (axes.T @ values) ** 2, np.maximum(variances, np.finfo(float).tiny)
+    t = max(0.0, float(np.mean(squares - variances)))
+    for _ in range(ROUNDS):
+        weights = 1.0 / (variances + t) ** 2
+        t = max(0.0, float(weights @ (squares - variances) / weights.sum()))
+    return t
+
+
+def _numbers(places: Array, side: float) -> NDArray[np.intp]:
+    """Numbers from 0 of the occupied cubes of this side in which the places (m, 3) lie."""
+    cubes = np.floor(places / side).astype(np.int64)
+    cubes -= cubes.min(axis=0)
+    shape = cubes.max(axis=0) + 1
+    keys = (cubes[:, 0] * shape[1] + cubes[:, 1]) * shape[2] + cubes[:, 2]
+    return np.asarray(np.unique(keys, return_inverse=True)[1]).reshape(-1)
+
+
+def _summed(values: Array, numbers: NDArray[np.intp], count: int | None = None) -> Array:
+    """Sums of values (m, ...) with the same number, (count, ...)."""
+    count = int(numbers.max()) + 1 if count is None else count
+    if count > MOST_DENSE:
+        out = np.zeros((count, *values.shape[1:]))
+        np.add.at(out, numbers, values)
+        return out
+    member = np.zeros((count, len(numbers)))
+    member[numbers, np.arange(len(numbers))] = 1.0
+    return np.asarray(member @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
+
+
+def _contiguous(*arrays: Array) -> tuple[Array, ...]:
+    return tuple(np.ascontiguousarray(each, dtype=np.float64) for each in arrays)
