@@ -276,7 +276,7 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
         origin = state.origin
     elif stages.guess is Guess.LAST:
         guess, origin = state.last_pose, "last"
-    return _measurement(stages, scan, points, stages.registrar.register(points, guess), origin)
+    return _measurement(stages, scan, points, stages.registrar.register(points, guess, scan.seq), origin)
 
 
 def _acquire(stages: Stages, scan: Scan, points: NDArray[Any], origin: str) -> Measurement:

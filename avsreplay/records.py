@@ -65,6 +65,7 @@ class Reason(Enum):
     NOT_CONVERGED = "not_converged"
     FEW_INLIERS = "few_inliers"
     FIT_ERROR = "fit_error"  # rms_m >= threshold
+    HALVES_DIFFER = "halves_differ"  # the poses from two halves of the scan differ by more than their errors
     POSE_JUMP = "pose_jump"  # weighted innovation norm >= threshold
     DOUBTFUL = "doubtful"  # large innovation: not decided yet whether scan, sensor or target is the cause
     SENSOR_BIAS = "sensor_bias"  # the measured poses have a constant offset that motion does not explain
@@ -214,11 +215,9 @@ class Alignment:
 
     Attributes:
         T_ac: measured pose of {C} in {A} (ICP iterates its inverse).
-        info: (6, 6) information of the error d = [theta; v], both in {C} [rad, m], where
-            T_ac_true = T_ac @ Exp(d); singular in directions that are not determined.
-        covariance: (6, 6) calibrated covariance of the same d, None if the view is degenerate.
-        message: why the back end failed or the pose is not accepted, else empty.
-        free_directions: directions that the view does not determine ("slides along x"), empty if none.
+        info: (6, 6) information of d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d); possibly singular.
+        covariance: (6, 6) calibrated covariance of the same d, systematic errors included; None if degenerate.
+        message: why the back end failed or the pose is not accepted.  free_directions: not determined, in words.
         split_nis: normalised squared difference of the poses from two halves of the scan, the larger of two splits.
     """
 
@@ -301,8 +300,7 @@ class Manoeuvre:
         t_ns: its most likely instant.  t_1s_s: standard deviation of the instant [s].
         velocity: (3,) change of the velocity of the centre of mass, in {A} [m/s].
         rate: (3,) change of the angular rate, in {B} [rad/s].
-        P: (6, 6) covariance of (rate, velocity).
-        detected_ns: instant of the scan at which it was decided.
+        P: (6, 6) covariance of (rate, velocity).  detected_ns: instant of the scan at which it was decided.
     """
 
     t_ns: int

@@ -147,6 +147,8 @@ class Row:
         "Root mean square distance of the inliers to the model.", "m", ".5f", 1e-4, 1e-7, table=True)
     free_directions: str | None = _exact(lambda o, s: o.alignment.free_directions or None,
         "Directions that the registration cannot determine, in words.")
+    split_nis: float | None = _number(if_points(lambda o: finite(o.alignment.split_nis)), "Normalised squared"
+        " difference of the poses from two halves of the scan, the larger of left/right and top/bottom.", fmt=".1f")
     reg_x_m: float | None = _metres(if_measured(lambda T: T.t[0]), "Measured position of {C} in {A}.")
     reg_y_m: float | None = _metres(if_measured(lambda T: T.t[1]), "See reg_x_m.")
     reg_z_m: float | None = _metres(if_measured(lambda T: T.t[2]), "See reg_x_m.")
@@ -344,7 +346,5 @@ _VALUES = tuple((f.name, f.metadata["value"]) for f in dataclasses.fields(Row))
 
 def columns() -> tuple[Column, ...]:
     """Every column in order."""
-    names = [f.name for f in dataclasses.fields(Column)]
-    return tuple(
-        Column(f.name, **{name: f.metadata[name] for name in names if name != "name"}) for f in dataclasses.fields(Row)
-    )
+    names = [f.name for f in dataclasses.fields(Column) if f.name != "name"]
+    return tuple(Column(f.name, **{n: f.metadata[n] for n in names}) for f in dataclasses.fields(Row))

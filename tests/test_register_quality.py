@@ -2,10 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from oracles.residuals import summed
 
-from avsreplay.register.covariance import Evidence, jackknife_covariance, without_dominant_patches
+from avsreplay.register.covariance import (
+    Evidence,
+    difference_covariance,
+    jackknife_covariance,
+    pose_covariance,
+    split_nis,
+    systematic_errors,
+    without_dominant_patches,
+)
 from avsreplay.register.quality import unbounded_directions
 
 
@@ -67,3 +77,86 @@ def test_a_motion_known_no_better_than_the_targets_size_is_loose() -> None:
     assert unbounded_directions(P, 3.0) == ("turns about z", "slides along y")
     assert unbounded_directions(P, 3e6) == ("turns about z",)
     assert unbounded_directions(np.eye(6) * 1e-6, 3.0) == ()
+
+
+def _ellipsoid(rng: np.random.Generator, count: int = 6000) -> tuple[np.ndarray, np.ndarray]:
+    """Points and normals of the near side of an ellipsoid with bumps, about 2 m across."""
+    u = rng.normal(size=(count, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    u[:, 2] = np.abs(u[:, 2])
+    axes = np.array([1.0, 0.7, 0.5])
+    p, n = u * axes, u / axes
+    n = n / np.linalg.norm(n, axis=1, keepdims=True) + 0.4 * np.sin(5.0 * p[:, [1, 2, 0]])
+    return p, n / np.linalg.norm(n, axis=1, keepdims=True)
+
+
+def _scan(rng: np.random.Generator, strain: float, noise: float = 0.003) -> Evidence:
+    """Sums at the least-squares pose of a scan whose surface is strained at random."""
+    p, n = _ellipsoid(rng)
+    S = strain * rng.normal(size=(3, 3))
+    e = np.sum(n * (p @ (S + S.T)), axis=1) + rng.normal(0.0, noise, len(p))
+    J = np.hstack([np.cross(p, n), n])
+    e = e - J @ np.linalg.lstsq(J, e, rcond=None)[0]
+    patch = np.unique(np.floor(p / 0.1), axis=0, return_inverse=True)[1].reshape(-1)
+    return summed(J, e, patch, p=p)
+
+
+def _nis(strain: float) -> tuple[float, float, float]:
+    """Mean over scans of the squared difference of halves over 6, and shares of it with the jackknife alone."""
+    rng, values, bare, sigma = np.random.default_rng(5), [], [], []
+    for _ in range(25):
+        found = _scan(rng, strain)
+        errors = systematic_errors(found, 2.0, 0.1)
+        none = replace(errors, block_m2=0.0, smooth_m2=0.0, amplitudes=np.zeros(7), fit=np.zeros(6))
+        values.append(split_nis(found, errors, np.eye(3)[:1]))
+        bare.append(split_nis(found, none, np.eye(3)[:1]))
+        jackknife = jackknife_covariance(found.normals, found.gradients)
+        sigma.append(np.trace(pose_covariance(found, errors)) / np.trace(jackknife))
+    return float(np.mean(values)) / 6.0, float(np.mean(bare)) / 6.0, float(np.median(sigma))
+
+
+def test_halves_of_a_strained_target_differ_as_the_covariance_says() -> None:
+    """The jackknife over patches takes the strain for independent errors of patches and claims too little."""
+    nis, bare, sigma = _nis(0.004)
+    assert 0.6 < nis < 1.6
+    assert bare > 2.5
+    assert sigma > 2.0
+
+
+def test_white_noise_adds_little_to_the_jackknife() -> None:
+    nis, bare, sigma = _nis(0.0)
+    assert 0.6 < nis < 1.3
+    assert 0.6 < bare < 1.4
+    assert 0.8 < sigma < 1.3
+
+
+def test_halves_that_disagree_beyond_all_errors_have_a_large_nis() -> None:
+    """One half of the scan is displaced as a whole, as a body with a joint is, and the covariance does not cover it."""
+    found = _scan(np.random.default_rng(8), 0.0)
+    moved = np.where(found.places[:, 0] < 0.0, 0.02, -0.02)
+    gradients = found.gradients + moved[:, None] * found.normals[:, :, 5]
+    errors = systematic_errors(found, 2.0, 0.1)
+    assert split_nis(replace(found, gradients=gradients), errors, np.eye(3)[:1]) > 60.0
+    assert split_nis(found, errors, np.eye(3)[:1]) < 60.0
+    assert split_nis(found.only(found.places[:, 0] < -0.93), errors, np.eye(3)[:1]) is None
+
+
+def test_parts_of_the_same_patches_have_only_their_own_errors() -> None:
+    """What two random halves of the points have in common does not move them apart."""
+    rng = np.random.default_rng(9)
+    values = []
+    for _ in range(20):
+        p, n = _ellipsoid(rng)
+        J = np.hstack([np.cross(p, n), n])
+        e = 0.01 * p[:, 0] * n[:, 0] + rng.normal(0.0, 0.003, len(p))
+        e = e - J @ np.linalg.lstsq(J, e, rcond=None)[0]
+        patch = np.unique(np.floor(p / 0.1), axis=0, return_inverse=True)[1].reshape(-1)
+        errors = systematic_errors(summed(J, e, patch, p=p), 2.0, 0.1)
+        half = rng.random(len(p)) < 0.5
+        parts = [
+            summed(J[k], e[k], np.unique(patch[k], return_inverse=True)[1].reshape(-1), p=p[k]) for k in (half, ~half)
+        ]
+        d = [np.linalg.lstsq(J[k], e[k], rcond=None)[0] for k in (half, ~half)]
+        step = d[1] - d[0]
+        values.append(step @ np.linalg.solve(difference_covariance(*parts, errors), step) / 6.0)
+    assert 0.6 < np.mean(values) < 1.5

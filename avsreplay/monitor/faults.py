@@ -52,6 +52,11 @@ class FaultParams(Settings):
         4.0, "The limit on the pose innovation is never below this multiple of its predicted 1 sigma.", above=0.0
     )
     min_inliers: int = setting(50, "Inliers that a healthy scan needs.", low=0)
+    split_nis_max: float = setting(
+        60.0,
+        "Normalised squared difference of the poses from two halves of the scan above which a scan is faulty.",
+        above=0.0,
+    )
     min_inlier_ratio: float = setting(0.3, "Ratio of inliers to points that a healthy scan needs.", low=0.0, high=1.0)
 
 
@@ -117,4 +122,6 @@ class FaultDetector:
             return Reason.FEW_INLIERS
         if poor_fit:
             return Reason.FIT_ERROR
+        if (alignment.split_nis or 0.0) > p.split_nis_max:
+            return Reason.HALVES_DIFFER
         return Reason.POSE_JUMP if jump else None

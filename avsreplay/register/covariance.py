@@ -171,17 +171,18 @@ def pose_covariance(found: Evidence, errors: Systematic) -> Array:
 
 
 def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | None:
-    """Return the larger normalised squared difference of the poses from two halves of the patches, for two splits.
+    """Return the larger normalised squared difference of the poses from two halves of the patches.
 
     Args:
         found: sums at the registered pose.
         errors: its systematic errors.
-        across: (2, 3) directions in {C}: the patches are split at their medians along each.
+        across: (k, 3) directions in {C}: the patches are split at their medians along each.
 
     Returns:
-        The larger of the two, each chi-square with 6 degrees of freedom; None if a half does not determine a pose.
+        The largest over the directions, each chi-square with 6 degrees of freedom; None if a half does not determine a
+        pose, or without directions.
     """
-    if found.counts.max(initial=1) == 1:
+    if found.counts.max(initial=1) == 1 or not len(across):
         return None
     unexplained, coupling = errors.unexplained(found), _coupling(found, errors)
     blocks = _numbers(found.places, BLOCK * errors.patch_m)
@@ -201,7 +202,7 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
             Y += sign * (inverse @ coupling[half].sum(axis=0))
         C += errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + errors.smooth_m2 * Y @ Y.T
         values.append(float(D @ np.linalg.pinv(C, hermitian=True) @ D))
-    return max(values)
+    return max(values, default=None)
 
 
 def difference_covariance(first: Evidence, second: Evidence, errors: Systematic) -> Array:

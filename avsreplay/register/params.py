@@ -89,6 +89,9 @@ class RegisterParams(Settings):
     subsample_m: float = setting(
         0.0, "Edge length of the voxels of which one point each is kept; 0 keeps all points.", unit="m", low=0.0
     )
+    split_every: int = setting(
+        5, "The poses from two halves of the scan are compared on every n-th scan (column split_nis).", low=1
+    )
     threads: int = setting(1, "Largest number of threads of a back end; the result does not depend on it.", low=1)
     index_cache: bool = setting(True, "Keep the index of a large model in the user's cache folder between runs.")
     acquire: AcquireParams = setting(AcquireParams, "The global search.")

@@ -98,10 +98,12 @@ def grade(
     fit: Fit,
     limits: RegistrationLimits,
     params: RegisterParams,
+    halves: bool = True,
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
-    Too few inliers give NO_OVERLAP whatever the convergence flag of the back end says.
+    Too few inliers give NO_OVERLAP whatever the convergence flag of the back end says. ``halves``: compare the poses
+    from two halves of the scan.
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
@@ -111,7 +113,8 @@ def grade(
     total = found.normals.sum(axis=0)
     info = frozen(total / found.noise_m**2)
     weakest = unobservable_directions(total, int(found.counts.sum()), found.centre) if overlap else ()
-    P, split = _covariance(found, fit.T_ca, index.extent_m) if overlap and not weakest else (None, None)
+    across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
+    P, split = _covariance(found, across, index.extent_m) if overlap and not weakest else (None, None)
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
         info, P, weakest = frozen(np.linalg.pinv(P, hermitian=True)), None, unbounded
@@ -130,10 +133,10 @@ def grade(
     )
 
 
-def _covariance(found: Evidence, T_ca: Pose, extent_m: float) -> tuple[Array, float | None]:
-    """Covariance of the pose, and the test of halves: left against right and top against bottom of the scan."""
+def _covariance(found: Evidence, across: Array, extent_m: float) -> tuple[Array | None, float | None]:
+    """Covariance of the pose, and the test of halves on both sides of the middle along ``across`` (k, 3) in {C}."""
     errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
-    return pose_covariance(found, errors), split_nis(found, errors, T_ca.R[:, :2].T)
+    return pose_covariance(found, errors), split_nis(found, errors, across)
 
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:

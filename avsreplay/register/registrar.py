@@ -61,12 +61,13 @@ class Registrar:
         self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
         self._restarter = Restarter(self._target, self._test)
 
-    def register(self, points: NDArray[Any], guess: Pose) -> Alignment:
+    def register(self, points: NDArray[Any], guess: Pose, seq: int = 0) -> Alignment:
         """Register a scan from a guess (eq:ICP).
 
         Args:
             points: (n, 3) in {A} [m], float32 or float64, possibly strided; points that are not finite are left out.
             guess: predicted T_ac. ICP aligns the scan to the model, so its inverse goes in and the inverse comes out.
+            seq: number of the scan; two halves of it are compared if ``split_every`` divides it.
 
         Returns:
             The pose T_ac with its quality. A failure is reported as its status, never as an exception. Where nothing
@@ -75,7 +76,7 @@ class Registrar:
         scan = self._scan(points)
         if len(scan) == 0:
             return quality.not_measured(len(points), AlignStatus.NO_POINTS, guess)
-        first = self._graded(scan, guess)
+        first = self._graded(scan, guess, halves=seq % self.params.split_every == 0)
         found = first if self._healthy(first) else self._recovered(scan, guess, first)
         return self._searched(scan, found) if self._far(guess, found) else found
 
@@ -217,13 +218,13 @@ class Registrar:
         status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason)
 
-    def _graded(self, scan: NDArray[Any], guess: Pose, width_m: float | None = None) -> Alignment:
+    def _graded(self, scan: NDArray[Any], guess: Pose, width_m: float | None = None, halves: bool = True) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
         fit = self._align(scan, guess.inverse(), width_m)
         if isinstance(fit, str):
             return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
-        return quality.grade(self._index, self._visibility, scan, fit, limits, self.params)
+        return quality.grade(self._index, self._visibility, scan, fit, limits, self.params, halves)
 
     def _align(self, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | str:
         """Run the back end; what it raises, or a result of another type, becomes the status FAILED with this text."""

@@ -114,13 +114,9 @@ class NormalEquations:
     With p_c = T_ca p_a, e = n . (foot - p_c) and J = de/dd = [p_c x n, n].
 
     Attributes:
-        info: (6, 6) sum J'J, not divided by the variance of the noise.
-        gradient: (6,) sum J'e.
-        inliers: points nearer than the gate.
-        sum_e2: sum of e^2 [m^2].
-        sum_d2: sum of the squared distances to the closest points [m^2].
-        points: finite points.
-        ignored: points with a coordinate that is not finite.
+        info: (6, 6) sum J'J, not divided by the variance of the noise.  gradient: (6,) sum J'e.
+        inliers: points nearer than the gate.  points: finite points.  ignored: points that are not finite.
+        sum_e2, sum_d2: sums of e^2 and of the squared distances to the closest points [m^2].
     """
 
     info: Array

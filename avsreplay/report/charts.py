@@ -52,6 +52,7 @@ _WINDOW = 10
 _KINDS = {  # place: colour and pattern
     "flagged": (
         *("not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged"),
+        "halves_differ",
         *("doubtful", "sensor_bias", "clock"),
     ),
     "injected": (

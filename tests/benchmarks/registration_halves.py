@@ -107,7 +107,9 @@ def main() -> None:
         print(f"{name}: {len(column)} scans")
         for split, values in table.items():
             print(f"  {split:16} mean {np.mean(values):5.2f}  median {np.median(values):5.2f}  max {max(values):5.1f}")
-        print(f"  split_nis / 6    mean {np.mean(column):5.2f}  median {np.median(column):5.2f}  max {max(column):5.1f}")
+        print(
+            f"  split_nis / 6    mean {np.mean(column):5.2f}  median {np.median(column):5.2f}  max {max(column):5.1f}"
+        )
         share = 100.0 * np.median(shares, axis=0)
         print(f"  1 sigma {np.median(degrees):.3f} deg, time {share[0]:.1f} % and {share[1]:.1f} %", flush=True)
 
