@@ -52,7 +52,9 @@ def stages(
         estimator=Estimator(estimator, start, surface.extent, clock[0]),
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
-        guidance=Guidance(config.robot.applied(config.plan), Supervisor(supervision), limits, surface.extent),
+        guidance=Guidance(
+            config.robot.applied(config.plan), Supervisor(supervision), limits, surface.extent, config.robot.gripper
+        ),
         target=target_geometry(surface, config.fixture_axis_c, limits.clearance_m is not None),
         guess=config.guess,
         deskew=config.deskew,

@@ -48,7 +48,7 @@ class Plan:
         t_go_s: Time from t_ns to the capture [s], NaN where there is none.
         costate: (6,) [c1, c2] of the primer vector p = c2 - c1 tau, tau from t_ns, of unit norm; NaN for a plan with
             ``thrust``.
-        a_max: Bound on the thrust [m/s2].
+        a_max: Bound on the thrust, or its constant magnitude where the turn of the gripper delays the capture [m/s2].
         lower_bound_s: Certified lower bound of t_go_s [s].
         position_error_m, velocity_error_mps: Terminal errors of the propagated plan.
         u_max: Largest |u| found along the propagated plan [m/s2].
@@ -60,6 +60,7 @@ class Plan:
         abort_margin_m: Smallest margin of the clearance if the robot aborts at any instant before the corridor [m]; NaN
             without a clearance.
         steps: Number of steps of the search.
+        attitude_s: Time from t_ns until the gripper has attitude and rate of the fixture [s]; NaN where not planned.
     """
 
     t_ns: int
@@ -78,6 +79,7 @@ class Plan:
     binding: str = ""
     abort_margin_m: float = math.nan
     steps: int = 0
+    attitude_s: float = math.nan
 
     @property
     def gap_s(self) -> float:

@@ -255,10 +255,10 @@ class Replanning:
         return target_scene(self.saved.estimator, belief, self._target, self._forecast(belief))
 
     def _planned(self, scene: Scene, t_ns: int, warm: plan.RobotPath | None = None) -> Plan:
-        if not self.limits.any:
-            return plan.rendezvous(scene.goal, *self.start, self.params, t_ns)
-        start = None if warm is None else (warm, 0.0)
-        return plan.constrained(scene, *self.start, self.params, self.limits, t_ns, self.saved.extent_m, warm=start)
+        turn_s = plan.turn_time(scene.attitude, self.robot.gripper, self.params, t_ns)
+        start, extent_m = None if warm is None else (warm, 0.0), self.saved.extent_m
+        problem = scene, *self.start, self.params, self.limits, t_ns, extent_m, start, turn_s or 0.0
+        return plan.with_turn(plan.constrained(*problem), turn_s)
 
     def path(self, made: Plan) -> plan.RobotPath:
         """Return the path of a plan from the start.
@@ -333,7 +333,9 @@ class Replanning:
         """Simulate the approach over the whole log under the supervisor; None without truth."""
         if self.saved.truth is None:
             return None
-        guidance = plan.Guidance(self.params, plan.Supervisor(self.supervisor), self.limits, self.saved.extent_m)
+        guidance = plan.Guidance(
+            self.params, plan.Supervisor(self.supervisor), self.limits, self.saved.extent_m, self.robot.gripper
+        )
         beliefs = {belief.t_ns: belief for belief in self.saved.beliefs}
         inputs = (
             planner_input(self.saved.estimator, belief, self._target, row.gamma, row.converged, self._forecast(belief))

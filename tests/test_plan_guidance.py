@@ -3,8 +3,18 @@
 import numpy as np
 import pytest
 
-from avsreplay.geometry import exp
-from avsreplay.plan import Action, Guidance, Limits, PlannerInput, PlanParams, Scene, Supervisor, SupervisorParams
+from avsreplay.geometry import angle, conjugate, exp, multiply
+from avsreplay.plan import (
+    Action,
+    Guidance,
+    Limits,
+    PlannerInput,
+    PlanParams,
+    Scene,
+    Supervisor,
+    SupervisorParams,
+    rendezvous,
+)
 from avsreplay.plan.limits import margin
 from avsreplay.records import Forecast
 
@@ -100,3 +110,28 @@ def test_limits_hold_in_every_plan_of_a_flight():
         constrained += plan.thrust is not None
         assert plan.margin_m >= 0.0 or margin(known.scene, limits, *state.segment.at(known.t_ns)) < limits.mouth_m
     assert constrained > 3
+
+
+@pytest.mark.parametrize("accel", [0.002, 0.05])
+def test_the_gripper_has_the_attitude_of_the_fixture_at_the_capture(accel):
+    rng = np.random.default_rng(3)
+    target, start = scene(rng), exp(np.array([1.5, -1.0, 0.4]))
+    guidance = Guidance(ROBOT, Supervisor(PARAMS), gripper=(start, accel))
+    exact = lambda dt: Forecast(dt, *(1e-4 * np.ones((3, len(dt)))))  # noqa: E731
+    known = (PlannerInput(round(t * 1e9), 1, True, target.after(t), exact) for t in np.arange(0.0, 120.0, 0.5))
+    attitudes, state = [], None
+    for each, state in guidance.fly(known):
+        turn = state.segment.turn
+        attitudes.append(turn.at(np.array([(each.t_ns - turn.t_ns) * 1e-9]))[0])
+        if state.captured_ns is not None:
+            break
+    assert state.captured_ns is not None
+    end_s = (state.segment.end_ns - turn.t_ns) * 1e-9
+    truth = target.attitude(np.array([state.segment.end_ns * 1e-9]))[0]
+    assert angle(multiply(conjugate(truth), turn.at(np.array([end_s]))[0])) < 1e-3
+    steps = angle(multiply(conjugate(np.array(attitudes[:-1])), np.array(attitudes[1:])))
+    assert steps.max() < 0.5  # the attitude is continuous over all replans
+    free = rendezvous(target.goal, np.zeros(3), np.zeros(3), ROBOT)
+    assert state.captured_ns * 1e-9 >= free.t_go_s - 1e-6
+    if accel == 0.002:
+        assert state.captured_ns * 1e-9 > free.t_go_s + 5.0

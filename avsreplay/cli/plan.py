@@ -197,6 +197,7 @@ def _plan_record(made: Plan, since_s: float) -> dict[str, Any]:
         "margin_m": made.margin_m,
         "limit": made.binding or None,
         "abort_margin_m": made.abort_margin_m,
+        "attitude_s": made.attitude_s,
     }
 
 
@@ -236,6 +237,8 @@ def _plan_facts(planning: Replanning, at_s: float, made: Plan, spread: Spread | 
             ("terminal errors", f"{made.position_error_m:.1e} m, {made.velocity_error_mps:.1e} m/s"),
             ("largest |u|", f"{made.u_max:.6g} of {made.a_max:.6g} m/s2"),
         ]
+    if abs(made.attitude_s) < float("inf"):
+        facts.append(("gripper", f"attitude and rate of the fixture after {made.attitude_s:.3f} s"))
     basis = "certified without the limits" if planning.limits.any else "certified"
     facts.append(("no capture before", f"{made.lower_bound_s:.4f} s after planning ({basis})"))
     if made.binding:

@@ -1,5 +1,6 @@
 """Time-optimal rendezvous with the grasp point under constraints, the supervisor, and their evaluation."""
 
+from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.evaluation import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
@@ -45,6 +46,7 @@ __all__ = [
     "SupervisorParams",
     "TargetGeometry",
     "Tolerance",
+    "Turn",
     "constrained",
     "draws",
     "execute",
@@ -54,4 +56,7 @@ __all__ = [
     "path_of",
     "rendezvous",
     "spread",
+    "turn_time",
+    "turn_to",
+    "with_turn",
 ]

@@ -55,6 +55,7 @@ class Subproblem:
         weight: Cost of the slack, in relative end time per length scale.
         speed: Bound on the speed.
         contact: Bound on |u - acceleration| in the last interval.
+        earliest: Lower bound of h.
         axes: (3, 3) rows e with |e.u| <= 1; None without bounds per axis.
         planes: Rows that must be at least 0.
         cones: Rows in groups of ``size``; in each group the first row bounds the norm of the others.
@@ -73,6 +74,7 @@ class Subproblem:
     speed: float | None = None
     contact: float | None = None
     axes: Array | None = None
+    earliest: float = 0.0
     planes: tuple[PointRows, ...] = ()
     cones: tuple[tuple[int, PointRows], ...] = ()
 
@@ -180,7 +182,7 @@ def _bounds(rows: _Rows, p: Subproblem, scale: float) -> None:
     """1 - change <= h/h_ref <= 1 + change, slack >= 0, and |e.w| <= h^2 (tangent) for bounds per axis."""
     rows.put(np.array([0, 1]), 9 * p.n + 6, np.array([-1.0, 1.0]))
     rows.put(np.array([2]), 9 * p.n + 7, -1.0)
-    rows.close(np.array([p.change - 1.0, 1.0 + p.change, 0.0]))
+    rows.close(np.array([-max(1.0 - p.change, p.earliest / p.h), 1.0 + p.change, 0.0]))
     if p.axes is not None:
         both, n, bound = np.concatenate([p.axes, -p.axes]), p.n, p.h**2 / scale
         row = np.arange(6 * n)

@@ -56,6 +56,7 @@ def constrained(
     t_ns: int = 0,
     extent_m: float = 8.0,
     warm: tuple[RobotPath, float] | None = None,
+    earliest_s: float = 0.0,
 ) -> Plan:
     """Plan a rendezvous under constraints.
 
@@ -68,6 +69,7 @@ def constrained(
         t_ns: Instant of planning.
         extent_m: Diagonal of the target's bounding box [m].
         warm: A path planned earlier and the time since its begin [s]; it is the first initial path.
+        earliest_s: Earliest capture allowed [s after t_ns].
 
     Returns:
         A plan with status ``optimal`` (within ``gap_s`` of the certified lower bound, which is the least time without
@@ -80,14 +82,16 @@ def constrained(
     limits = limits.resolved(extent_m)
     scene.check(limits)
     strongest = replace(params, a_max_mps2=largest_acceleration(limits, params))
-    free = rendezvous(scene.goal, r0, v0, strongest, t_ns)
+    free = rendezvous(scene.goal, r0, v0, strongest, t_ns, earliest_s)
     if not free.found or not limits.any or free.t_go_s <= params.latency_s:
         return free
     free = _necessary(scene, free, np.asarray(r0, float), params, limits)
     if not free.found:
         return free
     sampled = SampledScene(scene, params.horizon_s, params.grid_s)
-    case = Case(sampled, limits, params, np.asarray(r0, float), np.asarray(v0, float), 1e-5 * extent_m)
+    case = Case(
+        sampled, limits, params, np.asarray(r0, float), np.asarray(v0, float), 1e-5 * extent_m, earliest_s=earliest_s
+    )
     unlimited = _free_plan(case, free)
     return unlimited or _graded(case, free, _best_path(case, free, warm), t_ns)
 
@@ -168,7 +172,7 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
         status=PlanStatus.OPTIMAL if found.t_go_s - free.lower_bound_s <= SAME_TIME_S else PlanStatus.FEASIBLE,
         t_go_s=found.t_go_s,
         costate=none,
-        a_max=free.a_max,
+        a_max=case.a_max,
         lower_bound_s=free.lower_bound_s,
         position_error_m=position,
         velocity_error_mps=velocity,
@@ -251,6 +255,7 @@ def _converged(case: Case, reference: ReferencePath, latest_s: float = math.inf)
     """
     best: StepPath | None = None
     n = case.limits.nodes
+    reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
     off = np.zeros((2 * n, len(CONSTRAINTS)))
     change, slack, settled = _trust(case, reference), math.inf, 0
     for iteration in range(ITERATIONS):

@@ -36,6 +36,7 @@ class Case:
     v0: Array
     buffer_m: float
     coarse: bool = False
+    earliest_s: float = 0.0
 
     @property
     def wait_s(self) -> float:
@@ -129,6 +130,7 @@ def convex_subproblem(case: Case, reference: ReferencePath, off: Array, change: 
         speed=case.limits.speed_max_mps,
         contact=case.limits.contact_accel_mps2,
         axes=case.axes,
+        earliest=(case.earliest_s - case.wait_s) / n,
     )
     if not case.limits.geometric:
         return problem

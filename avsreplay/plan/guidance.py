@@ -14,6 +14,7 @@ import numpy as np
 
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
+from avsreplay.plan.attitude import Turn, turn_to, with_turn
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.limits import Scene, margin
 from avsreplay.plan.path import RobotPath, path_of
@@ -54,6 +55,7 @@ class Segment:
         path: Path from t_ns on; None: the robot coasts.
         previous: Segment flown before t_ns, None where t_ns has passed.
         capture: Whether the segment ends at the grasp point.
+        turn: Turn of the gripper; None where its attitude is not planned.
     """
 
     t_ns: int
@@ -62,6 +64,7 @@ class Segment:
     path: RobotPath | None = None
     previous: Segment | None = None
     capture: bool = False
+    turn: Turn | None = None
 
     def at(self, t_ns: int) -> tuple[Array, Array]:
         """Return the state of the robot at an instant.
@@ -111,7 +114,12 @@ class Guidance:
     """Flies the rendezvous under the decisions of a supervisor."""
 
     def __init__(
-        self, params: PlanParams, supervisor: Supervisor, limits: Limits | None = None, extent_m: float = 8.0
+        self,
+        params: PlanParams,
+        supervisor: Supervisor,
+        limits: Limits | None = None,
+        extent_m: float = 8.0,
+        gripper: tuple[Array, float] | None = None,
     ) -> None:
         """Create the guidance of one run.
 
@@ -120,7 +128,10 @@ class Guidance:
             supervisor: Supervisor with resolved parameters.
             limits: Constraints of every capture plan; none where None.
             extent_m: Diagonal of the target's bounding box [m].
+            gripper: Its attitude q_ag (4,) at the begin and its largest angular acceleration [rad/s2]; None: the
+                attitude is not planned.
         """
+        self.gripper = gripper
         self.params, self.supervisor = params, supervisor
         self.limits = (limits or Limits()).resolved(extent_m)
 
@@ -131,7 +142,7 @@ class Guidance:
             t_ns: Instant of the first scan [ns].
         """
         r0, v0 = np.array(self.params.robot_position_m), np.array(self.params.robot_velocity_mps)
-        return GuidanceState(Segment(t_ns, r0, v0))
+        return GuidanceState(Segment(t_ns, r0, v0, turn=Turn(t_ns, self.gripper[0]) if self.gripper else None))
 
     def fly(self, inputs: Iterable[PlannerInput]) -> Iterator[tuple[PlannerInput, GuidanceState]]:
         """Apply ``step`` to one input after the other.
@@ -204,17 +215,34 @@ class Guidance:
 
     def _capture_plan(self, segment: Segment, known: PlannerInput) -> tuple[Plan, Segment | None]:
         """Plan the capture under the limits; the path of the current segment is the first initial path."""
+        turn = self._turn(segment, known)
+        earliest_s = 0.0 if turn is None else turn.ready_s(self.params.horizon_s)
 
         def planner(scene: Scene, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
             if not self.limits.any:
-                return rendezvous(scene.goal, r0, v0, params, t_ns)
+                return rendezvous(scene.goal, r0, v0, params, t_ns, earliest_s)
             since_s = (t_ns - segment.t_ns) * 1e-9 + self.params.latency_s
             closing = segment.path is not None and segment.capture and since_s >= 0.0
             warm = (segment.path, since_s) if closing and segment.path is not None else None
-            return constrained(scene, r0, v0, params, self.limits, t_ns, warm=warm)
+            return constrained(scene, r0, v0, params, self.limits, t_ns, warm=warm, earliest_s=earliest_s)
 
         plan, made = self._plan(segment, known.scene, known.t_ns, planner)
-        return plan, made and replace(made, capture=True)
+        if turn is None or made is None:
+            return plan, made and replace(made, capture=True)
+        return with_turn(plan, earliest_s + self.params.latency_s), replace(made, capture=True, turn=turn)
+
+    def _turn(self, segment: Segment, known: PlannerInput) -> Turn | None:
+        """Return the turn of the gripper to the fixture after the latency; None where its attitude is not planned."""
+        before, attitude = segment.turn, known.scene.attitude
+        if self.gripper is None or before is None or attitude is None:
+            return None
+        wait_s = self.params.latency_s
+        begin_ns = known.t_ns + round(wait_s * 1e9)
+        since_s = (begin_ns - before.t_ns) * 1e-9
+        q0, rate0 = before.at(np.array([since_s]))[0], before.rate(since_s)
+        late = replace(self.params, latency_s=0.0)
+        found = turn_to(lambda t: attitude(t + wait_s), q0, rate0, self.gripper[1], late, begin_ns)
+        return found or Turn(begin_ns, q0)
 
     def _plan(self, segment: Segment, scene: Scene, t_ns: int, planner: _Planner) -> tuple[Plan, Segment | None]:
         """Plan from the state that the current segment reaches when the latency is over."""
@@ -227,7 +255,7 @@ class Guidance:
         if not plan.found:
             return plan, None
         previous = segment if t_ns < segment.t_ns else replace(segment, previous=None)
-        made = Segment(begin_ns, r0, v0, path_of(plan, r0, v0), previous)
+        made = Segment(begin_ns, r0, v0, path_of(plan, r0, v0), previous, turn=segment.turn)
         return _counted_from_planning(plan, wait_s), made
 
     def _facts(self, state: GuidanceState, known: PlannerInput, plan: Plan | None, segment: Segment | None) -> Facts:

@@ -64,7 +64,14 @@ class _Search:
     steps: int
 
 
-def rendezvous(goal: Trajectory, r0: Array, v0: Array, params: PlanParams | None = None, t_ns: int = 0) -> Plan:
+def rendezvous(
+    goal: Trajectory,
+    r0: Array,
+    v0: Array,
+    params: PlanParams | None = None,
+    t_ns: int = 0,
+    earliest_s: float = 0.0,
+) -> Plan:
     """Plan the time-optimal rendezvous without constraints other than |u| <= a_max (eq:terminal, eq:a_max).
 
     Args:
@@ -73,6 +80,7 @@ def rendezvous(goal: Trajectory, r0: Array, v0: Array, params: PlanParams | None
         v0: (3,) its velocity [m/s].
         params: Thrust, horizon, latency and grid; the defaults where None.
         t_ns: Instant of planning.
+        earliest_s: Earliest capture allowed [s after t_ns]; the thrust is smaller than the bound where it decides.
 
     Returns:
         A plan with status ``optimal`` (the first feasible time, certified by ``lower_bound_s``),
@@ -83,6 +91,31 @@ def rendezvous(goal: Trajectory, r0: Array, v0: Array, params: PlanParams | None
     """
     params = params or PlanParams()
     r0, v0 = _finite("r0", r0), _finite("v0", v0)
+    plan = _earliest(goal, r0, v0, params, t_ns)
+    return _not_before(goal, r0, v0, params, plan, earliest_s) if plan.found and plan.t_go_s < earliest_s else plan
+
+
+def _not_before(goal: Trajectory, r0: Array, v0: Array, params: PlanParams, plan: Plan, earliest_s: float) -> Plan:
+    """Return the plan that ends at the first grid time from ``earliest_s`` on at which the thrust suffices.
+
+    For a fixed time the least thrust has constant magnitude a*, so a later capture needs less than the bound.
+    """
+    for end in np.arange(earliest_s, params.horizon_s, params.grid_s):
+        t = float(end) - params.latency_s
+        rho, rate = goal(np.array([params.latency_s + t]))
+        dr, dv = rho[0] - r0 - v0 * (params.latency_s + t), rate[0] - v0
+        found = gauge(dr, t * dv - dr)
+        least = found.value / (t * t)
+        if least <= params.a_max_mps2:
+            path = CostatePath.from_normal(r0, v0, least, params.latency_s, t, found.P0, found.P1)
+            first = float(end) == earliest_s
+            graded = _grade(path, goal, plan.t_ns, _Search(earliest_s - params.latency_s, True, found, plan.steps))
+            return graded if first or not graded.found else replace(graded, status=PlanStatus.FEASIBLE)
+    return replace(_no_plan(plan.t_ns, params, _Search(earliest_s, False, None, 0)), status=PlanStatus.NOT_FOUND)
+
+
+def _earliest(goal: Trajectory, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
+    """Return the plan of the first feasible time."""
     search, sampled = _first_feasible(goal, r0, v0, params, near=True)
     if search.reached and search.normal is None:
         here = np.array([1.0, 0.0, 0.0])  # already at the goal: the thrust time is 0 and its direction has no effect

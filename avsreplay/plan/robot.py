@@ -235,10 +235,11 @@ class RobotParams(Settings):
         )
 
     @property
-    def start_attitude(self) -> Array:
-        """Quaternion (4,) that takes coordinates of the gripper to {A} at the start."""
+    def gripper(self) -> tuple[Array, float] | None:
+        """Attitude (4,) of the gripper at the start and its largest angular acceleration; None: not planned."""
         q = np.array(self.start_attitude_xyzw)
-        return np.asarray(q / np.linalg.norm(q))
+        turn = self.angular_accel_radps2
+        return None if turn is None else (np.asarray(q / np.linalg.norm(q)), turn)
 
     def described(self, params: PlanParams, limits: Limits) -> str:
         """Return the assumed robot in one line.

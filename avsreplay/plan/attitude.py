@@ -1,0 +1,188 @@
+"""Attitude of the gripper: it turns to the attitude and the rate of the fixture within an angular acceleration.
+
+The turn is planned in the rotation vector from the attitude at its begin: q(t) = q0 o exp(psi(t)). For a turn about one
+axis psi'' is the angular acceleration, so the time-optimal rendezvous of psi with the fixture is exact. For a general
+turn the bound on psi'' is reduced until the angular acceleration itself keeps its bound.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.geometry import Array
+from avsreplay.outcome import Plan
+from avsreplay.plan.path import CostatePath
+from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.records import Trajectory
+
+GRID_S = 0.1  # spacing of the samples of the relative attitude
+STEP_S = 1e-3  # of the difference quotients of the attitude
+INSTANTS = 201  # at which the angular acceleration of a turn is checked
+SAME_TIME_S = 1e-3  # a capture this soon after the turn is delayed by it
+REDUCTIONS = 8  # largest number of reductions of the bound on psi''
+
+Attitude = Callable[[Array], Array]
+"""Times (n,) [s] -> quaternions (n, 4) that take coordinates of a body to {A}."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Turn:
+    """A turn of the gripper; afterwards it follows the fixture.
+
+    Attributes:
+        t_ns: Begin of the turn.
+        q0: (4,) attitude of the gripper at t_ns, q_ag.
+        path: Rotation vector in the gripper's axes at t_ns [rad] as a path; None: the attitude is kept.
+        target: Attitude of the fixture, in seconds after t_ns.
+    """
+
+    t_ns: int
+    q0: Array
+    path: CostatePath | None = None
+    target: Attitude | None = None
+
+    def ready_s(self, horizon_s: float) -> float:
+        """Return the time until attitude and rate are those of the fixture [s].
+
+        Args:
+            horizon_s: Returned where no turn was found.
+        """
+        return horizon_s if self.path is None else self.path.t_go_s
+
+    def at(self, times: Array) -> Array:
+        """Return the attitude of the gripper (n, 4).
+
+        Args:
+            times: (n,) [s after t_ns].
+        """
+        if self.path is None or self.target is None:
+            return np.tile(self.q0, (len(times), 1))
+        turning = geometry.multiply(self.q0, geometry.exp(self.path.at(np.minimum(times, self.path.t_go_s))[0]))
+        return np.where((times >= self.path.t_go_s)[:, None], self.target(times), turning)
+
+    def rate(self, t: float) -> Array:
+        """Return the angular rate (3,) in the gripper's axes [rad/s].
+
+        Args:
+            t: Time [s after t_ns].
+        """
+        rate: Array = _rates(self.at, np.array([max(t, STEP_S)]))[0]
+        return rate
+
+
+def turn_to(target: Attitude, q0: Array, rate0: Array, accel: float, params: PlanParams, t_ns: int) -> Turn | None:
+    """Plan the turn of the gripper to the attitude and the rate of the fixture; None if none is found.
+
+    Args:
+        target: Attitude of the fixture, in seconds after t_ns.
+        q0: (4,) attitude of the gripper at t_ns.
+        rate0: (3,) its angular rate in its own axes [rad/s].
+        accel: Largest angular acceleration [rad/s2].
+        params: Horizon, latency and grid.
+        t_ns: Begin of the turn.
+    """
+    found = []
+    for winding in (0, -1):
+        goal, end_s = _relative(target, q0, params.horizon_s, winding)
+        if end_s > params.latency_s:
+            found.append(_within(goal, target, q0, rate0, accel, replace(params, horizon_s=end_s), t_ns))
+    turns = [turn for turn in found if turn is not None]
+    return min(turns, key=lambda turn: turn.ready_s(math.inf), default=None)
+
+
+def _within(
+    goal: Trajectory, target: Attitude, q0: Array, rate0: Array, accel: float, params: PlanParams, t_ns: int
+) -> Turn | None:
+    """Return the turn to one branch of the relative attitude whose angular acceleration keeps its bound."""
+    bound = accel
+    for _ in range(REDUCTIONS):
+        late = PlanParams(bound, params.horizon_s, params.latency_s, grid_s=params.grid_s)
+        plan = rendezvous(goal, np.zeros(3), rate0, late, t_ns)
+        if not plan.found:
+            return None
+        turn = Turn(t_ns, q0, CostatePath.of(plan, np.zeros(3), rate0), target)
+        largest = angular_acceleration(turn)
+        if largest <= accel * (1.0 + 1e-3):
+            return turn
+        bound *= 0.999 * accel / largest
+    return None
+
+
+def angular_acceleration(turn: Turn) -> float:
+    """Return the largest angular acceleration of a turn [rad/s2], by difference quotients at many instants.
+
+    Args:
+        turn: The turn; it must have a path.
+    """
+    times = np.linspace(0.0, turn.ready_s(0.0), INSTANTS)[1:-1]
+    rates = _rates(turn.at, np.concatenate([times - 5.0 * STEP_S, times + 5.0 * STEP_S]))
+    before, after = rates[: len(times)], rates[len(times) :]
+    return float(np.linalg.norm(after - before, axis=1).max(initial=0.0)) / (10.0 * STEP_S)
+
+
+def _rates(attitude: Attitude, times: Array) -> Array:
+    """Return the angular rates (n, 3) in the body's axes [rad/s] by central differences."""
+    step = geometry.multiply(geometry.conjugate(attitude(times - STEP_S)), attitude(times + STEP_S))
+    return np.asarray(geometry.log(step) / (2.0 * STEP_S))
+
+
+def _relative(target: Attitude, q0: Array, horizon_s: float, winding: int) -> tuple[Trajectory, float]:
+    """Return the rotation vector from q0 to the fixture with its derivative, and the time up to which it is continuous.
+
+    A rotation by theta about e is also one by theta - 2 pi; ``winding`` selects the branch at the begin.
+    """
+    from scipy.interpolate import CubicSpline
+
+    times = np.linspace(0.0, horizon_s, math.ceil(horizon_s / GRID_S) + 1)
+    psi = np.array(geometry.log(geometry.multiply(geometry.conjugate(q0), target(times))))
+    size = np.maximum(np.linalg.norm(psi, axis=1, keepdims=True), 1e-12)
+    branches = psi[:, None] + 2.0 * math.pi * np.array([-2, -1, 0, 1, 2])[None, :, None] * (psi / size)[:, None]
+    taken = np.empty_like(psi)
+    taken[0] = branches[0, 2 + winding]
+    for k in range(1, len(times)):
+        taken[k] = branches[k, int(np.argmin(np.sum((branches[k] - taken[k - 1]) ** 2, axis=1)))]
+    jumps = np.flatnonzero(np.linalg.norm(np.diff(taken, axis=0), axis=1) > 1.0)
+    last = int(jumps[0]) if len(jumps) else len(times) - 1
+    if last < 4:
+        return (lambda t: (np.zeros((len(t), 3)), np.zeros((len(t), 3)))), 0.0
+    spline = CubicSpline(times[: last + 1], taken[: last + 1])
+    return (lambda t: (np.asarray(spline(t)), np.asarray(spline(t, 1)))), float(times[last])
+
+
+def turn_time(
+    target: Attitude | None, gripper: tuple[Array, float] | None, params: PlanParams, t_ns: int
+) -> float | None:
+    """Return the time that a gripper at rest needs to attitude and rate of the fixture [s], at most the horizon.
+
+    Args:
+        target: Attitude of the fixture, in seconds after t_ns; None where it is not known.
+        gripper: Attitude (4,) of the gripper and its largest angular acceleration [rad/s2]; None: not planned.
+        params: Horizon, latency and grid.
+        t_ns: Instant of planning.
+
+    Returns:
+        The time, or None where the attitude is not planned.
+    """
+    if target is None or gripper is None:
+        return None
+    turn = turn_to(target, gripper[0], np.zeros(3), gripper[1], params, t_ns)
+    return params.horizon_s if turn is None else turn.ready_s(params.horizon_s)
+
+
+def with_turn(plan: Plan, turn_s: float | None) -> Plan:
+    """Return the plan with the time of the gripper's turn; ``attitude`` is its limit where the turn decides.
+
+    Args:
+        plan: The plan of the flight.
+        turn_s: Time until attitude and rate are those of the fixture [s after the instant of planning]; None where the
+            attitude is not planned.
+    """
+    if turn_s is None or not plan.found:
+        return plan
+    binding = "attitude" if plan.t_go_s <= turn_s + SAME_TIME_S else plan.binding
+    return replace(plan, attitude_s=turn_s, binding=binding)
