@@ -20,6 +20,7 @@ from avsreplay.records import (
     Alignment,
     Belief,
     BodyParameters,
+    Drift,
     Forecast,
     Innovation,
     Manoeuvre,
@@ -44,8 +45,7 @@ class Plan:
     """A rendezvous in least time: meet the grasp point in position and velocity with |u| <= a_max (eq:terminal).
 
     Attributes:
-        t_ns: Instant of planning.
-        t_go_s: Time from t_ns to the capture [s], NaN where there is none.
+        t_ns: Instant of planning.  t_go_s: Time from it to the capture [s], NaN where there is none.
         costate: (6,) [c1, c2] of the primer vector p = c2 - c1 tau, tau from t_ns, of unit norm; NaN for a plan with
             ``thrust``.
         a_max: Bound on the thrust, or its constant magnitude where the turn of the gripper delays the capture [m/s2].
@@ -55,8 +55,8 @@ class Plan:
         latency_s: Coasting time before the thrust [s].
         thrust: (n, 3) acceleration in {A} over n equal intervals [m/s2]; None where the costate defines the thrust.
         violation_m: Largest excess over the geometric constraints along the plan [m]; NaN without constraints.
-        margin_m: Smallest margin of the geometric constraints along the plan [m]; NaN without constraints.
-        binding: Name of the constraint with this margin, "" without constraints.
+        margin_m, binding: Smallest margin of the geometric constraints along the plan [m], and the constraint with it;
+            NaN and "" without constraints.
         abort_margin_m: Smallest margin of the clearance if the robot aborts at any instant before the corridor [m]; NaN
             without a clearance.
         steps: Number of steps of the search.
@@ -98,15 +98,14 @@ class MonitorReport:
 
     Attributes:
         ogm_rank: numerical rank of the scaled observability Gramian, at most 20.
-        ogm_log10_cond: log10 of its condition number, None below full rank.
-        ogm_log10_cond_scaled: the same after scaling by the prior standard deviations.
+        ogm_log10_cond, ogm_log10_cond_scaled: log10 of its condition number as it is and scaled by the prior standard
+            deviations; None below full rank.
         consistent: the innovations agree with their covariance; None before there are enough of them.
         violations: consistency checks that the estimate has failed so far.
-        nis_mean: mean NIS over the consistency window.
-        autocorrelation: lag-1 autocorrelation of the whitened innovations in that window.
+        nis_mean, autocorrelation: mean NIS and lag-1 autocorrelation of white innovations in the consistency window.
         converged: the planner may rely on the estimate.
-        covariance_converged: every block of the covariance is below its limit (the paper's criterion).
-        predictive_converged: the predicted standard deviations of the grasp point are below their limits.
+        covariance_converged, predictive_converged: every block of the covariance (the paper's criterion), or every
+            predicted standard deviation of the grasp point, is below its limit.
         unconverged: blocks whose covariance is above its limit.
         forecast: predicted standard deviations of the grasp point over the convergence horizon.
     """
@@ -130,24 +129,20 @@ class Outcome:
     """What the pipeline made of one scan.
 
     Attributes:
-        scan: the scan itself.
-        start_ns: instant of the first scan of the replay.
+        scan: the scan itself.  start_ns: instant of the first scan of the replay.
         guess: where the initial guess of the registration came from.
-        alignment: the graded pose.
-        innovation: None where no pose was measured.
+        alignment: the graded pose.  innovation: None where no pose was measured.
         verdict: gamma and its reason.
         belief: estimate after the update.
-        pose: estimated T_ac, the pose of {C} in {A}.
+        pose: estimated T_ac.
         pose_covariance: (6, 6) covariance of that pose: position in {A} [m], half-angle vector in {B} [rad].
         body: inertia, mass centre and rate in {C}.
         estimator: estimator in use: near, start, fit or filter.
-        sigma_hits: how often the bounds of the inertia ratios limited the gain so far.
-        r_floors: how many eigenvalues of R were raised to their lower limit so far.
+        sigma_hits, r_floors: how often a bound of the inertia ratios limited the gain, and a floor an eigenvalue of R.
         reinitialised: how often the filter or the given start was replaced by a fit so far.
-        manoeuvres: all changes of the target's velocity found so far.
+        manoeuvres: all changes of the target's velocity found so far.  drift: constant torque or force, if any.
         monitors: observability, consistency and convergence.
-        action: command of the supervisor to the robot.
-        supervisor_rule: rule of the supervisor that gave it.
+        action, supervisor_rule: command of the supervisor to the robot, and the rule that gave it.
         plan: capture plan in force, None before the first.
     """
 
@@ -166,6 +161,7 @@ class Outcome:
     r_floors: int
     reinitialised: int
     manoeuvres: tuple[Manoeuvre, ...]
+    drift: Drift | None
     monitors: MonitorReport
     action: str
     supervisor_rule: str
@@ -194,14 +190,10 @@ class Score:
     """An outcome compared with ground truth; None where there is no truth for it.
 
     Attributes:
-        fault: label of the fault injected into this scan.
-        reference: what the errors are taken against: "truth", or "fit" (a motion fitted to all healthy poses).
-        estimate: error of the estimated pose.
-        registration: error of the measured pose.
-        nees: normalised estimation error squared of the 20 states, for the best order of the principal axes.
-        nees_blocks: the same of each block of the state by itself.
-        planned: error of a plan made at this scan at its planned instant of capture.
-        captured: error of the capture where the gripper has closed since the last scan.
+        fault: label of the injected fault.  reference: "truth", or "fit" (a motion fitted to all healthy poses).
+        estimate, registration: errors of the estimated and of the measured pose.
+        nees, nees_blocks: normalised estimation error squared, for the best order of the principal axes, and by block.
+        planned: error of a plan made at this scan at its planned instant.  captured: of a capture since the last scan.
     """
 
     fault: str | None = None
@@ -246,21 +238,31 @@ def if_planned(get: Callable[[Outcome, Plan], float]) -> Value[float | None]:
     return lambda o, s: get(o, o.plan) if o.plan is not None and o.plan.found else None
 
 
-def last_manoeuvre(get: Callable[[Outcome, Manoeuvre], float]) -> Value[float | None]:
-    """Return a column value taken from the last manoeuvre, None before the first.
+def change_values(get: Callable[[Outcome], Manoeuvre | None]) -> tuple[Value[float | None], ...]:
+    """Return the column values of a manoeuvre or a drift, None where there is none.
 
     Args:
-        get: takes the value from the outcome and the manoeuvre.
+        get: takes it from the outcome.
+
+    Returns:
+        Instant [s], size of the linear part, size of the angular part, each followed by its standard deviation.
     """
-    return lambda o, s: get(o, o.manoeuvres[-1]) if o.manoeuvres else None
+
+    def of(value: Callable[[Outcome, Manoeuvre], float]) -> Value[float | None]:
+        return lambda o, s: None if (change := get(o)) is None else float(value(o, change))
+
+    return (
+        of(lambda o, m: since_start_s(o, m.t_ns)),
+        of(lambda o, m: m.t_1s_s),
+        of(lambda o, m: float(np.linalg.norm(m.velocity))),
+        of(lambda o, m: math.sqrt(np.trace(m.P[3:, 3:]))),
+        of(lambda o, m: float(np.linalg.norm(m.rate))),
+        of(lambda o, m: math.sqrt(np.trace(m.P[:3, :3]))),
+    )
 
 
 def if_measured(get: Callable[[Pose], float]) -> Value[float | None]:
-    """Return a column value taken from the registered pose, None where nothing was measured.
-
-    Args:
-        get: takes the value from the pose T_ac.
-    """
+    """Return a column value that ``get`` takes from the registered pose, None where nothing was measured."""
     return lambda o, s: float(get(o.alignment.T_ac)) if o.alignment.measured else None
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
-from avsreplay.estimate.body import body_parameters
+from avsreplay.estimate.chart import body_parameters
 from avsreplay.estimate.deskew import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor import observability
@@ -225,6 +225,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         r_floors=track.r_floors,
         reinitialised=track.reinitialised,
         manoeuvres=track.manoeuvres,
+        drift=track.drift,
         monitors=report,
         action=guidance.decision.action.value,
         supervisor_rule=guidance.decision.rule,

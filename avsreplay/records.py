@@ -197,8 +197,7 @@ class Fit:
     """What a back end returns.
 
     Attributes:
-        T_ca: pose that takes the scan {A} into the model {C}.
-        iterations: passes made.
+        T_ca: pose that takes the scan {A} into the model {C}.  iterations: passes made.
         converged: the back end's own convergence flag.
         matches: ``IcpResult.matches`` of the last pass, None if there is none; saves time, never changes a result.
     """
@@ -298,8 +297,7 @@ class Manoeuvre:
 
     Attributes:
         t_ns: its most likely instant.  t_1s_s: standard deviation of the instant [s].
-        velocity: (3,) change of the velocity of the centre of mass, in {A} [m/s].
-        rate: (3,) change of the angular rate, in {B} [rad/s].
+        velocity, rate: (3,) change of the mass centre's velocity in {A} [m/s], and of the angular rate in {B} [rad/s].
         P: (6, 6) covariance of (rate, velocity).  detected_ns: instant of the scan at which it was decided.
     """
 
@@ -309,6 +307,10 @@ class Manoeuvre:
     rate: Array
     P: Array
     detected_ns: int
+
+
+class Drift(Manoeuvre):
+    """A constant acceleration from ``t_ns`` on: ``rate`` by a torque [rad/s2], ``velocity`` by a force [m/s2]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -17,6 +17,7 @@ from avsreplay.outcome import (
     Score,
     Value,
     capture_error_values,
+    change_values,
     deviation,
     finite,
     full_angle_deg,
@@ -24,7 +25,6 @@ from avsreplay.outcome import (
     if_measured,
     if_planned,
     if_points,
-    last_manoeuvre,
     pose_error_values,
     position_1s_m,
     since_start_s,
@@ -43,8 +43,7 @@ class Column:
         name: field name, with its unit as suffix where it has one.
         unit: as printed in table headings, "" if none.
         fmt: format specification for tables.
-        rtol: relative golden tolerance; 0 with ``atol`` 0 means exact.
-        atol: absolute golden tolerance.
+        rtol, atol: relative and absolute golden tolerance; both 0 means exact.
         doc: meaning.
         table: shown in the per-scan table.
     """
@@ -107,6 +106,7 @@ def _exact(value: Value[T], doc: str, table: bool = False) -> T:
 
 
 _ESTIMATE, _REGISTRATION = pose_error_values(lambda s: s.estimate), pose_error_values(lambda s: s.registration)
+_PUSH, _DRIFT = change_values(lambda o: o.manoeuvres[-1] if o.manoeuvres else None), change_values(lambda o: o.drift)
 _PLANNED, _CAPTURED = capture_error_values(lambda s: s.planned), capture_error_values(lambda s: s.captured)
 
 
@@ -260,18 +260,18 @@ class Row:
         "How often the poses contradicted the filter or the given initial state, so that a fit replaced it.")
     manoeuvres: int | None = _exact(lambda o, s: len(o.manoeuvres),
         "Number of manoeuvres found so far: changes of the target's velocity that free motion does not explain.")
-    manoeuvre_s: float | None = _seconds(last_manoeuvre(lambda o, m: since_start_s(o, m.t_ns)),
-        "Instant of the last manoeuvre, since the first scan.")
-    manoeuvre_1s_s: float | None = _seconds(last_manoeuvre(lambda o, m: m.t_1s_s),
-        "Standard deviation of manoeuvre_s.")
-    manoeuvre_mps: float | None = _number(last_manoeuvre(lambda o, m: float(np.linalg.norm(m.velocity))),
-        "Change of the velocity of the centre of mass by the last manoeuvre.", "m/s")
-    manoeuvre_1s_mps: float | None = _number(last_manoeuvre(lambda o, m: float(np.sqrt(np.trace(m.P[3:, 3:])))),
-        "Standard deviation of that change (root of the trace).", "m/s")
-    manoeuvre_radps: float | None = _number(last_manoeuvre(lambda o, m: float(np.linalg.norm(m.rate))),
-        "Change of the angular rate by the last manoeuvre.", "rad/s")
-    manoeuvre_1s_radps: float | None = _number(last_manoeuvre(lambda o, m: float(np.sqrt(np.trace(m.P[:3, :3])))),
-        "Standard deviation of that change (root of the trace).", "rad/s")
+    manoeuvre_s: float | None = _seconds(_PUSH[0], "Instant of the last manoeuvre, since the first scan.")
+    manoeuvre_1s_s: float | None = _seconds(_PUSH[1], "Standard deviation of manoeuvre_s.")
+    manoeuvre_mps: float | None = _number(_PUSH[2], "Change of the mass centre's velocity by it.", "m/s")
+    manoeuvre_1s_mps: float | None = _number(_PUSH[3], "Standard deviation of that change (root of the trace).", "m/s")
+    manoeuvre_radps: float | None = _number(_PUSH[4], "Change of the angular rate by it.", "rad/s")
+    manoeuvre_1s_radps: float | None = _number(_PUSH[5], "Standard deviation of that (root of the trace).", "rad/s")
+    drift_s: float | None = _seconds(_DRIFT[0], "Onset of a constant torque or force, since the first scan.")
+    drift_1s_s: float | None = _seconds(_DRIFT[1], "Standard deviation of drift_s.")
+    drift_mps2: float | None = _number(_DRIFT[2], "Acceleration by that force.", "m/s2", atol=1e-9)
+    drift_1s_mps2: float | None = _number(_DRIFT[3], "Its standard deviation (root of the trace).", "m/s2", atol=1e-9)
+    drift_radps2: float | None = _number(_DRIFT[4], "Angular acceleration by that torque.", "rad/s2", atol=1e-9)
+    drift_1s_radps2: float | None = _number(_DRIFT[5], "Its standard deviation (root of trace).", "rad/s2", atol=1e-9)
 
     ogm_log10_cond: float | None = column(lambda o, s: o.monitors.ogm_log10_cond,
         "log10 of the condition number of the observability Gramian; null below full rank.",

@@ -7,8 +7,7 @@ import pytest
 import tumbling
 
 from avsreplay import geometry
-from avsreplay.estimate.body import body_parameters
-from avsreplay.estimate.chart import AXIS_PERMUTATIONS, permute_axes, permute_covariance
+from avsreplay.estimate.chart import AXIS_PERMUTATIONS, body_parameters, permute_axes, permute_covariance
 from avsreplay.records import Belief
 
 

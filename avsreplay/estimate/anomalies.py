@@ -81,7 +81,7 @@ class AnomalyTest:
     def _decided(self, track: Track) -> tuple[Track, Verdict]:
         """The track after a decision, or still in doubt."""
         window, first = (*track.recent, *track.doubtful), len(track.recent)
-        ranked = explain(window, first, self._priors, self.params.torque_noise_radps15, self.params.force)
+        ranked = explain(window, first, self._priors, *self.batch.noise_levels(track))
         best, margin = ranked[0], ranked[0].log_evidence - ranked[1].log_evidence
         last_chance = len(track.doubtful) >= _MOST
         explained = best.chi2 < _EXPLAINED * best.dof
@@ -116,7 +116,7 @@ class AnomalyTest:
     def _replayed(self, track: Track) -> Track:
         """All doubtful scans used after all, with their Cauchy weights."""
         epochs = track.doubtful
-        out = replace(epochs[0].track, recent=track.recent, manoeuvres=track.manoeuvres)
+        out = replace(epochs[0].track, recent=track.recent, manoeuvres=track.manoeuvres, drift=track.drift)
         for epoch in epochs:
             out = self._replay(out, epoch)
         return replace(out, recent=(*track.recent, *epochs)[-_RECENT:], doubtful=())
@@ -127,7 +127,7 @@ class AnomalyTest:
         start_ns, t_ns = at.t_ns, _last_change_ns(window, best)
         for after_s in best.changes_s:
             then_ns = start_ns + round(after_s * 1e9)
-            at, _ = propagate(at, then_ns, self.params.torque_noise_radps15, self.params.force)
+            at, _ = propagate(at, then_ns, *self.batch.noise_levels(track))
             P = at.P.copy()
             P[W, W] += self._priors.rate_radps**2 * np.eye(3)
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
@@ -164,7 +164,7 @@ class AnomalyTest:
         factors = np.array([window[3], window[0]]) * np.sqrt(inflation)
         rules = FitParams(rescale=False)
         fitted = fit(poses, prior.mean, prior, rules, factors)
-        now_ns, noise = fixes[-1].scan_ns, (self.params.torque_noise_radps15, self.params.force)
+        now_ns, noise = fixes[-1].scan_ns, self.batch.noise_levels(track)
         found = BatchCovariance(fitted, ())
         after_s = (now_ns - t_ns) * 1e-9
         problem, latest = Problem(poses, prior, fitted.effective), poses.latest(LATEST, after_s)
@@ -188,7 +188,7 @@ class AnomalyTest:
         if 2.0 * fitted.half_chi2 > _EXPLAINED * (6 * len(fixes) - 12):
             return None
         first = epochs[0].prediction.belief
-        out = Track(Belief(first.t_ns, first.x, first.P), "start", manoeuvres=track.manoeuvres)
+        out = Track(Belief(first.t_ns, first.x, first.P), "start", manoeuvres=track.manoeuvres, drift=track.drift)
         for epoch in epochs:
             out = self._replay(out, epoch)
         return replace(out, reinitialised=track.reinitialised + 1, sigma_hits=track.sigma_hits, r_floors=track.r_floors)

@@ -274,6 +274,7 @@ def fit(
             problem.reweigh(plain * np.sqrt(inflation))
             more, done = core.descend(params.max_steps, params.gain_tol)
             steps += more
+    core.linearise(core.chart)  # the last steps kept the Jacobian; the covariance needs that of the minimum
     return BatchFit(problem.chart, problem.covariance, core.cost, core.d, core.weights, plain, inflation, steps, done)
 
 

@@ -37,7 +37,8 @@ _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
 LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
-_SPHERE = 3.0  # tr I / I of a sphere
+_DISTURBED = 12  # error states that a disturbance reaches: attitude, rate, position, velocity
+SPHERE = 3.0  # tr I / I of a sphere
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,11 +155,20 @@ def final_mixture(
         if float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
             share = _accepted_share(base, move, recent)
         there = base.moved(share * move)
-        P = step @ (P - without) @ step.T + (1.0 - share) ** 2 * np.outer(move, move)
+        P = P if pin is not None or not n else _without(P, without)
+        P = step @ P @ step.T + (1.0 - share) ** 2 * np.outer(move, move)
         T = to_errors(there)
         P = T @ P @ T.T
         out.append(Component(weight, Belief(t_ns, to_state(there), 0.5 * (P + P.T))))
     return tuple(out)
+
+
+def _without(P: Array, part: Array) -> Array:
+    """P less a part of it, positive semidefinite: what rounding leaves below zero is zero."""
+    scale = np.sqrt(np.diagonal(P))
+    values, vectors = np.linalg.eigh((P - part) / np.outer(scale, scale))
+    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+    return np.asarray(root @ root.T)
 
 
 def _accepted_share(base: Chart, move: Array, latest: Problem) -> float:
@@ -227,7 +237,7 @@ def propagate_chart(chart: Chart, h: float) -> tuple[State, Array]:
 
 def memory_s(torque: float) -> float:
     """How far back [s] a fit may look: root density ``torque`` turns the body by its square T^3 / 3 in variance."""
-    return float(np.cbrt(3.0 * (_LINEAR_RAD / (_SPHERE * torque)) ** 2))
+    return float(np.cbrt(3.0 * (_LINEAR_RAD / (SPHERE * torque)) ** 2))
 
 
 def process_noise_pass(
@@ -242,9 +252,7 @@ def process_noise_pass(
     if pin is not None:
         k = P @ pin.row / float(pin.row @ P @ pin.row + pin.one_sigma**2)
         y, P = y - k * (pin.error(chart) * pin.one_sigma + float(pin.row @ y)), P - np.outer(k, pin.row @ P)
-    T, x = to_errors(chart), to_state(chart)
-    P = T @ P @ T.T
+    into = np.ascontiguousarray(np.linalg.inv(to_errors(chart))[:, :_DISTURBED])
+    density = torque_density(to_state(chart).sigma, noise[0])
     problem.core.linearise(chart.flat)
-    y, P = problem.core.smooth(T @ y, 0.5 * (P + P.T), torque_density(x.sigma, noise[0]), noise[1] ** 2)
-    back = np.linalg.inv(T)
-    return back @ y, back @ P @ back.T
+    return problem.core.smooth(y, 0.5 * (P + P.T), into, density, noise[1] ** 2)

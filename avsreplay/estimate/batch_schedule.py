@@ -16,8 +16,9 @@ import numpy as np
 
 from avsreplay.estimate import ekf
 from avsreplay.estimate.batch import FitParams, Prior
-from avsreplay.estimate.batch_covariance import memory_s, propagate_chart
+from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_chart
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
+from avsreplay.estimate.drift import find_drift
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, first_belief
 from avsreplay.estimate.measurement import in_fixture, measured_pose
@@ -28,6 +29,9 @@ from avsreplay.records import Belief, Innovation
 
 FEWEST_TO_FIT = 3
 FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
+FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a test of drift, and between two tests
+_DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
+_DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
 _RECENT = 0.1  # largest age of a given start over the fit's memory; until then disturbances change it little
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
 _LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
@@ -47,6 +51,7 @@ class BatchSchedule:
         self.params, self.noise, self.start = params, noise, start
         self.checked_poses = 0 if params.start is Start.PAPER else params.audit_poses
         self._rules = FitParams(rescale=params.adapt is not Adaptation.OFF)
+        self._drift_scale = (1e-3, _DRIFT_OF_SPEED * params.length("start_vel_1s_mps"))
         self._memory_ns = round(min(memory_s(params.torque_noise_radps15), _LONGEST_S) * 1e9)
 
     def initialised(self, track: Track, prediction: Prediction, innovation: Innovation, converged: bool) -> Track:
@@ -86,7 +91,11 @@ class BatchSchedule:
         """
         enough = max(FEWEST_TO_CHECK, CHECK_GROWTH * len(track.fixes))
         many_outliers = track.window.many_outliers
-        if not self.checked_poses or track.since < (FEWEST_WITH_OUTLIERS if many_outliers else enough):
+        if (
+            not self.checked_poses
+            or track.drift is not None
+            or track.since < (FEWEST_WITH_OUTLIERS if many_outliers else enough)
+        ):
             return track
         epoch_ns = track.fixes[0].t_ns
         rejected = track.batch is not None and track.batch.prior_rejected
@@ -95,6 +104,41 @@ class BatchSchedule:
         if (result.gaussian or many_outliers) and contradicted(track.belief, result.belief):
             return replace(self._adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
         return replace(track, since=0)
+
+    def check_for_drift(self, track: Track) -> Track:
+        """The track with the constant torque or force that its poses show, tested each time they have grown enough.
+
+        At its first detection the estimate is replaced by that of a fit with process noise of the same size, and the
+        filter continues with this noise. Later tests refine the reported values.
+        """
+        count, last = len(track.fixes), track.batch
+        due = max(FEWEST_TO_TEST, DRIFT_GROWTH * count)
+        if not self.checked_poses or last is None or count < FEWEST_WITH_DRIFT or track.untested < due:
+            return replace(track, untested=track.untested + 1)
+        track = replace(track, untested=0)
+        epoch_ns = track.fixes[0].t_ns
+        start = last.chart if last.epoch_ns == epoch_ns else chart_at(track.belief, epoch_ns)
+        factors = np.array([track.window.factors[3], track.window.factors[0]])
+        found = find_drift(track.fixes, start, self.params, factors, self._drift_scale)
+        if found is None:
+            return track
+        if track.drift is not None:
+            return replace(track, drift=replace(found, detected_ns=track.drift.detected_ns))
+        track = replace(track, drift=found)
+        result = batch_estimate(track.fixes, self.params, self._rules, start=start, noise=self.noise_levels(track))
+        return self._adopted(track, result, to_filter=True)
+
+    def noise_levels(self, track: Track) -> tuple[float, float]:
+        """Root densities of torque [rad/s^1.5] and force [m/s^1.5]: those of the settings, or those of the drift.
+
+        White noise of root density q changes the rate by q sqrt(T) within T, a constant acceleration a by a T; the two
+        are equal over ``_DRIFT_S``. The torque acts on the rate through B(sigma), which is 3 for a sphere.
+        """
+        torque, force = self.params.torque_noise_radps15, self.params.force
+        if track.drift is None:
+            return torque, force
+        sizes = [float(np.linalg.norm(v)) * np.sqrt(_DRIFT_S) for v in (track.drift.rate, track.drift.velocity)]
+        return max(torque, sizes[0] / SPHERE), max(force, sizes[1])
 
     def _first(self, track: Track, prediction: Prediction, innovation: Innovation) -> Belief:
         """The belief after the first poses, too few for a fit."""

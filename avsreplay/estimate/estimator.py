@@ -62,7 +62,6 @@ class Estimator:
         self._prior = None if self.start is None else given_prior(self.start)
         self._robust = params.robust and params.start is not Start.PAPER
         self._by_gain = self.params.by_gain
-        self._torque, self._force = self.params.torque_noise_radps15, self.params.force
 
     def initial(self, t_ns: int, T_ac: Pose) -> Track:
         """The track before the first scan: the given start, else a body at rest at a pose.
@@ -87,7 +86,7 @@ class Estimator:
         Raises:
             UsageError: the instant is too far from the last scan to predict the rotation.
         """
-        belief, Phi = dynamics.propagate(track.belief, t_ns, self._torque, self._force)
+        belief, Phi = dynamics.propagate(track.belief, t_ns, *self.batch.noise_levels(track))
         return Prediction(belief, Phi, measurement_jacobian(belief.x), track.window)
 
     def innovate(self, prediction: Prediction, alignment: Alignment) -> Innovation:
@@ -121,9 +120,11 @@ class Estimator:
         if innovation is None:
             return self.update(track, prediction, None, 0), verdict
         epoch = Epoch(replace(track, recent=(), doubtful=()), prediction, innovation, converged)
-        return self.anomalies.step(
+        after, verdict = self.anomalies.step(
             track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged)
         )
+        tested = verdict.gamma == 1 and self._robust and after.mode in ("fit", "filter")
+        return self.batch.check_for_drift(after) if tested else after, verdict
 
     def track_forecast(self, track: Track, times_s: Array) -> Forecast:
         """Predicted 1 sigma of the grasp point after a scan, by components where the likelihood is not Gaussian.
@@ -133,8 +134,8 @@ class Estimator:
             times_s: (n,) >= 0, ascending [s after the scan].
         """
         if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
-            return self.forecast(track.belief, times_s)
-        return mixture_forecast(track.batch.components, track.belief.t_ns, times_s, self._torque, self._force)
+            return dynamics.grasp_forecast(track.belief, times_s, *self.batch.noise_levels(track))
+        return mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *self.batch.noise_levels(track))
 
     def refitted_rows(self, track: Track) -> tuple[Array, Array, Array] | None:
         """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no new fit.
@@ -252,7 +253,7 @@ class Estimator:
             belief: mean and covariance now.
             times_s: (n,) >= 0, ascending [s after the belief's instant].
         """
-        return dynamics.grasp_forecast(belief, times_s, self._torque, self._force)
+        return dynamics.grasp_forecast(belief, times_s, self.params.torque_noise_radps15, self.params.force)
 
     def pose_covariance(self, belief: Belief) -> Array:
         """The covariance of the pose of {C}, H P H' (H of eq:innovation).

@@ -185,10 +185,12 @@ def batch_estimate(
     last: BatchResult | None = None,
     start: Chart | None = None,
     given: Prior | None = None,
+    noise: tuple[float, float] | None = None,
 ) -> BatchResult:
     """Fit all poses, from ``start`` or the values of the last fit; ``given`` is the prior at the first pose.
 
-    The given prior is left out once the poses contradict it.
+    The given prior is left out once the poses contradict it. ``noise``: root densities of torque and force, by default
+    those of the settings.
     """
     poses = poses_of(fixes)
     prior = weak = weak_prior(poses, params)
@@ -206,7 +208,7 @@ def batch_estimate(
         fitted, prior = (fitted, weak) if rejected else (joint, given)
     problem = Problem(points, prior, fitted.effective)
     found = covariance_of(problem, fitted, rules)
-    now_ns, noise = fixes[-1].scan_ns, (params.torque_noise_radps15, params.force)
+    now_ns, noise = fixes[-1].scan_ns, noise or (params.torque_noise_radps15, params.force)
     after_s = (now_ns - fixes[0].t_ns) * 1e-9
     components = final_mixture(found, problem, poses.latest(LATEST, after_s), noise, now_ns, after_s)
     gaussian = _determined(found, weak)

@@ -10,7 +10,7 @@ from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.noise import NoiseWindow
 from avsreplay.geometry import Array, frozen
-from avsreplay.records import Belief, Innovation, Manoeuvre
+from avsreplay.records import Belief, Drift, Innovation, Manoeuvre
 
 _NO_NOISE = frozen(np.zeros((6, 6)))
 
@@ -51,6 +51,8 @@ class Track:
         recent: the last accepted scans.  doubtful: the scans not yet decided on.  nis: of the last healthy scans.
         bias: an error of the sensor in effect, None where there is none.
         manoeuvres: all that were found.
+        drift: a constant torque or force on the target, None where none is found.  untested: healthy poses since the
+            last test for one.
     """
 
     belief: Belief
@@ -71,6 +73,8 @@ class Track:
     nis: tuple[float, ...] = ()
     bias: SensorBias | None = None
     manoeuvres: tuple[Manoeuvre, ...] = ()
+    drift: Drift | None = None
+    untested: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

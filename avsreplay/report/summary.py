@@ -14,7 +14,7 @@ from itertools import pairwise
 
 from avsreplay.records import BLOCKS, Label, State
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
-from avsreplay.report.summary_parts import Capture, CaptureFold, Parameter, Statistics, median, parameters
+from avsreplay.report.summary_parts import Capture, CaptureFold, Drifting, Parameter, Statistics, median, parameters
 from avsreplay.rows import Row
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
@@ -70,6 +70,7 @@ class Summary:
         reasons: why scans were flagged.  status: scans by the status of their registration.
         counts: losses and clock problems.  acceleration: of the target, in words.  Both are given by the caller.
         manoeuvres: of the target.  violations: consistency checks that the estimate failed.
+        drift: a constant torque or force on the target, None where none was found.
         weighed_down: healthy poses with a Cauchy weight below 1.  reinitialised: reinitialisations of the estimate.
         coasts: intervals of prediction without measurement.  interval_s: median between scans.
         gaps: intervals between scans longer than 1.5 times the median.
@@ -99,6 +100,7 @@ class Summary:
     weighed_down: int
     reinitialised: int | None
     manoeuvres: int | None
+    drift: Drifting | None
     violations: int | None
     nis: Share | None
     nees: Share | None
@@ -225,6 +227,7 @@ class SummaryFold:
             weighed_down=self._weighed_down,
             reinitialised=last.reinitialised if last else None,
             manoeuvres=last.manoeuvres if last else None,
+            drift=Drifting.of(last) if last else None,
             violations=last.violations if last else None,
             nis=_share(self._values.get("nis/healthy", []), NIS_BAND),
             nees=_share(self._values.get("nees", []), NEES_BAND),

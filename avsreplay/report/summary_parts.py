@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -15,6 +15,57 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.records import State
 from avsreplay.rows import Row
+
+
+@dataclass(frozen=True, slots=True)
+class Drifting:
+    """A constant torque or force on the target: onset since the first scan and accelerations, with 1 sigma."""
+
+    onset_s: float
+    onset_1s_s: float
+    force_mps2: float
+    force_1s_mps2: float
+    torque_radps2: float
+    torque_1s_radps2: float
+
+    @classmethod
+    def of(cls, row: Row) -> Drifting | None:
+        """Return the drift known at a row, None where there is none.
+
+        Args:
+            row: the last row of a run.
+        """
+        if row.drift_s is None:
+            return None
+        found = (row.drift_1s_s, row.drift_mps2, row.drift_1s_mps2, row.drift_radps2, row.drift_1s_radps2)
+        return cls(row.drift_s, *(value or 0.0 for value in found))
+
+    def __str__(self) -> str:
+        parts = [
+            f"{value:.3g} +- {sigma:.2g} {unit}"
+            for value, sigma, unit in (
+                (self.torque_radps2, self.torque_1s_radps2, "rad/s2"),
+                (self.force_mps2, self.force_1s_mps2, "m/s2"),
+            )
+            if value
+        ]
+        return f"{' and '.join(parts)} since {self.onset_s:.0f} +- {self.onset_1s_s:.0f} s"
+
+
+def events(rows: Sequence[Row], drift: Drifting | None) -> Iterator[str]:
+    """Yield what happened to the target and the sensor, in words: manoeuvres, drift, bias.
+
+    Args:
+        rows: all rows of the run.
+        drift: the drift of the target, None where there is none.
+    """
+    if rows and (count := rows[-1].manoeuvres):
+        times = "once" if count == 1 else f"{count} times"
+        yield f"the target manoeuvred {times}, the last time at {rows[-1].manoeuvre_s or 0.0:.1f} s"
+    if drift is not None:
+        yield f"a constant torque or force acts on the target: {drift}"
+    if biased := [row.t_s for row in rows if row.reason == "sensor_bias"]:
+        yield f"the sensor had a bias in {len(biased)} scans, first at {biased[0]:.1f} s"
 
 
 @dataclass(frozen=True, slots=True)

@@ -228,6 +228,8 @@ def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
         yield "manoeuvres", f"{summary.manoeuvres} found; {summary.violations or 0} consistency checks failed"
     if summary.acceleration is not None:
         yield "acceleration", summary.acceleration
+    if summary.drift is not None:
+        yield "drift", f"constant torque or force: {summary.drift}"
     seen = summary.observability
     if seen.rank is not None:
         full = "never full" if seen.full_rank_s is None else f"full from {seen.full_rank_s:.2f} s"

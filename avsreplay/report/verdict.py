@@ -13,6 +13,7 @@ from itertools import chain, groupby
 from typing import Any
 
 from avsreplay.report.summary import Summary
+from avsreplay.report.summary_parts import events
 from avsreplay.report.table import Table, TableCell
 from avsreplay.rows import Row
 
@@ -200,13 +201,7 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         when = next(row.t_s for row in rows if row.reinitialised)
         text = f"the estimate was reinitialised {_times(summary.reinitialised)}, first at {when:.1f} s"
         yield Concern(Grade.CHECK, f"{text}, because the poses contradicted it")
-    if rows and rows[-1].manoeuvres:
-        count, last = rows[-1].manoeuvres, rows[-1].manoeuvre_s
-        yield Concern(Grade.CHECK, f"the target manoeuvred {_times(count)}, the last time at {last or 0.0:.1f} s")
-    biased = [row for row in rows if row.reason == "sensor_bias"]
-    if biased:
-        text = f"the sensor had a bias in {len(biased)} scans, first at {biased[0].t_s:.1f} s"
-        yield Concern(Grade.CHECK, text)
+    yield from (Concern(Grade.CHECK, text) for text in events(rows, summary.drift))
     yield from _failed_checks(rows, summary)
     searches = [row for row in rows[1:] if row.guess == "acquired" and row.gamma == 1]
     if searches and rows[0].gamma == 1:

@@ -262,20 +262,29 @@ nb::tuple normal(const Problem& self) {
   return nb::make_tuple(made(A), made(b));
 }
 
+nb::tuple rows(const Problem& self) {
+  const size_t n = self.poses.size();
+  double *e, *H;
+  Numpy first = array({n, SEEN}, &e), second = array({n, SEEN, DIM}, &H);
+  for (size_t k = 0; k < n; ++k) self.whitened(k, e + SEEN * k, *reinterpret_cast<Rows*>(H + SEEN * DIM * k));
+  return nb::make_tuple(first, second);
+}
+
 Two absorbed(const Problem& self, const Matrix<DIM, DIM>& P) {
   Two out;
   self.absorbed(as<Square>(P.data()), out.data());
   return out;
 }
 
-nb::tuple smooth(const Problem& self, const Vector<DIM>& y0, const Matrix<DIM, DIM>& P0, const Three& torque, double force) {
+nb::tuple smooth(const Problem& self, const Vector<DIM>& y0, const Matrix<DIM, DIM>& P0, const Matrix<DIM, 12>& into,
+                 const Three& torque, double force) {
   double y[DIM];
   Square P;
   std::memcpy(y, y0.data(), sizeof y);
   std::memcpy(P, P0.data(), sizeof P);
   {
     nb::gil_scoped_release release;
-    self.smooth(y, P, torque.data(), force);
+    self.smooth(y, P, *reinterpret_cast<const double(*)[DIM][12]>(into.data()), torque.data(), force);
   }
   return nb::make_tuple(made(y), made(P));
 }
@@ -305,8 +314,9 @@ NB_MODULE(_motion, m) {
       .def("residuals", &residuals, nb::arg("chart"))
       .def("descend", &descend, nb::arg("most"), nb::arg("gain_tol"))
       .def("normal", &normal)
+      .def("rows", &rows)
       .def("absorbed", &absorbed, nb::arg("P"))
-      .def("smooth", &smooth, nb::arg("y"), nb::arg("P"), nb::arg("torque"), nb::arg("force"))
+      .def("smooth", &smooth, nb::arg("y"), nb::arg("P"), nb::arg("into"), nb::arg("torque"), nb::arg("force"))
       .def_prop_ro("chart", [](const Problem& self) { return flat(self.at); }, nb::rv_policy::move)
       .def_prop_ro("cost", [](const Problem& self) { return self.cost; })
       .def_prop_ro("d", [](const Problem& self) { return copied(self.d, {self.poses.size(), SEEN}); }, nb::rv_policy::move)

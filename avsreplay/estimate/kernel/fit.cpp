@@ -199,7 +199,6 @@ void Problem::reweigh() {
   cost = 0.5 * sum + penalty(at);
 }
 
-// Residual and Jacobian of a pose, of unit variance.
 void Problem::whitened(size_t k, double e[SEEN], Rows H) const {
   const double w = std::sqrt(weights[k]);
   const double* jacobian = &J[SEEN * DIM * k];
@@ -304,29 +303,44 @@ void Problem::absorbed(const Square P, double out[2]) const {
     }
 }
 
-void Problem::smooth(double y[DIM], Square P, const double torque_density[3], double force_density) const {
+void Problem::smooth(double y[DIM], Square P, const double into[DIM][12], const double torque_density[3],
+                     double force_density) const {
   const State x = state_of(at);
   double join[3][2], before[6][6] = {}, now[6][6], e[SEEN], t = 0;
   Body body = body_of(x, join);
   std::memcpy(body.push, torque_density, sizeof body.push);
   Flow flow = begin(turn_of(x));
-  Rows H;
+  Square place = {}, mixed = {}, speed = {};
+  for (int r = 0; r < DIM; ++r)
+    for (int c = 0; c < DIM; ++c)
+      for (int i = 6; i < 9; ++i) {
+        place[r][c] += into[r][i] * into[c][i];
+        mixed[r][c] += into[r][i] * into[c][i + 3] + into[r][i + 3] * into[c][i];
+        speed[r][c] += into[r][i + 3] * into[c][i + 3];
+      }
+  Rows H, HT;
   for (size_t k = 0; k < poses.size(); ++k) {
     const double last = t;
     t = poses[k].t;
     avs::advance(flow, body, t - last);
     at_start(flow, now);
-    Square Q = {};
-    for (int r = 0; r < 6; ++r)
-      for (int c = 0; c < 6; ++c) Q[r][c] = now[r][c] - before[r][c];
-    std::memcpy(before, now, sizeof before);
-    for (int r = 0; r < 3; ++r) {
-      Q[6 + r][6 + r] = force_density * (t * t * t - last * last * last) / 3;
-      Q[9 + r][9 + r] = force_density * (t - last);
-      Q[6 + r][9 + r] = Q[9 + r][6 + r] = -force_density * (t * t - last * last) / 2;
+    const double third = force_density * (t * t * t - last * last * last) / 3;
+    const double half = -force_density * (t * t - last * last) / 2, one = force_density * (t - last);
+    Square Q;
+    for (int r = 0; r < DIM; ++r) {
+      double row[6] = {};
+      for (int i = 0; i < 6; ++i)
+        for (int c = 0; c < 6; ++c) row[c] += into[r][i] * (now[i][c] - before[i][c]);
+      for (int c = 0; c < DIM; ++c)
+        Q[r][c] = dot(row, into[c], 6) + third * place[r][c] + half * mixed[r][c] + one * speed[r][c];
     }
+    std::memcpy(before, now, sizeof before);
     whitened(k, e, H);
-    pass(y, P, e, H, Q);
+    std::memset(HT, 0, sizeof HT);
+    for (int r = 0; r < SEEN; ++r)
+      for (int i = 0; i < DIM; ++i)
+        for (int c = 0; c < DIM; ++c) HT[r][c] += H[r][i] * T[i][c];
+    pass(y, P, e, HT, Q);
   }
 }
 

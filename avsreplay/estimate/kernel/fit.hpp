@@ -50,18 +50,21 @@ class Problem {
   void reweigh();
   // Normal equations A step = b in chart steps.
   void normal(Square A, double b[DIM]) const;
+  // Residual and Jacobian (by the error states at the epoch) of a pose, of unit variance.
+  void whitened(size_t k, double e[SEEN], Rows H) const;
   // Levenberg-Marquardt from the present linearisation; returns whether the stopping rule was met within `most` steps.
   bool descend(int most, double gain_tol, int& steps);
   // Weighted sum of tr C^-1 J P J' over the poses, of attitude and position; P in chart steps.
   void absorbed(const Square P, double out[2]) const;
-  // Kalman pass over the poses with process noise between them, from y and P (error states at the epoch).
-  void smooth(double y[DIM], Square P, const double torque_density[3], double force_density) const;
+  // Kalman pass over the poses with process noise between them, from y and P in chart steps. The error states of
+  // attitude to velocity are in other coordinates than P where two moments are nearly equal; `into` takes them to steps.
+  void smooth(double y[DIM], Square P, const double into[DIM][12], const double torque_density[3],
+              double force_density) const;
 
  private:
   double residual(const Measured& pose, const State& x, const Turn& turn, double d[SEEN]) const;
   double robust(double chi2, double* weight) const;
   double penalty(const Chart& chart) const;
-  void whitened(size_t k, double e[SEEN], Rows H) const;
 };
 
 // The rotation of a state, and its body with the derivative of sigma1..3 by the two that are states.

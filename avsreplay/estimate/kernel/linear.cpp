@@ -40,6 +40,17 @@ void solve(const double S[SEEN][SEEN], Seen B) {
   }
 }
 
+// S = H P H' + 1.
+void seen(const double P[DIM][DIM], const double H[SEEN][DIM], double S[SEEN][SEEN]) {
+  double HP[SEEN][DIM];
+  product<SEEN, DIM>(H, P, HP);
+  for (int r = 0; r < SEEN; ++r)
+    for (int c = 0; c < SEEN; ++c) {
+      S[r][c] = r == c;
+      for (int i = 0; i < DIM; ++i) S[r][c] += HP[r][i] * H[c][i];
+    }
+}
+
 // K = P H' S^-1.
 void gain(const double P[DIM][DIM], const double H[SEEN][DIM], const double S[SEEN][SEEN], double K[DIM][SEEN]) {
   double B[SEEN][DIM];
@@ -89,31 +100,20 @@ void correct(State& x, double P[DIM][DIM], const Pose& seen, const double colour
 }
 
 void pass(double y[DIM], double P[DIM][DIM], const double e[SEEN], const double H[SEEN][DIM], const double Q[DIM][DIM]) {
-  double S[SEEN][SEEN], HP[SEEN][DIM], K[SEEN][DIM];
+  double one[SEEN][SEEN] = {}, S[SEEN][SEEN], K[DIM][SEEN];
   for (int r = 0; r < DIM; ++r)
     for (int c = 0; c < DIM; ++c) P[r][c] += Q[r][c];
-  product<SEEN, DIM>(H, P, HP);
-  for (int r = 0; r < SEEN; ++r)
-    for (int c = 0; c < SEEN; ++c) {
-      S[r][c] = r == c;
-      for (int i = 0; i < DIM; ++i) S[r][c] += HP[r][i] * H[c][i];
-    }
-  std::memcpy(K, HP, sizeof K);
-  solve(S, K);
-  for (int i = 0; i < SEEN; ++i) {
-    double off = e[i];
-    for (int c = 0; c < DIM; ++c) off += H[i][c] * y[c];
-    S[i][0] = off;
+  seen(P, H, S);
+  gain(P, H, S, K);
+  double off[SEEN];
+  for (int r = 0; r < SEEN; ++r) {
+    one[r][r] = 1;
+    off[r] = e[r];
+    for (int i = 0; i < DIM; ++i) off[r] += H[r][i] * y[i];
   }
-  for (int i = 0; i < SEEN; ++i)
-    for (int r = 0; r < DIM; ++r) {
-      const double k = K[i][r];
-      for (int c = 0; c < DIM; ++c) P[r][c] -= k * HP[i][c];
-    }
-  for (int r = 0; r < DIM; ++r) {
-    for (int i = 0; i < SEEN; ++i) y[r] -= K[i][r] * S[i][0];
-    for (int c = 0; c < r; ++c) P[r][c] = P[c][r] = 0.5 * (P[r][c] + P[c][r]);
-  }
+  for (int r = 0; r < DIM; ++r)
+    for (int i = 0; i < SEEN; ++i) y[r] -= K[r][i] * off[i];
+  joseph(P, H, K, one);
 }
 
 }  // namespace avs

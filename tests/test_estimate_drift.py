@@ -1,0 +1,83 @@
+"""A constant torque or force: found with onset and size, tracked, and not found where there is none."""
+
+from __future__ import annotations
+
+import estimate_surprises as surprises
+import numpy as np
+import pytest
+import tumbling
+
+from avsreplay import geometry
+from avsreplay.estimate.chart import to_chart
+from avsreplay.estimate.drift import _equivalents, find_drift
+from avsreplay.estimate.dynamics import propagate_state
+from avsreplay.estimate.initialise import PoseFix
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.geometry import Pose
+
+PARAMS = EstimatorParams(correlated_share=0.1).resolved(4.0)
+
+
+def fixes_of(case: surprises.Case, seed: int, force: float = 0.0, onset_s: float = 0.0) -> tuple[PoseFix, ...]:
+    """Noisy poses of a case; ``force`` is a constant acceleration along x of {A} from ``onset_s`` on."""
+    times, states, _, _ = surprises.world_of(case, seed)
+    found = []
+    for t, a in zip(times, surprises.measured(case, times, states, seed), strict=True):
+        shift = np.array([0.5 * force * max(0.0, t - onset_s) ** 2, 0.0, 0.0])
+        found.append(PoseFix(round(t * 1e9), Pose(a.T_ac.q, a.T_ac.t + shift), a.covariance))
+    return tuple(found)
+
+
+def found_in(fixes: tuple[PoseFix, ...], case: surprises.Case, seed: int):
+    start = to_chart(surprises.world_of(case, seed)[1][0])
+    return find_drift(fixes, start, PARAMS, np.ones(2), (1e-3, 1e-3))
+
+
+@pytest.mark.parametrize("case", [surprises.Case("c"), surprises.Case("s", spin=2), surprises.Case("r", speed=1e-6)])
+@pytest.mark.parametrize("seed", range(3))
+def test_free_motion_shows_no_drift(case: surprises.Case, seed: int) -> None:
+    assert found_in(fixes_of(case, seed), case, seed) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_constant_force_is_found_with_its_onset(seed: int) -> None:
+    case = surprises.Case("c", seconds=100.0)
+    drift = found_in(fixes_of(case, seed, force=2e-4, onset_s=50.0), case, seed)
+    assert drift is not None
+    assert abs(drift.t_ns * 1e-9 - 50.0) < 4.0 * drift.t_1s_s
+    off = drift.velocity - np.array([2e-4, 0.0, 0.0])
+    assert np.linalg.norm(off) < 0.25 * 2e-4 + 4.0 * np.sqrt(np.trace(drift.P[3:, 3:]))
+    assert np.linalg.norm(drift.velocity) > 10.0 * np.sqrt(np.trace(drift.P[3:, 3:]))
+    assert not drift.rate.any()
+
+
+def test_the_equivalent_error_is_that_of_the_integrated_motion() -> None:
+    """B(t) against a motion that is pushed in 2,000 small steps."""
+    world = tumbling.draw(3, seconds=1.0)
+    x0, push = world.states[0], np.array([1e-5, -2e-5, 3e-5])
+    end, parts = 20.0, 2000
+    x = x0
+    for _ in range(parts):
+        x, _ = propagate_state(x, end / parts)
+        x = type(x)(x.q_ab, x.w_b + push * end / parts, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+    free, Phi = propagate_state(x0, end)
+    B = _equivalents(x0, np.array([end]))[0]
+    moved = Phi[:6, :6] @ B[:6, :3] @ push
+    turn = geometry.multiply(geometry.conjugate(free.q_ab), x.q_ab)[:3]
+    assert turn == pytest.approx(moved[:3], rel=0.02, abs=1e-5)
+    assert x.w_b - free.w_b == pytest.approx(moved[3:], rel=0.02, abs=1e-6)
+
+
+def test_a_constant_torque_is_reported_and_tracked() -> None:
+    """1e-4 rad/s2 per unit inertia: size and onset within their standard deviations, no claim beyond 4 sigma."""
+    case = surprises.Case("torque", torque=1e-4, seconds=60.0)
+    result = surprises.run(case, 0)
+    assert result.track is not None
+    drift = result.track.drift
+    assert drift is not None
+    size = float(np.linalg.norm(drift.rate))
+    assert abs(size - 1e-4) < 4.0 * np.sqrt(np.trace(drift.P[:3, :3]))
+    assert abs(drift.t_ns * 1e-9) < 4.0 * drift.t_1s_s
+    assert result.track.manoeuvres == ()
+    assert max(result.ratio[80:]) < 4.0
+    assert result.violations == []
