@@ -269,8 +269,7 @@ class Innovation:
     Attributes:
         alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.
         nis: alpha' S^-1 alpha.  distance_m: |d rho|.  angle_rad: rotation angle of the innovation.
-        weight: Cauchy weight of the pose in the update, 1 up to the 99.99 % point of NIS.
-        share: part of the variance R that is correlated between successive scans.
+        weight: Cauchy weight of the pose in the update.  share: part of R that is correlated between successive scans.
     """
 
     alpha: Array
