@@ -40,8 +40,7 @@ class Measurement:
 
     Attributes:
         alignment: the graded pose.  guess: start, truth, given, predicted, last, acquired; measured: pose of the log.
-        instants: (6, 6) mean instant of the measurement for each direction [s], see ``Registrar.instants``; None where
-            all points count as measured at the scan's instant.
+        instants: (6, 6) mean instant for each direction [s] (``Registrar.instants``); None for the scan's instant.
     """
 
     alignment: Alignment

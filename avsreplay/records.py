@@ -197,8 +197,7 @@ class Fit:
     """What a back end returns.
 
     Attributes:
-        T_ca: pose that takes the scan {A} into the model {C}.  iterations: passes made.
-        converged: the back end's own convergence flag.
+        T_ca: pose that takes the scan {A} into the model {C}.  iterations: passes made.  converged: its own flag.
         matches: ``IcpResult.matches`` of the last pass, None if there is none; saves time, never changes a result.
     """
 
