@@ -84,7 +84,7 @@ class IcpResult:
 
     Attributes:
         T_ca: (4, 4) scan {A} into model {C}.
-        iterations: passes made, of both kinds.
+        iterations: passes over all points; those over a part count as its share of the points, rounded up together.
         converged: the stopping rule held before n_max.
         inliers, rms_m: of the last pass, before its step (distance between point and closest point).
         gate_m: rejection distance after the last pass.

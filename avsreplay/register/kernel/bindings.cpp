@@ -158,7 +158,8 @@ class Index {
       Team team(threads);
       o = avs::icp(store_, code(), v, T.v, rule, team, matches);
     }
-    return nb::make_tuple(matrix(o.T), o.passes, o.converged, o.inliers, o.rms, o.gate, o.turn, o.move, o.ignored,
+    const int64_t part = o.few_passes ? (o.few_passes * few + v.n - 1) / v.n : 0;
+    return nb::make_tuple(matrix(o.T), o.passes - o.few_passes + part, o.converged, o.inliers, o.rms, o.gate, o.turn, o.move, o.ignored,
                           o.searched, nb::cast(std::move(matches)));
   }
 

@@ -232,7 +232,9 @@ Outcome icp(const Store& s, const Code& code, const View& v, const double* T, co
     const std::vector<double> points = part(v, rule.few);
     const View few{reinterpret_cast<const char*>(points.data()), rule.few, 3 * (int64_t)sizeof(double), sizeof(double), false};
     Memory memory(s, few.n, rule.keep);
-    if (passes.run(few, memory, plane, true))
+    const bool good = passes.run(few, memory, plane, true);
+    o.few_passes = o.passes;
+    if (good)
       plane = false;
     else
       begin();

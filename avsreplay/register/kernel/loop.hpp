@@ -16,7 +16,8 @@ struct Rule {
 
 struct Outcome {
   double T[12];  // rows of [R t]
-  int passes;
+  int passes;      // over all points and over a part of them
+  int few_passes;  // of those the ones over a part
   bool converged;
   int64_t inliers, ignored, searched;
   double rms, gate, turn, move;
