@@ -210,3 +210,23 @@ def test_the_command_names_the_missing_size_and_writes_results(tmp_path, motion,
     info = cli("info", log, "--poses")
     assert info.code == 0
     assert "20 measured poses" in info.out
+
+
+@pytest.mark.parametrize("lasts_s", [0.0, 0.8])
+def test_a_push_is_one_manoeuvre_with_its_time_and_size_also_if_it_lasts_for_scans(tmp_path, motion, lasts_s) -> None:
+    times, _, noisy = motion
+    push, begin = np.array([0.0, 0.06, -0.03]), 12.1
+    moved = []
+    for t_ns, pose in zip(times, noisy, strict=True):
+        t = t_ns * 1e-9 - 1.0 - begin
+        # constant thrust over lasts_s, then the velocity that it gave
+        way = 0.0 if t <= 0.0 else (0.5 * t * t / lasts_s if t < lasts_s else t - 0.5 * lasts_s)
+        moved.append(Pose(pose.q, pose.t + way * push))
+    sigma = (1e3 * POS_M, float(np.degrees(ROT_RAD)))
+    found, summary = rows(tum(tmp_path / "a.tum", times, moved), pose_sigma=sigma, extent_m=2.0)
+    assert summary.manoeuvres == 1
+    assert summary.reinitialised == 0
+    last = found[-1]
+    assert begin - 0.4 < last.manoeuvre_s < begin + lasts_s + 0.4
+    assert abs(last.manoeuvre_mps - np.linalg.norm(push)) < 4.0 * last.manoeuvre_1s_mps
+    assert all(row.gamma == 1 for row in found[-12:])

@@ -21,11 +21,12 @@ from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.dynamics import propagate
 from avsreplay.estimate.error_state import VEL, W
-from avsreplay.estimate.hypotheses import ChangePriors, Explanation, Hypothesis, explain
+from avsreplay.estimate.hypotheses import ChangePriors, Explanation, Hypothesis, cholesky_root, explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.noise import GATE
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import Epoch, Prediction, SensorBias, Track
+from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation, Manoeuvre, Reason, Verdict
 
 _FEWEST, _MOST, _RECENT = 3, 5, 3  # least and most doubtful scans at a decision; accepted scans kept
@@ -33,6 +34,7 @@ _MARGIN = 6.0  # a decision before _MOST scans needs these log odds of the best 
 _FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
 _READY = 8  # least number of poses of an estimate whose prediction can be tested
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
+_LEAST = 1e-9  # of the eigenvalues of the prior after a manoeuvre
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
 
 Update = Callable[[Track, Prediction, Innovation, int, bool], Track]
@@ -133,9 +135,7 @@ class AnomalyTest:
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
             at = replace(at, P=P)
         chart = to_chart(at.x)
-        T = to_errors(chart)
-        half = np.linalg.solve(T, P)
-        prior = Prior(chart, np.linalg.solve(T, half.T))
+        prior = Prior(chart, _definite(np.linalg.solve(to_errors(chart), cholesky_root(at.P))))
         after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
@@ -192,6 +192,14 @@ class AnomalyTest:
         for epoch in epochs:
             out = self._replay(out, epoch)
         return replace(out, reinitialised=track.reinitialised + 1, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
+
+
+def _definite(root: Array) -> Array:
+    """Root root', with eigenvalues, in units of the variances, raised to ``_LEAST``: its inverse is then definite."""
+    scale = np.linalg.norm(root, axis=1)
+    values, axes = np.linalg.eigh((root / scale[:, None]) @ (root / scale[:, None]).T)
+    half = axes * np.sqrt(np.maximum(values, _LEAST)) * scale[:, None]
+    return np.asarray(half @ half.T)
 
 
 def _after(window: tuple[Epoch, ...], found: Explanation) -> int:

@@ -1,4 +1,4 @@
-"""Reading of the target model: PLY with the reader of this package, STL, OBJ, OFF and GLB with trimesh."""
+"""Reading of the target model: PLY and PCD with the readers of this package, STL, OBJ, OFF and GLB with trimesh."""
 
 from __future__ import annotations
 
@@ -18,13 +18,14 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.files import BadFile
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown
+from avsreplay.log.pcd import read_pcd
 from avsreplay.log.ply import read_ply
 from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
 from avsreplay.records import Surface
 
 MAX_BYTES = 512 << 20
 _SILENT = logging.NullHandler()
-_FORMATS = ("ply", "stl", "obj", "off", "glb")
+_FORMATS = ("ply", "stl", "obj", "off", "glb", "pcd")
 MODEL_ENDINGS = tuple(f".{name}" for name in _FORMATS)
 # Exceptions that trimesh raises for malformed files.
 _FOREIGN = (
@@ -37,7 +38,7 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
     """Read a model file.
 
     Args:
-        path: PLY, STL, OBJ, OFF or GLB file; lengths in metres, frame {C} of the model.
+        path: PLY, STL, OBJ, OFF, GLB or (points alone) PCD file; lengths in metres, frame {C} of the model.
         cloud_ok: accept a file without faces as a point-cloud model.
 
     Returns:
@@ -109,7 +110,7 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
         hint = f"give a model as {', '.join(_FORMATS).upper()}"
         raise UnreadableInput(f"'{shown(suffix)}' is not a known model format", where=where, hint=hint)
     try:
-        vertices, faces = _ply(data) if suffix == "ply" else _trimesh(data, suffix)
+        vertices, faces = _OWN_READERS[suffix](data) if suffix in _OWN_READERS else _trimesh(data, suffix)
     except _FOREIGN as error:
         reason = shown(str(error) or type(error).__name__)[:120]
         raise UnreadableInput(
@@ -127,6 +128,15 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
 def _ply(data: bytes) -> tuple[Array, NDArray[np.int64]]:
     ply = read_ply(data)
     return ply.points().astype(np.float64), ply.faces
+
+
+def _pcd(data: bytes) -> tuple[Array, NDArray[Any]]:
+    """A PCD file is a point-cloud model; points without a return are left out."""
+    points = read_pcd(data).astype(np.float64)
+    return points[np.isfinite(points).all(axis=1)], np.zeros((0, 3), np.int32)
+
+
+_OWN_READERS = {"ply": _ply, "pcd": _pcd}
 
 
 def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
