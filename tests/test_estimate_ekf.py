@@ -148,3 +148,20 @@ def test_values_that_are_not_numbers_terminate() -> None:
         assert not np.all(np.isfinite(got.P))
     with pytest.raises(TypeError):
         _motion.correct(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, P, H[:5], np.ones(6), S, S, (1.0, 1.0))
+
+
+def test_an_innovation_covariance_is_definite_also_where_rounding_has_spoilt_the_prior() -> None:
+    x, rng = some_state(3), np.random.default_rng(2)
+    H = measurement_jacobian(x)
+    R = np.diag([1e-8, 1e-8, 1e-8, 1e-10, 1e-10, 1e-10])
+    root = rng.normal(size=(20, 20))
+    P = root @ root.T
+    spoilt = root[:, :3] @ root[:, :3].T - 1e-6 * np.eye(20)  # rounding errors of large variances exceed R
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(H @ spoilt @ H.T + R)
+    found = ekf.innovation_of(spoilt, H, np.full(6, 1e-3), R)
+    np.linalg.cholesky(found.S)
+    assert found.nis >= 0.0
+    good = ekf.innovation_of(P, H, np.full(6, 1e-3), R)
+    expected = H @ P @ H.T + R
+    np.testing.assert_array_equal(good.S, 0.5 * (expected + expected.T))

@@ -17,6 +17,9 @@ from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation, State
 
 
+_LEAST = 1e-12  # least eigenvalue of a repaired covariance, in units of its variances
+
+
 def innovation_of(
     P: Array, H: Array, alpha: Array, R: Array, robust: bool = False, correlated_share: float = 0.0
 ) -> Innovation:
@@ -31,12 +34,24 @@ def innovation_of(
         correlated_share: the part of R that neighbouring scans have in common.
     """
     unsymmetric = H @ P @ H.T + R
-    S = np.asarray(0.5 * (unsymmetric + unsymmetric.T), dtype=np.float64)
+    S = _definite(np.asarray(0.5 * (unsymmetric + unsymmetric.T), dtype=np.float64), R)
     half = min(1.0, float(np.sqrt(alpha[3:] @ alpha[3:])))
     distance = float(np.sqrt(alpha[:3] @ alpha[:3]))
     nis = float(alpha @ np.linalg.solve(S, alpha))
     weight = GATE / nis if robust and nis > GATE else 1.0
     return Innovation(alpha, S, R, nis, distance, 2.0 * float(np.arcsin(half)), weight, correlated_share)
+
+
+def _definite(S: Array, R: Array) -> Array:
+    """S, or, where rounding of a very large P has made it indefinite, R plus the positive part of S - R."""
+    try:
+        np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        scale = np.sqrt(np.abs(np.diagonal(S)) + np.diagonal(R))
+        values, axes = np.linalg.eigh((S - R) / np.outer(scale, scale))
+        half = axes * np.sqrt(np.maximum(values, _LEAST)) * scale[:, None]
+        S = half @ half.T + R
+    return S
 
 
 def gain(P: Array, H: Array, S: Array) -> Array:
