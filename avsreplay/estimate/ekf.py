@@ -16,7 +16,6 @@ from avsreplay.estimate.noise import GATE
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation, State
 
-
 _LEAST = 1e-12  # least eigenvalue of a repaired covariance, in units of its variances
 
 
