@@ -135,7 +135,9 @@ class AnomalyTest:
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
             at = replace(at, P=P)
         chart = to_chart(at.x)
-        prior = Prior(chart, _definite(np.linalg.solve(to_errors(chart), cholesky_root(at.P))))
+        prior = Prior(
+            chart, _definite(np.asarray(np.linalg.solve(to_errors(chart), cholesky_root(at.P)), dtype=np.float64))
+        )
         after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
