@@ -443,7 +443,50 @@ def aligned(registrar: Registrar, scan: Array, guess: Pose) -> Callable[[], tupl
     return run
 
 
-PARTS = {"meshes": meshes, "index": index, "speed": speed, "passes": passes, "converged": converged, "views": views}
+def sizes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
+    """Scans of 1,000 to 1,000,000 points, a mesh of a million triangles, one and two threads."""
+    import trimesh
+
+    targets = [surface]
+    bunny = shared("stanford-bunny", "bun_zipper.ply")
+    if bunny is not None:
+        vertices, faces = bunny.vertices, bunny.faces
+        for _ in range(0 if args.quick else 2):
+            vertices, faces = trimesh.remesh.subdivide(vertices, faces)
+        targets.append(scaled(Surface(np.asarray(vertices), np.asarray(faces, np.int32), "bunny, subdivided", "")))
+    for mesh in targets:
+        start, busy = time.perf_counter(), time.process_time()
+        SurfaceIndex.build(mesh, 0.15 * mesh.extent, threads=2)
+        clock, built = time.perf_counter() - start, time.process_time() - busy
+        print(
+            f"\n{mesh.name}: {len(mesh.faces)} triangles, index {built:.2f} s ({clock:.2f} s by the clock, 2 threads)"
+        )
+        one, two = (Registrar(mesh, RegisterParams(threads=t, index_cache=False)) for t in (1, 2))
+        for n in (1_000, 4_000) if args.quick else (1_000, 10_000, 100_000, 1_000_000):
+            scan, truth = look(mesh, n, 0.0, 3)
+            guess = off(truth, 3.0, 0.05, 4)
+            cases = {"1": Case(registered(one, scan, guess)), "2": Case(registered(two, scan, guess))}
+            cases["align"] = Case(aligned(one, scan, guess))
+            in_turn(cases, 1 if n > 100_000 else args.reps)
+            ms = 1e3 * statistics.median(cases["1"].cpu)
+            outside = 1 - ratio(cases["align"].cpu, cases["1"].cpu)
+            gain = ratio(cases["1"].seconds, cases["2"].seconds)
+            same = np.array_equal(cases["1"].T_ca, cases["2"].T_ca)
+            print(
+                f"{n:8} points: {ms:8.1f} ms processor, {1e6 * ms / n:7.0f} ns a point, {cases['1'].passes} passes, "
+                f"outside align {100 * outside:.0f} %, 2 threads {gain:.2f}x by the clock, same bits: {same}"
+            )
+
+
+PARTS = {
+    "meshes": meshes,
+    "sizes": sizes,
+    "index": index,
+    "speed": speed,
+    "passes": passes,
+    "converged": converged,
+    "views": views,
+}
 
 
 def main() -> None:

@@ -59,7 +59,7 @@ def timed(log: Path, n_scans: int | None, prefetch: int) -> tuple[int, float, fl
         with (
             tempfile.TemporaryDirectory() as folder,
             Run(job) as run,
-            ResultWriter(ResultDirectory(Path(folder) / "result"), run.surface, run.registrar) as writer,
+            ResultWriter(ResultDirectory(Path(folder) / "result"), run) as writer,
         ):
             begun, elapsed = time.process_time(), time.perf_counter()
             rows = list(run.rows(writer.listeners))
