@@ -16,7 +16,6 @@ import numpy as np
 
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import (
-    BLOCKS,
     Alignment,
     Belief,
     BodyParameters,
@@ -300,17 +299,6 @@ def capture_error_values(
         lambda o, s: None if (error := get(s)) is None else finite(error.speed_mps),
         lambda o, s: None if (error := get(s)) is None else finite(error.angle_deg),
     )
-
-
-def deviation(block: str, k: int | None = None) -> Value[float | None]:
-    """Return the root of the trace of a block of P, or the standard deviation of one of its states.
-
-    Args:
-        block: name of the block of error states.
-        k: index of a state in the block; the whole block if None.
-    """
-    where = BLOCKS[block] if k is None else BLOCKS[block].start + k
-    return lambda o, s: float(np.sqrt(np.diag(o.belief.P)[where].sum()))
 
 
 def full_angle_deg(variance: float) -> float:

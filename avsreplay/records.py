@@ -318,8 +318,8 @@ class BodyParameters:
     Attributes:
         inertia, inertia_1s: (3, 3) inertia tensor about the centre of mass over its trace, and 1 sigma of its entries.
         moments, moments_1s: (3,) principal moments over their sum, ascending, and their 1 sigma.
-        centre_c: (3,) centre of mass [m].  centre_1s_m: its 1 sigma, root of the trace [m].
-        rate_c: (3,) angular rate [rad/s].  rate_1s_radps: its 1 sigma, root of the trace [rad/s].
+        centre_c, centre_1s_m, rate_c, rate_1s_radps: (3,) centre of mass and angular rate, 1 sigma by root of the trace.
+        limited_1s: 1 sigma of sigma1, sigma2, varrho [m] and mu (half angle), at most that without any information.
     """
 
     inertia: Array
@@ -330,6 +330,7 @@ class BodyParameters:
     centre_1s_m: float
     rate_c: Array
     rate_1s_radps: float
+    limited_1s: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

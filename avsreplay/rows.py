@@ -18,7 +18,6 @@ from avsreplay.outcome import (
     Value,
     capture_error_values,
     change_values,
-    deviation,
     finite,
     full_angle_deg,
     if_innovation,
@@ -30,7 +29,6 @@ from avsreplay.outcome import (
     since_start_s,
     status,
 )
-from avsreplay.records import BLOCKS
 
 T = TypeVar("T")
 
@@ -194,17 +192,19 @@ class Row:
         fmt=".4f", table=True)
     sigma2: float | None = _number(lambda o, s: float(o.belief.x.sigma[1]), "Inertia ratio (Izz - Ixx) / Iyy.",
         fmt=".4f", table=True)
-    sigma1_1s: float | None = _number(deviation("sigma", 0), "Standard deviation of sigma1.")
-    sigma2_1s: float | None = _number(deviation("sigma", 1), "Standard deviation of sigma2.")
+    sigma1_1s: float | None = _number(lambda o, s: o.body.limited_1s[0],
+        "Standard deviation of sigma1, at most that of a value anywhere in its range.")
+    sigma2_1s: float | None = _number(lambda o, s: o.body.limited_1s[1], "Standard deviation of sigma2.")
     cx_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[0]), "Position of the fixture in {B} (varrho).")
     cy_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[1]), "See cx_m.")
     cz_m: float | None = _metres(lambda o, s: float(o.belief.x.c_b[2]), "See cx_m.")
-    c_1s_m: float | None = _number(deviation("varrho"), "Standard deviation of varrho (root of the trace).", "m")
+    c_1s_m: float | None = _number(lambda o, s: o.body.limited_1s[2],
+        "Standard deviation of varrho (root of the trace), at most that of any direction.", "m")
     mux: float | None = _number(lambda o, s: float(o.belief.x.q_bc[0]), "Fixture attitude mu = q_bc, scalar last.")
     muy: float | None = _number(lambda o, s: float(o.belief.x.q_bc[1]), "See mux.")
     muz: float | None = _number(lambda o, s: float(o.belief.x.q_bc[2]), "See mux.")
     muw: float | None = _number(lambda o, s: float(o.belief.x.q_bc[3]), "See mux.")
-    mu_1s_deg: float | None = _number(lambda o, s: full_angle_deg(np.diag(o.belief.P)[BLOCKS["mu"]].sum()),
+    mu_1s_deg: float | None = _number(lambda o, s: full_angle_deg(o.body.limited_1s[3] ** 2),
         "Standard deviation of mu (root of the trace).", "deg")
     com_x_m: float | None = _metres(lambda o, s: float(o.body.centre_c[0]), "Centre of mass in {C}.")
     com_y_m: float | None = _metres(lambda o, s: float(o.body.centre_c[1]), "See com_x_m.")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tumbling
@@ -61,3 +63,22 @@ def test_a_small_spread_is_the_linear_one() -> None:
     draws = [body_parameters(Belief(0, to_state(chart.moved(y * d)), np.eye(20))) for d in rng.normal(size=(400, 20))]
     assert found.moments_1s == pytest.approx(np.std([d.moments for d in draws], axis=0), rel=0.15)
     assert found.inertia_1s == pytest.approx(np.std([d.inertia for d in draws], axis=0), rel=0.2)
+
+
+@pytest.mark.parametrize("gap", [1e-6, 1e-3, 0.3])
+@pytest.mark.parametrize("wide", [1e-3, 1.0, 100.0])
+def test_standard_deviations_stay_in_the_physical_range(gap: float, wide: float) -> None:
+    """However wide the covariance and however undetermined the axes: no sigma beyond that of no information."""
+    x = tumbling.draw(3, seconds=1.0).states[0]
+    x = replace(x, sigma=np.array([gap, 0.4]))
+    P = np.diag(np.repeat([0.1, 0.1, 0.1, 0.1, 1.0, 1.0, 10.0], [3, 3, 3, 3, 2, 3, 3]) * wide) ** 2
+    body = body_parameters(Belief(0, x, P))
+    first, second, varrho, mu = body.limited_1s
+    raw = np.sqrt(np.diag(P))
+    assert 0.0 < first <= min(raw[12], 1.16)
+    assert 0.0 < second <= min(raw[13], 1.16)
+    assert 0.0 < mu <= min(np.sqrt(3.0) * raw[17], np.pi / 2.0)
+    assert varrho**2 <= body.centre_1s_m**2 + 2.0 * float(x.c_b @ x.c_b) + 1e-12
+    if wide == 1e-3:
+        assert first == pytest.approx(raw[12])
+        assert mu == pytest.approx(np.sqrt(3.0) * raw[17])

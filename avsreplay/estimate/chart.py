@@ -36,6 +36,7 @@ from avsreplay.records import Belief, BodyParameters, State
 
 ETA, RATE, POSITION, VELOCITY = (slice(k, k + 3) for k in (0, 3, 6, 9))
 INERTIA, ARM = slice(12, 17), slice(17, 20)
+_ANY_HALF_RAD = 0.5 * float(np.sqrt(np.pi**2 / 3.0 + 2.0))  # rms half angle of a uniformly distributed attitude
 _LARGEST_1S = 3.0  # largest 1 sigma of the logarithm of the mass moments; above it the inertia is undetermined
 
 
@@ -230,7 +231,24 @@ def body_parameters(belief: Belief) -> BodyParameters:
         centre_1s_m=float(np.sqrt(np.trace(P[ARM, ARM]))),
         rate_c=chart.w_c,
         rate_1s_radps=float(np.sqrt(np.trace(P[RATE, RATE]))),
+        limited_1s=_limited_1s(belief, float(np.trace(P[ARM, ARM]))),
     )
+
+
+def _limited_1s(belief: Belief, arm_variance: float) -> tuple[float, float, float, float]:
+    """1 sigma of sigma1, sigma2, varrho and mu, at most that of a parameter about which nothing is known.
+
+    Without information sigma is uniform in (-1, 1), mu is uniform over all attitudes, and varrho has any direction: the
+    linear covariance has no such limit where two moments are nearly equal and the axes are undetermined.
+    """
+    x, variance = belief.x, np.maximum(np.diagonal(belief.P), 0.0)
+    sigma = np.sqrt(np.minimum(variance[SIGMA], 1.0 / 3.0 + x.sigma**2))
+    varrho = min(float(variance[VARRHO].sum()), arm_variance + 2.0 * float(x.c_b @ x.c_b))
+    return float(sigma[0]), float(sigma[1]), float(np.sqrt(varrho)), min(_root(variance[DMU]), _ANY_HALF_RAD)
+
+
+def _root(variances: Array) -> float:
+    return float(np.sqrt(variances.sum()))
 
 
 def _inertia(M: Array) -> Array:

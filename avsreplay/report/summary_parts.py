@@ -114,6 +114,14 @@ class Parameter:
     error: float | None
     one_sigma: float | None
 
+    @property
+    def undetermined(self) -> bool:
+        """Return whether 1 sigma is that of a sigma or mu about which nothing is known."""
+        if self.one_sigma is None or self.name not in ("sigma1", "sigma2", "mu"):
+            return False
+        free = 131.0 if self.name == "mu" else 0.99 * math.sqrt(1.0 / 3.0 + self.estimate[0] ** 2)
+        return self.one_sigma >= free
+
 
 def parameters(row: Row, truth: State | None) -> tuple[Parameter, ...]:
     """Parameters of the body of a row, the paper's and those in {C}, against ``truth`` where it is given."""

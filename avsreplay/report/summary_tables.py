@@ -137,7 +137,8 @@ def parameter_table(summary: Summary) -> Table:
 
 
 def _parameter_values(p: Parameter) -> list[str]:
-    scalars = [number(v, ".4f", "") for v in (p.error, p.one_sigma)]
+    sigma = "undetermined" if p.undetermined else number(p.one_sigma, ".4f", "")
+    scalars = [number(p.error, ".4f", ""), sigma]
     vectors = ["" if v is None else " ".join(f"{x:.4f}" for x in v) for v in (p.estimate, p.truth)]
     return [*vectors, *scalars]
 
