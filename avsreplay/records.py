@@ -318,7 +318,7 @@ class BodyParameters:
     Attributes:
         inertia, inertia_1s: (3, 3) inertia tensor about the centre of mass over its trace, and 1 sigma of its entries.
         moments, moments_1s: (3,) principal moments over their sum, ascending, and their 1 sigma.
-        centre_c, centre_1s_m, rate_c, rate_1s_radps: (3,) centre of mass and angular rate, 1 sigma by root of the trace.
+        centre_c, centre_1s_m, rate_c, rate_1s_radps: (3,) centre of mass and angular rate, 1 sigma by root of trace.
         limited_1s: 1 sigma of sigma1, sigma2, varrho [m] and mu (half angle), at most that without any information.
     """
 
