@@ -6,9 +6,11 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from avsreplay.errors import UsageError
 from avsreplay.files import STDOUT
+from avsreplay.geometry import Pose
 from avsreplay.log import LogWriter, Loss, SourceOptions, open_source, read_surface
 from avsreplay.records import Label, LogHeader, Scan, ScanStatus, Surface, Truth
 from avsreplay.simulate import (
@@ -136,11 +138,11 @@ def record_scenario(scenario: Scenario, output: Path, options: RecordOptions, ti
     simulation = simulate(scenario, surface_for(scenario, options.model, options.cloud_model), meshes)
     header = _labelled(simulation.header, options, EPOCH_NS)
     with (
-        _writer(output, header, options) as writer,
+        _writer(output, header, options, moving_camera=scenario.params.camera is not None) as writer,
         _ticked(ticker, simulation.scans(), simulation.count) as scans,
     ):
         pairs = _with_faults(scans, header, options, EPOCH_NS)
-        tally = _fold(pairs, simulation.truth_of, writer, true_clock=True)
+        tally = _fold(pairs, simulation.truth_of, writer, true_clock=True, camera_of=simulation.camera_pose)
     by_hand = scenario.params.scanner.engine is Engine.AUTO and simulation.engine is Engine.EXACT
     slow = "embreex is not installed: rays were cast by the exact engine, which is slower"
     done = tally.recorded(output, writer.bytes, header)
@@ -227,6 +229,7 @@ def _fold(
     truth_of: Callable[[Scan], Truth],
     writer: LogWriter,
     true_clock: bool,
+    camera_of: Callable[[Scan], Pose | None] | None = None,
 ) -> _Tally:
     """Write scans with the truth at the scan as it was; a pair is (scan as it was, scan to write or None)."""
     tally = _Tally()
@@ -241,6 +244,9 @@ def _fold(
         truth = truth_of(before)
         if truth.pose is not None:
             writer.write_truth(before.log_ns, before.log_ns if true_clock else before.t_ns, truth.pose, truth.state)
+        camera = camera_of(before) if camera_of else None
+        if camera is not None:
+            writer.write_camera(before.log_ns, before.log_ns, camera)
         tally.add(scan)
     return tally
 
@@ -262,8 +268,9 @@ def _with_faults(
     return disturbed(scans, options.faults, epoch_ns, options.fault_seed, radius_m)
 
 
-def _writer(output: Path, header: LogHeader, options: RecordOptions) -> LogWriter:
-    return LogWriter(output, header, overwrite=options.overwrite, compression=options.compression)
+def _writer(output: Path, header: LogHeader, options: RecordOptions, moving_camera: bool = False) -> LogWriter:
+    rules: dict[str, Any] = {"overwrite": options.overwrite, "compression": options.compression}
+    return LogWriter(output, header, moving_camera=moving_camera, **rules)
 
 
 def _ticked(ticker: Ticker | None, scans: Iterable[Scan], due: int) -> AbstractContextManager[Iterator[Scan]]:

@@ -11,12 +11,15 @@ from numpy.testing import assert_allclose
 from scipy import stats
 
 from avsreplay import settings, toml_document
+from avsreplay.errors import UsageError
+from avsreplay.log import read_surface
 from avsreplay.records import Surface
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
 from avsreplay.simulate.inertia import principal
 from avsreplay.simulate.motion import Motion, MotionParams
-from avsreplay.simulate.optics import Material, beam, face_optics, merged
-from avsreplay.simulate.scanner import Pattern, Preset, Scanner, ScannerParams
+from avsreplay.simulate.optics import Material, beam, crosstalk, face_optics, merged
+from avsreplay.simulate.pattern import Pattern
+from avsreplay.simulate.scanner import Preset, Scanner, ScannerParams
 
 BODY = principal(np.diag([1.0, 1.1, 1.2]), np.zeros(3))
 CLEAN = ScannerParams(rays=(33, 33), fov_deg=(40.0, 40.0), noise_m=0.0, outlier_ratio=0.0)
@@ -199,3 +202,108 @@ def test_a_preset_gives_scans_and_its_figures_are_defaults_only(preset):
 def test_presets_are_exactly_the_classes():
     text = resources.files("avsreplay.simulate").joinpath("presets.toml").read_text("utf-8")
     assert set(tomllib.loads(text)) == {preset.value for preset in Preset if preset is not Preset.NONE}
+
+
+def grid_of(found):
+    """Ranges by direction, to compare two casts of one pattern."""
+    return {tuple(np.round(d, 12)): r for d, r in zip(found.directions, found.ranges, strict=True)}
+
+
+def test_more_returns_of_a_beam_separate_the_surfaces_on_an_edge():
+    """Half of each beam on the edge meets the near plate, half the far one: both ranges return, without a mixture."""
+    wide = replace(CLEAN, divergence_mrad=40.0, merge_m=0.1)
+    plates = (plate(0.0, x=(-1.0, 0.0)), plate(1.0, x=(-3.0, 3.0), y=(-3.0, 3.0)))
+    one = scanner(wide, *plates).cast(0.0)
+    two = scanner(replace(wide, returns=2), *plates).cast(0.0)
+    at_edge = np.abs(two.directions[:, 0]) < 1e-9
+    z = np.round(two.directions[at_edge, 2] * two.ranges[at_edge], 1)
+    assert set(z) == {3.0, 4.0}
+    assert len(two.ranges) > len(one.ranges)
+    assert np.abs(np.round(one.directions[:, 2] * one.ranges, 1)[:, None] - [3.0, 4.0]).min(axis=1).max() < 0.05
+
+
+def test_range_walk_is_proportional_to_the_logarithm_of_the_intensity():
+    materials = [Material("left", box_m=(-9, -9, -9, 0, 9, 9), reflectance=1.0), Material("right", reflectance=0.01)]
+    params = replace(CLEAN, range_walk_m=0.05, reference_m=3.0, max_incidence_deg=90.0)
+    left, right = plate(x=(-2.0, -0.1)), plate(x=(0.1, 2.0))
+    at = scanner(params, left, right, materials=materials[::-1])
+    clean = at.cast(0.0)
+    walked = at.disturb(clean, rng())
+    assert_allclose(walked.ranges - clean.ranges, -0.05 * np.log10(clean.intensities), atol=1e-12)
+    dark = clean.directions[:, 0] > 0.0
+    assert_allclose((walked.ranges - clean.ranges)[dark].mean() - (walked.ranges - clean.ranges)[~dark].mean(), 0.1,
+                    atol=0.02)  # fmt: skip
+
+
+def test_stray_light_pulls_all_ranges_to_that_of_the_strongest_return():
+    """A retro-reflector at 2 m and a plate at 4 m: phasors of a long modulation wave give the weighted mean."""
+    ranges, intensities, ratio = np.array([4.0, 4.2, 2.0]), np.array([0.5, 0.1, 100.0]), 1e-3
+    found = crosstalk(ranges, intensities, ratio)
+    wave = 1e4  # [m], long against the differences of range
+    phasors = intensities * np.exp(2j * np.pi * ranges / wave) + ratio * 100.0 * np.exp(2j * np.pi * 2.0 / wave)
+    assert_allclose(found, np.angle(phasors) * wave / (2.0 * np.pi), rtol=1e-6)
+    assert np.all(found[:2] < ranges[:2])
+    assert_allclose(found[2], 2.0)
+    assert len(crosstalk(np.zeros(0), np.zeros(0), 0.1)) == 0
+
+
+def test_a_saturated_return_blooms_over_the_rays_around_it():
+    """A retro-reflector seen by the central ray only fills a disc of bloom_deg; outside nothing changes."""
+    reflector = [Material("reflector", box_m=(-0.05, -0.05, -0.2, 0.05, 0.05, -0.1), retroreflectance=50.0)]
+    parts = (plate(-0.15, x=(-0.04, 0.04), y=(-0.04, 0.04)), plate())
+    params = replace(CLEAN, saturation=2.0, max_incidence_deg=90.0)
+    sharp, blooming = (scanner(replace(params, bloom_deg=d), *parts, materials=reflector).cast(0.0) for d in (0.0, 5.0))
+    before, after = grid_of(sharp), grid_of(blooming)
+    centre = np.array([0.0, 0.0, 1.0])
+    for direction, value in after.items():
+        away = math.degrees(math.acos(min(1.0, float(np.dot(direction, centre)))))
+        if away < 4.99:
+            assert_allclose(value, 2.85, atol=1e-9)
+        elif away > 5.01:
+            assert value == before[direction]
+    assert sum(abs(v - 2.85) < 1e-9 for v in after.values()) > 10
+
+
+def test_the_sun_blinds_specular_faces_that_mirror_it():
+    """A tilted mirror returns nothing if the sun is in the mirrored direction of the ray, and all if it is not."""
+    tilt = math.radians(20.0)
+    mirror = [Material("cells", specular=5.0, specular_width_deg=2.0)]
+    n = np.array([0.0, math.sin(tilt), -math.cos(tilt)])
+    ray = np.array([0.0, 0.0, 1.0])
+    mirrored = ray - 2.0 * (ray @ n) * n
+    params = replace(CLEAN, fov_deg=(2.0, 2.0), max_incidence_deg=90.0)
+    cast = lambda sun, m: len(scanner(replace(params, sun_a=sun), plate(), tilt_rad=tilt, materials=m).cast(0.0).ranges)  # noqa: E731
+    everything = cast(None, mirror)
+    assert everything == 33 * 33
+    assert cast(tuple(mirrored), mirror) == 0
+    assert cast(tuple(-mirrored), mirror) == everything
+    assert cast(tuple(mirrored), []) == everything  # a diffuse surface does not mirror
+
+
+def test_materials_apply_to_the_groups_of_an_obj_model(tmp_path):
+    text = """mtllib none.mtl
+v -1 -1 0
+v 0 -1 0
+v 0 1 0
+v -1 1 0
+v 1 -1 0
+v 1 1 0
+v 1 1 0
+g body
+usemtl white
+f 1 2 3 4
+g panel wing
+usemtl black
+f 2 5 6
+f 5 6 7
+f -6 -2 -5
+"""
+    (tmp_path / "parts.obj").write_text(text)
+    surface = read_surface(tmp_path / "parts.obj")
+    assert len(surface.faces) == 4  # one triangle without area was dropped, and a vertex merged
+    x = surface.vertices[surface.faces].mean(axis=1)[:, 0]
+    for group in ("panel", "wing", "black"):
+        optics = face_optics(surface, [Material("m", group=group, reflectance=0.9)])
+        assert_allclose(optics.diffuse, np.where(x > 0.0, 0.9, 0.5))
+    with pytest.raises(UsageError, match="no group 'nose' in the model; groups of the model: black, body, panel"):
+        face_optics(surface, [Material("m", group="nose")])

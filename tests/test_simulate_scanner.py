@@ -13,8 +13,9 @@ from avsreplay.errors import MissingBackend
 from avsreplay.records import Surface
 from avsreplay.simulate import Shape, builtin_surface, ray_casting
 from avsreplay.simulate.motion import Motion, MotionParams
+from avsreplay.simulate.pattern import FieldOfView, Pattern
 from avsreplay.simulate.ray_casting import Engine, RayCaster
-from avsreplay.simulate.scanner import FieldOfView, Pattern, Scanner, ScannerParams
+from avsreplay.simulate.scanner import Scanner, ScannerParams
 from avsreplay.simulate.target import TargetParams, body
 
 needs_embree = pytest.mark.skipif(

@@ -9,8 +9,10 @@ from numpy.testing import assert_allclose
 
 from avsreplay import geometry, toml_document
 from avsreplay.errors import UsageError
-from avsreplay.log import open_source
+from avsreplay.log import SourceOptions, open_source
 from avsreplay.record import RecordOptions, record_scenario
+from avsreplay.records import Scan
+from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.simulate import EPOCH_NS, builtin_surface, load_scenario, scenario_of, simulate
 from avsreplay.simulate.scene import SceneObject
 from avsreplay.simulate.target import ply_bytes
@@ -134,3 +136,89 @@ def test_presence_is_half_open():
     thing = SceneObject("x", start_s=1.0, duration_s=2.0)
     assert [thing.present(t) for t in (0.999, 1.0, 2.999, 3.0)] == [False, True, True, False]
     assert replace(thing, duration_s=None).present(math.inf)
+
+
+def test_an_appendage_swings_about_its_hinge_and_the_rest_stays():
+    """The points on a panel, turned back by the swing about the hinge, lie on the rigid model."""
+    panel = "[[appendage]]\nname = 'panel'\nbox_m = [-9.0, 0.6, -9.0, 9.0, 9.0, 9.0]\nhinge_m = [-0.7, 0.6, 0.3]\n"
+    panel += "axis_c = [1.0, 0.0, 0.0]\namplitude_deg = 20.0\nfrequency_hz = 0.25\n"
+    simulation, scans, swung = scans_of(panel)
+    index = SurfaceIndex.build(SURFACE, 0.5)
+    away = []
+    for scan, points in zip(scans, swung, strict=True):
+        T_ac = simulation.truth_of(scan).pose
+        p = T_ac.inverse().apply(points)
+        angle = math.radians(20.0) * math.sin(2.0 * math.pi * 0.25 * scan.seq)  # an oracle of its own: a plane rotation
+        y, z = p[:, 1] - 0.6, p[:, 2] - 0.3
+        back = np.column_stack([p[:, 0], math.cos(angle) * y + math.sin(angle) * z + 0.6,
+                                -math.sin(angle) * y + math.cos(angle) * z + 0.3])  # fmt: skip
+        rigid, turned = (np.sqrt(index.closest(x).d2) for x in (p, back))
+        assert np.minimum(rigid, turned).max() < 1e-5
+        away.append(rigid.max())
+    assert away[0] < 1e-5  # through the middle
+    assert away[1] > 0.2
+
+
+def test_an_appendage_without_a_face_is_refused():
+    with pytest.raises(UsageError, match="no face lies in the box of 'tail'"):
+        scans_of("[[appendage]]\nname = 'tail'\nbox_m = [50.0, 50.0, 50.0, 51.0, 51.0, 51.0]\n")
+
+
+CAMERA = """[camera]
+velocity_mps = [0.05, -0.02, 0.03]
+rate_radps = [0.0, 0.03, 0.01]
+vibration_m = 0.002
+vibration_deg = 0.2
+frequency_hz = 3.3
+"""
+
+
+def test_the_scans_of_a_moving_camera_lie_on_the_target_after_its_pose(tmp_path):
+    record_scenario(scenario_of(toml_document.parse(BASE + CAMERA, "s.toml")), tmp_path / "m.mcap", RecordOptions())
+    index = SurfaceIndex.build(SURFACE, 0.5)
+    away = {}
+    for name, options in (
+        ("topic", SourceOptions(sensor_topic="/camera/pose")),
+        ("tf", SourceOptions(fixed_frame="map")),
+        ("neither", SourceOptions()),
+    ):
+        with open_source(tmp_path / "m.mcap", options) as source:
+            far = [
+                np.sqrt(index.closest(source.truth_of(scan).pose.inverse().apply(np.float64(scan.points))).d2).max()
+                for scan in source.scans()
+            ]
+        away[name] = max(far)
+    assert away["topic"] < 1e-4
+    assert away["tf"] < 1e-4
+    assert away["neither"] > 0.05
+
+
+def test_the_reported_pose_of_the_camera_has_the_stated_error():
+    noisy = CAMERA + "pose_std_m = 0.01\npose_std_deg = 0.5\n"
+    text = BASE.replace("duration_s = 4.0", "duration_s = 400.0") + noisy
+    simulation = simulate(scenario_of(toml_document.parse(text, "s.toml")), SURFACE)
+    exact = simulate(scenario_of(toml_document.parse(text.replace("= 0.01\n", "= 0.0\n").replace(
+        "pose_std_deg = 0.5", "pose_std_deg = 0.0"), "s.toml")), SURFACE)  # fmt: skip
+    empty = np.zeros((0, 3), np.float32)
+    scans = [Scan(k, 0, empty, log_ns=EPOCH_NS + k * 1_000_000_000) for k in range(400)]
+    pairs = [(simulation.camera_pose(scan), exact.camera_pose(scan)) for scan in scans]
+    shift = np.array([a.t - b.t for a, b in pairs])
+    turn = np.array([geometry.log(geometry.multiply(geometry.conjugate(b.q), a.q)) for a, b in pairs])
+    assert_allclose(shift.std(), 0.01, rtol=0.1)
+    assert_allclose(np.degrees(turn).std(), 0.5, rtol=0.1)
+    assert simulation.camera_pose(scans[7]).t.tolist() == pairs[7][0].t.tolist()  # by seed
+
+
+def test_intensity_is_written_and_read_back(tmp_path):
+    path = tmp_path / "i.mcap"
+    _, scans, _ = scans_of("intensity = true\n")
+    record_scenario(scenario_of(toml_document.parse(BASE + "intensity = true\n", "s.toml")), path, RecordOptions())
+    with open_source(path, SourceOptions(crop_range=(0.0, 4.9))) as source:
+        for scan, made in zip(source.scans(), scans, strict=True):
+            near = np.linalg.norm(made.points.astype(np.float64), axis=1) <= 4.9
+            np.testing.assert_array_equal(scan.intensities, made.intensities[near])
+            assert len(scan.intensities) == len(scan.points) > 0
+            r2 = np.sum(scan.points.astype(np.float64) ** 2, axis=1)
+            assert np.all(scan.intensities <= 0.5 / r2 * (1.0 + 1e-4))  # Lambert: at most the reflectance over r^2
+    without = scans_of()[1]
+    assert all(scan.intensities is None for scan in without)

@@ -194,22 +194,36 @@ _DATATYPE = {"float32": 7, "float64": 8}
 
 
 def point_cloud2(
-    t_ns: int, frame: str, points: NDArray[Any], times_s: NDArray[Any] | None, point_type: str = "float32"
+    t_ns: int,
+    frame: str,
+    points: NDArray[Any],
+    times_s: NDArray[Any] | None,
+    point_type: str = "float32",
+    intensities: NDArray[Any] | None = None,
 ) -> bytes:
-    """Return a PointCloud2 of (n, 3) points [m]; ``times_s`` (n,) [s after the stamp] becomes the field ``t``."""
+    """Return a PointCloud2 of points.
+
+    Args:
+        t_ns: stamp [ns].
+        frame: its frame.
+        points: (n, 3) [m].
+        times_s: (n,) [s after the stamp], the field ``t``; None: no such field.
+        point_type: of the coordinates, ``float32`` or ``float64``.
+        intensities: (n,), the field ``intensity``; None: no such field.
+    """
     names = ["x", "y", "z"]
     formats = [f"<f{4 if point_type == 'float32' else 8}"] * 3
-    if times_s is not None:
-        names, formats = [*names, "t"], [*formats, "<f4"]
+    besides = [(name, values) for name, values in (("t", times_s), ("intensity", intensities)) if values is not None]
+    names, formats = [*names, *(name for name, _ in besides)], [*formats, *("<f4" for _ in besides)]
     table = np.empty(len(points), dtype={"names": names, "formats": formats})
     for axis, name in enumerate("xyz"):
         table[name] = points[:, axis]
-    if times_s is not None:
-        table["t"] = times_s
+    for name, values in besides:
+        table[name] = values
     packer = Packer().header(t_ns, frame).u32(1).u32(len(points)).u32(len(names))
     for name in names:
         offset = int(table.dtype.fields[name][1]) if table.dtype.fields else 0
-        kind = 7 if name == "t" else _DATATYPE[point_type]
+        kind = 7 if name in ("t", "intensity") else _DATATYPE[point_type]
         packer.string(name).u32(offset).u8(kind).u32(1)
     step = table.dtype.itemsize
     return packer.u8(0).u32(step).u32(step * len(points)).octets(table.tobytes()).u8(1).bytes()

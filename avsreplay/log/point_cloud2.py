@@ -16,6 +16,7 @@ from avsreplay.log.cdr import Cursor
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MAX_FIELDS = 256
 MAX_COORDINATE_M = 1e6  # a larger coordinate is a sensor error; squares and grid cells stay in range
+_INTENSITY_NAMES = ("intensity", "intensities", "i", "reflectivity")
 _TIME_NAMES = ("t", "time", "timestamp", "time_offset", "offset_time")
 
 
@@ -63,7 +64,7 @@ class Layout:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """A decoded cloud: finite points (n, 3) [m] in ``frame``, times (n,) [s] after the stamp or None.
+    """A decoded cloud: finite points (n, 3) [m] in ``frame``, their times [s] after the stamp and intensities, or None.
 
     ``pose`` is set instead of the points where the source holds measured poses.
     """
@@ -74,6 +75,7 @@ class Cloud:
     times_s: NDArray[np.float32] | None
     dropped: int
     pose: MeasuredPose | None = None
+    intensities: NDArray[np.float32] | None = None
 
 
 def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
@@ -89,12 +91,13 @@ def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
     layout = read_layout(payload, encoding)
     if 0 in layout.shape:
         return Cloud(layout.stamp_ns, layout.frame, np.zeros((0, 3), np.float32), None, 0)
-    points, times = _points(layout), _times(layout)
+    points, times, intensities = _points(layout), _times(layout), _intensities(layout)
     kept = usable(points)
     dropped = 0 if kept is None else len(points) - int(np.count_nonzero(kept))
     if kept is not None and dropped:
         points, times = points[kept], None if times is None else times[kept]
-    return Cloud(layout.stamp_ns, layout.frame, points, times, dropped)
+        intensities = None if intensities is None else intensities[kept]
+    return Cloud(layout.stamp_ns, layout.frame, points, times, dropped, intensities=intensities)
 
 
 def usable(points: NDArray[Any]) -> NDArray[np.bool_] | None:
@@ -181,6 +184,12 @@ def _times(layout: Layout) -> NDArray[np.float32] | None:
     if column.dtype.itemsize == 8 and len(column) and np.nanmax(np.abs(column)) > 1e6:
         return (column.astype(np.float64) - layout.stamp_ns * 1e-9).astype(np.float32)
     return column.astype(np.float32)
+
+
+def _intensities(layout: Layout) -> NDArray[np.float32] | None:
+    """Return the intensity (n,) of each point in the sensor's own unit."""
+    name = next((f.name for f in layout.fields if f.name in _INTENSITY_NAMES), None)
+    return None if name is None else layout.column(name).reshape(-1).astype(np.float32)
 
 
 def _relative(times_ns: NDArray[np.int64], stamp_ns: int) -> NDArray[np.float32]:

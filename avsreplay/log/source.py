@@ -230,6 +230,7 @@ class Source:
             log_ns=log_ns,
             frame="" if cloud is None else cloud.frame,
             pose=None if cloud is None else cloud.pose,
+            intensities=None if cloud is None else cloud.intensities,
         )
 
     def _body_at(self, t_ns: int) -> State | None:
@@ -249,7 +250,7 @@ class Source:
         if self._ground_truth.sensor is None:
             return cloud
         pose = self._sensor(t_ns, cloud.frame)
-        return Cloud(cloud.stamp_ns, cloud.frame, pose.apply(cloud.points), cloud.times_s, cloud.dropped)
+        return replace(cloud, points=pose.apply(cloud.points))
 
     def _sensor(self, t_ns: int, frame: str) -> Pose:
         """Return the pose of the sensor in the fixed frame. Raises BadMessage if it is unknown."""
@@ -293,7 +294,8 @@ def _cropped(cloud: Cloud, options: SourceOptions) -> Cloud:
         distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
         keep &= (distance >= options.crop_range[0]) & (distance <= options.crop_range[1])
     times = None if cloud.times_s is None else cloud.times_s[keep]
-    return Cloud(cloud.stamp_ns, cloud.frame, cloud.points[keep], times, cloud.dropped)
+    seen = None if cloud.intensities is None else cloud.intensities[keep]
+    return replace(cloud, points=cloud.points[keep], times_s=times, intensities=seen)
 
 
 def refuse_losses(source: Source) -> None:

@@ -23,6 +23,7 @@ from avsreplay.log.surface import surface_bytes
 from avsreplay.records import Label, LogHeader, Scan, State
 
 CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = "/points", "/truth/pose", "/truth/body", "/faults"
+CAMERA_TOPIC = "/camera/pose"
 CAMERA_FRAME, TARGET_FRAME, BODY_FRAME, ROOT_FRAME = "camera", "target", "target_body", "map"
 LIBRARY = "avsreplay"
 _TYPES = {
@@ -30,6 +31,8 @@ _TYPES = {
     TRUTH_TOPIC: "geometry_msgs/msg/PoseStamped",
     BODY_TOPIC: "nav_msgs/msg/Odometry",
     FAULT_TOPIC: "diagnostic_msgs/msg/DiagnosticArray",
+    CAMERA_TOPIC: "geometry_msgs/msg/PoseStamped",
+    "/tf": "tf2_msgs/msg/TFMessage",
     "/tf_static": "tf2_msgs/msg/TFMessage",
 }
 _INFINITE = "{sec: 9223372036, nsec: 854775807}"
@@ -88,6 +91,7 @@ class LogWriter:
         chunk_s: float = 1.0,
         streaming: bool = False,
         point_type: str = "float32",
+        moving_camera: bool = False,
     ) -> None:
         """Open the output and write the header.
 
@@ -100,6 +104,7 @@ class LogWriter:
             chunk_s: a chunk is also written when it reaches this span of the log clock [s].
             streaming: write under the final name from the first byte, for a reader that follows the file.
             point_type: type of the stored coordinates, ``float32`` or ``float64``.
+            moving_camera: the log holds no static transform of the camera; ``write_camera`` gives its poses.
 
         Raises:
             UsageError: the output exists, or its folder does not.
@@ -119,6 +124,7 @@ class LogWriter:
         self._partial = self._path if self._direct else self._path.with_name(self._path.name + ".partial")
         self._point_type, self._chunk_bytes, self._chunk_ns = point_type, chunk_bytes, round(chunk_s * 1e9)
         self._labels = sorted(_edges(header.labels), key=lambda edge: (edge[0], edge[1]))
+        self._moving, self._root = moving_camera, ROOT_FRAME if moving_camera else CAMERA_FRAME
         self._channels: dict[str, int] = {}
         self._counts: dict[str, int] = {}
         self._chunk_start_ns: int | None = None
@@ -147,7 +153,7 @@ class LogWriter:
             ValueError: a time is outside the range of a log.
             UnreadableInput: the output cannot be written.
         """
-        payload = point_cloud2(scan.t_ns, CAMERA_FRAME, scan.points, scan.times_s, self._point_type)
+        payload = point_cloud2(scan.t_ns, CAMERA_FRAME, scan.points, scan.times_s, self._point_type, scan.intensities)
         self._message(CLOUD_TOPIC, scan.log_ns, payload)
 
     def write_truth(self, log_ns: int, t_ns: int, pose: Pose, body: State | None = None) -> None:
@@ -163,9 +169,24 @@ class LogWriter:
             ValueError: a time is outside the range of a log.
             UnreadableInput: the output cannot be written.
         """
-        self._message(TRUTH_TOPIC, log_ns, pose_stamped(t_ns, CAMERA_FRAME, pose))
+        self._message(TRUTH_TOPIC, log_ns, pose_stamped(t_ns, self._root, pose))
         if body is not None:
-            self._message(BODY_TOPIC, log_ns, odometry(t_ns, CAMERA_FRAME, BODY_FRAME, body))
+            self._message(BODY_TOPIC, log_ns, odometry(t_ns, self._root, BODY_FRAME, body))
+
+    def write_camera(self, log_ns: int, t_ns: int, pose: Pose) -> None:
+        """Append the pose of a moving camera in the fixed frame, as a pose topic and as a transform.
+
+        Args:
+            log_ns: time on the log clock [ns].
+            t_ns: time of the pose [ns].
+            pose: T_wa.
+
+        Raises:
+            ValueError: a time is outside the range of a log.
+            UnreadableInput: the output cannot be written.
+        """
+        self._message(CAMERA_TOPIC, log_ns, pose_stamped(t_ns, ROOT_FRAME, pose))
+        self._message("/tf", log_ns, transform(t_ns, ROOT_FRAME, CAMERA_FRAME, pose))
 
     def close(self) -> None:
         """Finish and rename the file. Raises UnreadableInput if it cannot be written."""
@@ -229,6 +250,8 @@ class LogWriter:
         self._append(topic, log_ns, payload)
 
     def _static(self, log_ns: int) -> None:
+        if self._moving:
+            return
         self._append("/tf_static", log_ns, transform(log_ns, ROOT_FRAME, CAMERA_FRAME, Pose.identity()))
 
     def _labels_until(self, log_ns: int | None) -> None:

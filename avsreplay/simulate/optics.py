@@ -14,11 +14,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
+from avsreplay.errors import UsageError
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, setting
@@ -41,44 +43,121 @@ class Material(Settings):
         infinite=True,
         unset="all faces",
     )
+    group: str = setting(
+        "", "The faces of this group (g), object (o) or material (usemtl) of an OBJ model; empty: of any."
+    )
     reflectance: float = setting(REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
     specular: float = setting(0.0, "Strength of the specular lobe in units of a white diffuse surface.", low=0.0)
     specular_width_deg: float = setting(
         3.0, "Angle of incidence at which the specular lobe has fallen to 1/e.", unit="deg", above=0.0, below=90.0
     )
     dropout_ratio: float = setting(0.0, "Share of the returns that are lost.", low=0.0, high=1.0)
+    retroreflectance: float = setting(
+        0.0, "Intensity of a retro-reflector, at any incidence, in units of a white diffuse surface.", low=0.0
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FaceOptics:
-    """Optical properties of the faces of a surface, each (m,): diffuse, specular, width [rad], share of dropouts."""
+    """Optical properties of the faces of a surface, each (m,).
+
+    Attributes:
+        diffuse, specular, retro: reflectances.  width_rad: of the specular lobe.  dropouts: share of the returns.
+        normals: (m, 3) unit normals.
+    """
 
     diffuse: Array
     specular: Array
     width_rad: Array
     dropouts: Array
+    retro: Array
+    normals: Array
+
+    def part(self, faces: NDArray[np.intp]) -> FaceOptics:
+        """The properties of some of the faces."""
+        return FaceOptics(*(getattr(self, field.name)[faces] for field in fields(self)))
 
     def intensity(self, faces: NDArray[np.int64], cosines: Array, ranges: Array, reference_m: float) -> Array:
         """Intensity (n,) of returns from these faces (n,), by cosine of incidence (n,) and range (n,) [m]."""
         angle = np.arccos(np.minimum(cosines, 1.0))
         lobe = self.specular[faces] * np.exp(-np.square(angle / self.width_rad[faces]))
-        return np.asarray((self.diffuse[faces] * cosines + lobe) * np.square(reference_m / ranges))
+        reflected = self.diffuse[faces] * cosines + lobe + self.retro[faces]
+        return np.asarray(reflected * np.square(reference_m / ranges))
+
+    def glint(self, faces: NDArray[np.int64], directions: Array, sun: Array) -> NDArray[np.bool_]:
+        """Whether faces mirror the sun into the camera.
+
+        Args:
+            faces: (n,) of the returns.
+            directions: (n, 3) unit directions of the rays in the frame of the surface.
+            sun: (n, 3) unit vectors to the sun in the same frame.
+        """
+        n = self.normals[faces]
+        mirrored = directions - 2.0 * np.einsum("ni,ni->n", directions, n)[:, None] * n
+        cosine = np.einsum("ni,ni->n", mirrored, sun)
+        angle = 0.5 * np.arccos(np.clip(cosine, -1.0, 1.0))  # of the normal from the bisector
+        return np.asarray((self.specular[faces] > 0.0) & (angle < self.width_rad[faces]))
 
 
 def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
     """The optical properties of a surface's faces; those without a material have a diffuse reflectance of 0.5."""
     count = len(surface.faces)
-    optics = FaceOptics(np.full(count, REFLECTANCE), np.zeros(count), np.full(count, 0.1), np.zeros(count))
+    zero = np.zeros(count)
+    corners = surface.vertices[surface.faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+    optics = FaceOptics(
+        np.full(count, REFLECTANCE), zero.copy(), np.full(count, 0.1), zero.copy(), zero.copy(), normals
+    )
+    groups = face_groups(surface) if any(material.group for material in materials) else []
     centres = surface.vertices[surface.faces].mean(axis=1)
     for material in materials:
         inside = np.ones(count, dtype=bool)
         if material.box_m is not None:
             inside = np.all((centres >= material.box_m[:3]) & (centres <= material.box_m[3:]), axis=1)
+        if material.group:
+            named = np.array([material.group in names for names in groups], dtype=bool)
+            if not named.any():
+                there = ", ".join(sorted({name for names in groups for name in names})[:20]) or "none"
+                hint = f"groups of the model: {there}"
+                raise UsageError(f"no group '{material.group}' in the model", where="material.group", hint=hint)
+            inside &= named
         optics.diffuse[inside] = material.reflectance
+        optics.retro[inside] = material.retroreflectance
         optics.specular[inside] = material.specular
         optics.width_rad[inside] = math.radians(material.specular_width_deg)
         optics.dropouts[inside] = material.dropout_ratio
     return optics
+
+
+def face_groups(surface: Surface) -> list[frozenset[str]]:
+    """The names of group, object and material of every face of an OBJ model; empty sets for any other format.
+
+    Args:
+        surface: the model with the bytes of its file. Its faces are found by their centres, because a reader merges
+            vertices and drops faces without area.
+    """
+    vertices: list[list[float]] = []
+    centres: list[Array] = []
+    names: list[frozenset[str]] = []
+    now: dict[str, frozenset[str]] = {}
+    if surface.name.lower().endswith(".obj"):
+        for line in surface.data.decode("utf-8", "replace").splitlines():
+            word, _, rest = line.strip().partition(" ")
+            if word == "v":
+                vertices.append([float(x) for x in rest.split()[:3]])
+            elif word in ("g", "o", "usemtl"):
+                now[word] = frozenset(rest.split())
+            elif word == "f":
+                index = [int(part.split("/")[0]) for part in rest.split()]
+                corners = np.array([vertices[i - 1 if i > 0 else i] for i in index])
+                for k in range(1, len(corners) - 1):  # the triangles of a polygon
+                    centres.append(corners[[0, k, k + 1]].mean(axis=0))
+                    names.append(frozenset().union(*now.values()))
+    if not centres:
+        return [frozenset()] * len(surface.faces)
+    _, nearest = cKDTree(np.array(centres)).query(surface.vertices[surface.faces].mean(axis=1))
+    return [names[int(k)] for k in np.asarray(nearest)]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -156,3 +235,58 @@ def merged(ranges: Array, intensities: Array, merge_m: float) -> tuple[Array, Ar
     weights = weights / np.where(total > 0.0, total, 1.0)
     mean = (np.where(taking_part, ranges, 0.0) * weights).sum(axis=0)
     return np.where(total > 0.0, mean, np.inf), total / len(ranges), weights
+
+
+def separated(ranges: Array, intensities: Array, merge_m: float, returns: int) -> list[tuple[Array, Array, Array]]:
+    """The strongest returns of each beam, as of ``merged``; each ray takes part in one return at most.
+
+    Args:
+        ranges: (k, n) range of each ray [m], inf without a return.
+        intensities: (k, n) its intensity, 0 without a return.
+        merge_m: returns within this distance of a stronger one merge with it.
+        returns: most returns of a beam.
+    """
+    found = []
+    for _ in range(returns):
+        mean, intensity, weights = merged(ranges, intensities, merge_m)
+        found.append((mean, intensity, weights))
+        taken = weights > 0.0
+        ranges, intensities = np.where(taken, np.inf, ranges), np.where(taken, 0.0, intensities)
+    return found
+
+
+def crosstalk(ranges: Array, intensities: Array, ratio: float) -> Array:
+    """Ranges (n,) with stray light: a share of the strongest return is added to every return.
+
+    The sum of two returns of a continuous-wave instrument has, to first order in their difference, the mean of their
+    ranges weighted by intensity.
+    """
+    if not len(ranges):
+        return ranges
+    strongest = int(np.argmax(intensities))
+    stray = ratio * intensities[strongest]
+    return np.asarray((intensities * ranges + stray * ranges[strongest]) / (intensities + stray))
+
+
+def bloomed(rays: Array, saturated: Array, angle_rad: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rays within an angle of a saturated return.
+
+    Args:
+        rays: (n, 3) unit directions.
+        saturated: (m, 3) unit directions of the saturated returns.
+        angle_rad: radius of the bloom.
+
+    Returns:
+        Index of each such ray, and index of the nearest saturated return.
+    """
+    if not len(saturated):
+        none = np.zeros(0, dtype=np.intp)
+        return none, none
+    chord, nearest = cKDTree(saturated).query(rays)
+    ray = np.flatnonzero(chord <= 2.0 * math.sin(0.5 * angle_rad))
+    return ray, np.asarray(nearest)[ray]
+
+
+def part_of(surface: Surface, faces: NDArray[np.intp]) -> Surface:
+    """Some of the faces of a mesh."""
+    return surface if len(faces) == len(surface.faces) else replace(surface, faces=surface.faces[faces])

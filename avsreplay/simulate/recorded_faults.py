@@ -127,7 +127,9 @@ class _Disturbance:
             if fault.kind == "stamp_jump":
                 changed = replace(changed, t_ns=changed.t_ns + round(fault.strength * NS))
         if "frozen" in kinds and self.last is not None:
-            return replace(changed, points=self.last.points, times_s=self.last.times_s, status=self.last.status)
+            last = self.last
+            same = replace(changed, points=last.points, times_s=last.times_s, status=last.status)
+            return replace(same, intensities=last.intensities)
         if "frozen" not in kinds:
             self.last = changed
         return changed
@@ -148,7 +150,8 @@ class _Disturbance:
             returns = returns.in_order()
         times = returns.times_s.astype(np.float32) if timed else None
         status = scan.status if len(returns.ranges) else ScanStatus.EMPTY
-        return replace(scan, points=returns.points, times_s=times, status=status)
+        seen = None if scan.intensities is None else returns.intensities.astype(np.float32)
+        return replace(scan, points=returns.points, times_s=times, status=status, intensities=seen)
 
     def _applied(self, returns: Returns, fault: RecordedFault, number: int, seq: int) -> Returns:
         """One fault; each fault and scan has a random stream of its own."""
@@ -213,7 +216,8 @@ def _returns(scan: Scan) -> Returns:
     directions = points / np.where(ranges > 0.0, ranges, 1.0)[:, None]
     times = np.zeros(len(points)) if scan.times_s is None else np.asarray(scan.times_s, dtype=np.float64)
     one, zero = np.ones(len(points)), np.zeros(len(points))
-    return Returns(directions, ranges, times, one, zero, zero)
+    seen = one if scan.intensities is None else np.asarray(scan.intensities, dtype=np.float64)
+    return Returns(directions, ranges, times, one, seen, zero)
 
 
 def _view(directions: Array) -> Array:

@@ -14,14 +14,26 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from avsreplay.geometry import Array, frozen, rotate
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.motion import Motion
-from avsreplay.simulate.optics import FaceOptics, Material, TracedRays, beam, face_optics, merged
+from avsreplay.simulate.optics import (
+    FaceOptics,
+    Material,
+    TracedRays,
+    beam,
+    bloomed,
+    crosstalk,
+    face_optics,
+    part_of,
+    separated,
+)
+from avsreplay.simulate.pattern import FieldOfView, Pattern, ray_grid
 from avsreplay.simulate.ray_casting import Engine, RayCaster
-from avsreplay.simulate.scene import SceneBody
+from avsreplay.simulate.scene import Appendage, Camera, SceneBody, appendage_faces
 
 
 class Preset(Enum):
@@ -33,22 +45,6 @@ class Preset(Enum):
     RASTER_TRIANGULATION = "raster_triangulation"
     LISSAJOUS_LIDAR = "lissajous_lidar"
     SPINNING_LIDAR = "spinning_lidar"
-
-
-class Pattern(Enum):
-    """Order in which the rays are measured."""
-
-    FLASH = "flash"  # all rays at the stamp
-    RASTER = "raster"  # row after row over ``scan_s``, each point with its own time
-    LISSAJOUS = "lissajous"  # two sinusoidal mirrors over ``scan_s``
-    SPINNING = "spinning"  # a column of beams that rotates about the vertical axis over ``scan_s``
-
-
-class FieldOfView(Enum):
-    """Outline of the field of view."""
-
-    RECTANGLE = "rectangle"
-    CONE = "cone"  # the ellipse inside the rectangle
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,12 +113,33 @@ class ScannerParams(Settings):
     )
     range_min_m: float = setting(0.5, "Smallest range of a return.", unit="m", low=0.0)
     range_max_m: float = setting(12.0, "Largest range of a return.", unit="m", above=0.0)
+    intensity: bool = setting(False, "Write the intensity of each return to the log.")
+    returns: int = setting(
+        1, "Most returns of one beam, strongest first; more than one needs a divergence and merge_m.", low=1, high=7
+    )
+    range_walk_m: float = setting(
+        0.0, "Error of the range by which it grows for each factor of ten that the intensity is below 1.", unit="m"
+    )
+    crosstalk_ratio: float = setting(
+        0.0, "Share of the strongest return of a scan that is added to every return as stray light.", low=0.0, below=1.0
+    )
+    saturation: float = setting(
+        math.inf, "Intensity from which a return saturates the detector and blooms.", above=0.0, infinite=True
+    )
+    bloom_deg: float = setting(
+        0.0, "Rays within this angle of a saturated return give its range instead of their own.", unit="deg", low=0.0
+    )
+    sun_a: tuple[float, float, float] | None = setting(
+        None, "Unit vector to the sun in {A}; specular faces that mirror it return nothing.", unset="no sun"
+    )
     engine: Engine = setting(Engine.AUTO, "Ray casting: embree, exact (numpy), or embree where it is installed (auto).")
 
     def check(self) -> None:
         """Raise ValueError where the ranges, or pattern and duration, do not go together."""
         if self.range_min_m >= self.range_max_m:
             raise ValueError(f"range_min_m = {self.range_min_m} must be below range_max_m = {self.range_max_m}")
+        if self.sun_a is not None and not math.isclose(math.hypot(*self.sun_a), 1.0, abs_tol=1e-6):
+            raise ValueError(f"sun_a = {list(self.sun_a)} is not a unit vector")
         if (self.pattern is not Pattern.FLASH) != (self.scan_s > 0.0):
             raise ValueError(f"scan_s = {self.scan_s}: 0 for a flash, positive for any other pattern")
 
@@ -176,17 +193,34 @@ class Scanner:
     """
 
     def __init__(
-        self, params: ScannerParams, surface: Surface, motion: Motion, materials: Sequence[Material] = ()
+        self,
+        params: ScannerParams,
+        surface: Surface,
+        motion: Motion,
+        materials: Sequence[Material] = (),
+        appendages: Sequence[Appendage] = (),
+        camera: Camera | None = None,
     ) -> None:
-        self.params = params
-        self._motion = motion
-        self._caster = RayCaster(surface, params.engine)
-        self._optics = face_optics(surface, materials)
-        directions, self._times = _grid(params)
+        self.params = p = params
+        self._motion, self._camera = motion, camera
+        optics, owner = face_optics(surface, materials), appendage_faces(surface, appendages)
+        rigid = np.flatnonzero(owner < 0)
+        self._caster = RayCaster(part_of(surface, rigid), params.engine)
+        self._optics = optics.part(rigid)
+        self._flexible = [
+            (each, RayCaster(part_of(surface, faces), params.engine), optics.part(faces))
+            for k, each in enumerate(appendages)
+            for faces in [np.flatnonzero(owner == k)]
+        ]
+        directions, self._times = ray_grid(p.pattern, p.view, p.fov_deg, p.rays, p.lissajous, p.scan_s)
         self._rays = beam(directions, 1e-3 * params.divergence_mrad)
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         self.centre_c = frozen(0.5 * (low + high))
-        self.radius_m = float(np.max(np.linalg.norm(surface.vertices - self.centre_c, axis=1)))
+        reach = [float(np.max(np.linalg.norm(surface.vertices - self.centre_c, axis=1)))]
+        for each in appendages:  # wherever its hinge turns it
+            hinge = np.array(each.hinge_m)
+            reach.append(np.linalg.norm(hinge - self.centre_c) + np.linalg.norm(surface.vertices - hinge, axis=1).max())
+        self.radius_m, self._reach_m = reach[0], float(np.max(reach))
 
     @property
     def engine(self) -> Engine:
@@ -200,29 +234,63 @@ class Scanner:
             t_s: Time of the scan [s].
             bodies: Objects beside the target that are present.
         """
-        poses = self._poses(t_s)
+        times = np.array([t_s]) if self.params.pattern is Pattern.FLASH else t_s + self._times
+        target = self._motion.poses(times)
+        poses = self._seen(target, times)
         near = self._may_hit(*poses)
         found = [self._traced(self._caster, self._optics, poses, rays, near) for rays in self._rays]
+        for each, caster, optics in self._flexible:
+            placed = self._seen(each.placed(target, times), times)
+            for k, rays in enumerate(self._rays):
+                found[k] = found[k].nearer(self._traced(caster, optics, placed, rays, near))
+        every = np.arange(len(self._times))
         for body in bodies:
-            placed = body.params.poses(np.array([t_s]) if self.params.pattern is Pattern.FLASH else t_s + self._times)
-            every = np.arange(len(self._times))
+            placed = self._seen(body.params.poses(times), times)
             for k, rays in enumerate(self._rays):
                 found[k] = found[k].nearer(self._traced(body.caster, body.optics, placed, rays, every))
-        if bodies:
-            near = np.arange(len(self._times))
+        if bodies or self.params.bloom_deg > 0.0:
+            near = every
         returns = self._beams([each.chosen(near) for each in found], near)
-        return returns.keep(np.isfinite(returns.ranges) & (returns.intensities >= self.params.intensity_min))
+        returns = returns.keep(np.isfinite(returns.ranges) & (returns.intensities >= self.params.intensity_min))
+        return self._stray(returns)
+
+    def _stray(self, returns: Returns) -> Returns:
+        """Returns with stray light of the strongest one, and with the bloom of saturated ones."""
+        p = self.params
+        if p.crosstalk_ratio > 0.0:
+            returns = replace(returns, ranges=crosstalk(returns.ranges, returns.intensities, p.crosstalk_ratio))
+        if p.bloom_deg > 0.0:
+            strong = returns.keep(returns.intensities >= p.saturation)
+            ray, source = bloomed(self._rays[0], strong.directions, math.radians(p.bloom_deg))
+            if len(ray):
+                inside = np.asarray(cKDTree(self._rays[0][ray]).query(returns.directions)[0]) < 1e-9
+                bloom = replace(strong.keep(source), directions=self._rays[0][ray], times_s=self._times[ray])
+                returns = returns.keep(~inside).joined(bloom)
+        return returns
+
+    def _seen(self, poses: tuple[Array, Array], times_s: Array) -> tuple[Array, Array]:
+        """Poses (n, 3, 3), (n, 3) in the fixed frame as the moving camera sees them."""
+        if self._camera is None:
+            return poses
+        R_wa, t_wa = self._camera.poses(times_s)
+        back = np.swapaxes(R_wa, -1, -2)
+        return back @ poses[0], rotate(back, poses[1] - t_wa)
 
     def _beams(self, rays: list[TracedRays], near: NDArray[np.intp]) -> Returns:
         """The returns of beams from those of their rays."""
         ranges, intensities = np.stack([r.returned for r in rays]), np.stack([r.intensities for r in rays])
         if len(rays) == 1:
-            mean, intensity, weights = ranges[0], intensities[0], np.ones((1, len(near)))
+            groups = [(ranges[0], intensities[0], np.ones((1, len(near))))]
         else:
-            mean, intensity, weights = merged(ranges, intensities, self.params.merge_m)
-        cosines = (weights * np.stack([r.cosines for r in rays])).sum(axis=0)
-        dropouts = (weights * np.stack([r.dropouts for r in rays])).sum(axis=0)
-        return Returns(self._rays[0][near], mean, self._times[near], cosines, intensity, dropouts)
+            groups = separated(ranges, intensities, self.params.merge_m, self.params.returns)
+        found = None
+        for mean, intensity, weights in groups:
+            cosines = (weights * np.stack([r.cosines for r in rays])).sum(axis=0)
+            dropouts = (weights * np.stack([r.dropouts for r in rays])).sum(axis=0)
+            each = Returns(self._rays[0][near], mean, self._times[near], cosines, intensity, dropouts)
+            found = each if found is None else found.joined(each.keep(np.isfinite(mean)))
+        assert found is not None
+        return found
 
     def _traced(
         self,
@@ -242,6 +310,9 @@ class Scanner:
         seen &= cosines >= math.cos(math.radians(p.max_incidence_deg))
         traced = TracedRays.empty(len(rays))
         traced.ranges[near], traced.cosines[near] = ranges, cosines
+        if p.sun_a is not None:
+            sun = np.broadcast_to(rotate(R_inverse, np.array(p.sun_a)), (len(near), 3))
+            seen &= ~optics.glint(np.maximum(faces, 0), rotate(R_inverse, rays[near]), sun)
         back = near[seen]
         traced.returned[back] = ranges[seen]
         traced.intensities[back] = optics.intensity(faces[seen], cosines[seen], ranges[seen], p.reference_m)
@@ -257,6 +328,8 @@ class Scanner:
         if p.noise_incidence > 0.0:
             noise_m /= np.maximum(returns.cosines, 0.01) ** p.noise_incidence
         ranges = returns.ranges + noise_m * rng.standard_normal(n)
+        if p.range_walk_m != 0.0:
+            ranges = ranges - p.range_walk_m * np.log10(np.maximum(returns.intensities, 1e-6))
         wrong = rng.random(n) < p.outlier_ratio
         ranges = np.where(wrong, rng.uniform(p.range_min_m, p.range_max_m, n), ranges)
         lost = np.where(
@@ -267,12 +340,6 @@ class Scanner:
             ranges = np.round(ranges / p.quantisation_m) * p.quantisation_m
         return replace(returns, ranges=ranges).keep(kept & (ranges > 0.0))
 
-    def _poses(self, t_s: float) -> tuple[Array, Array]:
-        """Rotations (n, 3, 3) and positions (n, 3) of the target at the time of each ray; n = 1 for a flash."""
-        if self.params.pattern is Pattern.FLASH:
-            return self._motion.poses([t_s])
-        return self._motion.poses(t_s + self._times)
-
     def _may_hit(self, R_ac: Array, t_ac: Array) -> NDArray[np.intp]:
         """The rays that pass through the bounding sphere of the target."""
         centre = rotate(R_ac, self.centre_c) + t_ac
@@ -280,46 +347,4 @@ class Scanner:
         along = np.sum(directions * centre, axis=1)
         aside = np.sum(centre * centre, axis=1) - along * along
         spread = 1e-3 * self.params.divergence_mrad * np.maximum(along, 0.0)
-        return np.flatnonzero(aside <= (1.001 * self.radius_m + spread) ** 2)
-
-
-def _grid(params: ScannerParams) -> tuple[Array, Array]:
-    """Unit directions (n, 3) in {A} in the order of measurement, and times (n,) [s] after the stamp.
-
-    The rays of a flash are uniform on the image plane, those of a raster in the angle of its mirrors, row by row from
-    the top left. A Lissajous figure has as many rays as columns times rows. A spinning scanner measures column by
-    column from the left; its rays are uniform in azimuth and elevation.
-    """
-    (across, down), (columns, rows) = params.fov_deg, params.rays
-    halves = [math.radians(0.5 * across), math.radians(0.5 * down)]
-    if params.pattern is Pattern.LISSAJOUS:
-        count = columns * rows
-        phases = [2.0 * math.pi * (k + 0.5) / count for k in range(count)]
-        a, b = params.lissajous
-        image = [(math.sin(a * phase), math.sin(b * phase + 0.25 * math.pi)) for phase in phases]
-    elif params.pattern is Pattern.SPINNING:
-        image = [(u, v) for u in _steps(columns) for v in _steps(rows)]
-    else:
-        image = [(u, v) for v in _steps(rows) for u in _steps(columns)]
-    grid = np.array([_direction(params.pattern, halves, u, v) for u, v in image])
-    grid /= np.sqrt(np.sum(grid * grid, axis=1))[:, None]
-    group = rows if params.pattern is Pattern.SPINNING else 1  # rays that are measured at once
-    times = (np.arange(len(grid)) // group * group) * (params.scan_s / len(grid))
-    if params.view is FieldOfView.CONE:
-        inside = np.array([u * u + v * v <= 1.0 for u, v in image])
-        grid, times = grid[inside], times[inside]
-    return frozen(grid), frozen(times)
-
-
-def _direction(pattern: Pattern, halves: list[float], u: float, v: float) -> tuple[float, float, float]:
-    """The direction of a ray at (u, v) in (-1, 1) of the field of view with these half angles; not of unit length."""
-    if pattern is Pattern.FLASH:
-        return math.tan(halves[0]) * u, math.tan(halves[1]) * v, 1.0
-    if pattern is Pattern.SPINNING:
-        return math.sin(halves[0] * u), math.tan(halves[1] * v), math.cos(halves[0] * u)
-    return math.tan(halves[0] * u), math.tan(halves[1] * v), 1.0
-
-
-def _steps(n: int) -> list[float]:
-    """The centres of n equal cells over (-1, 1)."""
-    return [(2 * k + 1) / n - 1.0 for k in range(n)]
+        return np.flatnonzero(aside <= (1.001 * self._reach_m + spread) ** 2)

@@ -19,7 +19,7 @@ from avsreplay.simulate.faults import InjectedFault
 from avsreplay.simulate.motion import MotionParams
 from avsreplay.simulate.optics import Material
 from avsreplay.simulate.scanner import Preset, ScannerParams
-from avsreplay.simulate.scene import SceneObject
+from avsreplay.simulate.scene import Appendage, CameraParams, SceneObject
 from avsreplay.simulate.target import TargetParams
 
 MAX_SCANS = 10_000_000
@@ -66,6 +66,10 @@ class ScenarioParams(Settings):
     motion: MotionParams = setting(MotionParams, "The target's motion.")
     scanner: ScannerParams = setting(ScannerParams, "The scanner.")
     material: tuple[Material, ...] = setting((), "Optical properties of parts of the target, one table each.")
+    appendage: tuple[Appendage, ...] = setting((), "Flexible parts of the target, one table each.")
+    camera: CameraParams | None = setting(
+        None, "Motion of the camera, whose pose the log then holds.", unset="at rest at the origin of {A}"
+    )
     object: tuple[SceneObject, ...] = setting((), "Objects beside the target, one table each.")
     fault: tuple[InjectedFault, ...] = setting((), "The injected faults, one table [[fault]] each.")
     start: StartParams | None = setting(

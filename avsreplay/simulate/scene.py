@@ -12,9 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.geometry import Array, frozen
+from avsreplay.errors import UsageError
+from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Label, Surface
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.optics import REFLECTANCE, FaceOptics, Material, face_optics
@@ -68,6 +70,94 @@ class SceneObject(Settings):
             return None
         start, end = (epoch_ns + round(t * NS) for t in (self.start_s, self.start_s + self.duration_s))
         return Label(self.name, start, end, self.harmful)
+
+
+@dataclass(frozen=True, slots=True)
+class Appendage(Settings):
+    """One table [[appendage]]: a flexible part of the target, which swings about a hinge while the model is rigid."""
+
+    name: str = setting(doc="Name of the part.")
+    box_m: tuple[float, float, float, float, float, float] = setting(
+        doc="The faces whose centre is within (xmin, ymin, zmin, xmax, ymax, zmax) in {C} belong to it.",
+        unit="m",
+        infinite=True,
+    )
+    hinge_m: Triple = setting((0.0, 0.0, 0.0), "A point of the hinge in {C}.", unit="m")
+    axis_c: Triple = setting((1.0, 0.0, 0.0), "Unit vector along the hinge in {C}.")
+    amplitude_deg: float = setting(1.0, "Amplitude of the swing.", unit="deg", low=0.0, high=90.0)
+    frequency_hz: float = setting(0.1, "Frequency of the swing.", unit="Hz", above=0.0)
+    phase_deg: float = setting(0.0, "Phase of the swing at the time 0; 0: through the middle.", unit="deg")
+
+    def check(self) -> None:
+        """Raise ValueError where the axis is not a unit vector."""
+        if not math.isclose(math.hypot(*self.axis_c), 1.0, abs_tol=1e-3):
+            raise ValueError(f"axis_c = {list(self.axis_c)} is not a unit vector")
+
+    def placed(self, target: tuple[Array, Array], times_s: Array) -> tuple[Array, Array]:
+        """Poses (n, 3, 3), (n, 3) of the part in {A} from those of the target at times (n,) [s]."""
+        R_ac, t_ac = target
+        phase = 2.0 * math.pi * self.frequency_hz * times_s + math.radians(self.phase_deg)
+        angle = math.radians(self.amplitude_deg) * np.sin(phase)
+        R, hinge = geometry.matrix(geometry.exp(angle[:, None] * np.array(self.axis_c))), np.array(self.hinge_m)
+        return R_ac @ R, t_ac + geometry.rotate(R_ac, hinge - R @ hinge)
+
+
+def appendage_faces(surface: Surface, appendages: Sequence[Appendage]) -> NDArray[np.int64]:
+    """The number of the appendage (m,) to which each face belongs, -1 for the rigid part; of several the last.
+
+    Raises:
+        UsageError: no face lies in the box of an appendage.
+    """
+    owner = np.full(len(surface.faces), -1, dtype=np.int64)
+    centres = surface.vertices[surface.faces].mean(axis=1)
+    for k, each in enumerate(appendages):
+        inside = np.all((centres >= each.box_m[:3]) & (centres <= each.box_m[3:]), axis=1)
+        if not inside.any():
+            hint = "the box is in the axes of {C}, in metres"
+            raise UsageError(f"no face lies in the box of '{each.name}'", where="appendage.box_m", hint=hint)
+        owner[inside] = k
+    return owner
+
+
+@dataclass(frozen=True, slots=True)
+class CameraParams(Settings):
+    """The table [camera]: motion of the camera in the fixed frame, which is {A} at the time 0 without vibration."""
+
+    velocity_mps: Triple = setting((0.0, 0.0, 0.0), "Velocity in the fixed frame.", unit="m/s")
+    rate_radps: Triple = setting((0.0, 0.0, 0.0), "Constant angular rate in the fixed frame.", unit="rad/s")
+    vibration_m: float = setting(0.0, "Amplitude of the vibration along each axis.", unit="m", low=0.0)
+    vibration_deg: float = setting(0.0, "Amplitude of the vibration about each axis.", unit="deg", low=0.0, high=10.0)
+    frequency_hz: float = setting(5.0, "Frequency of the vibration.", unit="Hz", above=0.0)
+    pose_std_m: float = setting(0.0, "1 sigma of the position that the pose topic reports.", unit="m", low=0.0)
+    pose_std_deg: float = setting(0.0, "1 sigma of the attitude that it reports, each axis.", unit="deg", low=0.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Camera:
+    """A moving camera: its parameters and the phases (6,) of its vibration [rad]."""
+
+    params: CameraParams
+    phases: Array
+
+    def poses(self, times_s: Array) -> tuple[Array, Array]:
+        """Rotations R_wa (n, 3, 3) and positions (n, 3) in the fixed frame [m] at times (n,) [s]."""
+        p = self.params
+        swing = np.sin(2.0 * math.pi * p.frequency_hz * times_s[:, None] + self.phases)
+        turn = geometry.exp(times_s[:, None] * np.array(p.rate_radps))
+        shake = geometry.exp(math.radians(p.vibration_deg) * swing[:, 3:])
+        R = geometry.matrix(geometry.multiply(turn, shake))
+        return R, times_s[:, None] * np.array(p.velocity_mps) + p.vibration_m * swing[:, :3]
+
+    def pose(self, t_s: float) -> Pose:
+        """Return the pose T_wa at a time [s]."""
+        R, t = self.poses(np.array([t_s]))
+        return Pose(geometry.quaternion(R[0]), t[0])
+
+    def reported(self, t_s: float, rng: np.random.Generator) -> Pose:
+        """Return the pose that the topic reports, with its error."""
+        p, true = self.params, self.pose(t_s)
+        error = geometry.exp(math.radians(p.pose_std_deg) * rng.standard_normal(3))
+        return Pose(geometry.multiply(true.q, error), true.t + p.pose_std_m * rng.standard_normal(3))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

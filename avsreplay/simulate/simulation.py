@@ -11,21 +11,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from avsreplay.geometry import Pose
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.simulate import faults
 from avsreplay.simulate.faults import InjectedFault, Kind
 from avsreplay.simulate.motion import Motion
+from avsreplay.simulate.pattern import Pattern
 from avsreplay.simulate.ray_casting import Engine
-from avsreplay.simulate.scanner import Pattern, Returns, Scanner
+from avsreplay.simulate.scanner import Returns, Scanner
 from avsreplay.simulate.scenario import Scenario, belief
-from avsreplay.simulate.scene import SceneBody, scene_bodies
+from avsreplay.simulate.scene import Camera, SceneBody, scene_bodies
 from avsreplay.simulate.target import body
 
 EPOCH_NS = (
     1_700_000_000_000_000_000  # time of the first scan of every simulated log, fixed so that logs are reproducible
 )
 NS = 1_000_000_000
-_STREAMS = {"motion": 0, "start": 1, "noise": 2, "fault": 3, "plate": 4}
+_STREAMS = {"motion": 0, "start": 1, "noise": 2, "fault": 3, "plate": 4, "camera": 5, "camera_pose": 6}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,6 +45,7 @@ class Simulation:
     _motion: Motion = field(repr=False)
     _scanner: Scanner = field(repr=False)
     _bodies: Sequence[SceneBody] = field(repr=False, default=())
+    _camera: Camera | None = field(repr=False, default=None)
 
     @property
     def engine(self) -> Engine:
@@ -67,6 +70,16 @@ class Simulation:
         kinds = [kind.value for kind in self._faults(scan.log_ns)]
         kinds += [body.params.name for body in self._present(scan.log_ns) if body.params.duration_s is not None]
         return Truth(state.T_ac, state, next(iter(kinds), None))
+
+    def camera_pose(self, scan: Scan) -> Pose | None:
+        """Return the pose of the camera in the fixed frame as its topic reports it; None for a camera at rest.
+
+        Args:
+            scan: A scan of ``scans``.
+        """
+        if self._camera is None:
+            return None
+        return self._camera.reported((scan.log_ns - EPOCH_NS) / NS, self._rng("camera_pose", scan.seq))
 
     def _present(self, log_ns: int) -> list[SceneBody]:
         return [body for body in self._bodies if body.params.present((log_ns - EPOCH_NS) / NS)]
@@ -100,9 +113,16 @@ class Simulation:
             points=returns.points,
             times_s=returns.times_s.astype(np.float32) if timed else None,
             status=ScanStatus.OK if len(returns.ranges) else ScanStatus.EMPTY,
+            intensities=returns.intensities.astype(np.float32) if self._scenario.params.scanner.intensity else None,
         )
         if Kind.FROZEN in now and last is not None:
-            scan = replace(scan, points=last.points, times_s=last.times_s, status=last.status)
+            scan = replace(
+                scan,
+                points=last.points,
+                times_s=last.times_s,
+                intensities=last.intensities,
+                status=last.status,
+            )
         return scan
 
     def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault], state: State) -> Returns:
@@ -118,6 +138,8 @@ class Simulation:
             returns = replace(returns, ranges=returns.ranges + faults.strength(now[Kind.RANGE_BIAS]))
         if Kind.CLUTTER in now:
             ratio, centre = faults.strength(now[Kind.CLUTTER]), state.T_ac.apply(self._scanner.centre_c)
+            if self._camera is not None:
+                centre = self._camera.pose((log_ns - EPOCH_NS) / NS).inverse().apply(centre)
             returns = faults.clutter(returns, ratio, centre, self._scanner.radius_m, wrong)
         return returns.keep(np.zeros(len(returns.ranges), dtype=bool)) if Kind.EMPTY in now else returns.in_order()
 
@@ -144,7 +166,9 @@ def simulate(scenario: Scenario, surface: Surface, meshes: Mapping[str, Surface]
     params = scenario.params
     span_s = params.duration_s + params.scanner.scan_s
     motion = Motion(body(params.target, surface), params.motion, span_s, _generator(params.seed, "motion", 0))
-    scanner = Scanner(params.scanner, surface, motion, params.material)
+    phases = _generator(params.seed, "camera", 0).uniform(0.0, 2.0 * math.pi, 6)
+    camera = None if params.camera is None else Camera(params.camera, phases)
+    scanner = Scanner(params.scanner, surface, motion, params.material, params.appendage, camera)
     first = motion.state(0.0)
     start = None
     if params.start is not None:
@@ -161,7 +185,7 @@ def simulate(scenario: Scenario, surface: Surface, meshes: Mapping[str, Surface]
     )
     count = int(params.duration_s * params.rate_hz + 1e-9)
     bodies = scene_bodies(params.object, dict(meshes or {}), params.scanner.engine)
-    return Simulation(header, count, scenario, motion, scanner, bodies)
+    return Simulation(header, count, scenario, motion, scanner, bodies, camera)
 
 
 def _generator(seed: int, stream: str, k: int) -> np.random.Generator:
