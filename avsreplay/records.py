@@ -148,8 +148,7 @@ class Scan:
         seq: index in the replay, from 0.  t_ns: instant on the selected clock.  log_ns: time of reception.
         points: (n, 3) finite, float32 or float64, possibly strided, in {A} [m].
         times_s, intensities: (n,) instant relative to ``t_ns`` [s] and intensity of each point, or None.
-        dropped_points: number of non-finite points that were removed.  frame: that the message names, "" for none.
-        note: what was wrong with the message or its stamp.  pose: of a source of poses, which has no points.
+        dropped_points: non-finite ones.  frame: of the message, or "".  note: what was wrong.  pose: in place of points.
     """
 
     seq: int

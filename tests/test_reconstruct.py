@@ -324,3 +324,18 @@ def test_a_survey_keeps_few_scans_of_a_long_log():
     assert survey.offered == 200
     assert len(survey.chosen) == 50
     assert survey.chosen == tuple(range(0, 200, 4))
+
+
+def test_scans_of_a_plate_in_front_of_the_target_are_not_used():
+    """For three scans a plate hides the target entirely; it is flat, as are the faces of the target."""
+    scans, truth = turning(12, 10.0, noise_m=0.003)
+    rng = np.random.default_rng(8)
+    hidden = []
+    for scan in scans:
+        x, y = rng.uniform(-0.5, 0.5, (2, 300))
+        plate = np.column_stack([x, y, 1.6 + 0.3 * x])
+        hidden.append(scan if scan.seq not in (6, 7, 8) else Scan(seq=scan.seq, t_ns=scan.t_ns, points=plate))
+    made = reconstruct(lambda: hidden)
+    used = {t_ns // 500_000_000 for t_ns, _ in made.poses}
+    assert used == set(range(12)) - {6, 7, 8}
+    assert errors(made, truth)[:, 0].max() < 1.0

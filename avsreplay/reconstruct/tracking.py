@@ -16,6 +16,8 @@ from avsreplay.register import global_search
 
 SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
 KEEP_RATIO = 0.4  # share of the points of a scan that must lie on the model so far
+MOST_SHIFT = 0.4  # largest distance of the target's centre from its prediction, as a share of the extent
+SHIFT_PER_LOST = 0.01  # by which that share grows with every scan that was lost before
 LEAST_EXPLAINED = 0.15  # share of the model's visible side that a scan must show
 MOST_VIOLATING = 0.12  # share of points that may lie in the free space in front of what another view has measured
 GRAZING = np.cos(np.radians(70.0))  # least cosine of the inclination to a line of sight for a test of free space
@@ -104,10 +106,10 @@ def _tracked(
     """Register view k from its prediction, else by a search, note the result, and return the model that it gives."""
     guess = _predicted(views, found, k, extent)
     match = registered(views[k], model, guess, p.reach * extent, extent)
-    if not _accepted(match, views, found, k, model, extent):
+    if not _accepted(match, guess, views, found, k, model, extent):
         found.searches += 1
         match = _searched(views, found, k, model, guess, p, extent)
-    if not _accepted(match, views, found, k, model, extent):
+    if not _accepted(match, guess, views, found, k, model, extent):
         found.lost += 1
         return model
     found.lost = 0
@@ -119,9 +121,18 @@ def _tracked(
     return patchwork(views, found, p.thin * extent)
 
 
-def _accepted(match: Match, views: Sequence[ScanView], found: Tracked, k: int, model: Patchwork, extent: float) -> bool:
-    """Whether scan and model explain each other and no measured ray passes through a surface of the other."""
+def _accepted(
+    match: Match, guess: Pose, views: Sequence[ScanView], found: Tracked, k: int, model: Patchwork, extent: float
+) -> bool:
+    """Whether scan and model explain each other and no measured ray passes through a surface of the other.
+
+    The target must also be near its predicted position: something else in front of it fits somewhere on a flat side.
+    """
     if match.ratio < KEEP_RATIO or match.rms_m > 0.01 * extent:
+        return False
+    centre = model.points.mean(axis=0)
+    shift = float(np.linalg.norm(match.T_ac.apply(centre) - guess.apply(centre)))
+    if shift > (MOST_SHIFT + SHIFT_PER_LOST * found.lost) * extent:
         return False
     if _explained(views[k], model, match.T_ac, extent) < LEAST_EXPLAINED:
         return False
@@ -179,7 +190,7 @@ def _searched(
             tried.append((match.ratio, len(tried), match))
         for _, _, match in sorted(tried, key=lambda t: (-t[0], t[1]))[:6]:
             fine = registered(views[k], model, match.T_ac, p.reach * extent, extent)
-            if _accepted(fine, views, found, k, model, extent):
+            if _accepted(fine, guess, views, found, k, model, extent):
                 return fine
     return Match(guess, 0.0, float("inf"), 0.0)
 
