@@ -148,7 +148,7 @@ class Scan:
         seq: index in the replay, from 0.  t_ns: instant on the selected clock.  log_ns: time of reception.
         points: (n, 3) finite, float32 or float64, possibly strided, in {A} [m].
         times_s, intensities: (n,) instant relative to ``t_ns`` [s] and intensity of each point, or None.
-        dropped_points: non-finite ones.  frame: of the message, or "".  note: what was wrong.  pose: in place of points.
+        dropped_points: non-finite ones.  frame: of the message, or "".  note: what was wrong.  pose: in place of them.
     """
 
     seq: int
