@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -10,29 +10,17 @@ from typing import Any
 
 import numpy as np
 
-from avsreplay import plan, settings, toml_document
+from avsreplay import geometry, plan, settings, toml_document
 from avsreplay.build import target_geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.error_state import boxplus
-from avsreplay.geometry import Array
+from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
-from avsreplay.plan import (
-    Execution,
-    Limits,
-    Miss,
-    Motion,
-    PlanParams,
-    RobotParams,
-    Scene,
-    Spread,
-    SupervisorParams,
-    TargetGeometry,
-    Tolerance,
-)
-from avsreplay.records import Belief, State, Surface
-from avsreplay.report.result import Result, load_result
+from avsreplay.plan import Limits, PlannerInput, PlanParams, RobotParams, Scene, SupervisorParams
+from avsreplay.records import Alignment, AlignStatus, Belief, State, Surface
+from avsreplay.report.result import load_result
 from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
 from avsreplay.settings import Settings, setting
@@ -69,7 +57,7 @@ class Saved:
     name: str
     rows: Sequence[Row]
     beliefs: Sequence[Belief]
-    truth: Motion | None
+    truth: plan.Motion | None
     estimator: Estimator
     plan: PlanParams
     supervisor: SupervisorParams
@@ -123,7 +111,7 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
         what = f"{len(result.rows)} rows and {len(beliefs)} beliefs"
         raise UnreadableInput(what, where=str(path), hint="run again")
     config = result.header.get("config", {})
-    extent = extent_m or _extent(result, path)
+    extent = extent_m or result.extent_m(path)
     since_ns = result.rows[0].t_ns
     truth = None
     if len(result.poses) >= 4:
@@ -141,7 +129,7 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
         robot=_table(RobotParams, config, "robot"),
         axis_c=tuple(config.get("fixture_axis_c", (1.0, 0.0, 0.0))),
         extent_m=extent,
-        surface=_surface(result),
+        surface=result.surface,
         warnings=result.warnings,
     )
 
@@ -176,33 +164,10 @@ def with_settings(saved: Saved, assignments: Sequence[str]) -> Saved:
     )
 
 
-def _surface(result: Result) -> Surface | None:
-    if result.view is None or not len(result.view.vertices):
-        return None
-    vertices = np.asarray(result.view.vertices, dtype=np.float64)
-    return Surface(vertices, np.asarray(result.view.faces, dtype=np.int32), "view.npz", "")
-
-
-def _extent(result: Result, path: Path) -> float:
-    stated = result.header.get("model", {}).get("extent_m")
-    if stated is not None:
-        return float(stated)
-    if result.view is None or not len(result.view.vertices):
-        raise UsageError("the target's size is not known", where=str(path), hint="give it with --extent METRES")
-    return float(np.linalg.norm(np.ptp(result.view.vertices, axis=0)))
-
-
 class Replanning:
     """Planner for a saved result with other settings."""
 
-    def __init__(
-        self,
-        saved: Saved,
-        params: PlanParams,
-        limits: Limits,
-        supervisor: SupervisorParams,
-        robot: RobotParams | None = None,
-    ) -> None:
+    def __init__(self, saved: Saved, params: PlanParams, limits: Limits, supervisor: SupervisorParams) -> None:
         """Create the planning.
 
         Args:
@@ -210,12 +175,11 @@ class Replanning:
             params: Parameters of robot and planner.
             limits: Constraints of every capture plan.
             supervisor: Resolved parameters of the supervisor.
-            robot: The robot; that of the run where None.
 
         Raises:
             UsageError: A clearance is required and the result contains no model.
         """
-        self.saved, self.supervisor, self.robot = saved, supervisor, robot or saved.robot
+        self.saved, self.supervisor, self.robot = saved, supervisor, saved.robot
         self.params = self.robot.applied(params)
         self.robot_line = self.robot.described(params, limits)
         self._radius = self.robot.radius_m
@@ -224,7 +188,7 @@ class Replanning:
         if saved.surface is not None:
             self._target = target_geometry(saved.surface, saved.axis_c, limits.clearance_m is not None)
         elif limits.clearance_m is None:
-            self._target = TargetGeometry(np.array(saved.axis_c), np.zeros((1, 3)))
+            self._target = plan.TargetGeometry(np.array(saved.axis_c), np.zeros((1, 3)))
         else:
             raise UsageError("the result contains no model", where=saved.name, hint="plan without a clearance")
 
@@ -234,10 +198,10 @@ class Replanning:
         return np.array(self.params.robot_position_m), np.array(self.params.robot_velocity_mps)
 
     @property
-    def tolerance(self) -> Tolerance:
+    def tolerance(self) -> plan.Tolerance:
         """Largest errors of a capture: the supervisor's tolerances."""
         s = self.supervisor
-        return Tolerance(s.capture_pos_m or 0.0, s.capture_speed_mps or 0.0, s.capture_angle_deg)
+        return plan.Tolerance(s.capture_pos_m or 0.0, s.capture_speed_mps or 0.0, s.capture_angle_deg)
 
     def plan_at(self, index: int) -> Plan:
         """Plan from the belief after a scan, under the limits.
@@ -277,7 +241,7 @@ class Replanning:
         """
         return np.asarray(self.saved.estimator.attitude(belief)(np.array([after_s]))[0])
 
-    def spread_at(self, index: int, made: Plan, count: int, seed: int) -> Spread:
+    def spread_at(self, index: int, made: Plan, count: int, seed: int) -> plan.Spread:
         """Return the distribution of a plan over draws from the belief from which it was made.
 
         Args:
@@ -289,29 +253,30 @@ class Replanning:
         belief = self.saved.beliefs[index]
         offsets = plan.draws(belief.P, count, np.random.Generator(np.random.PCG64(seed)))
         drawn = [replace(belief, x=_bounded(boxplus(belief.x, d))) for d in offsets]
-        scenes = [self._scene(b) for b in drawn]
         path, aimed = self.path(made), self.attitude(belief, made.t_go_s)
 
         def planner(scene: Scene) -> Plan:
             return self._planned(scene, belief.t_ns, path)
 
-        futures = [plan.Future(scene) for scene in scenes]
+        futures = [plan.Future(self._scene(b)) for b in drawn]
         noise = self.robot.thrust_noise * self.params.a_max_mps2
         disturbance = plan.Disturbance(noise, np.random.Generator(np.random.PCG64([seed, 1])))
-        # contact is measured with the end-effector itself, without the margin of the plan
-        body = None if self.limits.clearance_m is None else replace(self.limits, clearance_m=max(self._radius, 1e-9))
-        return plan.spread(path, futures, planner, self.tolerance, aimed, disturbance, body)
+        return plan.spread(path, futures, planner, self.tolerance, aimed, disturbance, self._body)
 
-    def miss_at(self, index: int, made: Plan) -> Miss | None:
+    @property
+    def _body(self) -> Limits | None:
+        """The limits for contact: that of the end-effector itself, without the margin of the plan."""
+        return None if self.limits.clearance_m is None else replace(self.limits, clearance_m=max(self._radius, 1e-9))
+
+    def miss_at(self, index: int, made: Plan) -> plan.Miss | None:
         """Return the error of a plan made at scan ``index`` against the truth; None without truth or after the log."""
         if self.saved.truth is None or not made.found:
             return None
-        belief = self.saved.beliefs[index]
-        begin_s = (belief.t_ns - self.saved.since_ns) * 1e-9
+        belief, begin_s = self.saved.beliefs[index], self.saved.rows[index].t_s
         found = plan.miss(self.path(made), begin_s, self.saved.truth, self.attitude(belief, made.t_go_s))
         return found if np.isfinite(found.distance_m) else None
 
-    def hindsight(self, period_s: float) -> list[tuple[float, Plan, Miss | None]]:
+    def hindsight(self, period_s: float) -> list[tuple[float, Plan, plan.Miss | None]]:
         """Plan at regular intervals from convergence on, each time from the start.
 
         Args:
@@ -320,7 +285,7 @@ class Replanning:
         Returns:
             For each plan: time of planning [s after the first scan], the plan, and its error (see ``miss_at``).
         """
-        out: list[tuple[float, Plan, Miss | None]] = []
+        out: list[tuple[float, Plan, plan.Miss | None]] = []
         due_s = 0.0
         for k, row in enumerate(self.saved.rows):
             if row.converged and row.t_s >= due_s - 1e-6:
@@ -329,20 +294,56 @@ class Replanning:
                 due_s = row.t_s + period_s
         return out
 
-    def execute(self) -> Execution | None:
+    def flights(self, index: int, count: int, seed: int) -> plan.Flights:
+        """Fly approaches with replanning, measured scans, thrust errors and delay against draws from a belief.
+
+        Args:
+            index: scan at which the approach begins.
+            count: number of flights.
+            seed: of draws and errors.
+        """
+        belief, rng = self.saved.beliefs[index], np.random.Generator(np.random.PCG64([seed, 2]))
+        noise, ended = self.robot.thrust_noise * self.params.a_max_mps2, []
+        for offset in plan.draws(belief.P, count, rng):
+            drawn = replace(belief, x=_bounded(boxplus(belief.x, offset)))
+            flight = self._guidance(), self._measured(belief, drawn, rng), self._scene(drawn)
+            ended.append(plan.closed_loop(*flight, belief.t_ns, self.tolerance, noise, rng, self._body))
+        numbers = {name: sum(end == name for end, _ in ended) for name in ("captured", "outside", "abort")}
+        touched = sum(hit for _, hit in ended)
+        return plan.Flights(count, numbers["captured"], numbers["outside"], numbers["abort"], touched)
+
+    def _measured(self, belief: Belief, drawn: Belief, rng: np.random.Generator) -> Iterator[PlannerInput]:
+        """What guidance knows after each scan of a drawn target: the filter with poses of its own noise."""
+        estimator = Estimator(self.saved.estimator.params, belief, self.saved.extent_m)
+        motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)
+        track = estimator.initial(belief.t_ns, belief.x.T_ac)
+        step_ns = int(np.median(np.diff([row.t_ns for row in self.saved.rows])))
+        R = estimator.params.resolved(self.saved.extent_m).R0
+        for t_ns in range(belief.t_ns + step_ns, belief.t_ns + round(self.params.horizon_s * 2e9), step_ns):
+            dt = np.array([(t_ns - belief.t_ns) * 1e-9])
+            error = np.sqrt(np.diag(R)) * rng.standard_normal(6)
+            pose = Pose(geometry.multiply(attitude(dt)[0], geometry.exp(2.0 * error[3:])), motion(dt)[0][0] + error[:3])
+            seen = Alignment(pose, 1, True, 1000, 1000, 0.0, np.eye(6), AlignStatus.ALIGNED)
+            prior = estimator.predict(track, t_ns)
+            track = estimator.update(track, prior, estimator.innovate(prior, seen), 1)
+            forecast = partial(estimator.forecast, track.belief)
+            yield planner_input(estimator, track.belief, self._target, 1, True, forecast)
+
+    def _guidance(self) -> plan.Guidance:
+        supervisor, extent_m = plan.Supervisor(self.supervisor), self.saved.extent_m
+        return plan.Guidance(self.params, supervisor, self.limits, extent_m, self.robot.gripper)
+
+    def execute(self) -> plan.Execution | None:
         """Simulate the approach over the whole log under the supervisor; None without truth."""
         if self.saved.truth is None:
             return None
-        guidance = plan.Guidance(
-            self.params, plan.Supervisor(self.supervisor), self.limits, self.saved.extent_m, self.robot.gripper
-        )
         beliefs = {belief.t_ns: belief for belief in self.saved.beliefs}
         inputs = (
             planner_input(self.saved.estimator, belief, self._target, row.gamma, row.converged, self._forecast(belief))
             for belief, row in zip(self.saved.beliefs, self.saved.rows, strict=True)
         )
         turned = lambda known, after_s: self.attitude(beliefs[known.t_ns], after_s)  # noqa: E731
-        return plan.execute(guidance, inputs, self.saved.truth, turned, self.saved.since_ns)
+        return plan.execute(self._guidance(), inputs, self.saved.truth, turned, self.saved.since_ns)
 
 
 def _bounded(x: State) -> State:

@@ -134,6 +134,21 @@ def test_settings_of_supervisor_and_robot_can_be_changed(result):
     assert strict["execution"]["outcome"] != "captured"
 
 
+def test_whole_flights_are_counted_with_intervals(result):
+    args = (result, "--json", "--samples", 2, "--every", 99, "--at", 12, "--flights", 6)
+    calm, rough = (
+        json.loads(run(*args, "--set", f"robot.thrust_noise={noise}").stdout)["flights"] for noise in (0.0, 2.0)
+    )
+    for counts in (calm, rough):
+        assert counts["count"] == 6
+        assert counts["captured"] + counts["outside"] + counts["aborted"] <= 6
+    assert calm["captured"] >= 4
+    assert rough["captured"] < calm["captured"]
+    text = run(*args[:1], *args[2:]).stdout
+    assert "6 whole flights" in text
+    assert "touched" in text
+
+
 def test_a_start_of_two_numbers_is_refused(result):
     done = run(result, "--from", "1,2")
     assert done.exit_code == 2

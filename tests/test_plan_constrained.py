@@ -252,6 +252,26 @@ def test_the_robot_keeps_clear_of_the_body_and_arrives_from_outside(phase):
     assert along[before][-1] > 0.0
 
 
+@pytest.mark.parametrize("phase", [0.5, 1.8, 4.5])
+def test_an_abort_at_any_instant_outside_the_corridor_keeps_the_clearance(phase):
+    scene = replace(body(0.05, phase=phase), surface=ball)
+    limits = Limits(final_deg=15.0, final_range_m=0.5, mouth_m=0.01, clearance_m=0.3)
+    plan = constrained(scene, ORIGIN, ORIGIN, PARAMS, limits)
+    unsafe = constrained(scene, ORIGIN, ORIGIN, PARAMS, replace(limits, abort=False))
+    assert plan.found
+    assert plan.abort_margin_m >= 0.0
+    assert unsafe.found
+    assert unsafe.t_go_s <= plan.t_go_s + 0.1
+    path, after = path_of(plan, ORIGIN, ORIGIN), np.linspace(0.0, 30.0, 301)[:, None]
+    for t in np.linspace(0.0, plan.t_go_s, 200, endpoint=False):
+        r, v = (x[0] for x in path.at(np.array([t])))
+        if np.linalg.norm(r - scene.goal(np.array([t]))[0][0]) > 0.5:
+            away = (r - CENTRE) / np.linalg.norm(r - CENTRE)
+            flown_off = r + v * after + 0.5 * PARAMS.a_max_mps2 * away * after**2
+            gap = np.linalg.norm(flown_off - CENTRE, axis=1) - 0.8  # the ball does not move
+            assert gap.min() >= 0.3 - 0.02  # aborts are tried at 16 instants of the plan
+
+
 def test_the_clearance_grows_with_the_predicted_uncertainty():
     wide = replace(body(0.05, phase=1.8), surface=ball, sigma=lambda t: (np.full(len(t), 0.1), np.zeros(len(t))))
     limits = Limits(final_deg=15.0, final_range_m=0.5, mouth_m=0.01, clearance_m=0.1)

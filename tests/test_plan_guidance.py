@@ -1,5 +1,7 @@
 """Properties of guidance over random sequences of healthy and faulty scans, lost convergence, growing uncertainty."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,10 +13,15 @@ from avsreplay.plan import (
     PlannerInput,
     PlanParams,
     Scene,
+    Segment,
+    StepPath,
     Supervisor,
     SupervisorParams,
+    Tolerance,
+    closed_loop,
     rendezvous,
 )
+from avsreplay.plan.evaluation import pushed
 from avsreplay.plan.limits import margin
 from avsreplay.records import Forecast
 
@@ -135,3 +142,30 @@ def test_the_gripper_has_the_attitude_of_the_fixture_at_the_capture(accel):
     assert state.captured_ns * 1e-9 >= free.t_go_s - 1e-6
     if accel == 0.002:
         assert state.captured_ns * 1e-9 > free.t_go_s + 5.0
+
+
+def loop(noise_mps2, seed=0, latency_s=0.0):
+    """Result of one flight with an exact estimate and errors of the thrust."""
+    rng = np.random.default_rng(seed)
+    target = scene(rng)
+    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
+    known = (PlannerInput(round(t * 1e9), 1, True, target.after(t), exact) for t in np.arange(0.4, 120.0, 0.2))
+    guidance = Guidance(replace(ROBOT, latency_s=latency_s), Supervisor(PARAMS))
+    return closed_loop(guidance, known, target, 0, Tolerance(0.02, 0.01), noise_mps2, rng)[0]
+
+
+def test_replanning_removes_errors_of_the_thrust_as_far_as_the_last_second():
+    assert all(loop(0.0, seed, latency_s) == "captured" for seed in range(3) for latency_s in (0.0, 0.3))
+    assert all(loop(0.001, seed, 0.3) == "captured" for seed in range(3))
+    assert any(loop(0.2, seed, 0.3) != "captured" for seed in range(3))
+
+
+def test_a_pushed_segment_keeps_its_thrust_and_moves_on_from_the_new_state():
+    path = StepPath(np.zeros(3), np.zeros(3), np.array([[0.1, 0, 0], [0, 0.2, 0], [0, 0, -0.1]]), 0.5, 6.5)
+    segment = Segment(10**9, path.r0, path.v0, path)
+    dr, dv = np.array([0.01, -0.02, 0.03]), np.array([0.002, 0.001, -0.003])
+    moved = pushed(segment, 3 * 10**9, dr, dv)
+    for t_ns in (3 * 10**9, 5 * 10**9, 7_500_000_000):
+        (r, v), (s, w) = segment.at(t_ns), moved.at(t_ns)
+        assert np.allclose(s - r, dr + (t_ns - 3 * 10**9) * 1e-9 * dv, atol=1e-12)
+        assert np.allclose(w - v, dv, atol=1e-12)

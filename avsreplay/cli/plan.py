@@ -12,7 +12,7 @@ from avsreplay.cli.setting_options import robot_option, setting_option
 
 if TYPE_CHECKING:
     from avsreplay.outcome import Plan
-    from avsreplay.plan import Execution, Limits, Miss, PlanParams, Spread
+    from avsreplay.plan import Execution, Flights, Limits, Miss, PlanParams, Spread
     from avsreplay.replan import Replanning, Saved
     from avsreplay.report.table import Table
 
@@ -57,6 +57,13 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
     help="Change a setting of plan, limits, robot or supervisor.",
 )
 @click.option("--samples", type=click.IntRange(1), default=64, show_default=True, help="Draws from the belief.")
+@click.option(
+    "--flights",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Whole flights with replanning, thrust errors and delay against draws from the belief.",
+)
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the draws.")
 @click.option(
     "--every",
@@ -72,6 +79,7 @@ def command(
     result: Path,
     at_s: float | None,
     samples: int,
+    flights: int,
     seed: int,
     every_s: float | None,
     robot_file: Path | None,
@@ -108,6 +116,7 @@ def command(
     index = saved.index_at(at_s)
     made = _usable(lambda: planning.plan_at(index))
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
+    flown = _usable(lambda: planning.flights(index, flights, seed)) if made.found and flights else None
     limited = planning.limits.any
     period_s = every_s or (10.0 if limited else 2.0)
     hindsight = _usable(lambda: planning.hindsight(period_s))
@@ -115,9 +124,9 @@ def command(
     if export:
         _export(planning, made, export)
     if as_json:
-        click.echo(_document(planning, index, made, spread, hindsight, execution), nl=False)
+        click.echo(_document(planning, index, made, spread, hindsight, execution, flown), nl=False)
     else:
-        _print(planning, index, made, spread, hindsight, execution)
+        _print(planning, index, made, spread, hindsight, execution, flown)
 
 
 def _usable(action: Any) -> Any:
@@ -151,6 +160,7 @@ def _document(
     spread: Spread | None,
     hindsight: list[tuple[float, Plan, Miss | None]],
     execution: Execution | None,
+    flown: Flights | None,
 ) -> str:
     import json
 
@@ -167,6 +177,7 @@ def _document(
         "robot_line": planning.robot_line,
         "tolerance": settings.dump(planning.tolerance),
         "spread": settings.dump(spread) if spread else None,
+        "flights": settings.dump(flown) if flown else None,
         "hindsight": [
             {"made_at_s": at_s, **_plan_record(p, at_s), "miss": settings.dump(m) if m else None}
             for at_s, p, m in hindsight
@@ -216,12 +227,13 @@ def _print(
     spread: Spread | None,
     hindsight: list[tuple[float, Plan, Miss | None]],
     execution: Execution | None,
+    flown: Flights | None,
 ) -> None:
     from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
     console = make_console()
     at_s = planning.saved.rows[index].t_s
-    print_table(console, facts_table(f"Plan made at {at_s:.2f} s", _plan_facts(planning, at_s, made, spread)))
+    print_table(console, facts_table(f"Plan made at {at_s:.2f} s", _plan_facts(planning, at_s, made, spread, flown)))
     print_table(console, _hindsight_table(hindsight))
     if execution is not None:
         print_table(console, _execution_table(execution))
@@ -229,7 +241,9 @@ def _print(
             print_line(console, line)
 
 
-def _plan_facts(planning: Replanning, at_s: float, made: Plan, spread: Spread | None) -> list[tuple[str, str]]:
+def _plan_facts(
+    planning: Replanning, at_s: float, made: Plan, spread: Spread | None, flown: Flights | None
+) -> list[tuple[str, str]]:
     facts = [("robot", planning.robot_line), ("status", _status(made))]
     if made.found:
         facts += [
@@ -245,7 +259,7 @@ def _plan_facts(planning: Replanning, at_s: float, made: Plan, spread: Spread | 
         facts.append(("smallest margin", f"{made.margin_m:.4f} m ({made.binding}); excess {made.violation_m:.1e} m"))
     if abs(made.abort_margin_m) < float("inf"):
         facts.append(("margin of an abort", f"{made.abort_margin_m:.3f} m of clearance, from any instant"))
-    return facts + _spread_rows(spread)
+    return [*facts, *(spread.described() if spread else ()), *(flown.described() if flown else ())]
 
 
 def _status(made: Plan) -> str:
@@ -257,34 +271,6 @@ def _status(made: Plan) -> str:
         "infeasible_within_horizon": "proven impossible within the horizon",
     }
     return words.get(made.status.value, made.status.value)
-
-
-def _spread_rows(spread: Spread | None) -> list[tuple[str, str]]:
-    if spread is None:
-        return []
-    t, m, v, a = spread.t_go_s, spread.miss_m, spread.speed_mps, spread.angle_deg
-    return [
-        (
-            "t_go over belief",
-            f"mean {t.mean:.3f} s, 5-95 % {t.p05:.3f} to {t.p95:.3f} s; {spread.infeasible} without a plan",
-        ),
-        ("miss over belief", f"mean {1e3 * m.mean:.2f} mm, 5-95 % {1e3 * m.p05:.2f} to {1e3 * m.p95:.2f} mm"),
-        ("speed over belief", f"mean {1e3 * v.mean:.2f} mm/s, 5-95 % {1e3 * v.p05:.2f} to {1e3 * v.p95:.2f} mm/s"),
-        ("angle over belief", f"mean {a.mean:.3f} deg, 5-95 % {a.p05:.3f} to {a.p95:.3f} deg"),
-        (
-            "capture probability",
-            f"{spread.probability:.3f} (95 % {spread.probability_95[0]:.3f} to {spread.probability_95[1]:.3f}) "
-            f"in {spread.futures} draws without replanning",
-        ),
-        *_contact_rows(spread),
-    ]
-
-
-def _contact_rows(spread: Spread) -> list[tuple[str, str]]:
-    if not spread.contact >= 0.0:
-        return []
-    low, high = spread.contact_95
-    return [("contact probability", f"{spread.contact:.3f} (95 % {low:.3f} to {high:.3f}) outside the corridor")]
 
 
 def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:

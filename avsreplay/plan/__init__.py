@@ -2,7 +2,17 @@
 
 from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn
 from avsreplay.plan.constrained import constrained
-from avsreplay.plan.evaluation import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
+from avsreplay.plan.evaluation import (
+    Execution,
+    Flights,
+    Miss,
+    Motion,
+    Tolerance,
+    closed_loop,
+    execute,
+    interpolated,
+    miss,
+)
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Scene, TargetGeometry, hull_vertices
 from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of
@@ -27,6 +37,7 @@ __all__ = [
     "Disturbance",
     "Execution",
     "Facts",
+    "Flights",
     "Future",
     "Guidance",
     "GuidanceState",
@@ -47,6 +58,7 @@ __all__ = [
     "TargetGeometry",
     "Tolerance",
     "Turn",
+    "closed_loop",
     "constrained",
     "draws",
     "execute",

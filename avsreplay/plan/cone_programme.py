@@ -32,6 +32,7 @@ class PointRows:
         offset: (m,) value of -c.origin plus the constant of the row [m].
         rate: (m,) change of the row with the relative change of h, from the motion of the target [m].
         slack: (m,) coefficient of the common slack variable.
+        lead: (m,) the rows are those of the position this much later if the robot coasts [s]; None: at the instants.
     """
 
     interval: Index
@@ -40,6 +41,7 @@ class PointRows:
     offset: Array
     rate: Array
     slack: Array
+    lead: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -232,7 +234,8 @@ def _point_rows(rows: _Rows, p: Subproblem, points: PointRows, scale: float) -> 
     s = points.fraction[:, None]
     ends = np.tile((9 * p.n + 6, 9 * p.n + 7), (m, 1))
     columns = np.concatenate([first, q + first, w + first, ends], axis=1)
-    parts = (points.vector, s * points.vector, 0.5 * s * s * points.vector)
+    lead = np.zeros((m, 1)) if points.lead is None else points.lead[:, None] / p.h
+    parts = (points.vector, (s + lead) * points.vector, (0.5 * s * s + s * lead) * points.vector)
     values = np.concatenate([*parts, points.rate[:, None] / scale, points.slack[:, None]], axis=1)
     rows.put(np.repeat(np.arange(m), columns.shape[1]), columns.ravel(), -values.ravel())
     rows.close((points.offset - points.rate) / scale)

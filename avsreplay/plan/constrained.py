@@ -21,19 +21,18 @@ from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.convexification import (
     BETWEEN,
     COARSE_NODES,
-    Case,
     ReferencePath,
+    aborted,
     convex_subproblem,
     dense_margins,
     excess,
     initial_references,
     interval_fractions,
-    largest_acceleration,
     shortened,
     turn_rate,
     warm_reference,
 )
-from avsreplay.plan.limits import CONSTRAINTS, SampledScene, Scene
+from avsreplay.plan.limits import CONSTRAINTS, Case, SampledScene, Scene, largest_acceleration
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits
@@ -43,8 +42,6 @@ TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
 RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
 TURN_RAD = 0.5  # the target may turn by this much between two iterations
-ABORT_S = 30.0  # duration of an abort
-ABORTS = 16  # instants at which an abort is tried
 
 
 def constrained(
@@ -155,9 +152,10 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
         if float(np.linalg.norm(relative)) > limits.contact_accel_mps2:
             return None
     worst, name = _worst(case, path)
-    if worst < 0.0:
+    abort = aborted(case, path)
+    if worst < 0.0 or abort.short > 0.0:
         return None
-    return replace(free, violation_m=0.0, margin_m=worst, binding=name, abort_margin_m=_abort_margin(case, path))
+    return replace(free, violation_m=0.0, margin_m=worst, binding=name, abort_margin_m=abort.margin)
 
 
 def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
@@ -182,32 +180,8 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
         violation_m=max(-worst, 0.0),
         margin_m=worst,
         binding=name,
-        abort_margin_m=_abort_margin(case, found),
+        abort_margin_m=aborted(case, found).margin,
     )
-
-
-def _abort_margin(case: Case, path: RobotPath) -> float:
-    """Return the smallest margin of the clearance if the robot aborts at any of some instants outside the corridor.
-
-    An abort is the largest acceleration away from the centre of mass for ABORT_S seconds. NaN without a clearance.
-    """
-    limits = case.limits
-    if limits.clearance_m is None or case.scene.surface is None:
-        return math.nan
-    begin = np.linspace(case.wait_s, path.t_go_s, ABORTS, endpoint=False)
-    r, v = path.at(begin)
-    outside = np.linalg.norm(r - case.sampled.at(begin)[0], axis=1) > (limits.final_range_m or 0.0)
-    begin, r, v = begin[outside], r[outside], v[outside]
-    if not len(begin):
-        return math.nan
-    rho, R = case.sampled.at(begin)
-    centre = rho + R @ (np.zeros(3) if case.scene.centre_c is None else case.scene.centre_c)
-    away = (r - centre) / np.maximum(np.linalg.norm(r - centre, axis=1, keepdims=True), 1e-9)
-    after = np.linspace(0.0, ABORT_S, 3 * ABORTS)[None, :, None]
-    positions = r[:, None] + v[:, None] * after + 0.5 * case.params.a_max_mps2 * away[:, None] * after**2
-    times = (begin[:, None] + after[0, :, 0]).ravel()
-    y = case.sampled.coordinates(times, positions.reshape(-1, 3))
-    return float(case.scene.surface(y)[1].min()) - limits.clearance_m
 
 
 def _worst(case: Case, path: RobotPath) -> tuple[float, str]:
@@ -257,18 +231,21 @@ def _converged(case: Case, reference: ReferencePath, latest_s: float = math.inf)
     n = case.limits.nodes
     reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
     off = np.zeros((2 * n, len(CONSTRAINTS)))
-    change, slack, settled = _trust(case, reference), math.inf, 0
+    change, slack, settled, rows = _trust(case, reference), math.inf, 0, None
     for iteration in range(ITERATIONS):
-        found = solve(convex_subproblem(case, reference, off, change))
+        found = solve(convex_subproblem(case, reference, off, change, rows))
         if found is None:
             return best
         t = n * found.h
         path = StepPath(case.r0, case.v0, found.u, case.wait_s, case.wait_s + t)
-        over = excess(case, path)
+        over, abort = excess(case, path), aborted(case, path)
+        rows = abort.rows
         if found.slack <= case.buffer_m:
             path = _exact_end(case, path)
             allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
-            if _feasible(case, path, over, allowed) and (best is None or path.t_go_s < best.t_go_s):
+            if _feasible(case, path, max(over.max(), abort.short), allowed) and (
+                best is None or path.t_go_s < best.t_go_s
+            ):
                 best = path
         settled += abs(t - reference.t) <= max(TIME_TOLERANCE_S, RELATIVE_TOLERANCE * t)
         if settled and best is not None and (settled > 1 or path is best):
@@ -290,11 +267,11 @@ def _trust(case: Case, reference: ReferencePath) -> float:
     return float(min(0.25, TURN_RAD / max(turn, 1e-9)))
 
 
-def _feasible(case: Case, path: StepPath, over: Array, allowed: float) -> bool:
+def _feasible(case: Case, path: StepPath, over: float, allowed: float) -> bool:
     position, velocity = path.terminal_errors(case.scene.goal)
     short = path.t_go_s <= case.params.horizon_s
     exact = position <= 1e-8 and velocity <= 1e-8 and path.u_max() <= case.a_max and _within_axes(case, path.u)
-    return bool(short and exact and over.max() <= allowed)
+    return bool(short and exact and over <= allowed)
 
 
 def _within_axes(case: Case, u: Array) -> bool:

@@ -12,52 +12,16 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
-from avsreplay.plan.limits import CONSTRAINTS, Margins, SampledScene, Scene, margins
+from avsreplay.plan.limits import CONSTRAINTS, THRUST_SHARE, Case, Margins, margins
 from avsreplay.plan.path import RobotPath, StepPath, path_of
-from avsreplay.plan.rendezvous import PlanParams
-from avsreplay.plan.robot import Limits
 
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
-THRUST_SHARE = 1.0 - 1e-5  # share of a_max used by the programme; the rest corrects the terminal errors
 RESERVE = 3.0  # margin at the checked instants in units of the buffer, for the instants between them
 FAR = 2e4  # a constraint with a larger margin at the reference, in units of the buffer, is left out of the programme
 COARSE_NODES = 16  # thrust intervals while initial paths are compared
+ABORT_S = 30.0  # duration of an abort
+ABORTS = 16  # instants at which an abort is tried
 LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Case:
-    """Everything that does not change with the reference."""
-
-    sampled: SampledScene
-    limits: Limits
-    params: PlanParams
-    r0: Array
-    v0: Array
-    buffer_m: float
-    coarse: bool = False
-    earliest_s: float = 0.0
-
-    @property
-    def wait_s(self) -> float:
-        """Coasting time before the thrust [s]."""
-        return self.params.latency_s
-
-    @property
-    def a_max(self) -> float:
-        """Largest acceleration in any direction [m/s2]."""
-        return largest_acceleration(self.limits, self.params)
-
-    @property
-    def axes(self) -> Array | None:
-        """Rows (3, 3) whose product with the acceleration in {A} lies within 1 in each component; None without."""
-        bounds = self.limits.accel_axes_mps2
-        return None if bounds is None else self.limits.base_axes.T / (THRUST_SHARE * np.array(bounds))[:, None]
-
-    @property
-    def scene(self) -> Scene:
-        """The target."""
-        return self.sampled.scene
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,12 +30,6 @@ class ReferencePath:
 
     t: float
     r: Array
-
-
-def largest_acceleration(limits: Limits, params: PlanParams) -> float:
-    """Return the largest acceleration in any direction [m/s2]: the corner of the box where each axis is bounded."""
-    bounds = limits.accel_axes_mps2
-    return params.a_max_mps2 if bounds is None else math.hypot(*bounds)
 
 
 def interval_fractions(n: int) -> Array:
@@ -107,14 +65,69 @@ def excess(case: Case, path: StepPath) -> Array:
     return np.asarray(np.maximum(half, after))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Abort:
+    """Aborts from instants of a path outside the corridor: the largest acceleration away from the centre of mass.
+
+    Attributes:
+        margin: Smallest margin of the clearance during these aborts [m]; NaN without a clearance.
+        short: By how much it is negative, less what the start itself lacks; 0 where aborts are not required [m].
+        rows: Rows that require the margin; None where they are not needed.
+    """
+
+    margin: float = math.nan
+    short: float = 0.0
+    rows: PointRows | None = None
+
+
+def aborted(case: Case, path: RobotPath) -> Abort:
+    """Return the aborts from instants of a path, each with its worst moment."""
+    limits, scene = case.limits, case.scene
+    if limits.clearance_m is None or scene.surface is None:
+        return Abort()
+    begin = np.linspace(case.wait_s, path.t_go_s, ABORTS, endpoint=False)
+    r, v = path.at(begin)
+    outside = np.linalg.norm(r - case.sampled.at(begin)[0], axis=1) > (limits.final_range_m or 0.0)
+    if not outside.any():
+        return Abort()
+    begin, r, v = begin[outside], r[outside], v[outside]
+    rho, R = case.sampled.at(begin)
+    away = r - rho - R @ (np.zeros(3) if scene.centre_c is None else scene.centre_c)
+    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
+    after = np.linspace(0.0, ABORT_S, 3 * ABORTS)[None, :, None]
+    positions = r[:, None] + v[:, None] * after + 0.5 * case.params.a_max_mps2 * away[:, None] * after**2
+    times = begin[:, None] + after[0, :, 0]
+    y = case.sampled.coordinates(times.ravel(), positions.reshape(-1, 3))
+    foot, gap = scene.surface(y)
+    k = np.arange(len(begin)) * times.shape[1] + gap.reshape(times.shape).argmin(axis=1)
+    margins_m = gap[k] - limits.clearance_m
+    short = max(-float(margins_m.min()) - max(-float(margins_m[0]), 0.0), 0.0) if limits.abort else 0.0
+    if not limits.abort or not isinstance(path, StepPath):
+        return Abort(float(margins_m.min()), short)
+    normal = (y[k] - foot[k]) / np.where(np.abs(gap[k]) > 1e-9, gap[k], 1e-9)[:, None]
+    in_a = np.einsum("nij,nj->ni", case.sampled.at(times.ravel()[k])[1], normal)
+    lead = times.ravel()[k] - begin
+    part = (begin - case.wait_s) / path.step_s
+    interval = np.minimum(part.astype(np.int64), len(path.u) - 1)
+    offset = margins_m - RESERVE * case.buffer_m - np.sum(in_a * (r + lead[:, None] * v), axis=1)
+    rate = -lead * np.sum(in_a * v, axis=1)  # the velocity for given h v changes with h
+    on = margins_m < FAR * case.buffer_m
+    rows = PointRows(
+        interval[on], (part - interval)[on], in_a[on], offset[on], rate[on], np.ones(int(on.sum())), lead[on]
+    )
+    return Abort(float(margins_m.min()), short, rows)
+
+
 def allowed(start: Array, fraction: Array) -> Array:
     """Return the violation that is accepted while the robot returns from a violation at the start."""
     shrinking = np.maximum(1.0 - fraction / LEAD_BACK, 0.0)
     return np.asarray(np.maximum(-start, 0.0)[None, :] * shrinking[:, None])
 
 
-def convex_subproblem(case: Case, reference: ReferencePath, off: Array, change: float) -> Subproblem:
-    """Return the convex subproblem at a reference."""
+def convex_subproblem(
+    case: Case, reference: ReferencePath, off: Array, change: float, abort: PointRows | None = None
+) -> Subproblem:
+    """Return the convex subproblem at a reference, with the rows of aborts from the path of this reference."""
     n, t = case.limits.nodes, reference.t
     rho, rate = case.scene.goal(np.array([case.wait_s + t, case.wait_s + t - 1e-4]))
     problem = Subproblem(
@@ -132,6 +145,8 @@ def convex_subproblem(case: Case, reference: ReferencePath, off: Array, change: 
         axes=case.axes,
         earliest=(case.earliest_s - case.wait_s) / n,
     )
+    if abort is not None:
+        problem = replace(problem, planes=(abort,))
     if not case.limits.geometric:
         return problem
     rows = _RowMaker(case, reference)
@@ -174,7 +189,7 @@ class _RowMaker:
 
     def added(self, problem: Subproblem, off: Array) -> Subproblem:
         """Return the subproblem with the rows of all constraints."""
-        planes: list[PointRows] = []
+        planes = list(problem.planes)
         cones: list[tuple[int, PointRows]] = []
         limits, y, inside = self.limits, self.y, self.found.inside
         on = (self.found.values < self.far_m) & self.near[:, None]

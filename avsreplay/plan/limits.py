@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
+from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
 from avsreplay.records import Trajectory
 
+THRUST_SHARE = 1.0 - 1e-5  # share of a_max used by the cone programme; the rest corrects the terminal errors
 CONSTRAINTS = ("cone", "corridor", "sphere", "body", "workspace")  # in the order of the columns of ``margins``
 
 
@@ -272,3 +274,49 @@ class SampledScene:
             turn = geometry.matrix(self.scene.attitude(times)).reshape(-1, 9)
         spline: Callable[..., Array] = CubicSpline(times, np.concatenate([self.scene.goal(times)[0], turn], axis=1))
         return spline
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Case:
+    """Everything that does not change with the reference."""
+
+    sampled: SampledScene
+    limits: Limits
+    params: PlanParams
+    r0: Array
+    v0: Array
+    buffer_m: float
+    coarse: bool = False
+    earliest_s: float = 0.0
+
+    @property
+    def wait_s(self) -> float:
+        """Coasting time before the thrust [s]."""
+        return self.params.latency_s
+
+    @property
+    def a_max(self) -> float:
+        """Largest acceleration in any direction [m/s2]."""
+        return largest_acceleration(self.limits, self.params)
+
+    @property
+    def axes(self) -> Array | None:
+        """Rows (3, 3) whose product with the acceleration in {A} lies within 1 in each component; None without."""
+        bounds = self.limits.accel_axes_mps2
+        return None if bounds is None else self.limits.base_axes.T / (THRUST_SHARE * np.array(bounds))[:, None]
+
+    @property
+    def scene(self) -> Scene:
+        """The target."""
+        return self.sampled.scene
+
+
+def largest_acceleration(limits: Limits, params: PlanParams) -> float:
+    """Return the largest acceleration in any direction [m/s2]: the corner of the box where each axis is bounded.
+
+    Args:
+        limits: Limits, with a bound of each axis or without.
+        params: Acceleration without bounds of the axes.
+    """
+    bounds = limits.accel_axes_mps2
+    return params.a_max_mps2 if bounds is None else math.hypot(*bounds)

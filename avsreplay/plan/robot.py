@@ -55,6 +55,9 @@ class Limits(Settings):
     clearance_sigmas: float = setting(
         3.0, "Predicted standard deviations of the surface's position added to the clearance.", low=0.0
     )
+    abort: bool = setting(
+        True, "With a clearance: the robot keeps it if it aborts at any instant outside the final approach cone."
+    )
     base_m: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0), "Position of the robot's base in {A}, the centre of its workspace.", unit="m"
     )

@@ -15,7 +15,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
-from avsreplay.plan.evaluation import Tolerance
+from avsreplay.plan.evaluation import Tolerance, wilson
 from avsreplay.plan.limits import Scene, margins
 from avsreplay.plan.path import RobotPath
 from avsreplay.plan.robot import Limits
@@ -65,6 +65,33 @@ class Spread:
     probability_95: tuple[float, float]
     contact: float = math.nan
     contact_95: tuple[float, float] = (math.nan, math.nan)
+
+    def described(self) -> list[tuple[str, str]]:
+        """Return the figures as names and texts."""
+        t, (low, high) = self.t_go_s, self.probability_95
+        out = [
+            (
+                "t_go over belief",
+                f"mean {t.mean:.3f} s, 5-95 % {t.p05:.3f} to {t.p95:.3f} s; {self.infeasible} without a plan",
+            ),
+            ("miss over belief", _text(self.miss_m, 1e3, "mm", 2)),
+            ("speed over belief", _text(self.speed_mps, 1e3, "mm/s", 2)),
+            ("angle over belief", _text(self.angle_deg, 1.0, "deg", 3)),
+            (
+                "capture probability",
+                f"{self.probability:.3f} (95 % {low:.3f} to {high:.3f}) in {self.futures} draws without replanning",
+            ),
+        ]
+        if self.contact >= 0.0:
+            low, high = self.contact_95
+            text = f"{self.contact:.3f} (95 % {low:.3f} to {high:.3f}) outside the corridor"
+            out.append(("contact probability", text))
+        return out
+
+
+def _text(band: Band, scale: float, unit: str, digits: int) -> str:
+    mean, p05, p95 = (f"{scale * value:.{digits}f}" for value in (band.mean, band.p05, band.p95))
+    return f"mean {mean} {unit}, 5-95 % {p05} to {p95} {unit}"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,9 +200,9 @@ def spread(
         speed_mps=_band(misses[:, 1]),
         angle_deg=_band(misses[:, 2]),
         probability=float(inside.mean()),
-        probability_95=_wilson(int(inside.sum()), len(futures)),
+        probability_95=wilson(int(inside.sum()), len(futures)),
         contact=float(touched.mean()) if checked else math.nan,
-        contact_95=_wilson(int(touched.sum()), len(futures)) if checked else (math.nan, math.nan),
+        contact_95=wilson(int(touched.sum()), len(futures)) if checked else (math.nan, math.nan),
     )
 
 
@@ -186,14 +213,6 @@ def _touches(scene: Scene, limits: Limits, times: Array, r: Array) -> bool:
     R = geometry.matrix(scene.attitude(times[:-1]))
     y = np.einsum("nij,ni->nj", R, r[:-1] - scene.goal(times[:-1])[0])
     return bool(margins(scene, limits, y, r[:-1]).values[:, 3].min() < 0.0)
-
-
-def _wilson(successes: int, count: int) -> tuple[float, float]:
-    """Return the Wilson 95 % interval of a fraction."""
-    z2 = 1.96**2
-    centre = (successes + 0.5 * z2) / (count + z2)
-    half = 1.96 / (count + z2) * math.sqrt(successes * (count - successes) / count + 0.25 * z2)
-    return max(centre - half, 0.0), min(centre + half, 1.0)
 
 
 def _terminal_errors(

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from avsreplay.errors import UnreadableInput
+from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import read_json, read_limited, sha256
 from avsreplay.geometry import Pose
-from avsreplay.records import Label, State
+from avsreplay.records import Label, State, Surface
 from avsreplay.report.export import StampedPose
 from avsreplay.report.jsonl import read_rows
 from avsreplay.report.summary import Summary
@@ -51,6 +51,30 @@ class Result:
     view: View | None = None
     unverified: str = ""
     whole: bool = False
+
+    @property
+    def surface(self) -> Surface | None:
+        """The thinned model of the target; None where the result has none."""
+        if self.view is None or not len(self.view.vertices):
+            return None
+        vertices = np.asarray(self.view.vertices, dtype=np.float64)
+        return Surface(vertices, np.asarray(self.view.faces, dtype=np.int32), "view.npz", "")
+
+    def extent_m(self, path: Path) -> float:
+        """Return the diagonal of the target's bounding box [m].
+
+        Args:
+            path: the directory, for the error message.
+
+        Raises:
+            UsageError: it is not known.
+        """
+        stated = self.header.get("model", {}).get("extent_m")
+        if stated is not None:
+            return float(stated)
+        if self.view is None or not len(self.view.vertices):
+            raise UsageError("the target's size is not known", where=str(path), hint="give it with --extent METRES")
+        return float(np.linalg.norm(np.ptp(self.view.vertices, axis=0)))
 
     @property
     def losses(self) -> int:
