@@ -138,6 +138,37 @@ def test_a_failure_of_a_back_end_is_a_status(monkeypatch, surface: Surface, scan
     assert np.isfinite(found.T_ac.matrix).all()
 
 
+class _Unchanged(_Raising):
+    def align(self, points, guess):
+        return Fit(guess, 3, True)
+
+
+class _NearGuess(_Raising):
+    def align(self, points, guess):
+        return Fit(Pose(guess.q, guess.t + 1e-9), 3, True)
+
+
+def _off(degrees: float) -> Pose:
+    return example_pose() @ Pose(exp([0.0, np.radians(degrees), 0.0]), np.zeros(3))
+
+
+def test_a_guess_that_is_returned_unchanged_is_no_measurement(monkeypatch, surface: Surface, scan: np.ndarray) -> None:
+    """Even a good guess: it says nothing of this scan, and the filter would take it as a perfect confirmation."""
+    monkeypatch.setattr("avsreplay.register.registrar.load_backend", lambda name: _Unchanged)
+    noisy = scan + np.random.default_rng(3).normal(0.0, 0.005, scan.shape)
+    for degrees in (0.02, 0.5, 3.0):
+        found = Registrar(surface).register(noisy, _off(degrees))
+        assert found.status is AlignStatus.FAILED, degrees
+        assert "unchanged" in found.message
+
+
+def test_a_false_claim_of_convergence_is_found(monkeypatch, surface: Surface, scan: np.ndarray) -> None:
+    monkeypatch.setattr("avsreplay.register.registrar.load_backend", lambda name: _NearGuess)
+    found = Registrar(surface).register(scan, _off(0.4))
+    assert not found.converged
+    assert found.status is not AlignStatus.ALIGNED
+
+
 # --- the ruler
 
 

@@ -107,7 +107,7 @@ def _nis(strain: float) -> tuple[float, float, float]:
     for _ in range(25):
         found = _scan(rng, strain)
         errors = systematic_errors(found, 2.0, 0.1)
-        none = replace(errors, block_m2=0.0, smooth_m2=0.0, amplitudes=np.zeros(7), fit=np.zeros(6))
+        none = replace(errors, block_m2=0.0, smooth_m2=np.zeros(7), amplitudes=np.zeros(7), fit=np.zeros(6))
         values.append(split_nis(found, errors, np.eye(3)[:1]))
         bare.append(split_nis(found, none, np.eye(3)[:1]))
         jackknife = jackknife_covariance(found.normals, found.gradients)

@@ -46,6 +46,18 @@ def test_a_back_end_that_fails_is_named_in_every_row_and_in_the_verdict(message)
     assert any(message in reason.text for reason in verdict.reasons)
 
 
+def test_a_back_end_that_returns_its_guess_is_no_sensor():
+    """The first pose is that of the global search; the later ones would be those of the filter itself, with NIS 0."""
+    with Run(Job(source=LOG, options=SourceOptions(n_scans=4))) as run:
+        run.registrar._backend = type("Idle", (), {"align": staticmethod(lambda points, guess: Fit(guess, 1, True))})()
+        rows = list(run.rows())
+    message = "back end 'horn' returned its guess unchanged; the scan asks for another pose"
+    assert [(row.status, row.gamma, row.message) for row in rows[1:]] == [("failed", 0, message)] * 3
+    verdict = verdict_of(rows, Summary.fold(rows))
+    assert verdict.grade is Grade.FAIL
+    assert any(message in reason.text for reason in verdict.reasons)
+
+
 def test_a_healthy_scan_has_no_message():
     with Run(Job(source=LOG, options=SourceOptions(n_scans=2))) as run:
         assert [row.message for row in run.rows()] == [None] * 2

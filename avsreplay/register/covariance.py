@@ -10,12 +10,11 @@ Random errors
 Systematic errors
     Errors of the model or of the ranges that vary slowly over the target: a symmetric strain and an offset of the
     surface (size, aspect, shear, calibration of the scanner, thickness of paint or of the mesh). They are fitted with
-    the pose; the seven amplitudes are taken as draws of one normal distribution, whose variance is their maximum
-    likelihood estimate (empirical Bayes). A fitted amplitude within its statistical error gives no variance.
+    the pose; the amplitudes of the strain are taken as draws of one normal distribution, that of the offset of
+    another. Their variances are maximum likelihood estimates (empirical Bayes), 0 if not significant.
 
-``split_nis`` tests the result: pose from one half of the patches against the other half, normalised with the covariance
-of their difference, in which errors common to both halves cancel. Where errors are normal it is chi-square with 6
-degrees of freedom.
+``split_nis`` tests the result: pose from one half of the patches against the other, normalised with the covariance of
+their difference, in which common errors cancel. For normal errors it is chi-square with 6 degrees of freedom.
 """
 
 from __future__ import annotations
@@ -35,7 +34,8 @@ BLOCK = 4  # patches along a side of a block
 LEAST_HALF = 12  # patches that each half of a split needs
 WORST_CONDITION = 1e8  # of the scaled information of a half
 OBSERVABLE = 1e-4  # an amplitude whose mean squared residual per unit is less is not fitted
-MOST_DENSE = 200  # sums by number are matrix products up to this many numbers
+SIGNIFICANT = 4.0  # twice the log likelihood ratio: 2 % of the scans without systematic errors exceed it
+LEAST_DETERMINED = 0.05  # with a smaller share of the displacements of blocks left by the fit, they are not estimated
 ROUNDS = 8  # of the maximum likelihood estimate; the last ones change nothing
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
@@ -72,8 +72,8 @@ class Evidence:
 
     def only(self, keep: NDArray[np.bool_]) -> Evidence:
         """Return the evidence of the patches with ``keep`` (m,) true."""
-        patches = ("counts", "normals", "gradients", "offsets", "errors", "places")
-        return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self) if f.name in patches})
+        names = [f.name for f in fields(self)]
+        return replace(self, **{name: getattr(self, name)[keep] for name in names[names.index("counts") :]})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,19 +81,17 @@ class Systematic:
     """Errors of a scan that the jackknife over patches does not contain.
 
     Attributes:
-        extent_m: diagonal of the model's bounding box; strains are in units of this length.
-        patch_m: side of a patch.
+        extent_m: diagonal of the model's bounding box; the strains are per this length.  patch_m: side of a patch.
         block_m2: variance of the displacement of a block, each axis [m^2].
-        smooth_m2: variance of the amplitudes: six of the strain times the extent, and the offset [m^2].
-        amplitudes: (7,) their fitted values [m].
+        smooth_m2: (7,) variances of the amplitudes: six of the strain times the extent, and the offset [m^2].
+        amplitudes: (7,) their fitted values [m].  centre: (3,) about which the strain was fitted.
         fit: (6,) pose part of the common fit of pose and amplitudes.
-        centre: (3,) about which the strain was fitted.
     """
 
     extent_m: float
     patch_m: float
     block_m2: float
-    smooth_m2: float
+    smooth_m2: Array
     amplitudes: Array
     fit: Array
     centre: Array
@@ -106,8 +104,7 @@ class Systematic:
 def without_dominant_patches(found: Evidence) -> Evidence:
     """Return the evidence without the patches that give more than ``DOMINANT`` of the information on some motion.
 
-    Example: the barely visible side of a box is determined by a few points next to its edge, which may belong to the
-    neighbouring side.
+    Example: the barely visible side of a box is determined by a few points next to its edge.
     """
     keep = kernel_module().keep_patches(*_contiguous(found.normals), found.counts, DOMINANT, MIN_POINTS)
     return found if keep.all() else found.only(keep)
@@ -116,9 +113,8 @@ def without_dominant_patches(found: Evidence) -> Evidence:
 def jackknife_covariance(normals: Array, gradients: Array) -> Array:
     """Return the delete-a-block jackknife covariance (6, 6) of d = [theta; v], with patches of the model as blocks.
 
-    Errors within a patch may be correlated (the model is wrong there, a range error at grazing incidence, outliers near
-    the surface); patches are taken as independent. Without patch p, with sums N_p = J'J and g_p = sum of e J, d moves
-    by (N - N_p)^-1 g_p = N^-1 (I - N_p N^-1)^-1 g_p: a patch with high leverage moves it by more than its residuals.
+    Errors within a patch may be correlated, patches are taken as independent. Without patch p, with sums N_p = J'J and
+    g_p = sum of e J, d moves by (N - N_p)^-1 g_p = N^-1 (I - N_p N^-1)^-1 g_p.
 
     Args:
         normals: (m, 6, 6) sums of J'J.
@@ -139,7 +135,7 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     Returns:
         The variances; zero where every patch is a single point, or there are fewer than 24 patches.
     """
-    none = Systematic(extent_m, patch_m, 0.0, 0.0, np.zeros(7), np.zeros(6), found.centre)
+    none = Systematic(extent_m, patch_m, 0.0, np.zeros(7), np.zeros(7), np.zeros(6), found.centre)
     if len(found.counts) < 2 * LEAST_HALF or found.counts.max() == 1:
         return none
     N, g, basis = _joined(found, none)
@@ -150,7 +146,9 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     S = g[:, :, None] * g[:, None, :] / np.maximum(1.0 - leverage, 0.5)[:, None, None]
     block, M = _block_variance(N, g, S, inverse, found.counts, _numbers(found.places, BLOCK * patch_m))
     P = inverse @ (S.sum(axis=0) + block * M) @ inverse
-    smooth = _common_variance(fit[6:], P[6:, 6:])
+    strains = slice(6, 6 + int(np.count_nonzero(basis[:6].any(axis=0))))
+    smooth = np.repeat(_common_variance(fit[strains], P[strains, strains]), 7)
+    smooth[6] = _common_variance(fit[strains.stop :], P[strains.stop :, strains.stop :])
     return replace(none, block_m2=block, smooth_m2=smooth, amplitudes=basis @ fit[6:], fit=fit[:6])
 
 
@@ -163,10 +161,9 @@ def pose_covariance(found: Evidence, errors: Systematic) -> Array:
     """
     P = jackknife_covariance(found.normals, errors.unexplained(found))
     inverse = _pseudo_inverse(found.normals.sum(axis=0))
-    blocks = _numbers(found.places, BLOCK * errors.patch_m)
-    X = inverse @ _summed(found.normals[:, :, 3:], blocks)
+    X = inverse @ _summed(found.normals[:, :, 3:], _numbers(found.places, BLOCK * errors.patch_m))
     Y = inverse @ _coupling(found, errors).sum(axis=0)
-    P = P + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + errors.smooth_m2 * Y @ Y.T
+    P = P + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
     return np.asarray(0.5 * (P + P.T))
 
 
@@ -200,7 +197,7 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
             C += jackknife_covariance(normals, unexplained[half])
             X += sign * (inverse @ _summed(normals[:, :, 3:], blocks[half], len(X)))
             Y += sign * (inverse @ coupling[half].sum(axis=0))
-        C += errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + errors.smooth_m2 * Y @ Y.T
+        C += errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
         values.append(float(D @ _pseudo_inverse(C) @ D))
     return max(values, default=None)
 
@@ -208,8 +205,7 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
 def difference_covariance(first: Evidence, second: Evidence, errors: Systematic) -> Array:
     """Return the covariance (6, 6) of the difference of the poses from two parts of one scan.
 
-    Errors that both parts have in common cancel: those of patches and blocks in which both have points, and the
-    systematic errors as far as they move both poses alike.
+    Errors that both parts have in common cancel.
 
     Args:
         first: sums of the points of one part, at the pose registered from all points.
@@ -228,7 +224,7 @@ def difference_covariance(first: Evidence, second: Evidence, errors: Systematic)
         moves = moves + sign * _summed(np.asarray(moved), patches[k], len(moves))
         X = X + sign * (inverse @ _summed(part.normals[:, :, 3:], blocks[k], len(X)))
         Y = Y + sign * (inverse @ _coupling(part, errors).sum(axis=0))
-    C = moves.T @ moves + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + errors.smooth_m2 * Y @ Y.T
+    C = moves.T @ moves + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
     return np.asarray(0.5 * (C + C.T))
 
 
@@ -242,10 +238,8 @@ def _pseudo_inverse(N: Array) -> Array:
 def _inverse(N: Array) -> Array | None:
     """Inverse of the information of a half; None if it does not determine a pose."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), np.finfo(float).tiny))
-    values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
-    if values[0] * WORST_CONDITION < values[-1]:
-        return None
-    return np.asarray((vectors / values) @ vectors.T * np.outer(scale, scale))
+    values = np.linalg.eigvalsh(N * np.outer(scale, scale))
+    return _pseudo_inverse(N) if values[0] * WORST_CONDITION > values[-1] else None
 
 
 def _strains(found: Evidence, errors: Systematic) -> Array:
@@ -266,8 +260,6 @@ def _coupling(found: Evidence, errors: Systematic) -> Array:
 
 def _joined(found: Evidence, errors: Systematic) -> tuple[Array, Array, Array]:
     """Normal equations of pose and observable amplitudes by patch, N (m, k, k) and g (m, k), and their basis (7, k-6).
-
-    Amplitudes are observable as far as pose and the other amplitudes do not explain their residuals.
     """
     T, A = _strains(found, errors), _coupling(found, errors)
     m, turned = len(T), T.transpose(0, 2, 1)
@@ -278,8 +270,12 @@ def _joined(found: Evidence, errors: Systematic) -> tuple[Array, Array, Array]:
     e = np.column_stack([(turned @ found.gradients[:, 3:, None])[:, :, 0], found.errors])
     coupling, total = A.sum(axis=0), found.normals.sum(axis=0)
     free = F.sum(axis=0) - coupling.T @ _pseudo_inverse(total) @ coupling
-    values, vectors = np.linalg.eigh(0.5 * (free + free.T))
-    basis = vectors[:, values > OBSERVABLE * found.counts.sum()]
+    least = OBSERVABLE * found.counts.sum()
+    alone = free[:6, :6] - np.outer(free[:6, 6], free[6, :6]) / max(free[6, 6], least)
+    values, vectors = np.linalg.eigh(0.5 * (alone + alone.T))
+    strains = vectors[:, values > least]
+    basis = np.zeros((7, strains.shape[1] + (free[6, 6] > least)))
+    basis[:6, : strains.shape[1]], basis[6:, strains.shape[1] :] = strains, 1.0
     size = 6 + basis.shape[1]
     N, g = np.empty((m, size, size)), np.hstack([found.gradients, e @ basis])
     N[:, :6, :6], N[:, :6, 6:] = found.normals, A @ basis
@@ -313,11 +309,12 @@ def _block_variance(
     of_patches = moved[blocks] @ B.transpose(0, 2, 1)
     of_patches = of_patches.transpose(0, 2, 1)
     expected += fitted(Kb, of_blocks.transpose(0, 2, 1), M, weight) - fitted(K, of_patches, M, own)
-    return (max(0.0, float(found / expected)) if expected > 0.0 else 0.0), M
+    determined = expected > LEAST_DETERMINED * float(weight @ np.sum(moved[:, 3:6] ** 2, axis=(1, 2)))
+    return (max(0.0, float(found / expected)) if determined else 0.0), M
 
 
 def _common_variance(values: Array, P: Array) -> float:
-    """Variance t of values ~ N(0, t I + P) by weighted moments, iterated to the maximum of the likelihood."""
+    """Variance t of values ~ N(0, t I + P) of greatest likelihood, by weighted moments; 0 if not significant."""
     if not len(values):
         return 0.0
     variances, axes = np.linalg.eigh(P)
@@ -326,7 +323,9 @@ def _common_variance(values: Array, P: Array) -> float:
     for _ in range(ROUNDS):
         weights = 1.0 / (variances + t) ** 2
         t = max(0.0, float(weights @ (squares - variances) / weights.sum()))
-    return t
+    ratio = variances / (variances + t)
+    evidence = squares / variances @ (1.0 - ratio) + np.log(ratio).sum()  # twice the gain in log likelihood
+    return t if evidence > SIGNIFICANT else 0.0
 
 
 def _numbers(places: Array, side: float) -> NDArray[np.intp]:
@@ -341,10 +340,6 @@ def _numbers(places: Array, side: float) -> NDArray[np.intp]:
 def _summed(values: Array, numbers: NDArray[np.intp], count: int | None = None) -> Array:
     """Sums of values (m, ...) with the same number, (count, ...)."""
     count = int(numbers.max()) + 1 if count is None else count
-    if count > MOST_DENSE:
-        out = np.zeros((count, *values.shape[1:]))
-        np.add.at(out, numbers, values)
-        return out
     member = np.zeros((count, len(numbers)))
     member[numbers, np.arange(len(numbers))] = 1.0
     return np.asarray(member @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])

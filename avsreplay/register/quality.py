@@ -31,6 +31,8 @@ SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
 LEAST_RESIDUALS = 50
+UNCHANGED = 0.06  # chi-square with 6 degrees of freedom is smaller with probability 4e-6
+TOLERANCE_RAD, TOLERANCE_OF_EXTENT = np.radians(0.1), 1e-3  # least accuracy that the contract asks of a back end
 AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
 
 
@@ -109,6 +111,7 @@ def grade(
         return not_measured(len(points), AlignStatus.FAILED)
     found = evidence(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m, fit.matches)
     overlap = found.inliers >= max(params.min_inliers, params.min_inlier_ratio * found.points)
+    left = remaining_step(found)
     found = without_dominant_patches(found) if overlap else found
     total = found.normals.sum(axis=0)
     info = frozen(total / found.noise_m**2)
@@ -118,19 +121,44 @@ def grade(
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
         info, P, weakest = frozen(np.linalg.pinv(P, hermitian=True)), None, unbounded
+    settled = P is None or not _beyond(left, P, index.extent_m)
     return Alignment(
         T_ac=fit.T_ca.inverse(),
         iterations=fit.iterations,
-        converged=fit.converged,
+        converged=fit.converged and settled,
         points=found.points,
         inliers=found.inliers,
         rms_m=found.rms_m,
         info=info,
-        status=_status(overlap, fit.converged, bool(weakest)),
+        status=_status(overlap, fit.converged and settled, bool(weakest)),
         covariance=None if P is None else frozen(P),
         free_directions=", ".join(weakest),
         split_nis=split,
+        message=""
+        if settled
+        else "the back end reports convergence, but its pose is not at a minimum of the distances",
     )
+
+
+def remaining_step(found: Evidence) -> Array:
+    """Return the least-squares step (6,) that the residuals at a pose ask for; zero at a converged pose."""
+    return np.asarray(np.linalg.pinv(found.normals.sum(axis=0), hermitian=True) @ found.gradients.sum(axis=0))
+
+
+def unchanged_without_reason(found: Evidence) -> bool:
+    """Return whether the residuals at a pose, which a back end returned exactly as it got it, ask for a step.
+
+    At the true pose their statistic g' N^-1 g / noise^2 is chi-square with 6 degrees of freedom; at a minimum of the
+    distances it is zero.
+    """
+    statistic = remaining_step(found) @ found.gradients.sum(axis=0) / found.noise_m**2
+    return bool(statistic > UNCHANGED)
+
+
+def _beyond(step: Array, P: Array, extent_m: float) -> bool:
+    """Whether a step is larger than the tolerance of any back end and than three standard deviations of the pose."""
+    large = np.linalg.norm(step[:3]) > TOLERANCE_RAD or np.linalg.norm(step[3:]) > TOLERANCE_OF_EXTENT * extent_m
+    return bool(large and step @ np.linalg.pinv(P, hermitian=True) @ step > 9.0 * len(step))
 
 
 def _covariance(found: Evidence, across: Array, extent_m: float) -> tuple[Array | None, float | None]:

@@ -77,6 +77,8 @@ class Registrar:
         if len(scan) == 0:
             return quality.not_measured(len(points), AlignStatus.NO_POINTS, guess)
         first = self._graded(scan, guess, halves=seq % self.params.split_every == 0)
+        if first.status is AlignStatus.FAILED:
+            return first
         found = first if self._healthy(first) else self._recovered(scan, guess, first)
         return self._searched(scan, found) if self._far(guess, found) else found
 
@@ -224,6 +226,14 @@ class Registrar:
         if isinstance(fit, str):
             return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
+        start = guess.inverse()
+        if (fit.T_ca.q.tobytes(), fit.T_ca.t.tobytes()) == (start.q.tobytes(), start.t.tobytes()):
+            found = quality.evidence(self._index, self._visibility, scan, start, limits.gate_m, self.params.noise_m)
+            if found.inliers and quality.unchanged_without_reason(found):
+                message = (
+                    f"back end '{self.params.backend}' returned its guess unchanged; the scan asks for another pose"
+                )
+                return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=message)
         return quality.grade(self._index, self._visibility, scan, fit, limits, self.params, halves)
 
     def _align(self, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | str:
