@@ -259,8 +259,7 @@ def _coupling(found: Evidence, errors: Systematic) -> Array:
 
 
 def _joined(found: Evidence, errors: Systematic) -> tuple[Array, Array, Array]:
-    """Normal equations of pose and observable amplitudes by patch, N (m, k, k) and g (m, k), and their basis (7, k-6).
-    """
+    """Normal equations by patch of pose and observable amplitudes, N (m, k, k), g (m, k); their basis (7, k-6)."""
     T, A = _strains(found, errors), _coupling(found, errors)
     m, turned = len(T), T.transpose(0, 2, 1)
     F = np.zeros((m, 7, 7))
