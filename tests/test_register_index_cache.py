@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from pathlib import Path
 
@@ -79,14 +78,14 @@ def test_a_damaged_payload_is_never_used(surface: Surface, tmp_path: Path) -> No
     """Payloads with a right checksum but random words in them: refused, or searched without leaving the arrays."""
     SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
     path = saved(tmp_path)
-    good = path.read_bytes()[40:]
+    good = path.read_bytes()[index_cache.HEADER :]
     r = rng(3)
     restored = 0
     for _ in range(40):
         bad = bytearray(good)
         for at in r.integers(0, len(good) // 4, size=r.integers(1, 40)):
             bad[4 * at : 4 * at + 4] = r.integers(0, 2**32, dtype=np.uint32).tobytes()
-        path.write_bytes(b"AVSINDEX" + hashlib.sha256(bad).digest() + bad)
+        path.write_bytes(index_cache.MAGIC + index_cache.checksum(bad) + bad)
         model = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
         restored += model.restored
         assert len(answers(model)) == len(answers(model))

@@ -298,17 +298,17 @@ def kernel_module() -> Any:
 
 
 def _restored(kernel: Any, path: Path, primitives: int, faces: int, portable: bool) -> Any:
-    """The index in this file; None where there is none or the file is damaged: it is then built again."""
+    """The index in this file; None where there is none or it is damaged: it is then built again."""
     saved = index_cache.read(path)
     try:
-        return None if saved is None else kernel.Index(saved, primitives, faces or primitives, faces > 0, portable)
+        args = (primitives, faces or primitives, faces > 0, portable)
+        return None if saved is None else kernel.Index(np.frombuffer(saved, np.uint8), *args)
     except ValueError:
         return None
 
 
 def _points(points: NDArray[Any]) -> NDArray[Any]:
-    array = np.asarray(points)
-    if array.ndim != 2 or array.shape[1] != 3:
+    if (array := np.asarray(points)).ndim != 2 or array.shape[1] != 3:
         raise ValueError(f"points must be (n, 3), got {array.shape}")
     return array if array.dtype in (np.float32, np.float64) else array.astype(np.float64)
 

@@ -21,6 +21,7 @@ namespace {
 
 using Doubles = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
 using Ints = nb::ndarray<const int32_t, nb::c_contig, nb::device::cpu>;
+using Bytes = nb::ndarray<const uint8_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 using Numpy = nb::ndarray<nb::numpy, double>;
 
 void require(bool good, const char* what) {
@@ -111,8 +112,8 @@ class Index {
   }
 
   // From what `save` gave; the caller has checked that it is for this model and whole.
-  Index(nb::bytes saved, int64_t primitives, int64_t ids, bool mesh, bool portable) : portable_(portable) {
-    const bool sound = restore(saved.c_str(), saved.size(), primitives, ids, mesh, store_);
+  Index(const Bytes& saved, int64_t primitives, int64_t ids, bool mesh, bool portable) : portable_(portable) {
+    const bool sound = restore(reinterpret_cast<const char*>(saved.data()), saved.size(), primitives, ids, mesh, store_);
     require(sound, "not a sound index");
   }
 
@@ -307,7 +308,7 @@ NB_MODULE(_kernel, m) {
   nb::class_<Index>(m, "Index")
       .def(nb::init<Doubles, Ints, Ints, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
            nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
-      .def(nb::init<nb::bytes, int64_t, int64_t, bool, bool>(), nb::arg("saved"), nb::arg("primitives"), nb::arg("ids"),
+      .def(nb::init<Bytes, int64_t, int64_t, bool, bool>(), nb::arg("saved"), nb::arg("primitives"), nb::arg("ids"),
            nb::arg("mesh"), nb::arg("portable") = false)
       .def("save", &Index::save)
       .def("closest", &Index::closest, nb::arg("points"), nb::arg("threads") = 1,
