@@ -323,3 +323,17 @@ def test_the_spacecraft_meshes(name: str, vertices: int, faces: int) -> None:
     surface = read_surface(shared(f"spacecraft-meshes/{name}.obj"))
     assert len(surface.vertices) <= vertices
     assert len(surface.faces) == faces
+
+
+def test_a_pcd_file_is_a_point_cloud_model(tmp_path) -> None:
+    from avsreplay.log import read_surface
+
+    path = tmp_path / "part.pcd"
+    path.write_bytes(SEEDS["binary.pcd"])
+    points = read_pcd(SEEDS["binary.pcd"])
+    finite = points[np.isfinite(points).all(axis=1)]
+    surface = read_surface(path, cloud_ok=True)
+    np.testing.assert_array_equal(surface.vertices, finite.astype(np.float64))
+    assert len(surface.faces) == 0
+    with pytest.raises(UnreadableInput, match="--cloud-model"):
+        read_surface(path)
