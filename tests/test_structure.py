@@ -1,6 +1,7 @@
 """The house keeps its shape: one direction of imports, clean types and lint, a quick start."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -58,3 +59,11 @@ def test_the_diagrams_of_the_architecture_page_are_current():
 
 def test_the_package_states_that_it_is_typed():
     assert (ROOT / "avsreplay" / "py.typed").is_file()
+
+
+def test_the_tests_that_the_reliability_page_names_exist():
+    page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
+    named = set(re.findall(r"`(test_\w+)`", page))
+    code = "".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "tests").glob("test_*.py")))
+    assert len(named) > 30
+    assert {name for name in named if f"def {name}(" not in code} == set()
