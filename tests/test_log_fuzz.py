@@ -9,7 +9,9 @@ import struct
 from contextlib import suppress
 from pathlib import Path
 
+import fuzz_commands
 import numpy as np
+import outputs
 import pytest
 from fuzz_inputs import case, cloud1, digest, seeds
 from fuzz_logs import LIMIT_MIB, campaign, check
@@ -35,6 +37,12 @@ def test_mutated_files_give_scans_or_one_error_line() -> None:
     assert sum(tally.values()) == 800
     assert min(tally["read"], tally["partly"], tally["refused"]) > 50, "each way out is taken"
     assert peak < LIMIT_MIB
+
+
+def test_every_input_and_output_of_every_command_has_a_seed() -> None:
+    """A new option that names a file joins the campaigns, or this test fails and names it."""
+    assert len(fuzz_commands.listed()) > 30
+    assert len(outputs.listed()) > 10
 
 
 def test_a_mutation_depends_only_on_campaign_and_number() -> None:

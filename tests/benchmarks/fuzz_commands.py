@@ -29,7 +29,7 @@ from avsreplay.report.result import write_manifest
 
 LIMIT_S, LIMIT_MIB = 20, 512
 ROOT = Path(__file__).resolve().parents[2]
-OUTPUTS = {"output", "update_golden", "junit", "export"}
+OUTPUTS = {"output", "update_golden", "junit", "export", "mesh"}
 NUMBERS = (b"0", b"-1", b"1e999", b"-1e308", b"1e20", b"1e-320", b"9" * 400, b"9223372036854775807", b"nan", b"inf",
            b"true", b"null", b'"x"', b'"\\ud800"', b'"\\u001b[31m"', b"[]", b"{}", b"")  # fmt: skip
 SCENARIO = """name = "tiny"
@@ -60,6 +60,9 @@ key = "scenario.motion.attitude_xyzw"
 kind = "attitude"
 """
 RULES = '[[rule]]\nmetric = "pose_pos_rmse_m"\nmax = 0.5\nmax_ratio = 1.5\noptional = true\n'
+ROBOT = (
+    "[robot]\nmass_kg = 80.0\nthrust_axes_n = [6.0, 4.0, 4.0]\nreach_max_m = 9.0\ndelay_s = 0.2\nthrust_noise = 0.01\n"
+)
 RUN = ("--init", "truth", "--n-scans", "2")
 # (command, input) -> arguments; IN is the mutated input, the other words name intact seeds or outputs.
 CASES: dict[tuple[str, str], tuple[str, ...]] = {
@@ -70,6 +73,7 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "config_file"): ("log.mcap", "--config", "IN", *RUN),
     ("run", "model"): ("log.mcap", "--model", "IN", *RUN),
     ("run", "truth_file"): ("log.mcap", "--truth", "IN", *RUN),
+    ("run", "robot_file"): ("log.mcap", "--robot", "IN", *RUN),
     ("run", "golden"): ("log.mcap", "--golden", "IN", *RUN),
     ("info", "source"): ("IN",),
     ("info", "model"): ("log.mcap", "--model", "IN"),
@@ -81,6 +85,7 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("observability", "model"): ("log.mcap", "--model", "IN", "--n-scans", "2"),
     ("observability", "truth_file"): ("log.mcap", "--truth", "IN", "--n-scans", "2"),
     ("plan", "result"): ("IN", "--at", "0", "--samples", "2", "--every", "1"),
+    ("plan", "robot_file"): ("result", "--robot", "IN", "--at", "0", "--samples", "2", "--every", "1"),
     ("report", "result"): ("IN", "-o", "OUT.html"),
     ("export", "result"): ("IN", "--to", "csv", "-o", "OUT.csv"),
     ("compare", "results"): ("result", "IN", "-o", "OUT.html"),
@@ -93,12 +98,14 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("model", "truth_file"): ("log.mcap", "--truth", "IN", "-o", "OUT.ply"),
     ("config", "log"): ("IN",),
     ("config", "config_file"): ("--config", "IN"),
+    ("config", "robot_file"): ("--robot", "IN"),
 }
 SEEDS: dict[str, tuple[str, ...]] = {
     "source": ("log.mcap", "log.mcap", "scenario.toml", "scans"), "log": ("log.mcap",), "against": ("model.ply",),
     "model": ("model.ply", "model.obj"),
     "truth_file": ("result/truth.tum",), "config_file": ("config.toml",), "golden": ("result/rows.jsonl",),
-    "result": ("result",), "results": ("result",), "gate": ("rules.toml",), "campaign": ("campaign.toml",),
+    "result": ("result",), "results": ("result",), "gate": ("rules.toml",), "robot_file": ("robot.toml",),
+     "campaign": ("campaign.toml",),
     "output": ("sweep",),
 }  # fmt: skip
 
@@ -126,7 +133,7 @@ def build(folder: Path) -> None:
     from avsreplay.log import open_source
     from avsreplay.log.surface import surface_bytes
 
-    texts = {"scenario.toml": SCENARIO, "campaign.toml": CAMPAIGN, "rules.toml": RULES}
+    texts = {"scenario.toml": SCENARIO, "campaign.toml": CAMPAIGN, "rules.toml": RULES, "robot.toml": ROBOT}
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.redirect_stderr(io.StringIO()):

@@ -45,6 +45,7 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("compare", "output"): ("result", "result", "-o", "OUT", "--overwrite"),
     ("compare", "junit"): ("result", "result", "--gate", "rules.toml", "--junit", "OUT"),
     ("model", "output"): ("log.mcap", "-o", "OUT", "--overwrite"),
+    ("model", "mesh"): ("log.mcap", "-o", "other.ply", "--mesh", "OUT", "--overwrite"),
     ("sweep", "output"): ("campaign.toml", "-o", "OUT", "--workers", "0"),
 }
 FOLDERS = {("run", "output"), ("sweep", "output")}
@@ -157,6 +158,11 @@ def finished(line: list[str], place: Path, file_bytes: int | None = None) -> sub
     return subprocess.run(line, cwd=place, capture_output=True, text=True, timeout=600, check=False, preexec_fn=limits)
 
 
+def beside(path: Path, *kept: Path) -> list[str]:
+    """What stands in the folder of an output, without the second output of a command."""
+    return sorted(p.name for p in path.parent.iterdir() if p not in (path, *kept) and p.name != "other.ply")
+
+
 def contents(path: Path) -> dict[str, bytes]:
     """The bytes of a file, or of every file of a folder."""
     files = [path] if path.is_file() else sorted(p for p in path.rglob("*") if p.is_file())
@@ -178,7 +184,7 @@ def full_disk(case: tuple[str, str], seeds: Path, root: Path) -> Iterator[str]:
             yield f"FINDING {case} full disk: exit {done.returncode}: {done.stderr[-300:]}"
         elif case != ("sweep", "output") and contents(path) != old:
             yield f"FINDING {case} full disk: the old output has changed"
-        elif extra := [p.name for p in place.iterdir() if p not in (path, partial)]:
+        elif extra := beside(path, partial):
             yield f"FINDING {case} full disk: left {extra}"
         else:
             yield "full disk"
@@ -195,8 +201,8 @@ def two_writers(case: tuple[str, str], seeds: Path, root: Path) -> str:
     codes = sorted(writer.returncode for writer in both)
     if codes[0] or codes[1] not in (0, 2, 3) or any("Traceback" in text for text in errors):
         return f"FINDING {case} two writers: exits {codes}: {errors}"
-    if not is_complete(case, path) or [p.name for p in place.iterdir()] != [path.name]:
-        return f"FINDING {case} two writers: left {sorted(p.name for p in place.iterdir())}"
+    if not is_complete(case, path) or beside(path):
+        return f"FINDING {case} two writers: left {beside(path)}"
     return "two writers"
 
 
@@ -215,18 +221,17 @@ def kill(case: tuple[str, str], seeds: Path, root: Path, kills: int, rng: np.ran
         killed = writer.wait() == -signal.SIGKILL
         if case != ("sweep", "output") and not is_complete(case, path):
             yield f"FINDING {case}: after kill -9 the output is neither the old nor the new one"
-        elif number % 5 == 4 and (problem := _again(case, line, place, path)):
+        elif number % 5 == 4 and (problem := _again(case, line, path)):
             yield problem
         else:
             yield "killed" if killed else "finished before"
 
 
-def _again(case: tuple[str, str], line: list[str], place: Path, path: Path) -> str:
-    again = finished(line, place)
+def _again(case: tuple[str, str], line: list[str], path: Path) -> str:
+    again = finished(line, path.parent)
     if again.returncode:
         return f"FINDING {case}: after kill -9 the command fails: {again.stderr[-200:]}"
-    left = sorted(p.name for p in place.iterdir() if p != path)
-    return f"FINDING {case}: left behind: {left}" if left else ""
+    return f"FINDING {case}: left behind: {beside(path)}" if beside(path) else ""
 
 
 def main() -> int:
