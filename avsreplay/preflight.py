@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
 from avsreplay.log import LogInfo, Source, SourceOptions
+from avsreplay.log.options import Unit
 from avsreplay.records import Surface
 from avsreplay.register import Registrar
 from avsreplay.report.table import Table, TableCell
@@ -164,7 +165,9 @@ def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None) -> list[Advi
     if scale is None:
         return [Advice("fail", "size", f"{said}; no common unit explains the difference")]
     text = f"{said}: the model seems to be in {_UNITS[scale]}"
-    return [Advice("fail", "unit", text, f"--model-scale {scale:g}")]
+    unit = next((unit for unit in Unit if unit.metres == scale), None)
+    option = f"--model-scale {scale:g}" if unit is None else f"--model-unit {unit.value}"
+    return [Advice("fail", "unit", text, option)]
 
 
 def _unit(ratio: float) -> float | None:

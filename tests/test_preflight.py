@@ -10,7 +10,7 @@ import pytest
 
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
-from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo
+from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
 from avsreplay.log.surface import parse_surface, scaled, surface_bytes
 from avsreplay.preflight import diameter, preflight
 from avsreplay.records import Scan, ScanStatus
@@ -75,9 +75,9 @@ def test_a_fitting_model_is_ok(surface):
 @pytest.mark.parametrize(
     ("factor", "option", "unit"),
     [
-        (1000.0, "--model-scale 0.001", "millimetres"),
-        (100.0, "--model-scale 0.01", "centimetres"),
-        (39.37, "--model-scale 0.0254", "inches"),
+        (1000.0, "--model-unit mm", "millimetres"),
+        (100.0, "--model-unit cm", "centimetres"),
+        (39.37, "--model-unit inch", "inches"),
         (0.001, "--model-scale 1000", "scans are in millimetres"),
     ],
 )
@@ -89,7 +89,7 @@ def test_a_wrong_unit_is_named_with_the_factor(surface, factor, option, unit):
 
 def test_the_suggested_factor_makes_the_sizes_agree(surface):
     log, wrong = Log(_seen(surface)), scaled(surface, 1000.0)
-    factor = float(_found(preflight(log, wrong), "unit").option.split()[1])
+    factor = Unit(_found(preflight(log, wrong), "unit").option.split()[1]).metres
     assert _found(preflight(log, scaled(wrong, factor)), "size").grade == "ok"
 
 
@@ -158,10 +158,10 @@ def model_in_mm(tmp_path_factory, fixtures_folder):
 def test_a_model_in_millimetres_is_said_before_any_table(cli, fixtures_folder, model_in_mm):
     log = fixtures_folder / "tumble.mcap"
     info = json.loads(cli("info", log, "--model", model_in_mm, "--json").out)
-    assert [c["option"] for c in info["checks"] if c["grade"] == "fail"] == ["--model-scale 0.001"]
+    assert [c["option"] for c in info["checks"] if c["grade"] == "fail"] == ["--model-unit mm"]
     done = cli("run", log, "--model", model_in_mm, "--n-scans", 5)
-    assert "--model-scale 0.001" in done.err.splitlines()[0]
-    assert "--model-scale 0.001" in done.out.split("Scans:")[0]
-    right = cli("run", log, "--model", model_in_mm, "--model-scale", "0.001", "--n-scans", 5)
-    assert "model-scale 0.001" not in right.err.splitlines()[0]
+    assert "--model-unit mm" in done.err.splitlines()[0]
+    assert "--model-unit mm" in done.out.split("Scans:")[0]
+    right = cli("run", log, "--model", model_in_mm, "--model-unit", "mm", "--n-scans", 5)
+    assert "model-unit" not in right.err.splitlines()[0]
     assert "5 healthy" in right.out

@@ -72,6 +72,7 @@ def added(*options: Callable[[F], F]) -> Callable[[F], F]:
 source_options = added(
     source_setting("--model", type=PATH),
     source_setting("--cloud-model", is_flag=True),
+    source_setting("--model-unit"),
     source_setting("--model-scale", type=float),
     source_setting("--topic"),
     source_setting("--truth-topic"),
@@ -108,10 +109,13 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
         UsageError: a value is not allowed.
     """
     from avsreplay.log import ClockChoice, SourceOptions
+    from avsreplay.log.options import Unit
 
     given = {name: value for name, value in flags.items() if value is not None}
     if "clock" in given:
         given["clock"] = ClockChoice(given["clock"])
+    if "model_unit" in given:
+        given["model_unit"] = Unit(given["model_unit"])
     try:
         return SourceOptions(**given)
     except ValueError as error:

@@ -155,7 +155,7 @@ def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tu
     if surface is None:
         surface, trouble = _carried(recording)
         lost += trouble
-    return replace(header, surface=surface and scaled(surface, options.model_scale)), tuple(lost)
+    return replace(header, surface=surface and scaled(surface, options.model_factor)), tuple(lost)
 
 
 def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
@@ -205,7 +205,7 @@ def _open_pose_file(path: Path, options: SourceOptions) -> Source:
             raise UsageError("a pose file has no topics", where=f"{shown(path)}, {flag}", hint="leave it out")
     poses = PoseFile(path, options.rate_hz)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
-    header = LogHeader(surface=surface and scaled(surface, options.model_scale), notes={"source": "pose file"})
+    header = LogHeader(surface=surface and scaled(surface, options.model_factor), notes={"source": "pose file"})
     truth = GroundTruth()
     if options.truth_file is not None:
         truth = GroundTruth(*file_truth(read_poses(options.truth_file), options.truth_gap_s))
@@ -309,7 +309,7 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     times = _times(path, files, found)
     clouds = FolderClouds(files, options.rate_hz, options.max_message_mib << 20, times)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
-    surface = surface and scaled(surface, options.model_scale)
+    surface = surface and scaled(surface, options.model_factor)
     notes = {"source": "folder", "times": "given" if times else f"steady at {options.rate_hz!r} Hz"}
     ground_truth = _ground_truth(files, clouds.header_ns, by_name, found, options)
     besides = [p for p in (pose_file, path / _TIME_FILE) if p is not None and p.is_file() and p.is_relative_to(path)]

@@ -17,6 +17,20 @@ class ClockChoice(Enum):
     PUBLISH = "publish"  # time of publication, if the recorder stored it
 
 
+class Unit(Enum):
+    """Unit of the coordinates of a model file."""
+
+    M = "m"
+    CM = "cm"
+    MM = "mm"
+    INCH = "inch"
+
+    @property
+    def metres(self) -> float:
+        """Return one unit in metres."""
+        return {"m": 1.0, "cm": 0.01, "mm": 0.001, "inch": 0.0254}[self.value]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceOptions(Settings):
     """How to read a source: topics, frames, the part that is replayed, and clock."""
@@ -55,8 +69,11 @@ class SourceOptions(Settings):
         None, "Model file; 'auto' builds the model from the scans of the log.", unset="the log's own model"
     )
     cloud_model: bool = setting(False, "The model may be a point cloud without faces.")
+    model_unit: Unit = setting(Unit.M, "Unit of the coordinates of the model.")
     model_scale: float = setting(
-        1.0, "Factor from the unit of the model to metres: 0.001 for a model in millimetres.", above=0.0
+        1.0,
+        "Factor on the size of the model, in addition to its unit: 1.01 for a model that is 1 % too small.",
+        above=0.0,
     )
     clock: ClockChoice = setting(ClockChoice.HEADER, "Clock of the scans' times.")
     start_s: float | None = setting(None, "Begin, after the first scan.", unit="s")
@@ -93,6 +110,11 @@ class SourceOptions(Settings):
             raise ValueError(f"crop_box {box} is empty")
         if self.crop_range is not None and not self.crop_range[0] < self.crop_range[1]:
             raise ValueError(f"crop_range {self.crop_range} is empty")
+
+    @property
+    def model_factor(self) -> float:
+        """Return the factor from the coordinates of the model to metres."""
+        return self.model_unit.metres * self.model_scale
 
     @property
     def window_s(self) -> tuple[float, float]:
