@@ -113,7 +113,8 @@ class BatchSchedule:
         """
         count, last = len(track.fixes), track.batch
         due = max(FEWEST_TO_TEST, DRIFT_GROWTH * count)
-        if not self.checked_poses or last is None or count < FEWEST_WITH_DRIFT or track.untested < due:
+        ready = bool(self.checked_poses) and last is not None and count >= FEWEST_WITH_DRIFT
+        if not ready or last is None or track.untested < due or track.since == 0:  # never in the same scan as a fit
             return replace(track, untested=track.untested + 1)
         track = replace(track, untested=0)
         epoch_ns = track.fixes[0].t_ns

@@ -1,6 +1,8 @@
-"""Processor time of the estimator's parts. ``python tests/benchmarks/estimate_speed.py [--quick]``.
+"""Processor time of the estimator's parts. ``python tests/benchmarks/estimate_speed.py [--quick] [--scans]``.
 
-Each figure is the least of five repeats, so that other load on the machine matters little.
+Each figure is the least of five repeats, so that other load on the machine matters little. ``--scans``: instead, the
+time of estimator and monitors scan by scan over whole runs with simulated poses, mean and largest, the least of three
+repeats of each scan.
 """
 
 from __future__ import annotations
@@ -21,7 +23,10 @@ from avsreplay.estimate.chart import to_chart
 from avsreplay.estimate.dynamics import rotation_history
 from avsreplay.estimate.initialise import weak_prior
 from avsreplay.estimate.params import Constraint, Start
-from avsreplay.records import Alignment, Belief
+from avsreplay.monitor.convergence import Consistency, ConsistencyParams, Convergence, ConvergenceParams
+from avsreplay.monitor.faults import FaultDetector, FaultParams
+from avsreplay.pipeline import Monitors
+from avsreplay.records import Alignment, Belief, ScanStatus
 
 
 def least(run: Callable[[], object], count: int) -> float:
@@ -105,10 +110,51 @@ def fit_s(n: int, seconds: float) -> tuple[float, float, int]:
     return once, time.process_time() - begun, fitted.steps
 
 
+RUNS = ((2.0, 80.0, 0.1), (5.0, 120.0, 0.1), (10.0, 60.0, 0.1), (10.0, 100.0, 0.3))  # hz, seconds, rad/s
+
+
+def run_ms(hz: float, seconds: float, rate: float) -> np.ndarray:
+    """(n, 2) milliseconds of estimator and monitors for each scan of a cold start."""
+    world = tumbling.draw(1, seconds=seconds, hz=hz, rate=rate, sigma_max=0.85)
+    rng = np.random.Generator(np.random.PCG64(6))
+    seen = [tumbling.alignment(x.T_ac, rng, 0.002, np.radians(0.1)) for x in world.states]
+    estimator, detector = Estimator(EstimatorParams(correlated_share=0.1), None, 4.0), FaultDetector(FaultParams(), 4.0)
+    monitors = Monitors(Consistency(ConsistencyParams()), Convergence(ConvergenceParams(), 4.0))
+    state, track, spent = monitors.initial(np.ones(20)), estimator.initial(0, seen[0].T_ac), []
+    for t, alignment in zip(world.times, seen, strict=True):
+        begun = time.process_time()
+        prediction = estimator.predict(track, round(t * 1e9))
+        innovation = estimator.innovate(prediction, alignment)
+        verdict = detector.judge(ScanStatus.OK, alignment, innovation, prediction.belief)
+        track, verdict = estimator.step(track, prediction, innovation, verdict, state.convergence.converged)
+        middle = time.process_time()
+        state, _ = monitors.observe(state, estimator, prediction, innovation, verdict.gamma, track)
+        spent.append((1e3 * (middle - begun), 1e3 * (time.process_time() - middle)))
+    return np.array(spent)
+
+
+def whole_runs() -> None:
+    """Mean and largest time of a scan over whole runs."""
+    for hz, seconds, rate in RUNS:
+        least_ms = np.min([run_ms(hz, seconds, rate) for _ in range(3)], axis=0)
+        both = least_ms.sum(axis=1)
+        print(
+            f"{len(both)} scans at {hz:.0f} Hz, {rate} rad/s: estimator {least_ms[:, 0].mean():.2f} ms, at most"
+            f" {least_ms[:, 0].max():.0f}; with monitors {both.mean():.2f} ms, at most {both.max():.0f},"
+            f" {both[-len(both) // 3 :].mean():.2f} ms over the last third",
+            flush=True,
+        )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer repeats, no fit over 5,000 poses")
-    quick = parser.parse_args().quick
+    parser.add_argument("--scans", action="store_true", help="times scan by scan over whole runs")
+    given = parser.parse_args()
+    if given.scans:
+        whole_runs()
+        return
+    quick = given.quick
     count, near = 50 if quick else 400, EstimatorParams(start=Start.NEAR)
     parts = scan_us("gain", replace(near, constraint=Constraint.GAIN), count) | scan_us("chart", near, count)
     for name, value in (parts | ahead_us(count // 10)).items():

@@ -32,6 +32,7 @@ HEADS = (
     "case",
     "scans to the first flag: median, worst (bodies)",
     "manoeuvres",
+    "drifts: bodies, size, 1 sigma, onset (medians)",
     "size error, time error",
     "scans to recover: median, worst",
     "scans converged beyond 4 sigma",
@@ -231,6 +232,7 @@ def line(case: Case, results: list[Result]) -> str:
         case.name,
         f"{_middle(first)} ({len(first)}/{len(results)})",
         str(sum(map(len, found))),
+        _drifts(results),
         _sizes(results, found),
         _middle(back),
         str(sum(wrong)),
@@ -244,6 +246,16 @@ def line(case: Case, results: list[Result]) -> str:
         f"{1e3 * np.median([max(r.grasp[-20:]) for r in results]):.0f}",
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def _drifts(results: list[Result]) -> str:
+    """Bodies with a drift at the end; its torque [rad/s2] with 1 sigma and its onset [s], medians."""
+    found = [r.track.drift for r in results if r.track and r.track.drift]
+    if not found:
+        return "0"
+    size = np.median([np.linalg.norm(d.rate) for d in found])
+    sigma = np.median([np.sqrt(np.trace(d.P[:3, :3])) for d in found])
+    return f"{len(found)}: {size:.2g} +- {sigma:.1g}, {np.median([d.t_ns * 1e-9 for d in found]):.0f} s"
 
 
 def _middle(values: list[int]) -> str:
