@@ -157,9 +157,7 @@ def from_motion(rng: np.random.Generator) -> str:
     from avsreplay.estimate import _motion
 
     sigma, push = tuple(numbers(rng, 3)), tuple(numbers(rng, 3))
-    times = np.sort(
-        np.abs(numbers(rng, 5)) % 10.0
-    )  # a million radians, the limit, take minutes
+    times = np.sort(np.abs(numbers(rng, 5)) % 10.0)  # a million radians, the limit, take minutes
     state = [numbers(rng, k) for k in (4, 3, 3, 3, 2, 3, 4)]
     P = numbers(rng, 20, 20)
     done = _tried(lambda: _motion.follow(state[0], state[1], sigma, push, times))
