@@ -28,11 +28,10 @@ from avsreplay.plan.convexification import (
     excess,
     initial_references,
     interval_fractions,
-    shortened,
     turn_rate,
     warm_reference,
 )
-from avsreplay.plan.limits import CONSTRAINTS, Case, SampledScene, Scene, largest_acceleration
+from avsreplay.plan.limits import CONSTRAINTS, Case, SampledScene, Scene, largest_acceleration, margins
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits
@@ -41,6 +40,8 @@ ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
 RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
+IMPROVED = 2  # drafts whose entry is moved
+MOVES = 6  # largest number of moves of the entry in one direction
 TURN_RAD = 0.5  # the target may turn by this much between two iterations
 
 
@@ -200,7 +201,7 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
     and the results are refined in the order of their arrival times.
     """
     if warm is not None:
-        again = shortened(case, *warm)
+        again = _shortened(case, *warm)
         found = _converged(again, warm_reference(again, *warm))
         if found is not None:
             return found
@@ -212,6 +213,7 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
             drafts.append(draft)
         if drafts and reference.t > 1.5 * min(d.t_go_s for d in drafts):
             break
+    drafts = _improved(coarse, drafts)
     best: StepPath | None = None
     for draft in sorted(drafts, key=lambda d: d.t_go_s):
         if best is not None and draft.t_go_s > best.t_go_s:
@@ -220,6 +222,53 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
         if refined is not None and (best is None or refined.t_go_s < best.t_go_s):
             best = refined
     return best
+
+
+def _entries(case: Case, path: RobotPath) -> tuple[float, float]:
+    """Return the fractions of a flight from which it stays inside the cone and inside the corridor."""
+    s = interval_fractions(case.limits.nodes)
+    times = case.wait_s + (path.t_go_s - case.wait_s) * s
+    r = path.at(times)[0]
+    inside = margins(case.scene, case.limits, case.sampled.coordinates(times, r), r, case.sampled.sigma(times)).inside
+    found = []
+    for column in (0, 3 if case.limits.clearance_m is not None else 1):
+        outside = np.flatnonzero(~inside[:-1, column])
+        found.append(float(s[outside[-1] + 1]) if len(outside) else 0.0)
+    return found[0], found[1]
+
+
+def _shortened(case: Case, path: RobotPath, since_s: float) -> Case:
+    """Return the case with the interval length of an earlier path: the rest of its flight needs fewer intervals."""
+    if not isinstance(path, StepPath):
+        return case
+    left = math.ceil((path.t_go_s - since_s - case.wait_s) / path.step_s)
+    n = min(max(left, COARSE_NODES), case.limits.nodes)
+    return replace(case, limits=replace(case.limits, nodes=n))
+
+
+def _improved(case: Case, drafts: list[StepPath]) -> list[StepPath]:
+    """Return the earliest drafts with the entry into cone or corridor moved as long as the capture becomes earlier.
+
+    The alternative that is required at an instant follows from the reference, so that the iterations alone cannot move
+    the entry by more than they move the path.
+    """
+    if case.limits.cone_deg is None and case.limits.final_deg is None:
+        return drafts
+    which, step = 0 if case.limits.cone_deg is not None else 1, 0.5 / case.limits.nodes
+    out = []
+    for draft in sorted(drafts, key=lambda d: d.t_go_s)[:IMPROVED]:
+        best, start = draft, _entries(case, draft)
+        for direction in (-step, step):
+            for count in range(1, MOVES + 1):
+                entry = list(start)
+                entry[which] += count * direction
+                moved = replace(case, entry=(entry[0], entry[1]))
+                trial = _converged(moved, warm_reference(case, best, 0.0), best.t_go_s)
+                if trial is None or trial.t_go_s > best.t_go_s - TIME_TOLERANCE_S:
+                    break
+                best = trial
+        out.append(best)
+    return out
 
 
 def _converged(case: Case, reference: ReferencePath, latest_s: float = math.inf) -> StepPath | None:

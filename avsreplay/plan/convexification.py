@@ -177,6 +177,10 @@ class _RowMaker:
         self.fraction = np.where(np.arange(2 * n) % 2 == 0, 0.5, 1.0)
         self.r = reference.r
         self.found = margins(case.scene, case.limits, self.y, reference.r, case.sampled.sigma(times))
+        self.inside = self.found.inside
+        if case.entry is not None:
+            self.inside[:, 0] = s >= case.entry[0] - 1e-9
+            self.inside[:, 1] = self.inside[:, 3] = s >= case.entry[1] - 1e-9
         self.near = np.ones(2 * n, dtype=bool)
         self.near[-1] = False  # the grasp point itself is the end condition
 
@@ -191,8 +195,9 @@ class _RowMaker:
         """Return the subproblem with the rows of all constraints."""
         planes = list(problem.planes)
         cones: list[tuple[int, PointRows]] = []
-        limits, y, inside = self.limits, self.y, self.found.inside
-        on = (self.found.values < self.far_m) & self.near[:, None]
+        limits, y, inside = self.limits, self.y, self.inside
+        chosen = np.where(inside, self.found.first, self.found.second)
+        on = (chosen < self.far_m) & self.near[:, None]
         distance = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
         for i, degrees, length in (
             (0, limits.cone_deg, limits.cone_range_m),
@@ -224,10 +229,10 @@ class _RowMaker:
     ) -> None:
         """Add the clearance to the surface, or the corridor with its range where the reference is inside it."""
         found, limits = self.found, self.limits
-        k = np.flatnonzero(on & found.inside[:, 3])
+        k = np.flatnonzero(on & self.inside[:, 3])
         cones.append(self.cone(k, limits.final_deg or 0.0, off[k]))
         cones.append(self.ball(k, (limits.final_range_m or 0.0) - off[k]))
-        k = np.flatnonzero(on & ~found.inside[:, 3])
+        k = np.flatnonzero(on & ~self.inside[:, 3])
         foot = found.foot[k]
         gap = found.distance[k]
         normal = (self.y[k] - foot) / np.where(np.abs(gap) > 1e-9, gap, 1e-9)[:, None]
@@ -275,15 +280,6 @@ def _interleaved(rows: list[PointRows]) -> PointRows:
 
     names = ("interval", "fraction", "vector", "offset", "rate", "slack")
     return PointRows(*(mixed(name) for name in names))
-
-
-def shortened(case: Case, path: RobotPath, since_s: float) -> Case:
-    """Return the case with the interval length of an earlier path: the rest of its flight needs fewer intervals."""
-    if not isinstance(path, StepPath):
-        return case
-    left = math.ceil((path.t_go_s - since_s - case.wait_s) / path.step_s)
-    n = min(max(left, COARSE_NODES), case.limits.nodes)
-    return replace(case, limits=replace(case.limits, nodes=n))
 
 
 def warm_reference(case: Case, path: RobotPath, since_s: float) -> ReferencePath:

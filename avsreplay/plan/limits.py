@@ -278,7 +278,11 @@ class SampledScene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Case:
-    """Everything that does not change with the reference."""
+    """Everything that does not change with the reference.
+
+    Attributes:
+        entry: Fractions of the flight from which the cone and the corridor are required; None: the reference decides.
+    """
 
     sampled: SampledScene
     limits: Limits
@@ -288,6 +292,7 @@ class Case:
     buffer_m: float
     coarse: bool = False
     earliest_s: float = 0.0
+    entry: tuple[float, float] | None = None
 
     @property
     def wait_s(self) -> float:
