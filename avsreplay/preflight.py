@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
 from avsreplay.log import LogInfo, Source, SourceOptions
+from avsreplay.log.bytes_io import shown
 from avsreplay.log.options import Unit
 from avsreplay.records import Surface
 from avsreplay.register import Registrar
@@ -36,6 +37,7 @@ _UNITS = {
 }
 _POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
 _SAMPLED = 3000  # points of a scan that are grouped
+_LARGEST_SCENE = 50.0  # largest scan over the target in it, where the unit of the model is unknown
 _MARGIN = 0.25  # of the model's diameter around the target in a suggested crop
 
 
@@ -74,9 +76,9 @@ def preflight(source: Source, surface: Surface | None, registrar: Registrar | No
     """
     info = source.info()
     if source.options.poses:
-        return [*_poses(source, surface), *_transforms(info), *_truth(info), *_clock(info)]
+        return [*_poses(source, surface), *_transforms(info, source), *_truth(info), *_clock(info)]
     clouds = _sampled_clouds(source)
-    found = [*_sizes(clouds, surface), *_transforms(info), *_truth(info), *_clock(info)]
+    found = [*_sizes(clouds, surface), *_transforms(info, source), *_truth(info), *_clock(info)]
     share = None if registrar is None else _share_on_model(source, registrar)
     if share is not None:
         text = f"{100 * share:.0f} % of the points of the first scan are on the model at the first pose"
@@ -162,6 +164,8 @@ def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None) -> list[Advi
     if len(inside) * 2 > len(clouds):
         return [_crop_advice(clouds, inside, model_m)]
     scale = _unit(ratio)
+    if scale is None and (both := _unit_and_background(clouds, model_m, ratio, said)):
+        return both
     if scale is None:
         return [Advice("fail", "size", f"{said}; no common unit explains the difference")]
     text = f"{said}: the model seems to be in {_UNITS[scale]}"
@@ -175,6 +179,22 @@ def _unit(ratio: float) -> float | None:
     low, high = _ONE_SIDE
     fitting = [scale for scale in _UNITS if low <= ratio / scale <= high]
     return min(fitting, key=lambda scale: abs(np.log(ratio / scale / 0.9)), default=None)
+
+
+def _unit_and_background(clouds: Sequence[NDArray[Any]], model_m: float, ratio: float, said: str) -> list[Advice]:
+    """The unit with which a group of points in most scans has the size of the model; empty if there is none."""
+    best: tuple[float, list[Advice]] | None = None
+    for scale, name in _UNITS.items():
+        if not _MOST < ratio / scale < _LARGEST_SCENE:
+            continue
+        groups = [points for points in (_target(cloud, scale * model_m) for cloud in clouds) if points is not None]
+        if len(groups) * 2 <= len(clouds):
+            continue
+        off = abs(np.log(float(np.median([diameter(g, trimmed=False) for g in groups])) / (0.9 * scale * model_m)))
+        if best is None or off < best[0]:
+            unit = Advice("fail", "unit", f"{said}: the model seems to be in {name}", f"--model-scale {scale:g}")
+            best = off, [unit, _crop_advice(clouds, groups, scale * model_m)]
+    return [] if best is None else best[1]
 
 
 def _target(cloud: NDArray[Any], model_m: float) -> Array | None:
@@ -212,12 +232,17 @@ def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], model
     return Advice("check", "background", text, option)
 
 
-def _transforms(info: LogInfo) -> list[Advice]:
+def _transforms(info: LogInfo, source: Source) -> list[Advice]:
     found = [topic for topic in info.topics if topic.type.endswith("TFMessage") and topic.count]
     if not found:
         return []
     names = ", ".join(f"{topic.name} ({topic.count} messages)" for topic in found)
-    return [Advice("ok", "transforms", f"{names}; for a moving sensor use --fixed-frame FRAME")]
+    frame = source.scan_at(0).frame if len(source) else ""
+    root = source.moving_in(frame)
+    if root is not None and source.options.fixed_frame is None:
+        text = f"the frame of the clouds, '{shown(frame)}', moves in '{shown(root)}'"
+        return [Advice("check", "transforms", text, f"--fixed-frame {shown(root)}")]
+    return [Advice("ok", "transforms", names)]
 
 
 def _truth(info: LogInfo) -> list[Advice]:

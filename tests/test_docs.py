@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import click
@@ -33,9 +34,12 @@ def _name(page):
 
 
 @pytest.fixture
-def folder(tmp_path):
-    """An empty folder with the short recording of the fixtures in it."""
+def folder(tmp_path, request):
+    """An empty folder with the short recording of the fixtures, for the tutorial of an own log with its bag."""
     shutil.copy(ROOT / "fixtures" / "tumble.mcap", tmp_path / "tumble.mcap")
+    page = getattr(getattr(request.node, "callspec", None), "params", {}).get("page")
+    if page is not None and page.name == "your-own-log.md":
+        subprocess.run([sys.executable, ROOT / "docs" / "examples" / "own_bag.py", tmp_path], check=True)
     return tmp_path
 
 
@@ -74,6 +78,46 @@ def test_marked_blocks_run_in_order(page, folder):
 
 def test_something_is_marked():
     assert {"docs/index.md", "docs/ci.md"} <= {_name(page) for page in MARKED}
+
+
+def test_the_tutorial_of_an_own_log_gives_the_options_that_it_uses(tmp_path, cli):
+    subprocess.run([sys.executable, ROOT / "docs" / "examples" / "own_bag.py", tmp_path], check=True)
+    said = cli("info", "own.bag", "--model", "target.stl", "--json", cwd=tmp_path)
+    options = " ".join(check["option"] for check in json.loads(said.out)["checks"] if check["option"])
+    text = (ROOT / "docs" / "your-own-log.md").read_text(encoding="utf-8")
+    assert f"run own.bag --model target.stl {options} -o results/ --report" in text
+    done = cli("run", "own.bag", "--model", "target.stl", *options.split(), "--json", cwd=tmp_path)
+    rows = json.loads(done.out)["rows"]
+    assert sum(row["gamma"] for row in rows) >= 0.9 * len(rows) == 0.9 * 42
+    assert max(row["pos_err_m"] for row in rows) < 0.01
+    assert max(row["rot_err_deg"] for row in rows) < 0.5
+
+
+def _installed(package, site):
+    """Put a package of one module where an installer puts it, with its entry points."""
+    project = tomllib.loads((package / "pyproject.toml").read_text(encoding="utf-8"))
+    (module,) = project["tool"]["setuptools"]["py-modules"]
+    info = site / f"{module}-{project['project']['version']}.dist-info"
+    info.mkdir(parents=True)
+    shutil.copy(package / f"{module}.py", site)
+    head = f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion: {project['project']['version']}\n"
+    (info / "METADATA").write_text(head, encoding="utf-8")
+    groups = project["project"]["entry-points"].items()
+    lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items()) for group, points in groups]
+    (info / "entry_points.txt").write_text("".join(lines), encoding="utf-8")
+
+
+def test_the_back_end_of_the_tutorial_keeps_the_contract(tmp_path):
+    _installed(ROOT / "docs" / "examples" / "own_backend", tmp_path / "site")
+    done = subprocess.run(
+        [sys.executable, "-m", "avsreplay", "backends", "--check", "own"],
+        env={**_environment(), "PYTHONPATH": str(tmp_path / "site")},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def _command_lines(page):

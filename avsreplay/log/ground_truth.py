@@ -20,12 +20,16 @@ TruthLookup = Callable[[int, int, str], Pose | None]
 
 @dataclass(frozen=True, slots=True)
 class GroundTruth:
-    """Lookups by time for one source; None if it has no such data. ``track`` is the truth if it is a single track."""
+    """Lookups by time for one source; None if it has no such data. ``track`` is the truth if it is a single track.
+
+    ``moving_in`` gives the root frame in which a frame moves, where the transforms were collected.
+    """
 
     truth: TruthLookup | None = None
     track: PoseTrack | None = None
     body: PoseTrack | None = None
     sensor: Callable[[int, str], Pose | None] | None = None
+    moving_in: Callable[[str], str | None] = lambda _frame: None
 
 
 @dataclass(slots=True)
@@ -47,12 +51,12 @@ class TruthCollector:
         self._truth, self._body, self._sensor = (PoseTrack(gap, by_log) for _ in range(3))
         self._tf = TfBuffer(gap, by_log)
 
-    def sinks(self) -> dict[str, Sink]:
-        """Return the sink of each topic."""
+    def sinks(self, *, transforms: bool = False) -> dict[str, Sink]:
+        """Return the sink of each topic; ``transforms``: collect those of the log also if no option names a frame."""
         out = {self.options.truth_topic or TRUTH_TOPIC: _poses_only(self._truth), BODY_TOPIC: _poses_only(self._body)}
         if self.options.sensor_topic is not None:
             out[self.options.sensor_topic] = _poses_only(self._sensor)
-        if self._wants_tf:
+        if self._wants_tf or transforms:
             out.update({"/tf": self._tf.sink(static=False), "/tf_static": self._tf.sink(static=True)})
         return out
 
@@ -72,7 +76,8 @@ class TruthCollector:
     def ground_truth(self) -> GroundTruth:
         """Return the lookups, after the log was read."""
         truth, track = self._truth_lookup()
-        return GroundTruth(truth, track, self._body if len(self._body) else None, self._sensor_lookup())
+        body = self._body if len(self._body) else None
+        return GroundTruth(truth, track, body, self._sensor_lookup(), self._tf.moving_in)
 
     @property
     def _wants_tf(self) -> bool:

@@ -75,7 +75,7 @@ def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None)
 
 def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | None) -> Source:
     collector = TruthCollector(options)
-    recording = _open_recording(path, options.max_message_mib << 20, collector.sinks(), upto)
+    recording = _open_recording(path, options.max_message_mib << 20, collector.sinks(transforms=inspect), upto)
     try:
         topics = recording.topics()
         collector.check(topics, shown(path))

@@ -263,6 +263,13 @@ class TfBuffer:
         """Return the names of all frames."""
         return sorted({*self._parents, *self._parents.values()})
 
+    def moving_in(self, frame: str) -> str | None:
+        """Return the root of the tree above a frame if the frame moves in it, else None."""
+        frame, moves, steps = frame.lstrip("/"), False, 0
+        while frame in self._parents and steps <= len(self._parents):
+            moves, frame, steps = moves or frame in self._moving, self._parents[frame], steps + 1
+        return frame if moves else None
+
     def pose(self, parent: str, child: str, t_ns: int) -> Pose | None:
         """Return T_parent_child at ``t_ns``, None if the frames are not connected or the gap is too wide."""
         up, down = self._to_root(parent.lstrip("/"), t_ns), self._to_root(child.lstrip("/"), t_ns)

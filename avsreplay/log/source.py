@@ -153,6 +153,10 @@ class Source:
         pose = None if lookup is None else lookup(scan.t_ns, place, scan.frame)
         return Truth(pose, self._body_at(scan.t_ns), self._fault(scan.log_ns))
 
+    def moving_in(self, frame: str) -> str | None:
+        """Return the root frame in which a frame moves; None if it is fixed or the transforms were not collected."""
+        return self._ground_truth.moving_in(frame)
+
     def payloads(self) -> Iterator[tuple[bytes | memoryview, str]]:
         """Yield the serialised cloud messages with their encoding; none for a folder."""
         for at in self._selected:
