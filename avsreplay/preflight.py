@@ -37,7 +37,8 @@ _UNITS = {
 }
 _POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
 _SAMPLED = 3000  # points of a scan that are grouped
-_LARGEST_SCENE = 50.0  # largest scan over the target in it, where the unit of the model is unknown
+_LARGEST_SCENE = 300.0  # largest scan over the target in it, where the unit of the model is unknown
+_GAPS = 0.2, 0.3  # within and around a target of unknown unit, over its diameter
 _MARGIN = 0.25  # of the model's diameter around the target in a suggested crop
 
 
@@ -183,28 +184,27 @@ def _unit(ratio: float) -> float | None:
 
 def _unit_and_background(clouds: Sequence[NDArray[Any]], model_m: float, ratio: float, said: str) -> list[Advice]:
     """The unit with which a group of points in most scans has the size of the model; empty if there is none."""
-    best: tuple[float, list[Advice]] | None = None
-    for scale, name in _UNITS.items():
+    for scale, name in _UNITS.items():  # the most frequent unit first
         if not _MOST < ratio / scale < _LARGEST_SCENE:
             continue
-        groups = [points for points in (_target(cloud, scale * model_m) for cloud in clouds) if points is not None]
-        if len(groups) * 2 <= len(clouds):
-            continue
-        off = abs(np.log(float(np.median([diameter(g, trimmed=False) for g in groups])) / (0.9 * scale * model_m)))
-        if best is None or off < best[0]:
+        size = scale * model_m
+        found = [[_target(cloud, size, gap) for gap in _GAPS] for cloud in clouds]
+        # a group that grows with the gap is a part of something larger
+        groups = [one for one, two in found if one is not None and two is not None and len(two) < 1.2 * len(one)]
+        if len(groups) * 2 > len(clouds):
             unit = Advice("fail", "unit", f"{said}: the model seems to be in {name}", f"--model-scale {scale:g}")
-            best = off, [unit, _crop_advice(clouds, groups, scale * model_m)]
-    return [] if best is None else best[1]
+            return [unit, _crop_advice(clouds, groups, size)]
+    return []
 
 
-def _target(cloud: NDArray[Any], model_m: float) -> Array | None:
-    """The largest connected group of points with the size of the model, None if there is none."""
+def _target(cloud: NDArray[Any], model_m: float, gap: float = 0.1) -> Array | None:
+    """The largest group of points with the size of the model, connected over gaps up to a share of it, or None."""
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import connected_components
     from scipy.spatial import cKDTree
 
     points = np.asarray(cloud[:: max(len(cloud) // _SAMPLED, 1)], dtype=np.float64)
-    edges = cKDTree(points).query_pairs(0.1 * model_m, output_type="ndarray")
+    edges = cKDTree(points).query_pairs(gap * model_m, output_type="ndarray")
     ones = np.ones(len(edges))
     graph = csr_matrix((ones, (edges[:, 0], edges[:, 1])), shape=(len(points), len(points)))
     _, member = connected_components(graph, directed=False)

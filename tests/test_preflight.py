@@ -115,6 +115,13 @@ def test_no_unit_is_guessed_where_none_fits(surface):
     assert "no common unit" in _found(found, "size").text
 
 
+def test_unit_and_background_are_found_together(surface):
+    small = dataclasses.replace(surface, vertices=0.001 * surface.vertices)
+    found = preflight(Log(_seen(surface, wall=True)), small)
+    assert _found(found, "unit").option == "--model-scale 1000"
+    assert _found(found, "background").option.startswith("--crop-")
+
+
 def test_no_model_asks_for_one(surface):
     assert _found(preflight(Log(_seen(surface)), None), "model").option == "--model FILE"
 
