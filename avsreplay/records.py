@@ -249,8 +249,7 @@ class Belief:
     """Mean and covariance of the state at an instant.
 
     Attributes:
-        P: (20, 20) covariance of [dq_v, w, rho_o, v, sigma, varrho, dmu_v]; dq_v, dmu_v are HALF-angle vectors,
-            q = dq (x) q_hat and mu = mu_hat (x) dmu in the paper's product.
+        P: (20, 20) covariance of the error states, see the package's docstring; dq_v and dmu_v are HALF-angle vectors.
     """
 
     t_ns: int
