@@ -208,7 +208,7 @@ class ResultWriter:
 
     def __enter__(self) -> ResultWriter:
         self._directory.__enter__()
-        self._log = ResultLogWriter(self._directory.file("result.mcap"), self._run.surface)
+        self._log = ResultLogWriter(self._directory.file("result.mcap"), self._run)
         return self
 
     def __exit__(
@@ -244,7 +244,7 @@ class ResultWriter:
             what = f"the interrupted run differs in: {', '.join(different)}"
             raise UsageError(what, where=f"--resume {folder}", hint=hint)
         rows, self._beliefs, self._view, known = self._run.restore(folder / CHECKPOINT)
-        self._log.resume(folder / "result.mcap", known)
+        self._log.resume(folder / "result.mcap", known, rows[-1])
         return list(rows)
 
     def finish(self, rows: Sequence[Row], record: Mapping[str, Any], *, interrupted: bool = False) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,12 @@ from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief, Surface
 from avsreplay.report.export import row_poses
-from avsreplay.run import ReplayedScan
+from avsreplay.rows import Row, columns
+from avsreplay.run import ReplayedScan, Run
+from avsreplay.settings import dump
 
 PATH_POINTS = 41
+RESIDUAL_REACH = 0.05  # of the model's extent: larger residuals in the viewer log are cut to this
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 _STREAMED_COLUMNS = ("pos_err_m", "rot_err_deg", "rms_m", "nis", "sigma1", "sigma2", "t_go_s", "gamma")
 
@@ -55,12 +59,14 @@ class NewPaths:
 class ResultLogWriter:
     """A listener that writes each scan's outcome to ``result.mcap``; ``close`` completes the file."""
 
-    def __init__(self, path: Path, surface: Surface) -> None:
-        self._log, self.paths = ResultLog(path, surface), NewPaths()
+    def __init__(self, path: Path, run: Run) -> None:
+        configuration = json.dumps(dump(run.config), sort_keys=True)
+        self._log, self.paths = ResultLog(path, run.surface, configuration), NewPaths()
+        self._registrar, self._reach_m = run.registrar, RESIDUAL_REACH * run.surface.extent
 
-    def resume(self, written: Path, paths: NewPaths) -> None:
-        """Take over the messages of the log of an interrupted run, and the plans that it has seen."""
-        self._log.copy(written)
+    def resume(self, written: Path, paths: NewPaths, last: Row) -> None:
+        """Take over the messages of the log of an interrupted run, the plans that it has seen and its last row."""
+        self._log.copy(written, last.reason)
         self.paths = paths
 
     def close(self) -> None:
@@ -83,8 +89,16 @@ class ResultLogWriter:
                 healthy=row.gamma == 1,
                 message=row.reason,
                 values=values,
+                residuals=self._registrar.distance(outcome.scan.points, outcome.pose, self._reach_m),
+                columns=_numbers(row),
             )
         )
+
+
+def _numbers(row: Row) -> dict[str, float]:
+    """The numeric columns of a row that have a value."""
+    found = ((column.name, getattr(row, column.name)) for column in columns())
+    return {name: float(value) for name, value in found if isinstance(value, (int, float))}
 
 
 class RerunStream:

@@ -113,7 +113,7 @@ def test_result_log_opens_in_rosbags_with_every_message(result):
             message = reader.deserialize(raw, connection.msgtype)
             seen.setdefault(connection.topic, []).append(message)
     assert {t: len(m) for t, m in seen.items() if t in ("/tf", "/points_aligned", "/diagnostics")} == {
-        "/tf": count,
+        "/tf": 2 * count,  # the estimate and the true pose
         "/points_aligned": count,
         "/diagnostics": count,
     }
@@ -123,6 +123,17 @@ def test_result_log_opens_in_rosbags_with_every_message(result):
     assert first.pose.pose.position.x == row["x_m"]
     assert np.linalg.eigvalsh(first.pose.covariance.reshape(6, 6)).min() > 0.0
     assert len(seen["/model"][0].points) % 3 == 0
+    assert seen["/truth/model"][0].header.frame_id == "target_true"
+    for name in ("nis", "pos_err_m", "gamma", "ogm_rank"):
+        values = [row[name] for row in document["rows"] if row[name] is not None]
+        assert [message.data for message in seen[f"/rows/{name}"]] == values
+    cloud = next(m for m in seen["/points_aligned"] if m.width)
+    assert [field.name for field in cloud.fields] == ["x", "y", "z", "residual"]
+    points = np.frombuffer(cloud.data.tobytes(), np.dtype([("p", "<f4", 3), ("residual", "<f4")]))
+    assert 0.0 < np.median(points["residual"]) < 0.02
+    reasons = [row["reason"] for row in document["rows"]]
+    changes = [b for a, b in zip([None, *reasons], reasons, strict=False) if a != b]
+    assert [message.msg for message in seen["/rosout"]] == changes
 
 
 def test_the_covariance_in_the_result_log_is_that_of_the_rows(result):

@@ -200,6 +200,7 @@ def point_cloud2(
     times_s: NDArray[Any] | None,
     point_type: str = "float32",
     intensities: NDArray[Any] | None = None,
+    residuals: NDArray[Any] | None = None,
 ) -> bytes:
     """Return a PointCloud2 of points.
 
@@ -210,10 +211,12 @@ def point_cloud2(
         times_s: (n,) [s after the stamp], the field ``t``; None: no such field.
         point_type: of the coordinates, ``float32`` or ``float64``.
         intensities: (n,), the field ``intensity``; None: no such field.
+        residuals: (n,) [m], the field ``residual``; None: no such field.
     """
     names = ["x", "y", "z"]
     formats = [f"<f{4 if point_type == 'float32' else 8}"] * 3
-    besides = [(name, values) for name, values in (("t", times_s), ("intensity", intensities)) if values is not None]
+    fields = (("t", times_s), ("intensity", intensities), ("residual", residuals))
+    besides = [(name, values) for name, values in fields if values is not None]
     names, formats = [*names, *(name for name, _ in besides)], [*formats, *("<f4" for _ in besides)]
     table = np.empty(len(points), dtype={"names": names, "formats": formats})
     for axis, name in enumerate("xyz"):
@@ -223,7 +226,7 @@ def point_cloud2(
     packer = Packer().header(t_ns, frame).u32(1).u32(len(points)).u32(len(names))
     for name in names:
         offset = int(table.dtype.fields[name][1]) if table.dtype.fields else 0
-        kind = 7 if name in ("t", "intensity") else _DATATYPE[point_type]
+        kind = 7 if name not in ("x", "y", "z") else _DATATYPE[point_type]
         packer.string(name).u32(offset).u8(kind).u32(1)
     step = table.dtype.itemsize
     return packer.u8(0).u32(step).u32(step * len(points)).octets(table.tobytes()).u8(1).bytes()

@@ -1,13 +1,14 @@
 """The result of a run as a log for viewers: MCAP, profile ros2, CDR only.
 
 Frames: ``map`` over ``camera`` (identity, so that a viewer finds a root) and ``target`` under ``camera`` at each
-estimate. The cloud is given in ``target``: if the estimate is right, it lies on the model.
+estimate, ``target_true`` at each true pose. The cloud is given in ``target``: if the estimate is right, it lies on the
+model; its field ``residual`` is the distance to it [m]. Each numeric column has a topic ``/rows/NAME``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, transform
 from avsreplay.records import Surface
 
-CAMERA, TARGET, ROOT = "camera", "target", "map"
+CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
 LIBRARY = "avsreplay"
 CHUNK_BYTES = 1 << 20
 _TRIANGLE_LIST, _POINTS = 11, 8  # visualization_msgs Marker types
@@ -32,7 +33,11 @@ _TOPICS = {
     "/truth/pose": "geometry_msgs/msg/PoseStamped",
     "/plan": "nav_msgs/msg/Path",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/truth/model": "visualization_msgs/msg/Marker",
+    "/rosout": "rcl_interfaces/msg/Log",
 }
+_ROWS = "/rows/"
+_INFO, _WARN = 20, 30  # levels of rcl_interfaces/msg/Log
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,6 +54,8 @@ class ResultFrame:
         healthy: gamma.
         message: the reason.
         values: scalars by name.
+        residuals: (n,) distances of the points to the model at the estimate [m].
+        columns: numeric columns of the row by name.
     """
 
     t_ns: int
@@ -61,17 +68,20 @@ class ResultFrame:
     healthy: bool
     message: str
     values: Mapping[str, float | int | str]
+    residuals: NDArray[Any] | None = None
+    columns: Mapping[str, float] = field(default_factory=dict)
 
 
 class ResultLog:
     """Writer of ``result.mcap``; ``close`` finishes the file. The bytes depend only on what is written."""
 
-    def __init__(self, path: Path, surface: Surface) -> None:
+    def __init__(self, path: Path, surface: Surface, configuration: str = "") -> None:
         """Create the file and write the model.
 
         Args:
             path: the file.
             surface: the target model, written as a marker.
+            configuration: of the run as JSON, stored as metadata.
 
         Raises:
             UnreadableInput: the file cannot be written.
@@ -87,7 +97,9 @@ class ResultLog:
             raise UnreadableInput(what, where=str(path), hint="check the folder and its rights") from None
         self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
         self._writer.start(profile="ros2", library=LIBRARY)
-        self._surface, self._count = surface, 0
+        if configuration:
+            self._writer.add_metadata("avsreplay", {"configuration": configuration})
+        self._surface, self._count, self._state = surface, 0, ""
         self._channels: dict[str, int] = {}
 
     def close(self) -> None:
@@ -104,7 +116,8 @@ class ResultLog:
         t = frame.t_ns
         if self._count == 0:
             self._append("/tf_static", t, transform(t, ROOT, CAMERA, Pose.identity()))
-            self._append("/model", t, _marker(t, self._surface))
+            self._append("/model", t, _marker(t, TARGET, self._surface))
+            self._append("/truth/model", t, _marker(t, TRUE, self._surface))
         self._count += 1
         self._append("/tf", t, transform(t, CAMERA, TARGET, frame.estimate))
         pose = Packer().header(t, CAMERA).pose(frame.estimate).f64s(*frame.covariance.ravel())
@@ -112,20 +125,29 @@ class ResultLog:
         for topic, known in (("/registration/pose", frame.registration), ("/truth/pose", frame.truth)):
             if known is not None:
                 self._append(topic, t, pose_stamped(t, CAMERA, known))
+        if frame.truth is not None:
+            self._append("/tf", t, transform(t, CAMERA, TRUE, frame.truth))
         aligned = frame.estimate.inverse().apply(frame.points)
-        self._append("/points_aligned", t, point_cloud2(t, TARGET, aligned, None))
+        self._append("/points_aligned", t, point_cloud2(t, TARGET, aligned, None, residuals=frame.residuals))
         if frame.path is not None:
             self._append("/plan", t, _path(t, *frame.path))
         self._append("/diagnostics", t, _status(frame))
+        for name, value in frame.columns.items():
+            self._append(_ROWS + name, t, Packer().f64s(value).bytes())
+        if frame.message != self._state:
+            self._append("/rosout", t, _said(frame))
+        self._state = frame.message
 
-    def copy(self, written: Path) -> None:
+    def copy(self, written: Path, state: str) -> None:
         """Append all messages of another log of this kind, so that this one continues it.
 
         Args:
             written: the other log.
+            state: message of its last scan.
         """
         from mcap.reader import NonSeekingReader
 
+        self._state = state
         with written.open("rb") as stream:
             for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
                 self._count = message.sequence
@@ -133,7 +155,7 @@ class ResultLog:
 
     def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
         if topic not in self._channels:
-            kind = _TOPICS[topic]
+            kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
             text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
             schema = self._writer.register_schema(kind, "ros2msg", text.encode())
             self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
@@ -157,12 +179,20 @@ def _status(frame: ResultFrame) -> bytes:
     return packer.bytes()
 
 
-def _marker(t_ns: int, surface: Surface) -> bytes:
-    """Return a visualization_msgs Marker: the triangles of the model, or its points, in ``target``."""
+def _said(frame: ResultFrame) -> bytes:
+    """Return a rcl_interfaces Log: whether the scan is used, or why not."""
+    level = _INFO if frame.healthy else _WARN
+    packer = Packer().i32(frame.t_ns // 10**9).u32(frame.t_ns % 10**9).u8(level).string("avsreplay")
+    return packer.string(frame.message).string("").string("").u32(0).bytes()
+
+
+def _marker(t_ns: int, frame: str, surface: Surface) -> bytes:
+    """Return a visualization_msgs Marker: the triangles of the model, or its points, in a frame."""
     faces = surface.faces
     corners = surface.vertices[faces.reshape(-1)] if len(faces) else surface.vertices
-    packer = Packer().header(t_ns, TARGET).string("model").i32(0).i32(_TRIANGLE_LIST if len(faces) else _POINTS)
-    packer.i32(0).pose(Pose.identity()).f64s(1.0, 1.0, 1.0).f32s(0.6, 0.65, 0.7, 0.5)  # action, pose, scale, colour
+    colour = (0.6, 0.65, 0.7, 0.5) if frame == TARGET else (0.2, 0.7, 0.6, 0.25)
+    packer = Packer().header(t_ns, frame).string("model").i32(0).i32(_TRIANGLE_LIST if len(faces) else _POINTS)
+    packer.i32(0).pose(Pose.identity()).f64s(1.0, 1.0, 1.0).f32s(*colour)  # action, pose, scale, colour
     packer.i32(0).u32(0).u8(1)  # lifetime (none), locked to its frame
     packer.u32(len(corners)).f64s(*corners.reshape(-1)).u32(0)  # points, no colours per point
     packer.string("").header(t_ns, "").string("").octets(b"").u32(0)  # no texture
