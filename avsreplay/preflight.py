@@ -24,6 +24,7 @@ from avsreplay.report.table import Table, TableCell
 SCANS = 5
 _POSES = 200  # measured poses examined
 _LEAST, _MOST = 0.25, 1.3  # diameter of a scan over that of the model outside which something is wrong
+_LEFT_OVER = 2.0  # below it some background explains too large a scan better than feet (3.28) do
 _ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
 _UNITS = {
     0.001: "millimetres",
@@ -154,7 +155,8 @@ def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None) -> list[Advi
         return [Advice("check", "scans", "the examined scans hold no points")]
     scan_m = float(np.median([diameter(cloud) for cloud in clouds]))
     if surface is None:
-        return [Advice("fail", "model", f"there is no model; the scans measure {scan_m:.3g} m", "--model FILE")]
+        text = f"there is no model; the scans measure {scan_m:.3g} m"
+        return [Advice("fail", "model", text, "--model FILE or --model auto")]
     model_m = diameter(surface.vertices, trimmed=False)
     ratio = scan_m / model_m if model_m else np.inf
     said = f"the scans measure {scan_m:.3g} m, the model {model_m:.3g} m"
@@ -164,6 +166,9 @@ def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None) -> list[Advi
     inside = [points for points in targets if points is not None]
     if len(inside) * 2 > len(clouds):
         return [_crop_advice(clouds, inside, model_m)]
+    if _MOST < ratio < _LEFT_OVER:
+        text = f"{said}: points around the target seem to be left; a narrower --crop-box or --crop-range removes them"
+        return [Advice("check", "background", text)]
     scale = _unit(ratio)
     if scale is None and (both := _unit_and_background(clouds, model_m, ratio, said)):
         return both

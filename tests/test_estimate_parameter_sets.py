@@ -70,3 +70,5 @@ def test_the_command_prints_one_document() -> None:
     assert len(found["lines"]) == 3
     assert found["lines"][-1]["two"]["of"] == 20
     assert set(found["weakest"]) == {"two", "three", "known"}
+    keys = set(found["lines"][-1]["two"])  # the Gramian of the rows is another one, which has other names
+    assert keys == {"rank_fitted_motion", "of", "log10_cond_fitted_motion", "log10_cond_scaled_fitted_motion"}

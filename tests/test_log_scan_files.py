@@ -74,6 +74,15 @@ def test_scans_are_ordered_by_number_at_one_hertz(tmp_path: Path) -> None:
     assert [s.t_ns for s in thinned] == [s.t_ns for s in found][::2], "every second scan keeps its own time"
 
 
+def test_the_file_of_the_model_is_not_a_scan(tmp_path: Path) -> None:
+    for name in ("a1.ply", "a2.ply", "model.ply"):
+        trimesh.creation.box().export(tmp_path / name)
+    with open_source(tmp_path, SourceOptions(model=tmp_path / "model.ply")) as source:
+        assert len(source) == 2
+    with open_source(tmp_path, SourceOptions()) as source:
+        assert len(source) == 3
+
+
 def test_times_from_a_file_from_names_and_from_poses(tmp_path: Path) -> None:
     for stem in ("0", "1", "2"):
         np.save(tmp_path / f"{stem}.npy", POINTS)

@@ -122,8 +122,39 @@ def test_unit_and_background_are_found_together(surface):
     assert _found(found, "background").option.startswith("--crop-")
 
 
+def test_some_background_around_the_target_is_not_taken_for_a_unit(surface):
+    """A scan of about 1.5 times the model's diameter is not said to be in feet."""
+    far = 1.6 * diameter(surface.vertices, trimmed=False)
+    clouds = []
+    for cloud in _seen(surface):
+        line = cloud.mean(axis=0) + np.outer(np.linspace(-0.5, 0.5, len(cloud) // 2), [far, 0.0, 0.0])
+        clouds.append(np.concatenate([cloud, line]))
+    found = preflight(Log(clouds), surface)
+    assert all(advice.about != "unit" and "--model-scale" not in advice.option for advice in found)
+    assert "around the target" in _found(found, "background").text
+
+
+def test_info_with_a_model_built_from_the_scans(cli, tmp_path):
+    for k in range(2):
+        np.save(tmp_path / f"{k}.npy", np.random.default_rng(k).normal(size=(50, 3)).astype("f4"))
+    done = cli("info", tmp_path, "--model", "auto", "--json")
+    assert done.code == 0, done.err
+    (model,) = [a for a in json.loads(done.out)["checks"] if a["about"] == "model"]
+    assert (model["grade"], model["option"]) == ("ok", "--model auto")
+
+
+def test_info_says_why_a_run_refuses_a_log_without_scans(cli, shared_data):
+    bag = shared_data / "ros1-bags" / "ouster_512x10_raw.bag"
+    done = cli("info", bag, "--json")
+    assert done.code == 0, done.err
+    (scans,) = json.loads(done.out)["checks"]
+    assert scans["grade"] == "fail"
+    assert "raw sensor packets" in scans["text"]
+    assert scans["text"] in cli("run", bag, "--model", "auto").err
+
+
 def test_no_model_asks_for_one(surface):
-    assert _found(preflight(Log(_seen(surface)), None), "model").option == "--model FILE"
+    assert _found(preflight(Log(_seen(surface)), None), "model").option == "--model FILE or --model auto"
 
 
 def test_empty_scans_are_said():

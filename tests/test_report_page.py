@@ -588,6 +588,22 @@ def test_a_value_between_two_scans_without_one_is_drawn(opened, make_rows):
 
 
 @pytest.mark.slow
+def test_on_a_narrow_screen_a_wide_table_scrolls_and_keeps_the_names_of_its_rows(opened):
+    browser = opened(width=390)
+    script = """const box = [...document.querySelectorAll('.scroll')].find((b) => b.scrollWidth > b.clientWidth + 40);
+    box.scrollLeft = 1e6;
+    const at = box.getBoundingClientRect(), row = box.querySelector('tbody tr');
+    const head = row.firstElementChild.getBoundingClientRect(), last = row.lastElementChild.getBoundingClientRect();
+    return [head.left - at.left, at.right - last.right, getComputedStyle(box).backgroundImage,
+            document.documentElement.scrollWidth];"""
+    name, end, shadow, width = browser.execute_script(script)
+    assert -10 <= name <= 10  # the first column stays at the left edge
+    assert end >= 0  # the last column can be reached
+    assert shadow.count("gradient") == 2  # a shadow shows that there is more
+    assert width <= 390
+
+
+@pytest.mark.slow
 def test_zoom_and_scan_are_in_the_address(opened):
     browser = opened()
     _slide(browser, 10)

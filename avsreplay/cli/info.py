@@ -14,7 +14,7 @@ from avsreplay.cli.options import pose_options, read_options, source_options
 from avsreplay.cli.setting_options import source_setting
 
 if TYPE_CHECKING:
-    from avsreplay.log import ClockSummary, LogInfo, Loss
+    from avsreplay.log import ClockSummary, LogInfo, Loss, Source
     from avsreplay.preflight import Advice
     from avsreplay.report.table import Table
 
@@ -50,11 +50,14 @@ def command(source: Path, as_json: bool, **reading: Any) -> None:
     """  # noqa: D301
     from avsreplay.errors import DataLost
     from avsreplay.log import open_source
-    from avsreplay.preflight import preflight
 
-    with open_source(source, read_options(reading), inspect=True) as opened:
+    options = read_options(reading)
+    built = options.model == Path("auto")
+    if built:
+        options = dataclasses.replace(options, model=None)
+    with open_source(source, options, inspect=True) as opened:
         info = opened.info()
-        advice = preflight(opened, opened.header.surface) if info.cloud_topic or info.scans else []
+        advice = _advice(opened, built)
     if as_json:
         checks = [dataclasses.asdict(a) for a in advice]
         click.echo(json.dumps({**_document(info), "checks": checks}, indent=2))
@@ -63,6 +66,30 @@ def command(source: Path, as_json: bool, **reading: Any) -> None:
     if info.losses:
         what = f"{len(info.losses)} part(s) could not be read"
         raise DataLost(what, where=info.path, hint="run avsreplay doctor for details")
+
+
+def _advice(opened: Source, built: bool) -> list[Advice]:
+    """The checks before a run; for a log without a topic of scans, why a run would refuse it.
+
+    Args:
+        opened: the log, opened for inspection.
+        built: the model is to be built from the scans.
+    """
+    from avsreplay.errors import AvsError
+    from avsreplay.log import open_source
+    from avsreplay.preflight import Advice, preflight
+
+    info = opened.info()
+    if info.cloud_topic or info.scans:
+        found = preflight(opened, opened.header.surface)
+        text = "'avsreplay run' builds it from the scans if these show several sides of the target"
+        auto = Advice("ok", "model", text, "--model auto")
+        return [auto if built and a.about == "model" else a for a in found]
+    try:
+        open_source(opened.path, opened.options).close()
+    except AvsError as error:
+        return [Advice("fail", "scans", f"{error.what}; {error.hint}" if error.hint else error.what)]
+    return []
 
 
 def _document(info: LogInfo) -> dict[str, Any]:

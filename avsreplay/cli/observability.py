@@ -27,7 +27,9 @@ Examples:
 
 \b
 The log is replayed, one motion is fitted to all healthy poses, and the observability Gramian is summed along that
-motion: with sigma1 and sigma2 as parameters, with three independent sigma, and with all parameters known."""
+motion: with sigma1 and sigma2 as parameters, with three independent sigma, and with all parameters known.
+The columns ogm_rank and ogm_log10_cond of 'run' are another quantity: the Gramian along the estimates available at
+each scan. The keys of the JSON document therefore end in _fitted_motion."""
 
 
 @click.command("observability", epilog=EPILOG)
@@ -101,10 +103,10 @@ def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[
             folds[name] = observe(folds[name], Phi, H, _noise(row))
             found = measure(folds[name])
             line[name] = {
-                "rank": found.rank,
+                "rank_fitted_motion": found.rank,
                 "of": found.size,
-                "log10_cond": found.log10_cond,
-                "log10_cond_scaled": found.log10_cond_scaled,
+                "log10_cond_fitted_motion": found.log10_cond,
+                "log10_cond_scaled_fitted_motion": found.log10_cond_scaled,
             }
         lines.append(line)
     return lines, folds
@@ -129,7 +131,7 @@ def _print(found: dict[str, Any]) -> None:
         (f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name]))) for line in found["lines"]
     )
     console = make_console(plain_width=WIDTH)
-    note = "'run' sums the Gramian along the estimates available at each scan, so that its values differ from these"
+    note = "ogm_rank and ogm_log10_cond of 'run' are along the estimates available at each scan, and differ from these"
     print_table(console, Table(title, ("t\n[s]", *heads), rows, align="r", note=note))
     for name, words in found["weakest"].items():
         if words:
@@ -139,6 +141,6 @@ def _print(found: dict[str, Any]) -> None:
 def _cells(found: dict[str, Any]) -> tuple[str, str, str]:
     from avsreplay.report.table import number
 
-    conditions = (number(found[name], ".2f") for name in ("log10_cond", "log10_cond_scaled"))
-    raw, scaled = conditions
-    return f"{found['rank']}/{found['of']}", raw, scaled
+    names = ("log10_cond_fitted_motion", "log10_cond_scaled_fitted_motion")
+    raw, scaled = (number(found[name], ".2f") for name in names)
+    return f"{found['rank_fitted_motion']}/{found['of']}", raw, scaled

@@ -305,7 +305,7 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     pose_file = options.truth_file or _pose_file(path)
     by_name = read_conf(pose_file) if pose_file is not None and pose_file.suffix == ".conf" else {}
     found = read_poses(pose_file) if pose_file is not None and not by_name else None
-    files = scan_files(path, tuple(by_name))
+    files = scan_files(path, tuple(by_name), options.model)
     times = _times(path, files, found)
     clouds = FolderClouds(files, options.rate_hz, options.max_message_mib << 20, times)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)

@@ -102,12 +102,13 @@ SCAN_FORMATS = tuple(_READERS)
 _NUMBER = re.compile(r"\d+")
 
 
-def scan_files(folder: Path, names: Sequence[str] = ()) -> list[Path]:
+def scan_files(folder: Path, names: Sequence[str] = (), model: Path | None = None) -> list[Path]:
     """Return the scans of a folder, sorted by the numbers in their names, then by name.
 
     Args:
         folder: the folder.
         names: the files to use; if empty, all files of the most frequent known format.
+        model: file of the model, which is not a scan if it lies in the folder and ``names`` is empty.
 
     Raises:
         UnreadableInput: there are no scans, or a named file does not exist.
@@ -123,6 +124,8 @@ def scan_files(folder: Path, names: Sequence[str] = ()) -> list[Path]:
             )
         return sorted((folder / n for n in names), key=lambda p: by_number(p.name))
     found = [p for p in folder.iterdir() if p.is_file() and p.suffix.lower() in SCAN_FORMATS]
+    if model is not None and model.exists():
+        found = [p for p in found if not p.samefile(model)]
     if not found:
         hint = f"scans are {', '.join(SCAN_FORMATS)} files; a log is an MCAP or a ROS bag"
         raise UnreadableInput("no scans in this folder", where=shown(folder), hint=hint)

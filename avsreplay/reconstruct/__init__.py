@@ -141,7 +141,7 @@ def _refuse_still(turned: float, weakest: Sequence[float]) -> None:
         what = f"the scans show a turn of {np.degrees(turned):.1f} deg only"
         known = float(np.median(weakest)) > WEAKEST
         why = "the target is at rest" if known else "its surface does not determine its attitude, as that of a sphere"
-        raise UnreadableInput(f"{what}: {why}", hint="a model needs scans of several sides")
+        raise UnreadableInput(f"{what}: {why}", hint="a model needs scans of several sides; give one with --model FILE")
 
 
 def _notes(used: int, offered: int, coverage: float) -> tuple[str, ...]:

@@ -235,7 +235,8 @@ def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     if seen.rank is not None:
         full = "never full" if seen.full_rank_s is None else f"full from {seen.full_rank_s:.2f} s"
         raw, scaled = (number(value, ".1f", "none") for value in (seen.log10_cond, seen.log10_cond_scaled))
-        yield "Gramian", f"rank {seen.rank} of 20 ({full}); log10 condition {raw} raw, {scaled} scaled"
+        along = "along the estimates"
+        yield "Gramian", f"{along}: rank {seen.rank} of 20 ({full}); log10 condition {raw} raw, {scaled} scaled"
 
 
 def _plan_facts(summary: Summary) -> Iterable[tuple[str, str]]:

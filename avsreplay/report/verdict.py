@@ -84,7 +84,9 @@ class RunVerdict:
         if not self.reasons:
             return f"{self.grade.value}: no reason for concern was found."
         more = len(self.reasons) - 3
-        texts = [reason.text for reason in self.reasons[:3]] + ([f"{more} more reasons"] if more > 0 else [])
+        texts = [reason.text for reason in self.reasons[:3]] + (
+            [f"{more} more reason{'s' * (more > 1)}"] if more > 0 else []
+        )
         return f"{self.grade.value}: {'; '.join(texts)}."
 
     def record(self) -> dict[str, Any]:
