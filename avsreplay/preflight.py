@@ -269,7 +269,8 @@ def _clock(info: LogInfo) -> list[Advice]:
         f"{getattr(clock, name)} {name}" for name in ("unset", "jumps", "back", "equal") if getattr(clock, name)
     ]
     if not problems:
-        return [Advice("ok", "time stamps", f"median period {clock.period_s:.4g} s")]
+        text = f"median period {clock.period_s:.4g} s" if clock.period_s else "no period: a single scan"
+        return [Advice("ok", "time stamps", text)]
     option = "--clock log" if clock.clock == "header" else ""
     return [Advice("check", "time stamps", f"time stamps of scans: {', '.join(problems)}", option)]
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
     from avsreplay.log import GrowingLog
+    from avsreplay.preflight import Advice
     from avsreplay.report.golden import GoldenResult
     from avsreplay.report.summary import Summary
     from avsreplay.report.verdict import RunVerdict
@@ -158,14 +159,14 @@ def _job(log: Path, flags: dict[str, Any]) -> Job:
     return Job(source=log, options=read_options(flags), config_file=config_file, assignments=assignments)
 
 
-def _checked(run: Run) -> list[str]:
+def _checked(run: Run) -> list[Advice]:
     """Check the log before the replay: findings are printed on stderr, and are reasons of the verdict."""
     from avsreplay.preflight import preflight
 
     found = [advice for advice in preflight(run.source, run.surface, run.registrar) if advice.grade != "ok"]
     for advice in found:
         click.echo(f"avsreplay: {advice.about}: {advice.sentence}", err=True)
-    return [advice.sentence for advice in found]
+    return found
 
 
 class Outdated(Exception):
@@ -183,7 +184,7 @@ class _Finished:
     scans_per_s: float
 
 
-def _replayed(run: Run, advice: list[str], target: ResultDirectory | None, wanted: Wanted) -> _Finished:
+def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wanted: Wanted) -> _Finished:
     """Replay the log; ``target`` receives all results. An interrupt ends the replay and keeps what there is."""
     from avsreplay.cli.progress import tracked
     from avsreplay.report.verdict import verdict_of
@@ -210,7 +211,7 @@ def _replayed(run: Run, advice: list[str], target: ResultDirectory | None, wante
             viewer.close()
         summary = run.summary()
         record = _record(run, summary)
-        record["preflight"] = [*advice, *_model_notes(run)]
+        record["preflight"] = [*(a.sentence for a in advice), *_model_notes(run, advice)]
         if interrupted:
             record["interrupted_after"] = len(rows)
             how = "; add --resume to continue" if target else ""
@@ -231,8 +232,10 @@ def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
     return rows
 
 
-def _model_notes(run: Run) -> tuple[str, ...]:
-    """Return the findings on the model from the rows; they are also printed on stderr."""
+def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
+    """Return the findings on the model from the rows, unless its unit is wrong; they are also printed on stderr."""
+    if any(a.about == "unit" for a in advice):
+        return ()
     notes = run.model_check.notes()
     for note in notes:
         click.echo(f"avsreplay: model: {note}", err=True)
