@@ -298,3 +298,23 @@ def test_a_stray_vertex_within_the_limit_is_indexed(size: float) -> None:
     index = SurfaceIndex.build(Surface(vertices, faces, "boxes", ""), 0.5)
     q = on(mesh, 50, 30)
     assert np.sqrt(index.closest(q).d2).max() < 1e-9 * size
+
+
+def test_closest_point_on_a_dense_mesh() -> None:
+    """A point beyond a face of a convex surface, along the normal at the centroid, has that centroid as its foot.
+
+    The mesh is so fine that the first grid of the index has too many entries and a narrower one is built.
+    """
+    trimesh = pytest.importorskip("trimesh")
+    ball = trimesh.creation.icosphere(subdivisions=7)
+    surface = Surface(np.asarray(ball.vertices, float), np.asarray(ball.faces, np.int32), "ball", "")
+    index = SurfaceIndex.build(surface, 0.3)
+    chosen = np.arange(0, len(surface.faces), 97)
+    middle = surface.vertices[surface.faces[chosen]].mean(axis=1)
+    normal = np.asarray(ball.face_normals)[chosen]
+    for height in (1e-4, 0.004, 0.02, 0.1):
+        found = index.closest(middle + height * normal)
+        np.testing.assert_array_equal(found.id, chosen)
+        np.testing.assert_allclose(found.foot, middle, atol=1e-9)
+        np.testing.assert_allclose(found.d2, height**2, rtol=1e-6)
+    assert not np.any(index.closest(middle + 0.31 * normal).id >= 0)

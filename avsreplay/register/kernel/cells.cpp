@@ -10,9 +10,18 @@ namespace {
 
 constexpr double CELL_OF_GRAIN = 0.25;          // a cell's side over the median diagonal of a block
 constexpr double FINEST = 1.0 / 256, COARSEST = 1.0 / 32;  // and over the extent, at least and at most
+constexpr double FINEST_NARROW = 1.0 / 1024;     // the same for the cells of NARROW: bounds the number of bricks
 constexpr double BAND_OF_EXTENT = 0.01, BAND_OF_CELL = 3.0;  // cells so near to the surface have a list
 constexpr int64_t BLOCKS_A_TASK = 64;
-constexpr size_t MOST_NEAR = 6'000'000;  // pairs of a cell and a block; where there are more the cells are made larger
+constexpr size_t MOST_NEAR = 6'000'000;  // pairs of a cell and a block; where there are more another grid is tried
+constexpr uint32_t SAMPLE = 16;          // one block in so many gives the estimate of the number of pairs
+
+// Side of a cell over the median diagonal of a block, and band over the side. Where the first grid has too many pairs
+// these are tried before its cells are made larger: a cell as large as a block or larger is near to more blocks than a
+// list holds, so the lists of such a grid are incomplete and every search needs the tree as well.
+constexpr struct {
+  double cell_of_grain, band_of_cell;
+} NARROW[] = {{0.35, 1.0}, {0.5, 0.5}};
 
 // Lays the grid over the model for a given cell.
 void set_grid(Store& s, const Box& box, double cell, double band) {
@@ -51,6 +60,14 @@ bool gather(const Store& s, const Code& code, Team& team, float band, std::vecto
   size_t total = 0;
   for (const auto& p : parts) total += p.size();
   return good && total <= MOST_NEAR;
+}
+
+// Whether the number of pairs, estimated from a part of the blocks, is within the limit.
+bool seems_few(const Store& s, const Code& code, float band) {
+  std::vector<Near> pairs;
+  for (uint32_t k = 0; k < s.blocks; k += SAMPLE)
+    if (!code.cells(s, k, band, MOST_NEAR / SAMPLE, pairs)) return false;
+  return true;
 }
 
 // Numbers the bricks that are used and counts the entries of each cell; returns where each cell's entries begin.
@@ -94,14 +111,21 @@ void write_lists(Store& s, const std::vector<std::vector<Near>>& parts) {
 void build_cells(Store& s, const Code& code, Team& team) {
   if (s.blocks >= MOST_BLOCKS || !(s.extent > 0)) return;
   const Box box = root_box(s);
-  double cell = std::min(std::max(CELL_OF_GRAIN * s.grain, FINEST * s.extent), COARSEST * s.extent);
-  for (; cell < s.extent; cell *= 1.5) {
-    const double band = std::min(s.reach, std::min(BAND_OF_EXTENT * s.extent, BAND_OF_CELL * cell));
+  const auto made = [&](double cell, double band) {
     std::vector<std::vector<Near>> parts;
     set_grid(s, box, cell, band);
-    if (!gather(s, code, team, (float)band, parts)) continue;
+    if (!seems_few(s, code, (float)band) || !gather(s, code, team, (float)band, parts)) return false;
     write_lists(s, parts);
-    return;
+    return true;
+  };
+  const double first = std::min(std::max(CELL_OF_GRAIN * s.grain, FINEST * s.extent), COARSEST * s.extent);
+  for (double cell = first; cell < s.extent; cell *= 1.5) {
+    if (made(cell, std::min(s.reach, std::min(BAND_OF_EXTENT * s.extent, BAND_OF_CELL * cell)))) return;
+    if (cell > first) continue;
+    for (const auto& n : NARROW) {
+      const double side = n.cell_of_grain * s.grain;
+      if (side > FINEST_NARROW * s.extent && made(side, std::min(s.reach, n.band_of_cell * side))) return;
+    }
   }
   s.cell = 0, s.top.clear();
 }

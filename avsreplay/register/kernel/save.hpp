@@ -7,7 +7,7 @@
 
 namespace avs {
 
-constexpr uint32_t LAYOUT = 3;  // raise with any change of what is stored or how it is built
+constexpr uint32_t LAYOUT = 4;  // raise with any change of what is stored or how it is built
 
 std::string save(const Store& store);
 // False where the bytes are no sound Store of `primitives` faces or points of a surface with `ids` of them.
