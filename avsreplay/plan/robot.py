@@ -161,7 +161,7 @@ class RobotParams(Settings):
         "Largest distance of the end-effector from the base.",
         unit="m",
         above=0.0,
-        unset="the reach of the arm, else limits.reach_max_m",
+        unset="limits.reach_max_m",
     )
     reach_min_m: float | None = setting(
         None, "Smallest distance of the end-effector from the base.", unit="m", above=0.0, unset="limits.reach_min_m"
@@ -172,8 +172,6 @@ class RobotParams(Settings):
     thrust_noise: float = setting(
         0.0, "1 sigma of the thrust error of each axis, as a fraction of the largest thrust, over 1 s.", low=0.0
     )
-    urdf: str = setting("", "URDF file of a manipulator on the base; needs the extra 'arm'.")
-    tool: str = setting("", "Frame of the URDF that is the end-effector; the last one where empty.")
 
     def check(self) -> None:
         """Raise ValueError where values contradict each other."""

@@ -347,7 +347,7 @@ def views(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
 def shared(*path: str) -> Surface | None:
     """A mesh of the shared test data, or None where the data is not there."""
     file = Path(__file__).resolve().parents[2].parent.joinpath("shared", "data", *path)
-    file = file if file.exists() else Path(os.environ.get("AVSREPLAY_SHARED_DATA", "")).joinpath(*path)
+    file = file if file.exists() else Path(os.environ.get("SHARED_DATA", "")).joinpath(*path)
     if not file.is_file():
         print(f"left out: {path[-1]} (not there)")
         return None
