@@ -162,6 +162,13 @@ def test_a_guess_that_is_returned_unchanged_is_no_measurement(monkeypatch, surfa
         assert "unchanged" in found.message
 
 
+def test_a_scan_beside_the_target_is_no_failure_of_the_back_end(registrar: Registrar, scan: np.ndarray) -> None:
+    guess = example_pose()
+    found = registrar.register(scan + np.array([40.0, 0.0, 0.0]), guess)
+    assert (found.status, found.message) == (AlignStatus.NO_OVERLAP, "")
+    np.testing.assert_allclose(found.T_ac.t, guess.t, atol=1e-12)
+
+
 def test_a_false_claim_of_convergence_is_found(monkeypatch, surface: Surface, scan: np.ndarray) -> None:
     monkeypatch.setattr("avsreplay.register.registrar.load_backend", lambda name: _NearGuess)
     found = Registrar(surface).register(scan, _off(0.4))

@@ -39,6 +39,14 @@ def test_no_cell_is_cut_at_80(make_rows):
         assert "…" not in _printed(make_rows(n))
 
 
+def test_every_parameter_is_named_at_80(make_rows):
+    known = {"ixx": 0.4, "iyy": 0.3, "izz": 0.3, "ixy": 0.0051, "ixz": -0.0123, "iyz": -0.0451, "inertia_1s": 0.01}
+    text = _printed(make_rows(5, **known))
+    for name, value in zip(("xx", "yy", "zz", "xy", "xz", "yz"), list(known.values())[:6], strict=True):
+        line = next(line for line in text.splitlines() if line.startswith(f"inertia / trace in {{C}} {name}"))
+        assert f"{value:.4f}" in line
+
+
 def test_no_escape_codes_off_a_terminal(make_rows):
     assert "\x1b" not in _printed(make_rows(30))
 

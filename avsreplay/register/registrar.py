@@ -227,14 +227,15 @@ class Registrar:
             return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
         start = guess.inverse()
-        if (fit.T_ca.q.tobytes(), fit.T_ca.t.tobytes()) == (start.q.tobytes(), start.t.tobytes()):
-            found = quality.evidence(self._index, self._visibility, scan, start, limits.gate_m, self.params.noise_m)
-            if found.inliers and quality.unchanged_without_reason(found):
-                message = (
-                    f"back end '{self.params.backend}' returned its guess unchanged; the scan asks for another pose"
-                )
-                return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=message)
-        return quality.grade(self._index, self._visibility, scan, fit, limits, self.params, halves)
+        graded = quality.grade(self._index, self._visibility, scan, fit, limits, self.params, halves)
+        same = (fit.T_ca.q.tobytes(), fit.T_ca.t.tobytes()) == (start.q.tobytes(), start.t.tobytes())
+        if not (same and graded.measured):  # a guess that is kept for lack of overlap is no error of the back end
+            return graded
+        found = quality.evidence(self._index, self._visibility, scan, start, limits.gate_m, self.params.noise_m)
+        if not quality.unchanged_without_reason(found):
+            return graded
+        message = f"back end '{self.params.backend}' returned its guess unchanged; the scan asks for another pose"
+        return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=message)
 
     def _align(self, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | str:
         """Run the back end; what it raises, or a result of another type, becomes the status FAILED with this text."""

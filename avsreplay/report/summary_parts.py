@@ -149,7 +149,7 @@ def _in_fixture_frame(row: Row, truth: State | None) -> list[Parameter | None]:
     small = (row.moment_small, row.moment_middle, row.moment_large)
     entries = (row.ixx, row.iyy, row.izz, row.ixy, row.ixz, row.iyz)
     return [
-        _vector("moments / sum, ascending", "", small, moments, row.moments_1s),
+        _vector("moments / sum, ascending: 1 2 3", "", small, moments, row.moments_1s),
         _vector("inertia / trace in {C}: xx yy zz xy xz yz", "", entries, tensor, row.inertia_1s),
         _vector("mass centre in {C}", "m", (row.com_x_m, row.com_y_m, row.com_z_m), centre, row.com_1s_m),
     ]

@@ -130,17 +130,24 @@ def _verdict(episode: Episode) -> TableCell:
 
 
 def parameter_table(summary: Summary) -> Table:
-    """Estimated constants against the true ones."""
+    """Estimated constants against the true ones, one row for each component."""
     heads = ("parameter", "unit", "estimate", "truth", "error", "1 sigma")
-    rows = tuple((p.name, p.unit, *_parameter_values(p)) for p in summary.parameters)
-    return Table("Parameters at the last scan", heads, rows, align="llr")
+    rows = tuple(row for p in summary.parameters for row in _parameter_rows(p))
+    note = "error and 1 sigma of a vector are those of all its components together, given in its first row"
+    return Table("Parameters at the last scan", heads, rows, align="llr", note=note)
 
 
-def _parameter_values(p: Parameter) -> list[str]:
+def _parameter_rows(p: Parameter) -> list[tuple[str, ...]]:
+    name, _, listed = p.name.partition(": ")
+    components = listed.split() or ["x", "y", "z"] if len(p.estimate) > 1 else [""]
+    truth = p.truth or (None,) * len(p.estimate)
     sigma = "undetermined" if p.undetermined else number(p.one_sigma, ".4f", "")
-    scalars = [number(p.error, ".4f", ""), sigma]
-    vectors = ["" if v is None else " ".join(f"{x:.4f}" for x in v) for v in (p.estimate, p.truth)]
-    return [*vectors, *scalars]
+    rows = []
+    for k, component in enumerate(components):
+        last = (number(p.error, ".4f", ""), sigma) if k == 0 else ("", "")
+        label = f"{name} {component}".rstrip()
+        rows.append((label, p.unit, number(p.estimate[k], ".4f"), number(truth[k], ".4f", ""), *last))
+    return rows
 
 
 def in_one_line(summary: Summary) -> str:

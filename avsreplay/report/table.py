@@ -116,7 +116,7 @@ def _rich(console: Console, table: Table, tight: bool) -> RichTable:
     for k, head in enumerate(table.heads):
         right = table.right(k)
         justify = "right" if right else "left"
-        drawn.add_column(Text(head), justify=justify, no_wrap=right or tight, overflow="fold", vertical="bottom")  # type: ignore[arg-type]
+        drawn.add_column(Text(head), justify=justify, no_wrap=right or tight, overflow="fold", vertical="top")  # type: ignore[arg-type]
     for row in table.rows:
         drawn.add_row(*(_text(as_cell(cell), console) for cell in row))
     return drawn

@@ -275,10 +275,11 @@ def _robot(header: Mapping[str, Any]) -> str:
     plan = (header.get("config") or {}).get("plan") or {}
     if not plan:
         return ""
-    name = header.get("robot") or "default robot"
+    if header.get("robot"):
+        return str(header["robot"])
     facts = [f"a_max {plan['a_max_mps2']:g} m/s2"] if isinstance(plan.get("a_max_mps2"), (int, float)) else []
     facts += [f"latency {plan['latency_s']:g} s"] if isinstance(plan.get("latency_s"), (int, float)) else []
-    return ", ".join([name, *facts])
+    return ", ".join(["default robot", *facts])
 
 
 def worst_moments(rows: Sequence[Row]) -> list[Moment]:
