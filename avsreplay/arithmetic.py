@@ -5,6 +5,8 @@ has variants of the elementary functions with fused multiply-add. They round dif
 when the libraries are loaded, choose the variants that every processor with SSE4.2 has. The command line sets them and
 starts itself once more, because the C library reads its variable when the process starts. Other processes inherit them.
 
+OpenBLAS runs on one thread on every system, because the result of a product on several threads depends on their number.
+
 ``AVSREPLAY_ARITHMETIC=native`` leaves the choice to the libraries: faster, with bytes that depend on the processor.
 """
 
@@ -23,6 +25,8 @@ PINS = {
     "NPY_DISABLE_CPU_FEATURES": f"{_NUMPY} AVX512_SPR X86_V3 X86_V4",
     "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-AVX2,-FMA,-FMA4,-AVX2_Usable,-FMA_Usable,-FMA4_Usable",
 }
+
+THREADS = "OPENBLAS_NUM_THREADS"
 
 
 def available() -> bool:
@@ -47,6 +51,7 @@ def pin() -> None:
     Does nothing where ``AVSREPLAY_ARITHMETIC=native`` is set, where the system has no such variants, or where numpy
     has been imported, because it is too late then.
     """
+    os.environ[THREADS] = "1"  # the sums of a product on several threads depend on their number
     if os.environ.get(VARIABLE) == "native" or "numpy" in sys.modules or not sys.executable or not available():
         return
     glibc = os.environ.get("GLIBC_TUNABLES", "")

@@ -60,7 +60,9 @@ class ResultLogWriter:
     """A listener that writes each scan's outcome to ``result.mcap``; ``close`` completes the file."""
 
     def __init__(self, path: Path, run: Run) -> None:
-        configuration = json.dumps(dump(run.config), sort_keys=True)
+        settings = dump(run.config)
+        del settings["register"]["threads"]  # the file is the same for any number of threads
+        configuration = json.dumps(settings, sort_keys=True)
         self._log, self.paths = ResultLog(path, run.surface, configuration), NewPaths()
         self._registrar, self._reach_m = run.registrar, RESIDUAL_REACH * run.surface.extent
 

@@ -34,7 +34,7 @@ def test_an_interrupt_keeps_the_rows_so_far(make_rows):
     kept = []
     assert _collect(_interrupted(make_rows(3)), kept)
     assert [row.seq for row in kept] == [0, 1, 2]
-    assert not _collect(iter(make_rows(2)), [])
+    assert not _collect((row for row in make_rows(2)), [])
 
 
 def test_an_interrupt_before_the_first_row_ends_the_run():

@@ -46,7 +46,7 @@ def test_no_far_guess_ends_beside_the_truth(scans):
 def test_a_close_guess_is_registered_once(scans, monkeypatch):
     registrar, calls = Registrar(builtin_surface()), []
     graded = registrar._graded
-    monkeypatch.setattr(registrar, "_graded", lambda *args: calls.append(1) or graded(*args))
+    monkeypatch.setattr(registrar, "_graded", lambda *args, **named: calls.append(1) or graded(*args, **named))
     for scan in scans:
         registrar.register(scan.points, scan.truth)
     assert len(calls) == len(scans)

@@ -19,7 +19,7 @@ FILES = ("rows.jsonl", "estimate.tum", "registration.tum", "truth.tum", "beliefs
 
 def _write(out, prefetch, n_scans=15):
     with Run(Job(source=LOG, options=SourceOptions(n_scans=n_scans), prefetch=prefetch)) as run:
-        writer = ResultWriter(ResultDirectory(out), run.surface, run.registrar)
+        writer = ResultWriter(ResultDirectory(out), run)
         with writer:
             writer.finish(list(run.rows(writer.listeners)), {})
 

@@ -60,7 +60,7 @@ def test_errors_are_distances_to_the_truth_of_the_scan():
 def test_a_reference_is_fitted_when_asked_for_and_not_in_the_constructor(monkeypatch):
     passes = []
     scans = Source.scans
-    monkeypatch.setattr(Source, "scans", lambda source, prefetch=0: passes.append(1) or scans(source, prefetch))
+    monkeypatch.setattr(Source, "scans", lambda source, *args: passes.append(1) or scans(source, *args))
     with Run(Job(source=LOG, options=SourceOptions(n_scans=12), assignments=("reference=fit",))) as run:
         assert passes == []
         shown = []

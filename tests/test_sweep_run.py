@@ -148,7 +148,8 @@ def test_a_limited_campaign_is_resumed(campaign, reference, tmp_path):
 @pytest.mark.slow
 def test_a_killed_campaign_is_resumed(campaign, reference, tmp_path):
     args = [sys.executable, "-m", "avsreplay", "sweep", str(campaign), "-o", str(tmp_path / "out"), "--workers", "0"]
-    process = subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    env = os.environ | {"AVSREPLAY_ARITHMETIC": "native"}  # that of this process, which makes the reference
+    process = subprocess.Popen(args, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=env)
     journal = tmp_path / "out" / "journal.txt"
     while process.poll() is None and (not journal.exists() or journal.read_bytes().count(b"\n") < 2):
         time.sleep(0.005)

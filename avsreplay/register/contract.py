@@ -17,12 +17,12 @@ from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.backend import load_backend
 from avsreplay.register.params import RegisterParams
+from avsreplay.register.quality import ACCURACY
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import sample
 from avsreplay.register.visibility import Camera
 
 POINTS = 3000
-ACCURACY = (0.1, 1e-3)  # deg and share of the extent, for a back end that states none of its own
 SAME_RAD, SAME_OF_EXTENT = np.radians(0.01), 5e-5  # equal except for rounding and the stopping rule
 MOVE = Pose(exp([0.9, 0.4, -1.3]), np.array([-3.0, 2.0, 1.0]))
 SEED = 20

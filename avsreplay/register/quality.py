@@ -32,7 +32,7 @@ NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
 LEAST_RESIDUALS = 50
 UNCHANGED = 0.06  # chi-square with 6 degrees of freedom is smaller with probability 4e-6
-TOLERANCE_RAD, TOLERANCE_OF_EXTENT = np.radians(0.1), 1e-3  # least accuracy that the contract asks of a back end
+ACCURACY = (0.1, 1e-3)  # deg and share of the extent, of a back end that states none of its own
 AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
 
 
@@ -101,11 +101,12 @@ def grade(
     limits: RegistrationLimits,
     params: RegisterParams,
     halves: bool = True,
+    accuracy: tuple[float, float] = ACCURACY,
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
     Too few inliers give NO_OVERLAP whatever the convergence flag of the back end says. ``halves``: compare the poses
-    from two halves of the scan.
+    from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
@@ -121,7 +122,7 @@ def grade(
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
         info, P, weakest = frozen(np.linalg.pinv(P, hermitian=True)), None, unbounded
-    settled = P is None or not _beyond(left, P, index.extent_m)
+    settled = P is None or not _beyond(left, P, index.extent_m, accuracy)
     return Alignment(
         T_ac=fit.T_ca.inverse(),
         iterations=fit.iterations,
@@ -155,9 +156,9 @@ def unchanged_without_reason(found: Evidence) -> bool:
     return bool(statistic > UNCHANGED)
 
 
-def _beyond(step: Array, P: Array, extent_m: float) -> bool:
-    """Whether a step is larger than the tolerance of any back end and than three standard deviations of the pose."""
-    large = np.linalg.norm(step[:3]) > TOLERANCE_RAD or np.linalg.norm(step[3:]) > TOLERANCE_OF_EXTENT * extent_m
+def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float]) -> bool:
+    """Whether a step is larger than the accuracy of the back end and than three standard deviations of the pose."""
+    large = np.linalg.norm(step[:3]) > np.radians(accuracy[0]) or np.linalg.norm(step[3:]) > accuracy[1] * extent_m
     return bool(large and step @ np.linalg.pinv(P, hermitian=True) @ step > 9.0 * len(step))
 
 

@@ -57,6 +57,7 @@ class Registrar:
         self._index = _indexed(surface, self.limits.reach_m, self.params)
         self._visibility = Visibility(surface, self.params.camera)
         self._target = Target(surface, self._index, self.limits, self._visibility)
+        self._accuracy: tuple[float, float] = getattr(factory, "accuracy", quality.ACCURACY)
         self._backend = create_backend(self.params.backend, factory, self._target)
         self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
         self._restarter = Restarter(self._target, self._test)
@@ -227,7 +228,7 @@ class Registrar:
             return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
         start = guess.inverse()
-        graded = quality.grade(self._index, self._visibility, scan, fit, limits, self.params, halves)
+        graded = quality.grade(self._index, self._visibility, scan, fit, limits, self.params, halves, self._accuracy)
         same = (fit.T_ca.q.tobytes(), fit.T_ca.t.tobytes()) == (start.q.tobytes(), start.t.tobytes())
         if not (same and graded.measured):  # a guess that is kept for lack of overlap is no error of the back end
             return graded
