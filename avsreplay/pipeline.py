@@ -276,7 +276,8 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
         origin = state.origin
     elif stages.guess is Guess.LAST:
         guess, origin = state.last_pose, "last"
-    return _measurement(stages, scan, points, stages.registrar.register(points, guess, scan.seq), origin)
+    found = stages.registrar.register(points, guess, scan.seq, carried=points is not scan.points)
+    return _measurement(stages, scan, points, found, origin)
 
 
 def _acquire(stages: Stages, scan: Scan, points: NDArray[Any], origin: str) -> Measurement:
@@ -313,8 +314,7 @@ def _prediction_lost(stages: Stages, scan: Scan, predicted: Prediction) -> bool:
 
 def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> NDArray[Any]:
     """The points at the scan's instant: moved by the predicted motion where they have times and a motion is known."""
-    known = state.last_pose is not None or stages.estimator.start is not None
-    if scan.times_s is None or not (stages.deskew and known):
+    if scan.times_s is None or not (stages.deskew and (state.last_pose or stages.estimator.start)):
         return scan.points
     return deskew(scan.points, scan.times_s, replace(predicted, belief=stages.estimator.in_camera(predicted.belief)))
 

@@ -93,7 +93,7 @@ def test_a_known_acceleration_changes_poses_and_velocities_only(tmp_path: Path) 
     assert summary.acceleration is not None
     assert "given" in summary.acceleration
     ignored, _ = rows(tmp_path / "moved.tum", extent_m=2.0)
-    assert ignored[-1].r_pos_m > 3.0 * under[-1].r_pos_m  # without it the same poses are no free motion
+    assert any(row.gamma == 0 for row in ignored)  # without it the same poses contradict free motion
 
 
 def test_predictions_contain_the_acceleration() -> None:

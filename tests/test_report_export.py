@@ -74,8 +74,8 @@ def test_an_older_result_lacks_words_and_nulls_only(make_rows):
     del record["action"], record["rms_m"]
     row = parse_row(record, "x")
     assert (row.action, row.rms_m) == ("", None)
-    with pytest.raises(UnreadableInput, match="'points' is missing"):
-        parse_row({k: v for k, v in record.items() if k != "points"}, "x")
+    with pytest.raises(UnreadableInput, match="'t_ns' is missing"):
+        parse_row({k: v for k, v in record.items() if k != "t_ns"}, "x")
     with pytest.raises(UnreadableInput, match="'action' is missing or null"):
         parse_row(record | {"action": None}, "x")
 

@@ -49,6 +49,7 @@ def test_points_with_times_are_carried_to_one_instant(cli, fixtures_folder):
     with_it, without = rows(cli, log), rows(cli, log, "--no-deskew")
     assert rms(with_it, "reg_rot_err_deg") < 0.2 * rms(without, "reg_rot_err_deg")
     assert rms(with_it, "reg_pos_err_m") < 0.3 * rms(without, "reg_pos_err_m")
+    assert [row["seq"] for row in with_it if row["gamma"] == 0] == [22]  # the scan with the injected clock fault
 
 
 def test_a_reference_is_called_a_fit_and_never_truth(cli, fixtures_folder):

@@ -16,6 +16,7 @@ from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.covariance import (
     Evidence,
+    jackknife_covariance,
     pose_covariance,
     split_nis,
     systematic_errors,
@@ -102,11 +103,13 @@ def grade(
     params: RegisterParams,
     halves: bool = True,
     accuracy: tuple[float, float] = ACCURACY,
+    systematic: bool = True,
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
     Too few inliers give NO_OVERLAP whatever the convergence flag of the back end says. ``halves``: compare the poses
     from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
+    ``systematic``: the covariance includes errors that vary slowly over the target.
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
@@ -118,7 +121,7 @@ def grade(
     info = frozen(total / found.noise_m**2)
     weakest = unobservable_directions(total, int(found.counts.sum()), found.centre) if overlap else ()
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    P, split = _covariance(found, across, index.extent_m) if overlap and not weakest else (None, None)
+    P, split = _covariance(found, across, index.extent_m, systematic) if overlap and not weakest else (None, None)
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
         info, P, weakest = frozen(np.linalg.pinv(P, hermitian=True)), None, unbounded
@@ -162,10 +165,11 @@ def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float
     return bool(large and step @ np.linalg.pinv(P, hermitian=True) @ step > 9.0 * len(step))
 
 
-def _covariance(found: Evidence, across: Array, extent_m: float) -> tuple[Array | None, float | None]:
+def _covariance(found: Evidence, across: Array, extent_m: float, systematic: bool) -> tuple[Array | None, float | None]:
     """Covariance of the pose, and the test of halves on both sides of the middle along ``across`` (k, 3) in {C}."""
     errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
-    return pose_covariance(found, errors), split_nis(found, errors, across)
+    P = pose_covariance(found, errors) if systematic else jackknife_covariance(found.normals, found.gradients)
+    return P, split_nis(found, errors, across)
 
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:

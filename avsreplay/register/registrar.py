@@ -62,13 +62,16 @@ class Registrar:
         self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
         self._restarter = Restarter(self._target, self._test)
 
-    def register(self, points: NDArray[Any], guess: Pose, seq: int = 0) -> Alignment:
+    def register(self, points: NDArray[Any], guess: Pose, seq: int = 0, carried: bool = False) -> Alignment:
         """Register a scan from a guess (eq:ICP).
 
         Args:
             points: (n, 3) in {A} [m], float32 or float64, possibly strided; points that are not finite are left out.
             guess: predicted T_ac. ICP aligns the scan to the model, so its inverse goes in and the inverse comes out.
             seq: number of the scan; two halves of it are compared if ``split_every`` divides it.
+            carried: the points were carried to one instant by the predicted motion. An error of this motion distorts
+                the scan like a systematic error, but the estimator models it (``Alignment.instants``): the covariance
+                then leaves it out, so that it is not counted twice.
 
         Returns:
             The pose T_ac with its quality. A failure is reported as its status, never as an exception. Where nothing
@@ -77,7 +80,7 @@ class Registrar:
         scan = self._scan(points)
         if len(scan) == 0:
             return quality.not_measured(len(points), AlignStatus.NO_POINTS, guess)
-        first = self._graded(scan, guess, halves=seq % self.params.split_every == 0)
+        first = self._graded(scan, guess, halves=seq % self.params.split_every == 0, carried=carried)
         if first.status is AlignStatus.FAILED:
             return first
         found = first if self._healthy(first) else self._recovered(scan, guess, first)
@@ -221,14 +224,18 @@ class Registrar:
         status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason)
 
-    def _graded(self, scan: NDArray[Any], guess: Pose, width_m: float | None = None, halves: bool = True) -> Alignment:
+    def _graded(
+        self, scan: NDArray[Any], guess: Pose, width_m: float | None = None, halves: bool = True, carried: bool = False
+    ) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
         fit = self._align(scan, guess.inverse(), width_m)
         if isinstance(fit, str):
             return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
         start = guess.inverse()
-        graded = quality.grade(self._index, self._visibility, scan, fit, limits, self.params, halves, self._accuracy)
+        graded = quality.grade(
+            self._index, self._visibility, scan, fit, limits, self.params, halves, self._accuracy, not carried
+        )
         same = (fit.T_ca.q.tobytes(), fit.T_ca.t.tobytes()) == (start.q.tobytes(), start.t.tobytes())
         if not (same and graded.measured):  # a guess that is kept for lack of overlap is no error of the back end
             return graded
