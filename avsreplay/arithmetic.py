@@ -29,7 +29,7 @@ PINS = {
 THREADS = "OPENBLAS_NUM_THREADS"
 
 
-def available() -> bool:
+def has_variants() -> bool:
     """Return whether this system has the variants that ``PINS`` names: Linux with glibc on x86-64."""
     if not sys.platform.startswith("linux") or os.uname().machine != "x86_64":
         return False
@@ -41,7 +41,7 @@ def available() -> bool:
 
 def state() -> str:
     """Return ``"pinned"`` or ``"native"`` for this process, for ``run.json``."""
-    pinned = available() and all(value in os.environ.get(name, "") for name, value in PINS.items())
+    pinned = has_variants() and all(value in os.environ.get(name, "") for name, value in PINS.items())
     return "pinned" if pinned and not _numpy_variants() else "native"
 
 
@@ -52,7 +52,7 @@ def pin() -> None:
     has been imported, because it is too late then.
     """
     os.environ[THREADS] = "1"  # the sums of a product on several threads depend on their number
-    if os.environ.get(VARIABLE) == "native" or "numpy" in sys.modules or not sys.executable or not available():
+    if os.environ.get(VARIABLE) == "native" or "numpy" in sys.modules or not sys.executable or not has_variants():
         return
     glibc = os.environ.get("GLIBC_TUNABLES", "")
     os.environ.update(PINS)

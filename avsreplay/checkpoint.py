@@ -38,7 +38,7 @@ _ACCUMULATORS = {  # classes that collect values scan by scan and are no datacla
 }
 
 
-def pack(value: Any, named: Mapping[str, object]) -> bytes:
+def pack_state(value: Any, named: Mapping[str, object]) -> bytes:
     """Return a value as bytes.
 
     Args:
@@ -57,7 +57,7 @@ def pack(value: Any, named: Mapping[str, object]) -> bytes:
 
 
 def unpack(path: Path, named: Mapping[str, object]) -> Any:
-    """Read a value that ``pack`` made.
+    """Read a value that ``pack_state`` made.
 
     Args:
         path: the file.

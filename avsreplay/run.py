@@ -11,7 +11,7 @@ from typing import Any
 
 from avsreplay import arithmetic, pipeline, settings
 from avsreplay.build import first_state, stages
-from avsreplay.checkpoint import pack, unpack
+from avsreplay.checkpoint import pack_state, unpack
 from avsreplay.config import Against, RunConfig, load_config, pose_text, with_acceleration
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
@@ -213,7 +213,7 @@ class Run:
         """
         own = (self._state, self.done, self._fold, self.model_check, self._end, self._scored)
         motion = None if self._scored is None else self._scored.motion
-        return pack((*own, self._fixes, self._reference_instants, more), self._named(motion))
+        return pack_state((*own, self._fixes, self._reference_instants, more), self._named(motion))
 
     def restore(self, path: Path) -> Any:
         """Continue from a checkpoint; returns what was stored with it.

@@ -27,7 +27,7 @@ _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "og
 _STREAMED_COLUMNS = ("pos_err_m", "rot_err_deg", "rms_m", "nis", "sigma1", "sigma2", "t_go_s", "gamma")
 
 
-def pose_covariance(belief: Belief) -> Array:
+def message_covariance(belief: Belief) -> Array:
     """Return the (6, 6) covariance of the pose of {C}: position in {A} [m], rotation vector in {A} [rad].
 
     Args:
@@ -84,7 +84,7 @@ class ResultLogWriter:
                 t_ns=row.t_ns,
                 points=outcome.scan.points,
                 estimate=outcome.pose,
-                covariance=pose_covariance(outcome.belief),
+                covariance=message_covariance(outcome.belief),
                 registration=next((pose for _, pose in row_poses([row], "registration")), None),
                 truth=scan.truth.pose,
                 path=self.paths.of(scan.state),

@@ -9,7 +9,7 @@ import pytest
 
 from avsreplay import arithmetic
 
-needs_variants = pytest.mark.skipif(not arithmetic.available(), reason="only glibc on x86-64 has these variants")
+needs_variants = pytest.mark.skipif(not arithmetic.has_variants(), reason="only glibc on x86-64 has these variants")
 OTHER = {"OPENBLAS_CORETYPE": "Haswell", "NPY_DISABLE_CPU_FEATURES": "X86_V4", "GLIBC_TUNABLES": ""}
 
 

@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from avsreplay.checkpoint import pack, unpack
+from avsreplay.checkpoint import pack_state, unpack
 from avsreplay.cli.run import _collect
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
@@ -86,7 +86,7 @@ def test_ctrl_c_takes_effect_between_two_scans(make_rows):
 def test_objects_of_the_run_are_named_and_not_stored(tmp_path):
     owner, pose = object(), Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.arange(3.0))
     path = tmp_path / "c"
-    path.write_bytes(pack((owner, pose, {"a": [1.5]}), {"owner": owner}))
+    path.write_bytes(pack_state((owner, pose, {"a": [1.5]}), {"owner": owner}))
     replaced, again, rest = unpack(path, {"owner": 7})
     assert (replaced, rest) == (7, {"a": [1.5]})
     assert np.array_equal(again.matrix, pose.matrix)
@@ -122,7 +122,7 @@ def test_classes_that_act_when_created_are_refused(tmp_path):
 
 @pytest.mark.parametrize("cut", [0, 1, 20, -1])
 def test_a_damaged_checkpoint_is_one_line(tmp_path, cut):
-    data = pack({"a": np.arange(10.0), "b": Pose.identity()}, {})
+    data = pack_state({"a": np.arange(10.0), "b": Pose.identity()}, {})
     path = tmp_path / "c"
     path.write_bytes(data[:cut])
     with pytest.raises(UnreadableInput):

@@ -11,7 +11,7 @@ from avsreplay.register.covariance import (
     Evidence,
     difference_covariance,
     jackknife_covariance,
-    pose_covariance,
+    registration_covariance,
     split_nis,
     systematic_errors,
     without_dominant_patches,
@@ -111,7 +111,7 @@ def _nis(strain: float) -> tuple[float, float, float]:
         values.append(split_nis(found, errors, np.eye(3)[:1]))
         bare.append(split_nis(found, none, np.eye(3)[:1]))
         jackknife = jackknife_covariance(found.normals, found.gradients)
-        sigma.append(np.trace(pose_covariance(found, errors)) / np.trace(jackknife))
+        sigma.append(np.trace(registration_covariance(found, errors)) / np.trace(jackknife))
     return float(np.mean(values)) / 6.0, float(np.mean(bare)) / 6.0, float(np.median(sigma))
 
 

@@ -137,11 +137,11 @@ def test_result_log_opens_in_rosbags_with_every_message(result):
 
 
 def test_the_covariance_in_the_result_log_is_that_of_the_rows(result):
-    from avsreplay.viewers import pose_covariance
+    from avsreplay.viewers import message_covariance
 
     out, document = result
     for belief, row in zip(read_beliefs(out / "beliefs.npz"), document["rows"], strict=True):
-        covariance = pose_covariance(belief)
+        covariance = message_covariance(belief)
         assert np.sqrt(np.trace(covariance[:3, :3])) == pytest.approx(row["pos_1s_m"], rel=1e-9)
         assert np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))) == pytest.approx(row["rot_1s_deg"], rel=1e-9)
 

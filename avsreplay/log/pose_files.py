@@ -19,7 +19,7 @@ import numpy as np
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import MeasuredPose, Pose, matrix, normalise
 from avsreplay.log.bytes_io import BadMessage, shown
-from avsreplay.log.pose_messages import measured_pose
+from avsreplay.log.pose_messages import pose_of_numbers
 
 _MAX_BYTES = 256 << 20
 _MAX_SECONDS = 2**31 - 2  # a ROS 2 time has 31 bits of seconds
@@ -263,7 +263,7 @@ def _checked(values: list[float]) -> MeasuredPose | str:
     if len(values) != 7:
         raise ValueError
     try:
-        return measured_pose(values)
+        return pose_of_numbers(values)
     except BadMessage as error:
         return str(error)
 

@@ -102,13 +102,13 @@ def decode_measured(kind: str, payload: bytes | memoryview, encoding: str = "cdr
         BadMessage: the message is cut, or its pose is not finite or has no unit quaternion.
     """
     found = POSE_TYPES[kind](Cursor(payload, encoding))
-    pose = measured_pose(found.pose)
+    pose = pose_of_numbers(found.pose)
     if found.covariance is None:
         return found.t_ns, found.parent, pose
     return found.t_ns, found.parent, MeasuredPose(pose.T_ac, _in_fixture(found.covariance, pose.T_ac))
 
 
-def measured_pose(values: Sequence[float]) -> MeasuredPose:
+def pose_of_numbers(values: Sequence[float]) -> MeasuredPose:
     """Return a measured pose from x y z [m] qx qy qz qw.
 
     Raises:

@@ -152,7 +152,7 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     return replace(none, block_m2=block, smooth_m2=smooth, amplitudes=basis @ fit[6:], fit=fit[:6])
 
 
-def pose_covariance(found: Evidence, errors: Systematic) -> Array:
+def registration_covariance(found: Evidence, errors: Systematic) -> Array:
     """Return the covariance (6, 6) of the registered pose, systematic errors included.
 
     Args:

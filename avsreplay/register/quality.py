@@ -17,7 +17,7 @@ from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.covariance import (
     Evidence,
     jackknife_covariance,
-    pose_covariance,
+    registration_covariance,
     split_nis,
     systematic_errors,
     without_dominant_patches,
@@ -168,7 +168,7 @@ def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float
 def _covariance(found: Evidence, across: Array, extent_m: float, systematic: bool) -> tuple[Array | None, float | None]:
     """Covariance of the pose, and the test of halves on both sides of the middle along ``across`` (k, 3) in {C}."""
     errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
-    P = pose_covariance(found, errors) if systematic else jackknife_covariance(found.normals, found.gradients)
+    P = registration_covariance(found, errors) if systematic else jackknife_covariance(found.normals, found.gradients)
     return P, split_nis(found, errors, across)
 
 

@@ -142,7 +142,7 @@ def _parameter_rows(p: Parameter) -> list[tuple[str, ...]]:
     components = listed.split() or ["x", "y", "z"] if len(p.estimate) > 1 else [""]
     truth = p.truth or (None,) * len(p.estimate)
     sigma = "undetermined" if p.undetermined else number(p.one_sigma, ".4f", "")
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for k, component in enumerate(components):
         last = (number(p.error, ".4f", ""), sigma) if k == 0 else ("", "")
         label = f"{name} {component}".rstrip()

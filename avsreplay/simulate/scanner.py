@@ -33,7 +33,7 @@ from avsreplay.simulate.optics import (
 )
 from avsreplay.simulate.pattern import FieldOfView, Pattern, ray_grid
 from avsreplay.simulate.ray_casting import Engine, RayCaster
-from avsreplay.simulate.scene import Appendage, Camera, SceneBody, appendage_faces
+from avsreplay.simulate.scene import Appendage, MovingCamera, SceneBody, appendage_faces
 
 
 class Preset(Enum):
@@ -199,7 +199,7 @@ class Scanner:
         motion: Motion,
         materials: Sequence[Material] = (),
         appendages: Sequence[Appendage] = (),
-        camera: Camera | None = None,
+        camera: MovingCamera | None = None,
     ) -> None:
         self.params = p = params
         self._motion, self._camera = motion, camera

@@ -133,7 +133,7 @@ class CameraParams(Settings):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Camera:
+class MovingCamera:
     """A moving camera: its parameters and the phases (6,) of its vibration [rad]."""
 
     params: CameraParams

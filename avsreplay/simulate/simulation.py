@@ -20,7 +20,7 @@ from avsreplay.simulate.pattern import Pattern
 from avsreplay.simulate.ray_casting import Engine
 from avsreplay.simulate.scanner import Returns, Scanner
 from avsreplay.simulate.scenario import Scenario, belief
-from avsreplay.simulate.scene import Camera, SceneBody, scene_bodies
+from avsreplay.simulate.scene import MovingCamera, SceneBody, scene_bodies
 from avsreplay.simulate.target import body
 
 EPOCH_NS = (
@@ -45,7 +45,7 @@ class Simulation:
     _motion: Motion = field(repr=False)
     _scanner: Scanner = field(repr=False)
     _bodies: Sequence[SceneBody] = field(repr=False, default=())
-    _camera: Camera | None = field(repr=False, default=None)
+    _camera: MovingCamera | None = field(repr=False, default=None)
 
     @property
     def engine(self) -> Engine:
@@ -167,7 +167,7 @@ def simulate(scenario: Scenario, surface: Surface, meshes: Mapping[str, Surface]
     span_s = params.duration_s + params.scanner.scan_s
     motion = Motion(body(params.target, surface), params.motion, span_s, _generator(params.seed, "motion", 0))
     phases = _generator(params.seed, "camera", 0).uniform(0.0, 2.0 * math.pi, 6)
-    camera = None if params.camera is None else Camera(params.camera, phases)
+    camera = None if params.camera is None else MovingCamera(params.camera, phases)
     scanner = Scanner(params.scanner, surface, motion, params.material, params.appendage, camera)
     first = motion.state(0.0)
     start = None
