@@ -167,6 +167,8 @@ def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float
 
 def _covariance(found: Evidence, across: Array, extent_m: float, systematic: bool) -> tuple[Array | None, float | None]:
     """Covariance of the pose, and the test of halves on both sides of the middle along ``across`` (k, 3) in {C}."""
+    if not (systematic or len(across)):
+        return jackknife_covariance(found.normals, found.gradients), None
     errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
     P = registration_covariance(found, errors) if systematic else jackknife_covariance(found.normals, found.gradients)
     return P, split_nis(found, errors, across)
