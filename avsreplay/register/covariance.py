@@ -5,7 +5,7 @@ Two kinds of errors correlate the noise of points:
 
 Random errors
     Alike within a patch (a detail that the model lacks, a stripe of a range image): the delete-a-block jackknife with
-    patches as blocks. Displacements that neighbouring patches share, independent from one block of ``BLOCK`` patches a
+    patches as blocks. Displacements that neighbouring patches share, independent from one block of 4 patches a
     side to the next, add a variance; it is estimated from the products of residuals of different patches of a block.
 Systematic errors
     Errors of the model or of the ranges that vary slowly over the target: a symmetric strain and an offset of the
@@ -15,29 +15,20 @@ Systematic errors
 
 ``split_nis`` tests the result: pose from one half of the patches against the other, normalised with the covariance of
 their difference, in which common errors cancel. For normal errors it is chi-square with 6 degrees of freedom.
+
+The sums run over patches in C++ (``kernel/systematic.cpp``, ``kernel/covariance.cpp``), where the thresholds are.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
 from avsreplay.register.surface_index import kernel_module
-
-DOMINANT = 0.5  # a patch that contributes more than this share of the information on some motion is left out
-MIN_POINTS = 6  # no patch is left out where fewer points would remain
-ALONE = 1e-9  # keeps a motion finite that only one patch determines
-BLOCK = 4  # patches along a side of a block
-LEAST_HALF = 12  # patches that each half of a split needs
-WORST_CONDITION = 1e8  # of the scaled information of a half
-OBSERVABLE = 1e-4  # an amplitude whose mean squared residual per unit is less is not fitted
-SIGNIFICANT = 4.0  # twice the log likelihood ratio: 2 % of the scans without systematic errors exceed it
-LEAST_DETERMINED = 0.05  # with a smaller share of the displacements of blocks left by the fit, they are not estimated
-ROUNDS = 8  # of the maximum likelihood estimate; the last ones change nothing
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,17 +87,18 @@ class Systematic:
     fit: Array
     centre: Array
 
-    def unexplained(self, found: Evidence) -> Array:
-        """Return the gradients (m, 6) without what pose and amplitudes explain."""
-        return found.gradients - found.normals @ self.fit - _coupling(found, self) @ self.amplitudes
+    @property
+    def values(self) -> tuple[float, list[float], list[float], list[float]]:
+        """Variance of blocks, variances and values of the amplitudes, and the fit, as the kernel takes them."""
+        return float(self.block_m2), self.smooth_m2.tolist(), self.amplitudes.tolist(), self.fit.tolist()
 
 
 def without_dominant_patches(found: Evidence) -> Evidence:
-    """Return the evidence without the patches that give more than ``DOMINANT`` of the information on some motion.
+    """Return the evidence without the patches that give more than half of the information on some motion.
 
     Example: the barely visible side of a box is determined by a few points next to its edge.
     """
-    keep = kernel_module().keep_patches(*_contiguous(found.normals), found.counts, DOMINANT, MIN_POINTS)
+    keep = kernel_module().keep_patches(*_contiguous(found.normals), found.counts)
     return found if keep.all() else found.only(keep)
 
 
@@ -120,7 +112,7 @@ def jackknife_covariance(normals: Array, gradients: Array) -> Array:
         normals: (m, 6, 6) sums of J'J.
         gradients: (m, 6) sums of e J.
     """
-    P: Array = kernel_module().jackknife(*_contiguous(normals, gradients), ALONE)
+    P: Array = kernel_module().jackknife(*_contiguous(normals, gradients))
     return P
 
 
@@ -135,21 +127,8 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     Returns:
         The variances; zero where every patch is a single point, or there are fewer than 24 patches.
     """
-    none = Systematic(extent_m, patch_m, 0.0, np.zeros(7), np.zeros(7), np.zeros(6), found.centre)
-    if len(found.counts) < 2 * LEAST_HALF or found.counts.max() == 1:
-        return none
-    N, g, basis = _joined(found, none)
-    inverse = _pseudo_inverse(N.sum(axis=0))
-    fit = inverse @ g.sum(axis=0)
-    g = g - N @ fit
-    leverage = np.trace(N @ inverse, axis1=1, axis2=2) / len(fit)
-    S = g[:, :, None] * g[:, None, :] / np.maximum(1.0 - leverage, 0.5)[:, None, None]
-    block, M = _block_variance(N, g, S, inverse, found.counts, _numbers(found.places, BLOCK * patch_m))
-    P = inverse @ (S.sum(axis=0) + block * M) @ inverse
-    strains = slice(6, 6 + int(np.count_nonzero(basis[:6].any(axis=0))))
-    smooth = np.repeat(_common_variance(fit[strains], P[strains, strains]), 7)
-    smooth[6] = _common_variance(fit[strains.stop :], P[strains.stop :, strains.stop :])
-    return replace(none, block_m2=block, smooth_m2=smooth, amplitudes=basis @ fit[6:], fit=fit[:6])
+    table = _table(found, found.centre, extent_m, patch_m)
+    return Systematic(extent_m, patch_m, *table.systematic(), found.centre)
 
 
 def registration_covariance(found: Evidence, errors: Systematic) -> Array:
@@ -159,12 +138,8 @@ def registration_covariance(found: Evidence, errors: Systematic) -> Array:
         found: sums at the registered pose.
         errors: its systematic errors.
     """
-    P = jackknife_covariance(found.normals, errors.unexplained(found))
-    inverse = _pseudo_inverse(found.normals.sum(axis=0))
-    X = inverse @ _summed(found.normals[:, :, 3:], _numbers(found.places, BLOCK * errors.patch_m))
-    Y = inverse @ _coupling(found, errors).sum(axis=0)
-    P = P + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
-    return np.asarray(0.5 * (P + P.T))
+    P: Array = _table_of(found, errors).covariance(*errors.values)
+    return P
 
 
 def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | None:
@@ -181,167 +156,19 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
     """
     if found.counts.max(initial=1) == 1 or not len(across):
         return None
-    unexplained, coupling = errors.unexplained(found), _coupling(found, errors)
-    blocks = _numbers(found.places, BLOCK * errors.patch_m)
-    values = []
-    for along in across @ found.places.T:
-        low = along < np.median(along)
-        D, C = np.zeros(6), np.zeros((6, 6))
-        X, Y = np.zeros((blocks.max() + 1, 6, 3)), np.zeros((6, 7))
-        for half, sign in ((low, -1.0), (~low, 1.0)):
-            normals = found.normals[half]
-            inverse = _inverse(normals.sum(axis=0)) if len(normals) >= LEAST_HALF else None
-            if inverse is None:
-                return None
-            D += sign * (inverse @ found.gradients[half].sum(axis=0))
-            C += jackknife_covariance(normals, unexplained[half])
-            X += sign * (inverse @ _summed(normals[:, :, 3:], blocks[half], len(X)))
-            Y += sign * (inverse @ coupling[half].sum(axis=0))
-        C += errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
-        values.append(float(D @ _pseudo_inverse(C) @ D))
-    return max(values, default=None)
+    value = float(_table_of(found, errors).split(*errors.values, *_contiguous(across)))
+    return None if np.isnan(value) else value
 
 
-def difference_covariance(first: Evidence, second: Evidence, errors: Systematic) -> Array:
-    """Return the covariance (6, 6) of the difference of the poses from two parts of one scan.
-
-    Errors that both parts have in common cancel.
-
-    Args:
-        first: sums of the points of one part, at the pose registered from all points.
-        second: the same of the other part.
-        errors: systematic errors of the whole scan.
-    """
-    parts = ((first, -1.0), (second, 1.0))
-    places = np.vstack([first.places, second.places])
-    which = np.split(np.arange(len(places)), [len(first.places)])
-    patches, blocks = (_numbers(places, size * errors.patch_m) for size in (1, BLOCK))
-    moves, X, Y = np.zeros((patches.max() + 1, 6)), np.zeros((blocks.max() + 1, 6, 3)), np.zeros((6, 7))
-    for (part, sign), k in zip(parts, which, strict=True):
-        inverse = _pseudo_inverse(part.normals.sum(axis=0))
-        left = (1.0 + ALONE) * np.eye(6) - part.normals @ inverse
-        moved = np.linalg.solve(left, errors.unexplained(part)[:, :, None])[:, :, 0] @ inverse
-        moves = moves + sign * _summed(np.asarray(moved), patches[k], len(moves))
-        X = X + sign * (inverse @ _summed(part.normals[:, :, 3:], blocks[k], len(X)))
-        Y = Y + sign * (inverse @ _coupling(part, errors).sum(axis=0))
-    C = moves.T @ moves + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
-    return np.asarray(0.5 * (C + C.T))
+def _table_of(found: Evidence, errors: Systematic) -> Any:
+    return _table(found, errors.centre, errors.extent_m, errors.patch_m)
 
 
-def _pseudo_inverse(N: Array) -> Array:
-    """Pseudo-inverse of a symmetric positive semidefinite matrix; np.linalg.pinv takes eight times as long."""
-    values, vectors = np.linalg.eigh(N)
-    kept = values > len(N) * np.finfo(float).eps * values[-1]
-    return np.asarray((vectors[:, kept] / values[kept]) @ vectors[:, kept].T)
-
-
-def _inverse(N: Array) -> Array | None:
-    """Inverse of the information of a half; None if it does not determine a pose."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), np.finfo(float).tiny))
-    values = np.linalg.eigvalsh(N * np.outer(scale, scale))
-    return _pseudo_inverse(N) if values[0] * WORST_CONDITION > values[-1] else None
-
-
-def _strains(found: Evidence, errors: Systematic) -> Array:
-    """T (m, 3, 6): displacement of the middle of each patch per amplitude of the strain."""
-    q = (found.places - errors.centre) / errors.extent_m
-    T = np.zeros((len(q), 3, 6))
-    for k, (i, j) in enumerate(PAIRS):
-        T[:, i, k] += q[:, j]
-        if i != j:
-            T[:, j, k] += q[:, i]
-    return T
-
-
-def _coupling(found: Evidence, errors: Systematic) -> Array:
-    """A (m, 6, 7): sums over each patch of J times the residual per amplitude of strain and offset."""
-    return np.concatenate([found.normals[:, :, 3:] @ _strains(found, errors), found.offsets[:, :, None]], axis=2)
-
-
-def _joined(found: Evidence, errors: Systematic) -> tuple[Array, Array, Array]:
-    """Normal equations by patch of pose and observable amplitudes, N (m, k, k), g (m, k); their basis (7, k-6)."""
-    T, A = _strains(found, errors), _coupling(found, errors)
-    m, turned = len(T), T.transpose(0, 2, 1)
-    F = np.zeros((m, 7, 7))
-    F[:, :6, :6] = turned @ found.normals[:, 3:, 3:] @ T
-    F[:, :6, 6] = F[:, 6, :6] = (turned @ found.offsets[:, 3:, None])[:, :, 0]
-    F[:, 6, 6] = found.counts
-    e = np.column_stack([(turned @ found.gradients[:, 3:, None])[:, :, 0], found.errors])
-    coupling, total = A.sum(axis=0), found.normals.sum(axis=0)
-    free = F.sum(axis=0) - coupling.T @ _pseudo_inverse(total) @ coupling
-    least = OBSERVABLE * found.counts.sum()
-    alone = free[:6, :6] - np.outer(free[:6, 6], free[6, :6]) / max(free[6, 6], least)
-    values, vectors = np.linalg.eigh(0.5 * (alone + alone.T))
-    strains = vectors[:, values > least]
-    basis = np.zeros((7, strains.shape[1] + (free[6, 6] > least)))
-    basis[:6, : strains.shape[1]], basis[6:, strains.shape[1] :] = strains, 1.0
-    size = 6 + basis.shape[1]
-    N, g = np.empty((m, size, size)), np.hstack([found.gradients, e @ basis])
-    N[:, :6, :6], N[:, :6, 6:] = found.normals, A @ basis
-    N[:, 6:, :6], N[:, 6:, 6:] = N[:, :6, 6:].transpose(0, 2, 1), basis.T @ F @ basis
-    return N, g, basis
-
-
-def _block_variance(
-    N: Array, g: Array, S: Array, inverse: Array, counts: NDArray[np.int64], blocks: NDArray[np.intp]
-) -> tuple[float, Array]:
-    """Variance of the displacements of blocks by the method of moments, and its effect M (k, k) on the gradients.
-
-    The products of the gradients of different patches of a block, summed, have no contribution of errors within
-    patches. S (m, k, k) are the covariances of the gradients of the patches; the fit correlates them.
-    """
-    K, B = (N @ inverse)[:, 3:6], N[:, :, 3:6]
-    whole, moved = _summed(N, blocks), _summed(B, blocks)
-    Kb, M = (whole @ inverse)[:, 3:6], np.tensordot(moved, moved, ((0, 2), (0, 2)))
-    weight = 1.0 / np.bincount(blocks, counts)
-    own, total = weight[blocks], S.sum(axis=0)
-
-    def fitted(K: Array, S: Array, total: Array, weight: Array) -> float:
-        """What the fit of pose and amplitudes adds to the sum of squares of independent gradients."""
-        crossed = np.einsum("cij,cij->c", K, S[:, 3:6])
-        return float(weight @ (np.einsum("cij,cij->c", K @ total, K) - 2.0 * crossed))
-
-    found = weight @ np.sum(_summed(g, blocks)[:, 3:6] ** 2, axis=1) - own @ np.sum(g[:, 3:6] ** 2, axis=1)
-    found -= fitted(Kb, _summed(S, blocks), total, weight) - fitted(K, S, total, own)
-    expected = weight @ np.sum(moved[:, 3:6] ** 2, axis=(1, 2)) - own @ np.sum(B[:, 3:6] ** 2, axis=(1, 2))
-    of_blocks = moved @ moved.transpose(0, 2, 1)
-    of_patches = moved[blocks] @ B.transpose(0, 2, 1)
-    of_patches = of_patches.transpose(0, 2, 1)
-    expected += fitted(Kb, of_blocks.transpose(0, 2, 1), M, weight) - fitted(K, of_patches, M, own)
-    determined = expected > LEAST_DETERMINED * float(weight @ np.sum(moved[:, 3:6] ** 2, axis=(1, 2)))
-    return (max(0.0, float(found / expected)) if determined else 0.0), M
-
-
-def _common_variance(values: Array, P: Array) -> float:
-    """Variance t of values ~ N(0, t I + P) of greatest likelihood, by weighted moments; 0 if not significant."""
-    if not len(values):
-        return 0.0
-    variances, axes = np.linalg.eigh(P)
-    squares, variances = (axes.T @ values) ** 2, np.maximum(variances, np.finfo(float).tiny)
-    t = max(0.0, float(np.mean(squares - variances)))
-    for _ in range(ROUNDS):
-        weights = 1.0 / (variances + t) ** 2
-        t = max(0.0, float(weights @ (squares - variances) / weights.sum()))
-    ratio = variances / (variances + t)
-    evidence = squares / variances @ (1.0 - ratio) + np.log(ratio).sum()  # twice the gain in log likelihood
-    return t if evidence > SIGNIFICANT else 0.0
-
-
-def _numbers(places: Array, side: float) -> NDArray[np.intp]:
-    """Numbers from 0 of the occupied cubes of this side in which the places (m, 3) lie."""
-    cubes = np.floor(places / side).astype(np.int64)
-    cubes -= cubes.min(axis=0)
-    shape = cubes.max(axis=0) + 1
-    keys = (cubes[:, 0] * shape[1] + cubes[:, 1]) * shape[2] + cubes[:, 2]
-    return np.asarray(np.unique(keys, return_inverse=True)[1]).reshape(-1)
-
-
-def _summed(values: Array, numbers: NDArray[np.intp], count: int | None = None) -> Array:
-    """Sums of values (m, ...) with the same number, (count, ...)."""
-    count = int(numbers.max()) + 1 if count is None else count
-    member = np.zeros((count, len(numbers)))
-    member[numbers, np.arange(len(numbers))] = 1.0
-    return np.asarray(member @ values.reshape(len(values), -1)).reshape(count, *values.shape[1:])
+def _table(found: Evidence, centre: Array, extent_m: float, patch_m: float) -> Any:
+    """The sums as the kernel takes them."""
+    sums = (*_contiguous(found.normals, found.gradients, found.offsets), found.counts)
+    lengths = (tuple(centre.tolist()), float(extent_m), float(patch_m))
+    return kernel_module().Table(*sums, *_contiguous(found.errors, found.places), *lengths)
 
 
 def _contiguous(*arrays: Array) -> tuple[Array, ...]:

@@ -13,6 +13,7 @@ that of ``register``.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -25,7 +26,10 @@ from avsreplay.log import SourceOptions, open_source, read_surface
 from avsreplay.log.scan_files import read_points
 from avsreplay.records import Surface
 from avsreplay.register import Registrar, quality
-from avsreplay.register.covariance import difference_covariance, split_nis, systematic_errors
+from avsreplay.register.covariance import split_nis, systematic_errors
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from oracles.covariance import difference_covariance
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 

@@ -10,6 +10,7 @@
 #include <stdexcept>
 
 #include "build.hpp"
+#include "covariance.hpp"
 #include "evidence.hpp"
 #include "loop.hpp"
 #include "save.hpp"
@@ -271,31 +272,83 @@ class Index {
 };
 
 using Patches = nb::ndarray<const double, nb::c_contig, nb::device::cpu>;
-using Counts = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+using Counts = nb::ndarray<const int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
-void check_patches(const Patches& normals) {
+void check_patches(const Patches& normals, const Patches& gradients) {
   require(normals.ndim() == 3 && normals.shape(1) == 6 && normals.shape(2) == 6, "the sums of patches must be (m, 6, 6)");
+  require(gradients.ndim() == 2 && gradients.shape(0) == normals.shape(0) && gradients.shape(1) == 6,
+          "there must be six sums for each patch");
 }
 
-nb::ndarray<nb::numpy, bool> keep_patches(const Patches& normals, const Counts& counts, double most, int64_t least) {
-  check_patches(normals);
-  require(counts.ndim() == 1 && counts.shape(0) == normals.shape(0), "there must be a count for each patch");
+Numpy array66(const Six& P) {
+  double* out;
+  Numpy made = array<double>({6, 6}, &out);
+  std::memcpy(out, P.v, sizeof P.v);
+  return made;
+}
+
+nb::ndarray<nb::numpy, bool> keep_patches(const Patches& normals, const Counts& counts) {
+  require(normals.ndim() == 3 && normals.shape(1) == 6 && normals.shape(2) == 6, "the sums of patches must be (m, 6, 6)");
+  require(counts.shape(0) == normals.shape(0), "there must be a count for each patch");
   bool* keep;
   auto out = array<bool>({normals.shape(0)}, &keep);
   std::vector<uint8_t> kept(normals.shape(0), 1);
-  drop_dominant(normals.data(), counts.data(), (int64_t)kept.size(), most, least, kept.data());
+  drop_dominant(normals.data(), counts.data(), (int64_t)kept.size(), kept.data());
   std::copy(kept.begin(), kept.end(), keep);
   return out;
 }
 
-Numpy jackknife_of(const Patches& normals, const Patches& gradients, double alone) {
-  check_patches(normals);
-  require(gradients.ndim() == 2 && gradients.shape(0) == normals.shape(0) && gradients.shape(1) == 6,
-          "the gradients of patches must be (m, 6)");
-  double* P;
-  Numpy out = array<double>({6, 6}, &P);
-  jackknife(normals.data(), gradients.data(), (int64_t)normals.shape(0), alone, P);
-  return out;
+Numpy jackknife_of(const Patches& normals, const Patches& gradients) {
+  check_patches(normals, gradients);
+  return array66(jackknife(normals.data(), gradients.data(), (int64_t)normals.shape(0)));
+}
+
+// The sums of patches, kept alive by the arrays in it.
+struct Table {
+  Patches normals, gradients, offsets, errors, places;
+  Counts counts;
+  PatchTable table;
+
+  Table(Patches normals, Patches gradients, Patches offsets, Counts counts, Patches errors, Patches places,
+        std::array<double, 3> centre, double extent, double side)
+      : normals(normals), gradients(gradients), offsets(offsets), errors(errors), places(places), counts(counts) {
+    check_patches(normals, gradients), check_patches(normals, offsets);
+    const size_t m = normals.shape(0);
+    require(counts.shape(0) == m && errors.ndim() == 1 && errors.shape(0) == m, "there must be a count and an error for each patch");
+    require(places.ndim() == 2 && places.shape(0) == m && places.shape(1) == 3, "places must be (m, 3)");
+    require(extent > 0 && side > 0, "extent and patch size must be positive");
+    table = {(int64_t)m, normals.data(), gradients.data(), offsets.data(), errors.data(), places.data(), counts.data(),
+             {centre[0], centre[1], centre[2]}, extent, side};
+  }
+};
+
+using Seven = std::array<double, AMPLITUDES>;
+
+Systematic errors_of(double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit) {
+  Systematic e;
+  e.block = block;
+  std::copy(smooth.begin(), smooth.end(), e.smooth), std::copy(amplitudes.begin(), amplitudes.end(), e.amplitudes);
+  std::copy(fit.begin(), fit.end(), e.fit);
+  return e;
+}
+
+nb::tuple systematic_of(const Table& t) {
+  const Systematic e = systematic_errors(t.table);
+  double *smooth, *amplitudes, *fit;
+  auto a = array<double>({AMPLITUDES}, &smooth), b = array<double>({AMPLITUDES}, &amplitudes), c = array<double>({6}, &fit);
+  std::memcpy(smooth, e.smooth, sizeof e.smooth), std::memcpy(amplitudes, e.amplitudes, sizeof e.amplitudes);
+  std::memcpy(fit, e.fit, sizeof e.fit);
+  return nb::make_tuple(e.block, a, b, c);
+}
+
+Numpy covariance_of(const Table& t, double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit) {
+  return array66(covariance(t.table, errors_of(block, smooth, amplitudes, fit)));
+}
+
+double split_of(const Table& t, double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit,
+                const Patches& across) {
+  require(across.ndim() == 2 && across.shape(1) == 3, "directions must be (k, 3)");
+  return split(t.table, errors_of(block, smooth, amplitudes, fit), across.data(), (int64_t)across.shape(0));
 }
 
 }  // namespace
@@ -303,8 +356,15 @@ Numpy jackknife_of(const Patches& normals, const Patches& gradients, double alon
 NB_MODULE(_kernel, m) {
   m.attr("LAYOUT") = LAYOUT;
   nb::class_<Matches>(m, "Matches");
-  m.def("keep_patches", &keep_patches, nb::arg("normals"), nb::arg("counts"), nb::arg("most"), nb::arg("least"));
-  m.def("jackknife", &jackknife_of, nb::arg("normals"), nb::arg("gradients"), nb::arg("alone"));
+  m.def("keep_patches", &keep_patches, nb::arg("normals"), nb::arg("counts"));
+  m.def("jackknife", &jackknife_of, nb::arg("normals"), nb::arg("gradients"));
+  nb::class_<Table>(m, "Table")
+      .def(nb::init<Patches, Patches, Patches, Counts, Patches, Patches, std::array<double, 3>, double, double>(),
+           nb::arg("normals"), nb::arg("gradients"), nb::arg("offsets"), nb::arg("counts"), nb::arg("errors"),
+           nb::arg("places"), nb::arg("centre"), nb::arg("extent_m"), nb::arg("side_m"))
+      .def("systematic", &systematic_of)
+      .def("covariance", &covariance_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"))
+      .def("split", &split_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"), nb::arg("across"));
   nb::class_<Index>(m, "Index")
       .def(nb::init<Doubles, Ints, Ints, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
            nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)

@@ -2,10 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstring>
 #include <unordered_map>
-
-#include "step.hpp"
 
 namespace avs {
 namespace {
@@ -115,72 +112,6 @@ double median(std::vector<double>& x) {
   return x.size() % 2 ? *middle : 0.5 * (*middle + *std::max_element(x.begin(), middle));
 }
 
-using Matrix = double[6][6];
-
-// Root W of the pseudo-inverse of a symmetric positive semidefinite matrix: N^+ = W W'.
-void pseudo_root(const Matrix& N, Matrix& W) {
-  Matrix A, V;
-  std::memcpy(A, N, sizeof A);
-  eigen6(A, V);
-  double most = 0;
-  for (int k = 0; k < 6; ++k) most = std::max(most, A[k][k]);
-  for (int k = 0; k < 6; ++k) {
-    const double f = A[k][k] > 1.4e-15 * most ? 1 / std::sqrt(A[k][k]) : 0;
-    for (int i = 0; i < 6; ++i) W[i][k] = f * V[i][k];
-  }
-}
-
-void total(const double* normals, int64_t m, const uint8_t* keep, Matrix& N) {
-  std::memset(N, 0, sizeof N);
-  for (int64_t k = 0; k < m; ++k)
-    if (!keep || keep[k])
-      for (int i = 0; i < 36; ++i) N[i / 6][i % 6] += normals[36 * k + i];
-}
-
-// Largest eigenvalue of W' N_p W, if its trace exceeds `most`; the trace bounds it.
-double share(const double* Np, const Matrix& W, double most) {
-  Matrix B, A, V;
-  double trace = 0;
-  for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j) {
-      B[i][j] = 0;
-      for (int k = 0; k < 6; ++k) B[i][j] += Np[6 * i + k] * W[k][j];
-    }
-  for (int j = 0; j < 6; ++j)
-    for (int k = 0; k < 6; ++k) trace += W[k][j] * B[k][j];
-  if (!(trace > most)) return trace;
-  for (int i = 0; i < 6; ++i)
-    for (int j = 0; j <= i; ++j) {
-      double sum = 0;
-      for (int k = 0; k < 6; ++k) sum += W[k][i] * B[k][j];
-      A[i][j] = A[j][i] = sum;
-    }
-  eigen6(A, V);
-  double largest = 0;
-  for (int k = 0; k < 6; ++k) largest = std::max(largest, A[k][k]);
-  return largest;
-}
-
-// x = A^-1 x by elimination with row pivots; a pivot of zero leaves its unknown zero.
-void solve(Matrix& A, double* x) {
-  for (int k = 0; k < 6; ++k) {
-    int best = k;
-    for (int i = k + 1; i < 6; ++i)
-      if (std::fabs(A[i][k]) > std::fabs(A[best][k])) best = i;
-    std::swap(A[k], A[best]), std::swap(x[k], x[best]);
-    if (A[k][k] == 0) continue;
-    for (int i = k + 1; i < 6; ++i) {
-      const double f = A[i][k] / A[k][k];
-      for (int j = k; j < 6; ++j) A[i][j] -= f * A[k][j];
-      x[i] -= f * x[k];
-    }
-  }
-  for (int k = 5; k >= 0; --k) {
-    for (int j = k + 1; j < 6; ++j) x[k] -= A[k][j] * x[j];
-    x[k] = A[k][k] == 0 ? 0 : x[k] / A[k][k];
-  }
-}
-
 }  // namespace
 
 Evidence evidence(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, Team& team,
@@ -236,54 +167,6 @@ Looks looks(const Store& s, const Code& code, const View& v, const double* T, in
     }
   }
   return found;
-}
-
-void drop_dominant(const double* normals, const int64_t* counts, int64_t m, double most, int64_t least, uint8_t* keep) {
-  for (;;) {
-    Matrix N, W;
-    total(normals, m, keep, N);
-    pseudo_root(N, W);
-    std::vector<uint8_t> left(keep, keep + m);
-    int64_t points = 0, dropped = 0;
-    for (int64_t k = 0; k < m; ++k) {
-      if (!keep[k]) continue;
-      if (share(normals + 36 * k, W, most) > most) {
-        left[(size_t)k] = 0, ++dropped;
-        continue;
-      }
-      points += counts[k];
-    }
-    if (dropped == 0 || points < least) return;
-    std::copy(left.begin(), left.end(), keep);
-  }
-}
-
-void jackknife(const double* normals, const double* gradients, int64_t m, double alone, double* P) {
-  Matrix N, W, inverse;
-  total(normals, m, nullptr, N);
-  pseudo_root(N, W);
-  for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j) {
-      inverse[i][j] = 0;
-      for (int k = 0; k < 6; ++k) inverse[i][j] += W[i][k] * W[j][k];
-    }
-  std::memset(P, 0, 36 * sizeof *P);
-  for (int64_t p = 0; p < m; ++p) {
-    const double* Np = normals + 36 * p;
-    Matrix A;
-    for (int i = 0; i < 6; ++i)
-      for (int j = 0; j < 6; ++j) {
-        A[i][j] = i == j ? 1 + alone : 0;
-        for (int k = 0; k < 6; ++k) A[i][j] -= Np[6 * i + k] * inverse[k][j];
-      }
-    double x[6], moved[6] = {};
-    std::memcpy(x, gradients + 6 * p, sizeof x);
-    solve(A, x);
-    for (int i = 0; i < 6; ++i)
-      for (int k = 0; k < 6; ++k) moved[i] += inverse[i][k] * x[k];
-    for (int i = 0; i < 6; ++i)
-      for (int j = 0; j < 6; ++j) P[6 * i + j] += moved[i] * moved[j];
-  }
 }
 
 }  // namespace avs

@@ -38,13 +38,4 @@ struct Looks {
 };
 Looks looks(const Store& store, const Code& code, const View& points, const double* T, int64_t stride);
 
-// The rest works on m patches: normals (m, 6, 6), gradients (m, 6).
-
-// Clears in `keep` the patches that give more than `most` of the information on some motion of the patches kept, again
-// until there is none. Stops, with `keep` as it was, where fewer than `least` of the `counts` points would be left.
-void drop_dominant(const double* normals, const int64_t* counts, int64_t m, double most, int64_t least, uint8_t* keep);
-
-// P (6, 6) = sum over the patches p of m_p m_p', m_p = N^+ ((1 + alone) I - N_p N^+)^-1 g_p with N the sum of all N_p.
-void jackknife(const double* normals, const double* gradients, int64_t m, double alone, double* P);
-
 }  // namespace avs

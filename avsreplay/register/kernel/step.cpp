@@ -3,6 +3,8 @@
 #include <cmath>
 #include <cstring>
 
+#include "symmetric.hpp"
+
 namespace avs {
 namespace {
 
@@ -14,35 +16,10 @@ void rotation(const double* q, double* D) {
   D[8] = 2 * (x * z - w * y), D[9] = 2 * (y * z + w * x), D[10] = 1 - 2 * (x * x + y * y);
 }
 
-void turn(double& u, double& v, double c, double s) {
-  const double x = c * u - s * v;
-  v = s * u + c * v, u = x;
-}
-
-template <int N>
-void rotate_pair(double (&A)[N][N], double (&V)[N][N], int i, int j) {
-  const double theta = (A[j][j] - A[i][i]) / (2 * A[i][j]);
-  const double t = (theta < 0 ? -1 : 1) / (std::fabs(theta) + std::sqrt(theta * theta + 1));
-  const double c = 1 / std::sqrt(t * t + 1), s = t * c;
-  for (int k = 0; k < N; ++k) turn(A[k][i], A[k][j], c, s);
-  for (int k = 0; k < N; ++k) turn(A[i][k], A[j][k], c, s);
-  for (int k = 0; k < N; ++k) turn(V[k][i], V[k][j], c, s);
-}
-
 // Unit eigenvector of the largest eigenvalue of a symmetric matrix, by Jacobi's rotations.
 void largest_eigenvector(double (&A)[4][4], double* q) {
-  double V[4][4] = {{1, 0, 0, 0}, {0, 1, 0, 0}, {0, 0, 1, 0}, {0, 0, 0, 1}};
-  for (int sweep = 0; sweep < 30; ++sweep) {
-    double off = 0, diagonal = 0;
-    for (int i = 0; i < 4; ++i) {
-      diagonal += A[i][i] * A[i][i];
-      for (int j = i + 1; j < 4; ++j) off += A[i][j] * A[i][j];
-    }
-    if (off <= 1e-36 * diagonal) break;
-    for (int i = 0; i < 3; ++i)
-      for (int j = i + 1; j < 4; ++j)
-        if (A[i][j] != 0) rotate_pair(A, V, i, j);
-  }
+  double V[4][4];
+  eigen(A, V, 4, 1e-36);
   int best = 0;
   for (int j = 1; j < 4; ++j)
     if (A[j][j] > A[best][best]) best = j;
@@ -70,7 +47,7 @@ bool solve6(double (&H)[6][6], double* b, double& radius) {
     c[i] = b[i] / (i < 3 ? radius : 1);
     for (int j = 0; j < 6; ++j) A[i][j] = H[i][j] / ((i < 3 ? radius : 1) * (j < 3 ? radius : 1));
   }
-  eigen6(A, V);
+  eigen(A, V, 6, 1e-32);
   double most = 0;
   for (int k = 0; k < 6; ++k) most = A[k][k] > most ? A[k][k] : most;
   for (int k = 0; k < 6; ++k) {
@@ -115,22 +92,6 @@ void shift(double (&H)[6][6], double* b, const double* c) {
 }
 
 }  // namespace
-
-void eigen6(double (&A)[6][6], double (&V)[6][6]) {
-  for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j) V[i][j] = i == j ? 1 : 0;
-  for (int sweep = 0; sweep < 40; ++sweep) {
-    double off = 0, diagonal = 0;
-    for (int i = 0; i < 6; ++i) {
-      diagonal += A[i][i] * A[i][i];
-      for (int j = i + 1; j < 6; ++j) off += A[i][j] * A[i][j];
-    }
-    if (!(off > 1e-32 * diagonal)) break;
-    for (int i = 0; i < 5; ++i)
-      for (int j = i + 1; j < 6; ++j)
-        if (A[i][j] != 0) rotate_pair(A, V, i, j);
-  }
-}
 
 Step horn_step(const Sums& sums) {
   const double* a = sums.v;

@@ -18,8 +18,6 @@ bool plane_step(const Sums& sums, double longest, Step& step);
 // One Newton step of the sum of squared distances of the inliers, whose stationary points are the fixed points of Horn's
 // iteration: the gradient from Horn's moments, the second derivative from each foot's face, edge or vertex.
 bool newton_step(const Sums& sums, double longest, Step& step);
-// Eigenvalues (the diagonal that remains of A) and eigenvectors (columns of V) of a symmetric matrix, by Jacobi's rotations.
-void eigen6(double (&A)[6][6], double (&V)[6][6]);
 void compose(const double* D, double* T);  // T = D T, both rows of [R t]
 
 }  // namespace avs

@@ -1,0 +1,256 @@
+#include "covariance.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <vector>
+
+namespace avs {
+namespace {
+
+constexpr double DOMINANT = 0.5;            // a patch with more than this share of the information on a motion is left out
+constexpr int64_t LEAST_POINTS = 6;         // no patch is left out where fewer points would remain
+constexpr double ALONE = 1e-9;              // keeps a motion finite that only one patch determines
+constexpr int64_t LEAST_HALF = 12;          // patches that each half of a split needs
+constexpr double WORST_CONDITION = 1e8;     // of the scaled information of a half
+constexpr double TINY = std::numeric_limits<double>::min();
+
+// Largest eigenvalue of W' N_p W, if its trace exceeds DOMINANT; the trace bounds it.
+double share(const double* Np, const Six& W) {
+  Six B, A, V;
+  double trace = 0;
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j)
+      for (int k = 0; k < 6; ++k) B.v[i][j] += Np[6 * i + k] * W.v[k][j];
+  for (int j = 0; j < 6; ++j)
+    for (int k = 0; k < 6; ++k) trace += W.v[k][j] * B.v[k][j];
+  if (!(trace > DOMINANT)) return trace;
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j <= i; ++j) {
+      for (int k = 0; k < 6; ++k) A.v[i][j] += W.v[k][i] * B.v[k][j];
+      A.v[j][i] = A.v[i][j];
+    }
+  eigen(A.v, V.v, 6, 1e-32);
+  double largest = 0;
+  for (int k = 0; k < 6; ++k) largest = std::max(largest, A.v[k][k]);
+  return largest;
+}
+
+// Root W of the pseudo-inverse of N: N^+ = W W'.
+Six pseudo_root(Six N) {
+  Six V;
+  eigen(N.v, V.v, 6, 1e-32);
+  double most = 0;
+  for (int k = 0; k < 6; ++k) most = std::max(most, N.v[k][k]);
+  for (int k = 0; k < 6; ++k) {
+    const double f = N.v[k][k] > 1.4e-15 * most ? 1 / std::sqrt(N.v[k][k]) : 0;
+    for (int i = 0; i < 6; ++i) V.v[i][k] *= f;
+  }
+  return V;
+}
+
+// x = A^-1 x by elimination with row pivots; a pivot of zero leaves its unknown zero.
+void solve(Six& M, double* x) {
+  double(&A)[6][6] = M.v;
+  for (int k = 0; k < 6; ++k) {
+    int best = k;
+    for (int i = k + 1; i < 6; ++i)
+      if (std::fabs(A[i][k]) > std::fabs(A[best][k])) best = i;
+    std::swap(A[k], A[best]), std::swap(x[k], x[best]);
+    if (A[k][k] == 0) continue;
+    for (int i = k + 1; i < 6; ++i) {
+      const double f = A[i][k] / A[k][k];
+      for (int j = k; j < 6; ++j) A[i][j] -= f * A[k][j];
+      x[i] -= f * x[k];
+    }
+  }
+  for (int k = 5; k >= 0; --k) {
+    for (int j = k + 1; j < 6; ++j) x[k] -= A[k][j] * x[j];
+    x[k] = A[k][k] == 0 ? 0 : x[k] / A[k][k];
+  }
+}
+
+// Adds m_p m_p' of one patch to P.
+void add_move(const double* Np, const double* gradient, const Six& inverse, Six& P) {
+  Six A;
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) {
+      A.v[i][j] = i == j ? 1 + ALONE : 0;
+      for (int k = 0; k < 6; ++k) A.v[i][j] -= Np[6 * i + k] * inverse.v[k][j];
+    }
+  double x[6], moved[6] = {};
+  std::memcpy(x, gradient, sizeof x);
+  solve(A, x);
+  for (int i = 0; i < 6; ++i)
+    for (int k = 0; k < 6; ++k) moved[i] += inverse.v[i][k] * x[k];
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) P.v[i][j] += moved[i] * moved[j];
+}
+
+// The patches of one half, or all of them.
+struct Part {
+  std::vector<double> normals, gradients;  // (m, 6, 6), and (m, 6) without what pose and amplitudes explain
+  double sum[6] = {};                      // of the gradients as they are
+  std::array<std::array<double, AMPLITUDES>, 6> coupling{};
+  std::vector<std::array<double, 18>> blocks;  // sums of the displacements' columns of the normals
+};
+
+void add(const PatchTable& t, const Systematic& errors, int64_t p, int64_t block, Part& to) {
+  double T[3][6];
+  Coupling A;
+  strains(t, p, T);
+  couple(t, p, T, A);
+  const double *N = t.normals + 36 * p, *g = t.gradients + 6 * p;
+  to.normals.insert(to.normals.end(), N, N + 36);
+  for (int i = 0; i < 6; ++i) {
+    double left = g[i];
+    for (int j = 0; j < 6; ++j) left -= N[6 * i + j] * errors.fit[j];
+    for (int k = 0; k < AMPLITUDES; ++k) left -= A[i][k] * errors.amplitudes[k], to.coupling[i][k] += A[i][k];
+    to.gradients.push_back(left);
+    to.sum[i] += g[i];
+    for (int a = 0; a < 3; ++a) to.blocks[(size_t)block][(size_t)(3 * i + a)] += N[6 * i + 3 + a];
+  }
+}
+
+// What the systematic errors do to a pose, or to the difference of two.
+struct Effect {
+  std::vector<std::array<double, 18>> blocks;  // (6, 3) of each block
+  double smooth[6][AMPLITUDES] = {};
+
+  void add(const Part& part, const Six& inverse, double sign) {
+    blocks.resize(part.blocks.size());
+    for (int i = 0; i < 6; ++i)
+      for (int k = 0; k < 6; ++k) {
+        const double f = sign * inverse.v[i][k];
+        for (size_t b = 0; b < blocks.size(); ++b)
+          for (size_t a = 0; a < 3; ++a) blocks[b][(size_t)(3 * i) + a] += f * part.blocks[b][(size_t)(3 * k) + a];
+        for (int a = 0; a < AMPLITUDES; ++a) smooth[i][a] += f * part.coupling[k][a];
+      }
+  }
+
+  void add_to(const Systematic& errors, Six& P) const {
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j < 6; ++j) {
+        double sum = 0;
+        for (const auto& X : blocks)
+          for (size_t a = 0; a < 3; ++a) sum += X[(size_t)(3 * i) + a] * X[(size_t)(3 * j) + a];
+        P.v[i][j] += errors.block * sum;
+        for (int a = 0; a < AMPLITUDES; ++a) P.v[i][j] += errors.smooth[a] * smooth[i][a] * smooth[j][a];
+      }
+  }
+};
+
+// Whether the information of a half determines a pose.
+bool determines(Six N) {
+  double scale[6];
+  for (int i = 0; i < 6; ++i) scale[i] = 1 / std::sqrt(std::max(N.v[i][i], TINY));
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) N.v[i][j] *= scale[i] * scale[j];
+  Six V;
+  eigen(N.v, V.v, 6, 1e-32);
+  double least = N.v[0][0], most = least;
+  for (int k = 1; k < 6; ++k) least = std::min(least, N.v[k][k]), most = std::max(most, N.v[k][k]);
+  return least * WORST_CONDITION > most;
+}
+
+// Normalised squared difference of the poses from the patches below the median of `along`, and from the others.
+double difference(const PatchTable& t, const Systematic& errors, const std::vector<int64_t>& block, int64_t blocks,
+                  const std::vector<double>& along) {
+  std::vector<double> sorted = along;
+  std::sort(sorted.begin(), sorted.end());
+  const double middle = 0.5 * (sorted[(sorted.size() - 1) / 2] + sorted[sorted.size() / 2]);
+  Part parts[2];
+  for (Part& part : parts) part.blocks.resize((size_t)blocks);
+  for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, block[(size_t)p], parts[along[(size_t)p] < middle ? 0 : 1]);
+  double d[6] = {}, value = 0;
+  Six C;
+  Effect effect;
+  for (int half = 0; half < 2; ++half) {
+    const Part& part = parts[half];
+    const int64_t m = (int64_t)part.gradients.size() / 6;
+    const Six N = total(part.normals.data(), m);
+    if (m < LEAST_HALF || !determines(N)) return std::numeric_limits<double>::quiet_NaN();
+    const Six inverse = pseudo_inverse(N), P = jackknife(part.normals.data(), part.gradients.data(), m);
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j < 6; ++j) d[i] += (half ? 1 : -1) * inverse.v[i][j] * part.sum[j], C.v[i][j] += P.v[i][j];
+    effect.add(part, inverse, half ? 1 : -1);
+  }
+  effect.add_to(errors, C);
+  C = pseudo_inverse(C);
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) value += d[i] * C.v[i][j] * d[j];
+  return value;
+}
+
+}  // namespace
+
+Six total(const double* normals, int64_t m, const uint8_t* keep) {
+  Six N;
+  for (int64_t k = 0; k < m; ++k)
+    if (!keep || keep[k])
+      for (int i = 0; i < 36; ++i) N.v[i / 6][i % 6] += normals[36 * k + i];
+  return N;
+}
+
+void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint8_t* keep) {
+  for (;;) {
+    const Six W = pseudo_root(total(normals, m, keep));
+    std::vector<uint8_t> left(keep, keep + m);
+    int64_t points = 0, dropped = 0;
+    for (int64_t k = 0; k < m; ++k) {
+      if (!keep[k]) continue;
+      if (share(normals + 36 * k, W) > DOMINANT) {
+        left[(size_t)k] = 0, ++dropped;
+        continue;
+      }
+      points += counts[k];
+    }
+    if (dropped == 0 || points < LEAST_POINTS) return;
+    std::copy(left.begin(), left.end(), keep);
+  }
+}
+
+Six jackknife(const double* normals, const double* gradients, int64_t m) {
+  const Six W = pseudo_root(total(normals, m));
+  Six inverse, P;
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j)
+      for (int k = 0; k < 6; ++k) inverse.v[i][j] += W.v[i][k] * W.v[j][k];
+  for (int64_t p = 0; p < m; ++p) add_move(normals + 36 * p, gradients + 6 * p, inverse, P);
+  return P;
+}
+
+Six covariance(const PatchTable& t, const Systematic& errors) {
+  std::vector<int64_t> block;
+  Part all;
+  all.blocks.resize((size_t)number_blocks(t, block));
+  for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, block[(size_t)p], all);
+  Six P = jackknife(t.normals, all.gradients.data(), t.m);
+  Effect effect;
+  effect.add(all, pseudo_inverse(total(t.normals, t.m)), 1);
+  effect.add_to(errors, P);
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < i; ++j) P.v[i][j] = P.v[j][i] = 0.5 * (P.v[i][j] + P.v[j][i]);
+  return P;
+}
+
+double split(const PatchTable& t, const Systematic& errors, const double* across, int64_t k) {
+  std::vector<int64_t> block;
+  const int64_t blocks = number_blocks(t, block);
+  double worst = t.m && k ? 0 : std::numeric_limits<double>::quiet_NaN();
+  for (int64_t d = 0; d < k && t.m; ++d) {
+    std::vector<double> along((size_t)t.m);
+    for (int64_t p = 0; p < t.m; ++p) {
+      const double *a = across + 3 * d, *x = t.places + 3 * p;
+      along[(size_t)p] = a[0] * x[0] + a[1] * x[1] + a[2] * x[2];
+    }
+    const double found = difference(t, errors, block, blocks, along);
+    if (!(found <= worst)) worst = found;
+    if (std::isnan(found)) break;
+  }
+  return worst;
+}
+
+}  // namespace avs

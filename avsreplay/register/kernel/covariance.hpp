@@ -1,0 +1,53 @@
+// The covariance of a registered pose from the sums of its patches, see register/covariance.py.
+#pragma once
+#include <array>
+#include <cstdint>
+#include <vector>
+
+#include "symmetric.hpp"
+
+namespace avs {
+
+constexpr int AMPLITUDES = 7;  // six of a strain and the offset
+using Six = Square<6>;
+using Coupling = std::array<std::array<double, AMPLITUDES>, 6>;
+
+// Sums of m patches as in `PatchSums`, matrices complete and row by row.
+struct PatchTable {
+  int64_t m;
+  const double *normals, *gradients, *offsets, *errors, *places;
+  const int64_t* counts;
+  double centre[3];     // about which the strain is taken
+  double extent, side;  // of the model, and of a patch [m]
+};
+
+struct Systematic {
+  double block = 0, smooth[AMPLITUDES] = {}, amplitudes[AMPLITUDES] = {}, fit[6] = {};
+};
+
+// Clears in `keep` the patches that give too much of the information on some motion of the patches kept, again until there
+// is none. Stops, with `keep` as it was, where too few points would be left.
+void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint8_t* keep);
+
+// P = sum over the patches p of m_p m_p', m_p = N^+ ((1 + ALONE) I - N_p N^+)^-1 g_p with N the sum of all N_p.
+Six jackknife(const double* normals, const double* gradients, int64_t m);
+
+Systematic systematic_errors(const PatchTable& patches);
+
+// The jackknife of what `errors` leave unexplained, and their variances.
+Six covariance(const PatchTable& patches, const Systematic& errors);
+
+// The largest normalised squared difference of the poses of two halves, over the k directions `across` (k, 3); NaN where
+// a half does not determine a pose.
+double split(const PatchTable& patches, const Systematic& errors, const double* across, int64_t k);
+
+// Sum of the normals (m, 6, 6); of the patches kept where `keep` is given.
+Six total(const double* normals, int64_t m, const uint8_t* keep = nullptr);
+// T: displacement of the middle of a patch per amplitude of the strain.
+void strains(const PatchTable& patches, int64_t patch, double (&T)[3][6]);
+// A: sums over a patch of J times the residual per amplitude, with T of the same patch.
+void couple(const PatchTable& patches, int64_t patch, const double (&T)[3][6], Coupling& A);
+// The number of the block of each patch, in the order of the blocks' places; returns how many there are.
+int64_t number_blocks(const PatchTable& patches, std::vector<int64_t>& number);
+
+}  // namespace avs
