@@ -183,6 +183,8 @@ def quaternion(R_ab: ArrayLike) -> Array:
         (..., 4) unit quaternions ``[x y z w]`` with w >= 0.
     """
     R = np.asarray(R_ab, dtype=np.float64)
+    if R.ndim == 2:
+        return _quaternion(*R.ravel().tolist())
     xx, yy, zz = R[..., 0, 0], R[..., 1, 1], R[..., 2, 2]
     four_q_qT = np.empty((*R.shape[:-2], 4, 4))  # row k is 4 q_k q: the row of the largest q_k is well conditioned
     four_q_qT[..., 0, 0], four_q_qT[..., 1, 1] = 1 + xx - yy - zz, 1 - xx + yy - zz
@@ -198,6 +200,16 @@ def quaternion(R_ab: ArrayLike) -> Array:
         four_q_qT[..., i, j] = four_q_qT[..., j, i] = value
     best = np.argmax(np.diagonal(four_q_qT, axis1=-2, axis2=-1), axis=-1)
     return normalise(np.take_along_axis(four_q_qT, best[..., None, None], axis=-2)[..., 0, :])
+
+
+def _quaternion(
+    xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float, zz: float
+) -> Array:
+    squares = (1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz)
+    best = squares.index(max(squares))
+    a, b, c, d, e, f = xy + yx, xz + zx, yz + zy, zy - yz, xz - zx, yx - xy
+    row = ((squares[0], a, b, d), (a, squares[1], c, e), (b, c, squares[2], f), (d, e, f, squares[3]))[best]
+    return normalise(row)
 
 
 def exp(rotvec: ArrayLike) -> Array:

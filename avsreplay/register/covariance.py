@@ -116,6 +116,12 @@ def jackknife_covariance(normals: Array, gradients: Array) -> Array:
     return P
 
 
+def pseudo_inverse(N: Array) -> Array:
+    """Return the pseudo-inverse (6, 6) of a symmetric positive semidefinite matrix."""
+    inverse: Array = kernel_module().pseudo_inverse(*_contiguous(N))
+    return inverse
+
+
 def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Systematic:
     """Estimate the systematic errors of a scan from the structure of its residuals.
 

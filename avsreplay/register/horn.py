@@ -35,7 +35,7 @@ class HornBackend:
     def __init__(self, target: Target) -> None:
         limits = target.limits
         self._index, self._visibility = target.index, target.visibility
-        self._rule = IcpParams(
+        rule = IcpParams(
             n_max=limits.n_max,
             n_plane=min(PLANE_PASSES, limits.n_max),
             few=FEW_POINTS,
@@ -45,16 +45,18 @@ class HornBackend:
             eps_m=limits.eps_m,
             threads=limits.threads,
         )
+        self._rules = {facing: replace(rule, facing=facing) for facing in (False, True)}
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
-        return self._run(points, guess, self._rule)
+        return self._run(points, guess, self._rules)
 
     def align_within(self, points: NDArray[Any], guess: Pose, gate_m: float) -> Fit:
         """Return T_ca with correspondences nearer than ``gate_m`` [m] from the first pass to the last."""
-        return self._run(points, guess, replace(self._rule, gate_m=gate_m, floor_m=gate_m, tighten=0.0))
+        rules = {k: replace(rule, gate_m=gate_m, floor_m=gate_m, tighten=0.0) for k, rule in self._rules.items()}
+        return self._run(points, guess, rules)
 
-    def _run(self, points: NDArray[Any], guess: Pose, rule: IcpParams) -> Fit:
+    def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams]) -> Fit:
         facing = self._visibility.camera_c(self._index, points, guess) is not None
-        found = self._index.icp(points, guess, replace(rule, facing=facing))
+        found = self._index.icp(points, guess, rules[facing])
         return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches)

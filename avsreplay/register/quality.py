@@ -6,6 +6,7 @@ appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.covariance import (
     Evidence,
     jackknife_covariance,
+    pseudo_inverse,
     registration_covariance,
     split_nis,
     systematic_errors,
@@ -104,18 +106,23 @@ def grade(
     halves: bool = True,
     accuracy: tuple[float, float] = ACCURACY,
     systematic: bool = True,
+    guess: Pose | None = None,
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
     Too few inliers give NO_OVERLAP whatever the convergence flag of the back end says. ``halves``: compare the poses
     from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
-    ``systematic``: the covariance includes errors that vary slowly over the target.
+    ``systematic``: the covariance includes errors that vary slowly over the target. ``guess``: T_ca from which the back
+    end began; a pose that is this guess to the last bit, while the scan asks for another, is FAILED.
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
     found = evidence(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m, fit.matches)
     overlap = found.inliers >= max(params.min_inliers, params.min_inlier_ratio * found.points)
     left = remaining_step(found)
+    if overlap and _same(fit.T_ca, guess) and unchanged_without_reason(found):
+        failed = not_measured(len(points), AlignStatus.FAILED)
+        return replace(failed, message="returned its guess unchanged; the scan asks for another pose")
     found = without_dominant_patches(found) if overlap else found
     total = found.normals.sum(axis=0)
     info = frozen(total / found.noise_m**2)
@@ -124,7 +131,7 @@ def grade(
     P, split = _covariance(found, across, index.extent_m, systematic) if overlap and not weakest else (None, None)
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
-        info, P, weakest = frozen(np.linalg.pinv(P, hermitian=True)), None, unbounded
+        info, P, weakest = frozen(pseudo_inverse(P)), None, unbounded
     settled = P is None or not _beyond(left, P, index.extent_m, accuracy)
     return Alignment(
         T_ac=fit.T_ca.inverse(),
@@ -144,9 +151,13 @@ def grade(
     )
 
 
+def _same(T_ca: Pose, guess: Pose | None) -> bool:
+    return guess is not None and (T_ca.q.tobytes(), T_ca.t.tobytes()) == (guess.q.tobytes(), guess.t.tobytes())
+
+
 def remaining_step(found: Evidence) -> Array:
     """Return the least-squares step (6,) that the residuals at a pose ask for; zero at a converged pose."""
-    return np.asarray(np.linalg.pinv(found.normals.sum(axis=0), hermitian=True) @ found.gradients.sum(axis=0))
+    return pseudo_inverse(found.normals.sum(axis=0)) @ found.gradients.sum(axis=0)
 
 
 def unchanged_without_reason(found: Evidence) -> bool:
@@ -162,7 +173,7 @@ def unchanged_without_reason(found: Evidence) -> bool:
 def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float]) -> bool:
     """Whether a step is larger than the accuracy of the back end and than three standard deviations of the pose."""
     large = np.linalg.norm(step[:3]) > np.radians(accuracy[0]) or np.linalg.norm(step[3:]) > accuracy[1] * extent_m
-    return bool(large and step @ np.linalg.pinv(P, hermitian=True) @ step > 9.0 * len(step))
+    return bool(large and step @ pseudo_inverse(P) @ step > 9.0 * len(step))
 
 
 def _covariance(found: Evidence, across: Array, extent_m: float, systematic: bool) -> tuple[Array | None, float | None]:
@@ -208,13 +219,18 @@ def unobservable_directions(total: Array, count: int, centre: Array) -> tuple[st
     info, _ = scaled_information(total, count, centre)
     values, vectors = np.linalg.eigh(info)
     free = vectors[:, values < FREE_BELOW].T
+    if not len(free):
+        return ()
     return tuple(_words(row) for row in _sparse_basis(free))
 
 
 def unbounded_directions(P: Array, extent_m: float) -> tuple[str, ...]:
     """Name every motion whose standard deviation by P (6, 6) is at least the extent (rotations: 1 rad)."""
     scale = np.repeat([1.0, 1.0 / extent_m], 3)
-    values, vectors = np.linalg.eigh(P * np.outer(scale, scale))
+    scaled = P * np.outer(scale, scale)
+    if np.trace(scaled) < 1.0:  # the largest eigenvalue is not larger
+        return ()
+    values, vectors = np.linalg.eigh(scaled)
     return tuple(_words(row) for row in _sparse_basis(vectors[:, values >= 1.0].T))
 
 

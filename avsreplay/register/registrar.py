@@ -148,8 +148,9 @@ class Registrar:
             T_ac: pose of the model.
             most_m: larger distances are limited to this value [m]; it is at most the reach of the index.
         """
-        d2 = self._index.closest(T_ac.inverse().apply(points)).d2
-        return np.asarray(np.sqrt(np.minimum(d2, min(most_m, self._index.reach_m) ** 2)))
+        most_m = min(most_m, self._index.reach_m)
+        d2 = self._index.closest(T_ac.inverse().apply(points), most_m=most_m).d2
+        return np.asarray(np.sqrt(np.minimum(d2, most_m**2)))
 
     def scale_error(self, p: Array, camera_c: Array, width_m: float, rounds: int) -> tuple[float, float] | None:
         """Return delta (target over model, less 1) from points of a registered scan, and the information on it.
@@ -179,8 +180,8 @@ class Registrar:
         return GlobalSearch(self._target, self.params.acquire)
 
     def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
-        finite = np.isfinite(points).all(axis=1)
-        scan = points if finite.all() else points[finite]
+        finite = np.isfinite(points)
+        scan = points if finite.all() else points[finite.all(axis=1)]
         return thin(scan, self.params.subsample_m) if self.params.subsample_m > 0.0 else scan
 
     def _healthy(self, found: Alignment) -> bool:
@@ -228,22 +229,17 @@ class Registrar:
         self, scan: NDArray[Any], guess: Pose, width_m: float | None = None, halves: bool = True, carried: bool = False
     ) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
-        fit = self._align(scan, guess.inverse(), width_m)
+        start = guess.inverse()
+        fit = self._align(scan, start, width_m)
         if isinstance(fit, str):
             return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
-        start = guess.inverse()
-        graded = quality.grade(
-            self._index, self._visibility, scan, fit, limits, self.params, halves, self._accuracy, not carried
+        found = quality.grade(
+            self._index, self._visibility, scan, fit, limits, self.params, halves, self._accuracy, not carried, start
         )
-        same = (fit.T_ca.q.tobytes(), fit.T_ca.t.tobytes()) == (start.q.tobytes(), start.t.tobytes())
-        if not (same and graded.measured):  # a guess that is kept for lack of overlap is no error of the back end
-            return graded
-        found = quality.evidence(self._index, self._visibility, scan, start, limits.gate_m, self.params.noise_m)
-        if not quality.unchanged_without_reason(found):
-            return graded
-        message = f"back end '{self.params.backend}' returned its guess unchanged; the scan asks for another pose"
-        return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=message)
+        if found.status is AlignStatus.FAILED:
+            found = replace(found, T_ac=guess, message=f"back end '{self.params.backend}' {found.message}")
+        return found
 
     def _align(self, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | str:
         """Run the back end; what it raises, or a result of another type, becomes the status FAILED with this text."""

@@ -219,13 +219,20 @@ class SurfaceIndex:
         """Memory of the index [B]."""
         return int(self._index.nbytes)
 
-    def closest(self, points: NDArray[Any], *, threads: int = 1, camera_c: ArrayLike | None = None) -> Closest:
-        """Closest points of ``points`` (n, 3) [m] in {C}; a point that is not finite has none.
+    def closest(
+        self,
+        points: NDArray[Any],
+        *,
+        threads: int = 1,
+        camera_c: ArrayLike | None = None,
+        most_m: float = float("inf"),
+    ) -> Closest:
+        """Closest points of ``points`` (n, 3) [m] in {C}; one that is not finite, or ``most_m`` [m] away, has none.
 
         With ``camera_c`` (3,) [m] only faces that face this position are searched; a point cloud is searched whole.
         """
         camera = None if camera_c is None else tuple(float(x) for x in np.reshape(camera_c, 3))
-        return Closest(*self._index.closest(_points(points), threads, camera))
+        return Closest(*self._index.closest(_points(points), threads, camera, most_m))
 
     def icp(self, points: NDArray[Any], T_ca: ArrayLike | Pose, params: IcpParams | None = None) -> IcpResult:
         """Align the scan ``points`` (n, 3) [m] in {A} to the model from the guess ``T_ca`` (4, 4).

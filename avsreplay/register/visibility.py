@@ -21,7 +21,7 @@ CLEARANCE_OF_EXTENT = 0.25
 LEAST_FACING = 0.4
 PAIRED_EDGES = 0.95
 FAR_OF_EXTENT = 0.6  # if the median of a scan is this far from the origin, the camera was at the origin
-TESTED_POINTS = 500
+TESTED_POINTS = 200
 
 
 class Camera(Enum):

@@ -123,7 +123,8 @@ class Index {
     return nb::bytes(bytes.data(), bytes.size());
   }
 
-  nb::tuple closest(nb::handle points, int threads, std::optional<std::array<double, 3>> camera) const {
+  nb::tuple closest(nb::handle points, int threads, std::optional<std::array<double, 3>> camera, double most) const {
+    require(most > 0, "the largest distance must be positive");
     const Cloud cloud(points);
     const View v = cloud.view();
     const Vec3 eye = camera ? Vec3{(*camera)[0], (*camera)[1], (*camera)[2]} : Vec3{0, 0, 0};
@@ -139,7 +140,7 @@ class Index {
       Facing facing;
       code.face(store_, sided ? &eye : nullptr, 0, facing);
       team.each((v.n + CHUNK - 1) / CHUNK, [&](int64_t k) {
-        code.closest(store_, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), facing, sided, out);
+        code.closest(store_, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), facing, sided, std::min(most, store_.reach), out);
       });
     }
     return nb::make_tuple(foot, d2, id, normal);
@@ -298,6 +299,13 @@ nb::ndarray<nb::numpy, bool> keep_patches(const Patches& normals, const Counts& 
   return out;
 }
 
+Numpy pseudo_inverse_of(const Patches& N) {
+  require(N.ndim() == 2 && N.shape(0) == 6 && N.shape(1) == 6, "the matrix must be (6, 6)");
+  Six A;
+  std::memcpy(A.v, N.data(), sizeof A.v);
+  return array66(pseudo_inverse(A));
+}
+
 Numpy jackknife_of(const Patches& normals, const Patches& gradients) {
   check_patches(normals, gradients);
   return array66(jackknife(normals.data(), gradients.data(), (int64_t)normals.shape(0)));
@@ -357,6 +365,7 @@ NB_MODULE(_kernel, m) {
   m.attr("LAYOUT") = LAYOUT;
   nb::class_<Matches>(m, "Matches");
   m.def("keep_patches", &keep_patches, nb::arg("normals"), nb::arg("counts"));
+  m.def("pseudo_inverse", &pseudo_inverse_of, nb::arg("N"));
   m.def("jackknife", &jackknife_of, nb::arg("normals"), nb::arg("gradients"));
   nb::class_<Table>(m, "Table")
       .def(nb::init<Patches, Patches, Patches, Counts, Patches, Patches, std::array<double, 3>, double, double>(),
@@ -372,7 +381,7 @@ NB_MODULE(_kernel, m) {
            nb::arg("mesh"), nb::arg("portable") = false)
       .def("save", &Index::save)
       .def("closest", &Index::closest, nb::arg("points"), nb::arg("threads") = 1,
-           nb::arg("camera_c").none() = nb::none())
+           nb::arg("camera_c").none() = nb::none(), nb::arg("most_m") = HUGE_VAL)
       .def("icp", &Index::icp, nb::arg("points"), nb::arg("T_ca"), nb::arg("n_max"), nb::arg("n_plane"),
            nb::arg("gate_m"), nb::arg("tighten"), nb::arg("floor_m"), nb::arg("eps_rad"), nb::arg("eps_m"),
            nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false, nb::arg("newton") = false,

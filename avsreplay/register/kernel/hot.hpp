@@ -71,7 +71,7 @@ struct Code {
   // Appends the cells nearer than `band` to a block; false once there are more than `most`.
   bool (*cells)(const Store&, uint32_t block, float band, size_t most, std::vector<Near>&);
   void (*face)(const Store&, const Vec3* eye, double margin, Facing&);
-  void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Facing&, bool sided, const Feet&);
+  void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Facing&, bool sided, double bound, const Feet&);
   void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
   void (*pass)(const Store&, const View&, int64_t first, int64_t last, const Look&, Kept*, Sums&);
   // `kept`: where the searches begin, or null; what is said there must hold for the eye and the gate of `look`.

@@ -25,9 +25,9 @@ namespace AVS_ISA {
 #include "pass.hpp"
 
 static void closest(const Store& s, const View& v, int64_t first, int64_t last, const Facing& facing, bool sided,
-                    const Feet& out) {
-  s.mesh ? closest_kind<Triangles>(s, v, first, last, facing, sided, out)
-         : closest_kind<Points>(s, v, first, last, facing, sided, out);
+                    double bound, const Feet& out) {
+  s.mesh ? closest_kind<Triangles>(s, v, first, last, facing, sided, bound, out)
+         : closest_kind<Points>(s, v, first, last, facing, sided, bound, out);
 }
 
 static bool cells(const Store& s, uint32_t block, float band, size_t most, std::vector<Near>& out) {

@@ -254,9 +254,9 @@ static void match_kind(const Store& s, const View& v, int64_t first, int64_t las
 
 template <class Kind>
 static void closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const Facing& facing, bool sided,
-                         const Feet& out) {
+                         double bound, const Feet& out) {
   const double nan = std::numeric_limits<double>::quiet_NaN();
-  const Scope o = scope_of(s, facing, sided, s.reach, 0.f);
+  const Scope o = scope_of(s, facing, sided, bound, 0.f);
   int32_t seed = -1;
   for (int64_t i = first; i < last; ++i) {
     double p[3];
