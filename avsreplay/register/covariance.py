@@ -133,8 +133,8 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     Returns:
         The variances; zero where every patch is a single point, or there are fewer than 24 patches.
     """
-    table = _table(found, found.centre, extent_m, patch_m)
-    return Systematic(extent_m, patch_m, *table.systematic(), found.centre)
+    block_m2, smooth_m2, amplitudes, fit = _table(found, found.centre, extent_m, patch_m).systematic()
+    return Systematic(extent_m, patch_m, block_m2, smooth_m2, amplitudes, fit, found.centre)
 
 
 def registration_covariance(found: Evidence, errors: Systematic) -> Array:

@@ -157,7 +157,7 @@ def _same(T_ca: Pose, guess: Pose | None) -> bool:
 
 def remaining_step(found: Evidence) -> Array:
     """Return the least-squares step (6,) that the residuals at a pose ask for; zero at a converged pose."""
-    return pseudo_inverse(found.normals.sum(axis=0)) @ found.gradients.sum(axis=0)
+    return np.asarray(pseudo_inverse(found.normals.sum(axis=0)) @ found.gradients.sum(axis=0))
 
 
 def unchanged_without_reason(found: Evidence) -> bool:
