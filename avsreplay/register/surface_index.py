@@ -87,8 +87,7 @@ class IcpResult:
         iterations: passes over all points; those over a part count as its share of the points, rounded up together.
         converged: the stopping rule held before n_max.
         inliers, rms_m: of the last pass, before its step (distance between point and closest point).
-        gate_m: rejection distance after the last pass.
-        step_rad, step_m: the last step.
+        gate_m: rejection distance after the last pass.  step_rad, step_m: the last step.
         ignored: points with a coordinate that is not finite.
         searched: neighbour searches made over all passes.
         matches: opaque; shortens the search of :meth:`SurfaceIndex.evidence` for the same points.
@@ -164,8 +163,7 @@ class SurfaceIndex:
     Attributes:
         reach_m: no closest point is searched at this distance or farther.
         extent_m: diagonal of the bounding box of the surface.
-        primitives: triangles or points in the index.
-        dropped: triangles without area.
+        primitives: triangles or points in the index.  dropped: triangles without area.
         restored: the index was read from the cache instead of built.
     """
 
@@ -220,12 +218,7 @@ class SurfaceIndex:
         return int(self._index.nbytes)
 
     def closest(
-        self,
-        points: NDArray[Any],
-        *,
-        threads: int = 1,
-        camera_c: ArrayLike | None = None,
-        most_m: float = float("inf"),
+        self, points: NDArray[Any], *, threads: int = 1, camera_c: ArrayLike | None = None, most_m: float = np.inf
     ) -> Closest:
         """Closest points of ``points`` (n, 3) [m] in {C}; one that is not finite, or ``most_m`` [m] away, has none.
 
