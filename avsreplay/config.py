@@ -80,11 +80,12 @@ class RunConfig(Settings):
         return self.robot.described(self.plan, self.limits)
 
     def check(self) -> None:
-        """Raise ValueError for an invalid initial pose, or an axis that is not a unit vector."""
+        """Raise ValueError for an invalid initial pose, an axis that is not a unit vector, or an impossible robot."""
         if self.init not in ("log", "truth", "auto"):
             parse_pose(self.init)
         if abs(math.hypot(*self.fixture_axis_c) - 1.0) > 1e-6:
             raise ValueError(f"fixture_axis_c is {self.fixture_axis_c}, must be of unit length")
+        check_robot(self.robot, self.plan, self.limits)
 
 
 PAPER = (
@@ -183,6 +184,21 @@ def robot_settings(file: Path) -> tuple[str, ...]:
     document = load(file)
     build(RobotFile, document)
     return tuple(f"robot.{key}={toml_value(value)}" for key, value in document.table["robot"].items())
+
+
+def check_robot(robot: RobotParams, plan: PlanParams, limits: Limits) -> None:
+    """Raise ValueError where the robot does not fit to the other settings of a plan.
+
+    Args:
+        robot: the robot.
+        plan: parameters of the planner, some of which the robot replaces.
+        limits: constraints, some of which the robot replaces.
+    """
+    try:
+        robot.applied(plan)
+        robot.limited(limits)
+    except ValueError as error:
+        raise ValueError(f"with the values of [robot], {error}") from None
 
 
 def _over(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:

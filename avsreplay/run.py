@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from avsreplay import arithmetic, pipeline, settings
 from avsreplay.build import first_state, stages
@@ -22,12 +22,14 @@ from avsreplay.log.cloud_stream import ahead
 from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
 from avsreplay.plan import Motion
-from avsreplay.reconstruct import Reconstruction, at_grasp, reconstruct, surface_of
 from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.register import POSES, ModelCheck, Registrar
 from avsreplay.report.summary import Summary, SummaryFold
 from avsreplay.rows import Row
 from avsreplay.score import HealthyPoses, Scorer, matched_truth, reference_motion
+
+if TYPE_CHECKING:
+    from avsreplay.reconstruct import Reconstruction
 
 RECONSTRUCTED, MOST_LOSSES = Path("auto"), 100  # a model built from the log; losses listed one by one in run.json
 
@@ -318,6 +320,8 @@ class Run:
 
     def _without_model(self) -> LogHeader:
         """Reconstruct the model; start and true state of the log refer to another frame {C} and are dropped."""
+        from avsreplay.reconstruct import at_grasp, reconstruct, surface_of
+
         self._first_ns = self.source.scan_at(0).t_ns if len(self.source) else 0
         self._made = at_grasp(reconstruct(self.source.scans))
         true = dict(self.source.truth_poses())

@@ -12,10 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_server import CommandServer
 
 from avsreplay.rows import Row
 
 ROOT = Path(__file__).resolve().parents[1]
+SERVER = CommandServer()
 DATA = ROOT.parent / "shared" / "data"
 
 
@@ -29,22 +31,22 @@ class Done:
 
 
 def avsreplay(*args, cwd=None, env=None, timeout=300):
-    """Run the command line in a process of its own, as a user does."""
-    done = subprocess.run(
-        [sys.executable, "-m", "avsreplay", *map(str, args)],
-        cwd=cwd,
-        env={**os.environ, **(env or {})},
-        capture_output=True,
-        text=True,
-        timeout=timeout,
-        check=False,
-    )
-    return Done(done.returncode, done.stdout, done.stderr)
+    """Run the command line as a user does: in a fork of a process that has imported it, or in one of its own."""
+    words, environment = [*map(str, args)], {**os.environ, **(env or {})}
+    done = SERVER.run(words, cwd, environment, timeout)
+    if done is None:
+        command = [sys.executable, "-m", "avsreplay", *words]
+        ended = subprocess.run(
+            command, cwd=cwd, env=environment, capture_output=True, text=True, timeout=timeout, check=False
+        )
+        done = ended.returncode, ended.stdout, ended.stderr
+    return Done(*done)
 
 
 @pytest.fixture(scope="session")
 def cli():
-    return avsreplay
+    yield avsreplay
+    SERVER.close()
 
 
 @pytest.fixture(scope="session")

@@ -156,3 +156,25 @@ def test_terminal_escapes_in_names_are_escaped(cli, tmp_path):
     done = cli("run", path)
     assert done.code == 3
     assert "\x1b" not in done.err + done.out
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [
+        ("mass_kg = 1e-320\nthrust_axes_n = [6.0, 4.0, 4.0]", "a_max_mps2 is inf"),
+        ("accel_axes_mps2 = [1.0, 1.0, inf]", "accel_axes_mps2 is [1.0, 1.0, inf]"),
+        ("delay_s = 1e6", "latency_s is 1000000.0, must be below horizon_s"),
+    ],
+)
+def test_an_impossible_robot_is_one_line(tmp_path, text, what):
+    """Values that are allowed one by one, but not together with the planner's."""
+    from click.testing import CliRunner
+
+    from avsreplay.cli.config import command
+    from avsreplay.errors import UsageError
+
+    robot = tmp_path / "robot.toml"
+    robot.write_text(f"[robot]\n{text}\n")
+    ended = CliRunner().invoke(command, ["--robot", str(robot)])
+    assert isinstance(ended.exception, UsageError)
+    assert what in str(ended.exception)

@@ -209,3 +209,12 @@ def test_an_invalid_belief_is_named(result, tmp_path, name, value, says):
 
 def test_no_result_is_unreadable(tmp_path):
     assert isinstance(run(tmp_path / "nothing").exception, UnreadableInput)
+
+
+@pytest.mark.parametrize("text", ["mass_kg = 1e-320\nthrust_max_n = 5.0", "delay_s = 1e6"])
+def test_an_impossible_robot_is_one_line(result, tmp_path, text):
+    robot = tmp_path / "robot.toml"
+    robot.write_text(f"[robot]\n{text}\n")
+    ended = CliRunner().invoke(command, [str(result), "--robot", str(robot), "--at", "20"])
+    assert isinstance(ended.exception, UsageError)
+    assert "must be" in str(ended.exception)

@@ -158,6 +158,7 @@ def test_a_bad_pose_becomes_a_row_and_the_run_continues(tmp_path, motion) -> Non
     ("text", "what"),
     [
         ("1 2 3\n", "not a pose line"),
+        (f"{'9' * 400},0,0,1,1,0,0,0\n", "not a pose line"),
         ("t,x,y,z,qx,qy,qz\n0,1,2,3,0,0,0\n", "no column for qw"),
         ("t_s,x,y,z,qx,qy,qz,qw\nnow,1,2,3,0,0,0,1\n", "'now' is not a time"),
         ("0 nan 0 0 0 0 0 1\n", "no valid pose in this file; the first: a pose that is not finite"),

@@ -150,7 +150,8 @@ def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
     params: PlanParams = _usable(lambda: replace(saved.plan, **{k: v for k, v in given.items() if k in of_plan}))
     changed = {k: v for k, v in given.items() if k not in of_plan}
     limits: Limits = _usable(lambda: replace(saved.limits, **changed))
-    return Replanning(saved, params, limits, saved.supervisor)
+    made: Replanning = _usable(lambda: Replanning(saved, params, limits, saved.supervisor))
+    return made
 
 
 def _document(

@@ -69,6 +69,14 @@ def seconds_to_ns(text: str) -> int | None:
         return None
 
 
+def _whole_ns(word: str) -> int:
+    """A time in whole nanoseconds. Raises ValueError where it is none, or is beyond what 64 bits can hold."""
+    t_ns = int(word)
+    if abs(t_ns) >= _MAX_SECONDS * 1_000_000_000:
+        raise ValueError
+    return t_ns
+
+
 def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
     """Yield (file and line, words, whether it has commas) of each line that is not empty or a comment."""
     try:
@@ -89,10 +97,7 @@ def _line(words: list[str], commas: bool, where: str) -> tuple[int | None, Pose]
     try:
         if commas:  # EuRoC: nanoseconds, scalar first
             values = [float(w) for w in words[1:8]]
-            stamp = int(words[0])
-            if abs(stamp) >= _MAX_SECONDS * 1_000_000_000:
-                raise ValueError
-            return stamp, _pose(values[:3], [*values[4:7], values[3]])
+            return _whole_ns(words[0]), _pose(values[:3], [*values[4:7], values[3]])
         if len(words) == 12:
             return None, _from_rows([float(w) for w in words])
         t_ns, values = seconds_to_ns(words[0]), [float(w) for w in words[1:8]]
@@ -248,7 +253,7 @@ def _measured_line(words: list[str], commas: bool, where: str) -> tuple[int | No
     try:
         if commas:
             x, y, z, qw, *q = (_number(w) for w in words[1:8])
-            return int(words[0]), _checked([x, y, z, *q, qw])
+            return _whole_ns(words[0]), _checked([x, y, z, *q, qw])
         if len(words) == 12:
             return None, MeasuredPose(_from_rows([float(w) for w in words]))
         t_ns = seconds_to_ns(words[0])

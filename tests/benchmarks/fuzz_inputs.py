@@ -186,6 +186,18 @@ def mutate(data: bytes, rng: np.random.Generator, others: list[bytes]) -> bytes:
     return bytes(out)
 
 
+def in_place(data: bytes, rng: np.random.Generator) -> bytes:
+    """One to three changes that keep the length; the checksums of an uncompressed MCAP hold again."""
+    out = bytearray(data)
+    for _ in range(int(rng.integers(1, 4))):
+        if out:
+            size, change = len(out), (_flip, _set, _number)[int(rng.integers(3))]
+            out = change(out, rng, [])[:size]
+    if out[:8] == mcap.MAGIC:
+        _mend(out)
+    return bytes(out)
+
+
 def _flip(out: bytearray, rng: np.random.Generator, _: list[bytes]) -> bytearray:
     at = int(rng.integers(len(out)))
     out[at] ^= 1 << int(rng.integers(8))
@@ -257,6 +269,8 @@ def _mend(out: bytearray) -> None:
             data = bytes(out[at + 49 : at + 9 + length])
             struct.pack_into("<QI", out, at + 25, len(data), zlib.crc32(data))
             struct.pack_into("<Q", out, at + 41, len(data))
+        if opcode == mcap.ATTACHMENT and length > 4 and at + 9 + length <= len(out):
+            struct.pack_into("<I", out, at + 5 + length, zlib.crc32(bytes(out[at + 9 : at + 5 + length])))
         at += 9 + length
 
 

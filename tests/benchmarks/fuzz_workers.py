@@ -1,4 +1,4 @@
-"""The worker processes of the fuzz campaigns, shared by fuzz_logs.py and fuzz_commands.py."""
+"""The processes of the campaigns: workers of fuzz_logs.py and fuzz_commands.py, commands of outputs.py."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import sys
 import tempfile
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -141,6 +142,70 @@ def _one(check: Check, limit_s: int) -> str:
 
 def _alarm(_signal: int, _frame: object) -> None:
     raise Hang
+
+
+@dataclass(frozen=True)
+class Done:
+    """A finished command."""
+
+    returncode: int
+    stderr: str
+
+
+class Command:
+    """A command in a fork of this process, which has imported the package: it starts in milliseconds."""
+
+    def __init__(self, args: Sequence[str], place: Path, file_bytes: int | None = None, limit_s: int = 600) -> None:
+        """Start it.
+
+        Args:
+            args: its arguments.
+            place: its working directory.
+            file_bytes: no file may become larger, as on a full disk.
+            limit_s: it is ended after this time.
+        """
+        self._errors, end = os.pipe()
+        self.pid = os.fork()
+        if self.pid == 0:
+            os.close(self._errors)
+            os.dup2(end, 2)
+            self._run(args, place, file_bytes, limit_s)
+        os.close(end)
+
+    def kill(self) -> bool:
+        """Kill it; True if it was still running."""
+        os.kill(self.pid, signal.SIGKILL)
+        return self.wait().returncode == -signal.SIGKILL
+
+    def wait(self) -> Done:
+        """Wait for its end."""
+        with os.fdopen(self._errors, "rb") as stream:
+            text = stream.read().decode(errors="replace")
+        return Done(os.waitstatus_to_exitcode(os.waitpid(self.pid, 0)[1]), text)
+
+    def _run(self, args: Sequence[str], place: Path, file_bytes: int | None, limit_s: int) -> None:
+        code = 70
+        try:
+            with Path(os.devnull).open("r+b") as nothing:
+                os.dup2(nothing.fileno(), 0)
+                os.dup2(nothing.fileno(), 1)
+            os.chdir(place)
+            if file_bytes is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
+            signal.alarm(limit_s)
+            sys.argv = ["avsreplay", *args]
+            from avsreplay.__main__ import main
+
+            main()
+        except SystemExit as leaving:
+            code = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            for stream in (sys.stdout, sys.stderr):
+                with suppress(OSError, ValueError):
+                    stream.flush()
+            os._exit(code)
 
 
 def report(campaign: int, count: int, result: Campaign) -> int:

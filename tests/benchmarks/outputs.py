@@ -10,11 +10,8 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
-import signal
 import socket
 import stat
-import subprocess
 import sys
 import tempfile
 import threading
@@ -26,10 +23,12 @@ from pathlib import Path
 import click
 import numpy as np
 from fuzz_commands import OUTPUTS, build
+from fuzz_workers import Command, Done
 
 from avsreplay.cli import SUMMARIES, group
 from avsreplay.errors import AvsError
 from avsreplay.log import open_source
+from avsreplay.log.surface import read_surface
 from avsreplay.report.result import load_result
 
 RUN = ("log.mcap", "--init", "truth", "--n-scans", "2")
@@ -70,7 +69,7 @@ def listed() -> list[tuple[str, str]]:
 def command_line(case: tuple[str, str], seeds: Path, output: str) -> list[str]:
     """The arguments of a case."""
     words = (output if w == "OUT" else str(seeds / w) if (seeds / w).exists() else w for w in CASES[case])
-    return [sys.executable, "-m", "avsreplay", case[0], *words]
+    return [case[0], *words]
 
 
 def node(kind: str, place: Path) -> str:
@@ -109,9 +108,7 @@ def try_node(case: tuple[str, str], kind: str, seeds: Path, root: Path) -> str:
     place = Path(tempfile.mkdtemp(dir=root))
     output = node(kind, place)
     before = kinds(place)
-    done = subprocess.run(
-        command_line(case, seeds, output), cwd=place, capture_output=True, text=True, timeout=120, check=False
-    )
+    done = Command(command_line(case, seeds, output), place, limit_s=120).wait()
     after = kinds(place)
     lines = [line for line in done.stderr.splitlines() if line.startswith("avsreplay: ") and "warning" not in line]
     if "Traceback" in done.stderr or done.returncode in (1, 70) or (done.returncode and len(lines) != 1):
@@ -133,13 +130,15 @@ def is_complete(case: tuple[str, str], path: Path) -> bool:
             return (path / "summary.json").read_text(encoding="utf-8").endswith("}\n")
         if case == ("run", "output"):
             return not load_result(path).unverified
+        if path.suffix == ".ply":
+            return bool(len(read_surface(path, cloud_ok=True).vertices))
         if path.suffix == ".mcap":
             with open_source(path) as source:
                 return not source.losses
     except AvsError:
         return False
     text = path.read_text(encoding="utf-8", errors="replace")
-    ends = {".html": "</html>", ".xml": "</testsuites>", ".csv": "\n", ".jsonl": "\n", ".ply": ""}
+    ends = {".html": "</html>", ".xml": "</testsuites>", ".csv": "\n", ".jsonl": "\n"}
     return text.rstrip(" ").endswith(ends[path.suffix]) or text.rstrip().endswith(ends[path.suffix])
 
 
@@ -152,10 +151,9 @@ def output_of(case: tuple[str, str], place: Path) -> Path:
     return place / f"out{'' if case in FOLDERS else suffixes.get(case) or SUFFIX[case[0]]}"
 
 
-def finished(line: list[str], place: Path, file_bytes: int | None = None) -> subprocess.CompletedProcess[str]:
+def finished(line: list[str], place: Path, file_bytes: int | None = None) -> Done:
     """Run a command to its end; with ``file_bytes`` no file may become larger, as on a full disk."""
-    limits = None if file_bytes is None else lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
-    return subprocess.run(line, cwd=place, capture_output=True, text=True, timeout=600, check=False, preexec_fn=limits)
+    return Command(line, place, file_bytes).wait()
 
 
 def beside(path: Path, *kept: Path) -> list[str]:
@@ -196,9 +194,8 @@ def two_writers(case: tuple[str, str], seeds: Path, root: Path) -> str:
     place = Path(tempfile.mkdtemp(dir=root))
     path = output_of(case, place)
     line = command_line(case, seeds, str(path))
-    both = [subprocess.Popen(line, cwd=place, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) for _ in range(2)]
-    errors = [writer.communicate(timeout=600)[1].decode() for writer in both]
-    codes = sorted(writer.returncode for writer in both)
+    both = [writer.wait() for writer in [Command(line, place) for _ in range(2)]]
+    errors, codes = [writer.stderr for writer in both], sorted(writer.returncode for writer in both)
     if codes[0] or codes[1] not in (0, 2, 3) or any("Traceback" in text for text in errors):
         return f"FINDING {case} two writers: exits {codes}: {errors}"
     if not is_complete(case, path) or beside(path):
@@ -207,18 +204,20 @@ def two_writers(case: tuple[str, str], seeds: Path, root: Path) -> str:
 
 
 def kill(case: tuple[str, str], seeds: Path, root: Path, kills: int, rng: np.random.Generator) -> Iterator[str]:
-    """Write an output, then kill further writers of it at random moments; every fifth time one may finish."""
+    """Write an output, then kill ``kills`` further writers at random moments; every fifth time one may finish."""
     place = Path(tempfile.mkdtemp(dir=root))
     path = output_of(case, place)
     line = command_line(case, seeds, str(path))
     start = time.monotonic()
     finished(line, place)
     seconds = time.monotonic() - start
-    for number in range(kills):
-        writer = subprocess.Popen(line, cwd=place, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(float(rng.uniform(0.4, 1.0)) * seconds)
-        writer.send_signal(signal.SIGKILL)
-        killed = writer.wait() == -signal.SIGKILL
+    number = hits = 0
+    while hits < kills and number < 5 * kills:
+        number += 1
+        writer = Command(line, place)
+        time.sleep(float(rng.uniform(0.0, 1.0)) * seconds)
+        killed = writer.kill()
+        hits += killed
         if case != ("sweep", "output") and not is_complete(case, path):
             yield f"FINDING {case}: after kill -9 the output is neither the old nor the new one"
         elif number % 5 == 4 and (problem := _again(case, line, path)):
