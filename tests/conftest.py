@@ -45,6 +45,7 @@ def avsreplay(*args, cwd=None, env=None, timeout=300):
 
 @pytest.fixture(scope="session")
 def cli():
+    avsreplay("run", ROOT / "fixtures" / "tumble.mcap", "--n-scans", "1", "--json")  # the server keeps the imports
     yield avsreplay
     SERVER.close()
 
@@ -59,6 +60,48 @@ def shared_data():
     if not DATA.is_dir():
         pytest.skip("../shared/data is not here")
     return DATA
+
+
+SLOW = ROOT / "tests" / "slow.txt"
+MOST_S = 0.3  # processor time of a quick test
+
+
+def pytest_addoption(parser):
+    parser.addoption("--write-slow", action="store_true", help="measure all tests and write tests/slow.txt")
+
+
+def pytest_collection_modifyitems(config, items):
+    """Give the tests that slow.txt lists the marker ``slow``."""
+    if config.getoption("--write-slow"):
+        return
+    listed = {line.split()[1] for line in SLOW.read_text(encoding="utf-8").splitlines()}
+    for item in items:
+        if named(item) in listed:
+            item.add_marker("slow")
+
+
+def named(item):
+    """The name of a test without its parameters."""
+    return f"{item.path.name}::{getattr(item, 'originalname', item.name)}"
+
+
+SPENT: dict[str, float] = {}
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    before = sum(os.times()[:4]) + SERVER.spent_s
+    try:
+        return (yield)
+    finally:
+        spent = sum(os.times()[:4]) + SERVER.spent_s - before
+        SPENT[named(item)] = max(SPENT.get(named(item), 0.0), spent)
+
+
+def pytest_sessionfinish(session):
+    if session.config.getoption("--write-slow"):
+        lines = [f"{spent:6.1f} {name}" for name, spent in sorted(SPENT.items()) if spent > MOST_S]
+        SLOW.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 STEP_NS = 200_000_000

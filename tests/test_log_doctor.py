@@ -19,8 +19,7 @@ from rosbags.highlevel import AnyReader
 from avsreplay.cli import main
 from avsreplay.log import open_source
 from avsreplay.log.cdr import point_cloud2, schema_text
-from avsreplay.log.doctor import Severity, examine
-from avsreplay.log.repair import repair
+from avsreplay.log.doctor import Severity, examine, repair
 from avsreplay.records import LogHeader, Scan
 
 CLOUDS = scans(20, 100)

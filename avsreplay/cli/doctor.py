@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 if TYPE_CHECKING:
-    from avsreplay.log.doctor import Finding
-    from avsreplay.log.repair import Repaired
+    from avsreplay.log.doctor import Finding, Repaired
 
 
 EPILOG = """\b
@@ -45,8 +44,7 @@ def command(
     """  # noqa: D301
     from avsreplay.errors import UsageError
     from avsreplay.log import SourceOptions
-    from avsreplay.log.doctor import examine
-    from avsreplay.log.repair import repair
+    from avsreplay.log.doctor import examine, repair
 
     try:
         options = SourceOptions(topic=topic, max_message_mib=max_message_mib)

@@ -18,9 +18,9 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.files import BadFile
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown
-from avsreplay.log.pcd import read_pcd
 from avsreplay.log.ply import read_ply
 from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
+from avsreplay.log.scan_files import read_pcd
 from avsreplay.records import Surface
 
 MAX_BYTES = 512 << 20

@@ -17,10 +17,9 @@ from avsreplay import toml_document
 from avsreplay.errors import AvsError
 from avsreplay.log import SourceOptions, open_source, parse_surface
 from avsreplay.log.bytes_io import BadMessage
-from avsreplay.log.doctor import examine
+from avsreplay.log.doctor import examine, repair
 from avsreplay.log.point_cloud2 import decode_cloud
 from avsreplay.log.pose_files import read_conf, read_poses
-from avsreplay.log.repair import repair
 
 LIMIT_S, LIMIT_MIB, MESSAGE_MIB = 10, 512, 16
 MAX_SEED = 512 << 10

@@ -18,10 +18,9 @@ with atheris.instrument_imports(include=["avsreplay.log"]):
 
     from avsreplay.files import BadFile
     from avsreplay.log.bytes_io import BadMessage
-    from avsreplay.log.pcd import read_pcd, unpack_lzf
     from avsreplay.log.ply import read_ply
     from avsreplay.log.point_cloud2 import decode_cloud
-    from avsreplay.log.scan_files import read_points
+    from avsreplay.log.scan_files import read_pcd, read_points, unpack_lzf
 
 _SCRATCH = Path(tempfile.mkdtemp()) / "one.npy"
 
