@@ -24,6 +24,8 @@ from avsreplay.report.table import Table, TableCell
 SCANS = 5
 _POSES = 200  # measured poses examined
 _LEAST, _MOST = 0.25, 1.3  # diameter of a scan over that of the model outside which something is wrong
+_WHOLE = 1.1  # no scan of the target alone is larger than this
+_FEW = 0.02  # share of background below which it does not explain too large a scan
 _LEFT_OVER = 2.0  # below it some background explains too large a scan better than feet (3.28) do
 _ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
 _UNITS = {
@@ -160,12 +162,16 @@ def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None) -> list[Advi
     model_m = diameter(surface.vertices, trimmed=False)
     ratio = scan_m / model_m if model_m else np.inf
     said = f"the scans measure {scan_m:.3g} m, the model {model_m:.3g} m"
-    if _LEAST <= ratio <= _MOST:
+    if _LEAST <= ratio <= _WHOLE:
         return [Advice("ok", "size", said)]
     targets = [_target(cloud, model_m) for cloud in clouds] if ratio > _MOST else []
     inside = [points for points in targets if points is not None]
-    if len(inside) * 2 > len(clouds):
-        return [_crop_advice(clouds, inside, model_m)]
+    grouped = len(inside) * 2 > len(clouds)
+    if grouped and (crop := _crop_advice(clouds, inside, model_m)):
+        return [crop]
+    if grouped or _WHOLE < ratio <= _MOST:
+        text = f"{said}: the model is too small (then --model-scale {ratio:.2f} or more), or background is left"
+        return [Advice("check", "size", text)]
     if _MOST < ratio < _LEFT_OVER:
         text = f"{said}: points around the target seem to be left; a narrower --crop-box or --crop-range removes them"
         return [Advice("check", "background", text)]
@@ -198,7 +204,8 @@ def _unit_and_background(clouds: Sequence[NDArray[Any]], model_m: float, ratio: 
         groups = [one for one, two in found if one is not None and two is not None and len(two) < 1.2 * len(one)]
         if len(groups) * 2 > len(clouds):
             unit = Advice("fail", "unit", f"{said}: the model seems to be in {name}", f"--model-scale {scale:g}")
-            return [unit, _crop_advice(clouds, groups, size)]
+            crop = _crop_advice(clouds, groups, size)
+            return [unit, crop] if crop else [unit]
     return []
 
 
@@ -218,8 +225,8 @@ def _target(cloud: NDArray[Any], model_m: float, gap: float = 0.1) -> Array | No
     return max(fitting, key=len, default=None)
 
 
-def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], model_m: float) -> Advice:
-    """Most points are background: the crop that keeps the target in all examined scans."""
+def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], model_m: float) -> Advice | None:
+    """The crop that keeps the target in all examined scans; None if hardly any point lies outside it."""
     margin = _MARGIN * model_m
     ranges = [np.linalg.norm(points, axis=1) for points in targets]
     low, high = max(min(r.min() for r in ranges) - margin, 0.0), max(r.max() for r in ranges) + margin
@@ -232,8 +239,10 @@ def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], model
     box = ",".join(f"{v:.2f}" for v in (*corner, *other))
     use_range = by_range.mean() <= 1.2 * by_box.mean()
     option = f"--crop-range {low:.2f},{high:.2f}" if use_range else f"--crop-box {box}"
-    share = 100 * (1.0 - (by_range if use_range else by_box).mean())
-    text = f"{share:.0f} % of the points are background; a group of points has the size of the model ({model_m:.3g} m)"
+    share = 1.0 - (by_range if use_range else by_box).mean()
+    if share < _FEW:
+        return None
+    text = f"{100 * share:.0f} % of the points are background; a group of points has the size of the model ({model_m:.3g} m)"
     return Advice("check", "background", text, option)
 
 

@@ -87,7 +87,7 @@ def record(
         output: log to write (.mcap).
         seed: replaces the seed of the scenario.
         options: how to write.
-        reading: how to read a recorded source.
+        reading: how to read a recorded source; its duration replaces that of a scenario.
         ticker: shows progress.
 
     Returns:
@@ -99,10 +99,11 @@ def record(
     """
     options = options or RecordOptions()
     if source is None or source.suffix.lower() == ".toml":
-        if reading is not None:
-            hint = "leave out the flags for recorded sources"
+        duration_s = None if reading is None else reading.duration_s
+        if reading is not None and reading != SourceOptions(duration_s=duration_s):
+            hint = "leave out the options that read a recorded source; --duration and --seed apply to a scenario"
             raise UsageError("a scenario has no topics or files to read", where=str(source or "record"), hint=hint)
-        return record_scenario(load_scenario(source, seed), output, options, ticker)
+        return record_scenario(load_scenario(source, seed, duration_s), output, options, ticker)
     if seed is not None and not options.faults:
         hint = "leave out --seed; it is used with --fault only"
         raise UsageError("a recorded source has no seed", where=str(source), hint=hint)

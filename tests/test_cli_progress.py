@@ -64,6 +64,15 @@ def test_a_log_goes_through_a_pipe(fixtures_folder, tmp_path, cli):
     assert piped == direct
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")
+def test_a_pipe_without_data_is_named(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "avsreplay", "run", "-"], input="", capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 3
+    assert done.stderr.startswith("avsreplay: standard input: no data; ")
+
+
 def test_a_terminal_gets_no_binary_log(monkeypatch):
     from pathlib import Path
 

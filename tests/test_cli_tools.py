@@ -6,6 +6,8 @@ import json
 import numpy as np
 import pytest
 
+from avsreplay.cli import SUMMARIES
+
 
 @pytest.fixture(scope="module")
 def result(cli, fixtures_folder, tmp_path_factory):
@@ -69,23 +71,7 @@ def test_version_lists_the_libraries(cli):
         assert name in out
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "record",
-        "run",
-        "info",
-        "doctor",
-        "backends",
-        "plan",
-        "report",
-        "export",
-        "compare",
-        "sweep",
-        "config",
-        "completion",
-    ],
-)
+@pytest.mark.parametrize("name", SUMMARIES)
 def test_every_command_has_help_with_examples(name, cli):
     done = cli(name, "--help")
     assert done.code == 0, done.err

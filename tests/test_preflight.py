@@ -110,6 +110,13 @@ def test_a_wall_is_background_and_the_crop_keeps_the_target(surface):
         assert kept[~target].mean() < 0.05
 
 
+@pytest.mark.parametrize(("factor", "grade"), [(0.7, "check"), (0.8, "check"), (1.0, "ok"), (1.05, "ok")])
+def test_a_model_that_is_smaller_than_a_scan_is_doubtful(surface, factor, grade):
+    found = _found(preflight(Log(_seen(surface)), scaled(surface, factor)), "size")
+    assert found.grade == grade
+    assert ("too small" in found.text) == (grade == "check")
+
+
 def test_no_unit_is_guessed_where_none_fits(surface):
     found = preflight(Log([7000.0 * cloud for cloud in _seen(surface)]), surface)
     assert "no common unit" in _found(found, "size").text

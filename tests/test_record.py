@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from contextlib import contextmanager
 from dataclasses import astuple, replace
 from pathlib import Path
@@ -109,7 +110,7 @@ def test_same_seed_same_bytes_whatever_the_hash_seed(scenario, tmp_path):
 def test_the_builtin_scenario_needs_no_argument(monkeypatch, tmp_path):
     short = load_scenario()
     short = replace(short, params=replace(short.params, duration_s=2.0, fault=()))
-    monkeypatch.setattr(recording, "load_scenario", lambda path, seed: short)
+    monkeypatch.setattr(recording, "load_scenario", lambda *_: short)
     monkeypatch.chdir(tmp_path)
     done = CliRunner().invoke(command.command, ["-o", "tumble.mcap"])
     assert done.exit_code == 0
@@ -173,6 +174,15 @@ def test_without_embreex_the_log_is_recorded_and_a_note_is_printed(scenario, tmp
     done = CliRunner().invoke(command.command, [str(scenario), "-o", str(tmp_path / "a.mcap")])
     assert "note: embreex is not installed" in done.output
     assert len(read(tmp_path / "a.mcap")[1]) == 6
+
+
+def test_a_duration_replaces_that_of_a_scenario(scenario, tmp_path):
+    found = record(scenario, tmp_path / "x.mcap", reading=SourceOptions(duration_s=2.0))
+    assert (found.scans, found.seed) == (4, 3)
+    with open_source(tmp_path / "x.mcap") as source:
+        assert tomllib.loads(source.header.scenario)["duration_s"] == 2.0
+    with pytest.raises(UsageError, match="no topics"):
+        record(scenario, tmp_path / "y.mcap", reading=SourceOptions(duration_s=2.0, topic="/x"))
 
 
 def test_every_nth_scan_keeps_its_own_time(tmp_path):

@@ -131,6 +131,21 @@ def test_the_worst_moments_do_not_overlap_and_state_their_cause(make_rows):
     assert any(m.what.startswith("6 scans not used") and m.cause == "injected: full occlusion" for m in found)
 
 
+def test_a_rejected_measurement_is_no_moment_of_its_own(make_rows):
+    rows = _good(make_rows, n=35, gamma=0, reason="fit_error", fault=None, nis=5.0)
+    rows = [dataclasses.replace(r, nis=3000.0) if r.seq == 20 else r for r in rows]
+    (moment,) = worst_moments(rows)
+    assert moment.what.startswith("35 scans not used")
+
+
+def test_a_wrong_unit_stands_before_the_failures_that_it_explains(make_rows):
+    advice = [{"grade": "fail", "text": "the model seems to be in inches; add --model-unit inch"}]
+    good = _judged(_good(make_rows), header={**HEADER, "preflight": advice})
+    assert good.line.startswith("CHECK: the model seems to be in inches")
+    bad = _judged(_good(make_rows, pos_err_m=1.0), header={**HEADER, "preflight": advice})
+    assert bad.line.startswith("FAIL: the model seems to be in inches; add --model-unit inch; the median position")
+
+
 def test_json_and_page_carry_the_verdict_first(make_rows):
     rows = _good(make_rows, reinitialised=1)
     summary = Summary.fold(rows, labels=_labels(rows))

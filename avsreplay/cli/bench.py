@@ -62,7 +62,17 @@ class Tally:
         }
 
 
-@click.command("bench")
+EPILOG = """\b
+Examples:
+  avsreplay bench tumble.mcap
+  avsreplay bench tumble.mcap --backends horn,small_gicp --scans 200
+  avsreplay bench own.bag --model target.stl --topic /camera/points --json
+
+\b
+Exit codes: 0 ok, 2 usage, 3 unreadable input."""
+
+
+@click.command("bench", epilog=EPILOG)
 @click.argument("log", type=click.Path(path_type=Path))
 @click.option("--backends", default="horn,kiss", show_default=True, help="Names, separated by commas.")
 @click.option("--model", type=click.Path(path_type=Path), help="The target's model, where the log has none.")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from avsreplay.cli.setting_options import source_setting
-from avsreplay.errors import UsageError
+from avsreplay.errors import AvsError, UsageError
 
 if TYPE_CHECKING:
     from avsreplay.log import GrowingLog, SourceOptions
@@ -147,7 +147,13 @@ def log_file(log: Path, *, follow: bool = False) -> Iterator[tuple[Path, Growing
         return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "stdin"
-        yield path, GrowingLog(path, sys.stdin.buffer)
+        try:
+            yield path, GrowingLog(path, sys.stdin.buffer)
+        except AvsError as error:
+            error.where = (error.where or "").replace(str(path), "standard input") or None
+            if not path.stat().st_size:
+                error.what, error.hint = "no data", "see the message of the program that writes to the pipe"
+            raise
 
 
 def check_binary_output(output: Path) -> None:

@@ -211,7 +211,8 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
             viewer.close()
         summary = run.summary()
         record = _record(run, summary)
-        record["preflight"] = [*(a.sentence for a in advice), *_model_notes(run, advice)]
+        record["preflight"] = [{"grade": a.grade, "text": a.sentence} for a in advice]
+        record["preflight"] += [{"grade": "check", "text": note} for note in _model_notes(run, advice)]
         if interrupted:
             record["interrupted_after"] = len(rows)
             how = "; add --resume to continue" if target else ""
@@ -233,8 +234,8 @@ def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
 
 
 def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
-    """Return the findings on the model from the rows, unless its unit is wrong; they are also printed on stderr."""
-    if any(a.about == "unit" for a in advice):
+    """Return the findings on the model from the rows, unless its size is wrong; they are also printed on stderr."""
+    if any(a.about in ("unit", "size") for a in advice):
         return ()
     notes = run.model_check.notes()
     for note in notes:

@@ -77,7 +77,7 @@ class SourceOptions(Settings):
     )
     clock: ClockChoice = setting(ClockChoice.HEADER, "Clock of the scans' times.")
     start_s: float | None = setting(None, "Begin, after the first scan.", unit="s")
-    start_offset_s: float | None = setting(None, "The same as start_s.", unit="s")
+    start_offset_s: float | None = setting(None, "The same as --start.", unit="s")
     end_s: float | None = setting(None, "End (not included), after the first scan.", unit="s", unset="the last scan")
     duration_s: float | None = setting(None, "Length of the part that is replayed.", unit="s", unset="up to the end")
     n_scans: int | None = setting(None, "Largest number of scans.", low=1, unset="all")

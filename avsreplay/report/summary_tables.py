@@ -241,9 +241,9 @@ def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     seen = summary.observability
     if seen.rank is not None:
         full = "never full" if seen.full_rank_s is None else f"full from {seen.full_rank_s:.2f} s"
-        raw, scaled = (number(value, ".1f", "none") for value in (seen.log10_cond, seen.log10_cond_scaled))
-        along = "along the estimates"
-        yield "Gramian", f"{along}: rank {seen.rank} of 20 ({full}); log10 condition {raw} raw, {scaled} scaled"
+        raw, scaled = (number(value, ".1f") for value in (seen.log10_cond, seen.log10_cond_scaled))
+        condition = "" if seen.log10_cond is None else f"; log10 condition {raw} raw, {scaled} scaled"
+        yield "Gramian", f"along the estimates: rank {seen.rank} of 20 ({full}){condition}"
 
 
 def _plan_facts(summary: Summary) -> Iterable[tuple[str, str]]:

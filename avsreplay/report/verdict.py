@@ -118,7 +118,6 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     extent_m = (header.get("model") or {}).get("extent_m")
     stopped = header.get("interrupted_after")
     outside = [Concern(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
-    outside += [Concern(Grade.CHECK, text) for text in header.get("preflight") or ()]
     found = (
         _use(rows, summary),
         _errors(rows, extent_m),
@@ -126,7 +125,12 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
         _filter(rows, summary),
         _data(rows, summary),
     )
-    reasons = sorted((*outside, *chain.from_iterable(found)), key=lambda reason: reason.grade is not Grade.FAIL)
+    judged = list(chain.from_iterable(found))
+    worst = Grade.FAIL if any(reason.grade is Grade.FAIL for reason in judged) else Grade.CHECK
+    for advice in header.get("preflight") or ():
+        # a wrong unit or size explains the other reasons, so that it stands before them
+        outside.append(Concern(worst if advice["grade"] == "fail" else Grade.CHECK, advice["text"]))
+    reasons = sorted((*outside, *judged), key=lambda reason: reason.grade is not Grade.FAIL)
     return RunVerdict(
         grade=reasons[0].grade if reasons else Grade.PASS,
         reasons=tuple(reasons),
@@ -304,7 +308,8 @@ def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
         ("nis", "", 1.0, "NIS"),
     ):
         typical = _median(rows, column)
-        places = [(getattr(row, column), k) for k, row in enumerate(rows) if getattr(row, column) is not None]
+        used = [(k, row) for k, row in enumerate(rows) if row.gamma]  # the others belong to their interval
+        places = [(getattr(row, column), k) for k, row in used if getattr(row, column) is not None]
         for value, k in sorted(places, reverse=True)[:MOMENTS]:
             if typical and value > 3.0 * typical:
                 text = f"{name} {factor * value:.3g} {unit}".rstrip()

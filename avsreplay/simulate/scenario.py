@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tomli_w
 
 from avsreplay import geometry, toml_document
 from avsreplay.errors import UsageError
@@ -112,12 +113,13 @@ class Scenario:
         return {each.model: (self.folder or Path()) / each.model for each in self.params.object if each.model}
 
 
-def load_scenario(path: Path | None = None, seed: int | None = None) -> Scenario:
+def load_scenario(path: Path | None = None, seed: int | None = None, duration_s: float | None = None) -> Scenario:
     """Load a scenario.
 
     Args:
         path: Its file; None for the built-in scenario.
         seed: Replaces its own seed.
+        duration_s: Replaces its own duration [s].
 
     Raises:
         UnreadableInput: The file cannot be read.
@@ -125,8 +127,13 @@ def load_scenario(path: Path | None = None, seed: int | None = None) -> Scenario
     """
     if path is None:
         text = resources.files("avsreplay.simulate").joinpath("builtin.toml").read_text(encoding="utf-8")
-        return scenario_of(toml_document.parse(text, "built-in scenario"), seed)
-    return scenario_of(toml_document.load(path), seed, Path(path).parent)
+        document, folder = toml_document.parse(text, "built-in scenario"), None
+    else:
+        document, folder = toml_document.load(path), Path(path).parent
+    if duration_s is None:
+        return scenario_of(document, seed, folder)
+    changed = replace(document, table={**document.table, "duration_s": duration_s})
+    return replace(scenario_of(changed, seed, folder), text=tomli_w.dumps(changed.table))
 
 
 def scenario_of(document: toml_document.Document, seed: int | None = None, folder: Path | None = None) -> Scenario:
