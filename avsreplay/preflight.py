@@ -242,7 +242,8 @@ def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], model
     share = 1.0 - (by_range if use_range else by_box).mean()
     if share < _FEW:
         return None
-    text = f"{100 * share:.0f} % of the points are background; a group of points has the size of the model ({model_m:.3g} m)"
+    said = f"a group of points has the size of the model ({model_m:.3g} m)"
+    text = f"{100 * share:.0f} % of the points are background; {said}"
     return Advice("check", "background", text, option)
 
 
