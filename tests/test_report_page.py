@@ -237,6 +237,15 @@ def test_values_are_in_millimetres_where_the_tables_say_so(make_rows):
     assert far["position"]["unit"] == "m"
 
 
+def test_one_large_value_does_not_hide_the_others(make_rows):
+    """It decides neither the unit nor, on a linear axis, the height of all others."""
+    rows = [dataclasses.replace(r, rms_m=4.0, reg_pos_err_m=9.0) if r.seq == 30 else r for r in make_rows(40)]
+    found = {c["key"]: c for c in charts(derived(rows))}
+    assert (found["fit"]["unit"], found["fit"]["log"]) == ("mm", True)
+    assert found["position"]["unit"] == "mm"
+    assert not {c["key"]: c for c in charts(derived(make_rows(40)))}["fit"]["log"]
+
+
 def test_a_kind_has_the_same_colour_and_pattern_on_every_page(make_rows):
     def styles(rows):
         return {(s["lane"], s["word"]): (s["colour"], s["pattern"]) for s in spans(rows)}

@@ -60,8 +60,16 @@ def test_every_width_is_kept_and_what_is_left_out_is_named(make_rows, width):
 
 def test_units_are_in_the_headings(make_rows):
     text = _printed(make_rows(30), width=200)
-    for unit in ("[m]", "[deg]", "[s]"):
+    for unit in ("[mm]", "[deg]", "[s]"):
         assert unit in text.split("Errors")[0]
+
+
+def test_lengths_are_in_metres_from_1_m_on_and_in_millimetres_below(make_rows):
+    for error, cell, unit in ((0.0123, "12.3", "[mm]"), (1.25, "1.2500", "[m]")):
+        text = _printed(make_rows(3, pos_err_m=error, rms_m=0.5), width=200).split("Errors")[0]
+        heads, rows = text.split("scan ")[0] + text.split("scan ")[1].split("\n")[0], text.split("\n")
+        assert unit in heads
+        assert any(f" {cell} " in row for row in rows), text
 
 
 def test_headings_omit_the_suffix_and_keep_the_unit():

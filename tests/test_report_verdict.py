@@ -78,7 +78,7 @@ def test_the_end_of_the_log_without_a_used_scan_fails(make_rows):
         ({"pos_err_m": 0.2}, Grade.CHECK, "2.5 % of the model"),
         ({"rot_err_deg": 178.0}, Grade.FAIL, "median attitude error of all scans is 178 deg"),
         ({"rms_m": 0.3}, Grade.CHECK, "check unit, scale and model"),
-        ({"nees": 100.0}, Grade.CHECK, "the covariance is too small (overconfident), only 0 % of NEES inside"),
+        ({"nees": 100.0}, Grade.CHECK, "the covariance is too small (overconfident): only 0 % of NEES inside"),
         ({"nees": 1.0}, Grade.CHECK, "the covariance is too large"),
         ({"nis": 40.0}, Grade.CHECK, "only 0 % of NIS inside the 95 % band"),
         ({"consistent": False}, Grade.CHECK, "the innovations are inconsistent in 100 of 100 scans, first at 0.0 s"),

@@ -49,6 +49,7 @@ _DIRECT = (
     *("r_pos_m", "r_rot_deg", "capture_time_s", "earliest_capture_s", "plan_miss_m"),
 )
 _WINDOW = 10
+WIDE = 20.0  # largest over typical value from which an axis is logarithmic
 _KINDS = {  # place: colour and pattern
     "flagged": (
         *("not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged"),
@@ -113,10 +114,13 @@ def _chart(
     *,
     bands: Sequence[tuple[str, int]] = (),
     levels: Sequence[tuple[float, str, int]] = (),
-    log: bool = False,
+    log: bool | None = False,
     sigma: bool = True,
 ) -> Chart:
-    """One chart; ``bands`` are names whose columns end in ``_lo`` and ``_hi`` (1 sigma each if ``sigma``)."""
+    """One chart; ``bands`` are names whose columns end in ``_lo`` and ``_hi`` (1 sigma each if ``sigma``).
+
+    The axis is logarithmic if ``log``; if it is None, where the largest value is far above the typical one.
+    """
     return {
         "key": key,
         "title": title,
@@ -142,15 +146,17 @@ def charts(columns: Columns, truth: State | None = None, limits: Mapping[str, fl
         chart["series"] = [s for s in chart["series"] if s["column"] in columns]
         chart["bands"] = [b for b in chart["bands"] if f"{b['stem']}_lo" in columns]
         if chart["series"]:
-            kept.append(_in_millimetres(chart, columns))
+            kept.append(_scaled(chart, columns))
     return kept
 
 
-def _in_millimetres(chart: Chart, columns: Columns) -> Chart:
-    """A chart in metres whose values are below 1 m is drawn in millimetres, as in the tables."""
-    if chart["unit"] != "m" or chart["key"] == "arm":
-        return chart
-    if max(float(np.nanmax(np.abs(columns[s["column"]]))) for s in chart["series"]) >= 1.0:
+def _scaled(chart: Chart, columns: Columns) -> Chart:
+    """The chart with its axis; typical values in metres below 1 m are drawn in millimetres, as in the tables."""
+    sizes = [np.abs(columns[s["column"]]) for s in chart["series"]]
+    typical, largest = float(np.nanmedian(sizes[0])), max(float(np.nanmax(size)) for size in sizes)
+    if chart["log"] is None:
+        chart = chart | {"log": 0.0 < WIDE * typical < largest}
+    if chart["unit"] != "m" or chart["key"] == "arm" or typical >= 1.0:
         return chart
     levels = [level | {"y": 1000.0 * level["y"]} for level in chart["levels"]]
     return chart | {"unit": "mm", "factor": 1000.0, "levels": levels}
@@ -181,7 +187,7 @@ def _measurement_charts(limits: Mapping[str, float]) -> list[Chart]:
     nis = [(NIS_BAND[0], "2.5 %", 3), (NIS_BAND[1], "97.5 %", 3)]
     nees = [(NEES_BAND[0], "2.5 %", 3), (NEES_BAND[1], "97.5 %", 3)]
     return [
-        _chart("fit", "Fit error", "m", [_line("rms_m", "rms over inliers", 0)], levels=fit),
+        _chart("fit", "Fit error", "m", [_line("rms_m", "rms over inliers", 0)], levels=fit, log=None),
         _chart("inliers", "Inlier ratio", "", [_line("inlier_ratio", "inliers / points", 0)]),
         _chart("nis", "Innovation squared (NIS)", "", [_line("nis", "NIS", 0, points=True)], levels=nis, log=True),
         _chart("innovation", "Position innovation", "m", [_line("innov_m", "length", 0)], levels=jump, log=True),
@@ -223,8 +229,8 @@ def _plan_charts() -> list[Chart]:
     return [
         _chart("gramian", "Gramian condition, log10", "", condition),
         _chart("rank", "Gramian rank of 20", "", [_line("ogm_rank", "rank", 0)]),
-        _chart("noise", "Adapted noise, position", "m", [_line("r_pos_m", "1 sigma", 0)]),
-        _chart("noise_turn", "Adapted noise, attitude", "deg", [_line("r_rot_deg", "1 sigma", 0)]),
+        _chart("noise", "Adapted noise, position", "m", [_line("r_pos_m", "1 sigma", 0)], log=None),
+        _chart("noise_turn", "Adapted noise, attitude", "deg", [_line("r_rot_deg", "1 sigma", 0)], log=None),
         _chart(
             "capture",
             "Planned capture time",
@@ -234,7 +240,9 @@ def _plan_charts() -> list[Chart]:
             sigma=False,
         ),
         _chart(
-            "miss", "Miss distance in hindsight", "m", [_line("plan_miss_m", "of the plan made then", 1, points=True)]
+            *("miss", "Miss distance in hindsight", "m"),
+            [_line("plan_miss_m", "of the plan made then", 1, points=True)],
+            log=None,
         ),
     ]
 

@@ -23,9 +23,9 @@ from avsreplay.report.conclusion import ComparedRun, Conclusion
 from avsreplay.report.export import StampedPose
 from avsreplay.report.gate import RuleOutcome
 from avsreplay.report.summary import Summary
-from avsreplay.report.summary_tables import fact_lines, in_one_line, summary_tables
+from avsreplay.report.summary_tables import fact_lines, in_one_line, moments_table, summary_tables, verdict_table
 from avsreplay.report.table import Table, as_cell, facts_table
-from avsreplay.report.verdict import moments_table, verdict_of, verdict_table
+from avsreplay.report.verdict import verdict_of
 from avsreplay.report.view import View, scene
 from avsreplay.rows import Row
 

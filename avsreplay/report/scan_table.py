@@ -57,7 +57,7 @@ def scan_table(console: Console, rows: Sequence[Row], *, every: int | None = Non
     chosen, words = choose_rows(rows, every=every, show_all=show_all)
     plain = ascii_only(console)
     shown = {c.name: c for c in _shown(chosen)}
-    cells = {name: [_cell(row, c, _format(c, chosen)) for row in chosen] for name, c in shown.items()}
+    cells = {name: _cells(c, chosen) for name, c in shown.items()}
     heads = {name: _head(c, chosen) for name, c in shown.items()}
     widths = {
         name: max([*(len(c.signed(ascii_only=plain)) for c in cells[name]), *map(len, heads[name].split("\n"))]) + 1
@@ -74,21 +74,21 @@ def scan_table(console: Console, rows: Sequence[Row], *, every: int | None = Non
     )
 
 
-def head(column: Column) -> str:
-    """A heading of short words with the unit on the last line."""
+def head(column: Column, shown: str = "") -> str:
+    """A heading of short words with the unit on the last line; ``shown`` is the unit of the printed numbers."""
     name = _SHORT.get(column.name, column.name)
     unit = column.unit or ("s" if column.name == "capture_time_s" else "")
     name = name.removesuffix("_" + unit.replace("/", "p")) if unit else name
     lines = name.replace("_", " ").split(" ")
-    return "\n".join([*lines, f"[{unit}]"] if unit else lines)
+    return "\n".join([*lines, f"[{shown or unit}]"] if unit else lines)
 
 
 def _head(column: Column, rows: Sequence[Row]) -> str:
     if column.name == "reason":
         return "state"
     if column.name in ("pos_err_m", "rot_err_deg") and rows[0].reference == "fit":
-        return head(column).replace("err", "vs fit")
-    return head(column)
+        return head(column, _unit(column, rows)).replace("err", "vs fit")
+    return head(column, _unit(column, rows))
 
 
 def _shown(rows: Sequence[Row]) -> list[Column]:
@@ -97,17 +97,29 @@ def _shown(rows: Sequence[Row]) -> list[Column]:
     return [c for c in wanted if any(getattr(row, c.name) is not None for row in rows)]
 
 
-def _format(column: Column, rows: Sequence[Row]) -> str:
+def _unit(column: Column, rows: Sequence[Row]) -> str:
+    """Lengths are printed in millimetres where most are below 1 m."""
     if column.unit != "m" or not column.fmt.endswith("f"):
-        return column.fmt
-    values = (getattr(row, column.name) for row in rows)
-    return f".{decimals((v for v in values if v is not None), int(column.fmt[1:-1]), figures=2)}f"
+        return column.unit
+    sizes = sorted(abs(v) for row in rows if (v := getattr(row, column.name)) is not None)
+    return "mm" if sizes and sizes[len(sizes) // 2] < 1.0 else "m"
 
 
-def _cell(row: Row, column: Column, fmt: str) -> TableCell:
-    value: Any = getattr(row, column.name)
+def _cells(column: Column, rows: Sequence[Row]) -> list[TableCell]:
+    """The cells of one column."""
+    values: list[Any] = [getattr(row, column.name) for row in rows]
     if column.name == "reason":
-        return state_cell(row.gamma, row.reason)
+        return [state_cell(row.gamma, row.reason) for row in rows]
+    fmt = column.fmt
+    if _unit(column, rows) == "mm":
+        values = [None if v is None else 1000.0 * v for v in values]
+        fmt = f".{decimals((v for v in values if v is not None), 1, figures=2)}f"
+    elif column.unit == "m" and fmt.endswith("f"):
+        fmt = f".{decimals((v for v in values if v is not None), int(fmt[1:-1]), figures=2)}f"
+    return [_cell(value, fmt) for value in values]
+
+
+def _cell(value: Any, fmt: str) -> TableCell:
     if value is None:
         return TableCell("-", "faint")
     if isinstance(value, bool):
@@ -159,8 +171,9 @@ def print_sparks(console: Console, rows: Sequence[Row]) -> None:
     if not console.is_terminal or console.width < LEAST_WIDTH or ascii_only(console):
         return
     width = console.width - _LABEL
-    for name, unit, column in (("position error", "m", "pos_err_m"), ("attitude error", "deg", "rot_err_deg")):
-        values = [getattr(row, column) for row in rows]
+    for name, unit, column in (("position error", "mm", "pos_err_m"), ("attitude error", "deg", "rot_err_deg")):
+        found = [getattr(row, column) for row in rows]
+        values = [1000.0 * v if v is not None and unit == "mm" else v for v in found]
         known = [v for v in values if v is not None]
         if known:
             label = f"{name} to {max(known):.3g} {unit}"

@@ -11,7 +11,7 @@ from avsreplay.report.scan_table import print_sparks, scan_table
 from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Capture, Parameter, Statistics
 from avsreplay.report.table import Table, TableCell, decimals, facts_table, number, print_line, print_table
-from avsreplay.report.verdict import RunVerdict, moments_table, verdict_table
+from avsreplay.report.verdict import INSIDE_LEAST, Grade, RunVerdict
 from avsreplay.rows import Row
 
 _STATISTICS = ("rmse", "mean", "median", "std", "min", "max")
@@ -54,6 +54,28 @@ def print_tables(
     print_table(console, facts_table("Run", fact_lines(summary, scans_per_s=scans_per_s)))
 
 
+def verdict_table(verdict: RunVerdict) -> Table:
+    """Reasons, first pose, robot and changed settings, as on terminal and page."""
+    marks = {Grade.FAIL: "bad", Grade.CHECK: "warn", Grade.PASS: "good"}
+    rows: list[tuple[str | TableCell, ...]] = [
+        ("reason", TableCell(f"{r.grade.value}: {r.text}", marks[r.grade])) for r in verdict.reasons
+    ]
+    rows.append(("first pose from", verdict.first_pose))
+    if verdict.robot:
+        rows.append(("robot", verdict.robot))
+    rows += [("changed setting", text) for text in verdict.changed] or [("settings", "all at their defaults")]
+    return Table("Verdict", ("what", "value"), tuple(rows), align="l")
+
+
+def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -> Table:
+    """The worst moments; with ``place`` (row -> row of a page) a click leads to the scan."""
+    rows = []
+    for m in verdict.moments:
+        span = " to ".join(dict.fromkeys((f"{m.start_s:.1f}", f"{m.end_s:.1f}")))
+        rows.append((TableCell(span, scan=(place or {}).get(m.row)), m.what, m.cause))
+    return Table("Worst moments", ("t\n[s]", "what", "cause"), tuple(rows), align="l")
+
+
 def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, ...]:
     """Errors, injected faults, parameters and consistency; a table without content has no rows."""
     return error_table(summary), fault_table(summary, rows), parameter_table(summary), consistency_table(summary)
@@ -91,7 +113,7 @@ def consistency_table(summary: Summary) -> Table:
             name,
             str(share.count),
             f"{share.median / size:.2f}",
-            f"{100.0 * share.inside:.1f}",
+            TableCell(f"{100.0 * share.inside:.1f}", "warn" if share.inside < INSIDE_LEAST else ""),
             f"{share.low / size:.2f} to {share.high / size:.2f}",
         )
         for name, share, size in (*whole, *blocks)
@@ -126,7 +148,7 @@ def _nearest_row(episode: Episode, rows: Sequence[Row]) -> int | None:
 def _verdict(episode: Episode) -> TableCell:
     if episode.detected:
         return TableCell("detected" if episode.scans else "detected as a gap", "good")
-    return TableCell("missed", "bad") if episode.harmful else TableCell("harmless, used", "warn")
+    return TableCell("missed", "bad") if episode.harmful else TableCell("harmless, used")
 
 
 def parameter_table(summary: Summary) -> Table:
@@ -141,13 +163,18 @@ def _parameter_rows(p: Parameter) -> list[tuple[str, ...]]:
     name, _, listed = p.name.partition(": ")
     components = listed.split() or ["x", "y", "z"] if len(p.estimate) > 1 else [""]
     truth = p.truth or (None,) * len(p.estimate)
-    sigma = "undetermined" if p.undetermined else number(p.one_sigma, ".4f", "")
+    sigma = "undetermined" if p.undetermined else _small(p.one_sigma)
     rows: list[tuple[str, ...]] = []
     for k, component in enumerate(components):
-        last = (number(p.error, ".4f", ""), sigma) if k == 0 else ("", "")
+        last = (_small(p.error), sigma) if k == 0 else ("", "")
         label = f"{name} {component}".rstrip()
         rows.append((label, p.unit, number(p.estimate[k], ".4f"), number(truth[k], ".4f", ""), *last))
     return rows
+
+
+def _small(value: float | None) -> str:
+    """Four decimals, or two significant figures where these would hide the value."""
+    return number(value, ".1e" if value and abs(value) < 0.001 else ".4f", "")
 
 
 def in_one_line(summary: Summary) -> str:

@@ -14,7 +14,6 @@ from typing import Any
 
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_parts import events
-from avsreplay.report.table import Table, TableCell
 from avsreplay.rows import Row
 
 USED_FAIL, USED_CHECK = 0.5, 0.9  # share of the scans without an injected harmful fault that updated the filter
@@ -195,8 +194,8 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Consistency, reinitialisation and convergence."""
     for name, share in (("NEES", summary.nees), ("NIS", summary.nis)):
         if share is not None and share.count >= 10 and share.inside < INSIDE_LEAST:
-            low = "too small (overconfident)" if share.median > share.high else "too large"
-            where = f"the covariance is {low}, " if not share.low <= share.median <= share.high else ""
+            low = "too small (overconfident)" if share.median > share.high else "too large (conservative)"
+            where = f"the covariance is {low}: " if not share.low <= share.median <= share.high else ""
             yield Concern(Grade.CHECK, f"{where}only {100 * share.inside:.0f} % of {name} inside the 95 % band")
     inconsistent = [row for row in rows if row.consistent is False]
     if len(inconsistent) > 0.1 * len(rows):
@@ -329,25 +328,3 @@ def _cause(row: Row) -> str:
     if row.fault:
         return f"injected: {_plain(row.fault)}"
     return _plain(row.reason) if row.gamma == 0 else ""
-
-
-def verdict_table(verdict: RunVerdict) -> Table:
-    """Reasons, first pose, robot and changed settings, as on terminal and page."""
-    marks = {Grade.FAIL: "bad", Grade.CHECK: "warn", Grade.PASS: "good"}
-    rows: list[tuple[str | TableCell, ...]] = [
-        ("reason", TableCell(f"{r.grade.value}: {r.text}", marks[r.grade])) for r in verdict.reasons
-    ]
-    rows.append(("first pose from", verdict.first_pose))
-    if verdict.robot:
-        rows.append(("robot", verdict.robot))
-    rows += [("changed setting", text) for text in verdict.changed] or [("settings", "all at their defaults")]
-    return Table("Verdict", ("what", "value"), tuple(rows), align="l")
-
-
-def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -> Table:
-    """The worst moments; with ``place`` (row -> row of a page) a click leads to the scan."""
-    rows = []
-    for m in verdict.moments:
-        span = " to ".join(dict.fromkeys((f"{m.start_s:.1f}", f"{m.end_s:.1f}")))
-        rows.append((TableCell(span, scan=(place or {}).get(m.row)), m.what, m.cause))
-    return Table("Worst moments", ("t\n[s]", "what", "cause"), tuple(rows), align="l")

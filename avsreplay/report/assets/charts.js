@@ -73,10 +73,16 @@ const Charts = (() => {
   function axes(log) {
     const tens = (_, splits) => splits.map((v) => Math.abs(Math.log10(v) % 1) < 1e-9 ? v : null);
     const lines = log ? { filter: tens } : {};
+    const short = (v) => v !== 0 && (Math.abs(v) >= 1e5 || Math.abs(v) < 1e-3) ? v.toExponential().replace("e+", "e") : String(+v.toPrecision(6));
+    const decade = (v) => Math.abs(Math.log10(v) % 1) < 1e-9;
+    const words = (ticks) => {  // of many decades every second, third ... is named
+      const every = Math.ceil(ticks.filter((v) => v !== null && decade(v)).length / 5);
+      return ticks.map((v) => v === null || (log && every > 1 && !(decade(v) && Math.round(Math.log10(v)) % every === 0)) ? "" : short(v));
+    };
     const axis = { stroke: () => theme.faint, font: "11px system-ui, sans-serif", grid: { stroke: () => theme.line, width: 1 }, ticks: { stroke: () => theme.line, width: 1, size: 4 } };
     return [
       { ...axis, size: 26, values: (_, ticks) => ticks.map((v) => +v.toFixed(6) + " s") },
-      { ...axis, size: 62, grid: { ...axis.grid, ...lines }, ticks: { ...axis.ticks, ...lines }, values: (_, ticks) => ticks.map((v) => v === null ? "" : String(+v.toPrecision(6))) },
+      { ...axis, size: 62, grid: { ...axis.grid, ...lines }, ticks: { ...axis.ticks, ...lines }, values: (_, ticks) => words(ticks) },
     ];
   }
 
