@@ -41,6 +41,7 @@ struct Sums {
 struct Kept {
   double x, y, z;
   float radius2;   // the neighbour is the same nearer than this to (x, y, z); negative: nowhere
+  float block2;    // the same of its block, at least radius2
   int32_t lane;    // 8 block + lane, -1: none
 };
 

@@ -15,7 +15,7 @@ namespace {
 class Memory {
  public:
   Memory(const Store& s, int64_t n, bool allowed)
-      : extent_(s.extent), grain_(s.grain), longest_(allowed ? MOST_OF_GRAIN * s.grain : 0), kept_((size_t)n, Kept{0, 0, 0, -1.f, -1}) {}
+      : extent_(s.extent), grain_(s.grain), longest_(allowed ? MOST_OF_GRAIN * s.grain : 0), kept_((size_t)n, Kept{0, 0, 0, -1.f, -1.f, -1}) {}
 
   Kept* data() { return kept_.data(); }
   std::vector<Kept> take() { return std::move(kept_); }
@@ -30,7 +30,7 @@ class Memory {
   }
 
   void forget_radii() {
-    for (Kept& k : kept_) k.radius2 = -1.f;
+    for (Kept& k : kept_) k.radius2 = k.block2 = -1.f;
   }
 
  private:

@@ -4,7 +4,7 @@
 // the lists, then the blocks a few points ahead of the search.
 static_assert(CHUNK % 4 == 0, "sums run over four points at a time");
 
-enum Treat : uint8_t { IGNORED, SEARCHED, KEPT };
+enum Treat : uint8_t { IGNORED, SEARCHED, IN_BLOCK, KEPT };  // only the kept neighbour's block, or only the neighbour
 
 struct Chunk {
   alignas(32) double p[3][CHUNK];   // moved, relative to the model's centre
@@ -35,9 +35,9 @@ static inline void move(const double* T, const double* p, double* q) {
   for (int k = 0; k < 3; ++k) q[k] = T[4 * k] * p[0] + T[4 * k + 1] * p[1] + T[4 * k + 2] * p[2] + T[4 * k + 3];
 }
 
-static inline bool still_near(const Kept& k, const double* q) {
-  const double x = q[0] - k.x, y = q[1] - k.y, z = q[2] - k.z;
-  return x * x + y * y + z * z < (double)k.radius2;
+static inline Treat treat(const Kept& k, const double* q) {
+  const double x = q[0] - k.x, y = q[1] - k.y, z = q[2] - k.z, moved2 = x * x + y * y + z * z;
+  return moved2 < (double)k.radius2 ? KEPT : moved2 < (double)k.block2 ? IN_BLOCK : SEARCHED;
 }
 
 static void gather(const Store& s, const View& v, int64_t first, int n, const double* T, const Kept* kept, Chunk& c,
@@ -53,9 +53,9 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
     }
     move(T, p, q);
     for (int k = 0; k < 3; ++k) c.c[k][i] = q[k];
-    if (kept && still_near(kept[first + i], q)) {
-      c.search[i] = KEPT;
-    } else if (const uint32_t* word = word_at(s, q[0], q[1], q[2])) {
+    if (kept) c.search[i] = treat(kept[first + i], q);
+    if (c.search[i] != SEARCHED) continue;
+    if (const uint32_t* word = word_at(s, q[0], q[1], q[2])) {
       c.list[i] = word;
       fetch(word);
     }
@@ -83,18 +83,25 @@ static inline void enter(const Store& s, Chunk& c, int i, const Best& best, bool
 static inline Best none() { return {{0, 0, 0, 0, 0, FACE}, -1}; }
 
 template <class Kind>
-static inline Best keep_one(const Scope& o, const Query& q, const Kept& kept) {
+static inline Best keep_one(const Scope& o, const Query& q, const Kept& kept, Treat treat) {
   if (kept.lane < 0) return none();
-  return {Kind::foot(o.s, (uint32_t)kept.lane, q), kept.lane};
+  if (treat == KEPT) return {Kind::foot(o.s, (uint32_t)kept.lane, q), kept.lane};
+  Search<Kind> search(o, q);
+  search.run_block((uint32_t)kept.lane / LANES);
+  return search.best();
 }
+
+// Square of a length, with room for rounding; negative where it is not positive.
+static inline float squared(float room) { return room > 0.f ? room * room * 0.9999f : -1.f; }
 
 template <class Kind>
 static inline Best search_one(const Scope& o, const Query& q, const uint32_t* list, int32_t seed, Kept* kept) {
   Search<Kind> search(o, q);
   search.run(list, seed);
   if (kept) {
-    const float room = o.lead > 0.f ? search.room() : 0.f;
-    *kept = {q.x, q.y, q.z, room > 0 ? room * room * 0.9999f : -1.f, search.best().lane};
+    typename Search<Kind>::Room room{0.f, 0.f};
+    if (o.lead > 0.f) room = search.room();
+    *kept = {q.x, q.y, q.z, squared(room.lane), squared(room.block), search.best().lane};
   }
   return search.best();
 }
@@ -102,7 +109,7 @@ static inline Best search_one(const Scope& o, const Query& q, const uint32_t* li
 // A kept neighbour that no longer faces the eye is searched for again.
 template <class Kind>
 static inline bool is_kept(const Scope& o, Treat treat, const Kept* kept) {
-  return treat == KEPT && (!o.eye || kept->lane < 0 || Kind::faces(o.s, (uint32_t)kept->lane, *o.eye));
+  return treat >= IN_BLOCK && (!o.eye || kept->lane < 0 || Kind::faces(o.s, (uint32_t)kept->lane, *o.eye));
 }
 
 constexpr int AHEAD = 4;
@@ -132,7 +139,7 @@ static void search(const Scope& o, int64_t first, int n, Pass kind, Kept* kept, 
     Kept* memory = kept ? kept + first + i : nullptr;
     Best best;
     if (is_kept<Kind>(o, c.search[i], memory)) {
-      best = keep_one<Kind>(o, q, *memory);
+      best = keep_one<Kind>(o, q, *memory, c.search[i]);
     } else {
       const int32_t own = memory ? memory->lane : -1;
       best = search_one<Kind>(o, q, c.list[i], own < 0 && !c.list[i] ? last : own, memory);
@@ -242,7 +249,7 @@ static void match_kind(const Store& s, const View& v, int64_t first, int64_t las
     const Query q = query(s, c.c[0][i], c.c[1][i], c.c[2][i]);
     const int32_t own = memory ? memory->lane : -1;
     const Best best = is_kept<Kind>(o, c.search[i], memory)
-                          ? keep_one<Kind>(o, q, *memory)
+                          ? keep_one<Kind>(o, q, *memory, c.search[i])
                           : search_one<Kind>(o, q, c.list[i], own < 0 && !c.list[i] ? last_lane : own, nullptr);
     last_lane = best.lane;
     if (best.lane < 0 || !(best.foot.d2 < o.bound2)) continue;

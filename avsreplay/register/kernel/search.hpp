@@ -77,21 +77,39 @@ class Search {
     if (!is_near()) return;
     const uint32_t first = seed < 0 ? NO_CHILD : (uint32_t)seed / LANES;
     if (seed >= 0) visit(first);
-    if (list && in_list(list, first)) return;
-    first_ = second_ = 3e38f;  // the tree comes to the same blocks again
-    in_tree();
+    if (!list || !in_list(list, first)) {
+      first_ = other_ = 3e38f, waiting_ = 0;  // the tree comes to the same blocks again
+      in_tree();
+    }
+    resolve();
+  }
+
+  // Only this block. Where it holds the nearest lane, this finds it.
+  void run_block(uint32_t block) {
+    visit(block);
+    resolve();
   }
 
   const Best& best() const { return best_; }
 
-  // How far the query may move before another primitive can be the nearest, or one come within the bound. An eye that
-  // stays within the margin of `Facing` makes no difference.
-  float room() const {
-    if (best_.lane >= 0 && first_ < least_) return 0.f;  // a lane that may come to face the eye is nearer
-    const float first = std::sqrt(first_), second = std::sqrt(second_), known = std::sqrt(limit_);
-    const float next = best_.lane < 0 ? first : second;
-    const float gap = (next < known ? next : known) - (best_.lane < 0 ? o_.bound : first);
-    return (best_.lane < 0 ? gap : 0.5f * gap) - 3.f * s_.slack;
+  // How far the query may move before another primitive (`lane`), or one of another block (`block`), can be the nearest,
+  // or one come within the bound. An eye that stays within the margin of `Facing` makes no difference.
+  struct Room {
+    float lane, block;
+  };
+  Room room() const {
+    const float first = std::sqrt(first_), known = std::sqrt(limit_);
+    if (best_.lane < 0) {
+      const float gap = (first < known ? first : known) - o_.bound - 3.f * s_.slack;
+      return {gap, gap};
+    }
+    if (first_ < least_ || (uint32_t)best_.lane / LANES != first_block_) return {0.f, 0.f};
+    const float other = std::sqrt(other_), block = half(first, other < known ? other : known);
+    float lanes[LANES], second = 3e38f;
+    store8(lanes, first_lanes_);
+    for (int k = 0; k < LANES; ++k)
+      if (k != best_.lane % LANES && lanes[k] < second) second = lanes[k];
+    return {second < first_ ? 0.f : std::min(block, half(first, std::sqrt(second))), block};
   }
 
  private:
@@ -158,30 +176,47 @@ class Search {
     }
   }
 
+  // Measures the lanes of a block in single precision; those that may be the nearest wait for `resolve`.
   void visit(uint32_t block) {
-    const F8 d = Kind::distance2(s_, block, q_);
-    unsigned lanes = bits(d < f8(limit_)) & o_.facing.may[block];
-    if (!lanes) return;
-    alignas(32) float d2[LANES];
+    F8 d = Kind::distance2(s_, block, q_);
+    const unsigned may = o_.facing.may[block], sure = o_.facing.sure[block];
+    if (may != 0xffu) d = select(expand(may), d, f8(FAR));
+    const float nearest = least(d);
+    if (nearest < first_)
+      other_ = first_, first_ = nearest, first_block_ = block, first_lanes_ = d;
+    else
+      other_ = nearest < other_ ? nearest : other_;
+    if (!(nearest < exact_)) return;
+    if (sure == may)
+      tighten(nearest);
+    else
+      tighten_to_facing(block, d, sure);
+    if (waiting_ == MOST_WAITING) resolve();
+    wait_block_[waiting_] = block, wait_[waiting_++] = d;
+  }
+
+  void tighten_to_facing(uint32_t block, F8 d, unsigned sure) {
+    float d2[LANES];
     store8(d2, d);
-    const unsigned sure = o_.facing.sure[block];
-    float least = least_;
-    for (unsigned m = lanes; m; m &= m - 1) {
+    for (unsigned m = bits(d < f8(exact_)); m; m &= m - 1) {
       const int k = lowest_bit(m);
-      second_ = d2[k] < first_ ? first_ : d2[k] < second_ ? d2[k] : second_;
-      first_ = d2[k] < first_ ? d2[k] : first_;
-      if ((sure >> k & 1) && d2[k] < least) least = d2[k];
+      if (d2[k] < least_ && ((sure >> k & 1) || Kind::faces(s_, LANES * block + (uint32_t)k, *o_.eye))) tighten(d2[k]);
     }
-    tighten(least);
-    for (; lanes; lanes &= lanes - 1) {
-      const int k = lowest_bit(lanes);
-      if (!(d2[k] < exact_)) continue;
-      const uint32_t lane = LANES * block + (uint32_t)k;
-      if (!(sure >> k & 1) && !Kind::faces(s_, lane, *o_.eye)) continue;
-      const Foot f = Kind::foot(s_, lane, q_);
-      if (best_.lane < 0 ? f.d2 < best_.foot.d2 : nearer<Kind>(s_, f, lane, best_)) best_ = {f, (int32_t)lane};
-      tighten(d2[k]);
+  }
+
+  // Measures exactly what waits and may still be the nearest.
+  void resolve() {
+    for (int i = 0; i < waiting_; ++i) {
+      const unsigned sure = o_.facing.sure[wait_block_[i]];
+      for (unsigned lanes = bits(wait_[i] < f8(exact_)); lanes; lanes &= lanes - 1) {
+        const int k = lowest_bit(lanes);
+        const uint32_t lane = LANES * wait_block_[i] + (uint32_t)k;
+        if (!(sure >> k & 1) && !Kind::faces(s_, lane, *o_.eye)) continue;
+        const Foot f = Kind::foot(s_, lane, q_);
+        if (best_.lane < 0 ? f.d2 < best_.foot.d2 : nearer<Kind>(s_, f, lane, best_)) best_ = {f, (int32_t)lane};
+      }
     }
+    waiting_ = 0;
   }
 
   void tighten(float d2) {
@@ -191,12 +226,21 @@ class Search {
     exact_ = exact < exact_ ? exact : exact_, limit_ = limit < limit_ ? limit : limit_;
   }
 
+  float half(float nearest, float next) const { return 0.5f * (next - nearest) - 3.f * s_.slack; }
+
+  static constexpr float FAR = 3e38f;
+  static constexpr int MOST_WAITING = 8;
   const Scope& o_;
   const Store& s_;
   const Query& q_;
   Best best_;
   float p_[3];  // the query relative to the model's centre
   float exact_, limit_;  // squared distances under which lanes are measured exactly, and looked at
-  float least_ = 3e38f;  // least squared distance of a lane that counts
-  float first_ = 3e38f, second_ = 3e38f;  // least two of the lanes that may count
+  float least_ = FAR;   // least squared distance of a lane that counts
+  float first_ = FAR, other_ = FAR;  // least of the lanes that may count, and the least in any other block
+  uint32_t first_block_ = 0;
+  F8 first_lanes_{};    // squared distances in that block
+  int waiting_ = 0;
+  uint32_t wait_block_[MOST_WAITING];
+  F8 wait_[MOST_WAITING];
 };

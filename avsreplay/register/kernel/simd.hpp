@@ -129,11 +129,29 @@ static inline unsigned bits(F8::Mask m) {
 }
 
 static inline float least(F8 a) {
+#if AVS_VECTORS && defined(__AVX__)
+  __m128 m = _mm_min_ps(_mm256_castps256_ps128((__m256)a.v), _mm256_extractf128_ps((__m256)a.v, 1));
+  m = _mm_min_ps(m, _mm_movehl_ps(m, m));
+  return _mm_cvtss_f32(_mm_min_ss(m, _mm_movehdup_ps(m)));
+#else
   float t[8];
   store8(t, a);
   float m = t[0];
   for (int k = 1; k < 8; ++k) m = t[k] < m ? t[k] : m;
   return m;
+#endif
+}
+
+// The mask whose lane k is set where bit k is.
+static inline F8::Mask expand(unsigned bits) {
+#if AVS_VECTORS
+  const F8::Mask each = {1, 2, 4, 8, 16, 32, 64, 128}, all = each - each + (int32_t)bits;
+  return (all & each) == each;
+#else
+  F8::Mask r;
+  for (int k = 0; k < 8; ++k) r.v[k] = bits >> k & 1u ? -1 : 0;
+  return r;
+#endif
 }
 
 static inline double sum_in_order(D4 a) {
