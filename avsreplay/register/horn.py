@@ -13,7 +13,7 @@ from avsreplay.register.backend import Target
 from avsreplay.register.surface_index import IcpParams
 
 PLANE_PASSES = 3
-FEW_POINTS = 1000  # of a scan that has many more, for the first passes
+FEW_POINTS = 600  # of a scan that has many more, for the first passes
 
 
 class HornBackend:

@@ -81,7 +81,7 @@ class Patches {
  public:
   PatchSums& at(const Cube& cube) {
     if (sums_.empty() || !(cube == cubes_[last_])) {
-      last_ = number_.emplace(cube, sums_.size()).first->second;
+      last_ = number_.try_emplace(cube, sums_.size()).first->second;
       if (last_ == sums_.size()) cubes_.push_back(cube), sums_.emplace_back();
     }
     return sums_[last_];

@@ -172,6 +172,9 @@ class Passes {
     return true;
   }
 
+  // Standard error of a mean over the inliers [m].
+  double error() const { return o_.rms / std::sqrt((double)o_.inliers); }
+
  private:
   static constexpr int64_t MIN_INLIERS = 6;
 
@@ -184,7 +187,7 @@ class Passes {
 
   // Whether a step is below the standard error of a mean over the inliers.
   bool within_error(const Step& step) const {
-    return step.move + 0.25 * step.turn * s_.extent < o_.rms / std::sqrt((double)o_.inliers);
+    return step.move + 0.25 * step.turn * s_.extent < error();
   }
 
   const Store& s_;
@@ -195,6 +198,8 @@ class Passes {
   Outcome& o_;
 };
 
+// Length of the first step over all points that is expected after the passes over few, in units of the error of a mean.
+constexpr double FEW_MOVE = 3.0, FEW_TURN = 12.0;
 constexpr int64_t MANY = 4;  // times the few points: a scan from which they are taken
 
 }  // namespace
@@ -234,10 +239,13 @@ Outcome icp(const Store& s, const Code& code, const View& v, const double* T, co
     Memory memory(s, few.n, rule.keep);
     const bool good = passes.run(few, memory, plane, true);
     o.few_passes = o.passes;
-    if (good)
+    if (good) {
       plane = false;
-    else
+      const double error = passes.error();
+      o.turn = std::max(o.turn, FEW_TURN * error / s.extent), o.move = std::max(o.move, FEW_MOVE * error);
+    } else {
       begin();
+    }
   }
   Memory memory(s, v.n, rule.keep);
   passes.run(v, memory, plane, false);

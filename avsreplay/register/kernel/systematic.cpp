@@ -110,16 +110,18 @@ Equations joined(const PatchTable& t) {
   return out;
 }
 
+// What follows runs over all JOINED rows and columns; those from n on are zero.
+
 // What the fit of pose and amplitudes adds to the sum of squares of independent gradients: K Q K' - 2 K S' of the three
-// displacements, with K (3, n) their rows of N N^+ and S the same rows of the covariance of the gradients.
-double fitted(const Joined& K, const Joined& S, const Joined& Q, int n) {
+// displacements, with K their rows of N N^+ and S the same rows of the covariance of the gradients.
+double fitted(const Joined& K, const Joined& S, const Joined& Q) {
   double sum = 0;
-  for (int i = 3; i < 6; ++i)
-    for (int j = 0; j < n; ++j) {
-      double along = 0;
-      for (int k = 0; k < n; ++k) along += K.v[i][k] * Q.v[k][j];
-      sum += (along - 2 * S.v[i][j]) * K.v[i][j];
-    }
+  for (int i = 3; i < 6; ++i) {
+    double along[JOINED] = {};
+    for (int k = 0; k < JOINED; ++k)
+      for (int j = 0; j < JOINED; ++j) along[j] += K.v[i][k] * Q.v[k][j];
+    for (int j = 0; j < JOINED; ++j) sum += (along[j] - 2 * S.v[i][j]) * K.v[i][j];
+  }
   return sum;
 }
 
@@ -130,19 +132,19 @@ double squares(const Joined& N) {
   return sum;
 }
 
-// out += w A B' with the displacements' columns of A and B; `first` to `last`: rows.
-void add_outer(const Joined& A, const Joined& B, double w, int first, int last, int n, Joined& out) {
+// out += A B' with the displacements' columns of A and B; `first` to `last`: rows.
+void add_outer(const Joined& A, const Joined& B, int first, int last, Joined& out) {
   for (int i = first; i < last; ++i)
-    for (int j = 0; j < n; ++j)
-      out.v[i][j] += w * (A.v[i][3] * B.v[j][3] + A.v[i][4] * B.v[j][4] + A.v[i][5] * B.v[j][5]);
+    for (int j = 0; j < JOINED; ++j)
+      out.v[i][j] += A.v[i][3] * B.v[j][3] + A.v[i][4] * B.v[j][4] + A.v[i][5] * B.v[j][5];
 }
 
 // The displacements' rows of A B.
-Joined rows_of_product(const Joined& A, const Joined& B, int n) {
+Joined rows_of_product(const Joined& A, const Joined& B) {
   Joined out;
   for (int i = 3; i < 6; ++i)
-    for (int k = 0; k < n; ++k)
-      for (int j = 0; j < n; ++j) out.v[i][j] += A.v[i][k] * B.v[k][j];
+    for (int k = 0; k < JOINED; ++k)
+      for (int j = 0; j < JOINED; ++j) out.v[i][j] += A.v[i][k] * B.v[k][j];
   return out;
 }
 
@@ -152,11 +154,11 @@ struct Moments {
 };
 
 void add_moments(double weight, const Joined& N, const Row& g, const Joined& S, const Joined& M, const Joined& all,
-                 const Joined& of_blocks, const Joined& inverse, int n, Moments& to) {
-  const Joined K = rows_of_product(N, inverse, n);
+                 const Joined& of_blocks, const Joined& inverse, Moments& to) {
+  const Joined K = rows_of_product(N, inverse);
   const double own = g[3] * g[3] + g[4] * g[4] + g[5] * g[5];
-  to.found += weight * (own - fitted(K, S, all, n));
-  to.expected += weight * (squares(N) + fitted(K, M, of_blocks, n));
+  to.found += weight * (own - fitted(K, S, all));
+  to.expected += weight * (squares(N) + fitted(K, M, of_blocks));
 }
 
 // Variance of the displacements of blocks by the method of moments, and its effect M on the gradients. The products of
@@ -169,29 +171,28 @@ double block_variance(const PatchTable& t, const Equations& q, const std::vector
   std::vector<Row> g((size_t)blocks, Row{});
   std::vector<double> points((size_t)blocks, 0);
   Joined all;
-  const int n = q.n;
   for (int64_t p = 0; p < t.m; ++p) {
     const int64_t b = block[p];
     points[b] += (double)t.counts[p];
-    for (int i = 0; i < n; ++i) {
+    for (int i = 0; i < JOINED; ++i) {
       g[b][i] += q.g[p][i];
-      for (int j = 0; j < n; ++j)
+      for (int j = 0; j < JOINED; ++j)
         whole[b].v[i][j] += q.N[p].v[i][j], spread[b].v[i][j] += S[p].v[i][j], all.v[i][j] += S[p].v[i][j];
     }
   }
-  for (int64_t b = 0; b < blocks; ++b) add_outer(whole[b], whole[b], 1, 0, n, n, M);
+  for (int64_t b = 0; b < blocks; ++b) add_outer(whole[b], whole[b], 0, JOINED, M);
   Moments of_blocks, of_patches;
   double moved = 0;
   for (int64_t b = 0; b < blocks; ++b) {
     Joined own;
-    add_outer(whole[b], whole[b], 1, 3, 6, n, own);
-    add_moments(1 / points[b], whole[b], g[b], spread[b], own, all, M, inverse, n, of_blocks);
+    add_outer(whole[b], whole[b], 3, 6, own);
+    add_moments(1 / points[b], whole[b], g[b], spread[b], own, all, M, inverse, of_blocks);
     moved += squares(whole[b]) / points[b];
   }
   for (int64_t p = 0; p < t.m; ++p) {
     Joined own;
-    add_outer(q.N[p], whole[block[p]], 1, 3, 6, n, own);
-    add_moments(1 / points[block[p]], q.N[p], q.g[p], S[p], own, all, M, inverse, n, of_patches);
+    add_outer(q.N[p], whole[block[p]], 3, 6, own);
+    add_moments(1 / points[block[p]], q.N[p], q.g[p], S[p], own, all, M, inverse, of_patches);
   }
   const double expected = of_blocks.expected - of_patches.expected;
   if (!(expected > LEAST_DETERMINED * moved)) return 0;
@@ -235,13 +236,12 @@ std::vector<Joined> spreads(Equations& q, const Joined& inverse, const double* f
   std::vector<Joined> S(q.N.size());
   for (size_t p = 0; p < S.size(); ++p) {
     double leverage = 0;
-    for (int i = 0; i < q.n; ++i)
-      for (int j = 0; j < q.n; ++j) {
-        q.g[p][i] -= q.N[p].v[i][j] * fit[j];
-        leverage += q.N[p].v[i][j] * inverse.v[j][i] / q.n;
-      }
-    for (int i = 0; i < q.n; ++i)
-      for (int j = 0; j < q.n; ++j) S[p].v[i][j] = q.g[p][i] * q.g[p][j] / std::max(1 - leverage, 0.5);
+    Row& g = q.g[p];
+    for (int i = 0; i < JOINED; ++i)
+      for (int j = 0; j < JOINED; ++j) g[i] -= q.N[p].v[i][j] * fit[j], leverage += q.N[p].v[i][j] * inverse.v[i][j];
+    const double enlarge = 1 / std::max(1 - leverage / q.n, 0.5);
+    for (int i = 0; i < JOINED; ++i)
+      for (int j = 0; j < JOINED; ++j) S[p].v[i][j] = g[i] * g[j] * enlarge;
   }
   return S;
 }
