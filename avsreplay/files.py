@@ -10,8 +10,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import itertools
-import json
-import math
 import os
 import re
 import shutil
@@ -20,7 +18,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from avsreplay.errors import UnreadableInput, UsageError
 
@@ -225,12 +223,19 @@ def _beside(place: Path) -> Path:
 def _part(place: Path, *, folder: bool = False) -> Iterator[Path]:
     """Create a locked temporary file or folder beside ``place`` and remove it at the end if it is still there."""
     _remove_stale(place.parent)
-    part = _beside(place)
-    if folder:
-        part.mkdir()
-    else:
-        part.touch(exist_ok=False)
-    lock = _lock(part)
+    part, lock = _beside(place), None
+    while True:  # between its creation and its lock, another process may take it for a leftover and remove it
+        if folder:
+            part.mkdir()
+        else:
+            part.touch(exist_ok=False)
+        with contextlib.suppress(FileNotFoundError):
+            lock = _lock(part, wait=True)
+        if part.exists():
+            break
+        if lock is not None:
+            os.close(lock)
+            lock = None
     try:
         yield part
     finally:
@@ -239,15 +244,20 @@ def _part(place: Path, *, folder: bool = False) -> Iterator[Path]:
         _remove(part)
 
 
-def _lock(part: Path) -> int | None:
-    """Lock a temporary file until this process ends; None if the system or file system cannot lock files."""
+def _lock(part: Path, *, wait: bool = False) -> int | None:
+    """Lock a temporary file until this process ends; None if the system or file system cannot lock files.
+
+    Args:
+        part: the file or folder.
+        wait: whether to wait for a process that holds the lock.
+    """
     try:
         import fcntl
     except ModuleNotFoundError:  # Windows: an open file cannot be removed there
         return None
     handle = os.open(part, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
     except OSError:
         os.close(handle)
         return None
@@ -307,43 +317,3 @@ def read_limited(path: Path, limit: int, hint: str) -> bytes:
     except OSError as error:
         what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
         raise UnreadableInput(what, where=str(path), hint=hint) from None
-
-
-def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
-    """Return the value of a JSON text, with finite floats, integers of at most 64 bits and valid Unicode only.
-
-    Raises UnreadableInput otherwise.
-    """
-    try:
-        value = json.loads(text, parse_constant=_reject_constant)
-        _check_json(value)
-    except (ValueError, RecursionError) as error:
-        reason = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else "not valid JSON"
-        raise UnreadableInput(reason, where=where, hint=hint) from None
-    return value
-
-
-def read_json(path: Path, *, limit: int = 64 << 20, hint: str) -> Any:
-    """Return the value of a JSON file; see ``parse_json``. Raises UnreadableInput."""
-    return parse_json(read_limited(path, limit, hint), where=str(path), hint=hint)
-
-
-def _reject_constant(name: str) -> None:
-    raise ValueError(f"{name} is not JSON")
-
-
-def _check_json(value: Any) -> None:
-    """Raise ValueError for a number or a string that JSON permits and this program cannot use."""
-    if isinstance(value, str):
-        value.encode("utf-8")  # a lone surrogate is a UnicodeEncodeError, which is a ValueError
-    elif isinstance(value, float) and not math.isfinite(value):
-        raise ValueError("a number that is too large")
-    elif isinstance(value, int) and abs(value) >= 1 << 64:
-        raise ValueError("an integer that is too large")
-    elif isinstance(value, dict):
-        for key, item in value.items():
-            _check_json(key)
-            _check_json(item)
-    elif isinstance(value, list):
-        for item in value:
-            _check_json(item)

@@ -18,8 +18,9 @@ import pytest
 
 from avsreplay import files
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.files import check_output, output_folder, output_path, output_text, parse_json
+from avsreplay.files import check_output, output_folder, output_path, output_text
 from avsreplay.numpy_archive import read_npz
+from avsreplay.report.jsonl import parse_json
 
 posix = pytest.mark.skipif(os.name != "posix", reason="file nodes of POSIX")
 
@@ -180,6 +181,29 @@ def test_the_parts_of_a_killed_process_are_removed_and_those_of_a_living_one_kep
     files._CLEANED.clear()  # as in a new process
     write(path)
     assert only(tmp_path, "a.txt")
+
+
+@posix
+@pytest.mark.parametrize("locked", [False, True])
+@pytest.mark.parametrize("output", [output_path, output_folder])
+def test_a_part_that_another_process_takes_for_a_leftover_is_made_again(tmp_path, monkeypatch, output, locked) -> None:
+    """The other process comes between the creation and the lock, or waits for the lock."""
+    lock, taken = files._lock, []
+
+    def late(part, **options):
+        if taken:
+            return lock(part, **options)
+        taken.append(part)
+        made = lock(part, **options) if locked else None
+        files._remove(part)
+        return made if locked else lock(part, **options)
+
+    monkeypatch.setattr(files, "_lock", late)
+    with output(tmp_path / "x") as part:
+        (part / "file" if part.is_dir() else part).write_text("complete")
+    assert taken
+    assert (tmp_path / "x" / "file" if output is output_folder else tmp_path / "x").read_text() == "complete"
+    assert only(tmp_path, "x")
 
 
 def test_a_folder_is_replaced_when_it_is_complete(tmp_path: Path) -> None:

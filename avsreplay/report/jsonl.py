@@ -17,7 +17,7 @@ from types import TracebackType
 from typing import Any
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.files import output_text, parse_json
+from avsreplay.files import output_text, read_limited
 from avsreplay.rows import Row
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
@@ -163,3 +163,43 @@ def read_rows(path: str | Path) -> list[Row]:
             raise UnreadableInput(what, where=where, hint="the file is not as a run wrote it: run again")
         rows.append(row)
     return rows
+
+
+def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
+    """Return the value of a JSON text, with finite floats, integers of at most 64 bits and valid Unicode only.
+
+    Raises UnreadableInput otherwise.
+    """
+    try:
+        value = json.loads(text, parse_constant=_reject_constant)
+        _check_json(value)
+    except (ValueError, RecursionError) as error:
+        reason = "not UTF-8 text" if isinstance(error, UnicodeDecodeError) else "not valid JSON"
+        raise UnreadableInput(reason, where=where, hint=hint) from None
+    return value
+
+
+def read_json(path: Path, *, limit: int = 64 << 20, hint: str) -> Any:
+    """Return the value of a JSON file; see ``parse_json``. Raises UnreadableInput."""
+    return parse_json(read_limited(path, limit, hint), where=str(path), hint=hint)
+
+
+def _reject_constant(name: str) -> None:
+    raise ValueError(f"{name} is not JSON")
+
+
+def _check_json(value: Any) -> None:
+    """Raise ValueError for a number or a string that JSON permits and this program cannot use."""
+    if isinstance(value, str):
+        value.encode("utf-8")  # a lone surrogate is a UnicodeEncodeError, which is a ValueError
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ValueError("a number that is too large")
+    elif isinstance(value, int) and abs(value) >= 1 << 64:
+        raise ValueError("an integer that is too large")
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            _check_json(key)
+            _check_json(item)
+    elif isinstance(value, list):
+        for item in value:
+            _check_json(item)

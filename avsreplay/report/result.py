@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.files import read_json, read_limited, sha256
+from avsreplay.files import read_limited, sha256
 from avsreplay.geometry import Pose
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.export import StampedPose
-from avsreplay.report.jsonl import read_rows
+from avsreplay.report.jsonl import read_json, read_rows
 from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, read_view
 from avsreplay.rows import Row
