@@ -1,0 +1,124 @@
+"""Whether the tests of docs/reliability.md fail without the code that they test: ``python tests/benchmarks/guards.py``.
+
+For each guard, its text is replaced in a copy of the checkout, and the tests named here must then fail there; without a
+change they must pass. Prints one line per guard; exit code 1 if a test passes without its guard.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+# (file, text, replacement, tests that must fail)
+GUARDS: tuple[tuple[str, str, str, str], ...] = (
+    ("log/surface.py", "if np.abs(vertices).max() > MAX_COORDINATE_M:", "if False:",
+     "test_log_scan_files.py::test_a_model_with_a_vertex_that_is_too_far_away_is_rejected"),
+    ("register/surface_index.py", "if largest > LARGEST_M:", "if False:",
+     "test_register_surface_index.py::test_a_stray_vertex_is_named_as_too_large"),
+    ("files.py", "return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode) or stat.S_ISBLK(mode)", "return False",
+     "test_files.py::test_a_fifo_receives_the_output"),
+    ("files.py", "    place = path.resolve()\n    try:\n        if is_stream(place)",
+     "    place = path\n    try:\n        if is_stream(place)",
+     "test_files.py::test_a_symbolic_link_is_followed_and_never_replaced"),
+    ("files.py", "if len(os.fsencode(path.name)) > _NAME_BYTES:", "if False:",
+     "test_files.py::test_names_that_cannot_be_written_are_refused_before_any_work"),
+    ("files.py", "if not parent.is_dir():", "if False:",
+     "test_files.py::test_folders_that_cannot_be_written_are_refused_before_any_work"),
+    ("files.py", "            yield part\n            _swap(part, place)\n    except OSError as error:",
+     "            yield part\n            _swap(part, place)\n    except ZeroDivisionError as error:",
+     "test_cli_results.py::test_a_disk_that_is_full_during_a_run_keeps_the_old_result"),
+    ("files.py", "        if part.exists():\n            break", "        break",
+     "test_files.py::test_a_part_that_another_process_takes_for_a_leftover_is_made_again"),
+    ("cli/export.py", "    if not count:\n", "    if False:\n",
+     "test_cli_results.py::test_an_export_of_nothing_keeps_the_old_file"),
+    ("numpy_archive.py", "if count * dtype.itemsize > len(data) - start - size:", "if False:",
+     "test_files.py::test_an_archive_that_declares_too_much_is_refused"),
+    ("numpy_archive.py", "except _ZIP_ERRORS as error:", "except ZeroDivisionError as error:",
+     "test_files.py::test_every_damaged_archive_is_one_line"),
+    ("report/jsonl.py", 'raise ValueError("an integer that is too large")', "pass",
+     "test_files.py::test_json_that_this_program_cannot_use"),
+    ("report/result.py", "        if not same:\n", "        if False:\n",
+     "test_cli_results.py::test_a_changed_or_missing_file_is_found"),
+    ("report/result.py", "if not unverified and len(rows) != header.get(", "if False and len(rows) != header.get(",
+     "test_cli_results.py::test_cut_rows_cannot_pass"),
+    ("cli/compare.py", "        if run.losses:\n", "        if False:\n",
+     "test_cli_results.py::test_a_result_of_a_damaged_log_passes_no_gate_in_silence"),
+    ("settings.py", "isinstance(number, int) or math.isfinite(number) or (self.infinite and not math.isnan(number))",
+     "True", "test_cli_bad_input.py::test_an_invalid_option"),
+    ("log/index.py", "column.append(max(-MAX_NS, min(value, MAX_NS)))", "column.append(value)",
+     "test_log_source.py::test_times_that_ros_cannot_hold_are_cut_and_can_be_recorded"),
+    ("log/mcap_format.py", "if opcode == 0 or foreign > _MOST_FOREIGN:", "if False:",
+     "test_log_mcap_file.py::test_millions_of_records_of_length_zero_take_little_memory"),
+    ("cli/__init__.py", "        except BrokenPipeError:\n            raise StdoutClosed from None\n",
+     "        except ZeroDivisionError:\n            pass\n",
+     "test_cli_main.py::test_a_closed_pipe_is_not_a_failed_check"),
+    ("cli/__init__.py", "    except Exception as error:\n        code = _crash(error)\n", "",
+     "test_cli_main.py::test_no_error_exits_with_the_code_of_a_failed_check"),
+    ("sweep/journal.py", 'and line[:9] == b"%08x " % zlib.crc32(line[9:-1])', "",
+     "test_sweep_journal.py::test_one_changed_byte_costs_at_most_the_two_runs_that_it_touches"),
+    ("sweep/journal.py", "        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)", "        pass",
+     "test_sweep_journal.py::test_two_campaigns_cannot_use_one_directory"),
+    ("sweep/worker.py", 'return RunResult(task.id, "lossy", what, *found)',
+     'return RunResult(task.id, "ok", None, *found)',
+     "test_sweep_run.py::test_a_cut_log_is_lossy_and_exit_4_as_in_run"),
+    ("cli/sweep.py", 'default="127.0.0.1:0"', 'default="0.0.0.0:0"',
+     "test_sweep_run.py::test_dask_listens_on_the_loopback_only"),
+    ("arithmetic.py", "    os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])", "    return",
+     "test_arithmetic.py::test_the_process_starts_once_more_and_keeps_other_tunables"),
+    ("log/point_cloud2.py", "(np.abs(points) <= MAX_COORDINATE_M).all(axis=1)", "np.isfinite(points).all(axis=1)",
+     "test_log_point_cloud2.py::test_points_that_are_too_far_away_are_left_out_and_counted"),
+    ("report/jsonl.py", "if not name.isprintable() or len(name) > _MAX_NAME:", "if False:",
+     "test_report_golden.py::test_an_invalid_golden_file_is_one_line"),
+    ("report/export.py", '_FORMULA = ("=", "+", "-", "@", "\\t", "\\r")', '_FORMULA = ("\\0",)',
+     "test_cli_results.py::test_cells_that_a_spreadsheet_would_evaluate_are_quoted"),
+    ("log/pose_files.py", "    if abs(t_ns) >= _MAX_SECONDS * 1_000_000_000:\n        raise ValueError\n", "",
+     "test_register_poses.py::test_a_file_that_holds_no_poses_is_refused_with_file_and_line"),
+    ("config.py", "        check_robot(self.robot, self.plan, self.limits)\n", "",
+     "test_cli_bad_input.py::test_an_impossible_robot_is_one_line"),
+)  # fmt: skip
+
+
+def passes(checkout: Path, test: str) -> bool:
+    """Whether a test passes in a checkout. Raises RuntimeError if it does not exist."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"tests/{test}"]
+    environment = {**os.environ, "PYTHONPATH": str(checkout)}
+    done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode not in (0, 1):
+        raise RuntimeError(f"{test}: {done.stdout[-500:]}")
+    return done.returncode == 0
+
+
+def main() -> int:
+    """Remove each guard; exit 1 if its test passes all the same."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--only", default="", help="guards of files and tests that contain this text")
+    asked = parser.parse_args()
+    bad = 0
+    with tempfile.TemporaryDirectory() as folder:
+        checkout = Path(folder) / "checkout"
+        left_out = shutil.ignore_patterns(".git", "build", "dist", "__pycache__", ".*_cache", ".hypothesis")
+        shutil.copytree(ROOT, checkout, ignore=left_out)
+        for name, text, replacement, test in GUARDS:
+            if asked.only not in f"{name} {test}":
+                continue
+            path = checkout / "avsreplay" / name
+            whole = path.read_text(encoding="utf-8")
+            if whole.count(text) != 1:
+                raise SystemExit(f"{name} contains {text!r} {whole.count(text)} times")
+            path.write_text(whole.replace(text, replacement), encoding="utf-8")
+            without = passes(checkout, test)
+            path.write_text(whole, encoding="utf-8")
+            verdict = "ok" if not without and passes(checkout, test) else "NOT TESTED"
+            bad += verdict != "ok"
+            print(f"{verdict:<10} {name}: {test}", flush=True)
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
