@@ -22,7 +22,7 @@ import click
 from avsreplay import arithmetic
 from avsreplay.errors import AvsError, UsageError
 
-__all__ = ["main"]
+__all__ = ["execute"]
 
 SUMMARIES = {
     "record": "Write a log: simulate a scenario, or convert recorded scans.",
@@ -146,8 +146,8 @@ class StdoutClosed(BaseException):
     """The reader of standard output closed it; not an OSError, which click and rich turn into exit code 1."""
 
 
-def main() -> None:
-    """Entry point: run a command and exit with its code; every error is one line on stderr."""
+def execute() -> None:
+    """Run a command of the arguments of this process and exit with its code; every error is one line on stderr."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal
     try:

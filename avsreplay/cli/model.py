@@ -57,7 +57,10 @@ def command(
     The result is a point cloud with normals in a frame {C} that is fixed to the target: its origin is a grasp point
     on the surface and its x axis the outward normal there. Ground truth in LOG is not used. 'avsreplay run LOG
     --model auto' builds the model and replays the log against it in one step.
-    """
+    \f
+    Raises:
+        MissingBackend: a mesh is asked for and Open3D is not installed.
+    """  # noqa: D301
     import numpy as np
 
     from avsreplay.files import check_output, output_path

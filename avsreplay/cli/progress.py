@@ -51,6 +51,9 @@ def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[
     Args:
         rows: results so far; before the first one Ctrl-C interrupts at once.
         stop: called at the first Ctrl-C.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C was pressed a second time, or before the first result.
     """
     asked: list[int] = []
 

@@ -80,7 +80,10 @@ def command(log: Path, **flags: Any) -> None:
     LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs no option. With - as
     LOG an MCAP file is read from standard input, and each scan is replayed when it is there; --follow does the same
     with a file that is still written. The results are those of a replay of the complete log.
-    """
+    \f
+    Raises:
+        UsageError: options contradict each other.
+    """  # noqa: D301
     from avsreplay.result_dir import ResultDirectory
 
     wanted = Wanted(**{field.name: flags.pop(field.name) for field in fields(Wanted)})

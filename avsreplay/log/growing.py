@@ -80,7 +80,12 @@ class GrowingLog:
             before.close()
 
     def take(self, scan: Scan, truth: Truth) -> None:
-        """Remember what was used of a scan and its truth."""
+        """Remember what was used of a scan and its truth.
+
+        Args:
+            scan: the scan; its points are not kept.
+            truth: its ground truth.
+        """
         self._used.append((replace(scan, points=_NO_POINTS, times_s=None), truth))
 
     def outdated(self, *, planned: bool) -> bool:

@@ -321,7 +321,7 @@ def _pose_file(path: Path) -> Path | None:
     found = sorted({p for pattern in _POSE_FILES for p in path.glob(pattern) if p.is_file()})
     if len(found) > 1:
         names = ", ".join(shown(p.name) for p in found)
-        raise UsageError(f"several pose files: {names}", where=shown(path), hint="choose one with --truth-file")
+        raise UsageError(f"several pose files: {names}", where=shown(path), hint="choose one with --truth")
     return found[0] if found else None
 
 

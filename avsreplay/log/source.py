@@ -154,7 +154,11 @@ class Source:
         return Truth(pose, self._body_at(scan.t_ns), self._fault(scan.log_ns))
 
     def moving_in(self, frame: str) -> str | None:
-        """Return the root frame in which a frame moves; None if it is fixed or the transforms were not collected."""
+        """Return the root frame in which a frame moves; None if it is fixed or the transforms were not collected.
+
+        Args:
+            frame: name of the frame of a cloud.
+        """
         return self._ground_truth.moving_in(frame)
 
     def payloads(self) -> Iterator[tuple[bytes | memoryview, str]]:

@@ -292,6 +292,9 @@ def closed_loop(
 
     Returns:
         ``captured``, ``outside`` or the last action, and whether the end-effector touched the body.
+
+    Raises:
+        ValueError: There is no scan.
     """
     state: GuidanceState | None = None
     aimed: Array | None = None

@@ -100,7 +100,15 @@ class FaceOptics:
 
 
 def face_optics(surface: Surface, materials: Sequence[Material]) -> FaceOptics:
-    """The optical properties of a surface's faces; those without a material have a diffuse reflectance of 0.5."""
+    """The optical properties of a surface's faces; those without a material have a diffuse reflectance of 0.5.
+
+    Args:
+        surface: vertices and faces.
+        materials: what applies to which faces; a later one takes precedence.
+
+    Raises:
+        UsageError: a material names a group that the model does not have.
+    """
     count = len(surface.faces)
     zero = np.zeros(count)
     corners = surface.vertices[surface.faces]

@@ -51,6 +51,9 @@ class RecordedFault:
     def parse(cls, text: str) -> RecordedFault:
         """Return the fault that ``kind:start:duration[:strength]`` describes.
 
+        Args:
+            text: kind, start and duration [s], and for some kinds the strength.
+
         Raises:
             ValueError: The text has another form, or a value is out of range.
         """
@@ -74,7 +77,11 @@ class RecordedFault:
         return cls(kind, numbers[0], numbers[1], strength)
 
     def label(self, epoch_ns: int) -> Label:
-        """The label of the fault; its window begins ``start_s`` after ``epoch_ns`` on the log clock."""
+        """The label of the fault; its window begins ``start_s`` after ``epoch_ns`` on the log clock.
+
+        Args:
+            epoch_ns: time of the first scan on the log clock [ns].
+        """
         default, harmful = RECORDED_KINDS[self.kind]
         return Label(
             kind=self.kind,

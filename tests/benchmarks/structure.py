@@ -3,6 +3,7 @@
     python tests/benchmarks/structure.py                  # this checkout
     python tests/benchmarks/structure.py --json           # the same for machines
     python tests/benchmarks/structure.py --root CHECKOUT  # another checkout, for example an earlier version
+    python tests/benchmarks/structure.py --list           # the functions whose docstring lacks a section, small modules
 
 Definitions: a module is a Python file of the package. Code lines are lines without blanks, comments and docstrings. The
 import share counts the lines of import statements and of ``__all__`` over all lines. The path of one scan is what runs
@@ -31,10 +32,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--root", type=Path, default=ROOT, help="the checkout to measure")
     parser.add_argument("--json", action="store_true", help="one JSON document")
+    parser.add_argument("--list", action="store_true", help="what lacks a docstring section, and modules to merge")
     parser.add_argument("--scan-path", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.scan_path:
         print(json.dumps(scan_path(options.root)))
+        return
+    if options.list:
+        print(*lacking(options.root), *mergeable(options.root), sep="\n")
         return
     found = sizes(options.root) | names(options.root) | docstrings(options.root) | settings(options.root)
     found |= traced(options.root)
@@ -150,34 +155,58 @@ def names(root: Path) -> dict:
 
 def docstrings(root: Path) -> dict:
     """Docstrings of public functions and methods: present, with Args, with Raises where they raise."""
-    public = documented = with_args = needs_args = raising = says_raises = 0
-    exported = exported_args = 0
+    rows = list(documentation(root))
+    takes, exported = [r for r in rows if r["takes"]], [r for r in rows if r["takes"] and r["exported"]]
+    raising = [r for r in rows if r["raises"]]
+    return {
+        "public functions and methods": len(rows),
+        "  with a docstring": sum(bool(r["text"]) for r in rows),
+        "  with arguments": len(takes),
+        "  with arguments and an Args section": sum("Args:" in r["text"] for r in takes),
+        "exported functions with arguments": len(exported),
+        "  with an Args section": sum("Args:" in r["text"] for r in exported),
+        "functions that raise": len(raising),
+        "  whose docstring says so": sum("Raise" in r["text"] for r in raising),
+    }
+
+
+def documentation(root: Path):
+    """What the docstring of each public function or method should say, and its text."""
     api = exports(root)
     for path in modules(root):
         module = module_name(root, path)
         for name, node in public_functions(ast.parse(path.read_text(encoding="utf-8"))):
-            text = ast.get_docstring(node) or ""
-            public += 1
-            documented += bool(text)
-            takes = any(a.arg not in ("self", "cls") for a in (*node.args.args, *node.args.kwonlyargs))
-            needs_args += takes
-            with_args += takes and "Args:" in text
-            if takes and (name in api or module == "avsreplay"):
-                exported += 1
-                exported_args += "Args:" in text
-            if any(isinstance(n, ast.Raise) for n in ast.walk(node)):
-                raising += 1
-                says_raises += "Raise" in text
-    return {
-        "public functions and methods": public,
-        "  with a docstring": documented,
-        "  with arguments": needs_args,
-        "  with arguments and an Args section": with_args,
-        "exported functions with arguments": exported,
-        "  with an Args section": exported_args,
-        "functions that raise": raising,
-        "  whose docstring says so": says_raises,
-    }
+            yield {
+                "where": f"{path.relative_to(root)}:{node.lineno} {node.name}",
+                "text": ast.get_docstring(node) or "",
+                "takes": any(a.arg not in ("self", "cls") for a in (*node.args.args, *node.args.kwonlyargs)),
+                "exported": name in api or module == "avsreplay",
+                "raises": any(isinstance(n, ast.Raise) for n in ast.walk(node)),
+            }
+
+
+def lacking(root: Path):
+    """Exported functions without an Args section, and functions that raise without saying so."""
+    for row in documentation(root):
+        if row["takes"] and row["exported"] and "Args:" not in row["text"]:
+            yield f"{row['where']}: no Args"
+        if row["raises"] and "Raise" not in row["text"]:
+            yield f"{row['where']}: no Raises"
+
+
+def mergeable(root: Path):
+    """Modules under 150 lines with one importer, into which they would fit."""
+    known = {module_name(root, path): path for path in modules(root)}
+    importers: dict[str, set[str]] = collections.defaultdict(set)
+    for path in modules(root):
+        for name in imported(ast.parse(path.read_text(encoding="utf-8"))):
+            target = name if name in known else name.rpartition(".")[0]
+            importers[target].add(module_name(root, path))
+    lines = {name: path.read_text(encoding="utf-8").count("\n") for name, path in known.items()}
+    for name, count in sorted(lines.items()):
+        (only,) = importers[name] if len(importers[name]) == 1 else ("",)
+        if only and only != name.rpartition(".")[0] and count < 150 and count + lines[only] <= 370:
+            yield f"{name} ({count} lines) is imported by {only} only ({lines[only]} lines)"
 
 
 def exports(root: Path) -> set[str]:
