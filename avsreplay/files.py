@@ -273,7 +273,7 @@ def _remove_stale(folder: Path) -> None:
         for entry in folder.iterdir():
             if _PART.fullmatch(entry.name):
                 lock = _lock(entry)
-                if lock is not None or os.name == "nt":
+                if lock is not None or (os.name == "nt" and entry.is_file()):  # it cannot remove a file that is open
                     _remove(entry)
                 if lock is not None:
                     os.close(lock)

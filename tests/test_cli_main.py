@@ -74,3 +74,13 @@ def test_no_error_exits_with_the_code_of_a_failed_check(
     with pytest.raises(SystemExit) as left:
         cli.execute()
     assert left.value.code in (3, 70)
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "ascii"])
+def test_characters_that_the_output_cannot_encode_are_escaped(cli, fixtures_folder, tmp_path, encoding):
+    """As on Windows, whose standard output has a code page where it is not a terminal."""
+    log = tmp_path / "π.mcap"
+    log.write_bytes((fixtures_folder / "tumble.mcap").read_bytes())
+    done = cli("info", log, env={"PYTHONIOENCODING": encoding})
+    assert (done.code, done.err) == (0, "")
+    assert "\\u03c0.mcap" in done.out

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import importlib
+import io
 import os
 import sys
 import tempfile
@@ -150,6 +151,9 @@ def execute() -> None:
     """Run a command of the arguments of this process and exit with its code; every error is one line on stderr."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal
+    for stream in (sys.stdout, sys.stderr):  # a character that the encoding of the terminal does not have is escaped
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         code = group.main(standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY")
     except AvsError as error:
