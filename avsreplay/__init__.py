@@ -42,10 +42,12 @@ _HOME = {"AvsError": "errors", "Job": "run", "Row": "rows", "Run": "run", "RunCo
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
+    if name == "arithmetic":  # the one module that must be available before numpy is imported
+        return import_module(f"{__name__}.arithmetic")
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
 
 

@@ -20,7 +20,7 @@ from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan import Limits, PlannerInput, PlanParams, RobotParams, Scene, SupervisorParams
 from avsreplay.records import Alignment, AlignStatus, Belief, State, Surface
-from avsreplay.report.result import load_result
+from avsreplay.report.result import load_result, motion_samples
 from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
 from avsreplay.settings import Settings, setting
@@ -113,10 +113,8 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
     config = result.header.get("config", {})
     extent = extent_m or result.extent_m(path)
     since_ns = result.rows[0].t_ns
-    truth = None
-    if len(result.poses) >= 4:
-        times = np.array([(t_ns - since_ns) * 1e-9 for t_ns, _ in result.poses])
-        truth = plan.interpolated(times, [pose for _, pose in result.poses])
+    times, poses = motion_samples(result.poses, since_ns)
+    truth = plan.interpolated(times, poses) if len(poses) >= 4 else None
     return Saved(
         name=str(path),
         rows=result.rows,

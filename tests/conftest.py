@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,21 +64,26 @@ def shared_data():
 
 
 SLOW = ROOT / "tests" / "slow.txt"
-MOST_S = 0.3  # processor time of a quick test
+MOST_S, MOST_FIXTURE_S = 0.2, 1.0  # processor time of a quick test, and of a fixture of a module with quick tests
+SPENT: dict[object, float] = {}  # largest processor time of each test and fixture
 
 
 def pytest_addoption(parser):
-    parser.addoption("--write-slow", action="store_true", help="measure all tests and write tests/slow.txt")
+    parser.addoption("--write-slow", action="store_true", help="write the tests that are slow to tests/slow.txt")
 
 
-def pytest_collection_modifyitems(config, items):
+def pytest_collection_modifyitems(items):
     """Give the tests that slow.txt lists the marker ``slow``."""
-    if config.getoption("--write-slow"):
-        return
-    listed = {line.split()[1] for line in SLOW.read_text(encoding="utf-8").splitlines()}
+    listed = listed_as_slow()
     for item in items:
         if named(item) in listed:
             item.add_marker("slow")
+
+
+def listed_as_slow():
+    """Name and processor time of the tests in slow.txt."""
+    lines = SLOW.read_text(encoding="utf-8").splitlines()
+    return {name: float(spent) for spent, name in (line.split() for line in lines)}
 
 
 def named(item):
@@ -85,23 +91,40 @@ def named(item):
     return f"{item.path.name}::{getattr(item, 'originalname', item.name)}"
 
 
-SPENT: dict[str, float] = {}
+@contextmanager
+def measured(key):
+    before = sum(os.times()[:4]) + SERVER.spent_s
+    try:
+        yield
+    finally:
+        SPENT[key] = max(SPENT.get(key, 0.0), sum(os.times()[:4]) + SERVER.spent_s - before)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
-    before = sum(os.times()[:4]) + SERVER.spent_s
-    try:
+    with measured(named(item)):
         return (yield)
-    finally:
-        spent = sum(os.times()[:4]) + SERVER.spent_s - before
-        SPENT[named(item)] = max(SPENT.get(named(item), 0.0), spent)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_fixture_setup(fixturedef):
+    with measured(fixturedef):
+        return (yield)
 
 
 def pytest_sessionfinish(session):
-    if session.config.getoption("--write-slow"):
-        lines = [f"{spent:6.1f} {name}" for name, spent in sorted(SPENT.items()) if spent > MOST_S]
-        SLOW.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    """Write slow.txt; what it says of tests that were not run stays."""
+    if not session.config.getoption("--write-slow"):
+        return
+    table = {name: spent for name, spent in listed_as_slow().items() if name not in SPENT}
+    for item in session.items:
+        definitions = [d for found in item._fixtureinfo.name2fixturedefs.values() for d in found[-1:]]
+        fixture = max((SPENT.get(d, 0.0) for d in definitions if d.scope == "module"), default=0.0)
+        spent = max(SPENT.get(named(item), 0.0), fixture if fixture > MOST_FIXTURE_S else 0.0)
+        if named(item) in SPENT and spent > MOST_S:
+            table[named(item)] = spent
+    lines = [f"{spent:6.1f} {name}" for name, spent in sorted(table.items())]
+    SLOW.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 STEP_NS = 200_000_000

@@ -63,3 +63,25 @@ def test_the_process_starts_once_more_and_keeps_other_tunables():
 
 def test_a_process_that_has_imported_numpy_is_not_replaced():
     assert pinned_script("import numpy") == ["start", "native "]
+
+
+API = """
+import sys
+import avsreplay
+avsreplay.arithmetic.pin()
+from avsreplay.report.jsonl import dump_row
+for row in avsreplay.replay(sys.argv[1], n_scans=12):
+    print(dump_row(row))
+"""
+
+
+@needs_variants
+def test_a_script_that_pins_its_arithmetic_has_the_rows_of_the_command_on_any_processor(cli, fixtures_folder, tmp_path):
+    log, script = fixtures_folder / "spin-raster.mcap", tmp_path / "script.py"
+    script.write_text(API)
+    assert cli("run", log, "-o", tmp_path / "r", "--n-scans", "12").code == 0
+    rows = (tmp_path / "r" / "rows.jsonl").read_text(encoding="utf-8")
+    for variables in ({"OPENBLAS_CORETYPE": "Prescott"}, OTHER):
+        env = {k: v for k, v in os.environ.items() if k not in arithmetic.PINS} | variables
+        done = subprocess.run([sys.executable, script, log], env=env, capture_output=True, text=True, check=True)
+        assert done.stdout == rows

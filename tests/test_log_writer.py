@@ -257,3 +257,11 @@ def test_a_state_that_is_not_finite_is_one_line_and_leaves_no_file(tmp_path: Pat
     with pytest.raises(UsageError, match="not finite"):
         LogWriter(tmp_path / "a.mcap", LogHeader(labels=(label,)))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("t_ns", [-1, 2**63])
+def test_a_time_that_a_log_cannot_hold_is_one_line(tmp_path, t_ns):
+    scan = Scan(0, SECOND, np.zeros((1, 3), np.float32), log_ns=t_ns)
+    with pytest.raises(UnreadableInput, match="cannot be recorded"), LogWriter(tmp_path / "x.mcap", LogHeader()) as log:
+        log.write(scan)
+    assert not (tmp_path / "x.mcap").exists()

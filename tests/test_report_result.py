@@ -12,7 +12,7 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.export import write_tum
 from avsreplay.report.jsonl import write_rows
-from avsreplay.report.result import facts_record, load_result
+from avsreplay.report.result import facts_record, load_result, motion_samples
 from avsreplay.report.summary import Summary
 from avsreplay.report.view import PathView, View, read_view, thin_cloud, thin_surface, write_view
 
@@ -125,6 +125,8 @@ def test_no_rows_is_one_line(tmp_path):
         ("run.json", '{"facts": [1]}', "not as written"),
         ("truth.tum", "1 2 3", r"truth\.tum:1: not 'stamp"),
         ("truth.tum", "x 0 0 0 0 0 0 1", "not 'stamp"),
+        ("truth.tum", "1 0.5 nan 0 0 0 0 1", "not 'stamp"),
+        ("truth.tum", "nan 0 0 0 0 0 0 1", "not 'stamp"),
         ("view.npz", "nothing", "not a valid npz"),
     ],
 )
@@ -148,3 +150,11 @@ def test_a_view_with_a_part_missing_or_wrong(folder, missing):
     np.savez(path, **arrays, **{missing: np.array([[0, 1, 10**6]], np.int32)})
     with pytest.raises(UnreadableInput):
         read_view(path)
+
+
+def test_samples_of_a_motion_ascend():
+    """A log may contain a scan twice, and times that go back."""
+    poses = [Pose.identity() for _ in range(4)]
+    times, kept = motion_samples(list(zip([5_000_000_000, 1_000_000_000, 5_000_000_000, 2**62], poses, strict=True)), 0)
+    assert times.tolist() == [1.0, 5.0, 2**62 * 1e-9]
+    assert [id(p) for p in kept] == [id(poses[k]) for k in (1, 0, 3)]

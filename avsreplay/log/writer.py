@@ -150,8 +150,7 @@ class LogWriter:
             scan: its points in the camera frame {A} [m], and the times of the points [s] if it has them, are stored.
 
         Raises:
-            ValueError: a time is outside the range of a log.
-            UnreadableInput: the output cannot be written.
+            UnreadableInput: the output cannot be written, or a time is outside the range of a log.
         """
         payload = point_cloud2(scan.t_ns, CAMERA_FRAME, scan.points, scan.times_s, self._point_type, scan.intensities)
         self._message(CLOUD_TOPIC, scan.log_ns, payload)
@@ -166,8 +165,7 @@ class LogWriter:
             body: full state of {B} in {A}, if known.
 
         Raises:
-            ValueError: a time is outside the range of a log.
-            UnreadableInput: the output cannot be written.
+            UnreadableInput: the output cannot be written, or a time is outside the range of a log.
         """
         self._message(TRUTH_TOPIC, log_ns, pose_stamped(t_ns, self._root, pose))
         if body is not None:
@@ -182,8 +180,7 @@ class LogWriter:
             pose: T_wa.
 
         Raises:
-            ValueError: a time is outside the range of a log.
-            UnreadableInput: the output cannot be written.
+            UnreadableInput: the output cannot be written, or a time is outside the range of a log.
         """
         self._message(CAMERA_TOPIC, log_ns, pose_stamped(t_ns, ROOT_FRAME, pose))
         self._message("/tf", log_ns, transform(t_ns, ROOT_FRAME, CAMERA_FRAME, pose))
@@ -240,7 +237,8 @@ class LogWriter:
 
     def _message(self, topic: str, log_ns: int, payload: bytes) -> None:
         if not 0 <= log_ns < 2**63:
-            raise ValueError(f"log time {log_ns} ns is outside the range of a log")
+            hint = "the clock of a log begins at 0; give later times"
+            raise UnreadableInput(f"a time of {log_ns * 1e-9:g} s cannot be recorded", where=str(self._path), hint=hint)
         self._guarded(lambda: self._append_with_labels(topic, log_ns, payload))
 
     def _append_with_labels(self, topic: str, log_ns: int, payload: bytes) -> None:

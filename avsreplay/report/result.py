@@ -17,7 +17,7 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import read_limited, sha256
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.export import StampedPose
 from avsreplay.report.jsonl import read_json, read_rows
@@ -220,15 +220,30 @@ def read_tum(path: str | Path) -> list[StampedPose]:
     return out
 
 
+def motion_samples(poses: Sequence[StampedPose], since_ns: int) -> tuple[Array, list[Pose]]:
+    """Return the times [s] after ``since_ns`` and the poses, ascending, without those within 10 us of an earlier one.
+
+    Args:
+        poses: times and poses in any order.
+        since_ns: instant from which the times count [ns].
+    """
+    kept: list[tuple[float, Pose]] = []
+    for t_ns, pose in sorted(poses, key=lambda each: each[0]):
+        t_s = (t_ns - since_ns) * 1e-9
+        if not kept or t_s > kept[-1][0] + 1e-5:
+            kept.append((t_s, pose))
+    return np.array([t_s for t_s, _ in kept]), [pose for _, pose in kept]
+
+
 def _stamped(line: str, where: str) -> StampedPose:
     try:
         stamp, *words = line.split()
         x, y, z, *q = values = [float(v) for v in words]
         seconds = Decimal(stamp)
-        if not abs(seconds) < _LONGEST_S or len(q) != 4 or not max(map(abs, values)) < _LARGEST:
+        if not abs(seconds) < _LONGEST_S or len(q) != 4 or not all(abs(v) < _LARGEST for v in values):
             raise ValueError("a pose out of range")
         t_ns = int((seconds * 1_000_000_000).to_integral_value(ROUND_DOWN))
-        if abs(math.hypot(*q) - 1.0) > _UNIT:
+        if not abs(math.hypot(*q) - 1.0) <= _UNIT:
             raise ValueError("not a unit quaternion")
         return t_ns, Pose(q, [x, y, z])  # type: ignore[arg-type]
     except (ValueError, ArithmeticError):
