@@ -27,25 +27,113 @@ def _blocks(page):
 
 
 MARKED = [page for page in PAGES if any(block["mark"] for block in _blocks(page))]
+QUICK = {"docs/index.md"}
+SHORT = {"AVSREPLAY_RECORD_DURATION_S": "12", "AVSREPLAY_SWEEP_LIMIT": "2"}  # of what a page simulates itself
+ELSEWHERE = {  # command of a block that needs more than a folder: the test that runs such a command
+    "avsreplay run long.mcap": "test_checkpoint.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption",
+    "avsreplay sweep docs/campaigns/blackouts.toml -o": "test_sweep_run.py::test_a_worker_killed_in_the_middle",
+    "avsreplay sweep docs/campaigns/blackouts.toml --run": "test_sweep_run.py::test_the_worst_run_is_made_again",
+    "avsreplay sweep docs/campaigns/faults.toml": "test_sweep_fault_kinds.py::test_",
+    "avsreplay run $D/stanford-dragon": "test_real.py::test_the_folder_itself_runs",
+    "avsreplay run $D/primesense-bunny": "test_real.py::test_the_depth_views_of_a_figure",
+    "avsreplay run toss.csv": "test_real.py::test_gravity_is_found",
+    "avsreplay run $D/stanford-bunny": "test_real.py::test_every_bunny_scan",
+    "avsreplay run milk": "test_real.py::test_a_carton_in_a_depth_scene",
+    "avsreplay run $D/ros1-bags": "test_real.py::test_raw_packets_are_named",
+    "pip install docs/examples/own_backend": "test_docs.py::test_the_back_end_of_the_tutorial_keeps_the_contract",
+    "python3 -m venv .venv": ".ci/run",
+    "pip install -q '.[test]'": ".ci/run",
+}
 
 
 def _name(page):
     return str(page.relative_to(ROOT))
 
 
+def _parameter(page):
+    return pytest.param(page, id=_name(page), marks=() if _name(page) in QUICK else pytest.mark.slow)
+
+
+def _own_bag(folder):
+    subprocess.run([sys.executable, ROOT / "docs" / "examples" / "own_bag.py", folder], check=True)
+
+
+def _own_backend(folder):
+    _installed(ROOT / "docs" / "examples" / "own_backend", folder / "site")
+
+
+def _poses(folder):
+    """Poses of the recording as TUM and CSV files."""
+    from avsreplay.log import open_source
+
+    with open_source(folder / "tumble.mcap") as source:
+        poses = source.truth_poses()
+    lines = [(t, *pose.t, *pose.q) for t, pose in poses]
+    (folder / "flight.tum").write_text(
+        "".join(f"{t * 1e-9:.9f} {x} {y} {z} {a} {b} {c} {d}\n" for t, x, y, z, a, b, c, d in lines)
+    )
+    rows = (f"{t},{x},{y},{z},{a},{b},{c},{d}\n" for t, x, y, z, a, b, c, d in lines)
+    (folder / "flight.csv").write_text("t_ns,x,y,z,qx,qy,qz,qw\n" + "".join(rows))
+
+
+def _scenarios(folder):
+    """A scenario with a moving camera, its recording, and a log to inject faults into."""
+    text = "duration_s = 6.0\nrate_hz = 3.0\n[motion]\nrate_radps = [0.06, 0.064, -0.048]\n[scanner]\nrays = [40, 40]\n"
+    (folder / "scenario.toml").write_text(text)
+    (folder / "moving.toml").write_text(text + "[camera]\nvelocity_mps = [0.02, 0.0, 0.0]\n")
+    subprocess.run([sys.executable, "-m", "avsreplay", "record", "moving.toml", "-o", "x.mcap"], cwd=folder, check=True)
+    for name in ("y.mcap", "growing.mcap"):
+        shutil.copy(folder / "tumble.mcap", folder / name)
+
+
+def _real(folder):
+    data = ROOT.parent / "shared" / "data"
+    if not data.is_dir():
+        pytest.skip("../shared/data is not here")
+    (folder / "stanford-dragon").symlink_to(data / "stanford-dragon")
+    (folder / "tumble.mcap").unlink()
+
+
+def _campaigns(folder):
+    shutil.copytree(ROOT / "docs" / "campaigns", folder / "docs" / "campaigns")
+
+
+def _without_log(folder):
+    (folder / "tumble.mcap").unlink()
+
+
+def _clone(folder):
+    (folder / "docs" / "examples").mkdir(parents=True)
+    shutil.copy(ROOT / "docs" / "examples" / "own_bag.py", folder / "docs" / "examples")
+
+
+NEEDS = {
+    "README.md": (_own_bag, _without_log),
+    "docs/your-own-log.md": (_clone,),
+    "docs/your-own-backend.md": (_own_backend, _without_log),
+    "docs/poses.md": (_poses, _own_bag),
+    "docs/report.md": (_scenarios,),
+    "docs/scenario.md": (_scenarios,),
+    "docs/results.md": (_real,),
+    "docs/sweep.md": (_campaigns,),
+}
+
+
 @pytest.fixture
 def folder(tmp_path, request):
-    """An empty folder with the short recording of the fixtures, for the tutorial of an own log with its bag."""
+    """A folder with the short recording of the fixtures, and the files that a page assumes."""
     shutil.copy(ROOT / "fixtures" / "tumble.mcap", tmp_path / "tumble.mcap")
     page = getattr(getattr(request.node, "callspec", None), "params", {}).get("page")
-    if page is not None and page.name == "your-own-log.md":
-        subprocess.run([sys.executable, ROOT / "docs" / "examples" / "own_bag.py", tmp_path], check=True)
+    for prepare in NEEDS.get(_name(page), ()) if page is not None else ():
+        prepare(tmp_path)
     return tmp_path
 
 
-def _environment():
+def _environment(folder=None):
+    path = [str(folder / "site"), os.environ.get("PYTHONPATH", "")] if folder else []
     return {
         **os.environ,
+        **({"PYTHONPATH": os.pathsep.join(filter(None, path))} if path else {}),
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         "OMP_NUM_THREADS": "1",
     }
@@ -56,17 +144,17 @@ def _run(block, folder):
     done = subprocess.run(
         [*program, block["text"]],
         cwd=folder,
-        env=_environment(),
+        env={**_environment(folder), **SHORT},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
         check=False,
     )
     expected = int(block["mark"].partition("exit")[2] or 0)
     assert done.returncode == expected, f"{block['text']}\n{done.stdout[-2000:]}\n{done.stderr[-2000:]}"
 
 
-@pytest.mark.parametrize("page", MARKED, ids=_name)
+@pytest.mark.parametrize("page", [_parameter(page) for page in MARKED])
 def test_marked_blocks_run_in_order(page, folder):
     for block in _blocks(page):
         kind, _, rest = (block["mark"] or "").partition(":")
@@ -76,8 +164,27 @@ def test_marked_blocks_run_in_order(page, folder):
             _run(block, folder)
 
 
-def test_something_is_marked():
-    assert {"docs/index.md", "docs/ci.md"} <= {_name(page) for page in MARKED}
+def _commands(block):
+    lines = [line.strip() for line in block["text"].replace("\\\n", " ").splitlines()]
+    return [line for line in lines if re.match(r"(avsreplay|pip|python3? -m venv)\b", line)]
+
+
+def test_every_block_with_a_command_is_run_by_a_test():
+    """Marked blocks are run here; the others name the test that runs such a command."""
+    blocks = [(page, block) for page in PAGES if page.name != "CONTRIBUTING.md" for block in _blocks(page)]
+    shown = [(page, block) for page, block in blocks if block["language"] in ("", "sh", "bash", "console")]
+    found = set()
+    for page, block in shown:
+        if block["mark"] or not _commands(block):
+            continue
+        known = [start for start in ELSEWHERE if any(line.startswith(start) for line in _commands(block))]
+        assert known, f"{_name(page)} shows a command that no test runs: {block['text']}"
+        found.update(known)
+    assert found == set(ELSEWHERE)
+    for place in ELSEWHERE.values():
+        name, _, test = place.partition("::")
+        file = ROOT / name if name.startswith(".") else ROOT / "tests" / name
+        assert f"def {test}" in file.read_text(encoding="utf-8") if test else file.exists()
 
 
 def test_the_tutorial_of_an_own_log_gives_the_options_that_it_uses(tmp_path, cli):
