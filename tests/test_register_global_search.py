@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, matrix
@@ -15,9 +16,11 @@ from avsreplay.log.ply import read_ply
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import boxes, view
-from avsreplay.register.global_search import VisibleCentroids, attitudes, directions
+from avsreplay.register.global_search import GlobalSearch, SearchResult, VisibleCentroids, attitudes, directions
 from avsreplay.register.params import AcquireParams
-from avsreplay.register.sampling import thin_to, without_sparse_points
+from avsreplay.register.restarts import FIXED_WORK, HEALTHY_PASSES, HEALTHY_SCANS
+from avsreplay.register.sampling import sample, thin_to, without_sparse_points
+from avsreplay.register.surface_index import kernel_module
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SEED = 5
@@ -104,7 +107,60 @@ def test_a_scan_in_another_frame_than_the_cameras_is_found() -> None:
     assert np.degrees(geometry.angle(step.q)) < 0.5
 
 
+def test_a_target_of_which_a_third_is_in_the_scan_is_found(registrar: Registrar) -> None:
+    rng = np.random.default_rng(SEED)
+    for k in range(4):
+        truth = _any_pose(rng)
+        scan = _scan(boxes(), truth, rng, sigma=0.004)
+        across = scan[:, :2] @ np.array([np.cos(1.7 * k), np.sin(1.7 * k)])
+        found = registrar.acquire(scan[across < np.quantile(across, 0.35)])
+        if found.status is AlignStatus.ALIGNED:
+            assert _off_deg(truth, found.T_ac) < 1.0
+        assert found.status in (AlignStatus.ALIGNED, AlignStatus.AMBIGUOUS, AlignStatus.DEGENERATE)
+
+
+def test_a_search_that_fails_stops_at_the_budget(registrar: Registrar, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(SEED)
+    scan = rng.uniform([-2.0, -2.0, 7.0], [2.0, 2.0, 11.0], (800, 3))
+    search, spent = GlobalSearch.search, []
+
+    def counted(self: GlobalSearch, points: Array, number: int, before: object) -> SearchResult:
+        spent.append(self.work(len(points), number))
+        return search(self, points, number, before)
+
+    monkeypatch.setattr(GlobalSearch, "search", counted)
+    found = registrar.acquire(scan)
+    assert not found.measured
+    assert found.status is AlignStatus.BUDGET_EXHAUSTED
+    assert sum(spent) <= HEALTHY_SCANS * (HEALTHY_PASSES * len(scan) + FIXED_WORK)
+
+
 # --- the parts
+
+
+def test_a_looked_up_distance_is_that_to_the_sampled_surface(registrar: Registrar) -> None:
+    """Exact points cost almost nothing, points five cells away cost all; neither depends on the number of threads."""
+    surface = boxes()
+    points, normals = sample(surface, 3000)
+    field = kernel_module().Field(points, normals, 40)
+    still = np.eye(4)[None]
+    rule = (0, 1.0, 0.7, 1.0, 0.02 * surface.extent, False)
+    assert field.refine(points, still, *rule)[1][0] < 0.05
+    away = np.tile(np.eye(4), (50, 1, 1))
+    away[:, :3, 3] = 0.6 * surface.extent * directions(50)
+    costs = [field.refine(points, away, *rule, threads)[1] for threads in (1, 2)]
+    assert (costs[0] > 0.9).all()
+    assert costs[0].tobytes() == costs[1].tobytes()
+
+
+def test_a_body_with_a_near_symmetry_is_known_to_have_it() -> None:
+    search = Registrar(_box((2.0, 1.0, 0.6)))._global
+    turns = [float(np.degrees(geometry.angle(Pose.from_matrix(T).q))) for T in search._symmetries]
+    assert turns
+    assert all(angle > 175.0 for angle in turns)
+    tree = cKDTree(sample(_box((2.0, 1.0, 0.6)), 20_000)[0])
+    moved = [Pose.from_matrix(T).apply(sample(_box((2.0, 1.0, 0.6)), 1000)[0]) for T in search._symmetries]
+    assert all((tree.query(points)[0] < 0.1).mean() > 0.9 for points in moved)
 
 
 def test_attitudes_cover_all_rotations() -> None:

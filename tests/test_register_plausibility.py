@@ -11,7 +11,7 @@ from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
-from avsreplay.register.restarts import HEALTHY_PASSES, HEALTHY_SCANS, Budget
+from avsreplay.register.restarts import FIXED_WORK, HEALTHY_PASSES, HEALTHY_SCANS, Budget
 from avsreplay.register.segments import segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
@@ -97,7 +97,7 @@ def test_what_is_called_aligned_is_right(registrar: Registrar, surface: Surface,
 
 def test_the_budget_counts_work() -> None:
     budget = Budget(1000, spent=HEALTHY_PASSES * 1000)
-    left = (HEALTHY_SCANS - 1) * HEALTHY_PASSES * 1000
+    left = (HEALTHY_SCANS - 1) * HEALTHY_PASSES * 1000 + HEALTHY_SCANS * FIXED_WORK
     budget.spend(left - 500)
     assert budget.allows(500)
     assert not budget.exhausted

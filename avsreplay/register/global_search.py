@@ -2,14 +2,14 @@
 
 The search goes from coarse to fine. Every start (an attitude, with the centroid of the scan placed on the centroid of
 the surface visible from there) is refined by a few point-to-plane passes with few points against points sampled from
-the model; the best are refined with more points; the last few, all different poses, are registered to the model itself
-and ranked by the truncated distances that remain. If the camera position is unknown, six directions are tried for every
-attitude. If no pose explains the scan, more starts follow.
+the model, whose nearest one is looked up in a grid; the best are refined with more points; the last few, all different
+poses, are registered to the model itself and ranked by the truncated distances that remain. If no pose explains the
+scan, more starts follow: shifted ones for a target that is partly hidden, and other positions of the camera.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,28 +22,43 @@ from avsreplay.records import Surface
 from avsreplay.register.backend import Target
 from avsreplay.register.horn import HornBackend
 from avsreplay.register.params import AcquireParams
+from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
 from avsreplay.register.sampling import sample, thin_to, without_sparse_points
-from avsreplay.register.surface_index import IcpParams, SurfaceIndex
+from avsreplay.register.surface_index import kernel_module
 
 MODEL_POINTS = 3000
-REACH_OF_EXTENT = 0.5
+CELLS = 40  # of the grid along the diagonal of the model
 COARSE_OF_EXTENT, MIDDLE_OF_EXTENT = 0.03, 0.02  # distances beyond which a point counts as unexplained
+START_OF_EXTENT, FALL = 0.3, 0.7  # rejection distance of the first pass, and its factor from pass to pass
+FIRST_PASSES, FIRST_STRIDE, KEPT_AFTER_FIRST = (
+    2,
+    2,
+    3,
+)  # most starts are dropped after two passes with every second point
+SYMMETRIC, SYMMETRIES = 0.3, 6  # largest unexplained share of the surface turned onto itself; most motions tried
+TURNED_PASSES, TURNED_RIVALS = 6, 2
+RIVALS, RIVAL_WITHIN = 6, 0.15  # poses that are registered to the end: share of unexplained points over the least
 SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05  # two poses nearer than that are the same
 SIGMAS = 5.0
-FINE_PASSES = 40  # ICP from a wrong pose can take hundreds
+FINE_PASSES = 15  # from a wrong pose it can take hundreds
+LOOK_UPS = 4  # that cost as much as a search on the model
+ROUNDS = 3
 PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
 CELL_OF_EXTENT = 0.02
 LEAST_COSINE = 0.05
-SHIFT_OF_EXTENT = 0.25
+SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # of the starts across the direction to the camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Candidate:
-    """A pose T_ca with the mean truncated squared distance that remains and the share of inliers."""
+    """A pose T_ca and the distances (k,) [m] of the points of the scan from the faces that the camera sees."""
 
     T_ca: Pose
-    unexplained: float
-    inlier_ratio: float
+    distance: Array
+
+    def unexplained(self, width_m: float) -> Array:
+        """Return min(1, squared distance in units of the width) of each point."""
+        return np.minimum(self.distance / width_m, 1.0) ** 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,181 +66,199 @@ class SearchResult:
     """Result of a global search.
 
     Attributes:
-        best, second: the two best poses that differ by more than 10 deg or 0.05 of the extent; second may be None.
-        found: the best pose explains enough of the scan.
+        best, second: the two best poses T_ca that differ by more than 10 deg or 0.05 of the extent; second may be None.
+        width_m: distance beyond which a point is not on the model; it follows the noise.
+        inlier_ratio: share of the points of the scan on the model at the best pose.
         ambiguous: the second pose explains the scan as well, within the statistical error of these points.
-        starts: number of starts.
+        candidates: all poses that were registered to the end, for a further round.
     """
 
-    best: Candidate
-    second: Candidate | None
-    found: bool
+    best: Pose
+    second: Pose | None
+    width_m: float
+    inlier_ratio: float
     ambiguous: bool
-    starts: int
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Trial:
-    T_ca: Array  # (4, 4)
-    cost: float
-
-    @property
-    def pose(self) -> Pose:
-        return Pose.from_matrix(self.T_ca)
+    candidates: tuple[Candidate, ...]
 
 
 class GlobalSearch:
-    """Searches the pose of one target. Built once; a search does not change it.
-
-    The first round takes the origin of {A} as the camera position if the scan allows it
-    (``Visibility.direction_to_camera``); the second does not.
-    """
+    """Searches the pose of one target. Built once; a search does not change it."""
 
     def __init__(self, target: Target, params: AcquireParams) -> None:
         self._target, self._params = target, params
         self._extent = target.surface.extent
-        self._points, self._normals = _sampled(target.surface)
-        cloud = Surface(self._points, np.empty((0, 3), dtype=np.int32), target.surface.name, "")
-        self._cloud = SurfaceIndex.build(cloud, REACH_OF_EXTENT * self._extent)
+        points, normals = _sampled(target.surface)
         self._sided = target.visibility.sided
-        self._centroids = VisibleCentroids(self._points, self._normals, self._extent)
-        self._middle = self._points.mean(axis=0)
+        planes = normals if self._sided else target.index.closest(points).normal
+        self._field = kernel_module().Field(points, np.ascontiguousarray(planes), CELLS)
+        self._centroids = VisibleCentroids(points, normals if self._sided else np.zeros_like(normals), self._extent)
+        self._middle = points.mean(axis=0)
+        self._symmetries = self._near_symmetries(thin_to(points, params.middle_points))
         brief = replace(target.limits, n_max=min(FINE_PASSES, target.limits.n_max))
         self._refine = HornBackend(replace(target, limits=brief))
-        self._settle = HornBackend(target)
 
-    def search(self, points: NDArray[Any], first_round: int = 0, last_round: int = 2) -> SearchResult:
-        """Return the best poses for a scan (n, 3) in {A} [m], finite, n >= 1.
+    def work(self, points: int, number: int) -> int:
+        """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
+        p = self._params
+        few, some, fine = (min(points, most) for most in (p.coarse_points, p.middle_points, p.fine_points))
+        starts = p.starts * (1, SHIFTS, 7)[number]
+        looked = few * (
+            starts * (1 + FIRST_PASSES) // FIRST_STRIDE + p.starts // KEPT_AFTER_FIRST * (1 + p.coarse_passes)
+        )
+        looked += some * p.middle_starts * (1 + p.middle_passes)
+        looked += some * len(self._symmetries) * (1 + TURNED_PASSES)
+        return looked // LOOK_UPS + p.fine_starts * some + 10 * (1 + RIVALS // 2) * fine
 
-        Round 0 assumes that the whole visible side is in the scan. Round 1 shifts the starts, for a target that is
-        partly outside the scan or hidden. Round 2 does not assume the camera position. The first round that explains
-        the scan ends the search.
+    def search(self, points: NDArray[Any], number: int = 0, before: SearchResult | None = None) -> SearchResult:
+        """Return the best poses for a scan by one round of the search.
+
+        Args:
+            points: (n, 3) in {A} [m], finite, n >= 1.
+            number: 0 assumes that the whole visible side is in the scan; 1 shifts the starts, for a target that is
+                partly outside the scan or hidden; 2 does not assume the position of the camera.
+            before: result of another round for the same points, whose poses take part.
         """
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
         p = self._params
-        few, some, fine = (thin_to(scan, count) for count in (p.coarse_points, p.middle_points, p.fine_points))
+        few, some, fine = (
+            np.ascontiguousarray(thin_to(scan, count)) for count in (p.coarse_points, p.middle_points, p.fine_points)
+        )
         sight = self._target.visibility.direction_to_camera(scan)
-        finals: list[Candidate] = []
-        tried = 0
-        for sights, shifts, sided in self._rounds(few, sight)[first_round : last_round + 1]:
-            starts = list(self._starts(few.mean(axis=0), sights, shifts))
-            finals += self._refined(fine, self._selected(few, some, starts, sided))
-            tried += len(starts)
-            if max((final.inlier_ratio for final in finals), default=0.0) >= p.enough_ratio:
-                break
-        return self._verdict(fine, finals, tried)
+        sights, shifts, facing = self._rounds(few, sight)[number]
+        starts = self._starts(few.mean(axis=0), sights, shifts)
+        facing = facing and self._sided
+        found = self._refined(some, fine, self._selected(few, some, starts, facing), facing)
+        return self._verdict([*found, *(before.candidates if before else ())])
 
     def _rounds(self, few: Array, sight: Array | None) -> list[tuple[Sequence[Array | None], Array, bool]]:
         """Camera directions, shifts of the scan (k, 3) in {A} [m], and whether the directions can be relied on."""
         none = np.zeros((1, 3))
         axes = np.linalg.svd((few - few.mean(axis=0)) if sight is None else sight[None])[2]
-        across = SHIFT_OF_EXTENT * self._extent * (axes[:2] if sight is None else axes[1:])
+        turn = 2.0 * np.pi * np.arange(SHIFTS)[:, None] / SHIFTS
+        u, v = SHIFT_OF_EXTENT * self._extent * (axes[:2] if sight is None else axes[1:])
         known = sight is not None
         return [
             ([sight], none, known),
-            ([sight], np.vstack([across, -across]), known),
+            ([sight], np.cos(turn) * u + np.sin(turn) * v, known),
             ([sight, *_axes(few)], none, False),
         ]
 
-    def _starts(self, centroid_a: Array, sights: Sequence[Array | None], shifts: Array) -> Iterator[Pose]:
+    def _starts(self, centroid_a: Array, sights: Sequence[Array | None], shifts: Array) -> Array:
         """Every attitude with every camera direction and shift: centroid of the scan on that of the visible surface."""
-        quaternions = attitudes(self._params.starts)
-        for q, R_ca in zip(quaternions, geometry.matrix(quaternions), strict=True):
-            for sight in sights:
-                middle = self._middle if sight is None else self._centroids.of(R_ca @ sight)
-                for shift in shifts:
-                    yield Pose(q, middle - R_ca @ (centroid_a + shift))
+        R_ca = geometry.matrix(attitudes(self._params.starts))
+        starts = np.tile(np.eye(4), (len(sights), len(shifts), len(R_ca), 1, 1))
+        starts[..., :3, :3] = R_ca
+        for k, sight in enumerate(sights):
+            middle = self._middle if sight is None else self._centroids.of(R_ca @ sight)
+            for j, shift in enumerate(shifts):
+                starts[k, j, :, :3, 3] = middle - R_ca @ (centroid_a + shift)
+        return starts.reshape(-1, 4, 4)
 
-    def _selected(self, few: Array, some: Array, starts: list[Pose], sided: bool) -> list[Pose]:
+    def _selected(self, few: Array, some: Array, starts: Array, facing: bool) -> list[Pose]:
         """The best starts after passes with few points, then the best of these, all different, with more points."""
-        p, extent = self._params, self._extent
-        coarse = IcpParams(
-            n_max=p.coarse_passes,
-            n_plane=p.coarse_passes,
-            floor_m=COARSE_OF_EXTENT * extent,
-            eps_rad=1e-3,
-            eps_m=1e-3 * extent,
+        p, L, threads = self._params, self._extent, self._target.limits.threads
+        coarse = (FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
+        middle = (FALL, 0.01 * L, MIDDLE_OF_EXTENT * L, facing, threads)
+        narrow = START_OF_EXTENT * FALL**FIRST_PASSES
+        poses, costs = self._field.refine(
+            np.ascontiguousarray(few[::FIRST_STRIDE]), starts, FIRST_PASSES, START_OF_EXTENT * L, *coarse
         )
-        middle = IcpParams(
-            n_max=p.middle_passes,
-            n_plane=p.middle_passes,
-            gate_m=0.15 * extent,
-            floor_m=0.01 * extent,
-            eps_rad=1e-4,
-            eps_m=1e-4 * extent,
+        poses = _best(poses, costs, p.starts // KEPT_AFTER_FIRST)
+        poses, costs = self._field.refine(few, poses, p.coarse_passes, narrow * L, *coarse)
+        poses = _best(poses, costs, p.middle_starts)
+        poses, costs = self._field.refine(some, poses, p.middle_passes, narrow * L, *middle)
+        return self._different(_best(poses, costs, p.middle_starts), p.fine_starts, 0.5)
+
+    def _different(self, poses: Array, most: int, scale: float) -> list[Pose]:
+        """The first few of (k, 4, 4) that are different poses."""
+        R, middles = (
+            poses[:, :3, :3],
+            poses[:, :3, :3].transpose(0, 2, 1) @ (self._middle - poses[:, :3, 3])[:, :, None],
         )
-        trials = [self._trial(few, T_ca, coarse, COARSE_OF_EXTENT, sided) for T_ca in starts]
-        best = sorted(trials, key=lambda trial: trial.cost)[: p.middle_starts]
-        return self._different([self._trial(some, t.pose, middle, MIDDLE_OF_EXTENT, sided) for t in best])
-
-    def _trial(self, points: Array, T_ca: Pose, rule: IcpParams, beyond: float, sided: bool) -> _Trial:
-        end = self._cloud.icp(points, T_ca, rule).T_ca
-        found = self._cloud.closest(points @ end[:3, :3].T + end[:3, 3])
-        cost = np.minimum(found.d2 / (beyond * self._extent) ** 2, 1.0)
-        if sided and self._sided:  # the sampled points keep the outward normal of their face
-            away = np.einsum("ij,ij->i", self._normals[found.id], end[:3, 3] - self._points[found.id]) <= 0.0
-            cost[away] = 1.0
-        return _Trial(end, float(cost.mean()))
-
-    def _different(self, trials: list[_Trial]) -> list[Pose]:
-        """The best few that are different poses, best first."""
-        kept: list[Pose] = []
-        for trial in sorted(trials, key=lambda trial: trial.cost):
-            pose = trial.pose
-            if all(not self._same(pose, other, 0.5) for other in kept):
-                kept.append(pose)
-            if len(kept) == self._params.fine_starts:
+        near = 1.0 + 2.0 * np.cos(scale * SAME_RAD), scale * SAME_OF_EXTENT * self._extent
+        kept: list[int] = []
+        for k in range(len(poses)):
+            turned = np.einsum("kij,ij->k", R[kept], R[k]) > near[0]
+            if not (turned & (np.linalg.norm((middles[kept] - middles[k])[:, :, 0], axis=1) < near[1])).any():
+                kept.append(k)
+            if len(kept) == most:
                 break
-        return kept
+        return [Pose.from_matrix(poses[k]) for k in kept]
 
-    def _refined(self, fine: Array, poses: list[Pose]) -> list[Candidate]:
-        return [self._measured(fine, self._refine.align(fine, T_ca).T_ca) for T_ca in poses]
+    def _refined(self, some: Array, fine: Array, poses: list[Pose], facing: bool) -> list[Candidate]:
+        """The poses measured on the model; the best, and the very best by a near-symmetry, are registered to it."""
+        width = MIDDLE_OF_EXTENT * self._extent
+        found = [self._measured(some, T_ca) for T_ca in poses]
+        ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
+        most = float(ranked[0].unexplained(width).mean()) + RIVAL_WITHIN
+        best = [each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most]
+        found = [self._measured(fine, self._refine.align_within(fine, T_ca, width).T_ca) for T_ca in best]
+        first = min(found, key=lambda each: float(each.unexplained(width).mean())).T_ca
+        if not len(self._symmetries):
+            return found
+        rule = (FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
+        turned, costs = self._field.refine(some, self._symmetries @ first.matrix, TURNED_PASSES, 4.0 * width, *rule)
+        rivals = [Pose.from_matrix(T) for T in _best(turned, costs, TURNED_RIVALS)]
+        return [*found, *(self._measured(fine, self._refine.align_within(fine, T_ca, width).T_ca) for T_ca in rivals)]
+
+    def _near_symmetries(self, points: Array) -> Array:
+        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, without the identity: the best few."""
+        starts = self._starts(self._middle, [None], np.zeros((1, 3)))
+        few = np.ascontiguousarray(points[:: max(1, len(points) // self._params.coarse_points)])
+        poses = np.stack([pose.matrix for pose in self._selected(few, points, starts, False)])
+        rule = (FALL, 0.01 * self._extent, COARSE_OF_EXTENT * self._extent, False, 1)
+        poses, costs = self._field.refine(points, poses, 0, self._extent, *rule)
+        apart = [not self._same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
+        return np.ascontiguousarray(poses[apart & (costs < SYMMETRIC)][:SYMMETRIES])
 
     def _measured(self, points: Array, T_ca: Pose) -> Candidate:
-        cost = self._unexplained(points, T_ca)
-        return Candidate(T_ca, float(cost.mean()), float(np.mean(cost < 1.0)))
-
-    def _unexplained(self, points: Array, T_ca: Pose) -> Array:
-        """(n,) min(1, squared distance to the visible faces in units of the gate)."""
         target = self._target
         camera_c = target.visibility.camera_c(target.index, points, T_ca)
-        found = target.index.closest(T_ca.apply(points), camera_c=camera_c)
-        return np.minimum(found.d2 / target.limits.gate_m**2, 1.0)
+        d2 = target.index.closest(T_ca.apply(points), camera_c=camera_c).d2
+        return Candidate(T_ca, np.sqrt(np.minimum(d2, target.index.reach_m**2)))
 
-    def _verdict(self, fine: Array, finals: list[Candidate], starts: int) -> SearchResult:
-        ranked = sorted(finals, key=lambda final: final.unexplained)
-        second = next((other for other in ranked[1:] if not self._same(ranked[0].T_ca, other.T_ca, 1.0)), None)
-        rivals = [ranked[0], *([second] if second else [])]  # compared only after both have converged
-        rivals = [self._measured(fine, self._settle.align(fine, rival.T_ca).T_ca) for rival in rivals]
-        best, *rest = sorted(rivals, key=lambda rival: rival.unexplained)
-        second = rest[0] if rest and not self._same(best.T_ca, rest[0].T_ca, 1.0) else None
-        found = best.inlier_ratio >= self._params.least_ratio
-        return SearchResult(best, second, found, second is not None and self._as_good(fine, best, second), starts)
+    def _ranked(self, found: Sequence[Candidate]) -> tuple[list[Candidate], float]:
+        """The candidates, best first, and the distance [m] beyond which a point is unexplained."""
+        noise = min(robust_noise(each.distance) for each in found)
+        width = max(self._target.limits.gate_m, min(3.0 * noise, 3.0 * NOISE_OF_EXTENT * self._extent))
+        return sorted(found, key=lambda each: float(each.unexplained(width).mean())), width
 
-    def _as_good(self, fine: Array, best: Candidate, second: Candidate) -> bool:
+    def _verdict(self, found: Sequence[Candidate]) -> SearchResult:
+        (best, *rest), width = self._ranked(found)
+        second = next((other for other in rest if not self._same(best.T_ca, other.T_ca)), None)
+        inliers = float(np.mean(best.distance < width))
+        ambiguous = second is not None and self._as_good(best, second, width)
+        return SearchResult(best.T_ca, second.T_ca if second else None, width, inliers, ambiguous, tuple(found))
+
+    def _as_good(self, best: Candidate, second: Candidate, width: float) -> bool:
         """Test whether the excess cost of the second, point by point, is below 5 sigma of its mean or the margin."""
-        excess = self._unexplained(fine, second.T_ca) - self._unexplained(fine, best.T_ca)
-        error = SIGMAS * float(excess.std()) / np.sqrt(len(fine))
+        excess = second.unexplained(width) - best.unexplained(width)
+        error = SIGMAS * float(excess.std()) / np.sqrt(len(excess))
         return bool(excess.mean() < max(self._params.margin, error))
 
-    def _same(self, first: Pose, other: Pose, scale: float) -> bool:
+    def _same(self, first: Pose, other: Pose) -> bool:
         step = first @ other.inverse()  # in {C}
         shift = float(np.linalg.norm(step.apply(self._middle) - self._middle))
-        return float(geometry.angle(step.q)) < scale * SAME_RAD and shift < scale * SAME_OF_EXTENT * self._extent
+        return float(geometry.angle(step.q)) < SAME_RAD and shift < SAME_OF_EXTENT * self._extent
+
+
+def _best(poses: Array, costs: Array, most: int) -> Array:
+    """The poses (k, 4, 4) of least cost, best first; of equal costs the first."""
+    return np.ascontiguousarray(poses[np.argsort(costs, kind="stable")[:most]])
 
 
 class VisibleCentroids:
     """Centroid of the part of a model that a distant camera sees, tabulated for ``count`` directions."""
 
-    def __init__(self, points: Array, normals: Array, extent_m: float, count: int = 200) -> None:
+    def __init__(self, points: Array, normals: Array, extent_m: float, count: int = 80) -> None:
         """Build it from points sampled on the surface, (n, 3) in {C} [m]; zero normals: visible from all sides."""
         self._directions = directions(count)
         cell = CELL_OF_EXTENT * extent_m
         self._centroids = np.stack([_visible_centroid(points, normals, u, cell) for u in self._directions])
 
     def of(self, direction_c: Array) -> Array:
-        """Return the centroid (3,) in {C} [m] for the direction to the camera in {C}."""
-        centroid: Array = self._centroids[int(np.argmax(self._directions @ direction_c))]
+        """Return the centroid (..., 3) in {C} [m] for directions (..., 3) to the camera in {C}."""
+        centroid: Array = self._centroids[np.argmax(direction_c @ self._directions.T, axis=-1)]
         return centroid
 
 
@@ -252,11 +285,12 @@ def _visible_centroid(points: Array, normals: Array, towards: Array, cell_m: flo
     facing = cosine > LEAST_COSINE
     p, weight, depth = points[facing], cosine[facing], points[facing] @ towards
     across = np.linalg.svd(towards[None])[2][1:]
-    pixels = np.floor(p @ across.T / cell_m).astype(np.int64)
-    _, pixel = np.unique(pixels, axis=0, return_inverse=True)
+    image = np.floor(p @ across.T / cell_m).astype(np.int64)
+    image -= image.min(axis=0, initial=0)
+    pixel = image[:, 0] * (image[:, 1].max(initial=0) + 1) + image[:, 1]
     nearest = np.full(pixel.max(initial=-1) + 1, -np.inf)
-    np.maximum.at(nearest, pixel.reshape(-1), depth)
-    weight = weight * (depth > nearest[pixel.reshape(-1)] - cell_m)
+    np.maximum.at(nearest, pixel, depth)
+    weight = weight * (depth > nearest[pixel] - cell_m)
     if not weight.sum() > 0.0:
         return np.asarray(points.mean(axis=0))
     return np.asarray((p * weight[:, None]).sum(axis=0) / weight.sum())

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register.sampling import sample
-from avsreplay.register.surface_index import Closest, SurfaceIndex
+from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
 SURFACE_POINTS = 3000
@@ -37,7 +37,7 @@ LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance
 NORMAL_QUANTILES = np.array([0.38532, 0.52440, 0.67449, 0.84162, 1.03643, 1.28155, 1.64485])  # for a standard normal
 REFINEMENTS = 2
 NOISE_OF_EXTENT = 0.012  # with more noise than this no pose is accepted
-LEAST_CONTRAST = 6.0
+LEAST_CONTRAST, LEAST_CONTRAST_OF_PART = 6.0, 15.0  # the second where more than MOST_MISSING of the points are off
 MOST_VIOLATED = 0.15  # largest violated share of the surface that is either supported or violated
 MOST_MISSING = 0.1  # largest missing share, if at least as large a share of the scan is not on the model
 LEAST_COMPARED = 30  # with fewer surface points the test has no power
@@ -84,30 +84,34 @@ class PlausibilityTest:
             points: (n, 3) in {A} [m], n >= 1: the scan, or the part of it that may be the target; a few thousand points
                 are enough.
             T_ca: the pose to be tested.
-            scene: (m, 3) in {A} [m], the whole scan, for the test of free space; ``points`` if None.
+            scene: (m, 3) in {A} [m], the whole scan, for contrast and free space; ``points`` if None.
 
         Returns:
             The quantities and the reason of a rejection.
         """
         camera_c = self._visibility.camera_c(self._index, points, T_ca)
-        distance = self.distances(self._index.closest(T_ca.apply(points), camera_c=camera_c))
+        distance = self.measure(points, T_ca)
         noise = robust_noise(distance)
         width = max(self._gate, 3.0 * noise)
-        inner, outer = int(np.count_nonzero(distance < width)), int(np.count_nonzero(distance < 2.0 * width))
-        contrast = inner / max(1, outer - inner)
+        inner = int(np.count_nonzero(distance < width))
+        around = distance if scene is None else self.measure(scene, T_ca)
+        on, near = (int(np.count_nonzero(around < factor * width)) for factor in (1.0, 2.0))
+        contrast = on / max(1, near - on)
         rays = np.asarray(points if scene is None else scene, dtype=np.float64)
         violated, missing = (0.0, 0.0) if camera_c is None else self._not_supported(rays, T_ca, noise)
         found = Plausibility(noise, contrast, violated, missing, 1.0 - inner / len(points), "")
         return replace(found, reason=self._reason(found))
 
-    def distances(self, found: Closest) -> Array:
-        """Return the distances [m], limited to the reach of the index."""
-        return np.asarray(np.sqrt(np.minimum(found.d2, self._index.reach_m**2)))
+    def measure(self, points: NDArray[Any], T_ca: Pose) -> Array:
+        """Return the distances (n,) [m] of points (n, 3) in {A} to what the camera sees, at most the reach."""
+        camera_c = self._visibility.camera_c(self._index, points, T_ca)
+        d2 = self._index.closest(T_ca.apply(points), camera_c=camera_c).d2
+        return np.asarray(np.sqrt(np.minimum(d2, self._index.reach_m**2)))
 
     def _reason(self, found: Plausibility) -> str:
         if found.noise_m > NOISE_OF_EXTENT * self._extent:
             return f"distances to the model spread by {found.noise_m:.3g} m"
-        if found.contrast < LEAST_CONTRAST:
+        if found.contrast < (LEAST_CONTRAST_OF_PART if found.unexplained > MOST_MISSING else LEAST_CONTRAST):
             return f"only {found.contrast:.1f} times as many points on the surface as beside it"
         if found.violated > MOST_VIOLATED:
             return f"{100.0 * found.violated:.0f} % of the visible model surface lies in free space"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
-from itertools import chain, islice
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -19,16 +20,18 @@ from avsreplay.register.global_search import GlobalSearch, SearchResult
 from avsreplay.register.horn import HornBackend
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import PlausibilityTest
-from avsreplay.register.restarts import Budget, Restarter
+from avsreplay.register.restarts import Budget, Restart, Restarter
 from avsreplay.register.sampling import thin
-from avsreplay.register.segments import segments, without_scattered_points
+from avsreplay.register.segments import LARGER, segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
 LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in units of the gate) a fit is close
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
-SEARCH_WORK = 2_000_000  # approximate number of point searches in the first round of the global search
 MOST_SEGMENTS = 3
+MOST_ROUNDS = MOST_SEGMENTS + 3
+LEAST_TO_TURN = 0.2  # with fewer inliers turned starts have no prospect
+SURE_RATIO = 0.9  # a search with fewer inliers is followed by another
 MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
 
 
@@ -83,8 +86,8 @@ class Registrar:
         first = self._graded(scan, guess, halves=seq % self.params.split_every == 0, carried=carried)
         if first.status is AlignStatus.FAILED:
             return first
-        found = first if self._healthy(first) else self._recovered(scan, guess, first)
-        return self._searched(scan, found) if self._far(guess, found) else found
+        found = first if self._healthy(first) else self._recovered(scan, guess, first, carried)
+        return self._searched(scan, found, carried) if self._far(guess, found) else found
 
     def acquire(self, points: NDArray[Any]) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
@@ -100,33 +103,79 @@ class Registrar:
         scan = self._scan(points)
         if len(scan) == 0:
             return quality.not_measured(len(points), AlignStatus.NO_POINTS)
-        target = without_scattered_points(np.asarray(scan, dtype=np.float64))
-        attempts = chain(
-            [(target, 0, 0)],
-            ((part, 0, 0) for part in islice(segments(target, self._target.surface.extent), MOST_SEGMENTS)),
-            [(target, 1, 2)],
-        )
-        results: list[Alignment] = []
-        for part, first, last in attempts:
-            results.append(self._acquired(scan, part, self._global.search(part, first, last)))
-            if results[-1].measured or results[-1].status is AlignStatus.FAILED:
-                return results[-1]
-        return results[0]
+        return self._acquire(scan, Budget(len(scan)))
 
-    def _acquired(self, scan: NDArray[Any], part: Array, search: SearchResult) -> Alignment:
+    def _acquire(
+        self, scan: NDArray[Any], budget: Budget, carried: bool = False, rounds: int = MOST_ROUNDS
+    ) -> Alignment:
+        """The best plausible result of the searches that the budget allows; the first is always made."""
+        target = without_scattered_points(np.asarray(scan, dtype=np.float64))
+        few = self._restarter.part(target)
+        whole: SearchResult | None = None
+        results: list[Alignment] = []
+        for part, number in islice(self._attempts(target), rounds):
+            work = self._global.work(len(part), number)
+            if results and not budget.allows(work):
+                break
+            budget.spend(work)
+            search = self._global.search(part, number, whole if part is target else None)
+            whole = search if part is target else whole
+            results.append(self._acquired(scan, part, search, carried))
+            if results[-1].status is AlignStatus.FAILED:
+                return results[-1]
+            if results[-1].measured and self._sure(part, search):
+                break
+        measured = [(each, self._restarter.measure(few, each.T_ac.inverse())) for each in results if each.measured]
+        if measured:
+            width = max(self.limits.gate_m, 3.0 * min(restart.noise_m for _, restart in measured))
+            return min(measured, key=lambda each: each[1].cost(width))[0]
+        first = results[0]
+        if not budget.exhausted:
+            return first
+        message = "no pose of the model explains the scan, and no work is left for a longer search"
+        return replace(first, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=message)
+
+    def _sure(self, part: Array, search: SearchResult) -> bool:
+        """Whether no other round can find a better pose: what is not on the model is little, or another object."""
+        if search.width_m > self.limits.gate_m:
+            return False
+        return search.inlier_ratio >= SURE_RATIO or (not search.ambiguous and self._beside(part, search))
+
+    def _beside(self, part: Array, search: SearchResult) -> bool:
+        """Whether the points off the model are another object's, as far as free space can tell."""
+        at = self._restarter.measure(self._restarter.part(part), search.best)
+        return self._visibility.sided and at.separate(max(self.limits.gate_m, 3.0 * at.noise_m))
+
+    def _attempts(self, target: Array) -> Iterator[tuple[Array, int]]:
+        """What is searched and by which round: the whole scan, its parts, then the whole scan with other starts."""
+        extent = self._target.surface.extent
+        small = float(np.linalg.norm(np.ptp(target, axis=0))) <= LARGER * extent  # probably the target alone
+        yield target, 0
+        if small:
+            yield target, 1
+        for part in islice(segments(target, extent), MOST_SEGMENTS):
+            yield part, 0
+        if not small:
+            yield target, 1
+        yield target, 2
+
+    def _acquired(self, scan: NDArray[Any], part: Array, search: SearchResult, carried: bool) -> Alignment:
         """Register the result of a search of part of the scan on the whole scan, and test it."""
-        T_ca, few = search.best.T_ca, self._restarter.part(part)
-        width = max(self.limits.gate_m, 3.0 * self._restarter.measure(few, T_ca).noise_m)
-        found = self._graded(scan, T_ca.inverse(), width)
+        few = self._restarter.part(part)
+        start = self._restarter.measure(few, search.best)
+        width = max(self.limits.gate_m, 3.0 * start.noise_m)
+        found = self._graded(scan, search.best.inverse(), width, carried=carried)
         if found.status is AlignStatus.FAILED:
             return found
-        if not search.found or not found.measured:
+        p = self.params.acquire
+        least = p.least_separate if self._visibility.sided and start.separate(width) else p.least_ratio
+        if search.inlier_ratio < least or not found.measured:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None)
         reason = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan)).reason
         if reason:
             return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason)
         if search.ambiguous and search.second is not None:
-            words = quality.turn_words(search.best.T_ca @ search.second.T_ca.inverse())
+            words = quality.turn_words(search.best @ search.second.inverse())
             return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
         return found
 
@@ -193,10 +242,11 @@ class Registrar:
         angle = float(geometry.angle((guess.inverse() @ found.T_ac).q))
         return found.measured and found.status is not AlignStatus.DEGENERATE and angle > FAR_RAD
 
-    def _searched(self, scan: NDArray[Any], found: Alignment) -> Alignment:
+    def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
-        if Budget(len(scan), found.iterations * len(scan)).allows(SEARCH_WORK):
-            return self.acquire(scan)
+        budget = Budget(len(scan), found.iterations * len(scan))
+        if budget.allows(self._global.work(len(scan), 0)):
+            return self._acquire(scan, budget, carried)
         far = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a global search"
         return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=far)
 
@@ -208,22 +258,38 @@ class Registrar:
         far = float(np.linalg.norm(moved, axis=1).mean()) > self.limits.gate_m
         return far and found.rms_m > POOR_OF_GATE * self.limits.gate_m
 
-    def _recovered(self, scan: NDArray[Any], guess: Pose, first: Alignment) -> Alignment:
+    def _recovered(self, scan: NDArray[Any], guess: Pose, first: Alignment, carried: bool) -> Alignment:
         """Test a pose with a poor fit; restart if it is implausible, and report what remains implausible."""
         few = self._restarter.part(scan)
         budget = Budget(len(scan), spent=first.iterations * len(scan))
         kept = self._restarter.measure(few, first.T_ac.inverse())
-        suspect = self._doubtful(few, guess, first) or bool(self._test.check(few, kept.T_ca).reason)
-        if suspect:
-            kept = self._restarter.best(few, guess.inverse(), first.T_ac.inverse(), budget)
-        width = max(self.limits.gate_m, 3.0 * kept.noise_m)
-        unchanged = kept.T_ca.t.tobytes() == first.T_ac.inverse().t.tobytes() and width == self.limits.gate_m
-        final = first if unchanged else self._graded(scan, kept.T_ca.inverse(), width)
-        reason = self._test.check(few, final.T_ac.inverse()).reason if final.measured else ""
+        final, reason = first, self._test.check(few, kept.T_ca).reason if first.measured else ""
+        if not (self._doubtful(few, guess, first) or reason):
+            return self._regraded(scan, kept, first, carried)
+        before: Restart | None = None
+        for _ in range(2):
+            kept = self._restarter.best(few, guess.inverse(), first.T_ac.inverse(), budget, before)
+            final = self._regraded(scan, kept, first, carried)
+            reason = self._test.check(few, final.T_ac.inverse()).reason if final.measured else ""
+            if final.measured and not reason:
+                return final
+            if before is None and budget.allows(self._global.work(len(scan), 0)):
+                found = self._acquire(scan, budget, carried, rounds=1)
+                if found.status is AlignStatus.ALIGNED:
+                    return found
+            before = kept
+            if np.mean(kept.distance < self.limits.gate_m) < LEAST_TO_TURN:
+                break
         if not reason:
             return final
         status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason)
+
+    def _regraded(self, scan: NDArray[Any], kept: Restart, first: Alignment, carried: bool) -> Alignment:
+        """Register from the pose of a restart with a rejection distance that follows the noise."""
+        width = max(self.limits.gate_m, 3.0 * kept.noise_m)
+        same = kept.T_ca.t.tobytes() == first.T_ac.inverse().t.tobytes() and width == self.limits.gate_m
+        return first if same else self._graded(scan, kept.T_ca.inverse(), width, carried=carried)
 
     def _graded(
         self, scan: NDArray[Any], guess: Pose, width_m: float | None = None, halves: bool = True, carried: bool = False

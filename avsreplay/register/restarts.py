@@ -26,9 +26,11 @@ START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
 BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
-PASS_WORK = 300  # what a pass of a restart costs besides its points, in point searches
+PASS_WORK = 1500  # what a pass of a restart costs besides its points, in point searches
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
+NEAR, MOSTLY = 5.0, 0.9  # another object: of the points nearer than so many widths this share is on the model
 HEALTHY_PASSES = 12  # passes of an ordinary registration, over all points of the scan
+FIXED_WORK = 15_000  # what a registration costs besides its points: quality, covariance
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
 
@@ -41,7 +43,7 @@ class Budget:
     """
 
     def __init__(self, points: int, spent: int = 0) -> None:
-        self._left = HEALTHY_SCANS * HEALTHY_PASSES * points - spent
+        self._left = HEALTHY_SCANS * (HEALTHY_PASSES * points + FIXED_WORK) - spent
         self.exhausted = False
 
     def spend(self, searches: int) -> None:
@@ -65,6 +67,11 @@ class Restart:
     def cost(self, width_m: float) -> float:
         """Return the mean of min(1, squared distance in units of the width)."""
         return float(np.mean(np.minimum(self.distance / width_m, 1.0) ** 2))
+
+    def separate(self, width_m: float) -> bool:
+        """Return whether the points off the model are well away from it, as those of another object are."""
+        on, near = (int(np.count_nonzero(self.distance < factor * width_m)) for factor in (1.0, NEAR))
+        return on >= MOSTLY * near
 
 
 class Restarter:
@@ -94,8 +101,7 @@ class Restarter:
 
     def measure(self, points: NDArray[Any], T_ca: Pose) -> Restart:
         """Return the distances of ``points`` (n, 3) in {A} at a pose."""
-        camera_c = self._target.visibility.camera_c(self._target.index, points, T_ca)
-        distance = self._test.distances(self._target.index.closest(T_ca.apply(points), camera_c=camera_c))
+        distance = self._test.measure(points, T_ca)
         return Restart(T_ca, distance, robust_noise(distance))
 
     def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
@@ -108,7 +114,9 @@ class Restarter:
             budget.spend(found.iterations * (len(points) + PASS_WORK))
         return self.measure(points, T_ca)
 
-    def best(self, points: NDArray[Any], guess: Pose, result: Pose, budget: Budget) -> Restart:
+    def best(
+        self, points: NDArray[Any], guess: Pose, result: Pose, budget: Budget, before: Restart | None = None
+    ) -> Restart:
         """Return the best of the first result and the restarts, all T_ca; ends at the first plausible pose.
 
         Args:
@@ -116,10 +124,11 @@ class Restarter:
             guess: initial pose of the first registration.
             result: its result.
             budget: work that is left.
+            before: best of the restarts from guess and result; the starts are then poses turned by ``TURN_RAD``.
         """
-        found = [self.measure(points, result)]
+        found = [self.measure(points, result), *([before] if before else [])]
         tested: Restart | None = None  # the last pose that was tested, and is not plausible
-        for T_ca, start in self._starts(guess, result, points.mean(axis=0)):
+        for T_ca, start in self._starts(guess, result, points.mean(axis=0), before is not None):
             if not budget.allows(self.work(start) * (len(points) + PASS_WORK)):
                 break
             found.append(self.graduated(points, T_ca, start, budget))
@@ -151,14 +160,15 @@ class Restarter:
             return False
         return float(np.linalg.norm(step.apply(self._middle) - self._middle)) < 0.01 * self._extent
 
-    def _starts(self, guess: Pose, result: Pose, centre_a: Array) -> Iterator[tuple[Pose, float]]:
-        """Guess and result with a narrow and a wide start, then both rotated by TURN_RAD about each axis of {C}."""
+    def _starts(self, guess: Pose, result: Pose, centre_a: Array, turned: bool) -> Iterator[tuple[Pose, float]]:
+        """Guess and result with a narrow and a wide start, or both rotated by TURN_RAD about each axis of {C}."""
         narrow = self._narrow
         apart = np.abs(guess.matrix - result.matrix) / np.array([1.0, 1.0, 1.0, self._extent])
         bases = (guess, result) if apart.max() > SAME_POSE else (guess,)
-        yield from ((base, narrow) for base in bases)
-        yield guess, self._wide
-        for base in bases:
+        if not turned:
+            yield from ((base, narrow) for base in bases)
+            yield guess, self._wide
+        for base in bases if turned else ():
             centre = base.apply(centre_a)
             for axis in np.eye(3):
                 for sign in (1.0, -1.0):

@@ -47,7 +47,7 @@ class Visibility:
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         clear = CLEARANCE_OF_EXTENT * surface.extent if camera is Camera.AUTO else -np.inf
         self._box = (low, high, clear)
-        self._extent = surface.extent
+        self._extent, self._known = surface.extent, camera is not Camera.NONE
         self.sided = camera is Camera.ORIGIN or (camera is Camera.AUTO and is_outward(surface))
 
     def camera_c(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> Array | None:
@@ -58,10 +58,10 @@ class Visibility:
         return T_ca.t if facing >= LEAST_FACING * matched else None
 
     def direction_to_camera(self, points: NDArray[Any]) -> Array | None:
-        """Return the unit direction (3,) from a scan (n, 3) in {A} to the camera; None if its position is unknown."""
+        """Return the unit direction (3,) from a scan (n, 3) in {A} to the origin; None if the camera is not there."""
         centre = np.median(points, axis=0).astype(np.float64)
         distance = float(np.linalg.norm(centre))
-        if not self.sided or distance < FAR_OF_EXTENT * self._extent:
+        if not self._known or distance < FAR_OF_EXTENT * self._extent:
             return None
         direction: Array = -centre / distance
         return direction

@@ -10,6 +10,7 @@
 #include <stdexcept>
 
 #include "build.hpp"
+#include "coarse.hpp"
 #include "covariance.hpp"
 #include "evidence.hpp"
 #include "loop.hpp"
@@ -359,6 +360,36 @@ double split_of(const Table& t, double block, const Seven& smooth, const Seven& 
   return split(t.table, errors_of(block, smooth, amplitudes, fit), across.data(), (int64_t)across.shape(0));
 }
 
+using Poses = nb::ndarray<const double, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+
+Field field_of(const Doubles& points, const Doubles& normals, int across) {
+  require(points.ndim() == 2 && points.shape(1) == 3 && points.shape(0) > 0, "points must be (n, 3), n > 0");
+  require((int64_t)points.shape(0) <= Field::MOST, "too many points");
+  require(normals.ndim() == 2 && normals.shape(0) == points.shape(0) && normals.shape(1) == 3, "a normal for each point");
+  require(across > 0 && across <= 256, "cells along the diagonal must be in [1, 256]");
+  for (size_t k = 0; k < points.size(); ++k)
+    require(std::isfinite(points.data()[k]) && std::isfinite(normals.data()[k]), "a coordinate is not finite");
+  return Field(points.data(), normals.data(), (int64_t)points.shape(0), across);
+}
+
+nb::tuple refine(const Field& field, const Doubles& points, const Poses& T_ca, int passes, double gate, double fall,
+                 double floor, double beyond, bool facing, int threads) {
+  require(points.ndim() == 2 && points.shape(1) == 3, "points must be (n, 3)");
+  require(T_ca.shape(1) == 4 && T_ca.shape(2) == 4, "poses must be (k, 4, 4)");
+  require(beyond > 0 && passes >= 0, "the width must be positive");
+  const size_t n = T_ca.shape(0);
+  double *T, *cost;
+  auto poses = array<double>({n, 4, 4}, &T), costs = array<double>({n}, &cost);
+  std::memcpy(T, T_ca.data(), 16 * n * sizeof(double));
+  const CoarseRule rule{passes, gate, fall, floor, beyond, facing};
+  {
+    nb::gil_scoped_release release;
+    Team team(threads);
+    team.each((int64_t)n, [&](int64_t k) { cost[k] = field.refine(points.data(), (int64_t)points.shape(0), rule, T + 16 * k); });
+  }
+  return nb::make_tuple(poses, costs);
+}
+
 }  // namespace
 
 NB_MODULE(_kernel, m) {
@@ -374,6 +405,11 @@ NB_MODULE(_kernel, m) {
       .def("systematic", &systematic_of)
       .def("covariance", &covariance_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"))
       .def("split", &split_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"), nb::arg("across"));
+  nb::class_<Field>(m, "Field")
+      .def("__init__", [](Field* f, const Doubles& points, const Doubles& normals, int across) {
+        new (f) Field(field_of(points, normals, across)); }, nb::arg("points"), nb::arg("normals"), nb::arg("across"))
+      .def("refine", &refine, nb::arg("points"), nb::arg("T_ca"), nb::arg("passes"), nb::arg("gate_m"), nb::arg("fall"),
+           nb::arg("floor_m"), nb::arg("beyond_m"), nb::arg("facing"), nb::arg("threads") = 1);
   nb::class_<Index>(m, "Index")
       .def(nb::init<Doubles, Ints, Ints, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
            nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
