@@ -24,6 +24,7 @@ from avsreplay.settings import dump
 PATH_POINTS = 41
 RESIDUAL_REACH = 0.05  # of the model's extent: larger residuals in the viewer log are cut to this
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
+_COLUMNS = tuple(column.name for column in columns())
 _STREAMED_COLUMNS = ("pos_err_m", "rot_err_deg", "rms_m", "nis", "sigma1", "sigma2", "t_go_s", "gamma")
 
 
@@ -99,7 +100,7 @@ class ResultLogWriter:
 
 def _numbers(row: Row) -> dict[str, float]:
     """The numeric columns of a row that have a value."""
-    found = ((column.name, getattr(row, column.name)) for column in columns())
+    found = ((name, getattr(row, name)) for name in _COLUMNS)
     return {name: float(value) for name, value in found if isinstance(value, (int, float))}
 
 

@@ -292,10 +292,11 @@ def scale_error(
         e = np.einsum("ij,ij->i", n, q - found.foot[near])
         J, a = _jacobian(q - q.mean(axis=0), n), np.einsum("ij,ij->i", n, q - q.mean(axis=0))
         J, a, e = _weighted(J, a, e)
-        free = a - J @ np.linalg.lstsq(J, a, rcond=1e-6)[0]
+        of_a, of_e = np.linalg.lstsq(J, np.column_stack([a, e]), rcond=1e-6)[0].T
+        free = a - J @ of_a
         share = float(free @ free) / max(float(a @ a), np.finfo(float).tiny)
         step = float(free @ e) / max(float(free @ free), np.finfo(float).tiny)
-        d = np.linalg.lstsq(J, e - step * a, rcond=1e-6)[0]
+        d = of_e - step * of_a
         turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
         centre = q.mean(axis=0)
         moved = Pose(turn.q, (1.0 + delta) * (centre - turn.R @ centre - d[3:])) @ moved
