@@ -85,7 +85,7 @@ def test_a_damaged_payload_is_never_used(surface: Surface, tmp_path: Path) -> No
         bad = bytearray(good)
         for at in r.integers(0, len(good) // 4, size=r.integers(1, 40)):
             bad[4 * at : 4 * at + 4] = r.integers(0, 2**32, dtype=np.uint32).tobytes()
-        path.write_bytes(index_cache.MAGIC + index_cache.checksum(bad) + bad)
+        path.write_bytes(index_cache.header(bytes(bad), kernel.checksum) + bad)
         model = SurfaceIndex.build(surface, 0.5, cache_dir=tmp_path)
         restored += model.restored
         assert len(answers(model)) == len(answers(model))

@@ -199,18 +199,19 @@ class SurfaceIndex:
             MissingBackend: the C++ extension is not built.
         """
         vertices, faces = _checked(surface, reach_m)
-        kept = _with_area(vertices, faces)
-        if len(faces) and not len(kept):
-            raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
         kernel = kernel_module()
-        size = len(kept) if len(faces) else len(vertices)
         path = None if cache_dir is None else index_cache.cache_path(cache_dir, kernel.LAYOUT, vertices, faces, reach_m)
-        index = None if path is None else _restored(kernel, path, size, len(faces), portable)
+        index = None if path is None else _restored(kernel, path, len(faces) or len(vertices), len(faces) > 0, portable)
         restored = index is not None
-        index = index or kernel.Index(vertices, faces, kept, float(reach_m), threads, portable)
+        if index is None:
+            kept = _with_area(vertices, faces)
+            if len(faces) and not len(kept):
+                raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
+            index = kernel.Index(vertices, faces, kept, float(reach_m), threads, portable)
+        size = int(index.primitives)
         if path is not None and not restored:
-            index_cache.write(path, index.save())
-        return cls(float(reach_m), surface.extent, size, len(faces) - len(kept), restored, index)
+            index_cache.write(path, index.save(), kernel.checksum)
+        return cls(float(reach_m), surface.extent, size, max(0, len(faces) - size), restored, index)
 
     @property
     def nbytes(self) -> int:
@@ -297,12 +298,11 @@ def kernel_module() -> Any:
     return _kernel
 
 
-def _restored(kernel: Any, path: Path, primitives: int, faces: int, portable: bool) -> Any:
+def _restored(kernel: Any, path: Path, ids: int, mesh: bool, portable: bool) -> Any:
     """The index in this file; None where there is none or it is damaged: it is then built again."""
-    saved = index_cache.read(path)
+    saved = index_cache.read(path, kernel.checksum)
     try:
-        args = (primitives, faces or primitives, faces > 0, portable)
-        return None if saved is None else kernel.Index(np.frombuffer(saved, np.uint8), *args)
+        return None if saved is None else kernel.Index(saved, ids, mesh, portable)
     except ValueError:
         return None
 

@@ -145,7 +145,7 @@ def from_saved(rng: np.random.Generator) -> str:
     index = SurfaceIndex.build(surface, 0.5)
     saved = index._index.save()
     made = []
-    call = lambda: made.append(_kernel.Index(mutate(saved, rng, [saved]), index.primitives, len(surface.faces), True))  # noqa: E731
+    call = lambda: made.append(_kernel.Index(mutate(saved, rng, [saved]), len(surface.faces), True))  # noqa: E731
     if not _tried(call):
         return "index refused"
     use(made[0], rng)

@@ -114,8 +114,8 @@ class Index {
   }
 
   // From what `save` gave; the caller has checked that it is for this model and whole.
-  Index(const Bytes& saved, int64_t primitives, int64_t ids, bool mesh, bool portable) : portable_(portable) {
-    const bool sound = restore(reinterpret_cast<const char*>(saved.data()), saved.size(), primitives, ids, mesh, store_);
+  Index(const Bytes& saved, int64_t ids, bool mesh, bool portable) : portable_(portable) {
+    const bool sound = restore(reinterpret_cast<const char*>(saved.data()), saved.size(), ids, mesh, store_);
     require(sound, "not a sound index");
   }
 
@@ -229,6 +229,13 @@ class Index {
       found = avs::looks(store_, code(), v, T.v, stride);
     }
     return nb::make_tuple(found.matched, found.facing);
+  }
+
+  // Faces with an area, or points.
+  int64_t primitives() const {
+    int64_t n = (int64_t)LANES * (store_.blocks - 1);
+    for (unsigned m = store_.last_valid; m; m &= m - 1) ++n;
+    return n;
   }
 
   size_t bytes() const { return store_.bytes(); }
@@ -394,6 +401,7 @@ nb::tuple refine(const Field& field, const Doubles& points, const Poses& T_ca, i
 
 NB_MODULE(_kernel, m) {
   m.attr("LAYOUT") = LAYOUT;
+  m.def("checksum", [](const Bytes& b) { return checksum(reinterpret_cast<const char*>(b.data()), b.size()); }, nb::arg("payload"));
   nb::class_<Matches>(m, "Matches");
   m.def("keep_patches", &keep_patches, nb::arg("normals"), nb::arg("counts"));
   m.def("pseudo_inverse", &pseudo_inverse_of, nb::arg("N"));
@@ -413,7 +421,7 @@ NB_MODULE(_kernel, m) {
   nb::class_<Index>(m, "Index")
       .def(nb::init<Doubles, Ints, Ints, double, int, bool>(), nb::arg("vertices"), nb::arg("faces"),
            nb::arg("kept"), nb::arg("reach_m"), nb::arg("threads") = 1, nb::arg("portable") = false)
-      .def(nb::init<Bytes, int64_t, int64_t, bool, bool>(), nb::arg("saved"), nb::arg("primitives"), nb::arg("ids"),
+      .def(nb::init<Bytes, int64_t, bool, bool>(), nb::arg("saved"), nb::arg("ids"),
            nb::arg("mesh"), nb::arg("portable") = false)
       .def("save", &Index::save)
       .def("closest", &Index::closest, nb::arg("points"), nb::arg("threads") = 1,
@@ -428,6 +436,7 @@ NB_MODULE(_kernel, m) {
            nb::arg("least_patches"), nb::arg("facing") = false, nb::arg("threads") = 1,
            nb::arg("matches").none() = nb::none())
       .def("looks", &Index::looks, nb::arg("points"), nb::arg("T_ca"), nb::arg("stride"))
+      .def_prop_ro("primitives", &Index::primitives)
       .def_prop_ro("nbytes", &Index::bytes)
       .def_prop_ro("isa", &Index::isa)
       .def_prop_ro("shape", &Index::shape);

@@ -1,9 +1,12 @@
 #include "save.hpp"
 
+#include <algorithm>
 #include <cstring>
 
 namespace avs {
 namespace {
+
+constexpr size_t ALIGNED = 64;  // arrays begin at multiples of this
 
 class Writer {
  public:
@@ -14,6 +17,7 @@ class Writer {
   template <class T>
   void put(const Many<T>& values) {
     put((uint64_t)values.size());
+    bytes_.append((ALIGNED - bytes_.size() % ALIGNED) % ALIGNED, '\0');
     bytes_.append(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T));
   }
   std::string take() { return std::move(bytes_); }
@@ -24,7 +28,7 @@ class Writer {
 
 class Reader {
  public:
-  Reader(const char* data, size_t size) : at_(data), left_(size) {}
+  Reader(const char* data, size_t size) : begin_(data), at_(data), left_(size) {}
 
   template <class T>
   void get(T& value) {
@@ -34,12 +38,22 @@ class Reader {
   void get(Many<T>& values) {
     uint64_t n = 0;
     get(n);
+    const size_t gap = (ALIGNED - (size_t)(at_ - begin_) % ALIGNED) % ALIGNED;
+    good_ = good_ && gap <= left_;
+    if (good_) at_ += gap, left_ -= gap;
     if (!good_ || n > left_ / sizeof(T)) {
       good_ = false;
       return;
     }
-    values.resize((size_t)n);
-    copy(values.data(), (size_t)n * sizeof(T));
+    const size_t size = (size_t)n * sizeof(T);
+    if (reinterpret_cast<uintptr_t>(at_) % alignof(T) == 0) {
+      const T* first = reinterpret_cast<const T*>(at_);  // every bit pattern is a number of these types
+      values.assign(first, first + n);
+      at_ += size, left_ -= size;
+    } else {
+      values.resize((size_t)n);
+      copy(values.data(), size);
+    }
   }
   bool done() const { return good_ && left_ == 0; }
 
@@ -51,7 +65,7 @@ class Reader {
     at_ += size, left_ -= size;
   }
 
-  const char* at_;
+  const char *begin_, *at_;
   size_t left_;
   bool good_ = true;
 };
@@ -64,10 +78,9 @@ void each_field(S& s, Stream&& field) {
   field(s.low), field(s.cell), field(s.step), field(s.size), field(s.top), field(s.bricks), field(s.lists);
 }
 
-bool sound_sizes(const Store& s, int64_t primitives, int64_t ids) {
-  const size_t lanes = (size_t)LANES * s.blocks, n = (size_t)primitives;
-  if (s.blocks == 0 || s.blocks != (n + LANES - 1) / LANES) return false;
-  if (s.last_valid != (uint8_t)(0xff >> (lanes - n))) return false;
+bool sound_sizes(const Store& s, int64_t ids) {
+  const size_t lanes = (size_t)LANES * s.blocks;
+  if (s.blocks == 0 || s.last_valid == 0 || (s.last_valid & (s.last_valid + 1))) return false;
   if (s.id.size() != lanes || s.normals.size() != (s.mesh ? 0 : lanes)) return false;
   if ((s.mesh ? s.triangles.size() : s.points.size()) != lanes) return false;
   if ((s.mesh ? s.triangle_blocks.size() : s.point_blocks.size()) != s.blocks) return false;
@@ -130,11 +143,23 @@ std::string save(const Store& s) {
   return w.take();
 }
 
-bool restore(const char* data, size_t size, int64_t primitives, int64_t ids, bool mesh, Store& s) {
+uint64_t checksum(const char* data, size_t size) {
+  constexpr uint64_t factor = 0x9e3779b97f4a7c15u;  // odd: each step is invertible, so no single change is lost
+  uint64_t lane[4] = {1, 2, 3, size}, word;
+  const auto step = [&](uint64_t& to) { to = (to ^ word) * factor, to ^= to >> 29; };
+  size_t k = 0;
+  for (; k + 32 <= size; k += 32)
+    for (int i = 0; i < 4; ++i) std::memcpy(&word, data + k + 8 * i, 8), step(lane[i]);
+  for (; k < size; k += 8) word = 0, std::memcpy(&word, data + k, std::min(size - k, (size_t)8)), step(lane[k / 8 % 4]);
+  for (int i = 1; i < 4; ++i) word = lane[i], step(lane[0]);
+  return lane[0];
+}
+
+bool restore(const char* data, size_t size, int64_t ids, bool mesh, Store& s) {
   Reader r(data, size);
   each_field(s, [&](auto& value) { r.get(value); });
   s.mesh = mesh;
-  if (!r.done() || !sound_sizes(s, primitives, ids)) return false;
+  if (!r.done() || !sound_sizes(s, ids)) return false;
   uint32_t nodes = 0;
   return sound_tree(s, 0, s.blocks, nodes) && nodes == s.nodes.size() && sound_grid(s);
 }

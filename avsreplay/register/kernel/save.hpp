@@ -7,10 +7,12 @@
 
 namespace avs {
 
-constexpr uint32_t LAYOUT = 4;  // raise with any change of what is stored or how it is built
+constexpr uint32_t LAYOUT = 5;  // raise with any change of what is stored or how it is built
 
 std::string save(const Store& store);
-// False where the bytes are no sound Store of `primitives` faces or points of a surface with `ids` of them.
-bool restore(const char* data, size_t size, int64_t primitives, int64_t ids, bool mesh, Store& store);
+// Against damage on the disk, not against intent; of the same bytes in the order of this machine.
+uint64_t checksum(const char* data, size_t size);
+// False where the bytes are no sound Store of a surface with `ids` faces or points.
+bool restore(const char* data, size_t size, int64_t ids, bool mesh, Store& store);
 
 }  // namespace avs
