@@ -1,9 +1,9 @@
 """Surface indices kept on disk, so that a large model is indexed once.
 
 A file is ``<key>.avsindex``: 8 bytes of magic, a checksum of the payload (8 bytes), zeros up to 64, the payload. The
-key is the SHA-256 of the layout version, the byte order, the reach and the vertices and faces of the surface, so a changed
-model, reach or version uses another file. A truncated, altered or foreign file is ignored. A folder that
-cannot be written to is no error: the index is then built in every run, with the same result.
+key is the SHA-256 of the layout version, the byte order, the reach and the vertices and faces of the surface, so a
+changed model, reach or version uses another file. A truncated, altered or foreign file is ignored. A folder that cannot
+be written to is no error: the index is then built in every run, with the same result.
 """
 
 from __future__ import annotations
