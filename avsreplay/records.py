@@ -265,9 +265,8 @@ class Innovation:
     """Innovation alpha = z - h(x-) of z = (rho, deta_v) [m, half angle] and its covariance.
 
     Attributes:
-        alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.
-        nis: alpha' S^-1 alpha.  distance_m: |d rho|.  angle_rad: rotation angle of the innovation.
-        weight: Cauchy weight of the pose in the update.  share: part of R that is correlated between successive scans.
+        alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.  nis: alpha' S^-1 alpha.  distance_m: |d rho|.
+        angle_rad: rotation.  weight: Cauchy weight.  share: correlated part of R.  rms_m: of the registration [m].
     """
 
     alpha: Array
@@ -278,6 +277,7 @@ class Innovation:
     angle_rad: float
     weight: float = 1.0
     share: float = 0.0
+    rms_m: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -334,10 +334,10 @@ class BodyParameters:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Forecast:
-    """Predicted standard deviations of the grasp point; each is the root of the trace of its 3x3 covariance.
+    """Predicted standard deviations (n,) of the grasp point; each is the root of the trace of its 3x3 covariance.
 
     Attributes:
-        times_s: (n,) [s after now].  pos_1s_m, vel_1s_mps, rot_1s_rad: (n,) position, velocity, attitude (full angle).
+        times_s: [s after now].  pos_1s_m, vel_1s_mps, rot_1s_rad: of position, velocity, attitude (full angle).
     """
 
     times_s: Array

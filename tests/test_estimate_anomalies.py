@@ -48,7 +48,7 @@ def test_a_push_is_reported_and_followed(seed: int) -> None:
     off = np.concatenate([found.rate, found.velocity - result.true_velocity])
     assert off @ np.linalg.solve(found.P, off) < 22.5  # 99.9 % of chi-square with 6 degrees of freedom
     at = result.t.index(45.5)
-    assert result.reason.index("doubtful") - at <= 3
+    assert found.detected_ns * 1e-9 <= 47.0  # the fourth scan after it
     assert max(result.ratio[at + 10 :]) < 4.0
     doubtful = [k for k, reason in enumerate(result.reason) if reason == "doubtful"]
     assert not any(result.converged[k] for k in doubtful)
@@ -76,6 +76,65 @@ def test_a_bias_before_convergence_does_not_stay() -> None:
     assert max(error for error, _ in result.error[after + 5 :]) < 0.02
     assert result.track is not None
     assert result.track.reinitialised == 1
+
+
+def test_a_new_start_fails_no_check() -> None:
+    """The scans of a new start are used again with their own noise, without the factors of the estimate it replaces."""
+    case = surprises.Case("early", at_s=0.0, until_s=10.0, bias=0.15, seconds=16.0)
+    assert [v for seed in range(3) for v in surprises.run(case, seed).violations] == []
+
+
+def test_three_poses_that_agree_replace_the_first_ones() -> None:
+    """The first four poses are 15 cm off: too few for a test of the next ones, which agree with one another."""
+    case = surprises.Case("first", at_s=0.0, until_s=2.0, bias=0.15, seconds=10.0)
+    result = surprises.run(case, 0)
+    after = result.t.index(2.0)
+    assert result.reason[after : after + 3] == ["doubtful", "doubtful", "ok"]
+    assert max(error for error, _ in result.error[after + 2 :]) < 0.02
+
+
+@pytest.mark.parametrize("until_s", [1e9, 48.0])
+def test_a_bias_from_40_s_on_is_flagged_from_its_first_scan_before_convergence(until_s: float) -> None:
+    case = surprises.Case("bias", at_s=40.0, until_s=until_s, bias=0.03, seconds=54.0)
+    result = surprises.run(case, 1)
+    first = result.t.index(40.0)
+    last = min(len(result.t), int(np.searchsorted(result.t, until_s)))
+    assert not any(result.converged[:first])
+    assert not any(result.gamma[first:last])
+    assert all(result.gamma[last:])
+    assert set(result.reason[first + 3 : last]) == {"sensor_bias"}
+    assert max(error for error, _ in result.error[first:]) < 0.01
+
+
+def test_the_end_of_an_early_bias_restores_the_estimate_before_it() -> None:
+    """Biased from 8 to 12 s: the estimate begins anew at 8 s; at 12 s that of the first 8 s is right again."""
+    case = surprises.Case("bias", at_s=8.0, until_s=12.0, bias=0.15, seconds=20.0)
+    result = surprises.run(case, 2)
+    after = result.t.index(12.0)
+    assert max(error for error, _ in result.error[after + 2 :]) < 0.01
+    assert result.track is not None
+    assert result.track.reinitialised == 2
+    assert result.track.started_ns == 0
+
+
+@pytest.mark.parametrize(("before", "after", "began"), [(0.005, 0.006, True), (0.006, 0.005, False)])
+def test_the_residuals_of_the_registration_tell_which_poses_are_biased(
+    before: float, after: float, began: bool
+) -> None:
+    """A range error deforms the scan. The time since the start would give the opposite answer in both cases."""
+    from types import SimpleNamespace
+
+    from avsreplay.estimate import Estimator, EstimatorParams
+
+    def scan(rms: float, t_s: float) -> SimpleNamespace:
+        belief = SimpleNamespace(t_ns=round(t_s * 1e9))
+        return SimpleNamespace(innovation=SimpleNamespace(rms_m=rms), prediction=SimpleNamespace(belief=belief))
+
+    late = 1.0 if began else 100.0
+    recent = tuple(scan(before * (1.0 + 0.005 * k), late) for k in range(4))
+    doubtful = tuple(scan(after * (1.0 + 0.005 * k), late) for k in range(3))
+    track = SimpleNamespace(previous=None, started_ns=0, recent=recent, doubtful=doubtful)
+    assert Estimator(EstimatorParams(), None, 4.0).anomalies._bias_began(track) is began
 
 
 @pytest.mark.slow

@@ -23,21 +23,35 @@ from avsreplay.estimate.dynamics import propagate
 from avsreplay.estimate.error_state import VEL, W
 from avsreplay.estimate.hypotheses import ChangePriors, Explanation, Hypothesis, cholesky_root, explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
+from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import GATE
 from avsreplay.estimate.params import EstimatorParams, Start
-from avsreplay.estimate.track import Epoch, Prediction, SensorBias, Track
+from avsreplay.estimate.track import (
+    Epoch,
+    Prediction,
+    SensorBias,
+    Track,
+    confirmed,
+    nis_scale,
+    ready,
+    with_history,
+    with_nis,
+)
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation, Manoeuvre, Reason, Verdict
 
-_FEWEST, _MOST, _RECENT = 3, 5, 3  # least and most doubtful scans at a decision; accepted scans kept
-_MARGIN = 6.0  # a decision before _MOST scans needs these log odds of the best hypothesis over the next
-_FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
-_READY = 8  # least number of poses of an estimate whose prediction can be tested
+_FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decision; accepted scans kept
+_OVER_FREE, _OVER_NEXT = 3.0, 2.0  # log odds over free motion, and over the next hypothesis, of an early decision
+_RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 _LEAST = 1e-9  # of the eigenvalues of the prior after a manoeuvre
+_RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, in its spread, that tells which poses are biased
+_SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: a smaller offset is lost in the prediction's error
+_KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
 
 Update = Callable[[Track, Prediction, Innovation, int, bool], Track]
+Replay = Callable[[Track, Epoch], tuple[Track, Epoch]]
 
 
 class AnomalyTest:
@@ -47,12 +61,10 @@ class AnomalyTest:
         params: settings, auto values filled in.
         extent_m: the target's bounding diagonal [m].
         batch: converts healthy scans to the poses of a fit.
-        replay: predicts, forms the innovation of a stored scan and updates with it.
+        replay: predicts, forms the innovation of a stored scan and updates with it; returns the scan as it was used.
     """
 
-    def __init__(
-        self, params: EstimatorParams, extent_m: float, batch: BatchSchedule, replay: Callable[[Track, Epoch], Track]
-    ) -> None:
+    def __init__(self, params: EstimatorParams, extent_m: float, batch: BatchSchedule, replay: Replay) -> None:
         self.params, self.batch, self._replay = params, batch, replay
         self.enabled = params.robust and params.start is not Start.PAPER
         speed = 0.2 * params.length("start_vel_1s_mps")
@@ -62,71 +74,140 @@ class AnomalyTest:
         self, track: Track, epoch: Epoch, verdict: Verdict, update: Callable[[Track], Track]
     ) -> tuple[Track, Verdict]:
         """The track after a measured scan, and the verdict on it. ``update`` applies the scan to a track."""
-        nis = epoch.innovation.nis
-        suspicious = verdict.reason is Reason.POSE_JUMP or (verdict.gamma == 1 and nis > GATE * _nis_scale(track))
-        if not self.enabled or verdict.reason not in _TESTED or not _ready(track):
+        if not self.enabled or verdict.reason not in _TESTED:
             return (self._accepted(track, epoch, update) if verdict.gamma else update(track)), verdict
-        if not suspicious:
+        if track.bias is not None:
+            bias = _continued(track.bias, epoch)
+            if bias is not None:
+                return replace(track, belief=epoch.prediction.belief, bias=bias), Verdict(0, Reason.SENSOR_BIAS)
+            track = replace(track, bias=None)
+        doubtful = replace(track, belief=epoch.prediction.belief, doubtful=(*track.doubtful, epoch))
+        large = verdict.reason is Reason.POSE_JUMP
+        if not (ready(track) and track.recent):
+            large = large or (ready(track) and epoch.innovation.nis > GATE * nis_scale(track))
+            return self._undecidable(doubtful) if large else (self._accepted(track, epoch, update), verdict)
+        large = large or epoch.innovation.nis > GATE * nis_scale(track)
+        if not (large or track.doubtful or _long_run((*track.recent, epoch), nis_scale(track))):
             return self._accepted(track, epoch, update), verdict
-        if track.bias is not None and self._still_biased(track.bias, epoch.innovation):
-            return replace(track, belief=epoch.prediction.belief), Verdict(0, Reason.SENSOR_BIAS)
-        track = replace(track, belief=epoch.prediction.belief, doubtful=(*track.doubtful, epoch), bias=None)
-        if len(track.doubtful) < (_FEWEST if track.recent else _MOST):
-            return track, Verdict(0, Reason.DOUBTFUL)
-        return self._decided(track) if track.recent else self._by_agreement(track)
+        window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
+        ranked = explain(window, first, self._priors, *self.batch.noise_levels(track))
+        if not large and ranked[0].hypothesis not in (Hypothesis.MANOEUVRE, Hypothesis.SENSOR_BIAS):
+            return self._accepted(track, epoch, update), verdict
+        return self._decided(doubtful, window, ranked)
 
     def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:
         """A scan that agrees with the prediction: the doubtful scans before it were bad."""
-        after = update(replace(track, doubtful=(), bias=None))
-        return _with_nis(replace(after, recent=(*track.recent, epoch)[-_RECENT:]), track, epoch.innovation.nis)
+        after = update(replace(track, doubtful=(), manoeuvres=confirmed(track), pending=False))
+        return with_nis(replace(after, recent=(*track.recent, epoch)[-_RECENT:]), track, epoch.innovation.nis)
 
-    def _decided(self, track: Track) -> tuple[Track, Verdict]:
-        """The track after a decision, or still in doubt."""
-        window, first = (*track.recent, *track.doubtful), len(track.recent)
-        ranked = explain(window, first, self._priors, *self.batch.noise_levels(track))
-        best, margin = ranked[0], ranked[0].log_evidence - ranked[1].log_evidence
-        last_chance = len(track.doubtful) >= _MOST
-        explained = best.chi2 < _EXPLAINED * best.dof
-        if not last_chance and (margin < _MARGIN or not explained):
+    def _undecidable(self, track: Track) -> tuple[Track, Verdict]:
+        """Too few scans were accepted for the hypotheses to be compared: the doubtful ones may agree by themselves."""
+        if len(track.doubtful) < _FEWEST:
             return track, Verdict(0, Reason.DOUBTFUL)
-        established = track.doubtful[0].converged or (track.batch is not None and track.batch.gaussian)
-        if best.hypothesis is Hypothesis.FREE_MOTION:
-            return self._replayed(track), Verdict(1, Reason.OK)
+        return self._by_agreement(track)
+
+    def _decided(self, track: Track, window: tuple[Epoch, ...], ranked: list[Explanation]) -> tuple[Track, Verdict]:
+        """The track after a decision, or still in doubt."""
+        doubtful, in_doubt = len(track.doubtful), (track, Verdict(0, Reason.DOUBTFUL))
+        best, explained = ranked[0], ranked[0].chi2 < _EXPLAINED * ranked[0].dof
+        free = next(e.log_evidence for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
+        certain = explained and best.log_evidence - ranked[1].log_evidence >= _OVER_NEXT
+        certain = certain and (best.log_evidence - free >= _OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
+        if doubtful < _MOST and not certain:
+            return in_doubt
         if best.hypothesis is Hypothesis.MANOEUVRE and explained:
+            reported = self._reported(track, window, best)
             if _after(window, best) >= FEWEST_TO_FIT:
-                return self._manoeuvred(track, window, best), Verdict(1, Reason.OK)
-            if len(track.doubtful) < 2 * _MOST:  # the motion after it is not determined yet
-                return track, Verdict(0, Reason.DOUBTFUL)
-        if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and established:
-            return replace(track, doubtful=(), bias=SensorBias(best.size, best.P)), Verdict(0, Reason.SENSOR_BIAS)
+                return self._manoeuvred(reported, window, best), Verdict(1, Reason.OK)
+            if doubtful < 2 * _MOST:
+                return reported, Verdict(0, Reason.DOUBTFUL)
+        if doubtful < _FEWEST:
+            return in_doubt
+        if best.hypothesis is Hypothesis.FREE_MOTION:
+            before = replace(with_history(track.doubtful[0].track, track), recent=track.recent)
+            return self._used(before, track.doubtful), Verdict(1, Reason.OK)
+        if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):
+            return self._biased(track, window, best), Verdict(0, Reason.SENSOR_BIAS)
         if best.hypothesis is not Hypothesis.FROZEN or not explained:
             return self._by_agreement(track)
-        return replace(track, doubtful=()), Verdict(0, Reason.POSE_JUMP)
+        return with_history(track, track), Verdict(0, Reason.POSE_JUMP)
+
+    def _bias_began(self, track: Track) -> bool:
+        """Return whether a step in the pose is the beginning of a sensor error; it may as well be the end of one.
+
+        A range error deforms the scan, so the rms residual steps with it where the scan is registered. Otherwise the
+        poses are trusted that have been consistent for longer than sensor errors usually last. A pose that the estimate
+        before a new start predicted ends the error that caused the new start.
+        """
+        if self._previous_agrees(track):
+            return False
+        before, after = (
+            np.array([e.innovation.rms_m for e in epochs if e.innovation.rms_m > 0.0])
+            for epochs in (track.recent, track.doubtful)
+        )
+        if min(len(before), len(after)) >= _FEWEST:
+            spread = max(_LEAST_SPREAD, float(np.std(np.log(before))), float(np.std(np.log(after))))
+            step = float(np.log(np.median(after) / np.median(before)))
+            if abs(step) > _RMS_STEP * spread:
+                return step > 0.0
+        seconds = (track.doubtful[0].prediction.belief.t_ns - track.started_ns) * 1e-9
+        return seconds >= self.params.bias_s
+
+    def _biased(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
+        """The estimate of the poses before the sensor error, propagated to the present."""
+        first, last = len(track.recent), window[-1]
+        bias = SensorBias(best.size, best.P, last)
+        if best.onset >= first:
+            return replace(with_history(track, track), bias=bias)
+        then = window[best.onset].track
+        belief, _ = propagate(then.belief, last.prediction.belief.t_ns, *self.batch.noise_levels(track))
+        return replace(with_history(then, track), belief=belief, recent=track.recent[: best.onset], bias=bias)
 
     def _by_agreement(self, track: Track) -> tuple[Track, Verdict]:
         """The track initialised anew from the doubtful poses if they agree with one another; else they are bad."""
-        anew = self._initialised_anew(track)
+        old = track.previous
+        if old is not None and self._previous_agrees(track):
+            anew: Track | None = self._used(with_history(old, track), track.doubtful)
+        else:
+            anew = self._initialised_anew(track)
         if anew is not None:
-            return anew, Verdict(1, Reason.OK)
-        return replace(track, doubtful=()), Verdict(0, Reason.POSE_JUMP)
+            return replace(anew, reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
+        return with_history(track, track), Verdict(0, Reason.POSE_JUMP)
 
-    def _still_biased(self, bias: SensorBias, innovation: Innovation) -> bool:
-        """Return whether the offset explains this innovation, by the covariances of both."""
-        left = innovation.alpha - bias.offset
-        return float(left @ np.linalg.solve(innovation.S + bias.P, left)) < GATE
+    def _previous_agrees(self, track: Track) -> bool:
+        """Return whether the estimate before the last new start predicted the doubtful poses to within its errors."""
+        old = track.previous
+        if old is None or (track.doubtful[-1].prediction.belief.t_ns - old.belief.t_ns) * 1e-9 > _KEPT_S:
+            return False
+        for epoch in track.doubtful:
+            prior, seen = epoch.prediction.belief, epoch.innovation
+            belief, _ = propagate(old.belief, prior.t_ns, *self.batch.noise_levels(old))
+            H = measurement_jacobian(belief.x)
+            S = H @ belief.P @ H.T + seen.R
+            alpha = innovation_vector(belief.x, measured_pose(prior.x, seen.alpha))
+            if _chi2(alpha, S) > GATE or _chi2(seen.alpha, S) < GATE:
+                return False
+        return True
 
-    def _replayed(self, track: Track) -> Track:
-        """All doubtful scans used after all, with their Cauchy weights."""
-        epochs = track.doubtful
-        out = replace(epochs[0].track, recent=track.recent, manoeuvres=track.manoeuvres, drift=track.drift)
+    def _used(self, track: Track, epochs: tuple[Epoch, ...]) -> Track:
+        """The track with scans that were in doubt."""
+        out, used = track, []
         for epoch in epochs:
-            out = self._replay(out, epoch)
-        return replace(out, recent=(*track.recent, *epochs)[-_RECENT:], doubtful=())
+            out, again = self._replay(out, epoch)
+            used.append(again)
+        return replace(out, recent=(*track.recent, *used)[-_RECENT:])
+
+    def _reported(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
+        """The track with the manoeuvre in its list; a later report of the same one replaces the first."""
+        at_ns = window[0].track.belief.t_ns + round(best.after_s * 1e9)
+        now_ns = track.manoeuvres[-1].detected_ns if track.pending else window[-1].prediction.belief.t_ns
+        found = Manoeuvre(at_ns, best.after_1s_s, best.size[3:], best.size[:3], best.P, now_ns)
+        return replace(track, manoeuvres=(*confirmed(track), found), pending=True)
 
     def _manoeuvred(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
         """Rate and velocity fitted anew from the manoeuvre on; everything else is continuous."""
-        at = window[0].track.belief
-        start_ns, t_ns = at.t_ns, _last_change_ns(window, best)
+        start_ns, t_ns = window[0].track.belief.t_ns, _last_change_ns(window, best)
+        at = window[best.onset].track.belief  # of all scans before the first change
         for after_s in best.changes_s:
             then_ns = start_ns + round(after_s * 1e9)
             at, _ = propagate(at, then_ns, *self.batch.noise_levels(track))
@@ -141,9 +222,6 @@ class AnomalyTest:
         after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
-        now_ns = window[-1].prediction.belief.t_ns
-        middle_ns = start_ns + round(best.after_s * 1e9)
-        found = Manoeuvre(middle_ns, best.after_1s_s, best.size[3:], best.size[:3], best.P, now_ns)
         return replace(
             track,
             belief=result.belief,
@@ -155,7 +233,7 @@ class AnomalyTest:
             prior_ns=t_ns,
             recent=(),
             doubtful=(),
-            manoeuvres=(*track.manoeuvres, found),
+            pending=False,
         )
 
     def _fitted(self, track: Track, fixes: tuple[PoseFix, ...], prior: Prior, t_ns: int) -> BatchResult:
@@ -190,10 +268,43 @@ class AnomalyTest:
         if 2.0 * fitted.half_chi2 > _EXPLAINED * (6 * len(fixes) - 12):
             return None
         first = epochs[0].prediction.belief
-        out = Track(Belief(first.t_ns, first.x, first.P), "start", manoeuvres=track.manoeuvres, drift=track.drift)
-        for epoch in epochs:
-            out = self._replay(out, epoch)
-        return replace(out, reinitialised=track.reinitialised + 1, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
+        out = self._used(Track(Belief(first.t_ns, first.x, first.P), "start", started_ns=first.t_ns), epochs)
+        old = replace(track, recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None
+        out = replace(with_history(out, track), drift=track.drift, previous=old)
+        return replace(out, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
+
+
+def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
+    """The sensor error after one more scan, None where it has ended.
+
+    The error of the prediction grows while the estimate coasts, and with it the innovation. It changes little from one
+    scan to the next, where an offset that ends changes the innovation by its own size.
+    """
+    last, prediction = bias.last, epoch.prediction
+    if _chi2(bias.offset, epoch.innovation.S) < _SIGNIFICANT:
+        return None
+    turned = prediction.H @ prediction.Phi - last.prediction.H
+    P = turned @ last.prediction.belief.P @ turned.T + epoch.innovation.R + last.innovation.R
+    change = epoch.innovation.alpha - last.innovation.alpha
+    still, ended = _chi2(change, P), _chi2(change + bias.offset, P + bias.P)
+    gain = float(np.linalg.slogdet(P + bias.P)[1] - np.linalg.slogdet(P)[1])
+    return replace(bias, last=epoch) if still < min(GATE, ended + gain) else None
+
+
+def _chi2(y: Array, C: Array) -> float:
+    return float(y @ np.linalg.solve(C, y))
+
+
+def _long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
+    """Return whether the sum of the last whitened innovations is large, over one of several runs of scans."""
+    white = [np.linalg.solve(cholesky_root(e.innovation.S), e.innovation.alpha) for e in epochs[-_RUNS[-1] :]]
+    sums = np.cumsum(white[::-1], axis=0)
+    for n in _RUNS:
+        if n <= len(white):
+            variance = n * (1.0 + (n - 1) * epochs[-1].innovation.share)
+            if float(sums[n - 1] @ sums[n - 1]) > _RUN_GATE * scale * variance:
+                return True
+    return False
 
 
 def _definite(root: Array) -> Array:
@@ -213,28 +324,3 @@ def _after(window: tuple[Epoch, ...], found: Explanation) -> int:
 def _last_change_ns(window: tuple[Epoch, ...], found: Explanation) -> int:
     """Instant at which a manoeuvre ends [ns]."""
     return window[0].track.belief.t_ns + round(found.changes_s[-1] * 1e9)
-
-
-def _nis_scale(track: Track) -> float:
-    """How many times larger than chi-square the NIS of the accepted scans is: their median over that of chi-square.
-
-    Registration errors beyond the claimed covariance enlarge the NIS of all scans, so that of a doubtful scan must be
-    large compared with that of the accepted scans. The median is taken over many scans: errors of the registration last
-    for the whole log, while a sensor error that grows over some tens of scans must not raise the gate that detects it.
-    """
-    if len(track.nis) < _FEWEST_NIS:
-        return 1.0
-    return max(1.0, float(np.median(track.nis)) / _MEDIAN_CHI2)
-
-
-def _with_nis(after: Track, before: Track, nis: float) -> Track:
-    return replace(after, nis=(*before.nis, nis)[-_MOST_NIS:])
-
-
-def _ready(track: Track) -> bool:
-    """Return whether the estimate is based on enough poses for its prediction to be tested.
-
-    After a manoeuvre the prior keeps all but the velocities, so that few poses determine the motion.
-    """
-    least = FEWEST_TO_FIT if track.manoeuvres else _READY
-    return track.mode == "filter" or (track.mode == "fit" and track.batch is not None and track.batch.count >= least)

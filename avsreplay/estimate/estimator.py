@@ -71,10 +71,10 @@ class Estimator:
             T_ac: pose of {C} in {A}, used where no start is given.
         """
         if self.start is not None:
-            return Track(self.start, "near", prior=self._prior, prior_ns=self.start.t_ns)
+            return Track(self.start, "near", prior=self._prior, prior_ns=self.start.t_ns, started_ns=t_ns)
         T_ac = T_ac if self.fall is None else self.fall.pose_into(T_ac, t_ns)
         mode = "filter" if self.params.start is Start.PAPER else "start"
-        return Track(guessed_belief(t_ns, T_ac, self.params), mode)
+        return Track(guessed_belief(t_ns, T_ac, self.params), mode, started_ns=t_ns)
 
     def predict(self, track: Track, t_ns: int) -> Prediction:
         """The predicted mean and covariance at an instant (eq:KF_propagate).
@@ -100,7 +100,8 @@ class Estimator:
         R = self.noise.of(alignment, x, prediction.window)
         T_ac = alignment.T_ac if self.fall is None else self.fall.pose_into(alignment.T_ac, prediction.belief.t_ns)
         alpha, share = innovation_vector(x, T_ac), self.noise.correlated_share(alignment)
-        return ekf.innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
+        found = ekf.innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
+        return replace(found, rms_m=alignment.rms_m)
 
     def step(
         self, track: Track, prediction: Prediction, innovation: Innovation | None, verdict: Verdict, converged: bool
@@ -119,7 +120,7 @@ class Estimator:
         """
         if innovation is None:
             return self.update(track, prediction, None, 0), verdict
-        epoch = Epoch(replace(track, recent=(), doubtful=()), prediction, innovation, converged)
+        epoch = Epoch(replace(track, recent=(), doubtful=(), previous=None), prediction, innovation, converged)
         after, verdict = self.anomalies.step(
             track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged)
         )
@@ -182,15 +183,18 @@ class Estimator:
         R = self.noise.rescaled(innovation.R, prediction.window, track.window)
         return left, R, NO_INFLATION if track.inflation is None else track.inflation
 
-    def _replayed(self, track: Track, epoch: Epoch) -> Track:
-        """A stored scan, predicted and used again from another track."""
+    def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
+        """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""
         prediction = self.predict(track, epoch.prediction.belief.t_ns)
         prediction = replace(prediction, lag_s=epoch.prediction.lag_s, blur=epoch.prediction.blur)
         pose = measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha)
-        alpha, R = innovation_vector(prediction.belief.x, pose), epoch.innovation.R
+        alpha = innovation_vector(prediction.belief.x, pose)
+        R = self.noise.rescaled(epoch.innovation.R, epoch.prediction.window, track.window)
         P, share = prediction.belief.P, epoch.innovation.share
         innovation = ekf.innovation_of(P, prediction.H, alpha, R, self._robust, share)
-        return self.update(track, prediction, innovation, 1, epoch.converged)
+        innovation = replace(innovation, rms_m=epoch.innovation.rms_m)
+        used = Epoch(replace(track, recent=(), doubtful=(), previous=None), prediction, innovation, epoch.converged)
+        return self.update(track, prediction, innovation, 1, epoch.converged), used
 
     def update(
         self, track: Track, prediction: Prediction, innovation: Innovation | None, gamma: int, converged: bool = True

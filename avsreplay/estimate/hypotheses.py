@@ -26,8 +26,12 @@ from avsreplay.records import Belief
 
 _PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _PER_BAD_SCAN = math.log(1e-2)
-_INSTANTS = 8  # number of instants tried for a manoeuvre between two scans
-_TWO = (1, 6)  # of these instants, those of the two changes in each interval over which a long manoeuvre extends
+_INSTANTS, _FEWER, _LONG = 8, 4, 9  # instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
+_LONGEST_SPREAD = 6  # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
+_TAIL = 0.05  # probability that a manoeuvre is earlier, or later, than the interval in which it is allowed for
+_SCALES = (1.0, 0.1)  # of the prior standard deviations: a large or a small change
+_CHANGES = (slice(0, 3), slice(3, 6), slice(0, 6))  # rate, velocity, both
+_OFFSETS = (slice(6, 7), slice(0, 3), slice(0, 6))  # range, position, pose
 _SPREAD = (0.7, 0.1, 0.1, 0.1)  # prior share of manoeuvres at one instant, and over one, two and three intervals
 _ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
 
@@ -62,7 +66,8 @@ class Explanation:
         onset: index of the first affected scan.
         after_s: instant of a manoeuvre after the first scan's prior belief [s], with its standard deviation.
         size, P: (6,) (rate, velocity) of a manoeuvre or the offset of a sensor bias, with its covariance (6, 6).
-        changes_s: the instants at which a manoeuvre changes the velocity: one, or two in each interval of a long one.
+        changes_s: instants of free changes of the velocity: the ends of the 90 % interval of the instant, or two in
+            each interval between scans over which a manoeuvre extends.
     """
 
     hypothesis: Hypothesis
@@ -79,11 +84,15 @@ class Explanation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Window:
-    """Innovations y (6n,) about the trajectory predicted from the belief before the window, whitened by root."""
+    """Innovations y (6n,) about the trajectory predicted from the belief before the window.
+
+    ``C`` (6n, 6n) is their covariance without a change, ``whiten`` the inverse of its Cholesky factor.
+    """
 
     times_s: Array
     y: Array
     C: Array
+    whiten: Array
     rows: Array  # (n, 6, 20) H Phi from the start of the window
     poses: tuple[Pose, ...]
     R: tuple[Array, ...]
@@ -104,14 +113,13 @@ def explain(
     """
     start = epochs[0].track.belief
     window = _window(epochs, start, torque, force)
-    root = cholesky_root(window.C)
-    white = np.asarray(np.linalg.solve(root, window.y), dtype=np.float64)
-    free = -0.5 * float(white @ white) - float(np.log(np.diagonal(root)).sum())
+    white = window.whiten @ window.y
+    free = -0.5 * float(white @ white) + float(np.log(np.diagonal(window.whiten)).sum())
     n = len(epochs)
     found = [
         Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), 6 * n, n),
-        _manoeuvre(window, start, root, white, free, priors, n),
-        _sensor_bias(window, root, white, free, priors, n),
+        _manoeuvre(window, start, white, free, priors, n),
+        _sensor_bias(window, white, free, priors, n),
         _bad_scans(window, priors, first_doubtful, n),
         _frozen(window, first_doubtful, n),
     ]
@@ -161,7 +169,9 @@ def _window(epochs: Sequence[Epoch], start: Belief, torque: float, force: float)
     innovations = [e.innovation for e in epochs]
     R = tuple(i.R for i in innovations)
     flat = C.reshape(6 * n, 6 * n) + correlated_noise(R, [i.share for i in innovations])
-    return _Window(times, y.reshape(-1), 0.5 * (flat + flat.T), rows, tuple(poses), R, R_ba)
+    flat = 0.5 * (flat + flat.T)
+    whiten = np.asarray(np.linalg.inv(cholesky_root(flat)), dtype=np.float64)
+    return _Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, R_ba)
 
 
 def correlated_noise(R: Sequence[Array], shares: Sequence[float]) -> Array:
@@ -184,61 +194,82 @@ def correlated_noise(R: Sequence[Array], shares: Sequence[float]) -> Array:
 
 def _evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float, Array, Array]:
     """Log evidence, mean and covariance of the unknowns u ~ N(0, scale^2) in white = M u + N(0, 1)."""
-    precision = M.T @ M + np.diag(scale**-2.0)
-    P = np.linalg.inv(precision)
-    g = M.T @ white
-    u = P @ g
-    value = free + 0.5 * float(g @ u) - 0.5 * float(np.linalg.slogdet(precision)[1]) - float(np.log(scale).sum())
-    return value, u, 0.5 * (P + P.T)
+    A, b = M.T @ M * np.outer(scale, scale) + np.eye(len(scale)), scale * (M.T @ white)
+    inverse = np.linalg.inv(A)
+    v = inverse @ b
+    value = free + 0.5 * float(b @ v) - 0.5 * float(np.linalg.slogdet(A)[1])
+    return value, scale * v, np.outer(scale, scale) * (0.5 * (inverse + inverse.T))
 
 
-def _manoeuvre(
-    window: _Window, start: Belief, root: Array, white: Array, free: float, priors: ChangePriors, n: int
-) -> Explanation:
+def _mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice]) -> Array:
+    """(k,) log evidence over free motion of unknowns with columns M (k, m, n), the mean over kinds and prior widths.
+
+    A single prior that is wide in all directions would hide a small change of the velocity alone from few scans.
+    """
+    Mt = np.swapaxes(M, 1, 2)
+    G, g = Mt @ M, Mt @ white
+    found = []
+    for kind in kinds:
+        for factor in _SCALES:
+            s = factor * scale[kind]
+            A = G[:, kind, kind] * np.outer(s, s) + np.eye(len(s))
+            b = g[:, kind] * s
+            v = np.linalg.solve(A, b[:, :, None])[:, :, 0]
+            found.append(0.5 * (b * v).sum(axis=1) - 0.5 * np.linalg.slogdet(A)[1])
+    return np.asarray(np.logaddexp.reduce(found, axis=0) - math.log(len(found)))
+
+
+def _manoeuvre(window: _Window, start: Belief, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
     """A change of rate and velocity: at one instant, or spread over one to three intervals between scans.
 
     A thrust or an impact that is not instantaneous is a sum of changes, two in each interval, so that both the velocity
     and the pose at the end of the interval are free. All instants are marginalised for the evidence; the explanation is
-    the most likely.
+    the most likely, with rate and velocity free.
     """
+    count = _INSTANTS if n < _LONG else _FEWER
     edges = np.concatenate([[0.0], window.times_s[: n - 1]])
     lengths = np.diff(np.append(edges, window.times_s[-1]))
-    instants = (edges[:, None] + lengths[:, None] * _fractions()).reshape(-1)
-    columns = [_after_change(window, start, root, float(tau)) for tau in instants]
-    pairs = (_INSTANTS * np.arange(n)[:, None] + np.array(_TWO)).reshape(-1)
-    choices = [[[k] for k in range(len(instants))]]
-    choices += [[pairs[2 * k : 2 * (k + m)].tolist() for k in range(n + 1 - m)] for m in range(1, len(_SPREAD))]
-    kinds = [
-        [_changes(instants[k], [columns[j] for j in k], white, free, priors) for k in chosen] for chosen in choices
-    ]
-    evidence = [_log_mean([f.log_evidence for f in found]) for found in kinds]
-    total = _log_sum([math.log(share) + value for share, value in zip(_SPREAD, evidence, strict=True)])
-    best = max((f for found in kinds for f in found), key=lambda f: f.log_evidence)
-    single = [f.log_evidence for f in kinds[0]]
-    weight = np.exp(np.array(single) - max(single))
+    instants = (edges[:, None] + lengths[:, None] * ((np.arange(count) + 0.5) / count)).reshape(-1)
+    columns = np.array([_after_change(window, start, float(tau)) for tau in instants])
+    scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)
+    single = free + _mixed(columns, white, scale, _CHANGES)
+    k = int(np.argmax(single))
+    found = [replace(_changes(instants[[k]], columns[[k]], white, free, scale), log_evidence=float(single[k]))]
+    two = count * np.arange(max(0, n - _LONGEST_SPREAD), n)[:, None] + np.array([count // 8, count - 1 - count // 8])
+    evidence = [_log_mean(single.tolist())]
+    for m in range(1, len(_SPREAD)):
+        chosen = [two[k : k + m].reshape(-1) for k in range(len(two) + 1 - m)]
+        long = [_changes(instants[c], columns[c], white, free, scale) for c in chosen]
+        evidence.append(_log_mean([f.log_evidence for f in long]) if long else -math.inf)
+        found += long
+    best = max(found, key=lambda f: f.log_evidence)
+    total = float(np.logaddexp.reduce(np.log(_SPREAD) + evidence))
     after_s, step = best.after_s, float(lengths.max())
     spread = math.hypot(best.after_1s_s, step / math.sqrt(12.0))
     if len(best.changes_s) == 1:
+        weight = np.exp(single - single.max())
         after_s = float(weight @ instants / weight.sum())
         variance = float(weight @ (instants - after_s) ** 2 / weight.sum())
-        spread = math.hypot(math.sqrt(max(variance, 0.0)), step / _INSTANTS / math.sqrt(12.0))
+        spread = math.hypot(math.sqrt(max(variance, 0.0)), step / count / math.sqrt(12.0))
+        share = np.cumsum(weight) / weight.sum()
+        ends = instants[np.minimum(np.searchsorted(share, [_TAIL, 1.0 - _TAIL]), len(instants) - 1)]
+        best = replace(best, changes_s=tuple(np.unique(ends).tolist()))
     onset = int(np.searchsorted(window.times_s, best.changes_s[0], side="right"))
-    value = total + _PRIOR_ODDS
-    return replace(best, log_evidence=value, onset=onset, after_s=after_s, after_1s_s=spread)
+    return replace(best, log_evidence=total + _PRIOR_ODDS, onset=onset, after_s=after_s, after_1s_s=spread)
 
 
-def _after_change(window: _Window, start: Belief, root: Array, tau: float) -> Array:
+def _after_change(window: _Window, start: Belief, tau: float) -> Array:
     """Derivative (6n, 6) of the whitened innovations by a change of (rate, velocity) at an instant [s]."""
     _, Phi = propagate_state(start.x, tau)
     columns = np.linalg.inv(Phi)[:, [*range(W.start, W.stop), *range(VEL.start, VEL.stop)]]
     M = (window.rows @ columns) * (window.times_s > tau)[:, None, None]
-    return np.asarray(np.linalg.solve(root, M.reshape(-1, 6)), dtype=np.float64)
+    return np.asarray(window.whiten @ M.reshape(-1, 6))
 
 
-def _changes(instants: Array, columns: list[Array], white: Array, free: float, priors: ChangePriors) -> Explanation:
+def _changes(instants: Array, columns: Array, white: Array, free: float, scale: Array) -> Explanation:
     """Changes at given instants; size and P are those of their sum, ``after_s`` their mean weighted by size."""
-    m, scale = len(columns), np.repeat([priors.rate_radps, priors.velocity_mps], 3)
-    M = np.hstack(columns)
+    m = len(columns)
+    M = np.hstack(list(columns))
     value, u, P = _evidence(white, free, M, np.tile(scale, m))
     left = white - M @ u
     joined = np.tile(np.eye(6), m)
@@ -259,35 +290,27 @@ def _changes(instants: Array, columns: list[Array], white: Array, free: float, p
     )
 
 
-def _log_sum(values: Sequence[float]) -> float:
-    top = max(values)
-    return top + math.log(sum(math.exp(v - top) for v in values))
-
-
 def _log_mean(values: Sequence[float]) -> float:
-    return _log_sum(values) - math.log(len(values))
+    return float(np.logaddexp.reduce(values)) - math.log(len(values))
 
 
-def _fractions() -> Array:
-    return (np.arange(_INSTANTS) + 0.5) / _INSTANTS
-
-
-def _sensor_bias(window: _Window, root: Array, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
-    """A constant offset of the measured pose in {A} from one of the scans on."""
-    scale = np.repeat([priors.position_m, priors.half_angle], 3)
-    found = []
-    for onset in range(1, n):
-        M = np.zeros((n, 6, 6))
-        for k in range(onset, n):
-            M[k, :3, :3], M[k, 3:, 3:] = np.eye(3), window.R_ba[k]
-        whitened = np.asarray(np.linalg.solve(root, M.reshape(-1, 6)), dtype=np.float64)
-        value, u, P = _evidence(white, free, whitened, scale)
-        left = white - whitened @ u
-        found.append(Explanation(Hypothesis.SENSOR_BIAS, value, float(left @ left), 6 * n - 6, onset, size=u, P=P))
-    best = max(found, key=lambda e: e.log_evidence)
-    values = np.array([e.log_evidence for e in found])
-    evidence = float(best.log_evidence + np.log(np.exp(values - best.log_evidence).mean())) + _PRIOR_ODDS
-    return Explanation(Hypothesis.SENSOR_BIAS, evidence, best.chi2, best.dof, best.onset, size=best.size, P=best.P)
+def _sensor_bias(window: _Window, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
+    """A constant offset of the pose in {A} from one of the scans on: of its range, its position, or all of it."""
+    half = priors.half_angle
+    scale = np.concatenate([np.repeat([priors.position_m, half], 3), [priors.position_m]])
+    M = np.zeros((n, 6, 7))
+    for k, (pose, R_ba) in enumerate(zip(window.poses, window.R_ba, strict=True)):
+        M[k, :3, :3], M[k, 3:, 3:6] = np.eye(3), R_ba
+        M[k, :3, 6] = pose.t / max(float(np.linalg.norm(pose.t)), 1e-300)
+    since = np.arange(n)[None, :] >= np.arange(1, n)[:, None]
+    columns = window.whiten @ (M * since[:, :, None, None]).reshape(n - 1, 6 * n, 7)
+    values = free + _mixed(columns, white, scale, _OFFSETS)
+    onset = int(np.argmax(values)) + 1
+    whitened = columns[onset - 1][:, :6]
+    _, u, P = _evidence(white, free, whitened, scale[:6])
+    left = white - whitened @ u
+    evidence = _log_mean(values.tolist()) + _PRIOR_ODDS
+    return Explanation(Hypothesis.SENSOR_BIAS, evidence, float(left @ left), 6 * n - 6, onset, size=u, P=P)
 
 
 def _bad_scans(window: _Window, priors: ChangePriors, first: int, n: int) -> Explanation:

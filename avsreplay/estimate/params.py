@@ -124,6 +124,13 @@ class EstimatorParams(Settings):
         "Reduce the weight of a healthy pose whose NIS exceeds the 99.99 % point; the paper's initialisation never"
         " does.",
     )
+    bias_s: float = setting(
+        20.0,
+        "A step of the measured pose is the end of a sensor error before the estimate has lasted for this time, and the"
+        " beginning of one later, if the residuals of the registration do not tell.",
+        unit="s",
+        low=0.0,
+    )
     start_pos_1s_m: float | None = setting(
         None, "1 sigma of the position of the initial pose.", unit="m", above=0.0, of_extent=0.05
     )

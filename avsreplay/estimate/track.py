@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -12,15 +12,24 @@ from avsreplay.estimate.noise import NoiseWindow
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import Belief, Drift, Innovation, Manoeuvre
 
+_FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
+_READY, _READY_AFTER_MANOEUVRE = 8, 3  # least number of poses of an estimate whose prediction can be tested
 _NO_NOISE = frozen(np.zeros((6, 6)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SensorBias:
-    """A constant offset (6,) of the measured poses, in {A}: position [m] and half angle; P (6, 6) its covariance."""
+    """An error of the sensor in effect.
+
+    Attributes:
+        offset: (6,) of the measured poses in {A} at its onset: position [m] and half angle.
+        P: (6, 6) its covariance.
+        last: the last scan with this error.
+    """
 
     offset: Array
     P: Array
+    last: Epoch
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,7 +59,9 @@ class Track:
         prior, prior_ns: Gaussian prior of the fit and its instant: the given start, or that after a manoeuvre.
         recent: the last accepted scans.  doubtful: the scans not yet decided on.  nis: of the last healthy scans.
         bias: an error of the sensor in effect, None where there is none.
-        manoeuvres: all that were found.
+        started_ns: instant of the first scan of this estimate.
+        previous: the estimate before the last new start, None where there was none.
+        manoeuvres: all that were found.  pending: the last of them is reported, and the motion after it not determined.
         drift: a constant torque or force on the target, None where none is found.  untested: healthy poses since the
             last test for one.
     """
@@ -72,7 +83,10 @@ class Track:
     doubtful: tuple[Epoch, ...] = ()
     nis: tuple[float, ...] = ()
     bias: SensorBias | None = None
+    started_ns: int = 0
+    previous: Track | None = None
     manoeuvres: tuple[Manoeuvre, ...] = ()
+    pending: bool = False
     drift: Drift | None = None
     untested: int = 0
 
@@ -95,3 +109,46 @@ class Prediction:
     window: NoiseWindow
     lag_s: float = 0.0
     blur: Array | None = None
+
+
+def confirmed(track: Track) -> tuple[Manoeuvre, ...]:
+    """The manoeuvres without one that is still pending."""
+    return track.manoeuvres[:-1] if track.pending else track.manoeuvres
+
+
+def with_history(then: Track, now: Track) -> Track:
+    """An earlier track, with the events that were found since; no scan is in doubt."""
+    return replace(
+        then,
+        manoeuvres=confirmed(now),
+        pending=False,
+        drift=then.drift or now.drift,
+        previous=now.previous,
+        doubtful=(),
+    )
+
+
+def nis_scale(track: Track) -> float:
+    """How many times larger than chi-square the NIS of the accepted scans is: their median over that of chi-square.
+
+    Registration errors beyond the claimed covariance enlarge the NIS of all scans, so that of a doubtful scan must be
+    large compared with that of the accepted scans. The median is taken over many scans: errors of the registration last
+    for the whole log, while a sensor error that grows over some tens of scans must not raise the gate that detects it.
+    """
+    if len(track.nis) < _FEWEST_NIS:
+        return 1.0
+    return max(1.0, float(np.median(track.nis)) / _MEDIAN_CHI2)
+
+
+def with_nis(after: Track, before: Track, nis: float) -> Track:
+    """The track with the NIS of one more accepted scan."""
+    return replace(after, nis=(*before.nis, nis)[-_MOST_NIS:])
+
+
+def ready(track: Track) -> bool:
+    """Return whether the estimate is based on enough poses for its prediction to be tested.
+
+    After a manoeuvre the prior keeps all but the velocities, so that few poses determine the motion.
+    """
+    least = _READY_AFTER_MANOEUVRE if track.manoeuvres else _READY
+    return track.mode == "filter" or (track.mode == "fit" and track.batch is not None and track.batch.count >= least)
