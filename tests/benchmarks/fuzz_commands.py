@@ -124,7 +124,7 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
     ("info", "measured poses"): ((("IN", "--poses"),), ("truth.tum", "truth.csv", "poses.mcap")),
 }
 WHOLE = ("run", "observability", "bench", "model")  # commands that replay scans are drawn less often
-CHEAP = 6
+CHEAP = 12
 WITHOUT_OPTION = {case for case in CASES if " " in case[1] or case[1] == "interrupted"}
 
 
@@ -287,11 +287,7 @@ def check(case: tuple[str, str], seeds: Path, place: Path, rng: np.random.Genera
     words, seed = lines[int(rng.integers(len(lines)))], choices[int(rng.integers(len(choices)))]
     damaged_input = prepare(seed, seeds, place, rng)
     before = {p for p in place.rglob("*")}
-    args = [damaged_input if w == "IN" else place / w if w.startswith("OUT") else w for w in words]
-    args = [seeds / a if isinstance(a, str) and (seeds / a).exists() else a for a in args]
-    feed = damaged_input.open("rb") if "-" in words else None
-    with cached(damaged_input) if seed == "cache" else contextlib.nullcontext():
-        outcome, err = _run(case[0], args, feed)
+    outcome, err = invoke(case[0], words, damaged_input, seeds, place, cache=seed == "cache")
     left = {p for p in place.rglob("*")} - before - {place / w for w in words if w.startswith("OUT")}
     left = {p for p in left if damaged_input not in p.parents}
     if left:
@@ -300,6 +296,30 @@ def check(case: tuple[str, str], seeds: Path, place: Path, rng: np.random.Genera
         if "Warning" in line or "Traceback" in line or "\x1b" in line:
             raise AssertionError(f"on the terminal: {line!r}")
     return outcome
+
+
+def invoke(
+    command: str, words: tuple[str, ...], given: Path, seeds: Path, place: Path, *, cache: bool
+) -> tuple[str, str]:
+    """Run a command on an input; its outcome and what it wrote to standard error."""
+    args = [given if w == "IN" else place / w if w.startswith("OUT") else w for w in words]
+    args = [seeds / a if isinstance(a, str) and (seeds / a).exists() else a for a in args]
+    feed = given.open("rb") if "-" in words else None
+    with cached(given) if cache else contextlib.nullcontext():
+        return _run(command, args, feed)
+
+
+def check_seeds(seeds: Path, cases: list[tuple[str, str]]) -> None:
+    """Run every command on its intact inputs, so that later failures are due to a mutation. Raises SystemExit."""
+    for case in cases:
+        lines, choices = CASES[case]
+        for words in lines:
+            with tempfile.TemporaryDirectory() as place:
+                copied = Path(place) / f"in-{Path(choices[0]).name}"
+                (shutil.copytree if (seeds / choices[0]).is_dir() else shutil.copyfile)(seeds / choices[0], copied)
+                code, err = invoke(case[0], words, copied, seeds, Path(place), cache=choices[0] == "cache")
+            if code not in ("exit 0", "exit 1"):
+                raise SystemExit(f"{case} {words}: {code} with an intact input: {err}")
 
 
 def _run(command: str, args: list[object], feed: BinaryIO | None) -> tuple[str, str]:
@@ -323,7 +343,7 @@ def _line(text: str) -> str:
     return text.encode("unicode_escape").decode() + "\n"
 
 
-def campaign(number: int, inputs: list[int], seeds: Path, cases: list[tuple[str, str]], batch: int = 200) -> Campaign:
+def campaign(number: int, inputs: list[int], seeds: Path, cases: list[tuple[str, str]], batch: int = 1000) -> Campaign:
     """Run the mutations of a campaign in batches."""
 
     weights = np.array([1.0 if name in WHOLE else CHEAP for name, _ in cases])
@@ -351,6 +371,7 @@ def main() -> int:
     inputs = [asked.only] if asked.only is not None else list(range(asked.first, asked.first + count))
     with tempfile.TemporaryDirectory() as folder:
         build(Path(folder))
+        check_seeds(Path(folder), cases)
         return report(asked.campaign, len(inputs), campaign(asked.campaign, inputs, Path(folder), cases))
 
 
