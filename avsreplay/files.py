@@ -8,7 +8,6 @@ written are refused by ``check_output`` before any work is done.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import itertools
 import os
 import re
@@ -18,7 +17,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
+from typing import IO, BinaryIO
 
 from avsreplay.errors import UnreadableInput, UsageError
 
@@ -27,7 +26,6 @@ _NAME_BYTES = 255
 _PART = re.compile(r"\..+\.\d+\.\d+\.part", re.DOTALL)
 _CLEANED: set[Path] = set()
 _COUNTER = itertools.count()
-_BLOCK = 1 << 20
 
 
 class BadFile(ValueError):
@@ -251,17 +249,50 @@ def _lock(part: Path, *, wait: bool = False) -> int | None:
         part: the file or folder.
         wait: whether to wait for a process that holds the lock.
     """
-    try:
-        import fcntl
-    except ModuleNotFoundError:  # Windows: an open file cannot be removed there
+    if os.name == "nt":  # an open file cannot be removed there
         return None
     handle = os.open(part, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        _flock(handle, wait)
     except OSError:
         os.close(handle)
         return None
     return handle
+
+
+def _flock(handle: int, wait: bool) -> None:
+    """Lock an open file; Windows has no such lock. Raises OSError if that is impossible."""
+    with contextlib.suppress(ModuleNotFoundError):
+        import fcntl
+
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+
+
+def open_alone(path: Path) -> BinaryIO:
+    """Open a file for writing, emptied, that no other process writes; the lock ends when the file is closed.
+
+    Args:
+        path: the file; it is created if it does not exist.
+
+    Raises:
+        UsageError: another process writes the file.
+        OSError: the file cannot be opened.
+    """
+    while True:
+        stream = path.open("ab")  # the content of another writer is not removed
+        try:
+            _flock(stream.fileno(), wait=False)
+        except BlockingIOError:
+            stream.close()
+            hint = "wait for it, or name another output"
+            raise UsageError("another process is writing it", where=str(path), hint=hint) from None
+        except OSError:
+            pass  # a file system that cannot lock files
+        if path.exists() and os.fstat(stream.fileno()).st_ino == path.stat().st_ino:
+            stream.seek(0)
+            stream.truncate()
+            return stream
+        stream.close()  # the other process renamed it between the two calls
 
 
 def _remove_stale(folder: Path) -> None:
@@ -285,15 +316,6 @@ def _remove(path: Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
         else:
             path.unlink(missing_ok=True)
-
-
-def sha256(path: Path) -> str:
-    """Return the SHA-256 of a file. Raises OSError if it cannot be read."""
-    digest = hashlib.sha256()
-    with path.open("rb") as stream:
-        while block := stream.read(_BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def read_limited(path: Path, limit: int, hint: str) -> bytes:

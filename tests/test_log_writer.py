@@ -265,3 +265,20 @@ def test_a_time_that_a_log_cannot_hold_is_one_line(tmp_path, t_ns):
     with pytest.raises(UnreadableInput, match="cannot be recorded"), LogWriter(tmp_path / "x.mcap", LogHeader()) as log:
         log.write(scan)
     assert not (tmp_path / "x.mcap").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="Windows has no such lock")
+@pytest.mark.parametrize("streaming", [False, True])
+def test_a_second_recorder_of_a_file_is_refused_and_the_first_one_completes(tmp_path, streaming):
+    path = tmp_path / "x.mcap"
+    with LogWriter(path, LogHeader(seed=1), overwrite=True, streaming=streaming) as log:
+        log.write(Scan(0, SECOND, np.zeros((1, 3), np.float32), log_ns=SECOND))
+        with pytest.raises(UsageError, match="another process is writing it"):
+            LogWriter(path, LogHeader(seed=2), overwrite=True, streaming=streaming)
+    with open_source(path) as source:
+        assert (source.header.seed, len(source), list(source.losses)) == (1, 1, [])
+    assert [p.name for p in tmp_path.iterdir()] == ["x.mcap"]
+    with LogWriter(path, LogHeader(seed=3), overwrite=True, streaming=streaming):
+        pass
+    with open_source(path, inspect=True) as source:
+        assert source.header.seed == 3

@@ -145,7 +145,7 @@ def log_file(log: Path, *, follow: bool = False) -> Iterator[tuple[Path, Growing
     if str(log) != "-":
         yield log, GrowingLog(log) if follow else None
         return
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # Windows: the file is still open
         path = Path(folder) / "stdin"
         try:
             yield path, GrowingLog(path, sys.stdin.buffer)

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any, BinaryIO, cast
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.files import STDOUT, check_output, is_stream
+from avsreplay.files import STDOUT, check_output, is_stream, open_alone
 from avsreplay.geometry import Pose
 from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.header import HEADER_RECORD, encode_header
@@ -193,10 +193,15 @@ class LogWriter:
             self._guarded(lambda: self._static(0))
         self._labels_until(None)
         self._guarded(self._finish)
-        if self._partial != self._path:
-            if self._path.exists() and not self._overwrite:
-                raise UsageError("appeared while recording", where=str(self._path), hint=f"see {self._partial}")
-            self._partial.replace(self._path)
+        try:
+            if self._partial != self._path:
+                if self._path.exists() and not self._overwrite:
+                    raise UsageError("appeared while recording", where=str(self._path), hint=f"see {self._partial}")
+                if os.name == "nt":  # Windows does not rename a file that is open
+                    self._stream.close()
+                self._partial.replace(self._path)  # before the lock ends
+        finally:
+            self._stream.close()
 
     def _create(self) -> BinaryIO:
         if not self._direct and self._partial.exists() and not self._overwrite:
@@ -204,7 +209,7 @@ class LogWriter:
         try:
             if self._pipe:
                 return cast(BinaryIO, _Pipe(os.fdopen(os.dup(1), "wb") if self._stdout else self._partial.open("wb")))
-            return self._partial.open("wb")
+            return open_alone(self._partial)
         except OSError as error:
             raise UnreadableInput(
                 f"cannot be written: {error.strerror}", where=str(self._path), hint="name another output"
@@ -293,7 +298,6 @@ class LogWriter:
         self.bytes = self._stream.tell()
         if not self._pipe:
             os.fsync(self._stream.fileno())
-        self._stream.close()
 
     def _guarded(self, action: Callable[[], None]) -> None:
         try:

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.files import read_limited, sha256
+from avsreplay.files import read_limited
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.export import StampedPose
@@ -111,6 +112,15 @@ def write_manifest(folder: Path, record: Mapping[str, Any], rows: int) -> None:
     files = {path.name: {"bytes": path.stat().st_size, "sha256": sha256(path)} for path in sorted(folder.iterdir())}
     text = json.dumps({**record, "rows": rows, "files": files}, indent=1, allow_nan=False)
     (folder / "run.json").write_text(text + "\n", encoding="utf-8")
+
+
+def sha256(path: Path) -> str:
+    """Return the SHA-256 of a file. Raises OSError if it cannot be read."""
+    digest = hashlib.sha256()
+    with path.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def load_result(path: str | Path) -> Result:
