@@ -8,7 +8,7 @@ def main() -> None:
     arithmetic.pin()  # before anything imports numpy
     from avsreplay import cli
 
-    cli.execute()
+    cli.entry_point()
 
 
 if __name__ == "__main__":

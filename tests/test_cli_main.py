@@ -52,7 +52,7 @@ def test_an_unexpected_error_is_one_line_and_a_report(
     monkeypatch.setattr(cli.group, "main", broken)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with pytest.raises(SystemExit) as left:
-        cli.execute()
+        cli.entry_point()
     assert left.value.code == 70
     err = capsys.readouterr().err
     assert len(err.strip().splitlines()) == 1
@@ -72,7 +72,7 @@ def test_no_error_exits_with_the_code_of_a_failed_check(
     monkeypatch.setattr(cli.group, "main", broken)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     with pytest.raises(SystemExit) as left:
-        cli.execute()
+        cli.entry_point()
     assert left.value.code in (3, 70)
 
 

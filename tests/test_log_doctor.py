@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer as McapWriter
 from rosbags.highlevel import AnyReader
 
-from avsreplay.cli import execute
+from avsreplay.cli import entry_point
 from avsreplay.log import open_source
 from avsreplay.log.cdr import point_cloud2, schema_text
 from avsreplay.log.doctor import Severity, examine, repair
@@ -32,7 +32,7 @@ def run(*args: object) -> subprocess.CompletedProcess[str]:
     sys.argv = ["avsreplay", *map(str, args)]
     try:
         with redirect_stdout(out), redirect_stderr(err), pytest.raises(SystemExit) as ended:
-            execute()
+            entry_point()
     finally:
         sys.argv = before
     return subprocess.CompletedProcess(sys.argv, int(ended.value.code or 0), out.getvalue(), err.getvalue())

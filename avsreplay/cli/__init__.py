@@ -23,7 +23,7 @@ import click
 from avsreplay import arithmetic
 from avsreplay.errors import AvsError, UsageError
 
-__all__ = ["execute"]
+__all__ = ["entry_point"]
 
 SUMMARIES = {
     "record": "Write a log: simulate a scenario, or convert recorded scans.",
@@ -147,7 +147,7 @@ class StdoutClosed(BaseException):
     """The reader of standard output closed it; not an OSError, which click and rich turn into exit code 1."""
 
 
-def execute() -> None:
+def entry_point() -> None:
     """Run a command of the arguments of this process and exit with its code; every error is one line on stderr."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal

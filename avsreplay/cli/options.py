@@ -139,6 +139,9 @@ def log_file(log: Path, *, follow: bool = False) -> Iterator[tuple[Path, Growing
     Args:
         log: the log; "-" is standard input, which is copied to a temporary file while it is read.
         follow: whether the log is a file that is still written.
+
+    Raises:
+        AvsError: the log cannot be followed, or what reads it fails.
     """
     from avsreplay.log import GrowingLog
 
