@@ -273,7 +273,8 @@ class Registrar:
             reason = self._test.check(few, final.T_ac.inverse()).reason if final.measured else ""
             if final.measured and not reason:
                 return final
-            if before is None and budget.allows(self._global.work(len(scan), 0)):
+            overlap = first.status is not AlignStatus.NO_OVERLAP  # without, the scan may show something else
+            if before is None and overlap and budget.allows(self._global.work(len(scan), 0)):
                 found = self._acquire(scan, budget, carried, rounds=1)
                 if found.status is AlignStatus.ALIGNED:
                     return found
