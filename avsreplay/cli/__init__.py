@@ -29,6 +29,7 @@ SUMMARIES = {
     "record": "Write a log: simulate a scenario, or convert recorded scans.",
     "run": "Replay a log, print tables, compare with a golden file.",
     "model": "Build a model of an unknown target from the scans of a log.",
+    "odometry": "Track an unknown target through the scans of a log, without a model.",
     "info": "Show the content of a log.",
     "doctor": "Check a log for damage and repair it.",
     "backends": "List the registration back ends; run the contract tests on one.",

@@ -18,7 +18,11 @@ if TYPE_CHECKING:
 EPILOG = """\b
 Examples:
   avsreplay backends
-  avsreplay backends --check horn"""
+  avsreplay backends --check horn
+
+\b
+"On other processors": the same bytes on every x86-64 Linux machine with the same libraries, or how far a pose can
+differ: libraries that stop by their own rules may take another number of iterations. See docs/ci.md."""
 
 
 @click.command("backends", epilog=EPILOG)
@@ -41,12 +45,12 @@ def _list(as_json: bool) -> None:
     if as_json:
         _print_json([dataclasses.asdict(state) for state in states])
     else:
-        heads = ("name", "installed", "version", "description", "how to install")
+        heads = ("name", "installed", "version", "description", "on other processors", "how to install")
         _print_table("Registration back ends", heads, map(_state_row, states))
 
 
 def _state_row(state: Availability) -> tuple[str, ...]:
-    return state.name, "yes" if state.installed else "no", state.version, state.about, state.get
+    return state.name, "yes" if state.installed else "no", state.version, state.about, state.elsewhere, state.get
 
 
 def _check(name: str, as_json: bool) -> None:

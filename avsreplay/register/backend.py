@@ -74,6 +74,7 @@ class Availability:
         version: version of the library that it uses, "" if none.
         about: what it does, in one line.
         get: how to install it, "" if it is installed.
+        elsewhere: how far its results on another processor can differ.
     """
 
     name: str
@@ -81,6 +82,7 @@ class Availability:
     version: str
     about: str
     get: str
+    elsewhere: str = ""
 
 
 def names() -> tuple[str, ...]:
@@ -128,12 +130,20 @@ def _state(name: str) -> Availability:
 
 
 def _availability(name: str, factory: Any) -> Availability:
-    """Read the class attributes ``requires`` (module, distribution), ``about`` and ``get``; each is optional."""
+    """Read the optional class attributes ``requires`` (module, distribution), ``about``, ``get`` and ``same_bytes``."""
     requires: tuple[tuple[str, str], ...] = getattr(factory, "requires", ())
     missing = [module for module, _ in requires if importlib.util.find_spec(module) is None]
     version = "" if missing or not requires else _version(requires[0][1])
     get = str(getattr(factory, "get", "install the package that provides it")) if missing else ""
-    return Availability(name, not missing, version, str(getattr(factory, "about", "")), get)
+    return Availability(name, not missing, version, str(getattr(factory, "about", "")), get, _elsewhere(factory))
+
+
+def _elsewhere(factory: Any) -> str:
+    """Attribute ``same_bytes``, or the stated accuracy: a back end that stops by its own rule can end anywhere in it."""
+    if getattr(factory, "same_bytes", False):
+        return "same bytes"
+    degrees, share = getattr(factory, "accuracy", (None, None))
+    return "unknown" if degrees is None else f"within {degrees:g} deg, {share:g} of the extent"
 
 
 def _version(distribution: str) -> str:

@@ -26,6 +26,7 @@ class HornBackend:
 
     name: ClassVar[str] = "horn"
     accuracy: ClassVar[tuple[float, float]] = (0.001, 1e-05)
+    same_bytes: ClassVar[bool] = True  # on every x86-64 processor
     about: ClassVar[str] = (
         "point-to-plane start, then Newton steps to the fixed point of Horn's quaternion ICP on the mesh itself, C++"
     )

@@ -35,8 +35,8 @@ RECENTRE_VOXELS = 50.0
 class KissBackend:
     """Three maps, coarse to fine, with voxels of ``reach_m``, of ``gate_m`` and of their geometric mean in between.
 
-    The coarse maps are used with points thinned by the library's rule; the middle one is left out where the library's
-    adaptive threshold, after the first, is small enough for the finest. Deskewing is the pipeline's, by the predicted
+    The coarse maps are used with points thinned by the library's rule, the middle one with the library's adaptive
+    threshold, which follows the error of the guess. Deskewing is the pipeline's, by the predicted
     motion. The library does not return its iteration count, so ``Fit.iterations`` counts its calls. ``converged``
     means that one more call, started from the last result, moved the outermost points of the model by less than 0.01
     ``gate_m``.
@@ -65,20 +65,21 @@ class KissBackend:
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         scan = np.ascontiguousarray(points, dtype=np.float64)
-        T_ca, calls = guess, 0
-        for (voxel, voxel_map), (finer, _) in zip(self._maps[:-1], self._maps[1:], strict=True):
-            if calls and 3.0 * self._threshold(guess, T_ca) < finer:
-                break
-            some = T_ca.inverse().apply(
-                thinned(T_ca.apply(scan), voxel)
-            )  # voxels of {C}: a moved camera changes nothing
-            T_ca, calls = self._run(some, voxel, voxel_map, T_ca), calls + 1
-        T_ca = self._run(scan, *self._maps[-1], T_ca)
-        again = self._run(scan, *self._maps[-1], T_ca)
-        return Fit(again, calls + 2, self._settled(T_ca, again))
+        (reach, coarse), (voxel, middle), (gate, fine) = self._maps
+        T_ca = self._run(_thinned_at(scan, guess, reach), coarse, guess, reach)
+        sigma = self.threshold(guess, T_ca)
+        T_ca = self._run(_thinned_at(scan, T_ca, voxel), middle, T_ca, 3.0 * sigma)
+        T_ca = self._run(scan, fine, T_ca, gate)
+        again = self._run(scan, fine, T_ca, gate)
+        return Fit(again, len(self._maps) + 1, self._settled(T_ca, again))
 
-    def _threshold(self, guess: Pose, found: Pose) -> float:
-        """The library's adaptive threshold after the first stage, which measured the error of the guess."""
+    def threshold(self, guess: Pose, found: Pose) -> float:
+        """Return the library's adaptive threshold [m] after the first stage, which measured the error of the guess.
+
+        Args:
+            guess: initial T_ca.
+            found: T_ca after the first stage.
+        """
         from kiss_icp.config.parser import KISSConfig
         from kiss_icp.threshold import AdaptiveThreshold
 
@@ -91,10 +92,10 @@ class KissBackend:
         rule.update_model_deviation((guess.inverse() @ found).matrix)
         return float(rule.get_threshold())
 
-    def _run(self, scan: NDArray[np.float64], voxel: float, voxel_map: Any, T_ca: Pose) -> Pose:
+    def _run(self, scan: Array, voxel_map: Any, T_ca: Pose, reach_m: float) -> Pose:
         # Pose re-orthonormalises: the matrix of a unit quaternion is a rotation to 1e-16.
-        T = self._registration.align_points_to_map(scan, voxel_map, T_ca.matrix, voxel, (voxel / 3.0) ** 2)
-        return Pose.from_matrix(T)
+        kernel = (reach_m / 3.0) ** 2
+        return Pose.from_matrix(self._registration.align_points_to_map(scan, voxel_map, T_ca.matrix, reach_m, kernel))
 
     def _settled(self, before: Pose, after: Pose) -> bool:
         step = after @ before.inverse()  # in {C}, where a rotation of the target does not appear as a translation
@@ -108,8 +109,9 @@ class KissOdometry:
 
     Adaptive threshold, constant velocity, deskewing and the thinning by voxels are the library's. Lengths are given to
     it in voxels, so that its defaults (voxel 1, threshold 2, least motion 0.1, range 100) hold for a target of any
-    size: the voxel is a hundredth of the extent. {C} is parallel to {A} of the first scan, its origin at the centroid
-    of that scan. What does not move with the target must be cropped before.
+    size: the voxel is a hundredth of the extent. The first motion is that of the centroid, where the library would
+    begin at rest. {C} is parallel to {A} of the first scan, its origin at the centroid of that scan. What does not move
+    with the target must be cropped before.
     """
 
     def __init__(self, extent_m: float, deskew: bool = True) -> None:
@@ -121,9 +123,9 @@ class KissOdometry:
         """
         self._voxel_m, self._deskew = extent_m / VOXELS, deskew
         self._odometry: Any = None
-        self._centre = np.zeros(3)
+        self._centre, self._first, self._count = np.zeros(3), np.zeros(3), 0
 
-    def add(self, points: NDArray[Any], times_s: NDArray[Any] | None = None) -> Pose:
+    def add(self, points: NDArray[Any], times_s: NDArray[Any] | None = None) -> tuple[Pose, float]:
         """Register the next scan.
 
         Args:
@@ -131,16 +133,20 @@ class KissOdometry:
             times_s: (n,) instants of the points [s], or None.
 
         Returns:
-            T_ac at the instant of the last point if the scan was deskewed, otherwise of the whole scan.
+            T_ac and its instant [s]: that of the last point if the scan was deskewed, otherwise 0.
         """
         scan = np.ascontiguousarray(points, dtype=np.float64)
-        self._recentre(scan.mean(axis=0))
+        middle = scan.mean(axis=0)
+        self._recentre(middle)
+        if self._count == 1:
+            self._odometry.last_delta[:3, 3] = (self._first - middle) / self._voxel_m
+        self._count += 1
         timed = times_s is not None and self._deskew and float(np.ptp(times_s)) > 0.0
         instants = np.asarray(times_s, dtype=np.float64) if timed else np.empty(0)
         self._odometry.register_frame((scan - self._centre) / self._voxel_m, instants)
         pose = Pose.from_matrix(self._odometry.last_pose)
         T_ca = Pose(pose.q, self._voxel_m * pose.t - pose.R @ self._centre)
-        return T_ca.inverse()
+        return T_ca.inverse(), float(instants.max()) if timed else 0.0
 
     def _recentre(self, middle: Array) -> None:
         """Keep the origin of what the library sees near the target, where its range has its usual meaning."""
@@ -152,6 +158,7 @@ class KissOdometry:
             config.data.max_range, config.mapping.voxel_size = VOXELS, 1.0
             config.data.deskew, config.registration.max_num_threads = self._deskew, 1
             self._odometry, self._centre = KissICP(config), middle
+            self._first = middle
         shift = np.eye(4)
         shift[:3, 3] = (middle - self._centre) / self._voxel_m
         if float(np.linalg.norm(shift[:3, 3])) > RECENTRE_VOXELS:
@@ -159,6 +166,11 @@ class KissOdometry:
             self._odometry.last_pose = self._odometry.last_pose @ shift
             self._odometry.last_delta = back @ self._odometry.last_delta @ shift
             self._centre = middle
+
+
+def _thinned_at(scan: Array, T_ca: Pose, voxel_m: float) -> Array:
+    """The points thinned by voxels of {C}, where moving the camera together with the guess changes nothing."""
+    return T_ca.inverse().apply(thinned(T_ca.apply(scan), voxel_m))
 
 
 def thinned(points: Array, voxel_m: float) -> Array:

@@ -33,6 +33,7 @@ class PoseBackend:
     """The entry of ``poses`` in the list of back ends; it cannot align clouds."""
 
     name = POSES
+    same_bytes = True
     about = "no registration: the log holds measured poses of a tracker (pose topic, TUM, CSV)"
 
     def __init__(self, target: Target) -> None:
