@@ -139,7 +139,7 @@ def _availability(name: str, factory: Any) -> Availability:
 
 
 def _elsewhere(factory: Any) -> str:
-    """Attribute ``same_bytes``, or the stated accuracy: a back end that stops by its own rule can end anywhere in it."""
+    """Attribute ``same_bytes``, or the stated accuracy: one that stops by its own rule can end anywhere in it."""
     if getattr(factory, "same_bytes", False):
         return "same bytes"
     degrees, share = getattr(factory, "accuracy", (None, None))
