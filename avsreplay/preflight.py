@@ -40,6 +40,7 @@ _UNITS = {
 }
 _POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "TransformStamped")
 _SAMPLED = 3000  # points of a scan that are grouped
+_SEARCHED = 20_000  # points of a scan in which the model is searched
 _LARGEST_SCENE = 300.0  # largest scan over the target in it, where the unit of the model is unknown
 _GAPS = 0.2, 0.3  # within and around a target of unknown unit, over its diameter
 _MARGIN = 0.25  # of the model's diameter around the target in a suggested crop
@@ -82,7 +83,7 @@ def preflight(source: Source, surface: Surface | None, registrar: Registrar | No
     if source.options.poses:
         return [*_poses(source, surface), *_transforms(info, source), *_truth(info), *_clock(info)]
     clouds = _sampled_clouds(source)
-    found = [*_sizes(clouds, surface), *_transforms(info, source), *_truth(info), *_clock(info)]
+    found = [*_sizes(clouds, surface, registrar), *_transforms(info, source), *_truth(info), *_clock(info)]
     share = None if registrar is None else _share_on_model(source, registrar)
     if share is not None:
         text = f"{100 * share:.0f} % of the points of the first scan are on the model at the first pose"
@@ -152,7 +153,7 @@ def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
     return float(np.linalg.norm(points - second, axis=1).max())
 
 
-def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None) -> list[Advice]:
+def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None, registrar: Registrar | None) -> list[Advice]:
     if not clouds:
         return [Advice("check", "scans", "the examined scans hold no points")]
     scan_m = float(np.median([diameter(cloud) for cloud in clouds]))
@@ -164,10 +165,12 @@ def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None) -> list[Advi
     said = f"the scans measure {scan_m:.3g} m, the model {model_m:.3g} m"
     if _LEAST <= ratio <= _WHOLE:
         return [Advice("ok", "size", said)]
+    if ratio > _MOST and _unit(ratio) is None and (crop := _crop_of_located(clouds, surface, registrar)):
+        return [crop]
     targets = [_target(cloud, model_m) for cloud in clouds] if ratio > _MOST else []
     inside = [points for points in targets if points is not None]
     grouped = len(inside) * 2 > len(clouds)
-    if grouped and (crop := _crop_advice(clouds, inside, model_m)):
+    if grouped and (crop := _crop_advice(clouds, inside, _of_size(model_m))):
         return [crop]
     if grouped or _WHOLE < ratio <= _MOST:
         text = f"{said}: the model is too small (then --model-scale {ratio:.2f} or more), or background is left"
@@ -204,7 +207,7 @@ def _unit_and_background(clouds: Sequence[NDArray[Any]], model_m: float, ratio: 
         groups = [one for one, two in found if one is not None and two is not None and len(two) < 1.2 * len(one)]
         if len(groups) * 2 > len(clouds):
             unit = Advice("fail", "unit", f"{said}: the model seems to be in {name}", f"--model-scale {scale:g}")
-            crop = _crop_advice(clouds, groups, size)
+            crop = _crop_advice(clouds, groups, _of_size(size))
             return [unit, crop] if crop else [unit]
     return []
 
@@ -225,9 +228,31 @@ def _target(cloud: NDArray[Any], model_m: float, gap: float = 0.1) -> Array | No
     return max(fitting, key=len, default=None)
 
 
-def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], model_m: float) -> Advice | None:
+def _of_size(model_m: float) -> str:
+    return f"a group of points has the size of the model ({model_m:.3g} m)"
+
+
+def _crop_of_located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Registrar | None) -> Advice | None:
+    """The crop around the model where a search finds it; None if it is found in less than half of the scans.
+
+    The search looks at the connected parts of the scan with the size of the model, and tests every pose: size alone
+    does not tell the target from other objects.
+    """
+    from avsreplay.register import Registrar
+
+    registrar, found = registrar or Registrar(surface), []
+    for k, cloud in enumerate(clouds):
+        pose = registrar.acquire(cloud[:: max(len(cloud) // _SEARCHED, 1)])
+        if pose.measured:
+            found.append(pose.T_ac.apply(surface.vertices))
+        if 2 * (k + 1 - len(found)) > len(clouds):
+            return None
+    return _crop_advice(clouds, found, f"the model was found in {len(found)} of {len(clouds)} examined scans")
+
+
+def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], why: str) -> Advice | None:
     """The crop that keeps the target in all examined scans; None if hardly any point lies outside it."""
-    margin = _MARGIN * model_m
+    margin = _MARGIN * max(diameter(points, trimmed=False) for points in targets)
     ranges = [np.linalg.norm(points, axis=1) for points in targets]
     low, high = max(min(r.min() for r in ranges) - margin, 0.0), max(r.max() for r in ranges) + margin
     everything = np.concatenate([np.asarray(cloud, dtype=np.float64) for cloud in clouds])
@@ -242,8 +267,7 @@ def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], model
     share = 1.0 - (by_range if use_range else by_box).mean()
     if share < _FEW:
         return None
-    said = f"a group of points has the size of the model ({model_m:.3g} m)"
-    text = f"{100 * share:.0f} % of the points are background; {said}"
+    text = f"{100 * share:.0f} % of the points are background; {why}"
     return Advice("check", "background", text, option)
 
 

@@ -155,15 +155,19 @@ def test_raw_packets_are_named_and_a_road_scene_fits_no_spacecraft(shared_data, 
     assert [r["gamma"] for r in document["rows"]] == [0] * 5
 
 
-def test_a_carton_in_a_depth_scene_is_found_within_a_crop(shared_data, tmp_path, cli):
+def test_a_carton_in_a_depth_scene_is_found_with_the_crop_that_info_proposes(shared_data, tmp_path, cli):
     """No ground truth: the reference is the best of 641 starts of a trimmed ICP by others, see the data's README."""
+    import json
+
     from avsreplay import geometry
     from avsreplay.log import read_surface
 
     source = shared_data / "kinect-milk-scene"
     (tmp_path / "scene.pcd").write_bytes((source / "milk_cartoon_all_small_clorox.pcd").read_bytes())
-    crop = "--crop-box=-0.16,-0.01,-0.91,0.03,0.25,-0.69"
-    done = cli("run", tmp_path, "--model", source / "milk.pcd", "--cloud-model", crop, "--json")
+    model = ("--model", source / "milk.pcd", "--cloud-model", "--json")
+    checks = json.loads(cli("info", tmp_path, *model).out)["checks"]
+    crop = next(check["option"] for check in checks if check["about"] == "background").split()
+    done = cli("run", tmp_path, *model, *crop)
     row = rows_of(done)[0]
     q = np.array([row[f"reg_q{name}"] for name in "xyzw"])
     t = np.array([row[f"reg_{name}_m"] for name in "xyz"])
