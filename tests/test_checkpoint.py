@@ -94,7 +94,7 @@ def test_objects_of_the_run_are_named_and_not_stored(tmp_path):
 
 @pytest.mark.parametrize(
     ("module", "name"),
-    [("os", "unlink"), ("avsreplay.files", "sha256"), ("avsreplay.log.writer", "os.unlink"), ("builtins", "eval")],
+    [("os", "unlink"), ("avsreplay.files", "is_stream"), ("avsreplay.log.writer", "os.unlink"), ("builtins", "eval")],
 )
 def test_a_checkpoint_from_elsewhere_runs_no_code(tmp_path, module, name):
     path, victim = tmp_path / "c", tmp_path / "victim"
