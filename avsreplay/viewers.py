@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import json
+import os
+import socket
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avsreplay import geometry
-from avsreplay.errors import MissingBackend
+from avsreplay import __version__, geometry
+from avsreplay.errors import MissingBackend, UsageError
 from avsreplay.estimate.measurement import measurement_jacobian
+from avsreplay.files import check_output
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.result_log import ResultFrame, ResultLog
 from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan.guidance import Segment
-from avsreplay.records import Belief, Surface
+from avsreplay.records import Belief
 from avsreplay.report.export import row_poses
 from avsreplay.rows import Row, columns
 from avsreplay.run import ReplayedScan, Run
@@ -25,7 +29,8 @@ PATH_POINTS = 41
 RESIDUAL_REACH = 0.05  # of the model's extent: larger residuals in the viewer log are cut to this
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 _COLUMNS = tuple(column.name for column in columns())
-_STREAMED_COLUMNS = ("pos_err_m", "rot_err_deg", "rms_m", "nis", "sigma1", "sigma2", "t_go_s", "gamma")
+CONE_EDGES = 24
+RERUN_PORT = 9876  # on which a Rerun viewer listens
 
 
 def message_covariance(belief: Belief) -> Array:
@@ -63,8 +68,8 @@ class ResultLogWriter:
     def __init__(self, path: Path, run: Run) -> None:
         settings = dump(run.config)
         del settings["register"]["threads"]  # the file is the same for any number of threads
-        configuration = json.dumps(settings, sort_keys=True)
-        self._log, self.paths = ResultLog(path, run.surface, configuration), NewPaths()
+        facts = {"configuration": json.dumps(settings, sort_keys=True), "version": __version__}
+        self._log, self.paths = ResultLog(path, run.surface, facts, approach_cones(run)), NewPaths()
         self._registrar, self._reach_m = run.registrar, RESIDUAL_REACH * run.surface.extent
 
     def resume(self, written: Path, paths: NewPaths, last: Row) -> None:
@@ -93,6 +98,7 @@ class ResultLogWriter:
                 message=row.reason,
                 values=values,
                 residuals=self._registrar.distance(outcome.scan.points, outcome.pose, self._reach_m),
+                intensities=outcome.scan.intensities,
                 columns=_numbers(row),
             )
         )
@@ -104,28 +110,57 @@ def _numbers(row: Row) -> dict[str, float]:
     return {name: float(value) for name, value in found if isinstance(value, (int, float))}
 
 
-class RerunStream:
-    """A listener that sends model, cloud, poses and scalars to a Rerun viewer (extra ``rerun``)."""
+def approach_cones(run: Run) -> Array | None:
+    """Return the ends (m, 3) of line pieces in {C} [m] that outline the cones of the approach; None without a cone.
 
-    def __init__(self, surface: Surface, file: Path | None = None) -> None:
-        """Start the viewer or open the file, and send the model.
+    Args:
+        run: its configuration gives angles, lengths and the axis of the fixture.
+    """
+    extent = run.surface.extent
+    limits = run.config.robot.limited(run.config.limits).resolved(extent)
+    axis = np.asarray(run.config.fixture_axis_c, dtype=np.float64)
+    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    across /= np.linalg.norm(across)
+    turn = np.linspace(0.0, 2.0 * np.pi, CONE_EDGES + 1)[:, None]
+    circle = np.cos(turn) * across + np.sin(turn) * np.cross(axis, across)
+    pieces = []
+    for degrees, length in ((limits.cone_deg, limits.cone_range_m), (limits.final_deg, limits.final_range_m)):
+        if degrees is not None and length is not None:
+            half = np.radians(degrees)
+            rim = length * (np.cos(half) * axis + np.sin(half) * circle)
+            pieces += [np.stack([np.zeros_like(rim), rim], axis=1), np.stack([rim[:-1], rim[1:]], axis=1)]
+    return np.concatenate(pieces).reshape(-1, 3) if pieces else None
+
+
+class RerunStream:
+    """A listener that shows a run in a Rerun viewer, or writes it to a file for one (extra ``rerun``)."""
+
+    def __init__(self, run: Run, target: str) -> None:
+        """Open the viewer or the file, and send what does not change.
 
         Args:
-            surface: model of the target.
-            file: .rrd file to write instead of opening a viewer.
+            run: the run that is shown.
+            target: "view" starts a viewer, "connect" uses one that runs on this computer; else an .rrd file to write.
 
         Raises:
             MissingBackend: rerun-sdk is not installed.
+            UsageError: there is no display, no viewer to connect to, or the file has another suffix.
         """
+        _check_target(target)
         try:
             import rerun
         except ModuleNotFoundError:
-            hint = "install avsreplay[rerun]"
+            hint = "install it with: pip install 'avsreplay[rerun]'"
             raise MissingBackend("rerun-sdk is not installed", where="--rerun", hint=hint) from None
         self._rr: Any = rerun
-        rerun.init("avsreplay", spawn=file is None)
-        if file is not None:
-            rerun.save(str(file))
+        self._registrar, self._reach_m = run.registrar, RESIDUAL_REACH * run.surface.extent
+        self._paths = NewPaths()
+        rerun.init("avsreplay", spawn=target == "view")
+        if target == "connect":
+            rerun.connect_grpc()
+        elif target != "view":
+            rerun.save(target)
+        surface = run.surface
         model = (
             rerun.Mesh3D(vertex_positions=surface.vertices, triangle_indices=surface.faces)
             if len(surface.faces)
@@ -133,19 +168,26 @@ class RerunStream:
         )
         for name in ("estimate", "truth"):
             rerun.log(f"camera/{name}/model", model, static=True)
+        cones = approach_cones(run)
+        if cones is not None:
+            rerun.log("camera/estimate/cone", rerun.LineStrips3D(cones.reshape(-1, 2, 3)), static=True)
 
     def __call__(self, scan: ReplayedScan) -> None:
         """Take one scan of a run."""
-        rr, row = self._rr, scan.row
+        rr, row, outcome = self._rr, scan.row, scan.outcome
         rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
-        rr.log("camera/scan", rr.Points3D(np.array(scan.outcome.scan.points, np.float32, order="C")))
-        self._place("camera/estimate", scan.outcome.pose)
+        points = np.array(outcome.scan.points, np.float32, order="C")
+        residuals = self._registrar.distance(outcome.scan.points, outcome.pose, self._reach_m)
+        rr.log("camera/scan", rr.Points3D(points, colors=_colours(residuals / self._reach_m)))
+        self._place("camera/estimate", outcome.pose)
         if scan.truth.pose is not None:
             self._place("camera/truth", scan.truth.pose)
-        for name in _STREAMED_COLUMNS:
-            value = getattr(row, name)
-            if value is not None:
-                rr.log(f"rows/{name}", rr.Scalars(float(value)))
+        self._ellipsoid(outcome.belief, outcome.pose)
+        path = self._paths.of(scan.state)
+        if path is not None:
+            rr.log("camera/plan", rr.LineStrips3D([path[1]]))
+        for name, value in _numbers(row).items():
+            rr.log(f"rows/{name}", rr.Scalars(value))
         if row.gamma == 0:
             rr.log("rows/reason", rr.TextLog(row.reason))
 
@@ -155,3 +197,36 @@ class RerunStream:
 
     def _place(self, path: str, pose: Pose) -> None:
         self._rr.log(path, self._rr.Transform3D(translation=pose.t, quaternion=pose.q))
+
+    def _ellipsoid(self, belief: Belief, pose: Pose) -> None:
+        """The 3 sigma ellipsoid of the position of {C}."""
+        variances, axes = np.linalg.eigh(message_covariance(belief)[:3, :3])
+        axes[:, 0] *= np.linalg.det(axes)  # a rotation
+        sizes = 3.0 * np.sqrt(np.maximum(variances, 0.0))
+        q = geometry.quaternion(axes)
+        shape = self._rr.Ellipsoids3D(half_sizes=[sizes], centers=[pose.t], quaternions=[q])
+        self._rr.log("camera/position_3_sigma", shape)
+
+
+def _colours(share: Array) -> Array:
+    """Colours (n, 3) from blue (on the model) to yellow (far from it); ``share`` (n,) is 0 to 1."""
+    near, far = np.array([0.0, 114.0, 178.0]), np.array([240.0, 228.0, 66.0])
+    return np.asarray(near + np.clip(np.nan_to_num(share, nan=1.0), 0.0, 1.0)[:, None] * (far - near), np.uint8)
+
+
+def _check_target(target: str) -> None:
+    """Raise UsageError where nothing can be shown."""
+    if target == "view":
+        if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+            hint = "write a file with --rerun FILE.rrd, or start 'rerun' and use --rerun connect"
+            raise UsageError("there is no display", where="--rerun view", hint=hint)
+    elif target == "connect":
+        try:
+            socket.create_connection(("127.0.0.1", RERUN_PORT), 1.0).close()
+        except OSError:
+            what = f"no viewer listens on port {RERUN_PORT} of this computer"
+            raise UsageError(what, where="--rerun connect", hint="start one with the command 'rerun'") from None
+    elif not target.endswith(".rrd"):
+        raise UsageError("neither view, connect nor a file .rrd", where=f"--rerun {target}", hint="name a file .rrd")
+    else:
+        check_output(Path(target))

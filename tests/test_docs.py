@@ -31,6 +31,7 @@ QUICK = {"docs/index.md"}
 SHORT = {"AVSREPLAY_RECORD_DURATION_S": "12", "AVSREPLAY_SWEEP_LIMIT": "2"}  # of what a page simulates itself
 ELSEWHERE = {  # command of a block that needs more than a folder: the test that runs such a command
     "avsreplay run long.mcap": "test_checkpoint.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption",
+    "avsreplay run tumble.mcap --rerun": "test_run.py::test_a_run_is_written_for_rerun",
     "avsreplay sweep docs/campaigns/blackouts.toml -o": "test_sweep_run.py::test_a_worker_killed_in_the_middle",
     "avsreplay sweep docs/campaigns/blackouts.toml --run": "test_sweep_run.py::test_the_worst_run_is_made_again",
     "avsreplay sweep docs/campaigns/faults.toml": "test_sweep_fault_kinds.py::test_",

@@ -1,6 +1,7 @@
 """``avsreplay run`` as a user has it: tables, JSON, result directory, precedence of settings."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -146,16 +147,79 @@ def test_the_covariance_in_the_result_log_is_that_of_the_rows(result):
         assert np.degrees(np.sqrt(np.trace(covariance[3:, 3:]))) == pytest.approx(row["rot_1s_deg"], rel=1e-9)
 
 
-def test_a_run_streams_to_rerun(fixtures_folder, tmp_path):
+def test_a_run_is_written_for_rerun(fixtures_folder, tmp_path):
     pytest.importorskip("rerun", reason="the extra 'rerun' is not installed")
     from avsreplay.run import Job, Run
     from avsreplay.viewers import RerunStream
 
     with Run(Job(source=fixtures_folder / "tumble.mcap")) as run:
-        stream = RerunStream(run.surface, tmp_path / "x.rrd")
+        stream = RerunStream(run, str(tmp_path / "x.rrd"))
         rows = list(run.rows([stream]))
         stream.close()
-    assert (tmp_path / "x.rrd").stat().st_size > 100 * len(rows)
+    written = (tmp_path / "x.rrd").read_bytes()
+    assert len(written) > 100 * len(rows)
+    for name in (b"camera/estimate/model", b"camera/position_3_sigma", b"camera/plan", b"rows/nis", b"rows/reason"):
+        assert name in written
+
+
+@pytest.mark.parametrize(
+    ("target", "says"),
+    [
+        ("view", "there is no display; write a file with --rerun FILE.rrd"),
+        ("connect", "no viewer listens on port"),
+        ("x.txt", "name a file .rrd"),
+        ("x.rrd", "pip install 'avsreplay[rerun]'"),
+    ],
+)
+def test_what_rerun_needs_is_said_in_one_line(target, says, fixtures_folder, monkeypatch, tmp_path):
+    from avsreplay import viewers
+    from avsreplay.errors import UsageError
+    from avsreplay.run import Job, Run
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(viewers.sys, "platform", "linux")
+    monkeypatch.setattr(viewers, "RERUN_PORT", 1)  # nothing listens there
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with Run(Job(source=fixtures_folder / "tumble.mcap")) as run, pytest.raises(UsageError) as caught:
+        viewers.RerunStream(run, target)
+    assert says in str(caught.value)
+
+
+def test_the_viewers_own_decoder_reads_every_message(result):
+    decoder = pytest.importorskip("mcap_ros2.decoder", reason="mcap-ros2-support is not installed")
+    from mcap.reader import make_reader
+
+    out, document = result
+    seen = {}
+    with (out / "result.mcap").open("rb") as stream:
+        for _, channel, _, message in make_reader(
+            stream, decoder_factories=[decoder.DecoderFactory()]
+        ).iter_decoded_messages():
+            seen.setdefault(channel.topic, []).append(message)
+    assert len(seen["/points_aligned"]) == len(document["rows"])
+    assert seen["/estimate/pose"][0].pose.pose.position.x == document["rows"][0]["x_m"]
+    assert seen["/model"][0].type == 11
+
+
+def test_the_cones_of_the_approach_are_in_the_viewer_log(fixtures_folder, tmp_path, cli):
+    from rosbags.highlevel import AnyReader
+
+    angle, length = 20.0, 0.5
+    limits = [
+        word for text in (f"final_deg={angle}", f"final_range_m={length}") for word in ("--set", f"limits.{text}")
+    ]
+    done = cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 3, *limits, "-o", tmp_path / "r")
+    assert done.code == 0, done.err
+    with AnyReader([tmp_path / "r" / "result.mcap"]) as reader:
+        (found,) = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/plan/cone"]
+    points = np.array([(p.x, p.y, p.z) for p in found.points])
+    away = np.linalg.norm(points, axis=1)
+    rim = points[away > 1e-9]
+    np.testing.assert_allclose(away[away > 1e-9], length, rtol=1e-12)
+    np.testing.assert_allclose(np.degrees(np.arccos(rim[:, 0] / length)), angle, rtol=1e-9)
+    assert found.header.frame_id == "target"
 
 
 def test_an_empty_folder_takes_the_results(cli, fixtures_folder, tmp_path):

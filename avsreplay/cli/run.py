@@ -73,7 +73,12 @@ Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
 @click.option("--plain", is_flag=True, help="Print no curves of error and gamma.")
-@click.option("--rerun", "to_rerun", is_flag=True, help="Stream the run to a Rerun viewer (needs the extra 'rerun').")
+@click.option(
+    "--rerun",
+    "to_rerun",
+    metavar="FILE.rrd|view|connect",
+    help="Write the run for the Rerun viewer, start one, or use one that runs (needs the extra 'rerun').",
+)
 def command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
@@ -133,7 +138,7 @@ class Wanted:
     table_every: int | None
     table_all: bool
     plain: bool
-    to_rerun: bool
+    to_rerun: str | None
     least: str | None
 
     def check(self) -> None:
@@ -195,7 +200,7 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
     from avsreplay.viewers import RerunStream
 
     keeper = ResultWriter(target, run) if target else None
-    viewer = RerunStream(run.surface) if wanted.to_rerun else None
+    viewer = RerunStream(run, wanted.to_rerun) if wanted.to_rerun else None
     listeners: list[Listener] = [viewer] if viewer else []
     with keeper or nullcontext():
         begun = time.perf_counter()

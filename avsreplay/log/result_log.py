@@ -2,7 +2,8 @@
 
 Frames: ``map`` over ``camera`` (identity, so that a viewer finds a root) and ``target`` under ``camera`` at each
 estimate, ``target_true`` at each true pose. The cloud is given in ``target``: if the estimate is right, it lies on the
-model; its field ``residual`` is the distance to it [m]. Each numeric column has a topic ``/rows/NAME``.
+model; its field ``residual`` is the distance to it [m]. ``/plan/cone`` holds the cones in which the planned approach
+stays. Each numeric column has a topic ``/rows/NAME``.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from avsreplay.records import Surface
 CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
 LIBRARY = "avsreplay"
 CHUNK_BYTES = 1 << 20
-_TRIANGLE_LIST, _POINTS = 11, 8  # visualization_msgs Marker types
+_TRIANGLE_LIST, _POINTS, _LINES = 11, 8, 5  # visualization_msgs Marker types
 _TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/tf": "tf2_msgs/msg/TFMessage",
@@ -32,6 +33,7 @@ _TOPICS = {
     "/estimate/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
     "/truth/pose": "geometry_msgs/msg/PoseStamped",
     "/plan": "nav_msgs/msg/Path",
+    "/plan/cone": "visualization_msgs/msg/Marker",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/truth/model": "visualization_msgs/msg/Marker",
     "/rosout": "rcl_interfaces/msg/Log",
@@ -55,6 +57,7 @@ class ResultFrame:
         message: the reason.
         values: scalars by name.
         residuals: (n,) distances of the points to the model at the estimate [m].
+        intensities: (n,) of the points, None if the scanner gives none.
         columns: numeric columns of the row by name.
     """
 
@@ -69,19 +72,23 @@ class ResultFrame:
     message: str
     values: Mapping[str, float | int | str]
     residuals: NDArray[Any] | None = None
+    intensities: NDArray[Any] | None = None
     columns: Mapping[str, float] = field(default_factory=dict)
 
 
 class ResultLog:
     """Writer of ``result.mcap``; ``close`` finishes the file. The bytes depend only on what is written."""
 
-    def __init__(self, path: Path, surface: Surface, configuration: str = "") -> None:
+    def __init__(
+        self, path: Path, surface: Surface, metadata: Mapping[str, str] | None = None, cone: Array | None = None
+    ) -> None:
         """Create the file and write the model.
 
         Args:
             path: the file.
             surface: the target model, written as a marker.
-            configuration: of the run as JSON, stored as metadata.
+            metadata: of the run, by name, for example its configuration as JSON.
+            cone: (m, 3) ends of line pieces in {C} [m] that show the cones of the approach; None without a cone.
 
         Raises:
             UnreadableInput: the file cannot be written.
@@ -97,9 +104,9 @@ class ResultLog:
             raise UnreadableInput(what, where=str(path), hint="check the folder and its rights") from None
         self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
         self._writer.start(profile="ros2", library=LIBRARY)
-        if configuration:
-            self._writer.add_metadata("avsreplay", {"configuration": configuration})
-        self._surface, self._count, self._state = surface, 0, ""
+        if metadata:
+            self._writer.add_metadata("avsreplay", dict(metadata))
+        self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
         self._channels: dict[str, int] = {}
 
     def close(self) -> None:
@@ -116,8 +123,11 @@ class ResultLog:
         t = frame.t_ns
         if self._count == 0:
             self._append("/tf_static", t, transform(t, ROOT, CAMERA, Pose.identity()))
-            self._append("/model", t, _marker(t, TARGET, self._surface))
-            self._append("/truth/model", t, _marker(t, TRUE, self._surface))
+            self._append("/model", t, _model_marker(t, TARGET, self._surface))
+            self._append("/truth/model", t, _model_marker(t, TRUE, self._surface))
+            if self._cone is not None:
+                width_m = 0.002 * self._surface.extent
+                self._append("/plan/cone", t, _marker(t, TARGET, _LINES, self._cone, (0.0, 0.62, 0.45, 0.9), width_m))
         self._count += 1
         self._append("/tf", t, transform(t, CAMERA, TARGET, frame.estimate))
         pose = Packer().header(t, CAMERA).pose(frame.estimate).f64s(*frame.covariance.ravel())
@@ -128,7 +138,8 @@ class ResultLog:
         if frame.truth is not None:
             self._append("/tf", t, transform(t, CAMERA, TRUE, frame.truth))
         aligned = frame.estimate.inverse().apply(frame.points)
-        self._append("/points_aligned", t, point_cloud2(t, TARGET, aligned, None, residuals=frame.residuals))
+        besides = {"intensities": frame.intensities, "residuals": frame.residuals}
+        self._append("/points_aligned", t, point_cloud2(t, TARGET, aligned, None, **besides))
         if frame.path is not None:
             self._append("/plan", t, _path(t, *frame.path))
         self._append("/diagnostics", t, _status(frame))
@@ -186,14 +197,22 @@ def _said(frame: ResultFrame) -> bytes:
     return packer.string(frame.message).string("").string("").u32(0).bytes()
 
 
-def _marker(t_ns: int, frame: str, surface: Surface) -> bytes:
+def _model_marker(t_ns: int, frame: str, surface: Surface) -> bytes:
     """Return a visualization_msgs Marker: the triangles of the model, or its points, in a frame."""
     faces = surface.faces
     corners = surface.vertices[faces.reshape(-1)] if len(faces) else surface.vertices
     colour = (0.6, 0.65, 0.7, 0.5) if frame == TARGET else (0.2, 0.7, 0.6, 0.25)
-    packer = Packer().header(t_ns, frame).string("model").i32(0).i32(_TRIANGLE_LIST if len(faces) else _POINTS)
-    packer.i32(0).pose(Pose.identity()).f64s(1.0, 1.0, 1.0).f32s(*colour)  # action, pose, scale, colour
+    return _marker(t_ns, frame, _TRIANGLE_LIST if len(faces) else _POINTS, corners, colour, 1.0)
+
+
+def _marker(
+    t_ns: int, frame: str, kind: int, points: Array, colour: tuple[float, float, float, float], scale: float
+) -> bytes:
+    """Return a visualization_msgs Marker of points (m, 3) in a frame."""
+    name = "cone" if kind == _LINES else "model"
+    packer = Packer().header(t_ns, frame).string(name).i32(0).i32(kind)
+    packer.i32(0).pose(Pose.identity()).f64s(scale, scale, scale).f32s(*colour)  # action, pose, scale, colour
     packer.i32(0).u32(0).u8(1)  # lifetime (none), locked to its frame
-    packer.u32(len(corners)).f64s(*corners.reshape(-1)).u32(0)  # points, no colours per point
+    packer.u32(len(points)).f64s(*points.reshape(-1)).u32(0)  # points, no colours per point
     packer.string("").header(t_ns, "").string("").octets(b"").u32(0)  # no texture
     return packer.string("").string("").string("").octets(b"").u8(0).bytes()  # text, mesh resource, mesh file
