@@ -138,8 +138,8 @@ class ResultLog:
         if frame.truth is not None:
             self._append("/tf", t, transform(t, CAMERA, TRUE, frame.truth))
         aligned = frame.estimate.inverse().apply(frame.points)
-        besides = {"intensities": frame.intensities, "residuals": frame.residuals}
-        self._append("/points_aligned", t, point_cloud2(t, TARGET, aligned, None, **besides))
+        cloud = point_cloud2(t, TARGET, aligned, None, intensities=frame.intensities, residuals=frame.residuals)
+        self._append("/points_aligned", t, cloud)
         if frame.path is not None:
             self._append("/plan", t, _path(t, *frame.path))
         self._append("/diagnostics", t, _status(frame))
