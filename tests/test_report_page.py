@@ -637,3 +637,30 @@ def test_a_bar_has_a_tooltip_and_hovering_moves_the_3d_view(opened):
     _settled(browser)
     assert "no points of this scan" in _text(browser, "#scene")  # the scan under the pointer is in the blackout
     assert not _text(browser, "#now").startswith("scan 0 ")
+
+
+@pytest.mark.slow
+def test_the_tables_and_figures_of_a_campaign_can_be_read_at_every_width(browser, tmp_path):
+    from avsreplay.sweep.page import build_sweep_page
+    from avsreplay.sweep.statistics import quantiles, rate
+    from avsreplay.sweep.summary import HEADLINES, Cell, SweepSummary, WorstRun
+
+    rates = {name: rate(3, 9) for name in ("converged", "capture planned", "no fault missed", "no false alarm")}
+    metrics = {name: quantiles([0.1 * k for k in range(9)]) for name in HEADLINES}
+    cells = tuple(
+        Cell({"scenario.scanner.noise_m": noise}, 9, {"ok": 9}, metrics, rates, None) for noise in (0.004, 0.008)
+    )
+    worst = (WorstRun("a" * 24, 1, 0, 3325833263181678374, "ok", "position error 0.01085 m (healthy scan)"),)
+    summary = SweepSummary("noise", 18, 18, {"ok": 18}, cells, None, worst=worst)
+    (tmp_path / "page.html").write_text(build_sweep_page(summary), encoding="utf-8")
+    for width in (1400, 390):
+        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        browser.get((tmp_path / "page.html").as_uri())
+        script = """return [document.documentElement.scrollWidth,
+            Math.max(...[...document.querySelectorAll('.scroll')].map((b) => b.scrollWidth - b.clientWidth)),
+            Math.min(...[...document.querySelectorAll('.figure text')].map((t) => t.getBoundingClientRect().height))]"""
+        page, hidden, text = browser.execute_script(script)
+        assert page <= width
+        assert text >= 10  # pixels
+        assert width < 500 or hidden <= 0  # nothing is cut off where there is room

@@ -73,12 +73,7 @@ Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
 @click.option("--plain", is_flag=True, help="Print no curves of error and gamma.")
-@click.option(
-    "--rerun",
-    "to_rerun",
-    metavar="FILE.rrd|view|connect",
-    help="Write the run for the Rerun viewer, start one, or use one that runs (needs the extra 'rerun').",
-)
+@click.option("--rerun", "to_rerun", metavar="FILE.rrd|view|connect", help="Show the run in Rerun (extra 'rerun').")
 def command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 

@@ -52,6 +52,7 @@ class Table:
         rows: cells in the order of the headings.
         align: a letter per column, "l" (text, may wrap) or "r" (numbers); the last letter holds for all further ones.
         note: one line under the table.
+        wide: whether a page gives it the whole width.
     """
 
     title: str
@@ -59,6 +60,7 @@ class Table:
     rows: tuple[tuple[str | TableCell, ...], ...]
     align: str = "lr"
     note: str = ""
+    wide: bool = False
 
     def right(self, column: int) -> bool:
         """Whether a column is aligned to the right."""

@@ -60,7 +60,7 @@ def worst_table(worst: Sequence[WorstRun]) -> Table:
         (run.id, str(run.cell), str(run.repeat), "" if run.seed is None else str(run.seed), run.status, run.reason)
         for run in worst
     )
-    return Table("Worst runs", ("run", "combination", "repeat", "seed", "status", "reason"), rows)
+    return Table("Worst runs", ("run", "combination", "repeat", "seed", "status", "reason"), rows, "lrrrl", wide=True)
 
 
 def words(values: Mapping[str, Any]) -> str:
@@ -81,16 +81,15 @@ def combination_table(cells: Sequence[tuple[int, Cell]]) -> Table:
         nees = cell.nees
         text = "" if nees is None else f"{nees.mean_per_dof:.3f} ({nees.low:.3f} to {nees.high:.3f})"
         rows.append((f"{number}: {words(cell.values)}", str(cell.runs), str(cell.status.get("ok", 0)), text))
-    return Table(
-        "Combinations", ("combination", "runs", "ok", "NEES per state at the end\n(band where consistent)"), tuple(rows)
-    )
+    heads = ("combination", "runs", "ok", "NEES per state at the end\n(band where consistent)")
+    return Table("Combinations", heads, tuple(rows), wide=True)
 
 
 def rate_table(cells: Sequence[tuple[int, Cell]]) -> Table:
     """A row per combination: share of the runs that meet each criterion, with its 95 % interval."""
     names = list(cells[0][1].rates) if cells else []
     rows = tuple((str(number), *(_share(cell.rates[name]) for name in names)) for number, cell in cells)
-    return Table("Success", ("combination", *names), rows)
+    return Table("Success", ("combination", *names), rows, wide=True)
 
 
 def cell_table(number: int, cell: Cell) -> Table:
@@ -126,6 +125,7 @@ def detector_table(detector: Detector) -> Table:
         f"Fault tests over {detector.harmful} harmful and {detector.other} other scans of all runs",
         ("test", "harmful scans flagged", "other scans flagged", "threshold", "area under\nthe ROC curve"),
         tuple(rows),
+        wide=True,
     )
 
 
@@ -210,7 +210,7 @@ def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
     """
     title = "By kind of fault: times in s, errors in mm and deg; ~: harmless by its label; none: outside every window"
     injected = any(cell.kinds.keys() - {NONE} for _, cell in cells)
-    return Table(title, _KIND_HEADS, tuple(_kind_rows(cells)) if injected else ())
+    return Table(title, _KIND_HEADS, tuple(_kind_rows(cells)) if injected else (), wide=True)
 
 
 def _kind_rows(cells: Sequence[tuple[int, Cell]]) -> Iterator[tuple[str, ...]]:
