@@ -178,6 +178,14 @@ def test_a_covariance_that_is_not_positive_definite_still_has_a_root() -> None:
     np.testing.assert_array_equal(cholesky_root(definite), np.linalg.cholesky(definite))
 
 
-@pytest.mark.parametrize("case", [surprises.Case("rest", speed=1e-6, seconds=20.0), surprises.Case("c", seconds=20.0)])
-def test_a_clean_log_fails_no_check(case: surprises.Case) -> None:
-    assert surprises.run(case, 0).violations == []
+@pytest.mark.parametrize(
+    ("case", "seed"),
+    [
+        (surprises.Case("rest", speed=1e-6, seconds=20.0), 0),
+        (surprises.Case("clean", seconds=20.0), 0),
+        pytest.param(surprises.Case("spin y", spin=1, seconds=130.0), 2, marks=pytest.mark.slow),
+        pytest.param(surprises.Case("spin z", spin=2, seconds=150.0), 0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_clean_log_fails_no_check(case: surprises.Case, seed: int) -> None:
+    assert surprises.run(case, seed).violations == []

@@ -14,7 +14,7 @@ errors are propagated back to the epoch, where the transition is the identity, a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,9 +32,10 @@ from avsreplay.records import Belief, Forecast, State
 
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
 _TRIAL = 2.0  # distance along a direction at which the cost is compared with the Gaussian one [sigma]
-_RISE, _TRIES = 0.5 * _NODE**2, 4
+_RISE, _TRIES, _LOST = 0.5 * _NODE**2, 6, 3.0
 _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
+_ROUNDING = 1e-9  # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
 LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
 _DISTURBED = 12  # error states that a disturbance reaches: attitude, rate, position, velocity
@@ -52,10 +53,15 @@ class ProfilePoint:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Component:
-    """One Gaussian of a mixture: its weight, and mean and covariance at the last pose."""
+    """One Gaussian of a mixture: its weight, and mean and covariance at the last pose.
+
+    ``P_chart`` (20, 20) is the covariance in the chart: where two moments are nearly equal, rounding of the much larger
+    error states of mu would spoil that of the other states.
+    """
 
     weight: float
     belief: Belief
+    P_chart: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,15 +74,16 @@ class NonGaussianDirection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchCovariance:
-    """A fit with its non-Gaussian directions."""
+    """A fit with its non-Gaussian directions: those that could be profiled, and whether there are others."""
 
     fitted: BatchFit
     directions: tuple[NonGaussianDirection, ...]
+    others: bool = False
 
     @property
     def gaussian(self) -> bool:
         """Return whether the likelihood is Gaussian up to two sigma."""
-        return not self.directions
+        return not (self.directions or self.others)
 
 
 def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> BatchCovariance:
@@ -89,14 +96,17 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Batc
     """
     scale = problem.prior.one_sigma
     values, vectors = np.linalg.eigh(fitted.P_chart / np.outer(scale, scale))
-    directions = []
+    directions, others = [], False
     for value, vector in zip(values[::-1][: params.try_directions], vectors.T[::-1], strict=False):
         axis = vector * scale * np.sqrt(max(float(value), 0.0))
         if _non_gaussian(problem, fitted, params, axis):
             row = vector / scale / np.sqrt(value)  # row @ axis = 1
-            points = [_profile(problem, fitted, params, axis, row, s) for s in (_NODE, -_NODE)]
-            directions.append(NonGaussianDirection(axis, (points[0], points[1])))
-    return BatchCovariance(fitted, tuple(directions))
+            first, second = (_profile(problem, fitted, params, axis, row, s) for s in (_NODE, -_NODE))
+            if first is None or second is None:
+                others = True  # its part of the covariance stays that of the fit
+            else:
+                directions.append(NonGaussianDirection(axis, (first, second)))
+    return BatchCovariance(fitted, tuple(directions), others)
 
 
 def _non_gaussian(problem: Problem, fitted: BatchFit, params: FitParams, axis: Array) -> bool:
@@ -110,17 +120,25 @@ def _non_gaussian(problem: Problem, fitted: BatchFit, params: FitParams, axis: A
 
 def _profile(
     problem: Problem, fitted: BatchFit, params: FitParams, axis: Array, row: Array, side: float
-) -> ProfilePoint:
-    """The fit with the direction fixed at ``side`` sigma, adjusted at most ``_TRIES`` times until the cost fits."""
-    there, P = fitted.chart.moved(side * axis), fitted.P_chart
+) -> ProfilePoint | None:
+    """The fit with the direction fixed where the cost has risen by ``_RISE``: the best of ``_TRIES``, from ``side`` on.
+
+    A fit that ends far above that begins again nearer to the minimum: it did not follow the valley of the cost. None if
+    no fit came near: its covariance would not be that of a point in the valley.
+    """
+    there, found = fitted.chart.moved(side * axis), []
     for _ in range(_TRIES):
         pin = Pin(fitted.chart, row, side, _PIN_1S)
         there, P = problem.pinned(there, params, pin)
         rise = problem.cost(there) - fitted.half_chi2
+        found.append((abs(float(np.log(max(rise, 1e-9) / _RISE))), ProfilePoint(there, P, pin)))
         if abs(rise - _RISE) < 0.2 * _RISE:
             break
         side *= float(np.clip(np.sqrt(_RISE / max(rise, 1e-9)), 0.4, 2.5))
-    return ProfilePoint(there, P, pin)
+        if rise > _LOST * _RISE:
+            there = fitted.chart.moved(side * axis)
+    off, best = min(found, key=lambda f: f[0])
+    return best if off < float(np.log(_LOST)) else None
 
 
 def final_mixture(
@@ -145,7 +163,7 @@ def final_mixture(
     axes = sum((np.outer(d.axis, d.axis) for d in found.directions), np.zeros((DIM, DIM)))
     bases: list[tuple[float, Chart, Pin | None, Array]] = [(1.0 - 2.0 * _WEIGHT * n, fitted.chart, None, axes)]
     bases += [(_WEIGHT, p.chart, p.pin, np.zeros((DIM, DIM))) for d in found.directions for p in d.points]
-    out = []
+    out, lost = [], 0.0
     recent = Problem(latest, problem.prior, fitted.effective)
     for weight, chart, pin, without in bases:
         y, P = process_noise_pass(chart, pin, problem, noise)
@@ -157,10 +175,22 @@ def final_mixture(
         there = base.moved(share * move)
         P = P if pin is not None or not n else _without(P, without)
         P = step @ P @ step.T + (1.0 - share) ** 2 * np.outer(move, move)
+        if pin is not None and _least_eigenvalue(P) < -_ROUNDING:
+            lost += weight  # about an unstable spin, rounding at the epoch has grown beyond the covariance
+            continue
         T = to_errors(there)
-        P = T @ P @ T.T
-        out.append(Component(weight, Belief(t_ns, to_state(there), 0.5 * (P + P.T))))
-    return tuple(out)
+        P_errors = T @ P @ T.T
+        out.append(Component(weight, Belief(t_ns, to_state(there), 0.5 * (P_errors + P_errors.T)), P))
+    return (replace(out[0], weight=out[0].weight + lost), *out[1:])
+
+
+def _least_eigenvalue(P: Array) -> float:
+    """The least eigenvalue of P in units of its variances; minus infinity where a variance is not positive."""
+    variances = np.diagonal(P)
+    if not np.all(variances > 0.0):
+        return -np.inf
+    scale = np.sqrt(variances)
+    return float(np.linalg.eigvalsh(P / np.outer(scale, scale))[0])
 
 
 def _without(P: Array, part: Array) -> Array:
@@ -190,10 +220,9 @@ def moments(components: tuple[Component, ...]) -> Belief:
     T = to_errors(here)
     P = np.zeros((DIM, DIM))
     for component in components:
-        there = to_chart(component.belief.x)
-        back = T @ np.linalg.inv(to_errors(there))  # the component's error states about the mean
-        y = T @ there.minus(here)
-        P += component.weight * (np.outer(y, y) + back @ component.belief.P @ back.T)
+        y = to_chart(component.belief.x).minus(here)
+        P += component.weight * (np.outer(y, y) + component.P_chart)
+    P = T @ P @ T.T
     return Belief(first.t_ns, first.x, 0.5 * (P + P.T))
 
 
