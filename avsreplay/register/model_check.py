@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.registrar import Registrar
-from avsreplay.register.segments import without_scattered_points
+from avsreplay.register.sampling import without_scattered_points
 from avsreplay.register.visibility import is_outward
 
 POINTS = 1500  # points used of each scan

@@ -21,8 +21,7 @@ from avsreplay.register.horn import HornBackend
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.restarts import Budget, Restart, Restarter
-from avsreplay.register.sampling import thin
-from avsreplay.register.segments import LARGER, segments, without_scattered_points
+from avsreplay.register.sampling import LARGER, segments, thin, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 

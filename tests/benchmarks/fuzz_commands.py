@@ -256,10 +256,11 @@ def damaged(data: bytes, name: str, rng: np.random.Generator) -> bytes:
             data = change(data, rng)
         return data
     if name.endswith(".avsindex") and rng.random() < 0.8:
-        from avsreplay.register.index_cache import HEADER, MAGIC, checksum
+        from avsreplay.register.index_cache import HEADER, header
+        from avsreplay.register.surface_index import kernel_module
 
         payload = in_place(data[HEADER:], rng)
-        return MAGIC + checksum(payload) + payload
+        return header(payload, kernel_module().checksum) + payload
     return in_place(data, rng) if rng.random() < 0.6 else mutate(data, rng, [data])
 
 
