@@ -40,11 +40,11 @@ def timed(log: Path, n_scans: int | None, prefetch: int) -> tuple[int, float, fl
         return found
 
     def counting(original):
-        def counted(self, *args):
+        def counted(self, *args, **named):
             begun = time.thread_time()
             depth[0] += 1
             try:
-                return original(self, *args)
+                return original(self, *args, **named)
             finally:
                 depth[0] -= 1
                 spent[0] += 0.0 if depth[0] else time.thread_time() - begun
