@@ -153,8 +153,9 @@ def entry_point() -> None:
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal
     for stream in (sys.stdout, sys.stderr):  # a character that the encoding of the terminal does not have is escaped
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+        with contextlib.suppress(OSError, ValueError):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
     try:
         code = group.main(standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY")
     except AvsError as error:

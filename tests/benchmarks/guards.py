@@ -1,7 +1,7 @@
 """Whether the tests of docs/reliability.md fail without the code that they test: ``python tests/benchmarks/guards.py``.
 
-For each guard, its text is replaced in a copy of the checkout, and the tests named here must then fail there; without a
-change they must pass. Prints one line per guard; exit code 1 if a test passes without its guard.
+The tests named here must pass in a copy of the checkout. Then, for each guard, its text is replaced there, and its test
+must fail. Prints one line per guard; exit code 1 if a test passes without its guard.
 """
 
 from __future__ import annotations
@@ -90,13 +90,13 @@ GUARDS: tuple[tuple[str, str, str, str], ...] = (
 )  # fmt: skip
 
 
-def passes(checkout: Path, test: str) -> bool:
-    """Whether a test passes in a checkout. Raises RuntimeError if it does not exist."""
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", f"tests/{test}"]
+def passes(checkout: Path, *tests: str) -> bool:
+    """Whether all tests pass in a checkout. Raises RuntimeError if one does not exist."""
+    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *(f"tests/{t}" for t in tests)]
     environment = {**os.environ, "PYTHONPATH": str(checkout)}
     done = subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
     if done.returncode not in (0, 1):
-        raise RuntimeError(f"{test}: {done.stdout[-500:]}")
+        raise RuntimeError(f"{tests}: {done.stdout[-500:]}")
     return done.returncode == 0
 
 
@@ -105,24 +105,24 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--only", default="", help="guards of files and tests that contain this text")
     asked = parser.parse_args()
+    guards = [guard for guard in GUARDS if asked.only in f"{guard[0]} {guard[3]}"]
     bad = 0
     with tempfile.TemporaryDirectory() as folder:
         checkout = Path(folder) / "checkout"
         left_out = shutil.ignore_patterns(".git", "build", "dist", "__pycache__", ".*_cache", ".hypothesis")
         shutil.copytree(ROOT, checkout, ignore=left_out)
-        for name, text, replacement, test in GUARDS:
-            if asked.only not in f"{name} {test}":
-                continue
+        if not passes(checkout, *(test for *_, test in guards)):
+            raise SystemExit("a test fails with its guard")
+        for name, text, replacement, test in guards:
             path = checkout / "avsreplay" / name
             whole = path.read_text(encoding="utf-8")
             if whole.count(text) != 1:
                 raise SystemExit(f"{name} contains {text!r} {whole.count(text)} times")
             path.write_text(whole.replace(text, replacement), encoding="utf-8")
-            without = passes(checkout, test)
+            tested = not passes(checkout, test)
             path.write_text(whole, encoding="utf-8")
-            verdict = "ok" if not without and passes(checkout, test) else "NOT TESTED"
-            bad += verdict != "ok"
-            print(f"{verdict:<10} {name}: {test}", flush=True)
+            bad += not tested
+            print(f"{'ok' if tested else 'NOT TESTED':<10} {name}: {test}", flush=True)
     return 1 if bad else 0
 
 
