@@ -1,7 +1,8 @@
-"""Makes the pictures of the documentation from the tool's own output: ``python docs/pictures.py [LOG]``.
+"""Makes the pictures of the documentation from the tool's own output: ``python docs/pictures.py [LOG [FULL]]``.
 
-Needs Chromium (``apt-get install chromium``) and Pillow. Without LOG it uses the short recording of the fixtures. The
-pictures are terminal screens at 80 and 160 columns, the page at 1400 and 390 pixels, a comparison, and an animation.
+Needs Chromium (``apt-get install chromium``) and Pillow. Without LOG it uses the short recording of the fixtures; with
+FULL, a recording of the built-in scenario, it also makes the plots of the results page.
+The pictures are terminal screens at 80 and 160 columns, the page at 1400 and 390 pixels, a comparison, and an animation.
 """
 
 from __future__ import annotations
@@ -84,6 +85,15 @@ def phone(page: Path, to: Path, folder: Path) -> None:
     shot(frame, to, 390, 1500)
 
 
+def plots(page: Path, to: Path, folder: Path) -> None:
+    """The first charts of a page, without anything else."""
+    hidden = "header, #lead, #controls, #scene, .tables, footer { display: none !important }"
+    style = f"<style>{hidden} main {{ display: block !important }}</style></head>"
+    bare = folder / "plots.html"
+    bare.write_text(page.read_text(encoding="utf-8").replace("</head>", style, 1), encoding="utf-8")
+    shot(bare, to, 900, 1130)
+
+
 def animation(frames: list[Path], to: Path) -> None:
     """The pictures one after another at one size."""
     images = []
@@ -96,8 +106,8 @@ def animation(frames: list[Path], to: Path) -> None:
     images[0].save(to, save_all=True, append_images=images[1:], duration=[1800, 3500, 4500], loop=0, optimize=True)
 
 
-def main(log: Path) -> None:
-    """Make all pictures."""
+def main(log: Path, full: Path | None = None) -> None:
+    """Make all pictures; ``full`` is the recording of the built-in scenario, for the page of results."""
     IMAGES.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -111,6 +121,10 @@ def main(log: Path) -> None:
         page = folder / "results" / "report.html"
         shot(page, IMAGES / "page.png", 1400, 1300)
         phone(page, IMAGES / "page-390.png", folder)
+        if full is not None:
+            shutil.copy(full, folder / "full.mcap")
+            terminal(80, "run", "full.mcap", "-o", "full", "--report", cwd=folder)
+            plots(folder / "full" / "report.html", IMAGES / "results.png", folder)
         terminal(80, "run", "tumble.mcap", "-o", "other", "--set", "estimator.adapt=off", cwd=folder)
         terminal(80, "compare", "results", "other", "-o", "compare.html", cwd=folder)
         shot(folder / "compare.html", IMAGES / "comparison.png", 1400, 1000)
@@ -122,4 +136,5 @@ def main(log: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "fixtures" / "tumble.mcap")
+    given = [Path(word) for word in sys.argv[1:3]]
+    main(*(given or [ROOT / "fixtures" / "tumble.mcap"]))

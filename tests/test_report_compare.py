@@ -199,7 +199,7 @@ def test_the_table_shows_changes_and_the_first_divergence(runs):
     done = _run(runs / "base", runs / "same", runs / "worse")
     assert done.exit_code == 0, done.output
     assert "+100.0 %" in done.output
-    assert "worse: worse in all_pos_rmse_m" in done.output
+    assert "worse: worse in rms position error of all scans (" in done.output
     assert "same: no difference; all 40 rows agree" in done.output
     assert "same: all 40 rows agree with base" in done.output
     assert "worse: 40 cells differ from base, first at scan 0, column pos_err_m" in done.output

@@ -89,7 +89,7 @@ def test_one_used_scan_of_35_is_worse_not_better(make_rows):
     for name in ("healthy_ratio", "all_pos_rmse_m", "t1_s"):
         assert changes[name].word == "worse", name
     assert changes["t1_s"].note == "lost"
-    assert "t1_s (lost)" in found.sentence
+    assert "time of convergence (lost)" in found.sentence
 
 
 def test_a_problem_that_disappears_is_not_a_lost_figure(make_rows):

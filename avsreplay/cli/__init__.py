@@ -27,10 +27,10 @@ __all__ = ["entry_point"]
 
 SUMMARIES = {
     "record": "Write a log: simulate a scenario, or convert recorded scans.",
-    "run": "Replay a log, print tables, compare with a golden file.",
+    "run": "Replay a log and print verdict and tables.",
     "model": "Build a model of an unknown target from the scans of a log.",
     "odometry": "Track an unknown target through the scans of a log, without a model.",
-    "info": "Show the content of a log.",
+    "info": "Show the content of a log and the options that a run needs.",
     "doctor": "Check a log for damage and repair it.",
     "backends": "List the registration back ends; run the contract tests on one.",
     "bench": "Compare the speed and error of back ends on a log.",
@@ -40,7 +40,7 @@ SUMMARIES = {
     "export": "Write a saved result as CSV, Parquet, TUM or KITTI.",
     "compare": "Compare saved results; gate one against a baseline.",
     "sweep": "Run a campaign of many runs and summarise it.",
-    "config": "Print the effective configuration.",
+    "config": "Print the effective settings of a run.",
     "completion": "Print the completion script of a shell.",
 }
 

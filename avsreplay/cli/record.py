@@ -77,7 +77,7 @@ def command(
     """Write a log: simulate a scenario, or convert recorded scans.
 
     SOURCE is a scenario (.toml), a folder of PLY or PCD scans, a ROS 1 or ROS 2 bag, or an MCAP; without it the
-    built-in scenario is simulated. The log holds the model, the scenario and the truth,
+    built-in scenario is simulated; --duration shortens it. The log holds the model, the scenario and the truth,
     so that 'avsreplay run' needs no option. Faults may be injected into any of these; each is labelled in the log, and
     the same seed gives the same bytes.
 

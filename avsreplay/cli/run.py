@@ -57,13 +57,13 @@ Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
     "-o",
     "--output",
     type=PATH,
-    help="Write rows, trajectories, beliefs and configuration to this directory.",
+    help="Write rows, trajectories, beliefs and settings to this directory.",
 )
 @click.option("--report", "page", is_flag=True, help="Add the HTML page, report.html, to the result directory.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
 @click.option("--resume", is_flag=True, help="Continue the interrupted run in the result directory.")
-@click.option("--follow", is_flag=True, help="LOG is still written: replay each scan when it is there, to the end.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+@click.option("--follow", is_flag=True, help="LOG is still being written: replay each scan as soon as it is complete.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @click.option(
     "--require",
     "least",
@@ -77,9 +77,10 @@ Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
 def command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
-    LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs no option. With - as
-    LOG an MCAP file is read from standard input, and each scan is replayed when it is there; --follow does the same
-    with a file that is still written. The results are those of a replay of the complete log.
+    LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs no option; for any
+    other log 'avsreplay info LOG --model FILE' names the options that it needs. If LOG is -, an MCAP file is read from
+    standard input, and each scan is replayed as soon as it is complete; --follow does the same with a file that is
+    still being written. The results are those of a replay of the complete log.
     \f
     Raises:
         UsageError: options contradict each other.

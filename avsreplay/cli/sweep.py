@@ -52,7 +52,9 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished, but runs failed or da
 @click.option("--limit", type=click.IntRange(0), help="Largest number of runs to make now.")
 @click.option("--retry-failed", is_flag=True, help="Make failed and crashed runs again.")
 @click.option("--plan", "only_plan", is_flag=True, help="List the runs without making them.")
-@click.option("--run", "run_id", metavar="ID", help="Make one run again, by its id or the begin of it, as 'run' does.")
+@click.option(
+    "--run", "run_id", metavar="ID", help="Make one run again, as 'run' does; the first characters of its id suffice."
+)
 @click.option("--report", "page", is_flag=True, help="With --run: add the HTML report to the result directory.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
 def command(

@@ -20,10 +20,18 @@ from avsreplay.report.compare import METRICS, changed_settings, first_divergence
 from avsreplay.report.summary import Summary
 from avsreplay.rows import Row
 
-HEADLINES = (
-    *("healthy_ratio", "all_pos_rmse_m", "all_rot_rmse_deg", "faults_missed", "false_alarm_rate"),
-    *("nees_inside", "t1_s", "capture_s", "capture_miss_m", "losses"),
-)
+HEADLINES = {  # the metrics of the conclusion: words, unit and factor
+    "healthy_ratio": ("scans used", " %", 100.0),
+    "all_pos_rmse_m": ("rms position error of all scans", " mm", 1000.0),
+    "all_rot_rmse_deg": ("rms attitude error of all scans", " deg", 1.0),
+    "faults_missed": ("missed faults", "", 1.0),
+    "false_alarm_rate": ("false alarms", " %", 100.0),
+    "nees_inside": ("NEES inside its band", " %", 100.0),
+    "t1_s": ("time of convergence", " s", 1.0),
+    "capture_s": ("time of capture", " s", 1.0),
+    "capture_miss_m": ("miss at capture", " mm", 1000.0),
+    "losses": ("lost parts of the log", "", 1.0),
+}
 _MORE = {"scans", "healthy", "healthy_ratio", "nis_inside", "nees_inside", "ogm_rank"}
 _NEUTRAL = {"nis_median", "nees_median", "sigma_hits", "ogm_log10_cond", "iterations_median", "weighed_down"}
 _MAY_BE_MISSING = ("coast_", "recovery_s")  # absent also where nothing went wrong
@@ -224,4 +232,7 @@ def _overall(changes: Sequence[Change], *, same: bool, rows: int) -> tuple[str, 
 
 
 def _said(change: Change) -> str:
-    return f"{change.metric} ({change.note or f'{change.base:.4g} to {change.other:.4g}'})"
+    words, unit, factor = HEADLINES[change.metric]
+    if change.note or change.base is None or change.other is None:
+        return f"{words} ({change.note or 'no value'})"
+    return f"{words} ({factor * change.base:.4g} to {factor * change.other:.4g}{unit})"
