@@ -2,7 +2,8 @@
 
 Needs Chromium (``apt-get install chromium``) and Pillow. Without LOG it uses the short recording of the fixtures; with
 FULL, a recording of the built-in scenario, it also makes the plots of the results page.
-The pictures are terminal screens at 80 and 160 columns, the page at 1400 and 390 pixels, a comparison, and an animation.
+The pictures are terminal screens at 80 and 160 columns, the page at 1400 and 390 pixels, a comparison,
+and an animation.
 """
 
 from __future__ import annotations
