@@ -320,14 +320,11 @@ class Run:
 
     def _without_model(self) -> LogHeader:
         """Reconstruct the model; start and true state of the log refer to another frame {C} and are dropped."""
-        from avsreplay.reconstruct import at_grasp, reconstruct, surface_of
+        from avsreplay.reconstruct import at_grasp, reconstruct, surface_of, true_frame
 
         self._first_ns = self.source.scan_at(0).t_ns if len(self.source) else 0
         self._made = at_grasp(reconstruct(self.source.scans))
-        true = dict(self.source.truth_poses())
-        known = ((true.get(t_ns), T_ac) for t_ns, T_ac in self._made.poses)
-        # true {C} to reconstructed {C}: the two coincide, by definition, at the first scan that has both
-        self._T_cr = next((truth.inverse() @ T_ac for truth, T_ac in known if truth is not None), None)
+        self._T_cr = true_frame(self._made, self.source.truth_poses())
         return replace(self.source.header, surface=surface_of(self._made), start=None, truth=None)
 
     def _true(self, scan: Scan) -> Truth:

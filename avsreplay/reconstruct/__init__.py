@@ -46,6 +46,7 @@ __all__ = [
     "reconstruct",
     "reconstruction_ply",
     "surface_of",
+    "true_frame",
 ]
 
 WEAKEST = 1e-3  # below this ratio of the eigenvalues of a registration, a surface does not determine the pose
@@ -76,15 +77,17 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
         what = f"only {len(survey.chosen)} of {survey.offered} scans have {p.fewest_points} points or more"
         raise UnreadableInput(what, hint="a model needs three at least")
     views, tracked = _tracked(scans, survey, p)
-    keys, rms, gate = refined(views, tracked, p, survey.extent)
-    poses = all_poses(views, tracked, keys, p, survey.extent)
+    better, keys, rms, gate = refined(views, tracked, p, survey.extent)
+    poses = all_poses(better, tracked, keys, p, survey.extent)
     turned, coverage = turn_and_coverage([views[k] for k in poses], list(poses.values()))
     _refuse_still(turned, tracked.weakest)
     motion = free_motion([views[k].t_ns for k in sorted(poses)], [poses[k] for k in sorted(poses)], survey.extent)
     if motion is not None:
         moved = _on_motion(views, poses, motion)
         used = {k: moved[k] for k in keys if k in moved}
-        if len(used) > 2 and pair_rms(views, used, gate) < AS_WELL * pair_rms(views, {k: keys[k] for k in used}, gate):
+        if len(used) > 2 and pair_rms(better, used, gate) < AS_WELL * pair_rms(
+            better, {k: keys[k] for k in used}, gate
+        ):
             poses = moved
     chosen = dict(sorted(poses.items())[:: max(1, -(-len(poses) // MOST_FUSED))])
     twist = twists([view.t_ns for view in views], poses, motion if survey.timed else None)
@@ -110,6 +113,28 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
         sights=tuple(sights),
         frame="origin at the centroid of the first scan, axes parallel to those of the camera at that scan",
     )
+
+
+def true_frame(made: Reconstruction, truth: Iterable[tuple[int, Pose]]) -> Pose | None:
+    """The constant transformation from the true frame {C} to the reconstructed one, for the comparison of poses.
+
+    The frame of a reconstruction is arbitrary. It is related to the true frame by the mean over all scans, so that the
+    error of a single pose does not appear in the errors of all others. The mean attitude is the eigenvector of F. L.
+    Markley et al., Averaging quaternions, Journal of Guidance, Control, and Dynamics 30(4), 2007.
+
+    Args:
+        made: the reconstruction.
+        truth: instants [ns] and true poses T_ac.
+
+    Returns:
+        The pose of the reconstructed {C} in the true {C}; None if no scan has a true pose.
+    """
+    true = dict(truth)
+    each = [true[t_ns].inverse() @ T_ac for t_ns, T_ac in made.poses if t_ns in true]
+    if not each:
+        return None
+    q = np.array([T.q for T in each])
+    return Pose(np.linalg.eigh(q.T @ q)[1][:, 3], np.mean([T.t for T in each], axis=0))
 
 
 def _tracked(scans: Scans, survey: Survey, p: ReconstructionParams) -> tuple[list[ScanView], Tracked]:

@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.tracking import (
     KEEP_RATIO,
-    MOST_POINTS,
     SAME_SIDE,
     ReconstructionParams,
     Tracked,
@@ -22,6 +21,7 @@ from avsreplay.reconstruct.tracking import (
     registered,
 )
 from avsreplay.reconstruct.views import (
+    NEIGHBOURS,
     ScanView,
     Survey,
     Twist,
@@ -36,27 +36,60 @@ from avsreplay.reconstruct.views import (
 from avsreplay.records import Scan
 from avsreplay.register import global_search
 
-PAIR_TURN_RAD = np.radians(60.0)  # key scans seen from directions closer than this are compared in the refinement
-PAIRS = 8  # most key scans with which one is compared
+PAIR_TURN_RAD = np.radians(90.0)  # key scans seen from directions closer than this are compared in the refinement
+PAIRS = 12  # most key scans with which one is compared
+PAIR_POINTS = 600  # of a scan in one comparison
+FEWEST_COMMON = 30  # points that two scans must share to be compared
+FEWEST_KEYS = 40  # of a shorter log every scan is a key scan in the refinement
+MERGED = 30  # nearest points of all key scans from which a normal is estimated
+MERGED_REACH = 0.03  # their largest distance as a share of the extent
 MOST_SIGHTS = 60  # scans that are asked whether they saw through a point
 SPREAD_RAD = np.radians(30.0)  # a direction counts as covered if a scan was taken from within this angle of it
 
 
 def refined(
     views: Sequence[ScanView], tracked: Tracked, p: ReconstructionParams, extent: float
-) -> tuple[dict[int, Pose], float, float]:
-    """Poses of the key views that minimise the distances between all overlapping pairs.
+) -> tuple[list[ScanView], dict[int, Pose], float, float]:
+    """Poses of the key views that minimise the distances between overlapping pairs.
+
+    The pairs of one view are spread evenly over the angles up to PAIR_TURN_RAD: pairs of views of nearly the same side
+    do not show a common displacement of all scans along the line of sight. After a first adjustment the normals are
+    estimated again, from the points of all key scans together.
 
     Returns:
-        T_ac by number of the view, the rms of the distances that is left, and the gate that was used for them [m].
+        The views with the better normals, T_ac by number of the key view, the rms of the distances that is left, and
+        the gate that was used for them [m].
     """
-    keys = tracked.keys
-    poses = [tracked.poses[k].inverse() for k in keys]
-    trees = [cKDTree(views[k].points) for k in keys]
-    gate, rms = 0.03 * extent, 0.0
+    keys, known = list(tracked.keys), sorted(tracked.poses)
+    if len(keys) < FEWEST_KEYS:
+        others = [k for k in known if k not in tracked.keys]
+        keys = sorted(keys + others[:: max(1, -(-len(others) // (FEWEST_KEYS - len(keys))))])
+    poses, better = {k: tracked.poses[k] for k in keys}, list(views)
+    gate = 0.03 * extent
+    poses, _, gate = _adjusted(better, poses, p, extent, (gate, 3e-4 * extent))
+    for k, view in _with_merged_normals(better, poses, extent).items():
+        better[k] = view
+    poses, rms, gate = _adjusted(better, poses, p, extent, (gate, 1e-4 * extent))
+    return better, poses, rms, gate
+
+
+def _adjusted(
+    views: Sequence[ScanView],
+    start: dict[int, Pose],
+    p: ReconstructionParams,
+    extent: float,
+    gate_and_enough: tuple[float, float],
+) -> tuple[dict[int, Pose], float, float]:
+    """Gauss-Newton iterations of the poses of all key views, until the largest step is small enough [m].
+
+    The gate [m] follows the distances.
+    """
+    gate, enough = gate_and_enough
+    keys = sorted(start)
+    poses, rms = [start[k].inverse() for k in keys], 0.0
     scale = np.tile(np.array([1.0 / extent] * 3 + [1.0] * 3), len(keys))
     for _ in range(p.refinements):
-        N, g, every = _normal_equations(views, keys, trees, poses, gate)
+        N, g, every = _normal_equations(views, keys, poses, gate)
         N[:6, :6] += np.eye(6) * max(np.trace(N), 1.0)  # the first view defines the frame
         N = N * np.outer(scale, scale)
         N[np.diag_indices_from(N)] += 1e-6 * np.trace(N) / len(N)
@@ -64,72 +97,85 @@ def refined(
         poses = [moved(T, step[6 * i : 6 * i + 6]) for i, T in enumerate(poses)]
         rms = float(np.sqrt(np.mean(every**2)))
         tighter = max(3.0 * 1.4826 * float(np.median(np.abs(every))), 0.006 * extent)
-        small = np.abs(step / scale).max() < 1e-4 * extent
+        small = np.abs(step / scale).max() < enough
         if small and tighter > 0.98 * gate:
             break
         gate = min(gate, tighter)
     return {k: T.inverse() for k, T in zip(keys, poses, strict=True)}, rms, gate
 
 
+def _with_merged_normals(views: Sequence[ScanView], poses: dict[int, Pose], extent: float) -> dict[int, ScanView]:
+    """The key views with normals from the nearest points of all of them that lie on the same side of the target."""
+    keys = sorted(poses)
+    p = np.vstack([poses[k].inverse().apply(views[k].points) for k in keys])
+    n = np.vstack([views[k].normals @ poses[k].R for k in keys])
+    d, index = cKDTree(p).query(p, k=min(MERGED, len(p)))
+    near = (np.einsum("ni,nki->nk", n, n[index]) > SAME_SIDE) & (d < MERGED_REACH * extent)
+    count = near.sum(axis=1)
+    off = np.where(near[:, :, None], p[index], 0.0)
+    off = np.where(near[:, :, None], off - off.sum(axis=1, keepdims=True) / count[:, None, None], 0.0)
+    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))[1][:, :, 0]
+    normals *= np.where(np.einsum("ni,ni->n", normals, n) < 0.0, -1.0, 1.0)[:, None]
+    normals = np.where((count >= NEIGHBOURS)[:, None], normals, n)
+    ends = np.cumsum([len(views[k].points) for k in keys])[:-1]
+    return {k: replace(views[k], normals=m @ poses[k].R.T) for k, m in zip(keys, np.split(normals, ends), strict=True)}
+
+
 def pair_rms(views: Sequence[ScanView], poses: dict[int, Pose], gate: float) -> float:
     """Rms of the distances between all overlapping pairs of views at poses T_ac [m]."""
     keys = sorted(poses)
-    trees = [cKDTree(views[k].points) for k in keys]
-    _, _, every = _normal_equations(views, keys, trees, [poses[k].inverse() for k in keys], gate)
+    _, _, every = _normal_equations(views, keys, [poses[k].inverse() for k in keys], gate)
     return float(np.sqrt(np.mean(every**2)))
 
 
 def _normal_equations(
-    views: Sequence[ScanView], keys: Sequence[int], trees: Sequence[cKDTree], poses: Sequence[Pose], gate: float
+    views: Sequence[ScanView], keys: Sequence[int], poses: Sequence[Pose], gate: float
 ) -> tuple[Array, Array, Array]:
-    """Normal matrix (6n, 6n) and right side (6n,) of the steps of all poses T_ca, and the distances [m]."""
-    N, g, distances = np.zeros((6 * len(keys), 6 * len(keys))), np.zeros(6 * len(keys)), [np.zeros(1)]
-    for i, j in _pairs(sight_lines([views[k] for k in keys], poses)):
-        distances.append(_pair_terms(views[keys[i]], views[keys[j]], trees[j], poses, (i, j), gate, N, g))
-    return N, g, np.concatenate(distances)
+    """Normal matrix (6n, 6n) and right side (6n,) of the steps of all poses T_ca, and the distances [m].
+
+    A distance is that of a point of view i to the nearest point of view j, along the mean of the two normals.
+    """
+    count, first = len(keys), np.cumsum([0] + [len(views[k].points) for k in keys])
+    p = np.vstack([T.apply(views[k].points) for k, T in zip(keys, poses, strict=True)])
+    n = np.vstack([views[k].normals @ T.R.T for k, T in zip(keys, poses, strict=True)])
+    weight = np.concatenate([views[k].weight for k in keys])
+    pairs = np.array(_pairs(sight_lines([views[k] for k in keys], poses)), dtype=np.int64).reshape(-1, 2)
+    found = [np.zeros((3, 0), dtype=np.int64)]
+    for number, (i, j) in enumerate(pairs):
+        own = np.arange(first[i], first[i + 1], max(1, (first[i + 1] - first[i]) // PAIR_POINTS))
+        d, index = views[keys[j]].tree.query((p[own] - poses[j].t) @ poses[j].R, distance_upper_bound=gate)
+        near = np.isfinite(d)
+        near[near] = np.einsum("ni,ni->n", n[own[near]], n[first[j] + index[near]]) > SAME_SIDE
+        if near.sum() >= FEWEST_COMMON:
+            found.append(np.stack([own[near], first[j] + index[near], np.full(int(near.sum()), number)]))
+    a, b, pair = np.hstack(found)
+    if not len(a):
+        return np.eye(6 * count), np.zeros(6 * count), np.zeros(1)
+    along = between(n[a], n[b])
+    e = np.einsum("ni,ni->n", along, p[b] - p[a])
+    w = np.maximum(1.0 - (e / gate) ** 2, 0.0) ** 2 * weight[a] * weight[b]
+    J = np.hstack([np.cross(p[a], along), along])
+    begin = np.flatnonzero(np.diff(pair, prepend=-1))
+    M = np.add.reduceat((J * w[:, None])[:, :, None] * J[:, None, :], begin, axis=0)
+    r = np.add.reduceat(J * (w * e)[:, None], begin, axis=0)
+    i, j = pairs[pair[begin]].T
+    N, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
+    for u, v, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
+        np.add.at(N, (u, v), sign * M)
+    np.add.at(g, i, r)
+    np.add.at(g, j, -r)
+    return N.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.ravel(), np.asarray(e)
 
 
 def _pairs(directions: Array) -> list[tuple[int, int]]:
-    """Ordered pairs of key views whose directions of view differ by less than PAIR_TURN_RAD; the nearest PAIRS each."""
+    """Ordered pairs of key views whose directions of view differ by less than PAIR_TURN_RAD: PAIRS each, spread evenly."""
     found = []
     for i, at in enumerate(directions):
         cosine = directions @ at
         order = [int(j) for j in np.argsort(-cosine, kind="stable") if j != i and cosine[j] > np.cos(PAIR_TURN_RAD)]
-        found += [(i, j) for j in order[:PAIRS]]
+        places = np.unique(np.linspace(0, len(order) - 1, PAIRS).round().astype(int)) if order else []
+        found += [(i, order[k]) for k in places]
     return found
-
-
-def _pair_terms(
-    a: ScanView, b: ScanView, tree: cKDTree, poses: Sequence[Pose], ij: tuple[int, int], gate: float, N: Array, g: Array
-) -> Array:
-    """Add the distances of the points of view i to the planes of view j to the normal equations of both poses."""
-    i, j = ij
-    every = max(1, len(a.points) // MOST_POINTS)
-    points, normals, weight = a.points[::every], a.normals[::every], a.weight[::every]
-    p_c = poses[i].apply(points)
-    p_b = poses[j].inverse().apply(p_c)
-    d, index = tree.query(p_b, distance_upper_bound=gate)
-    near = np.isfinite(d)
-    index = np.where(near, index, 0)
-    n_c = b.normals[index] @ poses[j].R.T
-    n_a = normals @ poses[i].R.T
-    near &= np.einsum("ni,ni->n", n_a, n_c) > SAME_SIDE
-    p, n = p_c[near], between(n_a[near], n_c[near])
-    q = poses[j].apply(b.points[index[near]])
-    e = np.einsum("ni,ni->n", n, q - p)
-    if len(e) < 30:
-        return np.zeros(0)
-    w = np.maximum(1.0 - (e / gate) ** 2, 0.0) ** 2 * weight[near] * b.weight[index[near]]
-    J = np.hstack([np.cross(p, n), n])
-    M, r = (J * w[:, None]).T @ J, J.T @ (w * e)
-    u, v = slice(6 * i, 6 * i + 6), slice(6 * j, 6 * j + 6)
-    N[u, u] += M
-    N[v, v] += M
-    N[u, v] -= M
-    N[v, u] -= M
-    g[u] += r
-    g[v] -= r
-    return np.asarray(e)
 
 
 def all_poses(
@@ -160,6 +206,19 @@ class Sight:
     def seen_through(self, p_c: Array, spacing_m: float) -> Array:
         """How far behind points (m, 3) of {C} this scan measured a surface in the same direction [m]; 0: nothing."""
         return depth_behind(self.T_ac.apply(p_c), self.points, self.camera, spacing_m)
+
+    def without_return(self, p_c: Array, normals: Array, reach_m: float) -> NDArray[np.bool_]:
+        """Whether points (m, 3) of {C} on surfaces inclined by less than 60 degrees lie where this scan has no points.
+
+        The nearest line of sight with a return must pass farther away than ``reach_m`` and three times the spacing of
+        the points of the scan, so that something in front of a point also counts as a return.
+        """
+        p, rays = self.T_ac.apply(p_c) - self.camera, self.points - self.camera
+        far = np.linalg.norm(p, axis=1)
+        tree = cKDTree(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        spacing = float(np.median(np.asarray(cKDTree(self.points).query(self.points, k=5)[0])[:, 4]))
+        facing = np.abs(np.einsum("ni,ni->n", normals @ self.T_ac.R.T, p)) > 0.5 * far
+        return np.asarray(facing & (np.asarray(tree.query(p / far[:, None])[0]) * far > max(reach_m, 3.0 * spacing)))
 
 
 def fused(

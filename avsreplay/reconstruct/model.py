@@ -24,6 +24,7 @@ PATCH = 0.04  # radius of a grasp patch as a share of the extent
 APPROACH = np.cos(np.radians(20.0))  # of the cone about the outward normal that must be free
 MOST_REGIONS = 10
 FEWEST_IN_REGION = 10  # points
+FEWEST_EMPTY = 3.0  # scans without a return from a surface that they faced
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -195,7 +196,8 @@ class Region:
     """A part of the target that differs from its CAD model.
 
     Attributes:
-        kind: ``added`` (measured where the model has no surface) or ``missing`` (scans saw through its surface).
+        kind: ``added`` (measured where the model has no surface), ``missing`` (scans saw through its surface) or
+            ``no_return`` (scans that faced its surface have no points there: missing, or a material that returns none).
         points: number of points.  centre_m: its centre in the frame of the CAD model [m].
         size_m: diagonal of its bounding box [m].
         deviation_m: median distance, positive outside the model, negative where it is missing; NaN beyond ``most_m``.
@@ -261,13 +263,14 @@ def deviations(made: Reconstruction, cad: Surface) -> Deviations:
     tolerance = max(4.0 * 1.4826 * median, 3.0 * made.voxel_m)
     extra = np.flatnonzero(~(np.abs(signed) < tolerance))
     regions = _regions("added", p_m[extra], signed[extra], made.voxel_m)
-    regions += _regions("missing", *_missing(made, cad, T_mc, tolerance), made.voxel_m)
+    for kind, found_m, away in _missing(made, cad, T_mc, tolerance):
+        regions += _regions(kind, found_m, -away, made.voxel_m)
     largest = tuple(sorted(regions, key=lambda r: (-r.size_m, r.kind, r.centre_m[0]))[:MOST_REGIONS])
     return Deviations(T_mc, signed, most, ratio, median, float(np.quantile(known, 0.95)), largest)
 
 
-def _missing(made: Reconstruction, cad: Surface, T_mc: Pose, tolerance: float) -> tuple[Array, Array]:
-    """Points of the CAD surface that two scans or more saw through, and minus their distances to the model [m]."""
+def _missing(made: Reconstruction, cad: Surface, T_mc: Pose, tolerance: float) -> list[tuple[str, Array, Array]]:
+    """Points of the CAD surface that scans saw through or had no return from, and their distances to the model [m]."""
     corners = cad.vertices[cad.faces]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     rng = np.random.default_rng(0)
@@ -280,10 +283,17 @@ def _missing(made: Reconstruction, cad: Surface, T_mc: Pose, tolerance: float) -
     p_c = T_mc.inverse().apply(p_m)
     away = np.asarray(cKDTree(made.points).query(p_c)[0])
     far = away > tolerance + 2.0 * made.voxel_m
-    through = np.zeros(int(far.sum()))
-    for sight in made.sights:
+    normals = _unit_rows(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[face[far]] @ T_mc.R
+    through, empty = np.zeros((2, int(far.sum())))
+    for sight in made.sights if far.any() else ():
         through += sight.seen_through(p_c[far], 1.5 * made.voxel_m) > 6.0 * made.voxel_m
-    return p_m[far][through >= 2.0], -away[far][through >= 2.0]
+        empty += sight.without_return(p_c[far], normals, 3.0 * made.voxel_m)
+    kinds = (("missing", through >= 2.0), ("no_return", (empty >= FEWEST_EMPTY) & (through < 2.0)))
+    return [(kind, p_m[far][which], away[far][which]) for kind, which in kinds]
+
+
+def _unit_rows(v: Array) -> Array:
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30))
 
 
 def _regions(kind: str, points: Array, deviation: Array, voxel_m: float) -> list[Region]:

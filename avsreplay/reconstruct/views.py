@@ -21,6 +21,7 @@ NEIGHBOURS = 12  # nearest points from which a normal is estimated
 ISOLATED = 4.0  # a point is isolated if its fourth neighbour is farther than this many times the median
 LINK = 2.0  # points closer than this many times the typical distance of the fourth neighbour belong together
 SMALL_GROUP = 0.02  # a group with a smaller share of the points does not count for the extent
+SIDES = np.array([0.61, 0.53, 0.59])  # the two sides of a thin wall have normals of opposite sign along this direction
 FAR_OF_EXTENT = 0.6  # a scan whose centroid is farther than this from the origin of {A} was taken from the origin
 
 
@@ -32,6 +33,7 @@ class ScanView:
         t_ns: instant.  camera: (3,) position of the camera in {A} [m].
         points: (n, 3) thinned points in {A} [m].  normals: (n, 3) unit normals toward the camera.
         weight: (n,) cosine of the inclination to the line of sight: grazing points are the least accurate.
+        tree: over the points.  rays: over the directions from the camera to the points.
     """
 
     t_ns: int
@@ -39,6 +41,8 @@ class ScanView:
     points: Array
     normals: Array
     weight: Array
+    tree: cKDTree
+    rays: cKDTree
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -120,7 +124,8 @@ def thinned_view(scan: Scan, survey: Survey, size_m: float, twist: Twist | None 
     points = thinned(full, size_m)
     normals, lines = normals_of(points, full, survey.camera), survey.camera - points
     weight = np.einsum("ni,ni->n", normals, lines) / np.linalg.norm(lines, axis=1)
-    return ScanView(scan.t_ns, survey.camera, points, normals, weight)
+    rays = -lines / np.linalg.norm(lines, axis=1, keepdims=True)
+    return ScanView(scan.t_ns, survey.camera, points, normals, weight, cKDTree(points), cKDTree(rays))
 
 
 def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
@@ -176,12 +181,21 @@ def _camera(clouds: Sequence[Array]) -> Array:
 
 def thinned(points: Array, size_m: float) -> Array:
     """The point nearest to the mean of each voxel: a measured point, because a mean lies inside a curved surface."""
-    _, inverse = np.unique(np.floor(points / size_m).astype(np.int64), axis=0, return_inverse=True)
-    cell = inverse.ravel()
+    cell = cell_of(points, size_m)
     off = np.linalg.norm(points - means(points, cell)[cell], axis=1)
     order = np.lexsort((np.arange(len(points)), off, cell))
     first = np.flatnonzero(np.diff(cell[order], prepend=-1))
     return np.asarray(points[order[first]])
+
+
+def cell_of(points: Array, size_m: float, normals: Array | None = None) -> NDArray[np.intp]:
+    """Number (n,) of the occupied voxel of every point; with normals the two sides of a thin wall are distinguished."""
+    place = np.floor(points / size_m).astype(np.int64)
+    place -= place.min(axis=0)
+    x, y, z = place.T
+    width = place.max(axis=0) + 1
+    side = np.zeros(len(points), dtype=np.int64) if normals is None else (normals @ SIDES > 0.0).astype(np.int64)
+    return np.asarray(np.unique(((x * width[1] + y) * width[2] + z) * 2 + side, return_inverse=True)[1].ravel())
 
 
 def means(values: Array, cell: NDArray[np.intp]) -> Array:
@@ -195,10 +209,7 @@ def averaged(points: Array, normals: Array, size_m: float) -> tuple[Array, Array
 
     The two sides of a thin wall, which have opposite normals, are averaged separately.
     """
-    side = np.sign(normals @ np.array([0.61, 0.53, 0.59]))
-    cells = np.column_stack([np.floor(points / size_m), side]).astype(np.int64)
-    _, inverse = np.unique(cells, axis=0, return_inverse=True)
-    cell = inverse.ravel()
+    cell = cell_of(points, size_m, normals)
     mean, normal = means(points, cell), means(normals, cell)
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     return mean, normal, cell
@@ -226,13 +237,17 @@ def turn(a: Pose, b: Pose) -> float:
     return float(geometry.angle(geometry.multiply(geometry.conjugate(a.q), b.q)))
 
 
-def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float) -> Array:
-    """How far the surface that was measured in the direction of each point p lies behind it [m]; 0 where none was."""
+def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float, tree: cKDTree | None = None) -> Array:
+    """How far the surface that was measured in the direction of each point p lies behind it [m]; 0 where none was.
+
+    ``tree`` is that over the directions of the measured points, if it is known.
+    """
     if not len(p):
         return np.zeros(0)
     rays, own = measured - camera, p - camera
     far, r = np.linalg.norm(rays, axis=1), np.linalg.norm(own, axis=1)
-    distances, nearest = cKDTree(rays / far[:, None]).query(own / r[:, None], k=3)
+    tree = tree or cKDTree(rays / far[:, None])
+    distances, nearest = tree.query(own / r[:, None], k=3, distance_upper_bound=spacing_m / r.min())
     d, index = np.asarray(distances), np.asarray(nearest)
     hit = d[:, 2] < spacing_m / r
-    return np.where(hit, far[index].min(axis=1) - r, 0.0)
+    return np.where(hit, far[np.where(hit[:, None], index, 0)].min(axis=1) - r, 0.0)
