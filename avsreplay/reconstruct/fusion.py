@@ -168,13 +168,13 @@ def _normal_equations(
 
 
 def _pairs(directions: Array) -> list[tuple[int, int]]:
-    """Ordered pairs of key views whose directions of view differ by less than PAIR_TURN_RAD: PAIRS each, spread evenly."""
+    """Ordered pairs of key views whose directions of view differ by less than PAIR_TURN_RAD, PAIRS each."""
     found = []
     for i, at in enumerate(directions):
         cosine = directions @ at
         order = [int(j) for j in np.argsort(-cosine, kind="stable") if j != i and cosine[j] > np.cos(PAIR_TURN_RAD)]
-        places = np.unique(np.linspace(0, len(order) - 1, PAIRS).round().astype(int)) if order else []
-        found += [(i, order[k]) for k in places]
+        if order:
+            found += [(i, order[int(k)]) for k in np.unique(np.linspace(0, len(order) - 1, PAIRS).round())]
     return found
 
 
