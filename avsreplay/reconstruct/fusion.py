@@ -65,26 +65,18 @@ def refined(
         others = [k for k in known if k not in tracked.keys]
         keys = sorted(keys + others[:: max(1, -(-len(others) // (FEWEST_KEYS - len(keys))))])
     poses, better = {k: tracked.poses[k] for k in keys}, list(views)
-    gate = 0.03 * extent
-    poses, _, gate = _adjusted(better, poses, p, extent, (gate, 3e-4 * extent))
-    for k, view in _with_merged_normals(better, poses, extent).items():
-        better[k] = view
-    poses, rms, gate = _adjusted(better, poses, p, extent, (gate, 1e-4 * extent))
+    gate, rms = 0.03 * extent, 0.0
+    for _ in range(2):
+        poses, rms, gate = _adjusted(better, poses, p, extent, gate)
+        for k, view in _with_merged_normals(better, poses, extent).items():
+            better[k] = view
     return better, poses, rms, gate
 
 
 def _adjusted(
-    views: Sequence[ScanView],
-    start: dict[int, Pose],
-    p: ReconstructionParams,
-    extent: float,
-    gate_and_enough: tuple[float, float],
+    views: Sequence[ScanView], start: dict[int, Pose], p: ReconstructionParams, extent: float, gate: float
 ) -> tuple[dict[int, Pose], float, float]:
-    """Gauss-Newton iterations of the poses of all key views, until the largest step is small enough [m].
-
-    The gate [m] follows the distances.
-    """
-    gate, enough = gate_and_enough
+    """Gauss-Newton iterations of the poses of all key views; the gate [m] follows the distances."""
     keys = sorted(start)
     poses, rms = [start[k].inverse() for k in keys], 0.0
     scale = np.tile(np.array([1.0 / extent] * 3 + [1.0] * 3), len(keys))
@@ -97,7 +89,7 @@ def _adjusted(
         poses = [moved(T, step[6 * i : 6 * i + 6]) for i, T in enumerate(poses)]
         rms = float(np.sqrt(np.mean(every**2)))
         tighter = max(3.0 * 1.4826 * float(np.median(np.abs(every))), 0.006 * extent)
-        small = np.abs(step / scale).max() < enough
+        small = np.abs(step / scale).max() < 1e-4 * extent
         if small and tighter > 0.98 * gate:
             break
         gate = min(gate, tighter)
