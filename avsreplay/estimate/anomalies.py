@@ -21,7 +21,7 @@ from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.dynamics import propagate
 from avsreplay.estimate.error_state import VEL, W
-from avsreplay.estimate.hypotheses import ChangePriors, Explanation, Hypothesis, cholesky_root, explain
+from avsreplay.estimate.hypotheses import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis, cholesky_root, explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import GATE
@@ -91,7 +91,9 @@ class AnomalyTest:
             return self._accepted(track, epoch, update), verdict
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
         ranked = explain(window, first, self._priors, *self.batch.noise_levels(track))
-        if not large and ranked[0].hypothesis not in (Hypothesis.MANOEUVRE, Hypothesis.SENSOR_BIAS):
+        best = ranked[0].hypothesis
+        changed = best is Hypothesis.MANOEUVRE and _odds_over_free(ranked) >= _OVER_FREE
+        if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
             return self._accepted(track, epoch, update), verdict
         return self._decided(doubtful, window, ranked)
 
@@ -110,9 +112,8 @@ class AnomalyTest:
         """The track after a decision, or still in doubt."""
         doubtful, in_doubt = len(track.doubtful), (track, Verdict(0, Reason.DOUBTFUL))
         best, explained = ranked[0], ranked[0].chi2 < _EXPLAINED * ranked[0].dof
-        free = next(e.log_evidence for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
         certain = explained and best.log_evidence - ranked[1].log_evidence >= _OVER_NEXT
-        certain = certain and (best.log_evidence - free >= _OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
+        certain = certain and (_odds_over_free(ranked) >= _OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
         if doubtful < _MOST and not certain:
             return in_doubt
         if best.hypothesis is Hypothesis.MANOEUVRE and explained:
@@ -289,6 +290,16 @@ def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
     still, ended = _chi2(change, P), _chi2(change + bias.offset, P + bias.P)
     gain = float(np.linalg.slogdet(P + bias.P)[1] - np.linalg.slogdet(P)[1])
     return replace(bias, last=epoch) if still < min(GATE, ended + gain) else None
+
+
+def _odds_over_free(ranked: list[Explanation]) -> float:
+    """Log odds of the best hypothesis over free motion, with the noise that its own residuals show if that is larger.
+
+    Errors of the registration that are larger than claimed, or correlated, resemble small changes of the motion.
+    """
+    best = ranked[0]
+    free = next(e.log_evidence for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
+    return (best.log_evidence - free - PRIOR_ODDS) / max(1.0, best.chi2 / best.dof) + PRIOR_ODDS
 
 
 def _chi2(y: Array, C: Array) -> float:

@@ -24,7 +24,7 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Belief
 
-_PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
+PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _PER_BAD_SCAN = math.log(1e-2)
 _INSTANTS, _FEWER, _LONG = 8, 4, 9  # instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
 _LONGEST_SPREAD = 6  # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
@@ -255,7 +255,7 @@ def _manoeuvre(window: _Window, start: Belief, white: Array, free: float, priors
         ends = instants[np.minimum(np.searchsorted(share, [_TAIL, 1.0 - _TAIL]), len(instants) - 1)]
         best = replace(best, changes_s=tuple(np.unique(ends).tolist()))
     onset = int(np.searchsorted(window.times_s, best.changes_s[0], side="right"))
-    return replace(best, log_evidence=total + _PRIOR_ODDS, onset=onset, after_s=after_s, after_1s_s=spread)
+    return replace(best, log_evidence=total + PRIOR_ODDS, onset=onset, after_s=after_s, after_1s_s=spread)
 
 
 def _after_change(window: _Window, start: Belief, tau: float) -> Array:
@@ -309,7 +309,7 @@ def _sensor_bias(window: _Window, white: Array, free: float, priors: ChangePrior
     whitened = columns[onset - 1][:, :6]
     _, u, P = _evidence(white, free, whitened, scale[:6])
     left = white - whitened @ u
-    evidence = _log_mean(values.tolist()) + _PRIOR_ODDS
+    evidence = _log_mean(values.tolist()) + PRIOR_ODDS
     return Explanation(Hypothesis.SENSOR_BIAS, evidence, float(left @ left), 6 * n - 6, onset, size=u, P=P)
 
 
@@ -320,7 +320,7 @@ def _bad_scans(window: _Window, priors: ChangePriors, first: int, n: int) -> Exp
     for k in range(first, n):
         C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += np.diag(extra)
     value, chi2 = _gaussian(window.y, C)
-    value += _PRIOR_ODDS + _PER_BAD_SCAN * (n - first)
+    value += PRIOR_ODDS + _PER_BAD_SCAN * (n - first)
     return Explanation(Hypothesis.BAD_SCANS, value, chi2, 6 * n, first)
 
 
@@ -331,7 +331,7 @@ def _frozen(window: _Window, first: int, n: int) -> Explanation:
         away = _difference(window.poses[k], window.poses[first - 1], window.R_ba[k])
         part, size = _gaussian(away, 2.0 * window.R[k])
         value, chi2 = value + part, chi2 + size
-    return Explanation(Hypothesis.FROZEN, value + _PRIOR_ODDS, chi2, 6 * n, first)
+    return Explanation(Hypothesis.FROZEN, value + PRIOR_ODDS, chi2, 6 * n, first)
 
 
 def _difference(a: Pose, b: Pose, R_ba: Array) -> Array:
