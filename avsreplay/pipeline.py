@@ -205,7 +205,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     gamma = verdict.gamma
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, innovation, gamma, track)
     forecast = partial(stages.estimator.track_forecast, track)
-    belief = stages.estimator.in_camera(track.belief)
+    belief = stages.estimator.published(track)
     known = planner_input(stages.estimator, belief, stages.target, gamma, report.converged, forecast)
     guidance = stages.guidance.step(state.guidance or stages.guidance.initial(scan.t_ns), known)
     outcome = Outcome(

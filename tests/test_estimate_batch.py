@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.batch import FitParams, Pin, Poses, Prior, Problem, fit, normal_points
+from avsreplay.estimate.batch import FitParams, Pin, Poses, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import (
     BatchCovariance,
     covariance_of,
@@ -26,6 +26,7 @@ from avsreplay.estimate.dynamics import advance, flow, process_noise, rotation_h
 from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import measurement_jacobian, to_fixture
+from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.reference import reference_fit
 from avsreplay.geometry import Pose

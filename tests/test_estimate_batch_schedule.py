@@ -18,6 +18,7 @@ from avsreplay.estimate.chart import nees, to_chart, to_errors
 from avsreplay.estimate.ekf import innovation_of
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.initialise import PoseFix, batch_estimate, given_prior, poses_of, rough_state, weak_prior
+from avsreplay.estimate.noise_levels import NO_LEVELS
 from avsreplay.estimate.params import Constraint, Start
 from avsreplay.monitor.convergence import Consistency, ConsistencyParams
 from avsreplay.records import Belief, State
@@ -160,7 +161,7 @@ def test_the_estimate_of_a_disturbed_body_is_consistent(start: Start) -> None:
 
 def test_contradiction_counts_in_the_fits_own_spread() -> None:
     found = fixes(4, 100.0)
-    cold = batch_estimate(found, WHITE.resolved(2.0), FitParams())
+    cold = batch_estimate(found, WHITE.resolved(2.0), FitParams(), NO_LEVELS)
     assert not contradicted(cold.belief, cold.belief)
     sizes = np.sqrt(np.linalg.eigvalsh(cold.belief.P))
     axis = np.linalg.eigh(cold.belief.P)[1][:, -1]

@@ -17,18 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import rotation_path
-from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.noise import GATE, integrated_autocorrelation
 from avsreplay.geometry import Array
 from avsreplay.records import State
 from avsreplay.settings import Settings, setting
 
 _FEWEST_FOR_FACTORS = 12
-_POINTS, _SPAN_RAD = 128, 0.25  # normal points, and least rotation over which poses are joined [rad]
 _PIN_TOL = 0.02  # half chi-square: tolerance of a fit with one direction fixed
 
 
@@ -60,6 +56,9 @@ class Poses:
         times_s: (n,) since the fit's epoch [s].  q: (n, 4) q_ac.  t: (n, 3) [m].
         C: (n, 6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
         counts: (n,) number of poses that each normal point stands for; None where they are measured poses.
+        shares: (n,) part of C that poses seen from nearly the same direction have in common; None for 0.
+        within: squared whitened differences of poses from their normal points, of attitude and position, and their
+            degrees of freedom; None where there are none.
         root: (n, 6, 6) lower triangular with root C root' = 1.
         info: (n, 2, 3, 3) inverse covariance of the attitude and of the position by itself.
     """
@@ -69,6 +68,8 @@ class Poses:
     t: Array
     C: Array
     counts: Array | None = None
+    shares: Array | None = None
+    within: tuple[tuple[float, float], float] | None = None
     root: Array = field(init=False)
     info: Array = field(init=False)
 
@@ -88,7 +89,13 @@ class Poses:
 
     def upto(self, count: int) -> Poses:
         """The first ``count`` poses."""
-        return Poses(self.times_s[:count], self.q[:count], self.t[:count], self.C[:count])
+        return Poses(
+            self.times_s[:count],
+            self.q[:count],
+            self.t[:count],
+            self.C[:count],
+            shares=None if self.shares is None else self.shares[:count],
+        )
 
     def latest(self, count: int, epoch_s: float) -> Poses:
         """The last ``count`` poses, with times from ``epoch_s``."""
@@ -178,10 +185,13 @@ class Problem:
         prior: Gaussian prior of the initial values.
         factors: (2,) on the standard deviations of attitude and position.
         start: the chart of the first linearisation.
+        slack: factor on the squared residual from which a pose is an outlier, where disturbances add to it.
     """
 
-    def __init__(self, poses: Poses, prior: Prior, factors: Array, start: Chart | None = None) -> None:
-        self.poses, self.prior, self.factors = poses, prior, factors
+    def __init__(
+        self, poses: Poses, prior: Prior, factors: Array, start: Chart | None = None, slack: float = 1.0
+    ) -> None:
+        self.poses, self.prior, self.factors, self._slack = poses, prior, factors, slack
         core = _motion.Problem(
             poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, _inverse(prior.P)
         )
@@ -193,7 +203,7 @@ class Problem:
     def reweigh(self, factors: Array, redescend: bool = True) -> None:
         """Use other noise factors, or Huber's weights in place of Cauchy's, with the same linearisation."""
         self.factors = factors
-        self.core.noise(_pair(factors), redescend)
+        self.core.noise(_pair(factors), redescend, self._slack)
 
     def cost(self, chart: Chart) -> float:
         """Half chi-square of initial values, including the prior."""
@@ -238,6 +248,8 @@ def fit(
     params: FitParams,
     factors: Array | None = None,
     every: Poses | None = None,
+    robust_start: bool = False,
+    slack: float = 1.0,
 ) -> BatchFit:
     """Fit from ``start``. The noise factors begin at ``factors`` and are refined where ``params.rescale`` is set.
 
@@ -250,6 +262,8 @@ def fit(
         params: settings of the fit.
         factors: (2,) noise factors of a fit that ended at ``start``. None begins at 1, with Huber's weights.
         every: the poses that ``poses`` are normal points of; the noise is estimated from their residuals.
+        robust_start: begin with Huber's weights although ``factors`` are given.
+        slack: as in ``Problem``.
 
     Raises:
         ValueError: fewer than three poses.
@@ -258,9 +272,9 @@ def fit(
         raise ValueError(f"{len(poses)} poses, three at least are needed")
     every = poses if every is None else every
     least = np.sqrt(np.full(2, params.least_inflation))
-    problem = Problem(poses, prior, least if factors is None else factors, start)
+    problem = Problem(poses, prior, least if factors is None else factors, start, slack)
     core, steps = problem.core, 0
-    if factors is None:
+    if factors is None or robust_start:
         problem.reweigh(problem.factors, redescend=False)
         steps = core.descend(params.max_steps, params.gain_tol)[0]
         problem.reweigh(problem.factors)
@@ -293,43 +307,3 @@ def _noise_of(problem: Problem, every: Poses) -> tuple[Array, Array]:
     factors = np.sqrt((sizes + problem.core.absorbed(problem.covariance)) / (3.0 * float(weights.sum())))
     white *= np.sqrt(weights)[:, None]
     return factors, np.array([integrated_autocorrelation(white[:, :3]), integrated_autocorrelation(white[:, 3:])])
-
-
-def normal_points(poses: Poses, reference: Chart, factors: Array) -> Poses:
-    """At most some hundred poses that carry the information of many: weighted means about a reference motion.
-
-    Neighbouring poses, while the body turns by a fraction of a radian, are replaced by the reference's pose at their
-    mean instant, corrected by the mean of their differences from it, with the inverse of the sum of their information
-    as covariance. The difference of two solutions of the motion changes little over such a turn, so the fit to the
-    normal points is the fit to the poses. Satellite laser ranging reduces its observations to normal points in the same
-    way.
-
-    Args:
-        poses: the measurements.
-        reference: initial values of a motion close to them.
-        factors: (2,) noise factors of attitude and position, for the weights of outliers.
-    """
-    n, rate = len(poses), float(np.linalg.norm(reference.w_c))
-    if n <= _POINTS:
-        return poses
-    since = poses.times_s - poses.times_s[0]
-    turned = np.floor(rate * since / max(_SPAN_RAD, rate * float(since[-1]) / _POINTS)).astype(int)
-    place = np.arange(n) - np.searchsorted(turned, turned)
-    first = np.flatnonzero(np.diff(turned, prepend=-1) | (place % -(-n // _POINTS) == 0))
-    d = poses.residuals(Problem(poses, Prior(reference, np.eye(DIM)), factors), reference)
-    white = (poses.root @ (d / np.repeat(factors, 3))[:, :, None])[:, :, 0]
-    weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
-    counts = np.diff(first, append=n)
-    shifted = np.add.reduceat(weights, first) < 0.5 * counts  # the reference is off, not the poses
-    weights = np.where(np.repeat(shifted, counts), 1.0, weights)
-    info = weights[:, None, None] * (np.swapaxes(poses.root, 1, 2) @ poses.root)
-    C = _inverse(np.add.reduceat(info, first))
-    mean = (C @ np.add.reduceat(info @ d[:, :, None], first))[:, :, 0]
-    times = np.add.reduceat(weights * poses.times_s, first) / np.add.reduceat(weights, first)
-    x = to_state(reference)
-    q_ab = rotation_path(x).at(times)[0]
-    q = geometry.multiply(geometry.multiply(q_ab, x.q_bc), geometry.exp(-mean[:, :3]))
-    t = x.r_a + times[:, None] * x.v_a + geometry.matrix(q_ab) @ x.c_b
-    return Poses(
-        times, q, t - (geometry.matrix(q) @ mean[:, 3:, None])[:, :, 0], 0.5 * (C + np.swapaxes(C, 1, 2)), counts
-    )

@@ -56,19 +56,21 @@ class Component:
     """One Gaussian of a mixture: its weight, and mean and covariance at the last pose.
 
     ``P_chart`` (20, 20) is the covariance in the chart: where two moments are nearly equal, rounding of the much larger
-    error states of mu would spoil that of the other states.
+    error states of mu would spoil that of the other states. ``share`` is the part of the correction by process noise
+    that the mean contains.
     """
 
     weight: float
     belief: Belief
     P_chart: Array
+    share: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NonGaussianDirection:
-    """A non-Gaussian direction: its part ``axis axis'`` of P_chart, and the profile fits on either side."""
+    """A non-Gaussian direction: ``row`` (20,) of the coordinate along it, and the profile fits on either side."""
 
-    axis: Array
+    row: Array
     points: tuple[ProfilePoint, ProfilePoint]
 
 
@@ -105,7 +107,7 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Batc
             if first is None or second is None:
                 others = True  # its part of the covariance stays that of the fit
             else:
-                directions.append(NonGaussianDirection(axis, (first, second)))
+                directions.append(NonGaussianDirection(row, (first, second)))
     return BatchCovariance(fitted, tuple(directions), others)
 
 
@@ -148,6 +150,7 @@ def final_mixture(
     noise: tuple[float, float],
     t_ns: int,
     after_s: float,
+    spread: Array | None = None,
 ) -> tuple[Component, ...]:
     """The fit with process noise as a Gaussian mixture at the last pose; the first component has the published mean.
 
@@ -158,29 +161,30 @@ def final_mixture(
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
         t_ns: the instant of the last scan [ns].
         after_s: that instant after the epoch [s].
+        spread: (20, 20) M in chart steps: M P M' is the covariance with the correlation of the poses' errors.
     """
     fitted, n = found.fitted, len(found.directions)
-    axes = sum((np.outer(d.axis, d.axis) for d in found.directions), np.zeros((DIM, DIM)))
-    bases: list[tuple[float, Chart, Pin | None, Array]] = [(1.0 - 2.0 * _WEIGHT * n, fitted.chart, None, axes)]
-    bases += [(_WEIGHT, p.chart, p.pin, np.zeros((DIM, DIM))) for d in found.directions for p in d.points]
+    bases: list[tuple[float, Chart, Pin | None]] = [(1.0 - 2.0 * _WEIGHT * n, fitted.chart, None)]
+    bases += [(_WEIGHT, p.chart, p.pin) for d in found.directions for p in d.points]
     out, lost = [], 0.0
     recent = Problem(latest, problem.prior, fitted.effective)
-    for weight, chart, pin, without in bases:
+    for weight, chart, pin in bases:
         y, P = process_noise_pass(chart, pin, problem, noise)
+        P = P if spread is None or pin is not None else spread @ P @ spread.T  # for the trajectory of the fit alone
         x, step = propagate_chart(chart, after_s)
         base, move = to_chart(x), step @ y
         share = 1.0
         if float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
             share = _accepted_share(base, move, recent)
         there = base.moved(share * move)
-        P = P if pin is not None or not n else _without(P, without)
+        P = P if pin is not None else _fixed(P, [d.row for d in found.directions])
         P = step @ P @ step.T + (1.0 - share) ** 2 * np.outer(move, move)
         if pin is not None and _least_eigenvalue(P) < -_ROUNDING:
             lost += weight  # about an unstable spin, rounding at the epoch has grown beyond the covariance
             continue
         T = to_errors(there)
         P_errors = T @ P @ T.T
-        out.append(Component(weight, Belief(t_ns, to_state(there), 0.5 * (P_errors + P_errors.T)), P))
+        out.append(Component(weight, Belief(t_ns, to_state(there), 0.5 * (P_errors + P_errors.T)), P, share))
     return (replace(out[0], weight=out[0].weight + lost), *out[1:])
 
 
@@ -193,12 +197,12 @@ def _least_eigenvalue(P: Array) -> float:
     return float(np.linalg.eigvalsh(P / np.outer(scale, scale))[0])
 
 
-def _without(P: Array, part: Array) -> Array:
-    """P less a part of it, positive semidefinite: what rounding leaves below zero is zero."""
-    scale = np.sqrt(np.diagonal(P))
-    values, vectors = np.linalg.eigh((P - part) / np.outer(scale, scale))
-    root = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
-    return np.asarray(root @ root.T)
+def _fixed(P: Array, rows: list[Array]) -> Array:
+    """P given the coordinates along ``rows``: their variance is that between the components of the mixture."""
+    for row in rows:
+        column = P @ row
+        P = P - (1.0 - _PIN_1S**2) * np.outer(column, column) / float(row @ column)
+    return P
 
 
 def _accepted_share(base: Chart, move: Array, latest: Problem) -> float:
@@ -264,9 +268,13 @@ def propagate_chart(chart: Chart, h: float) -> tuple[State, Array]:
     return there, np.asarray(np.linalg.solve(to_errors(to_chart(there)), Phi @ to_errors(chart)))
 
 
-def memory_s(torque: float) -> float:
-    """How far back [s] a fit may look: root density ``torque`` turns the body by its square T^3 / 3 in variance."""
-    return float(np.cbrt(3.0 * (_LINEAR_RAD / (SPHERE * torque)) ** 2))
+def memory_s(torque: float, pose_rad: float = _LINEAR_RAD**2) -> float:
+    """How far back [s] a fit may look: root density ``torque`` turns the body by its square T^3 / 3 in variance.
+
+    The problem is linear as long as the square of that rotation is less than the error of a pose, ``pose_rad``.
+    """
+    turn = min(_LINEAR_RAD, float(np.sqrt(pose_rad)))
+    return float(np.cbrt(3.0 * (turn / (SPHERE * torque)) ** 2))
 
 
 def process_noise_pass(

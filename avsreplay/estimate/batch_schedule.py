@@ -20,11 +20,13 @@ from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_char
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
 from avsreplay.estimate.drift import find_drift
 from avsreplay.estimate.dynamics import propagate_state
-from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, first_belief
-from avsreplay.estimate.measurement import in_fixture, measured_pose
+from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, first_belief, improved_levels
+from avsreplay.estimate.measurement import in_fixture, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
-from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
+from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
+from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import Prediction, Track
+from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation
 
 FEWEST_TO_FIT = 3
@@ -34,6 +36,9 @@ _DRIFT_S = 30.0  # time over which the process noise changes the velocity as muc
 _DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
 _RECENT = 0.1  # largest age of a given start over the fit's memory; until then disturbances change it little
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
+_LEAST_TORQUE = 1e-6  # a fit looks back as far as this torque noise allows, even without disturbances [rad/s^1.5]
+_MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
+LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
 _LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
 _instant = attrgetter("t_ns")
 
@@ -50,9 +55,8 @@ class BatchSchedule:
     def __init__(self, params: EstimatorParams, noise: Noise, start: Belief | None) -> None:
         self.params, self.noise, self.start = params, noise, start
         self.checked_poses = 0 if params.start is Start.PAPER else params.audit_poses
-        self._rules = FitParams(rescale=params.adapt is not Adaptation.OFF)
+        self._rules = FitParams(rescale=False)
         self._drift_scale = (1e-3, _DRIFT_OF_SPEED * params.length("start_vel_1s_mps"))
-        self._memory_ns = round(min(memory_s(params.torque_noise_radps15), _LONGEST_S) * 1e9)
 
     def initialised(self, track: Track, prediction: Prediction, innovation: Innovation, converged: bool) -> Track:
         """The track after a healthy pose while the fit is in use: a new fit if enough poses have come since the last.
@@ -67,10 +71,11 @@ class BatchSchedule:
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
             start = chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
             given = self._given(track)
-            result = batch_estimate(track.fixes, self.params, self._rules, last, start, given)
+            result = batch_estimate(track.fixes, self.params, self._rules, self._levels(track), last, start, given)
             rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
             track = replace(track, reinitialised=track.reinitialised + rejected)
-            return self._adopted(track, result, result.gaussian and converged)
+            remembers = forgot and track.levels.slack > 1.0  # the filter remembers what later fits cannot use
+            return self._adopted(track, result, result.gaussian and (converged or remembers))
         if last.gaussian:
             belief = ekf.chart_update(prediction.belief, prediction.H, innovation, last.inflation)
             return replace(track, belief=belief)
@@ -100,10 +105,22 @@ class BatchSchedule:
         epoch_ns = track.fixes[0].t_ns
         rejected = track.batch is not None and track.batch.prior_rejected
         begin, given = chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
-        result = batch_estimate(track.fixes, self.params, self._rules, start=begin, given=given)
-        if (result.gaussian or many_outliers) and contradicted(track.belief, result.belief):
+        last = track.batch if track.batch is not None and track.batch.epoch_ns == epoch_ns else None
+        result = batch_estimate(
+            track.fixes, self.params, self._rules, self._levels(track), last, start=begin, given=given
+        )
+        sound = result.gaussian and _better_than_measured(result.belief, track.R)
+        if (sound or many_outliers) and contradicted(track.belief, result.belief):
             return replace(self._adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
+        whole = last is not None and result.components[0].share == 1.0  # the fit has all poses of the filter
+        if sound and whole:
+            return self._adopted(track, result, to_filter=True)
         return replace(track, since=0)
+
+    def between_fits(self, track: Track) -> Track:
+        """The track after a healthy scan with what is done between fits: noise levels, else the test for a drift."""
+        after = self.with_levels(track)
+        return after if after.unlevelled == 0 else self.check_for_drift(after)
 
     def check_for_drift(self, track: Track) -> Track:
         """The track with the constant torque or force that its poses show, tested each time they have grown enough.
@@ -120,26 +137,52 @@ class BatchSchedule:
         epoch_ns = track.fixes[0].t_ns
         start = last.chart if last.epoch_ns == epoch_ns else chart_at(track.belief, epoch_ns)
         factors = np.array([track.window.factors[3], track.window.factors[0]])
-        found = find_drift(track.fixes, start, self.params, factors, self._drift_scale)
+        found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels)
         if found is None:
             return track
         if track.drift is not None:
             return replace(track, drift=replace(found, detected_ns=track.drift.detected_ns))
         track = replace(track, drift=found)
-        result = batch_estimate(track.fixes, self.params, self._rules, start=start, noise=self.noise_levels(track))
+        result = batch_estimate(track.fixes, self.params, self._rules, self._levels(track), start=start)
         return self._adopted(track, result, to_filter=True)
 
     def noise_levels(self, track: Track) -> tuple[float, float]:
-        """Root densities of torque [rad/s^1.5] and force [m/s^1.5]: those of the settings, or those of the drift.
+        """Root densities of torque [rad/s^1.5] and force [m/s^1.5], given or estimated.
 
-        White noise of root density q changes the rate by q sqrt(T) within T, a constant acceleration a by a T; the two
-        are equal over ``_DRIFT_S``. The torque acts on the rate through B(sigma), which is 3 for a sphere.
+        Where they are given, those of a drift apply if larger. White noise of root density q changes the rate by q
+        sqrt(T) within T, a constant acceleration a by a T; the two are equal over ``_DRIFT_S``. The torque acts on the
+        rate through B(sigma), which is 3 for a sphere.
         """
-        torque, force = self.params.torque_noise_radps15, self.params.force
-        if track.drift is None:
-            return torque, force
-        sizes = [float(np.linalg.norm(v)) * np.sqrt(_DRIFT_S) for v in (track.drift.rate, track.drift.velocity)]
-        return max(torque, sizes[0] / SPHERE), max(force, sizes[1])
+        found, drift = [track.levels.torque, track.levels.force], track.drift
+        sizes = (0.0, 0.0) if drift is None else (float(np.linalg.norm(v)) for v in (drift.rate, drift.velocity))
+        for k, (given, size) in enumerate(zip(self.params.disturbances, sizes, strict=True)):
+            if given is not None:
+                found[k] = max(given, size * np.sqrt(_DRIFT_S) / (SPHERE, 1.0)[k])
+        return found[0], found[1]
+
+    def _levels(self, track: Track) -> NoiseLevels:
+        torque, force = self.noise_levels(track)
+        return replace(track.levels, torque=torque, force=force)
+
+    def _memory_ns(self, track: Track) -> int:
+        """How far back a fit looks [ns]."""
+        torque, half = max(self.noise_levels(track)[0], _LEAST_TORQUE), np.trace(track.R[3:, 3:])
+        return round(min(memory_s(torque, 2.0 * float(np.sqrt(half)) or 1.0), _LONGEST_S) * 1e9)
+
+    def with_levels(self, track: Track) -> Track:
+        """The track with new noise levels, where the poses have grown enough since they were last estimated."""
+        count, last = len(track.fixes), track.batch
+        due = max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
+        ready = bool(self.checked_poses) and last is not None and count >= FEWEST
+        if not ready or last is None or track.unlevelled < due or track.since == 0:
+            return replace(track, unlevelled=track.unlevelled + 1)
+        epoch_ns = track.fixes[0].t_ns
+        start = last.chart if last.epoch_ns == epoch_ns else chart_at(track.belief, epoch_ns)
+        levels = improved_levels(track.fixes, last, start, self.params, track.levels)
+        used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
+        more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
+        since = count if more else track.since  # the estimate so far does not allow for these disturbances: fit again
+        return replace(track, levels=levels, unlevelled=0, since=since)
 
     def _first(self, track: Track, prediction: Prediction, innovation: Innovation) -> Belief:
         """The belief after the first poses, too few for a fit."""
@@ -150,7 +193,7 @@ class BatchSchedule:
     def _given(self, track: Track) -> Prior | None:
         """The track's prior, propagated to the first pose; None where disturbances or time have made it useless."""
         t_ns = track.fixes[0].t_ns
-        if track.prior is None or t_ns - track.prior_ns > _RECENT * self._memory_ns:
+        if track.prior is None or t_ns - track.prior_ns > _RECENT * self._memory_ns(track):
             return None
         x, step = propagate_chart(track.prior.mean, (t_ns - track.prior_ns) * 1e-9)
         P = step @ track.prior.P @ step.T
@@ -166,7 +209,7 @@ class BatchSchedule:
 
     def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
         """The poses within the fit's memory, including this one."""
-        oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns, key=_instant)
+        oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns(track), key=_instant)
         return (*track.fixes[oldest:], self.fix(prediction, innovation))
 
     def fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
@@ -186,6 +229,13 @@ def chart_at(belief: Belief, t_ns: int) -> Chart:
     """The belief's mean propagated to another instant, as a starting point of a fit."""
     there, _ = propagate_state(belief.x, (t_ns - belief.t_ns) * 1e-9)
     return to_chart(there)
+
+
+def _better_than_measured(belief: Belief, R: Array) -> bool:
+    """Return whether the pose is known at least as well as from a single measurement with the noise R (6, 6)."""
+    H = measurement_jacobian(belief.x)
+    S = H @ belief.P @ H.T
+    return all(float(np.trace(S[b, b])) <= float(np.trace(R[b, b])) for b in (slice(0, 3), slice(3, 6)))
 
 
 def contradicted(belief: Belief, fitted: Belief) -> bool:

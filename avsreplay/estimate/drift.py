@@ -14,11 +14,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from avsreplay.estimate.batch import FitParams, Poses, Problem, fit, normal_points
+from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.dynamics import rotation_history
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
+from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, disturbance_evidence
+from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import Array
 from avsreplay.records import Drift, State
@@ -27,6 +29,7 @@ _ONSETS = 12  # number of onsets tried, the first at the epoch
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
 _STEP_RAD = 0.1  # step of the integral B
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
+_CONSTANT = 5.0  # log odds of a drift over random disturbances from which it is reported
 _KINDS = (slice(0, 3), slice(3, 6), slice(0, 6))  # torque, force, both
 _PER_KIND = (0.0, 0.0, math.log(1e-2))  # log prior odds of each
 
@@ -46,7 +49,12 @@ class _Linear:
 
 
 def find_drift(
-    fixes: tuple[PoseFix, ...], start: Chart, params: EstimatorParams, factors: Array, scale: tuple[float, float]
+    fixes: tuple[PoseFix, ...],
+    start: Chart,
+    params: EstimatorParams,
+    factors: Array,
+    scale: tuple[float, float],
+    levels: NoiseLevels = NO_LEVELS,
 ) -> Drift | None:
     """The drift that the poses show, None where free motion explains them.
 
@@ -56,6 +64,7 @@ def find_drift(
         params: settings, auto values filled in.
         factors: (2,) noise factors of attitude and position of the poses.
         scale: prior 1 sigma of the angular acceleration [rad/s2] and of the acceleration [m/s2].
+        levels: noise levels; random disturbances explain the poses as well, and better unless they are constant.
     """
     poses = poses_of(fixes)
     prior = weak_prior(poses, params)
@@ -74,7 +83,7 @@ def find_drift(
         found = [_explained(linear, points, here, b, t, widths, inflation) for b, t in zip(there, onsets, strict=True)]
         k = int(np.argmax([f.log_odds for f in found]))
         best, inflation = found[k], _remaining_noise(linear, points, here, there[k], found[k])
-    if best.log_odds < _FOUND:
+    if best.log_odds < _FOUND or best.log_odds - _random(poses, fitted.chart, prior, factors, levels) < _CONSTANT:
         return None
     odds = np.array([f.log_odds for f in found])
     weight = np.exp(odds - odds.max())
@@ -83,6 +92,12 @@ def find_drift(
     spread = math.hypot(math.sqrt(float(weight @ (onsets - mean) ** 2 / weight.sum())), spacing / math.sqrt(12.0))
     onset_ns = fixes[0].t_ns + round(best.onset_s * 1e9)
     return Drift(onset_ns, spread, best.u[3:], best.u[:3], best.P, fixes[-1].scan_ns)
+
+
+def _random(poses: Poses, chart: Chart, prior: Prior, factors: Array, levels: NoiseLevels) -> float:
+    """Log odds of random disturbances over free motion."""
+    points = normal_points(poses, chart, factors, MOST_POINTS)
+    return disturbance_evidence(points, Problem(points, prior, factors, chart), levels)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

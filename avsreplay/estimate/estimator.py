@@ -20,6 +20,7 @@ from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_covariance import mixture_forecast
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import to_state
+from avsreplay.estimate.error_state import RHO
 from avsreplay.estimate.initialise import given_prior, guessed_belief
 from avsreplay.estimate.measurement import (
     innovation_vector,
@@ -27,7 +28,7 @@ from avsreplay.estimate.measurement import (
     measurement_jacobian,
     residual,
 )
-from avsreplay.estimate.noise import NO_INFLATION, Noise
+from avsreplay.estimate.noise import NO_INFLATION, Noise, line_of_sight_1s
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import Epoch, Prediction, Track
 from avsreplay.geometry import Array, Pose
@@ -125,7 +126,7 @@ class Estimator:
             track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged)
         )
         tested = verdict.gamma == 1 and self._robust and after.mode in ("fit", "filter")
-        return self.batch.check_for_drift(after) if tested else after, verdict
+        return self.batch.between_fits(after) if tested else after, verdict
 
     def track_forecast(self, track: Track, times_s: Array) -> Forecast:
         """Predicted 1 sigma of the grasp point after a scan, by components where the likelihood is not Gaussian.
@@ -134,9 +135,12 @@ class Estimator:
             track: after the scan.
             times_s: (n,) >= 0, ascending [s after the scan].
         """
+        noise, b = self.batch.noise_levels(track), self._common_1s(track)
         if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
-            return dynamics.grasp_forecast(track.belief, times_s, *self.batch.noise_levels(track))
-        return mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *self.batch.noise_levels(track))
+            found = dynamics.grasp_forecast(track.belief, times_s, *noise)
+        else:
+            found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise)
+        return replace(found, pos_1s_m=np.hypot(found.pos_1s_m, float(np.linalg.norm(b))))
 
     def refitted_rows(self, track: Track) -> tuple[Array, Array, Array] | None:
         """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no new fit.
@@ -214,6 +218,28 @@ class Estimator:
             return self.batch.initialised(track, prediction, innovation, converged)
         return self.batch.check_against_batch(self._filtered(track, prediction, innovation))
 
+    def published(self, track: Track) -> Belief:
+        """The belief in {A} with the error of the position along the line of sight that all poses may have in common.
+
+        No later pose reduces that error, so it is no part of the belief that the filter carries.
+
+        Args:
+            track: after a scan.
+        """
+        belief, b = self.in_camera(track.belief), self._common_1s(track)
+        if not b.any():
+            return belief
+        P = belief.P.copy()
+        P[RHO, RHO] += np.outer(b, b)
+        return replace(belief, P=P)
+
+    def _common_1s(self, track: Track) -> Array:
+        """(3,) 1 sigma of that error in {A} [m]."""
+        if track.batch is None or track.batch.share == 0.0:
+            return np.zeros(3)
+        share = float(track.levels.common_share(track.batch.share)[1])
+        return line_of_sight_1s(self.in_camera(track.belief).x.T_ac.t, track.R[:3, :3], share)
+
     def in_camera(self, belief: Belief) -> Belief:
         """The belief of a track or a prediction in {A}; it differs only where an acceleration is known.
 
@@ -257,7 +283,8 @@ class Estimator:
             belief: mean and covariance now.
             times_s: (n,) >= 0, ascending [s after the belief's instant].
         """
-        return dynamics.grasp_forecast(belief, times_s, self.params.torque_noise_radps15, self.params.force)
+        torque, force = (given or 0.0 for given in self.params.disturbances)
+        return dynamics.grasp_forecast(belief, times_s, torque, force)
 
     def pose_covariance(self, belief: Belief) -> Array:
         """The covariance of the pose of {C}, H P H' (H of eq:innovation).
@@ -275,7 +302,8 @@ class Estimator:
         """The filter's posterior, its noise window and its memory of poses."""
         prior = prediction.belief
         dt_ns = prior.t_ns - track.belief.t_ns
-        inflation = self.noise.inflation(track.inflation, prior.x.w_b, dt_ns, innovation.share)
+        mean = 0.0 if track.batch is None else track.batch.share
+        inflation = self.noise.inflation(track.inflation, mean, prior.x.w_b, dt_ns, innovation.share)
         if self._by_gain and track.batch is None:
             belief, hits = ekf.constrained_update(prior, prediction.H, innovation, self.params.sigma_margin, inflation)
         else:

@@ -18,7 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit, normal_points
+from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import (
     LATEST,
     BatchCovariance,
@@ -32,12 +32,15 @@ from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.error_state import DIM, boxplus, hamilton
 from avsreplay.estimate.measurement import in_camera, measurement_jacobian
 from avsreplay.estimate.noise import BOUND
-from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels, sandwich
+from avsreplay.estimate.normal_points import normal_points
+from avsreplay.estimate.params import Adaptation, EstimatorParams
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
 
 _PAIR_RAD = 0.7
 _DRAWS, _EDGE = 500, 0.99
+_LEVEL_STEPS, _LEVEL_TOL = 20, 0.1
 _DETERMINED = 0.5  # a direction whose posterior sigma is above this share of the prior's is determined by the prior
 
 
@@ -74,6 +77,7 @@ class BatchResult:
         components: the Gaussian mixture that ``belief`` has the moments of.
         prior_rejected: the poses contradict the given start, and it was left out.
         points: the poses of the fit, or their normal points.
+        share: mean claimed part of the variance of the poses that near views have in common.
     """
 
     epoch_ns: int
@@ -86,6 +90,7 @@ class BatchResult:
     components: tuple[Component, ...] = ()
     prior_rejected: bool = False
     points: Poses | None = None
+    share: float = 0.0
 
 
 def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
@@ -128,6 +133,7 @@ def poses_of(fixes: tuple[PoseFix, ...], epoch_ns: int | None = None) -> Poses:
         np.array([f.T_ac.q for f in fixes]),
         np.array([f.T_ac.t for f in fixes]),
         np.array([f.C for f in fixes]),
+        shares=np.array([f.correlated_share for f in fixes]),
     )
 
 
@@ -182,48 +188,82 @@ def batch_estimate(
     fixes: tuple[PoseFix, ...],
     params: EstimatorParams,
     rules: FitParams,
+    levels: NoiseLevels,
     last: BatchResult | None = None,
     start: Chart | None = None,
     given: Prior | None = None,
-    noise: tuple[float, float] | None = None,
 ) -> BatchResult:
-    """Fit all poses, from ``start`` or the values of the last fit; ``given`` is the prior at the first pose.
+    """Fit all poses with noise of these levels, from ``start`` or the values of the last fit.
 
-    The given prior is left out once the poses contradict it. ``noise``: root densities of torque and force, by default
-    those of the settings.
+    ``given`` is the prior at the first pose; it is left out once the poses contradict it.
     """
     poses = poses_of(fixes)
     prior = weak = weak_prior(poses, params)
     if start is None:
         start = to_chart(rough_state(fixes)) if last is None else last.chart
-    share = float(np.mean([f.correlated_share for f in fixes]))
-    rules = replace(rules, least_inflation=params.colour(_mean_turn(poses), share))
-    factors = None if last is None else last.factors * np.sqrt(last.inflation)
-    points = normal_points(poses, start, np.ones(2) if factors is None else factors)
-    fitted = fit(points, start, weak, rules, factors, poses)
-    rejected = last is not None and last.prior_rejected
+    share = float(np.mean(poses.shares)) if poses.shares is not None else 0.0
+    plain = levels.factors(share)
+    if last is None:
+        points = normal_points(poses, start, plain)
+        inflation = sandwich(Problem(points, given or weak, plain, start), points, levels)[1]
+    else:
+        inflation = last.inflation
+    factors = plain * np.sqrt(inflation)
+    points = normal_points(poses, start, factors * np.sqrt(levels.slack))
+    first, rejected = last is None, last is not None and last.prior_rejected
+    noise, slack = (levels.torque, levels.force), levels.slack
+    fitted = fit(points, start, weak, rules, factors, robust_start=first, slack=slack)
     if given is not None and not rejected:
-        joint = fit(points, start, given, rules, factors, poses)
+        joint = fit(points, start, given, rules, factors, robust_start=first, slack=slack)
         rejected = _contradicts(points, fitted, weak, joint, given)
         fitted, prior = (fitted, weak) if rejected else (joint, given)
-    problem = Problem(points, prior, fitted.effective)
+    problem = Problem(points, prior, factors, fitted.chart, slack)
     found = covariance_of(problem, fitted, rules)
-    now_ns, noise = fixes[-1].scan_ns, noise or (params.torque_noise_radps15, params.force)
+    problem.core.linearise(fitted.chart.flat)
+    spread, inflation = sandwich(problem, points, levels)
+    now_ns = fixes[-1].scan_ns
     after_s = (now_ns - fixes[0].t_ns) * 1e-9
-    components = final_mixture(found, problem, poses.latest(LATEST, after_s), noise, now_ns, after_s)
+    components = final_mixture(found, problem, poses.latest(LATEST, after_s), noise, now_ns, after_s, spread)
     gaussian = _determined(found, weak)
     return BatchResult(
         epoch_ns=fixes[0].t_ns,
         chart=fitted.chart,
         count=len(poses),
-        factors=fitted.factors,
-        inflation=fitted.inflation,
+        factors=plain,
+        inflation=inflation,
         belief=moments(components),
         gaussian=gaussian,
         components=components,
         prior_rejected=rejected,
         points=points,
+        share=share,
     )
+
+
+def improved_levels(
+    fixes: tuple[PoseFix, ...], result: BatchResult, start: Chart, params: EstimatorParams, levels: NoiseLevels
+) -> NoiseLevels:
+    """Noise levels from the residuals of the poses.
+
+    Args:
+        fixes: healthy poses, oldest first.
+        result: the last fit.
+        start: its chart, at the first pose.
+        params: settings, auto values filled in.
+        levels: the last estimate.
+    """
+    poses = poses_of(fixes)
+    factors = levels.factors(result.share) * np.sqrt(result.inflation)
+    prior, chart, gate = weak_prior(poses, params), start, factors * np.sqrt(levels.slack)
+    for _ in range(2):  # about the last motion, then about the one that fits
+        points = normal_points(poses, chart, gate, MOST_POINTS)
+        problem = Problem(points, prior, factors, chart, np.inf)  # residuals with disturbances have the weight 1
+        problem.core.descend(_LEVEL_STEPS, _LEVEL_TOL)
+        chart = problem.chart
+    problem.core.linearise(chart.flat)
+    claimed = params.adapt is Adaptation.OFF
+    found = estimate_levels(points, problem, levels, claimed, params.disturbances)
+    return replace(found, count=len(poses))
 
 
 def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior) -> bool:
@@ -233,12 +273,6 @@ def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, g
     """
     alone, with_given = (Problem(poses, prior, fitted.effective) for prior in (weak, given))
     return 2.0 * (with_given.cost(joint.chart) - alone.cost(fitted.chart)) > BOUND
-
-
-def _mean_turn(poses: Poses) -> float:
-    """Mean rotation from one pose to the next [rad]."""
-    steps = geometry.multiply(geometry.conjugate(poses.q[:-1]), poses.q[1:])
-    return float(np.mean(geometry.angle(steps)))
 
 
 def _determined(found: BatchCovariance, weak: Prior) -> bool:

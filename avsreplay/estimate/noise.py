@@ -3,9 +3,11 @@
 Adaptation (eq:R_resudua2) uses a ring buffer that is summed anew at each epoch, so that rounding errors do not
 accumulate. Two rules. ``matrix`` is the paper's: R = Sigma + H P+ H', Sigma the mean of r r'. ``scale`` keeps the
 shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
-attitude, s^2 = mean of tr(R_b^-1 (r r' + H P+ H')) / 3 over the block. It estimates two numbers from a window instead
-of 21, so the scatter of the factors hardly affects the consistency. The mean uses the weights of the updates, so that
-outliers do not increase R.
+attitude: s^2 = sum of r' R_b^-1 r over the sum of the degrees of freedom that the update leaves, 3 - tr(R_b^-1 H P+ H')
+/ s^2 for a block, which is where the derivative of the likelihood of the innovations vanishes. The level of the last
+fit is its prior, worth a few scans: where the disturbances are large, the residuals say little about R. It estimates
+two numbers from a window instead of 21, so the scatter of the factors hardly affects the consistency. The sums use the
+weights of the updates, so that outliers do not increase R.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ NO_INFLATION = frozen(np.ones(2))
 _ONES = frozen(np.ones(6))
 _FREE_RAD = 1.0  # standard deviation of an attitude direction that a degenerate view does not determine
 _MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of the window's weight
+_LEVEL_DOF = 10.0  # degrees of freedom that the level of the last fit is worth in the window
+_LINE_OF_SIGHT = 0.5  # variance of an error that all views have in common over that of the common errors
 _LAGS = (5, 10, 20, 40)
 
 
@@ -41,11 +45,18 @@ def integrated_autocorrelation(e: Array) -> float:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoiseEpoch:
-    """One healthy epoch: r r' (6, 6), H P+ H' (6, 6), trace of their sum by block relative to the base R, weight."""
+    """One healthy epoch.
+
+    Attributes:
+        outer: r r' (6, 6).  HPH: H P+ H' (6, 6).
+        squares: r' R_b^-1 r of position and attitude.  left: the degrees of freedom that the update leaves of them.
+        weight: of the update.
+    """
 
     outer: Array
     HPH: Array
-    ratios: tuple[float, float]
+    squares: tuple[float, float]
+    left: tuple[float, float]
     weight: float
 
 
@@ -57,11 +68,13 @@ class NoiseWindow:
         factors: (6,) standard deviations relative to the base R, position three times, attitude three times; 1 until
             the window is full.
         many_outliers: more than a tenth of the weight is lost: the poses contradict the estimate.
+        level: (2,) variance of position and attitude relative to the base R by the last fit.
     """
 
     epochs: tuple[NoiseEpoch, ...]
     factors: Array
     many_outliers: bool
+    level: tuple[float, float] = (1.0, 1.0)
 
     @classmethod
     def empty(cls) -> NoiseWindow:
@@ -74,9 +87,11 @@ def push(
 ) -> NoiseWindow:
     """The window with one more epoch: residual (6,) after the update, H P+ H' (6, 6), the base R that was used."""
     outer = residual[:, None] * residual
-    position, attitude = np.linalg.solve(_blocks(base), _blocks(outer + HPH)).trace(axis1=1, axis2=2).tolist()
-    epoch = NoiseEpoch(outer, HPH, (position / 3.0, attitude / 3.0), weight)
-    return _summed((*window.epochs[-length + 1 :], epoch), length)
+    squares = np.linalg.solve(_blocks(base), _blocks(outer)).trace(axis1=1, axis2=2).tolist()
+    known = np.linalg.solve(_blocks(base), _blocks(HPH)).trace(axis1=1, axis2=2) / window.factors[::3] ** 2
+    left = np.maximum(3.0 - known, 0.0).tolist()
+    epoch = NoiseEpoch(outer, HPH, (squares[0], squares[1]), (left[0], left[1]), weight)
+    return _summed((*window.epochs[-length + 1 :], epoch), length, window.level)
 
 
 def _blocks(A: Array) -> Array:
@@ -84,17 +99,16 @@ def _blocks(A: Array) -> Array:
     return A.reshape(2, 3, 2, 3).diagonal(axis1=0, axis2=2).transpose(2, 0, 1)
 
 
-def _summed(epochs: tuple[NoiseEpoch, ...], length: int) -> NoiseWindow:
-    weight = position = attitude = 0.0
-    for epoch in epochs:
-        weight += epoch.weight
-        position += epoch.weight * epoch.ratios[0]
-        attitude += epoch.weight * epoch.ratios[1]
+def _summed(epochs: tuple[NoiseEpoch, ...], length: int, level: tuple[float, float]) -> NoiseWindow:
+    weight = sum(epoch.weight for epoch in epochs)
     many_outliers = weight < (1.0 - _MANY_OUTLIERS) * len(epochs)
     if len(epochs) < length:
-        return NoiseWindow(epochs, np.ones(6), many_outliers)
-    s, t = math.sqrt(position / weight), math.sqrt(attitude / weight)
-    return NoiseWindow(epochs, np.array((s, s, s, t, t, t)), many_outliers)
+        return NoiseWindow(epochs, np.ones(6), many_outliers, level)
+    factors = []
+    for block in (0, 1):
+        squares = sum(epoch.weight * epoch.squares[block] for epoch in epochs) + _LEVEL_DOF * level[block]
+        factors.append(math.sqrt(squares / (sum(epoch.weight * epoch.left[block] for epoch in epochs) + _LEVEL_DOF)))
+    return NoiseWindow(epochs, np.repeat(factors, 3), many_outliers, level)
 
 
 def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
@@ -109,9 +123,9 @@ def matrix_noise(window: NoiseWindow, R0: Array, length: int) -> Array:
 def filled(base: Array, factors: Array, length: int) -> NoiseWindow:
     """A full window with the noise ``factors`` (2,) of attitude and position that a fit found on ``base`` (6, 6)."""
     attitude, position = factors.tolist()
-    s = factors[::-1].repeat(3)
-    epoch = NoiseEpoch(base * np.outer(s, s), np.zeros((6, 6)), (position**2, attitude**2), 1.0)
-    return _summed((epoch,) * length, length)
+    s, level = factors[::-1].repeat(3), (position**2, attitude**2)
+    epoch = NoiseEpoch(base * np.outer(s, s), np.zeros((6, 6)), (3.0 * level[0], 3.0 * level[1]), (3.0, 3.0), 1.0)
+    return _summed((epoch,) * length, length, level)
 
 
 def floored(R: Array, R0: Array, fraction: float) -> Array:
@@ -141,6 +155,23 @@ def _eigen(R: Array, R0: Array) -> tuple[Array, Array]:
     inside = np.linalg.solve(root, np.linalg.solve(root, R).T)
     values, vectors = np.linalg.eigh(0.5 * (inside + inside.T))
     return values, root @ vectors
+
+
+def line_of_sight_1s(x_position: Array, R: Array, share: float) -> Array:
+    """(3,) 1 sigma, along the line of sight, of an error of the position that all views have in common [m].
+
+    No residual shows such an error: the same offset of all poses is the same motion elsewhere.
+
+    Args:
+        x_position: (3,) of the fixture in {A} [m].
+        R: (3, 3) covariance of a measured position in {A} [m^2].
+        share: part of the variance of the position that near views have in common.
+    """
+    distance = float(np.linalg.norm(x_position))
+    if distance == 0.0:
+        return np.zeros(3)
+    u = x_position / distance
+    return np.asarray(u * np.sqrt(_LINE_OF_SIGHT * share * float(u @ R @ u)))
 
 
 class Noise:
@@ -186,13 +217,13 @@ class Noise:
         """The share of R that the poses of neighbouring scans have in common."""
         return self.params.share(alignment.inliers, alignment.rms_m / self._extent_m)
 
-    def inflation(self, known: Array | None, w_b: Array, dt_ns: int, correlated_share: float) -> Array:
+    def inflation(self, known: Array | None, mean: float, w_b: Array, dt_ns: int, correlated_share: float) -> Array:
         """(2,) factor on R for errors correlated in time: that of the last fit, else from the rotation between scans.
 
-        The paper's filter assumes white errors.
+        That of the fit holds for the ``mean`` share of its poses. The paper's filter assumes white errors.
         """
         if known is not None:
-            return known
+            return 1.0 + (known - 1.0) * (correlated_share / mean if mean > 0.0 else 1.0)
         if self.params.start is Start.PAPER:
             return NO_INFLATION
         turn = float(np.linalg.norm(w_b)) * dt_ns * 1e-9

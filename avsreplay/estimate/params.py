@@ -53,15 +53,19 @@ class Adaptation(Enum):
 class EstimatorParams(Settings):
     """Settings of the estimator: noise, adaptation and initialisation."""
 
-    torque_noise_radps15: float = setting(
-        1e-6, "Root spectral density of the angular acceleration noise eps_tau.", unit="rad/s^1.5", above=0.0
+    torque_noise_radps15: float | None = setting(
+        None,
+        "Root spectral density of the angular acceleration noise eps_tau.",
+        unit="rad/s^1.5",
+        low=0.0,
+        unset="estimated from the residuals of the poses",
     )
     force_noise_mps15: float | None = setting(
         None,
         "Root spectral density of the linear acceleration noise eps_f.",
         unit="m/s^1.5",
-        above=0.0,
-        of_extent=1e-6,
+        low=0.0,
+        unset="estimated from the residuals of the poses",
     )
     acceleration_mps2: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0), "Constant acceleration of the centre of mass in {A}, known: gravity, thrust.", unit="m/s2"
@@ -229,9 +233,9 @@ class EstimatorParams(Settings):
         return given(getattr(self, name))
 
     @property
-    def force(self) -> float:
-        """Root density of eps_f, filled in."""
-        return given(self.force_noise_mps15)
+    def disturbances(self) -> tuple[float | None, float | None]:
+        """Root densities of torque and force noise that are given; None for one that is estimated."""
+        return self.torque_noise_radps15, self.force_noise_mps15
 
     @property
     def start_1s(self) -> Array:

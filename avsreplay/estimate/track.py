@@ -9,6 +9,7 @@ import numpy as np
 from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.noise import NoiseWindow
+from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import Belief, Drift, Innovation, Manoeuvre
 
@@ -64,6 +65,7 @@ class Track:
         manoeuvres: all that were found.  pending: the last of them is reported, and the motion after it not determined.
         drift: a constant torque or force on the target, None where none is found.  untested: healthy poses since the
             last test for one.
+        levels: noise levels estimated so far.  unlevelled: healthy poses since the last estimate of them.
     """
 
     belief: Belief
@@ -89,6 +91,8 @@ class Track:
     pending: bool = False
     drift: Drift | None = None
     untested: int = 0
+    levels: NoiseLevels = NO_LEVELS
+    unlevelled: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

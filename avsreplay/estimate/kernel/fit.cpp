@@ -125,11 +125,11 @@ double Problem::residual(const Measured& pose, const State& x, const Turn& turn,
 }
 
 double Problem::robust(double chi2, double* weight) const {
-  const double over = chi2 / GATE;
+  const double gate = slack * GATE, over = chi2 / gate;
   *weight = 1;
   if (!(over > 1)) return chi2;
   *weight = redescend ? 1 / over : 1 / std::sqrt(over);
-  return redescend ? GATE * (1 + log_of(over)) : GATE * (2 * std::sqrt(over) - 1);
+  return redescend ? gate * (1 + log_of(over)) : gate * (2 * std::sqrt(over) - 1);
 }
 
 double Problem::penalty(const Chart& chart) const {

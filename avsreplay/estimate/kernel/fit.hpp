@@ -35,6 +35,7 @@ class Problem {
   bool pinned = false;
   double factors[2] = {1, 1};  // on the noise of attitude and position
   bool redescend = true;  // Cauchy's weights, else Huber's
+  double slack = 1;  // on chi-square from which a pose is an outlier
 
   // The linearisation at the present chart.
   Chart at;

@@ -1,0 +1,347 @@
+"""Levels of the noise from the data: restricted maximum likelihood of its variance components.
+
+The residuals of a fit are a sum of independent parts whose covariances are known but for a factor:
+
+- errors of the registered poses, independent from scan to scan;
+- errors of the registered poses that views of the target from nearly the same direction have in common (points next to
+  an edge, interior faces, a coarse mesh): a function on the sphere of view directions, with a Gaussian correlation;
+- the disturbance torque and force, white in time, which displace all later poses.
+
+Attitude and position have factors of their own, so that there are six. They are estimated from some tens of normal
+points by the average-information algorithm (Gilmour, Thompson and Cullis, Biometrics 51, 1995), which takes the degrees
+of freedom of the fit into account; a factor whose derivative is negative at zero is zero. Differences within the normal
+points give the independent part of the errors as well. The claimed noise is the prior, worth a few poses.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.estimate.batch import Poses, Problem
+from avsreplay.estimate.chart import Chart, to_errors, to_state
+from avsreplay.estimate.dynamics import rotation_history, torque_density
+from avsreplay.estimate.error_state import RHO, VEL
+from avsreplay.geometry import Array
+
+MOST_POINTS = 40  # normal points of an estimate
+FEWEST = 12  # poses from which the levels are estimated
+_VIEW_RAD = 0.5  # 1 sigma of the correlation of the common errors over the direction of view
+_CLAIMED_DOF, _LAW_DOF = 6.0, 1.0  # weight of the prior of the independent and of the common errors
+_STEP = 3.0  # largest factor on a variance in one step
+_SIGNIFICANT = 1.0, 1.0  # standard deviations from which torque and force are taken as real
+_LARGEST_FALL, _NONE = 4.0, 1e-16  # of a disturbance's density from one estimate to the next; density taken as zero
+_LARGEST_SKEW = 3.0  # largest ratio of the mean of a variance to its most likely value
+_SMALL = 0.3  # part of its standard deviation below which a disturbance may become zero
+_MOST_FACTOR = 100.0  # largest factor on a claimed variance
+_WORK = 2 * MOST_POINTS**3  # sum of cubes of the numbers of points over the steps of an estimate
+_MOST_STEPS = 6
+_LARGEST = 4.0  # of the squared residuals with disturbances over their mean
+BLOCKS = 2  # attitude, position
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseLevels:
+    """Variance components, relative to the covariance that the registration claims.
+
+    Attributes:
+        white: (attitude, position) factor on the independent part of the claimed variance.
+        common: the same on the part that near views have in common.
+        torque, force: root densities of the disturbances [rad/s^1.5, m/s^1.5].
+        slack: by which disturbances enlarge the squared residuals of a fit without them, at least 1.
+        count: poses of the estimate, 0 for the prior.
+    """
+
+    white: tuple[float, float] = (1.0, 1.0)
+    common: tuple[float, float] = (1.0, 1.0)
+    torque: float = 0.0
+    force: float = 0.0
+    slack: float = 1.0
+    count: int = 0
+
+    def factors(self, share: float) -> Array:
+        """(2,) factors on the claimed standard deviations of poses with this claimed share of common errors."""
+        return np.sqrt([w * (1.0 - share) + c * share for w, c in zip(self.white, self.common, strict=True)])
+
+    def common_share(self, share: float) -> Array:
+        """(2,) part of the variance that near views have in common, where the claimed part is ``share``."""
+        return np.array(self.common) * share / self.factors(share) ** 2
+
+
+NO_LEVELS = NoiseLevels()
+"""The prior: noise as claimed, no disturbances."""
+
+
+def view_correlation(poses: Poses) -> Array:
+    """(n, n) correlation of the common errors of poses, by the direction from the target to the camera in {C}."""
+    u = (poses.t[:, None, :] @ geometry.matrix(poses.q))[:, 0]
+    u /= np.maximum(np.linalg.norm(u, axis=1), 1e-300)[:, None]
+    angle = np.arccos(np.clip(u @ u.T, -1.0, 1.0))
+    return np.asarray(np.exp(-0.5 * (angle / _VIEW_RAD) ** 2))
+
+
+def pose_error_covariance(points: Poses, levels: NoiseLevels, factors: Array) -> Array:
+    """(2, n, n) covariance of the whitened residuals of attitude and of position, each the same for its three axes.
+
+    Args:
+        points: poses, or normal points.
+        levels: variance components.
+        factors: (2,) noise factors with which the residuals are whitened.
+    """
+    white, common = _parts(points)
+    return np.array([(levels.white[b] * white + levels.common[b] * common) / factors[b] ** 2 for b in range(BLOCKS)])
+
+
+def _parts(points: Poses) -> tuple[Array, Array]:
+    """Covariances (n, n) of the independent and of the common errors of whitened poses at unit factors."""
+    n = len(points)
+    share = np.zeros(n) if points.shares is None else points.shares
+    amplitude = np.sqrt(share * (np.ones(n) if points.counts is None else points.counts))
+    return np.diag(1.0 - share), amplitude[:, None] * view_correlation(points) * amplitude
+
+
+def sandwich(problem: Problem, points: Poses, levels: NoiseLevels) -> tuple[Array, Array]:
+    """How correlated errors change the covariance of a fit that takes the poses as independent.
+
+    Args:
+        problem: linearised at the minimum of its cost, with the noise factors of the fit.
+        points: the poses of the problem.
+        levels: variance components.
+
+    Returns:
+        M (20, 20) in chart steps: M P M' is the covariance of the estimate, P that of the fit. And the inflation (2,)
+        of independent noise of attitude and position with the same effect in the mean over the directions determined.
+    """
+    J = problem.core.rows()[1] @ to_errors(problem.chart)
+    n, scale = len(points), problem.prior.one_sigma
+    told, basis = np.linalg.eigh(problem.core.normal()[0] * np.outer(scale, scale))
+    told = np.sqrt(np.maximum(told, 1e-15 * told[-1]))
+    L, inverse = scale[:, None] * basis / told, told[:, None] * basis.T / scale  # P = L L'
+    P, total = L @ L.T, np.linalg.inv(problem.prior.P)
+    plain = levels.factors(_mean_share(points))
+    V, inflation = pose_error_covariance(points, levels, problem.factors), np.ones(BLOCKS)
+    for b in range(BLOCKS):
+        rows = J[:, 3 * b : 3 * b + 3].reshape(n, -1)
+        columns = rows.reshape(-1, 20)
+        found = columns.T @ (V[b] @ rows).reshape(-1, 20)
+        total = total + found
+        alone = float(np.sum(P * (columns.T @ columns)))
+        inflation[b] = float(np.sum(P * found)) / alone * float(problem.factors[b] / plain[b]) ** 2
+    values, axes = np.linalg.eigh(L.T @ total @ L)
+    M = (L @ axes) @ (np.sqrt(np.maximum(values, 0.0))[:, None] * (axes.T @ inverse))
+    return np.asarray(M), np.maximum(inflation, 1.0)
+
+
+def _mean_share(points: Poses) -> float:
+    return 0.0 if points.shares is None else float(np.mean(points.shares))
+
+
+def estimate_levels(
+    points: Poses, problem: Problem, levels: NoiseLevels, claimed: bool, fixed: tuple[float | None, float | None]
+) -> NoiseLevels:
+    """Improve variance components by a bounded number of steps, from those of an estimate with fewer poses.
+
+    Args:
+        points: normal points, at most ``MOST_POINTS``.
+        problem: their cost, linearised at the fit.
+        levels: the last estimate.
+        claimed: the noise of the poses is as claimed; only the disturbances are estimated.
+        fixed: root densities of torque and force that are given; None to estimate them.
+    """
+    n, theta = len(points), _variances(levels)
+    open_ = np.array([*([not claimed] * 4), *(f is None for f in fixed)])
+    open_[2:4] &= points.shares is not None and bool(np.any(points.shares))
+    for k, given in enumerate(fixed):
+        theta[4 + k] = theta[4 + k] if given is None else given**2
+    data, parts = _linearised(points, problem)
+    for _ in range(min(_MOST_STEPS, max(1, _WORK // n**3))):
+        theta, spread = _improved(theta, open_, parts, data, points)
+    theta[4:] = [
+        value if not free else _mean(float(value), float(one), least)
+        for value, one, least, free in zip(theta[4:], spread[4:], _SIGNIFICANT, open_[4:], strict=True)
+    ]
+    before = np.array([levels.torque, levels.force]) ** 2  # one estimate may fail; disturbances do not end at once
+    theta[4:] = np.where(open_[4:], np.maximum(theta[4:], before / _LARGEST_FALL), theta[4:])
+    theta[4:] = np.where(theta[4:] > _NONE, theta[4:], 0.0)
+    white, common = (float(theta[0]), float(theta[1])), (float(theta[2]), float(theta[3]))
+    slack = _slack(data.e, theta, parts) if theta[4] or theta[5] else 1.0
+    torque, force = float(theta[4]) ** 0.5, float(theta[5]) ** 0.5
+    return replace(levels, white=white, common=common, torque=torque, force=force, slack=slack)
+
+
+def _mean(variance: float, one_sigma: float, least: float) -> float:
+    """Mean of a variance component with this most likely value, 0 where it is not significant.
+
+    Its distribution is nearly that of the reciprocal of chi-square with as many degrees of freedom as give the standard
+    deviation; it is skew, and its mean above the most likely value.
+    """
+    if variance <= least * one_sigma:
+        return 0.0
+    return variance / max(1.0 - (one_sigma / variance) ** 2, 1.0 / _LARGEST_SKEW)
+
+
+def _slack(e: Array, theta: Array, parts: Sequence[Array]) -> float:
+    """Mean square of the residuals over that of the pose errors, with a margin for the largest."""
+    n = len(e) // 6
+    noise = np.concatenate([np.tile(np.diagonal(theta[b] * parts[b] + theta[2 + b] * parts[2 + b]), 3) for b in (0, 1)])
+    return max(1.0, _LARGEST * float(np.sum(e * e / noise)) / (6 * n))
+
+
+def disturbance_evidence(points: Poses, problem: Problem, levels: NoiseLevels) -> float:
+    """Log likelihood of the poses with the disturbances of ``levels`` over that of free motion.
+
+    Args:
+        points: normal points, at most ``MOST_POINTS``.
+        problem: their cost, linearised at the fit.
+        levels: variance components.
+    """
+    if not (levels.torque or levels.force):
+        return 0.0
+    data, parts = _linearised(points, problem)
+    theta = _variances(levels)
+    free = theta.copy()
+    free[4:] = 0.0
+    return _log_likelihood(theta, parts, data) - _log_likelihood(free, parts, data)
+
+
+def _variances(levels: NoiseLevels) -> Array:
+    return np.array([*levels.white, *levels.common, levels.torque**2, levels.force**2])
+
+
+def _log_likelihood(theta: Array, parts: Sequence[Array], data: _Residuals) -> float:
+    """Of the residuals, marginal over the initial values, without its constant."""
+    V = _covariance(theta, parts)
+    inverse = np.linalg.inv(V)
+    VJ = inverse @ data.J
+    A = data.J.T @ VJ + data.info
+    step = -np.linalg.solve(A, VJ.T @ data.e + data.info @ data.off)
+    left, off = data.e + data.J @ step, data.off + step
+    square = float(left @ inverse @ left + off @ data.info @ off)
+    return -0.5 * (square + float(np.linalg.slogdet(V)[1]) + float(np.linalg.slogdet(A)[1]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Residuals:
+    """Whitened residuals e (6n,) and their Jacobian J (6n, 20); information and offset (20,) of the prior.
+
+    The rows are ordered by axis, attitude first, and for each axis by pose.
+    """
+
+    e: Array
+    J: Array
+    info: Array
+    off: Array
+
+
+def _linearised(points: Poses, problem: Problem) -> tuple[_Residuals, Sequence[Array]]:
+    """Residuals about the chart of ``problem``, and the covariances of the six components."""
+    e, H = problem.core.rows()
+    J = np.ascontiguousarray((H @ to_errors(problem.chart)).transpose(1, 0, 2)).reshape(6 * len(points), -1)
+    info: Array = np.asarray(np.linalg.inv(problem.prior.P), dtype=np.float64)
+    off = problem.chart.minus(problem.prior.mean)
+    return _Residuals(np.ascontiguousarray(e.T).reshape(-1), J, info, off), _components(points, problem, H)
+
+
+def _covariance(theta: Array, parts: Sequence[Array]) -> Array:
+    """V (6n, 6n) of the residuals."""
+    V = theta[4] * parts[4] + theta[5] * parts[5]
+    n = len(V) // 6
+    for axis in range(6):
+        b, here = axis // 3, slice(axis * n, axis * n + n)
+        V[here, here] += theta[b] * parts[b] + theta[2 + b] * parts[2 + b]
+    return np.asarray(V)
+
+
+def _components(points: Poses, problem: Problem, H: Array) -> Sequence[Array]:
+    """Covariances of the six components at unit factors: (n, n) per axis for the errors, (6n, 6n) for disturbances."""
+    n = len(points)
+    white, common = _parts(points)
+    f = problem.factors**-2.0
+    torque, force = _disturbances(points.times_s, problem.chart, H)
+    columns = [np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(6 * n, -1) for M in (torque, force)]
+    return (white * f[0], white * f[1], common * f[0], common * f[1], *(M @ M.T for M in columns))
+
+
+def _disturbances(times_s: Array, chart: Chart, H: Array) -> tuple[Array, Array]:
+    """Derivatives (n, 6, 3(n-1)) of whitened residuals by impulses of torque and force of unit density.
+
+    The disturbance between two neighbouring poses acts as one impulse in the middle. An impulse equals the errors at
+    the epoch from which free motion leads to it.
+    """
+    x, n = to_state(chart), len(times_s)
+    middle, root = 0.5 * (times_s[1:] + times_s[:-1]), np.sqrt(np.diff(times_s))
+    later = times_s[:, None] > middle
+    back = np.linalg.inv(rotation_history(x, middle).S[:, :, :6])[:, :, 3:] * np.sqrt(torque_density(x.sigma, 1.0))
+    turn = (H[:, :, :6].reshape(-1, 6) @ back.transpose(1, 0, 2).reshape(6, -1)).reshape(n, 6, -1, 3)
+    push = H[:, :, None, VEL] - middle[:, None] * H[:, :, None, RHO]
+    weight = (later * root)[:, None, :, None]
+    return (turn * weight).reshape(n, 6, -1), (push * weight).reshape(n, 6, -1)
+
+
+def _improved(
+    theta: Array, open_: NDArray[np.bool_], parts: Sequence[Array], data: _Residuals, points: Poses
+) -> tuple[Array, Array]:
+    """One step of average information from variance components theta (6,), and their standard deviations (6,)."""
+    n = len(points)
+    inverse = np.linalg.inv(_covariance(theta, parts))
+    VJ = inverse @ data.J
+    G = np.linalg.inv(data.J.T @ VJ + data.info)
+    moved = -G @ (VJ.T @ data.e + data.info @ data.off)
+    left = data.e + data.J @ moved
+    P, Py = inverse - VJ @ G @ VJ.T, inverse @ left
+    applied, traces = np.zeros((6, 6 * n)), np.zeros(6)
+    for k in range(6):
+        if not open_[k]:
+            continue
+        if k >= 4:
+            applied[k], traces[k] = parts[k] @ Py, float(np.sum(P * parts[k]))
+            continue
+        for axis in range(3 * (k % 2), 3 * (k % 2) + 3):
+            here = slice(axis * n, axis * n + n)
+            applied[k, here] = parts[k] @ Py[here]
+            traces[k] += float(np.sum(P[here, here] * parts[k]))
+    score = 0.5 * (applied @ Py - traces)
+    info = 0.5 * (applied @ P @ applied.T)
+    for k, (dof, size) in enumerate(_priors(points)):
+        if dof > 0.0:
+            score[k] += 0.5 * dof * (size / theta[k] - 1.0) / theta[k]
+            info[k, k] += 0.5 * dof / theta[k] ** 2
+    return _stepped(theta, open_, score, info)
+
+
+def _priors(points: Poses) -> list[tuple[float, float]]:
+    """Degrees of freedom and mean of what is known of the first four components besides the normal points."""
+    out = []
+    share = _mean_share(points)
+    for b in range(BLOCKS):
+        dof, total = _CLAIMED_DOF, _CLAIMED_DOF
+        if points.within is not None:
+            dof, total = dof + points.within[1], total + points.within[0][b] / max(1.0 - share, 1e-3)
+        out.append((dof, total / dof))
+    return [*out, (_LAW_DOF, 1.0), (_LAW_DOF, 1.0)]
+
+
+def _stepped(theta: Array, open_: NDArray[np.bool_], score: Array, info: Array) -> tuple[Array, Array]:
+    """The components after a step, each changed by a bounded factor, and their standard deviations.
+
+    A disturbance whose derivative is negative goes to zero once it is a small part of its own standard deviation.
+    """
+    disturbance = np.arange(6) >= 4
+    free = open_ & ((theta > 0.0) | (score > 0.0)) & (np.diagonal(info) > 0.0)
+    out, spread = theta.copy(), np.zeros(6)
+    if not np.any(free):
+        return out, spread
+    scale = np.sqrt(np.diagonal(info)[free])
+    inverse = np.linalg.pinv(info[np.ix_(free, free)] / np.outer(scale, scale), rcond=1e-9, hermitian=True)
+    spread[free] = np.sqrt(np.diagonal(inverse)) / scale
+    factor = np.where(disturbance, _STEP**2, _STEP)[free]
+    old, new = theta[free], theta[free] + inverse @ (score[free] / scale) / scale
+    started = np.where(old > 0.0, np.clip(new, old / factor, old * factor), np.maximum(new, 0.0))
+    small = disturbance[free] & (new <= 0.0) & (old * scale < _SMALL)
+    out[free] = np.where(small, 0.0, started)
+    out[:4] = np.clip(out[:4], 1.0 / _MOST_FACTOR, _MOST_FACTOR)
+    return out, spread

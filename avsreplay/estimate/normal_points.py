@@ -1,0 +1,89 @@
+"""Normal points: few poses that carry the information of many, for fits whose cost does not grow with the log."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.estimate.batch import Poses, Prior, Problem
+from avsreplay.estimate.chart import Chart, to_state
+from avsreplay.estimate.dynamics import rotation_path
+from avsreplay.estimate.error_state import DIM
+from avsreplay.estimate.noise import GATE
+from avsreplay.geometry import Array
+
+_POINTS, _SPAN_RAD = 128, 0.25  # normal points, and least rotation over which poses are joined [rad]
+
+
+def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _POINTS) -> Poses:
+    """At most some hundred poses that carry the information of many: weighted means about a reference motion.
+
+    Neighbouring poses, while the body turns by a fraction of a radian, are replaced by the reference's pose at their
+    mean instant, corrected by the mean of their differences from it, with the inverse of the sum of their information
+    as covariance. The difference of two solutions of the motion changes little over such a turn, so the fit to the
+    normal points is the fit to the poses. Satellite laser ranging reduces its observations to normal points in the same
+    way.
+
+    Args:
+        poses: the measurements.
+        reference: initial values of a motion close to them.
+        factors: (2,) noise factors of attitude and position, for the weights of outliers.
+        most: number of normal points above which poses are joined; there are about twice as many at most.
+    """
+    n, rate = len(poses), float(np.linalg.norm(reference.w_c))
+    if n <= most:
+        return poses
+    since = poses.times_s - poses.times_s[0]
+    turned = np.floor(rate * since / max(_SPAN_RAD, rate * float(since[-1]) / most)).astype(int)
+    place = np.arange(n) - np.searchsorted(turned, turned)
+    first = np.flatnonzero(np.diff(turned, prepend=-1) | (place % -(-n // most) == 0))
+    d = poses.residuals(Problem(poses, Prior(reference, np.eye(DIM)), factors), reference)
+    white = (poses.root @ (d / np.repeat(factors, 3))[:, :, None])[:, :, 0]
+    weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
+    counts = np.diff(first, append=n)
+    shifted = np.add.reduceat(weights, first) < 0.5 * counts  # the reference is off, not the poses
+    weights = np.where(np.repeat(shifted, counts), 1.0, weights)
+    info = weights[:, None, None] * (np.swapaxes(poses.root, 1, 2) @ poses.root)
+    C = np.linalg.inv(np.add.reduceat(info, first))
+    mean = (C @ np.add.reduceat(info @ d[:, :, None], first))[:, :, 0]
+    within = _within(poses, d, weights, first, counts)
+    shares = None if poses.shares is None else np.add.reduceat(poses.shares, first) / counts
+    times = np.add.reduceat(weights * poses.times_s, first) / np.add.reduceat(weights, first)
+    x = to_state(reference)
+    q_ab = rotation_path(x).at(times)[0]
+    q = geometry.multiply(geometry.multiply(q_ab, x.q_bc), geometry.exp(-mean[:, :3]))
+    t = x.r_a + times[:, None] * x.v_a + geometry.matrix(q_ab) @ x.c_b
+    return Poses(
+        times,
+        q,
+        t - (geometry.matrix(q) @ mean[:, 3:, None])[:, :, 0],
+        0.5 * (C + np.swapaxes(C, 1, 2)),
+        counts,
+        shares,
+        within,
+    )
+
+
+def _within(
+    poses: Poses, d: Array, weights: Array, first: NDArray[np.int64], counts: NDArray[np.int64]
+) -> tuple[tuple[float, float], float]:
+    """Squared whitened residuals d (n, 6) about a straight line through each normal point, and degrees of freedom.
+
+    The line takes what is left of the difference between the motion and its reference.
+    """
+    white = np.sqrt(weights)[:, None] * (poses.root @ d[:, :, None])[:, :, 0]
+    one = np.sqrt(weights)
+    late = one * (poses.times_s - np.repeat(np.add.reduceat(poses.times_s, first) / counts, counts))
+    sums = [[np.add.reduceat(a * b, first) for b in (one, late)] for a in (one, late)]
+    some = (counts > 3) & (sums[1][1] > 0.0)
+    if not np.any(some):
+        return (0.0, 0.0), 0.0
+    A: Array = np.moveaxis(np.array(sums), 2, 0)[some]
+    rhs = np.stack([np.add.reduceat(a[:, None] * white, first, axis=0) for a in (one, late)], axis=1)[some]
+    lines = np.linalg.solve(A, rhs)
+    kept = np.repeat(some, counts)
+    left = white[kept] - np.repeat(lines[:, 0], counts[some], axis=0) * one[kept, None]
+    left -= np.repeat(lines[:, 1], counts[some], axis=0) * late[kept, None]
+    dof = 3.0 * max(float(weights[kept].sum()) - 2.0 * int(some.sum()), 0.0)
+    return (float((left[:, :3] ** 2).sum()), float((left[:, 3:] ** 2).sum())), dof

@@ -1,0 +1,109 @@
+"""Levels of the noise from simulated poses whose noise is known: white, common to near views, and disturbances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import tumbling
+
+from avsreplay import geometry
+from avsreplay.estimate.batch import Problem
+from avsreplay.estimate.chart import to_chart
+from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
+from avsreplay.estimate.noise import line_of_sight_1s
+from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, estimate_levels, sandwich
+from avsreplay.estimate.normal_points import normal_points
+from avsreplay.estimate.params import EstimatorParams
+from avsreplay.geometry import Pose
+
+PARAMS = EstimatorParams().resolved(2.0)
+SIGMA = np.repeat([np.radians(0.2), 0.004], 3)
+HZ = 2.0
+
+
+def fixes(states, seed: int, *, share: float = 0.0, claimed: float = 0.0, factor: float = 1.0):
+    """Poses with ``share`` of the variance a smooth random function of the direction of view; ``claimed`` is theirs."""
+    rng = np.random.Generator(np.random.PCG64([seed, 40]))
+    waves, phases = rng.normal(size=(300, 3)) / 0.5, rng.uniform(0.0, 2.0 * np.pi, 300)
+    sizes = rng.normal(size=(300, 6)) * np.sqrt(2.0 / 300)
+    out = []
+    for k, x in enumerate(states):
+        view = geometry.matrix(x.T_ac.q).T @ x.T_ac.t
+        common = np.cos(waves @ (view / np.linalg.norm(view)) + phases) @ sizes
+        d = factor * SIGMA * (np.sqrt(1.0 - share) * rng.normal(size=6) + np.sqrt(share) * common)
+        pose = x.T_ac @ Pose(geometry.exp(d[:3]), d[3:])
+        out.append(PoseFix(round(k / HZ * 1e9), pose, np.diag(SIGMA**2), 0, claimed))
+    return tuple(out)
+
+
+def levels_of(found, truth, rounds: int = 4) -> tuple[NoiseLevels, Problem]:
+    """Levels after some estimates that start from one another."""
+    poses, chart, levels = poses_of(found), to_chart(truth), NO_LEVELS
+    for _ in range(rounds):
+        points = normal_points(poses, chart, levels.factors(0.0), MOST_POINTS)
+        problem = Problem(points, weak_prior(poses, PARAMS), np.ones(2), chart, np.inf)
+        problem.core.descend(40, 1e-3)
+        chart = problem.chart
+        problem.core.linearise(chart.flat)
+        levels = estimate_levels(points, problem, levels, False, (None, None))
+    return levels, problem
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_the_level_of_white_noise_is_found_and_no_disturbance_beside_it(seed: int) -> None:
+    world = tumbling.draw(seed, seconds=100.0, hz=HZ, sigma_max=0.85)
+    levels, _ = levels_of(fixes(world.states, seed, factor=2.0), world.states[0])
+    assert levels.white == pytest.approx((4.0, 4.0), rel=0.25)
+    assert levels.torque < 5e-6
+    assert levels.force < 5e-6
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_density_of_a_random_torque_is_found_within_a_factor_of_two(seed: int) -> None:
+    world = tumbling.pushed(seed, 3e-5, seconds=60.0, hz=HZ)
+    levels, _ = levels_of(fixes(world.states, seed), world.states[0])
+    assert 1.5e-5 < levels.torque < 6e-5
+    assert levels.white == pytest.approx((1.0, 1.0), rel=0.4)
+
+
+def test_a_given_density_is_not_changed() -> None:
+    world = tumbling.draw(3, seconds=30.0, hz=HZ, sigma_max=0.85)
+    poses = poses_of(fixes(world.states, 3))
+    chart = to_chart(world.states[0])
+    points = normal_points(poses, chart, np.ones(2), MOST_POINTS)
+    problem = Problem(points, weak_prior(poses, PARAMS), np.ones(2), chart, np.inf)
+    levels = estimate_levels(points, problem, NO_LEVELS, True, (1e-5, 0.0))
+    assert (levels.torque, levels.force) == (pytest.approx(1e-5), 0.0)
+    assert levels.white == (1.0, 1.0)
+
+
+def test_errors_that_near_views_share_are_found_and_widen_the_covariance() -> None:
+    found = []
+    for seed in range(4):
+        world = tumbling.draw(seed, seconds=100.0, hz=HZ, sigma_max=0.85)
+        for share in (0.0, 0.4):
+            levels, problem = levels_of(fixes(world.states, seed, share=share, claimed=0.1), world.states[0])
+            _, inflation = sandwich(problem, problem.poses, levels)
+            found.append((*levels.common_share(0.1), *inflation))
+    white, shared = np.mean(found[::2], axis=0), np.mean(found[1::2], axis=0)
+    assert np.all(white[:2] < 0.12)
+    assert shared[:2] == pytest.approx([0.4, 0.4], abs=0.15)
+    assert np.all(shared[2:] > 1.5 * white[2:])
+
+
+def test_normal_points_know_the_noise_within_them() -> None:
+    world = tumbling.draw(5, seconds=300.0, hz=HZ, sigma_max=0.85)
+    poses = poses_of(fixes(world.states, 5, factor=3.0))
+    points = normal_points(poses, to_chart(world.states[0]), 3.0 * np.ones(2), MOST_POINTS)
+    assert points.within is not None
+    squares, dof = points.within
+    assert dof > 500.0
+    assert np.array(squares) / dof == pytest.approx([9.0, 9.0], rel=0.2)
+
+
+def test_the_common_error_lies_along_the_line_of_sight() -> None:
+    at, R = np.array([0.0, 3.0, 4.0]), np.diag([1.0, 4.0, 9.0])
+    b = line_of_sight_1s(at, R, 0.5)
+    assert b / np.linalg.norm(b) == pytest.approx(at / 5.0)
+    assert b @ b == pytest.approx(0.25 * (0.36 * 4.0 + 0.64 * 9.0))
+    assert not line_of_sight_1s(np.zeros(3), R, 0.5).any()
