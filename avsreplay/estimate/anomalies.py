@@ -46,7 +46,7 @@ _RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 _LEAST = 1e-9  # of the eigenvalues of the prior after a manoeuvre
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, in its spread, that tells which poses are biased
-_SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: a smaller offset is lost in the prediction's error
+_SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
 
@@ -282,10 +282,10 @@ def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
     scan to the next, where an offset that ends changes the innovation by its own size.
     """
     last, prediction = bias.last, epoch.prediction
-    if _chi2(bias.offset, epoch.innovation.S) < _SIGNIFICANT:
-        return None
     turned = prediction.H @ prediction.Phi - last.prediction.H
     P = turned @ last.prediction.belief.P @ turned.T + epoch.innovation.R + last.innovation.R
+    if _chi2(bias.offset, P + bias.P) < _SIGNIFICANT:
+        return None
     change = epoch.innovation.alpha - last.innovation.alpha
     still, ended = _chi2(change, P), _chi2(change + bias.offset, P + bias.P)
     gain = float(np.linalg.slogdet(P + bias.P)[1] - np.linalg.slogdet(P)[1])
