@@ -314,6 +314,45 @@ def test_keeping_neighbours_gives_the_same_bits(target: Surface) -> None:
     assert everything(model, scan, FACING) == everything(model, scan, replace(FACING, keep=False))
 
 
+def sheet(n: int) -> Surface:
+    """A wavy square of 2 (n - 1)^2 small triangles; their outer side is +z."""
+    x, y = np.meshgrid(np.linspace(-1.0, 1.0, n), np.linspace(-1.0, 1.0, n), indexing="ij")
+    z = 0.1 * np.sin(3.0 * x) * np.cos(4.0 * y) + 0.15 * x * y
+    k = np.arange(n * n).reshape(n, n)
+    a, b, c, d = (each.ravel() for each in (k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]))
+    faces = np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, d])])
+    return surface(np.column_stack([x.ravel(), y.ravel(), z.ravel()]), faces)
+
+
+@pytest.mark.parametrize("facing", [False, True])
+def test_on_small_triangles_most_searches_are_skipped_with_the_same_bits(facing: bool) -> None:
+    """Neighbouring triangles are nearly as near as the nearest: only its block can be kept, not the triangle."""
+    mesh, r = sheet(80), rng(31)
+    model = SurfaceIndex.build(mesh, 0.4)
+    at = mesh.vertices[r.integers(len(mesh.vertices), size=3000)] + 0.01 * r.standard_normal((3000, 3))
+    camera = Pose(exp([0.0, np.pi, 0.0]), np.array([0.0, 0.0, 4.0]))
+    scan = camera.inverse().apply(at)
+    guess = Pose(exp([0.004, -0.003, 0.002]), np.array([0.004, 0.002, -0.003])) @ camera
+    rule = IcpParams(n_max=12, n_plane=2, gate_m=0.1, tighten=0.0, eps_rad=0.0, eps_m=0.0, facing=facing)
+    kept, plain = (model.icp(scan, guess, replace(rule, keep=keep)) for keep in (True, False))
+    assert kept.T_ca.tobytes() == plain.T_ca.tobytes()
+    assert kept.rms_m == plain.rms_m < 0.02
+    assert kept.searched < 0.4 * plain.searched
+    found = [model.evidence(scan, kept.T_ca, 0.1, 0.2, 24, facing=facing, matches=m) for m in (None, kept.matches)]
+    assert found[0].gradients.tobytes() == found[1].gradients.tobytes()
+
+
+def test_closest_points_beyond_the_largest_distance_are_none(target: Surface) -> None:
+    """``most_m`` removes the farther ones and changes no other."""
+    model = SurfaceIndex.build(target, 0.4)
+    points = rng(32).uniform(-1.5, 1.5, (2000, 3))
+    all_of_them, near = model.closest(points), model.closest(points, most_m=0.1)
+    inside = all_of_them.d2 < 0.1**2
+    assert 0 < np.count_nonzero(inside) < len(points)
+    np.testing.assert_array_equal(near.id, np.where(inside, all_of_them.id, -1))
+    np.testing.assert_array_equal(near.foot[inside], all_of_them.foot[inside])
+
+
 @pytest.mark.parametrize("rule", [IcpParams(few=200), IcpParams(few=200, facing=True)], ids=["both sides", "facing"])
 def test_a_part_of_the_scan_leads_to_the_fixed_point_of_the_whole(target: Surface, rule: IcpParams) -> None:
     """One more pass of Horn's over all points stays, for any number of threads, with and without kept neighbours."""
