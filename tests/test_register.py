@@ -351,6 +351,8 @@ def test_a_cylinder_seen_from_the_side_keeps_its_place_along_the_axis(guess_deg:
     assert "slides along z" in found.free_directions
     assert np.degrees(np.arccos(step.R[2, 2])) < 0.1  # the axis is found
     assert np.linalg.norm(step.t[:2]) < 0.01
+    if guess_deg == 0.0:
+        assert abs(np.degrees(geometry.log(step.q)[2])) < 0.05  # the rotation about it stays that of the guess
     # The position along it stays that of the guess, where the surface was seen: one radius beside the axis.
     assert abs(step.t[2]) < 1.8 * np.radians(guess_deg) + 0.002
 

@@ -97,6 +97,11 @@ class GlobalSearch:
         brief = replace(target.limits, n_max=min(FINE_PASSES, target.limits.n_max))
         self._refine = HornBackend(replace(target, limits=brief))
 
+    @property
+    def near_symmetric(self) -> bool:
+        """Whether a motion carries most of the surface onto itself."""
+        return len(self._symmetries) > 0
+
     def work(self, points: int, number: int) -> int:
         """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
         p = self._params

@@ -33,6 +33,7 @@ LEAST_PATCHES = 24
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
+AS_MANY, AS_NEAR = 0.99, 1.02  # inliers and rms of a pose that fits as well
 LEAST_RESIDUALS = 50
 UNCHANGED = 0.06  # chi-square with 6 degrees of freedom is smaller with probability 4e-6
 ACCURACY = (0.1, 1e-3)  # deg and share of the extent, of a back end that states none of its own
@@ -222,6 +223,37 @@ def unobservable_directions(total: Array, count: int, centre: Array) -> tuple[st
     if not len(free):
         return ()
     return tuple(_words(row) for row in _sparse_basis(free))
+
+
+def with_free_directions_of(
+    guess: Pose, index: SurfaceIndex, visibility: Visibility, points: NDArray[Any], T_ca: Pose, gate_m: float
+) -> Pose:
+    """Return the pose of a degenerate view with its unobservable directions as in the guess.
+
+    Passes over a curved surface drift along them. To first order in the difference, so that the result is kept only if
+    the surface still fits.
+
+    Args:
+        guess: predicted T_ca.
+        index: of the model.
+        visibility: of its faces.
+        points: (n, 3) in {A} [m].
+        T_ca: registered pose.
+        gate_m: distance of an inlier [m].
+    """
+    found = evidence(index, visibility, points, T_ca, gate_m)
+    sums = without_dominant_patches(found)
+    info, radius = scaled_information(sums.normals.sum(axis=0), int(sums.counts.sum()), sums.centre)
+    values, vectors = np.linalg.eigh(info)
+    free = vectors[:, values < FREE_BELOW]
+    step = guess @ T_ca.inverse()
+    motion = np.concatenate([radius * geometry.log(step.q), step.apply(sums.centre) - sums.centre])
+    along = free @ (free.T @ motion)
+    q = geometry.exp(along[:3] / radius)
+    kept = Pose(q, sums.centre + along[3:] - geometry.matrix(q) @ sums.centre) @ T_ca
+    moved = evidence(index, visibility, points, kept, gate_m)
+    fits = moved.inliers >= AS_MANY * found.inliers and moved.rms_m <= AS_NEAR * found.rms_m
+    return kept if fits else T_ca
 
 
 def unbounded_directions(P: Array, extent_m: float) -> tuple[str, ...]:

@@ -27,6 +27,7 @@ from avsreplay.register.visibility import Visibility
 
 LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in units of the gate) a fit is close
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
+TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 MOST_SEGMENTS = 3
 MOST_ROUNDS = MOST_SEGMENTS + 3
 LEAST_TO_TURN = 0.2  # with fewer inliers turned starts have no prospect
@@ -239,7 +240,9 @@ class Registrar:
     def _far(self, guess: Pose, found: Alignment) -> bool:
         """A measured pose so far from the guess that another local minimum may be better."""
         angle = float(geometry.angle((guess.inverse() @ found.T_ac).q))
-        return found.measured and found.status is not AlignStatus.DEGENERATE and angle > FAR_RAD
+        if not found.measured or found.status is AlignStatus.DEGENERATE or angle < TURNED_RAD:
+            return False
+        return angle > FAR_RAD or self._global.near_symmetric
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
@@ -303,6 +306,9 @@ class Registrar:
         found = quality.grade(
             self._index, self._visibility, scan, fit, limits, self.params, halves, self._accuracy, not carried, start
         )
+        if found.status is AlignStatus.DEGENERATE:
+            at = (self._index, self._visibility, scan, fit.T_ca, limits.gate_m)
+            found = replace(found, T_ac=quality.with_free_directions_of(start, *at).inverse())
         if found.status is AlignStatus.FAILED:
             found = replace(found, T_ac=guess, message=f"back end '{self.params.backend}' {found.message}")
         return found
