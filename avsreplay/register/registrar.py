@@ -86,8 +86,8 @@ class Registrar:
         first = self._graded(scan, guess, halves=seq % self.params.split_every == 0, carried=carried)
         if first.status is AlignStatus.FAILED:
             return first
-        found = first if self._healthy(first) else self._recovered(scan, guess, first, carried)
-        return self._searched(scan, found, carried) if self._far(guess, found) else found
+        found, searched = (first, False) if self._healthy(first) else self._recovered(scan, guess, first, carried)
+        return self._searched(scan, found, carried) if self._far(guess, found) and not searched else found
 
     def acquire(self, points: NDArray[Any]) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
@@ -260,33 +260,33 @@ class Registrar:
         far = float(np.linalg.norm(moved, axis=1).mean()) > self.limits.gate_m
         return far and found.rms_m > POOR_OF_GATE * self.limits.gate_m
 
-    def _recovered(self, scan: NDArray[Any], guess: Pose, first: Alignment, carried: bool) -> Alignment:
-        """Test a pose with a poor fit; restart if it is implausible, and report what remains implausible."""
+    def _recovered(self, scan: NDArray[Any], guess: Pose, first: Alignment, carried: bool) -> tuple[Alignment, bool]:
+        """Test a pose with a poor fit and restart if it is implausible; whether the result is of a global search."""
         few = self._restarter.part(scan)
         budget = Budget(len(scan), spent=first.iterations * len(scan))
         kept = self._restarter.measure(few, first.T_ac.inverse())
         final, reason = first, self._test.check(few, kept.T_ca).reason if first.measured else ""
         if not (self._doubtful(few, guess, first) or reason):
-            return self._regraded(scan, kept, first, carried)
+            return self._regraded(scan, kept, first, carried), False
         before: Restart | None = None
         for _ in range(2):
             kept = self._restarter.best(few, guess.inverse(), first.T_ac.inverse(), budget, before)
             final = self._regraded(scan, kept, first, carried)
             reason = self._test.check(few, final.T_ac.inverse()).reason if final.measured else ""
             if final.measured and not reason:
-                return final
+                return final, False
             overlap = first.status is not AlignStatus.NO_OVERLAP  # without, the scan may show something else
             if before is None and overlap and budget.allows(self._global.work(len(scan), 0)):
                 found = self._acquire(scan, budget, carried, rounds=1)
                 if found.status is AlignStatus.ALIGNED:
-                    return found
+                    return found, True
             before = kept
             if np.mean(kept.distance < self.limits.gate_m) < LEAST_TO_TURN:
                 break
         if not reason:
-            return final
+            return final, False
         status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
-        return replace(final, status=status, covariance=None, free_directions="", message=reason)
+        return replace(final, status=status, covariance=None, free_directions="", message=reason), False
 
     def _regraded(self, scan: NDArray[Any], kept: Restart, first: Alignment, carried: bool) -> Alignment:
         """Register from the pose of a restart with a rejection distance that follows the noise."""
