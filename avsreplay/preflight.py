@@ -184,9 +184,12 @@ def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None, registrar: R
     if scale is None:
         return [Advice("fail", "size", f"{said}; no common unit explains the difference")]
     text = f"{said}: the model seems to be in {_UNITS[scale]}"
+    return [Advice("fail", "unit", text, _unit_option(scale))]
+
+
+def _unit_option(scale: float) -> str:
     unit = next((unit for unit in Unit if unit.metres == scale), None)
-    option = f"--model-scale {scale:g}" if unit is None else f"--model-unit {unit.value}"
-    return [Advice("fail", "unit", text, option)]
+    return f"--model-scale {scale:g}" if unit is None else f"--model-unit {unit.value}"
 
 
 def _unit(ratio: float) -> float | None:
@@ -206,7 +209,7 @@ def _unit_and_background(clouds: Sequence[NDArray[Any]], model_m: float, ratio: 
         # a group that grows with the gap is a part of something larger
         groups = [one for one, two in found if one is not None and two is not None and len(two) < 1.2 * len(one)]
         if len(groups) * 2 > len(clouds):
-            unit = Advice("fail", "unit", f"{said}: the model seems to be in {name}", f"--model-scale {scale:g}")
+            unit = Advice("fail", "unit", f"{said}: the model seems to be in {name}", _unit_option(scale))
             crop = _crop_advice(clouds, groups, _of_size(size))
             return [unit, crop] if crop else [unit]
     return []
