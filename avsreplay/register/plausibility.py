@@ -73,6 +73,8 @@ class PlausibilityTest:
 
     def __init__(self, surface: Surface, index: SurfaceIndex, visibility: Visibility, gate_m: float) -> None:
         self._index, self._visibility, self._gate, self._extent = index, visibility, gate_m, surface.extent
+        # distances to a cloud contain the spacing of its points, which has a longer tail than noise
+        self._contrast_of_part = LEAST_CONTRAST_OF_PART if len(surface.faces) else LEAST_CONTRAST
         self._points, self._normals = sample(surface, SURFACE_POINTS)
         self._points = self._points[:: max(1, len(self._points) // SURFACE_POINTS)]
         self._normals = self._normals[: len(self._points)]
@@ -111,7 +113,7 @@ class PlausibilityTest:
     def _reason(self, found: Plausibility) -> str:
         if found.noise_m > NOISE_OF_EXTENT * self._extent:
             return f"distances to the model spread by {found.noise_m:.3g} m"
-        if found.contrast < (LEAST_CONTRAST_OF_PART if found.unexplained > MOST_MISSING else LEAST_CONTRAST):
+        if found.contrast < (self._contrast_of_part if found.unexplained > MOST_MISSING else LEAST_CONTRAST):
             return f"only {found.contrast:.1f} times as many points on the surface as beside it"
         if found.violated > MOST_VIOLATED:
             return f"{100.0 * found.violated:.0f} % of the visible model surface lies in free space"
