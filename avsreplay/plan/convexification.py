@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
-from avsreplay.plan.limits import CONSTRAINTS, THRUST_SHARE, Case, Margins, margins
+from avsreplay.plan.limits import CONSTRAINTS, THRUST_SHARE, Case, Margins, in_fixture, margins
 from avsreplay.plan.path import RobotPath, StepPath, path_of
 
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
@@ -21,6 +20,7 @@ FAR = 2e4  # a constraint with a larger margin at the reference, in units of the
 COARSE_NODES = 16  # thrust intervals while initial paths are compared
 ABORT_S = 30.0  # duration of an abort
 ABORTS = 16  # instants at which an abort is tried
+_WITH_RADIUS = np.concatenate([np.zeros((1, 3)), np.eye(3)])  # rows of a ball: its radius, then the coordinates
 LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight
 
 
@@ -59,7 +59,7 @@ def excess(case: Case, path: StepPath) -> Array:
         return np.zeros((2 * n, len(CONSTRAINTS)))
     times, found = dense_margins(case, path)
     fraction = (times[1:] - times[0]) / (times[-1] - times[0])
-    over = np.maximum(RESERVE * case.buffer_m - found.between - allowed(found.values[0], fraction), 0.0)
+    over = np.maximum(RESERVE * case.buffer_m - found.between - allowed(case.start, fraction), 0.0)
     half = over.reshape(2 * n, BETWEEN // 2, -1).max(axis=1)
     after = np.concatenate([half[1:], half[-1:]])
     return np.asarray(np.maximum(half, after))
@@ -87,26 +87,27 @@ def aborted(case: Case, path: RobotPath) -> Abort:
         return Abort()
     begin = np.linspace(case.wait_s, path.t_go_s, ABORTS, endpoint=False)
     r, v = path.at(begin)
-    outside = np.linalg.norm(r - case.sampled.at(begin)[0], axis=1) > (limits.final_range_m or 0.0)
+    rho, R = case.sampled.at(begin)
+    outside = np.linalg.norm(r - rho, axis=1) > (limits.final_range_m or 0.0)
     if not outside.any():
         return Abort()
     begin, r, v = begin[outside], r[outside], v[outside]
-    rho, R = case.sampled.at(begin)
-    away = r - rho - R @ (np.zeros(3) if scene.centre_c is None else scene.centre_c)
+    away = r - rho[outside] - R[outside] @ (np.zeros(3) if scene.centre_c is None else scene.centre_c)
     away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-9)
     after = np.linspace(0.0, ABORT_S, 3 * ABORTS)[None, :, None]
     positions = r[:, None] + v[:, None] * after + 0.5 * case.params.a_max_mps2 * away[:, None] * after**2
-    times = begin[:, None] + after[0, :, 0]
-    y = case.sampled.coordinates(times.ravel(), positions.reshape(-1, 3))
+    times = (begin[:, None] + after[0, :, 0]).ravel()
+    rho, R = case.sampled.at(times)
+    y = in_fixture(R, positions.reshape(-1, 3) - rho)
     foot, gap = scene.surface(y)
-    k = np.arange(len(begin)) * times.shape[1] + gap.reshape(times.shape).argmin(axis=1)
+    k = gap.reshape(len(begin), -1).argmin(axis=1) + np.arange(len(begin)) * after.size
     margins_m = gap[k] - limits.clearance_m
     short = max(-float(margins_m.min()) - max(-float(margins_m[0]), 0.0), 0.0) if limits.abort else 0.0
     if not limits.abort or not isinstance(path, StepPath):
         return Abort(float(margins_m.min()), short)
     normal = (y[k] - foot[k]) / np.where(np.abs(gap[k]) > 1e-9, gap[k], 1e-9)[:, None]
-    in_a = np.einsum("nij,nj->ni", case.sampled.at(times.ravel()[k])[1], normal)
-    lead = times.ravel()[k] - begin
+    in_a = (R[k] @ normal[:, :, None])[:, :, 0]
+    lead = times[k] - begin
     part = (begin - case.wait_s) / path.step_s
     interval = np.minimum(part.astype(np.int64), len(path.u) - 1)
     offset = margins_m - RESERVE * case.buffer_m - np.sum(in_a * (r + lead[:, None] * v), axis=1)
@@ -150,10 +151,7 @@ def convex_subproblem(
     if not case.limits.geometric:
         return problem
     rows = _RowMaker(case, reference)
-    start = margins(
-        case.scene, case.limits, case.sampled.coordinates(np.zeros(1), case.r0[None]), case.r0[None]
-    ).values[0]
-    return rows.added(problem, off + rows.sag[:, None] - allowed(start, interval_fractions(n)))
+    return rows.added(problem, off + rows.sag[:, None] - allowed(case.start, interval_fractions(n)))
 
 
 class _RowMaker:
@@ -167,11 +165,10 @@ class _RowMaker:
         self.far_m = FAR * case.buffer_m
         self.rho, self.R = case.sampled.at(times)
         drho, dR = case.sampled.at(times, 1)
-        self.y = np.einsum("nij,ni->nj", self.R, reference.r - self.rho)
-        dy = np.einsum("nij,ni->nj", dR, reference.r - self.rho) - np.einsum("nij,ni->nj", self.R, drho)
+        self.y = in_fixture(self.R, reference.r - self.rho)
+        dy = in_fixture(dR, reference.r - self.rho) - in_fixture(self.R, drho)
         self.dy = dy * (reference.t * s)[:, None]  # change with the relative change of the end time
-        first = case.sampled.coordinates(np.array([case.wait_s]), (case.r0 + case.wait_s * case.v0)[None])
-        bend = np.linalg.norm(np.diff(np.concatenate([first, self.y]), 2, axis=0), axis=1) / 8.0
+        bend = np.linalg.norm(np.diff(np.concatenate([case.begin_c[None], self.y]), 2, axis=0), axis=1) / 8.0
         self.sag = np.concatenate([bend, bend[-1:]])  # distance of the path in {C} from its chord between two points
         self.interval = np.arange(2 * n) // 2
         self.fraction = np.where(np.arange(2 * n) % 2 == 0, 0.5, 1.0)
@@ -184,12 +181,21 @@ class _RowMaker:
         self.near = np.ones(2 * n, dtype=bool)
         self.near[-1] = False  # the grasp point itself is the end condition
 
-    def rows(self, k: Index, vector: Array, constant: Array, slack: float) -> PointRows:
-        """Return rows vector.y + constant (+ slack) at the points k; vector (m, 3) in {C}."""
-        in_a = np.einsum("nij,nj->ni", self.R[k], vector)
-        offset = constant - np.sum(in_a * self.rho[k], axis=1)
-        rate = np.sum(vector * self.dy[k], axis=1)
-        return PointRows(self.interval[k], self.fraction[k], in_a, offset, rate, np.full(len(k), slack))
+    def rows(self, k: Index, vectors: Array, constant: Array | float) -> PointRows:
+        """Return g rows vector.y for each point k, the first with a constant and slack; vectors (m or 1, g, 3) in {C}."""
+        vectors = np.broadcast_to(vectors, (len(k), *vectors.shape[1:]))
+        in_a = vectors @ self.R[k].transpose(0, 2, 1)
+        offset = -(in_a @ self.rho[k][:, :, None])[:, :, 0]
+        rate = (vectors @ self.dy[k][:, :, None])[:, :, 0]
+        return self.grouped(k, in_a, offset, rate, constant)
+
+    def grouped(self, k: Index, in_a: Array, offset: Array, rate: Array, constant: Array | float) -> PointRows:
+        """Return rows (m, g) ordered point by point; the first of each point has the constant and the slack."""
+        g = in_a.shape[1]
+        offset[:, 0] += constant
+        slack = np.tile(np.eye(1, g)[0], len(k))
+        interval, fraction = np.repeat(self.interval[k], g), np.repeat(self.fraction[k], g)
+        return PointRows(interval, fraction, in_a.reshape(-1, 3), offset.ravel(), rate.ravel(), slack)
 
     def added(self, problem: Subproblem, off: Array) -> Subproblem:
         """Return the subproblem with the rows of all constraints."""
@@ -207,14 +213,14 @@ class _RowMaker:
                 k = np.flatnonzero(on[:, i] & inside[:, i])
                 cones.append(self.cone(k, degrees, off[k, i]))
                 k = np.flatnonzero(on[:, i] & ~inside[:, i])
-                planes.append(self.rows(k, y[k] / distance[k], -(length or 0.0) - off[k, i], 1.0))
+                planes.append(self.rows(k, (y[k] / distance[k])[:, None], -(length or 0.0) - off[k, i]))
         if limits.keepout_m is not None and self.scene.centre_c is not None:
             k = np.flatnonzero(on[:, 2] & inside[:, 2])
             cones.append(self.ball(k, (limits.keepout_release_m or 0.0) - off[k, 2]))
             k = np.flatnonzero(on[:, 2] & ~inside[:, 2])
             out = y[k] - self.scene.centre_c
             normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
-            planes.append(self.rows(k, normal, -normal @ self.scene.centre_c - limits.keepout_m - off[k, 2], 1.0))
+            planes.append(self.rows(k, normal[:, None], -normal @ self.scene.centre_c - limits.keepout_m - off[k, 2]))
         if limits.clearance_m is not None:
             self._body(planes, cones, on[:, 3], off[:, 3])
         self._workspace(planes, cones, np.flatnonzero(self.near), off[:, 4])
@@ -236,50 +242,36 @@ class _RowMaker:
         foot = found.foot[k]
         gap = found.distance[k]
         normal = (self.y[k] - foot) / np.where(np.abs(gap) > 1e-9, gap, 1e-9)[:, None]
-        planes.append(self.rows(k, normal, -np.sum(normal * foot, axis=1) - found.clearance[k] - off[k], 1.0))
+        planes.append(
+            self.rows(k, normal[:, None], -np.sum(normal * foot, axis=1) - found.clearance[k] - off[k])
+        )
 
     def _workspace(self, planes: list[PointRows], cones: list[tuple[int, PointRows]], k: Index, off: Array) -> None:
         """Add the shell around the robot's base, which is fixed in {A}."""
         limits, base, m = self.limits, np.array(self.limits.base_m), len(k)
 
-        def rows(vector: Array, constant: Array, slack: float) -> PointRows:
-            interval, fraction = self.interval[k], self.fraction[k]
-            return PointRows(interval, fraction, vector, constant - vector @ base, np.zeros(m), np.full(m, slack))
+        def rows(vectors: Array, constant: Array) -> PointRows:
+            return self.grouped(k, vectors, -(vectors @ base), np.zeros(vectors.shape[:2]), constant)
 
         if limits.reach_max_m is not None:
-            parts = [rows(np.zeros((m, 3)), limits.reach_max_m - off[k], 1.0)]
-            parts += [rows(np.tile(e, (m, 1)), np.zeros(m), 0.0) for e in np.eye(3)]
-            cones.append((4, _interleaved(parts)))
+            cones.append((4, rows(np.tile(_WITH_RADIUS, (m, 1, 1)), limits.reach_max_m - off[k])))
         if limits.reach_min_m is not None:
             out = self.r[k] - base
             normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
-            planes.append(rows(normal, -limits.reach_min_m - off[k], 1.0))
+            planes.append(rows(normal[:, None], -limits.reach_min_m - off[k]))
 
     def cone(self, k: Index, degrees: float, off: Array) -> tuple[int, PointRows]:
         """Return |across| <= tan(degrees) along + mouth - off at the points k."""
         axis = np.asarray(self.scene.axis_c)
-        across = np.linalg.svd(axis[None, :])[2][1:]
-        first = np.tile(math.tan(math.radians(degrees)) * axis, (len(k), 1))
-        rows = [self.rows(k, first, (self.limits.mouth_m or 0.0) - off, 1.0)]
-        rows += [self.rows(k, np.tile(e, (len(k), 1)), np.zeros(len(k)), 0.0) for e in across]
-        return 3, _interleaved(rows)
+        side = np.eye(3)[int(np.abs(axis).argmin())]
+        side = side - (side @ axis) * axis
+        side /= np.linalg.norm(side)
+        vectors = np.stack([math.tan(math.radians(degrees)) * axis, side, np.cross(axis, side)])
+        return 3, self.rows(k, vectors[None], (self.limits.mouth_m or 0.0) - off)
 
     def ball(self, k: Index, radius: Array) -> tuple[int, PointRows]:
         """Return |y| <= radius at the points k."""
-        rows = [self.rows(k, np.zeros((len(k), 3)), radius, 1.0)]
-        rows += [self.rows(k, np.tile(e, (len(k), 1)), np.zeros(len(k)), 0.0) for e in np.eye(3)]
-        return 4, _interleaved(rows)
-
-
-def _interleaved(rows: list[PointRows]) -> PointRows:
-    """Return rows of equal length ordered point by point."""
-
-    def mixed(name: str) -> Any:
-        stacked = np.stack([getattr(row, name) for row in rows], axis=1)
-        return stacked.reshape(-1, *stacked.shape[2:])
-
-    names = ("interval", "fraction", "vector", "offset", "rate", "slack")
-    return PointRows(*(mixed(name) for name in names))
+        return 4, self.rows(k, _WITH_RADIUS[None], radius)
 
 
 def warm_reference(case: Case, path: RobotPath, since_s: float) -> ReferencePath:

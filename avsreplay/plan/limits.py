@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -231,6 +231,11 @@ def margin(scene: Scene, limits: Limits, r: Array, v: Array) -> float:
     return least
 
 
+def in_fixture(R: Array, vectors: Array) -> Array:
+    """Return the coordinates R' v (n, 3) in {C} of vectors (n, 3) in {A}, R (n, 3, 3)."""
+    return np.asarray((vectors[:, None, :] @ R)[:, 0])
+
+
 class SampledScene:
     """Motion of {C} sampled on a grid and interpolated by cubic splines; the grid is extended when needed."""
 
@@ -252,8 +257,7 @@ class SampledScene:
     def coordinates(self, times: Array, r: Array) -> Array:
         """Return the coordinates in {C} (n, 3) of positions r (n, 3) in {A}."""
         rho, R = self.at(times)
-        out: Array = np.einsum("nij,ni->nj", R, r - rho)
-        return out
+        return in_fixture(R, r - rho)
 
     def sigma(self, times: Array) -> tuple[Array, Array] | None:
         """Return the predicted 1 sigma of position [m] and attitude [rad] at times (n,); None where unknown."""
@@ -282,6 +286,7 @@ class Case:
 
     Attributes:
         entry: Fractions of the flight from which the cone and the corridor are required; None: the reference decides.
+        begin_c: (3,) position in {C} where the thrust begins.  start: (5,) margins there.
     """
 
     sampled: SampledScene
@@ -293,6 +298,15 @@ class Case:
     coarse: bool = False
     earliest_s: float = 0.0
     entry: tuple[float, float] | None = None
+    begin_c: Array = field(init=False)
+    start: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        at, r = np.array([self.params.latency_s]), (self.r0 + self.params.latency_s * self.v0)[None]
+        y = self.sampled.coordinates(at, r)
+        object.__setattr__(self, "begin_c", y[0])
+        found = margins(self.scene, self.limits, y, r, self.sampled.sigma(at))
+        object.__setattr__(self, "start", found.values[0])
 
     @property
     def wait_s(self) -> float:

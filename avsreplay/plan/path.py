@@ -8,7 +8,7 @@ equal intervals.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -167,11 +167,17 @@ class StepPath:
     u: Array
     latency_s: float
     t_go_s: float
+    _nodes: tuple[Array, Array] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "r0", frozen(self.r0, 3))
         object.__setattr__(self, "v0", frozen(self.v0, 3))
         object.__setattr__(self, "u", frozen(self.u, -1, 3))
+        h, zero = self.step_s, np.zeros((1, 3))
+        v = self.v0 + np.concatenate([zero, h * np.cumsum(self.u, axis=0)])
+        start = self.r0 + self.latency_s * self.v0
+        r = start + np.concatenate([zero, np.cumsum(h * v[:-1] + 0.5 * h * h * self.u, axis=0)])
+        object.__setattr__(self, "_nodes", (r, v))
 
     @property
     def step_s(self) -> float:
@@ -180,12 +186,7 @@ class StepPath:
 
     def nodes(self) -> tuple[Array, Array]:
         """Return positions [m] and velocities [m/s], each (n + 1, 3) in {A}, at the ends of the intervals."""
-        h = self.step_s
-        zero = np.zeros((1, 3))
-        v = self.v0 + np.concatenate([zero, h * np.cumsum(self.u, axis=0)])
-        start = self.r0 + self.latency_s * self.v0
-        r = start + np.concatenate([zero, np.cumsum(h * v[:-1] + 0.5 * h * h * self.u, axis=0)])
-        return r, v
+        return self._nodes
 
     def _interval(self, times: Array) -> tuple[Array, Array]:
         since = np.clip(times - self.latency_s, 0.0, self.t_go_s - self.latency_s)
@@ -207,7 +208,7 @@ class StepPath:
         Args:
             times: (n,) [s after the instant of planning].
         """
-        r, v = self.nodes()
+        r, v = self._nodes
         k, s = self._interval(times)
         early = np.minimum(times - self.latency_s, 0.0)[:, None]
         late = np.maximum(times - self.t_go_s, 0.0)[:, None]
