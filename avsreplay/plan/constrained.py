@@ -39,6 +39,11 @@ from avsreplay.plan.robot import Limits
 ITERATIONS = 14  # largest number of iterations of one initial path
 TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
 RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
+ROUGH_TOLERANCE = 2e-3  # the same while initial paths are compared, and where an earlier plan is renewed
+SAME_PATH = 5e-3  # drafts whose end times differ by less, relative to them, have the same minimum
+ALTERNATING = 4  # from this iteration on the aborts of the iteration before are required too: the worst may alternate
+NEAR_REFERENCE = 0.02  # relative change of the end time from which on the excess tightens the constraints
+HOPELESS = 1.2  # an iteration this much later than the best path ends its initial path
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
 IMPROVED = 2  # drafts whose entry is moved
 MOVES = 6  # largest number of moves of the entry in one direction
@@ -202,7 +207,7 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
     """
     if warm is not None:
         again = _shortened(case, *warm)
-        found = _converged(again, warm_reference(again, *warm))
+        found = _converged(again, warm_reference(again, *warm), warm=_rest(again, *warm))
         if found is not None:
             return found
     coarse = replace(case, limits=replace(case.limits, nodes=min(COARSE_NODES, case.limits.nodes)), coarse=True)
@@ -213,10 +218,10 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
             drafts.append(draft)
         if drafts and reference.t > 1.5 * min(d.t_go_s for d in drafts):
             break
-    drafts = _improved(coarse, drafts)
+    drafts = _improved(coarse, sorted(drafts, key=lambda d: d.t_go_s))
     best: StepPath | None = None
     for draft in sorted(drafts, key=lambda d: d.t_go_s):
-        if best is not None and draft.t_go_s > best.t_go_s:
+        if best is not None and (draft.t_go_s > best.t_go_s):
             break
         refined = _converged(case, warm_reference(case, draft, 0.0))
         if refined is not None and (best is None or refined.t_go_s < best.t_go_s):
@@ -246,6 +251,18 @@ def _shortened(case: Case, path: RobotPath, since_s: float) -> Case:
     return replace(case, limits=replace(case.limits, nodes=n))
 
 
+def _rest(case: Case, path: RobotPath, since_s: float) -> StepPath:
+    """Return the rest of an earlier path from ``since_s`` after its begin on, with the intervals of the case."""
+    n, t = case.limits.nodes, max(path.t_go_s - since_s - case.wait_s, 1e-3)
+    u = path.thrust(since_s + case.wait_s + t * (np.arange(n) + 0.5) / n)
+    return StepPath(case.r0, case.v0, u, case.wait_s, case.wait_s + t)
+
+
+def _same(first: StepPath, second: StepPath) -> bool:
+    """Return whether two drafts are the same local minimum, as far as their end times tell."""
+    return abs(first.t_go_s - second.t_go_s) <= SAME_PATH * second.t_go_s
+
+
 def _improved(case: Case, drafts: list[StepPath]) -> list[StepPath]:
     """Return the earliest drafts with the entry into cone or corridor moved as long as the capture becomes earlier.
 
@@ -255,8 +272,9 @@ def _improved(case: Case, drafts: list[StepPath]) -> list[StepPath]:
     if case.limits.cone_deg is None and case.limits.final_deg is None:
         return drafts
     which, step = 0 if case.limits.cone_deg is not None else 1, 0.5 / case.limits.nodes
-    out = []
-    for draft in sorted(drafts, key=lambda d: d.t_go_s)[:IMPROVED]:
+    out: list[StepPath] = []
+    different = [draft for k, draft in enumerate(drafts) if not any(_same(draft, other) for other in drafts[:k])]
+    for draft in different[:IMPROVED]:
         best, start = draft, _entries(case, draft)
         for direction in (-step, step):
             for count in range(1, MOVES + 1):
@@ -271,16 +289,20 @@ def _improved(case: Case, drafts: list[StepPath]) -> list[StepPath]:
     return out
 
 
-def _converged(case: Case, reference: ReferencePath, latest_s: float = math.inf) -> StepPath | None:
+def _converged(
+    case: Case, reference: ReferencePath, latest_s: float = math.inf, warm: StepPath | None = None
+) -> StepPath | None:
     """Iterate from a reference until the end time no longer changes; return the earliest feasible path seen.
 
-    The iterations end without a result where the end time remains later than ``latest_s``.
+    The iterations end without a result where the end time remains later than ``latest_s``. The first iteration requires
+    the aborts of ``warm``, a path near the reference.
     """
     best: StepPath | None = None
-    n = case.limits.nodes
+    n, tolerance = case.limits.nodes, ROUGH_TOLERANCE if case.coarse or warm is not None else RELATIVE_TOLERANCE
     reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
     off = np.zeros((2 * n, len(CONSTRAINTS)))
-    change, slack, settled, rows = _trust(case, reference), math.inf, 0, None
+    change, slack, settled = _trust(case, reference), math.inf, 0
+    rows = () if warm is None else aborted(case, warm).rows
     for iteration in range(ITERATIONS):
         found = solve(convex_subproblem(case, reference, off, change, rows))
         if found is None:
@@ -288,7 +310,7 @@ def _converged(case: Case, reference: ReferencePath, latest_s: float = math.inf)
         t = n * found.h
         path = StepPath(case.r0, case.v0, found.u, case.wait_s, case.wait_s + t)
         over, abort = excess(case, path), aborted(case, path)
-        rows = abort.rows
+        rows = (*abort.rows, *(rows[:1] if iteration >= ALTERNATING else ()))
         if found.slack <= case.buffer_m:
             path = _exact_end(case, path)
             allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
@@ -296,14 +318,15 @@ def _converged(case: Case, reference: ReferencePath, latest_s: float = math.inf)
                 best is None or path.t_go_s < best.t_go_s
             ):
                 best = path
-        settled += abs(t - reference.t) <= max(TIME_TOLERANCE_S, RELATIVE_TOLERANCE * t)
+        settled += abs(t - reference.t) <= max(TIME_TOLERANCE_S, tolerance * t)
         if settled and best is not None and (settled > 1 or path is best):
             return best
         stuck = best is None and found.slack > 0.9 * slack
-        hopeless = iteration >= 3 and (path.t_go_s > latest_s or (stuck and iteration >= 6))
+        late = path.t_go_s > (latest_s if iteration >= 3 else HOPELESS * latest_s)
+        hopeless = iteration >= 1 and (late or (stuck and iteration >= 6))
         if hopeless or t > case.params.horizon_s - case.wait_s:
             return best
-        if abs(t - reference.t) <= 0.02 * t:
+        if abs(t - reference.t) <= NEAR_REFERENCE * t:
             off += 1.2 * over + np.where(over > 0.0, case.buffer_m, 0.0)
         slack, reference = found.slack, ReferencePath(t, path.at(case.wait_s + t * interval_fractions(n))[0])
         change = max(0.5 * change, 1e-3) if iteration >= 6 else _trust(case, reference)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,12 +73,12 @@ class Abort:
     Attributes:
         margin: Smallest margin of the clearance during these aborts [m]; NaN without a clearance.
         short: By how much it is negative, less what the start itself lacks; 0 where aborts are not required [m].
-        rows: Rows that require the margin; None where they are not needed.
+        rows: Rows that require the margin; empty where they are not needed.
     """
 
     margin: float = math.nan
     short: float = 0.0
-    rows: PointRows | None = None
+    rows: tuple[PointRows, ...] = ()
 
 
 def aborted(case: Case, path: RobotPath) -> Abort:
@@ -113,10 +114,9 @@ def aborted(case: Case, path: RobotPath) -> Abort:
     offset = margins_m - RESERVE * case.buffer_m - np.sum(in_a * (r + lead[:, None] * v), axis=1)
     rate = -lead * np.sum(in_a * v, axis=1)  # the velocity for given h v changes with h
     on = margins_m < FAR * case.buffer_m
-    rows = PointRows(
-        interval[on], (part - interval)[on], in_a[on], offset[on], rate[on], np.ones(int(on.sum())), lead[on]
-    )
-    return Abort(float(margins_m.min()), short, rows)
+    ones = np.ones(int(on.sum()))
+    rows = PointRows(interval[on], (part - interval)[on], in_a[on], offset[on], rate[on], ones, lead[on])
+    return Abort(float(margins_m.min()), short, (rows,))
 
 
 def allowed(start: Array, fraction: Array) -> Array:
@@ -126,9 +126,9 @@ def allowed(start: Array, fraction: Array) -> Array:
 
 
 def convex_subproblem(
-    case: Case, reference: ReferencePath, off: Array, change: float, abort: PointRows | None = None
+    case: Case, reference: ReferencePath, off: Array, change: float, aborts: tuple[PointRows, ...] = ()
 ) -> Subproblem:
-    """Return the convex subproblem at a reference, with the rows of aborts from the path of this reference."""
+    """Return the convex subproblem at a reference, with the rows of aborts from paths near it."""
     n, t = case.limits.nodes, reference.t
     rho, rate = case.scene.goal(np.array([case.wait_s + t, case.wait_s + t - 1e-4]))
     problem = Subproblem(
@@ -146,8 +146,7 @@ def convex_subproblem(
         axes=case.axes,
         earliest=(case.earliest_s - case.wait_s) / n,
     )
-    if abort is not None:
-        problem = replace(problem, planes=(abort,))
+    problem = replace(problem, planes=aborts)
     if not case.limits.geometric:
         return problem
     rows = _RowMaker(case, reference)
@@ -262,16 +261,22 @@ class _RowMaker:
 
     def cone(self, k: Index, degrees: float, off: Array) -> tuple[int, PointRows]:
         """Return |across| <= tan(degrees) along + mouth - off at the points k."""
-        axis = np.asarray(self.scene.axis_c)
-        side = np.eye(3)[int(np.abs(axis).argmin())]
-        side = side - (side @ axis) * axis
-        side /= np.linalg.norm(side)
-        vectors = np.stack([math.tan(math.radians(degrees)) * axis, side, np.cross(axis, side)])
-        return 3, self.rows(k, vectors[None], (self.limits.mouth_m or 0.0) - off)
+        vectors = _cone_rows(tuple(np.asarray(self.scene.axis_c).tolist()), degrees)
+        return 3, self.rows(k, vectors, (self.limits.mouth_m or 0.0) - off)
 
     def ball(self, k: Index, radius: Array) -> tuple[int, PointRows]:
         """Return |y| <= radius at the points k."""
         return 4, self.rows(k, _WITH_RADIUS[None], radius)
+
+
+@lru_cache(maxsize=16)
+def _cone_rows(axis: tuple[float, float, float], degrees: float) -> Array:
+    """Return the rows (1, 3, 3) of a cone about an axis in {C}: its radius, and the coordinates across the axis."""
+    e = np.array(axis)
+    side = np.eye(3)[int(np.abs(e).argmin())]
+    side = side - (side @ e) * e
+    side /= np.linalg.norm(side)
+    return np.stack([math.tan(math.radians(degrees)) * e, side, np.cross(e, side)])[None]
 
 
 def warm_reference(case: Case, path: RobotPath, since_s: float) -> ReferencePath:
