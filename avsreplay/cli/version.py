@@ -7,7 +7,7 @@ from importlib import metadata
 
 import avsreplay
 
-PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", "clarabel", "click", "rich")
+PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", "click", "rich")
 
 
 def versions() -> dict[str, str]:

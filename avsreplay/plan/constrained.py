@@ -41,6 +41,7 @@ TIME_TOLERANCE_S = 2e-3  # change of the end time that ends the iterations
 RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
 ROUGH_TOLERANCE = 2e-3  # the same while initial paths are compared, and where an earlier plan is renewed
 SAME_PATH = 5e-3  # drafts whose end times differ by less, relative to them, have the same minimum
+LATER, LATER_S = 1.02, 0.1  # a renewed plan that is later than the earlier one by more starts the full search
 ALTERNATING = 4  # from this iteration on the aborts of the iteration before are required too: the worst may alternate
 NEAR_REFERENCE = 0.02  # relative change of the end time from which on the excess tightens the constraints
 HOPELESS = 1.2  # an iteration this much later than the best path ends its initial path
@@ -202,14 +203,15 @@ def _worst(case: Case, path: RobotPath) -> tuple[float, str]:
 def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> StepPath | None:
     """Return the earliest capture found.
 
-    A warm start that converges is taken. Otherwise every initial path is iterated on a coarse grid with a coarse check,
-    and the results are refined in the order of their arrival times.
+    A warm start that converges to about the same end time is taken. Otherwise every initial path is iterated on a coarse
+    grid with a coarse check, and the results are refined in the order of their arrival times.
     """
+    best: StepPath | None = None
     if warm is not None:
         again = _shortened(case, *warm)
-        found = _converged(again, warm_reference(again, *warm), warm=_rest(again, *warm))
-        if found is not None:
-            return found
+        best = _converged(again, warm_reference(again, *warm), warm=warm)
+        if best is not None and best.t_go_s <= LATER * max(warm[0].t_go_s - warm[1], case.earliest_s) + LATER_S:
+            return best
     coarse = replace(case, limits=replace(case.limits, nodes=min(COARSE_NODES, case.limits.nodes)), coarse=True)
     drafts: list[StepPath] = []
     for reference in initial_references(coarse, free):
@@ -219,7 +221,6 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
         if drafts and reference.t > 1.5 * min(d.t_go_s for d in drafts):
             break
     drafts = _improved(coarse, sorted(drafts, key=lambda d: d.t_go_s))
-    best: StepPath | None = None
     for draft in sorted(drafts, key=lambda d: d.t_go_s):
         if best is not None and (draft.t_go_s > best.t_go_s):
             break
@@ -249,13 +250,6 @@ def _shortened(case: Case, path: RobotPath, since_s: float) -> Case:
     left = math.ceil((path.t_go_s - since_s - case.wait_s) / path.step_s)
     n = min(max(left, COARSE_NODES), case.limits.nodes)
     return replace(case, limits=replace(case.limits, nodes=n))
-
-
-def _rest(case: Case, path: RobotPath, since_s: float) -> StepPath:
-    """Return the rest of an earlier path from ``since_s`` after its begin on, with the intervals of the case."""
-    n, t = case.limits.nodes, max(path.t_go_s - since_s - case.wait_s, 1e-3)
-    u = path.thrust(since_s + case.wait_s + t * (np.arange(n) + 0.5) / n)
-    return StepPath(case.r0, case.v0, u, case.wait_s, case.wait_s + t)
 
 
 def _same(first: StepPath, second: StepPath) -> bool:
@@ -290,19 +284,19 @@ def _improved(case: Case, drafts: list[StepPath]) -> list[StepPath]:
 
 
 def _converged(
-    case: Case, reference: ReferencePath, latest_s: float = math.inf, warm: StepPath | None = None
+    case: Case, reference: ReferencePath, latest_s: float = math.inf, warm: tuple[RobotPath, float] | None = None
 ) -> StepPath | None:
     """Iterate from a reference until the end time no longer changes; return the earliest feasible path seen.
 
     The iterations end without a result where the end time remains later than ``latest_s``. The first iteration requires
-    the aborts of ``warm``, a path near the reference.
+    the aborts of ``warm``, an earlier path and the time since its begin.
     """
     best: StepPath | None = None
     n, tolerance = case.limits.nodes, ROUGH_TOLERANCE if case.coarse or warm is not None else RELATIVE_TOLERANCE
     reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
     off = np.zeros((2 * n, len(CONSTRAINTS)))
     change, slack, settled = _trust(case, reference), math.inf, 0
-    rows = () if warm is None else aborted(case, warm).rows
+    rows = () if warm is None else aborted(case, *warm).rows
     for iteration in range(ITERATIONS):
         found = solve(convex_subproblem(case, reference, off, change, rows))
         if found is None:

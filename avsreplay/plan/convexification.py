@@ -81,13 +81,13 @@ class Abort:
     rows: tuple[PointRows, ...] = ()
 
 
-def aborted(case: Case, path: RobotPath) -> Abort:
-    """Return the aborts from instants of a path, each with its worst moment."""
+def aborted(case: Case, path: RobotPath, since_s: float = 0.0) -> Abort:
+    """Return the aborts from instants of a path later than ``since_s`` after its begin, each with its worst moment."""
     limits, scene = case.limits, case.scene
     if limits.clearance_m is None or scene.surface is None:
         return Abort()
-    begin = np.linspace(case.wait_s, path.t_go_s, ABORTS, endpoint=False)
-    r, v = path.at(begin)
+    begin = np.linspace(case.wait_s, path.t_go_s - since_s, ABORTS, endpoint=False)
+    r, v = path.at(since_s + begin)
     rho, R = case.sampled.at(begin)
     outside = np.linalg.norm(r - rho, axis=1) > (limits.final_range_m or 0.0)
     if not outside.any():
@@ -104,13 +104,13 @@ def aborted(case: Case, path: RobotPath) -> Abort:
     k = gap.reshape(len(begin), -1).argmin(axis=1) + np.arange(len(begin)) * after.size
     margins_m = gap[k] - limits.clearance_m
     short = max(-float(margins_m.min()) - max(-float(margins_m[0]), 0.0), 0.0) if limits.abort else 0.0
-    if not limits.abort or not isinstance(path, StepPath):
+    if not limits.abort:
         return Abort(float(margins_m.min()), short)
     normal = (y[k] - foot[k]) / np.where(np.abs(gap[k]) > 1e-9, gap[k], 1e-9)[:, None]
     in_a = (R[k] @ normal[:, :, None])[:, :, 0]
     lead = times[k] - begin
-    part = (begin - case.wait_s) / path.step_s
-    interval = np.minimum(part.astype(np.int64), len(path.u) - 1)
+    part = (begin - case.wait_s) * limits.nodes / (path.t_go_s - since_s - case.wait_s)
+    interval = np.minimum(part.astype(np.int64), limits.nodes - 1)
     offset = margins_m - RESERVE * case.buffer_m - np.sum(in_a * (r + lead[:, None] * v), axis=1)
     rate = -lead * np.sum(in_a * v, axis=1)  # the velocity for given h v changes with h
     on = margins_m < FAR * case.buffer_m
@@ -280,9 +280,15 @@ def _cone_rows(axis: tuple[float, float, float], degrees: float) -> Array:
 
 
 def warm_reference(case: Case, path: RobotPath, since_s: float) -> ReferencePath:
-    """Return the rest of an earlier path from ``since_s`` after its begin on as a reference."""
-    t = max(path.t_go_s - since_s - case.wait_s, 1e-3)
-    return ReferencePath(t, path.at(since_s + case.wait_s + t * interval_fractions(case.limits.nodes))[0])
+    """Return the rest of an earlier path from ``since_s`` after its begin on as a reference.
+
+    Its end is moved to the grasp point, as the estimate has changed since, and its begin to the robot.
+    """
+    t, s = max(path.t_go_s - since_s - case.wait_s, 1e-3), interval_fractions(case.limits.nodes)
+    r = path.at(since_s + case.wait_s + t * np.concatenate([[0.0], s]))[0]
+    first = case.r0 + case.wait_s * case.v0 - r[0]
+    last = case.sampled.at(np.array([case.wait_s + t]))[0][0] - r[-1]
+    return ReferencePath(t, r[1:] + first + (s * s)[:, None] * (last - first))
 
 
 def initial_references(case: Case, free: Plan) -> list[ReferencePath]:

@@ -23,6 +23,8 @@ from avsreplay.plan.robot import Limits
 from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
 from avsreplay.records import Forecast
 
+SEARCH_AGAIN = 1.1  # ratio to the time to go of the latest full search from which on all initial paths are searched
+
 _CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 
 
@@ -56,6 +58,7 @@ class Segment:
         previous: Segment flown before t_ns, None where t_ns has passed.
         capture: Whether the segment ends at the grasp point.
         turn: Turn of the gripper; None where its attitude is not planned.
+        searched_s: Time to go that the latest search over all initial paths found [s].
     """
 
     t_ns: int
@@ -65,6 +68,7 @@ class Segment:
     previous: Segment | None = None
     capture: bool = False
     turn: Turn | None = None
+    searched_s: float = math.inf
 
     def at(self, t_ns: int) -> tuple[Array, Array]:
         """Return the state of the robot at an instant.
@@ -100,6 +104,7 @@ class GuidanceState:
         decision: The latest decision.
         made_ns: When the latest segment of a hold or retreat was planned.
         captured_ns: When the gripper closed.
+        draft: Segment of the latest capture plan that was found, flown or not; the next plan begins with its path.
     """
 
     segment: Segment
@@ -108,6 +113,7 @@ class GuidanceState:
     decision: Decision = field(default_factory=lambda: Decision(Action.STAND_STILL, ""))
     made_ns: int | None = None
     captured_ns: int | None = None
+    draft: Segment | None = None
 
 
 class Guidance:
@@ -175,12 +181,13 @@ class Guidance:
         plan, segment = self._replan(state, known)
         facts = self._facts(state, known, plan, segment)
         supervisor, decision = self.supervisor.decide(state.supervisor, facts)
-        state = replace(state, supervisor=supervisor, decision=decision, plan=plan)
+        draft = segment if segment is not None and segment is not state.segment else state.draft
+        state = replace(state, supervisor=supervisor, decision=decision, plan=plan, draft=draft)
         if decision.action not in _CLOSING:
             return self._withdraw(state, known)
         if segment is None:  # the approach resumes between two replanning instants
-            plan, segment = self._capture_plan(state.segment, known)
-        return replace(state, plan=plan, segment=segment or state.segment, made_ns=None)
+            plan, segment = self._capture_plan(state, known)
+        return replace(state, plan=plan, segment=segment or state.segment, made_ns=None, draft=segment or state.draft)
 
     def _replan(self, state: GuidanceState, known: PlannerInput) -> tuple[Plan | None, Segment | None]:
         """Return the capture plan in force, renewed where it is due, and the segment that flies it, if any."""
@@ -192,7 +199,7 @@ class Guidance:
         left_s = (state.segment.end_ns - known.t_ns) * 1e-9 if closing else math.inf
         if not self._due(age_s, left_s):
             return state.plan, flown
-        plan, segment = self._capture_plan(state.segment, known)
+        plan, segment = self._capture_plan(state, known)
         if segment is None and flown is not None and self._still_valid(flown, known):
             return state.plan, flown
         return plan, segment or flown
@@ -213,23 +220,36 @@ class Guidance:
         near = left_s <= 2.0 * self.supervisor.params.commit_s
         return (age_s >= self.params.replan_period_s - 1e-6 or near) and left_s > self.params.latency_s
 
-    def _capture_plan(self, segment: Segment, known: PlannerInput) -> tuple[Plan, Segment | None]:
-        """Plan the capture under the limits; the path of the current segment is the first initial path."""
+    def _capture_plan(self, state: GuidanceState, known: PlannerInput) -> tuple[Plan, Segment | None]:
+        """Plan the capture under the limits; the path of the latest plan is the first initial path.
+
+        All initial paths are searched where there is none, or where the time to go exceeds that of the latest search.
+        """
+        segment, draft = state.segment, state.draft
         turn = self._turn(segment, known)
         earliest_s = 0.0 if turn is None else turn.ready_s(self.params.horizon_s)
+        searched_s = math.inf if draft is None else draft.searched_s
 
         def planner(scene: Scene, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
+            nonlocal searched_s
             if not self.limits.any:
                 return rendezvous(scene.goal, r0, v0, params, t_ns, earliest_s)
-            since_s = (t_ns - segment.t_ns) * 1e-9 + self.params.latency_s
-            closing = segment.path is not None and segment.capture and since_s >= 0.0
-            warm = (segment.path, since_s) if closing and segment.path is not None else None
-            return constrained(scene, r0, v0, params, self.limits, t_ns, warm=warm, earliest_s=earliest_s)
+            problem = scene, r0, v0, params, self.limits, t_ns
+            if draft is not None and draft.path is not None:
+                since_s = (t_ns - draft.t_ns) * 1e-9 + self.params.latency_s
+                warm = (draft.path, max(since_s, 0.0))
+                plan = constrained(*problem, warm=warm, earliest_s=earliest_s)
+                if plan.found and plan.t_go_s <= SEARCH_AGAIN * searched_s:
+                    return plan
+            plan = constrained(*problem, earliest_s=earliest_s)
+            searched_s = plan.t_go_s
+            return plan
 
         plan, made = self._plan(segment, known.scene, known.t_ns, planner)
-        if turn is None or made is None:
-            return plan, made and replace(made, capture=True)
-        return with_turn(plan, earliest_s + self.params.latency_s), replace(made, capture=True, turn=turn)
+        if made is None:
+            return plan, None
+        made = replace(made, capture=True, turn=turn or made.turn, searched_s=searched_s)
+        return (plan if turn is None else with_turn(plan, earliest_s + self.params.latency_s)), made
 
     def _turn(self, segment: Segment, known: PlannerInput) -> Turn | None:
         """Return the turn of the gripper to the fixture after the latency; None where its attitude is not planned."""

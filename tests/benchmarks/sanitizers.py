@@ -168,7 +168,18 @@ def from_motion(rng: np.random.Generator) -> str:
     return "motion used" if done else "motion refused"
 
 
-KINDS = (from_model, from_arrays, from_saved, from_motion)
+def from_cone(rng: np.random.Generator) -> str:
+    """Random stagewise cone programmes, some with rows that do not fit."""
+    from avsreplay.plan import _cone
+
+    n, sizes = int(rng.integers(1, 6)), rng.integers(1, 6, int(rng.integers(1, 20)))
+    stage = np.repeat(rng.integers(0, n, len(sizes)), sizes).astype(np.int32)
+    rows = numbers(rng, 11 * len(stage)).reshape(-1, 11), numbers(rng, len(stage))
+    done = _tried(lambda: _cone.solve(n, (0.0, 0.1, 0.2), (1.0, 10.0), stage, *rows, sizes.astype(np.int32)))
+    return "accepted" if done else "refused"
+
+
+KINDS = (from_model, from_arrays, from_saved, from_motion, from_cone)
 
 
 def fuzz(campaign: int, inputs: list[int]) -> int:

@@ -1,0 +1,128 @@
+"""The cone programme of one iteration against an independent solver, and what the extension refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from avsreplay.plan import _cone
+from avsreplay.plan.cone_programme import PointRows, Subproblem, solve
+
+
+def _rows(rng, n, count, vectors, offset, slack=True):
+    """Rows at random instants; the first of each group has the offset and the slack."""
+    group = vectors.shape[1]
+    interval = np.repeat(rng.integers(0, n, count), group)
+    fraction = np.repeat(np.where(rng.random(count) < 0.5, 0.5, 1.0), group)
+    constant = np.zeros((count, group))
+    constant[:, 0] = offset
+    first = np.tile(np.eye(1, group)[0] * slack, count)
+    return PointRows(
+        interval, fraction, vectors.reshape(-1, 3), constant.ravel(), 0.1 * rng.normal(size=count * group), first
+    )
+
+
+def _problem(seed, n=8):
+    """A random rendezvous with half-spaces, balls and bounds on speed and contact."""
+    rng = np.random.default_rng(seed)
+    rho, rate = 4.0 * rng.normal(size=3), 0.05 * rng.normal(size=3)
+    planes = _rows(rng, n, 6, rng.normal(size=(6, 1, 3)), rng.uniform(-0.5, 4.0, 6))
+    ball = np.concatenate([np.zeros((4, 1, 3)), np.tile(np.eye(3), (4, 1, 1))], axis=1)
+    return Subproblem(
+        n=n,
+        h=2.2 * np.sqrt(np.linalg.norm(rho) / 0.1) / n,
+        r0=np.zeros(3),
+        v0=0.05 * rng.normal(size=3),
+        rho=rho,
+        rate=rate,
+        acceleration=0.003 * rng.normal(size=3),
+        a_max=0.1,
+        change=0.25,
+        speed=1.0 if seed % 2 else None,
+        contact=0.08 if seed % 3 == 0 else None,
+        axes=np.eye(3) / 0.08 if seed % 4 == 0 else None,
+        planes=(planes,),
+        cones=((4, _rows(rng, n, 4, ball, rng.uniform(2.0, 6.0, 4))),),
+    )
+
+
+def _independent(p):
+    """The same programme in Clarabel, its constraints collected by evaluating them: interval length and slack."""
+    clarabel = pytest.importorskip("clarabel", reason="the independent solver is not installed")
+    from scipy import sparse
+
+    def values(x):
+        """All constraints at x = (w, h/h_ref, slack), in metres; positive parts first, then cones of four rows."""
+        w, g, slack = x[:-2].reshape(p.n, 3), x[-2], x[-1]
+        q = p.v0 * p.h * g + np.concatenate([np.zeros((1, 3)), np.cumsum(w, axis=0)])
+        r = p.r0 + np.concatenate([np.zeros((1, 3)), np.cumsum(q[:-1] + 0.5 * w, axis=0)])
+
+        def at(rows):
+            k, s = rows.interval, rows.fraction[:, None]
+            point = r[k] + s * q[k] + 0.5 * s * s * w[k]
+            return np.sum(rows.vector * point, axis=1) + rows.offset + rows.rate * (g - 1.0) + rows.slack * slack
+
+        positive = [g - max(1.0 - p.change, p.earliest / p.h), 1.0 + p.change - g, slack, *at(p.planes[0])]
+        if p.axes is not None:
+            bound = p.h**2 * (2.0 * g - 1.0)
+            positive += [*(bound - w @ p.axes.T).ravel(), *(bound + w @ p.axes.T).ravel()]
+        cones = [np.array([p.a_max * p.h**2 * (2.0 * g - 1.0), *w[k]]) for k in range(p.n)]
+        if p.speed is not None:
+            cones += [np.array([p.speed * p.h * g, *q[k + 1]]) for k in range(p.n)]
+        if p.contact is not None:
+            square = p.h**2 * (2.0 * g - 1.0)
+            cones.append(np.array([p.contact * square, *(w[-1] - p.acceleration * square)]))
+        cones.append(np.array([slack, *(r[-1] - p.rho - p.rate * p.n * p.h * (g - 1.0))]))
+        turn = p.acceleration * p.n * p.h
+        cones.append(np.array([slack / p.n, *(q[-1] - p.h * (p.rate + turn) * g + p.h * turn)]))
+        return np.concatenate([positive, *cones, at(p.cones[0][1])]), len(positive)
+
+    size = 3 * p.n + 2
+    base, positive = values(np.zeros(size))
+    C = np.stack([values(e)[0] - base for e in np.eye(size)], axis=1)
+    scale = max(np.linalg.norm(p.rho - p.r0 - p.v0 * p.n * p.h), 0.5 * p.a_max * (p.n * p.h) ** 2)
+    cost = np.zeros(size)
+    cost[-2:] = 1.0, p.weight / scale
+    kinds = [clarabel.NonnegativeConeT(positive)]
+    kinds += [clarabel.SecondOrderConeT(4)] * ((len(base) - positive) // 4)
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    problem = sparse.csc_matrix((size, size)), cost, sparse.csc_matrix(-C), base, kinds, settings
+    x = np.array(clarabel.DefaultSolver(*problem).solve().x)
+    return p.h * x[-2], x[-1], values, scale
+
+
+@pytest.mark.parametrize("seed", range(24))
+def test_a_programme_has_the_solution_of_an_independent_solver(seed):
+    """Cost, feasibility in the constraints written anew, and the interval length where the slack is zero in both."""
+    p = _problem(seed)
+    h, slack, values, scale = _independent(p)
+    found = solve(p)
+    assert found is not None
+    ours, theirs = found.h / p.h + p.weight * found.slack / scale, h / p.h + p.weight * slack / scale
+    assert ours == pytest.approx(theirs, abs=3e-5 * max(1.0, abs(theirs)))
+    x = np.concatenate([(found.u * found.h**2).ravel(), [found.h / p.h, found.slack]])
+    s, positive = values(x)
+    assert s[:positive].min() > -1e-6 * scale
+    cones = s[positive:].reshape(-1, 4)
+    assert (cones[:, 0] - np.linalg.norm(cones[:, 1:], axis=1)).min() > -1e-6 * scale
+
+
+def test_a_programme_without_a_solution_has_none():
+    """A speed bound below the speed at the begin."""
+    p = _problem(2)
+    p = Subproblem(**{name: getattr(p, name) for name in ("n", "h", "r0", "rho", "rate", "acceleration", "a_max")},
+                   v0=np.array([5.0, 0.0, 0.0]), change=0.25, speed=0.01)
+    assert solve(p) is None
+
+
+def test_rows_that_do_not_fit_are_refused():
+    """Cones across stages, rows without a cone, stages outside the programme."""
+    C, d = np.zeros((2, 11)), np.zeros(2)
+
+    def call(stage, cones):
+        return _cone.solve(2, (0.0, 0.0, 0.0), (1.0, 1.0), np.array(stage, np.int32), C, d, np.array(cones, np.int32))
+
+    for stage, cones in (([0, 1], [2]), ([0, 0], [1]), ([0, 2], [1, 1]), ([0, 0], [5]), ([0, 0], [1, 0, 1])):
+        with pytest.raises(ValueError, match=r"cone|stage"):
+            call(stage, cones)
