@@ -111,8 +111,12 @@ def test_a_programme_has_the_solution_of_an_independent_solver(seed):
 def test_a_programme_without_a_solution_has_none():
     """A speed bound below the speed at the begin."""
     p = _problem(2)
-    p = Subproblem(**{name: getattr(p, name) for name in ("n", "h", "r0", "rho", "rate", "acceleration", "a_max")},
-                   v0=np.array([5.0, 0.0, 0.0]), change=0.25, speed=0.01)
+    p = Subproblem(
+        **{name: getattr(p, name) for name in ("n", "h", "r0", "rho", "rate", "acceleration", "a_max")},
+        v0=np.array([5.0, 0.0, 0.0]),
+        change=0.25,
+        speed=0.01,
+    )
     assert solve(p) is None
 
 

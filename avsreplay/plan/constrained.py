@@ -210,7 +210,7 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
     if warm is not None:
         again = _shortened(case, *warm)
         best = _converged(again, warm_reference(again, *warm), warm=warm)
-        if best is not None and best.t_go_s <= LATER * max(warm[0].t_go_s - warm[1], case.earliest_s) + LATER_S:
+        if best is not None and best.t_go_s <= LATER * max(_expected(case, *warm), case.earliest_s) + LATER_S:
             return best
     coarse = replace(case, limits=replace(case.limits, nodes=min(COARSE_NODES, case.limits.nodes)), coarse=True)
     drafts: list[StepPath] = []
@@ -250,6 +250,12 @@ def _shortened(case: Case, path: RobotPath, since_s: float) -> Case:
     left = math.ceil((path.t_go_s - since_s - case.wait_s) / path.step_s)
     n = min(max(left, COARSE_NODES), case.limits.nodes)
     return replace(case, limits=replace(case.limits, nodes=n))
+
+
+def _expected(case: Case, path: RobotPath, since_s: float) -> float:
+    """Return the time to go that an earlier path leads to expect: what is left of it, or all of it for a robot off it."""
+    away = float(np.linalg.norm(path.at(np.array([since_s]))[0][0] - case.r0))
+    return path.t_go_s - (since_s if away <= (case.limits.mouth_m or 0.0) else 0.0)
 
 
 def _same(first: StepPath, second: StepPath) -> bool:

@@ -241,9 +241,7 @@ class _RowMaker:
         foot = found.foot[k]
         gap = found.distance[k]
         normal = (self.y[k] - foot) / np.where(np.abs(gap) > 1e-9, gap, 1e-9)[:, None]
-        planes.append(
-            self.rows(k, normal[:, None], -np.sum(normal * foot, axis=1) - found.clearance[k] - off[k])
-        )
+        planes.append(self.rows(k, normal[:, None], -np.sum(normal * foot, axis=1) - found.clearance[k] - off[k]))
 
     def _workspace(self, planes: list[PointRows], cones: list[tuple[int, PointRows]], k: Index, off: Array) -> None:
         """Add the shell around the robot's base, which is fixed in {A}."""
