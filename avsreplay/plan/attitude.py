@@ -154,6 +154,24 @@ def _relative(target: Attitude, q0: Array, horizon_s: float, winding: int) -> tu
     return (lambda t: (np.asarray(spline(t)), np.asarray(spline(t, 1)))), float(times[last])
 
 
+def next_turn(before: Turn, target: Attitude, accel_radps2: float, params: PlanParams, t_ns: int) -> Turn:
+    """Return the turn to the fixture that begins after the latency; the attitude is kept where none was found.
+
+    Args:
+        before: The turn until then.
+        target: Attitude of the fixture, in seconds after t_ns.
+        accel_radps2: Largest angular acceleration [rad/s2].
+        params: Horizon, latency and grid.
+        t_ns: Instant of planning.
+    """
+    wait_s = params.latency_s
+    begin_ns = t_ns + round(wait_s * 1e9)
+    since_s = (begin_ns - before.t_ns) * 1e-9
+    q0, rate0 = before.at(np.array([since_s]))[0], before.rate(since_s)
+    late = replace(params, latency_s=0.0)
+    return turn_to(lambda t: target(t + wait_s), q0, rate0, accel_radps2, late, begin_ns) or Turn(begin_ns, q0)
+
+
 def turn_time(
     target: Attitude | None, gripper: tuple[Array, float] | None, params: PlanParams, t_ns: int
 ) -> float | None:

@@ -147,7 +147,7 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
     """Return the plan without constraints where it satisfies all of them; None where it does not."""
     path, limits = path_of(free, case.r0, case.v0), case.limits
     times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * limits.nodes + 1)
-    if not _within_axes(case, path.thrust(times)):
+    if not case.within_axes(path.thrust(times)):
         return None
     if limits.speed_max_mps is not None:
         speed = np.linalg.norm(path.at(times)[1], axis=1)
@@ -203,8 +203,8 @@ def _worst(case: Case, path: RobotPath) -> tuple[float, str]:
 def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> StepPath | None:
     """Return the earliest capture found.
 
-    A warm start that converges to about the same end time is taken. Otherwise every initial path is iterated on a coarse
-    grid with a coarse check, and the results are refined in the order of their arrival times.
+    A warm start that converges to about the same end time is taken. Otherwise every initial path is iterated on a
+    coarse grid with a coarse check, and the results are refined in the order of their arrival times.
     """
     best: StepPath | None = None
     if warm is not None:
@@ -253,7 +253,7 @@ def _shortened(case: Case, path: RobotPath, since_s: float) -> Case:
 
 
 def _expected(case: Case, path: RobotPath, since_s: float) -> float:
-    """Return the time to go that an earlier path leads to expect: what is left of it, or all of it for a robot off it."""
+    """Return the time to go expected from an earlier path: what is left of it, all of it for a robot off it."""
     away = float(np.linalg.norm(path.at(np.array([since_s]))[0][0] - case.r0))
     return path.t_go_s - (since_s if away <= (case.limits.mouth_m or 0.0) else 0.0)
 
@@ -312,7 +312,7 @@ def _converged(
         over, abort = excess(case, path), aborted(case, path)
         rows = (*abort.rows, *(rows[:1] if iteration >= ALTERNATING else ()))
         if found.slack <= case.buffer_m:
-            path = _exact_end(case, path)
+            path = path.ending_at(case.scene.goal)
             allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
             if _feasible(case, path, max(over.max(), abort.short), allowed) and (
                 best is None or path.t_go_s < best.t_go_s
@@ -342,22 +342,5 @@ def _trust(case: Case, reference: ReferencePath) -> float:
 def _feasible(case: Case, path: StepPath, over: float, allowed: float) -> bool:
     position, velocity = path.terminal_errors(case.scene.goal)
     short = path.t_go_s <= case.params.horizon_s
-    exact = position <= 1e-8 and velocity <= 1e-8 and path.u_max() <= case.a_max and _within_axes(case, path.u)
+    exact = position <= 1e-8 and velocity <= 1e-8 and path.u_max() <= case.a_max and case.within_axes(path.u)
     return bool(short and exact and over <= allowed)
-
-
-def _within_axes(case: Case, u: Array) -> bool:
-    """Return whether accelerations (n, 3) in {A} are within the bounds of every axis of the base."""
-    bounds = case.limits.accel_axes_mps2
-    return bounds is None or bool(np.all(np.abs(u @ case.limits.base_axes) <= bounds))
-
-
-def _exact_end(case: Case, path: StepPath) -> StepPath:
-    """Remove the terminal errors by the thrust correction of least norm."""
-    n, h = len(path.u), path.step_s
-    rho, rate = case.scene.goal(np.array([path.t_go_s]))
-    r, v = path.nodes()
-    k = np.arange(n)
-    rows = np.stack([h * h * (n - k - 0.5), np.full(n, h)])  # effect of u_k on the last position and velocity
-    errors = np.stack([rho[0] - r[-1], rate[0] - v[-1]])
-    return replace(path, u=path.u + rows.T @ np.linalg.solve(rows @ rows.T, errors))

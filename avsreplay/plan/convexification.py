@@ -181,7 +181,7 @@ class _RowMaker:
         self.near[-1] = False  # the grasp point itself is the end condition
 
     def rows(self, k: Index, vectors: Array, constant: Array | float) -> PointRows:
-        """Return g rows vector.y for each point k, the first with a constant and slack; vectors (m or 1, g, 3) in {C}."""
+        """Return g rows vector.y for each point k, the first with constant and slack; vectors (m or 1, g, 3) in {C}."""
         vectors = np.broadcast_to(vectors, (len(k), *vectors.shape[1:]))
         in_a = vectors @ self.R[k].transpose(0, 2, 1)
         offset = -(in_a @ self.rho[k][:, :, None])[:, :, 0]

@@ -14,7 +14,7 @@ import numpy as np
 
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
-from avsreplay.plan.attitude import Turn, turn_to, with_turn
+from avsreplay.plan.attitude import Turn, next_turn, with_turn
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.limits import Scene, margin
 from avsreplay.plan.path import RobotPath, path_of
@@ -226,7 +226,9 @@ class Guidance:
         All initial paths are searched where there is none, or where the time to go exceeds that of the latest search.
         """
         segment, draft = state.segment, state.draft
-        turn = self._turn(segment, known)
+        turn = None
+        if self.gripper is not None and segment.turn is not None and known.scene.attitude is not None:
+            turn = next_turn(segment.turn, known.scene.attitude, self.gripper[1], self.params, known.t_ns)
         earliest_s = 0.0 if turn is None else turn.ready_s(self.params.horizon_s)
         searched_s = math.inf if draft is None else draft.searched_s
 
@@ -250,19 +252,6 @@ class Guidance:
             return plan, None
         made = replace(made, capture=True, turn=turn or made.turn, searched_s=searched_s)
         return (plan if turn is None else with_turn(plan, earliest_s + self.params.latency_s)), made
-
-    def _turn(self, segment: Segment, known: PlannerInput) -> Turn | None:
-        """Return the turn of the gripper to the fixture after the latency; None where its attitude is not planned."""
-        before, attitude = segment.turn, known.scene.attitude
-        if self.gripper is None or before is None or attitude is None:
-            return None
-        wait_s = self.params.latency_s
-        begin_ns = known.t_ns + round(wait_s * 1e9)
-        since_s = (begin_ns - before.t_ns) * 1e-9
-        q0, rate0 = before.at(np.array([since_s]))[0], before.rate(since_s)
-        late = replace(self.params, latency_s=0.0)
-        found = turn_to(lambda t: attitude(t + wait_s), q0, rate0, self.gripper[1], late, begin_ns)
-        return found or Turn(begin_ns, q0)
 
     def _plan(self, segment: Segment, scene: Scene, t_ns: int, planner: _Planner) -> tuple[Plan, Segment | None]:
         """Plan from the state that the current segment reaches when the latency is over."""

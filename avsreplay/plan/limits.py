@@ -324,6 +324,11 @@ class Case:
         bounds = self.limits.accel_axes_mps2
         return None if bounds is None else self.limits.base_axes.T / (THRUST_SHARE * np.array(bounds))[:, None]
 
+    def within_axes(self, u: Array) -> bool:
+        """Return whether accelerations (n, 3) in {A} are within the bounds of every axis of the base."""
+        bounds = self.limits.accel_axes_mps2
+        return bounds is None or bool(np.all(np.abs(u @ self.limits.base_axes) <= bounds))
+
     @property
     def scene(self) -> Scene:
         """The target."""

@@ -8,7 +8,7 @@ equal intervals.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -223,6 +223,18 @@ class StepPath:
             goal: Trajectory of the grasp point in {A}, in seconds after the instant of planning.
         """
         return _terminal_errors(self, goal)
+
+    def ending_at(self, goal: Trajectory) -> StepPath:
+        """Return the path without terminal errors: its thrust with the correction of least norm.
+
+        Args:
+            goal: Trajectory of the grasp point in {A}, in seconds after the instant of planning.
+        """
+        n, h = len(self.u), self.step_s
+        rho, rate = goal(np.array([self.t_go_s]))
+        rows = np.stack([h * h * (n - np.arange(n) - 0.5), np.full(n, h)])  # of u_k on the last position and velocity
+        errors = np.stack([rho[0] - self._nodes[0][-1], rate[0] - self._nodes[1][-1]])
+        return replace(self, u=self.u + rows.T @ np.linalg.solve(rows @ rows.T, errors))
 
     def u_max(self) -> float:
         """Return the largest |u| [m/s2]."""
