@@ -13,6 +13,7 @@ from avsreplay.cli.setting_options import robot_option, setting_option
 if TYPE_CHECKING:
     from avsreplay.outcome import Plan
     from avsreplay.plan import Execution, Flights, Limits, Miss, PlanParams, Spread
+    from avsreplay.plan.arm import Arm, JointPath
     from avsreplay.replan import Replanning, Saved
     from avsreplay.report.table import Table
 
@@ -98,9 +99,12 @@ def command(
     Raises:
         UsageError: an option or setting is invalid, or --export has no plan.  UnreadableInput: RESULT cannot be read.
     """  # noqa: D301
+    from dataclasses import replace
+
     from avsreplay.config import robot_settings
     from avsreplay.errors import UsageError
     from avsreplay.files import check_output
+    from avsreplay.plan.arm import with_arm
     from avsreplay.replan import load_saved, with_settings
 
     for name, value in (("--every", every_s), ("--extent", extent_m)):
@@ -112,21 +116,22 @@ def command(
     saved = with_settings(load_saved(result, extent_m), (*of_robot, *assignments))
     for line in saved.warnings:
         click.echo(f"avsreplay: warning: {line}", err=True)
-    planning = _planning(saved, flags)
+    robot, arm = with_arm(saved.robot)
+    planning = _planning(replace(saved, robot=robot), flags)
     index = saved.index_at(at_s)
     made = _usable(lambda: planning.plan_at(index))
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
     flown = _usable(lambda: planning.flights(index, flights, seed)) if made.found and flights else None
-    limited = planning.limits.any
-    period_s = every_s or (10.0 if limited else 2.0)
+    joints = _usable(lambda: _joints(planning, index, made, arm)) if made.found and arm else None
+    period_s = every_s or (10.0 if planning.limits.any else 2.0)
     hindsight = _usable(lambda: planning.hindsight(period_s))
     execution = _usable(planning.execute)
     if export:
         _export(planning, made, export)
     if as_json:
-        click.echo(_document(planning, index, made, spread, hindsight, execution, flown), nl=False)
+        click.echo(_document(planning, index, made, spread, hindsight, execution, flown, joints), nl=False)
     else:
-        _print(planning, index, made, spread, hindsight, execution, flown)
+        _print(planning, index, made, spread, hindsight, execution, flown, joints)
 
 
 def _usable(action: Any) -> Any:
@@ -148,10 +153,18 @@ def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
     given = {name: value for name, value in flags.items() if value is not None}
     of_plan = {f.name for f in fields(PlanParams)}
     params: PlanParams = _usable(lambda: replace(saved.plan, **{k: v for k, v in given.items() if k in of_plan}))
-    changed = {k: v for k, v in given.items() if k not in of_plan}
-    limits: Limits = _usable(lambda: replace(saved.limits, **changed))
+    limits: Limits = _usable(lambda: replace(saved.limits, **{k: v for k, v in given.items() if k not in of_plan}))
     made: Replanning = _usable(lambda: Replanning(saved, params, limits, saved.supervisor))
     return made
+
+
+def _joints(planning: Replanning, index: int, made: Plan, arm: Arm) -> JointPath:
+    """Return the joints of the arm during the last metres."""
+    from avsreplay.plan import Scene
+
+    belief, estimator = planning.saved.beliefs[index], planning.saved.estimator
+    scene = Scene(estimator.motion(belief), estimator.attitude(belief))
+    return arm.last_metres(planning.path(made), scene, planning.limits)
 
 
 def _document(
@@ -162,6 +175,7 @@ def _document(
     hindsight: list[tuple[float, Plan, Miss | None]],
     execution: Execution | None,
     flown: Flights | None,
+    joints: JointPath | None,
 ) -> str:
     import json
 
@@ -179,6 +193,7 @@ def _document(
         "tolerance": settings.dump(planning.tolerance),
         "spread": settings.dump(spread) if spread else None,
         "flights": settings.dump(flown) if flown else None,
+        "arm": joints.record() if joints else None,
         "hindsight": [
             {"made_at_s": at_s, **_plan_record(p, at_s), "miss": settings.dump(m) if m else None}
             for at_s, p, m in hindsight
@@ -229,12 +244,16 @@ def _print(
     hindsight: list[tuple[float, Plan, Miss | None]],
     execution: Execution | None,
     flown: Flights | None,
+    joints: JointPath | None,
 ) -> None:
     from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
     console = make_console()
     at_s = planning.saved.rows[index].t_s
-    print_table(console, facts_table(f"Plan made at {at_s:.2f} s", _plan_facts(planning, at_s, made, spread, flown)))
+    facts = _plan_facts(planning, at_s, made)
+    for found in (joints, spread, flown):
+        facts += found.described() if found else []
+    print_table(console, facts_table(f"Plan made at {at_s:.2f} s", facts))
     print_table(console, _hindsight_table(hindsight))
     if execution is not None:
         print_table(console, _execution_table(execution))
@@ -242,9 +261,7 @@ def _print(
             print_line(console, line)
 
 
-def _plan_facts(
-    planning: Replanning, at_s: float, made: Plan, spread: Spread | None, flown: Flights | None
-) -> list[tuple[str, str]]:
+def _plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str, str]]:
     facts = [("robot", planning.robot_line), ("status", _status(made))]
     if made.found:
         facts += [
@@ -260,7 +277,7 @@ def _plan_facts(
         facts.append(("smallest margin", f"{made.margin_m:.4f} m ({made.binding}); excess {made.violation_m:.1e} m"))
     if abs(made.abort_margin_m) < float("inf"):
         facts.append(("margin of an abort", f"{made.abort_margin_m:.3f} m of clearance, from any instant"))
-    return [*facts, *(spread.described() if spread else ()), *(flown.described() if flown else ())]
+    return facts
 
 
 def _status(made: Plan) -> str:

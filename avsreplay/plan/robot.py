@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 
 import numpy as np
 
@@ -166,6 +167,12 @@ class RobotParams(Settings):
     reach_min_m: float | None = setting(
         None, "Smallest distance of the end-effector from the base.", unit="m", above=0.0, unset="limits.reach_min_m"
     )
+    urdf: str | None = setting(
+        None,
+        "URDF of a manipulator that carries the end-effector: 'avsreplay plan' states whether its joints can fly the"
+        " last metres, and its reach is the workspace where reach_max_m is not given.",
+    )
+    urdf_frame: str | None = setting(None, "Frame of the gripper in the URDF.", unset="its last frame")
     delay_s: float | None = setting(
         None, "Time between planning and the first thrust.", unit="s", low=0.0, unset="plan.latency_s"
     )
@@ -262,6 +269,7 @@ class RobotParams(Settings):
             f"radius {self.radius_m:g} m",
             f"from ({', '.join(f'{x:g}' for x in params.robot_position_m)}) m in {{A}}",
             *([reach] if reach else []),
+            *([] if self.urdf is None else [f"arm {PurePath(self.urdf).name}"]),
             f"delay {params.latency_s:g} s",
             f"thrust noise {self.thrust_noise:g}",
         ]
