@@ -65,6 +65,13 @@ def test_the_workspace_is_a_shell_about_the_base():
     assert not far.found  # the grasp point itself is out of reach
 
 
+def test_a_robot_that_starts_at_its_base_uses_the_whole_workspace():
+    free = constrained(still(), np.zeros(3), np.zeros(3), PlanParams(), Limits(final_deg=15.0))
+    plan = constrained(still(), np.zeros(3), np.zeros(3), PlanParams(), Limits(final_deg=15.0, reach_max_m=20.0))
+    assert plan.found
+    assert plan.t_go_s == pytest.approx(free.t_go_s, rel=1e-3)
+
+
 def test_thrust_and_size_of_the_robot():
     robot = RobotParams(mass_kg=80.0, thrust_max_n=2.0, radius_m=0.15)
     assert robot.applied(PlanParams()).a_max_mps2 == pytest.approx(0.025)

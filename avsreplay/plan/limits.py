@@ -209,7 +209,10 @@ def margins(scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array
         first[:, 3], second[:, 3] = corridor, gap - clearance
     if limits.reach_max_m is not None or limits.reach_min_m is not None:
         from_base = np.linalg.norm(r - np.array(limits.base_m), axis=1)
-        second[:, 4] = np.minimum((limits.reach_max_m or math.inf) - from_base, from_base - (limits.reach_min_m or 0.0))
+        second[:, 4] = np.minimum(
+            math.inf if limits.reach_max_m is None else limits.reach_max_m - from_base,
+            math.inf if limits.reach_min_m is None else from_base - limits.reach_min_m,
+        )
     return Margins(first, second, foot, gap, clearance)
 
 
