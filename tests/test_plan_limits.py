@@ -65,11 +65,10 @@ def test_the_workspace_is_a_shell_about_the_base():
     assert not far.found  # the grasp point itself is out of reach
 
 
-def test_a_robot_that_starts_at_its_base_uses_the_whole_workspace():
-    free = constrained(still(), np.zeros(3), np.zeros(3), PlanParams(), Limits(final_deg=15.0))
-    plan = constrained(still(), np.zeros(3), np.zeros(3), PlanParams(), Limits(final_deg=15.0, reach_max_m=20.0))
-    assert plan.found
-    assert plan.t_go_s == pytest.approx(free.t_go_s, rel=1e-3)
+def test_a_robot_at_its_base_is_inside_a_workspace_without_a_smallest_reach():
+    limits = Limits(reach_max_m=20.0, base_m=(1.0, 2.0, 3.0))
+    at_base = margins(still(), limits, np.array([[4.0, 0.0, 0.0]]), np.array([[1.0, 2.0, 3.0]]))
+    assert at_base.values[0, 4] == pytest.approx(20.0)
 
 
 def test_thrust_and_size_of_the_robot():
