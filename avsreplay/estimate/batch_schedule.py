@@ -113,8 +113,8 @@ class BatchSchedule:
         if (sound or many_outliers) and contradicted(track.belief, result.belief):
             return replace(self._adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
         whole = last is not None and result.components[0].share == 1.0  # the fit has all poses of the filter
-        if sound and whole:
-            return self._adopted(track, result, to_filter=True)
+        if sound and whole:  # the noise of the last scans may differ from the level of all poses
+            return replace(self._adopted(track, result, to_filter=True), window=track.window)
         return replace(track, since=0)
 
     def between_fits(self, track: Track) -> Track:
