@@ -154,6 +154,8 @@ class BatchSchedule:
         rate through B(sigma), which is 3 for a sphere.
         """
         found, drift = [track.levels.torque, track.levels.force], track.drift
+        if track.levels.count == 0:  # not yet estimated
+            found[0] = _LEAST_TORQUE
         sizes = (0.0, 0.0) if drift is None else (float(np.linalg.norm(v)) for v in (drift.rate, drift.velocity))
         for k, (given, size) in enumerate(zip(self.params.disturbances, sizes, strict=True)):
             if given is not None:
