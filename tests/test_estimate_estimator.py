@@ -17,7 +17,7 @@ from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.estimate.params import Adaptation, Constraint, NoiseSource
 from avsreplay.geometry import Pose
-from avsreplay.records import Belief, Innovation, State
+from avsreplay.records import Belief, Innovation, Reason, State, Verdict
 
 WHITE = np.ones(2)
 QUIET = EstimatorParams(torque_noise_radps15=1e-9, force_noise_mps15=1e-9, adapt=Adaptation.OFF, correlated_share=0.0)
@@ -102,7 +102,7 @@ def run(
     for t, x in zip(world.times[1:], world.states[1:], strict=True):
         prediction = estimator.predict(track, round(t * 1e9))
         seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, pos_m, np.radians(rot_deg), reported))
-        track = estimator.update(track, prediction, seen, 1)
+        track, _ = estimator.step(track, prediction, seen, Verdict(1, Reason.OK), True)
         yield track, seen
 
 
