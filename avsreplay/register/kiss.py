@@ -23,6 +23,7 @@ from avsreplay.register.sampling import sample
 POINTS_PER_VOXEL = 20
 SURFACE_POINTS = 100_000
 SETTLED_OF_GATE = 0.01
+FINE_CALLS = 6  # with the finest map, each of at most n_max iterations
 STEP_OF_EPS = 10.0  # gives 1e-4, the default of the library: its last steps move from one map point to the next
 FAR_M = 1e9  # no part of the map is deleted because of its distance
 THINNED = 1.5  # voxel of the points used in the coarse stages over the voxel of the map, the rule of the library
@@ -70,8 +71,11 @@ class KissBackend:
         sigma = self.threshold(guess, T_ca)
         T_ca = self._run(_thinned_at(scan, T_ca, voxel), middle, T_ca, 3.0 * sigma)
         T_ca = self._run(scan, fine, T_ca, gate)
-        again = self._run(scan, fine, T_ca, gate)
-        return Fit(again, len(self._maps) + 1, self._settled(T_ca, again))
+        for calls in range(1, FINE_CALLS):
+            before, T_ca = T_ca, self._run(scan, fine, T_ca, gate)
+            if self._settled(before, T_ca):
+                return Fit(T_ca, len(self._maps) + calls, True)
+        return Fit(T_ca, len(self._maps) + FINE_CALLS - 1, False)
 
     def threshold(self, guess: Pose, found: Pose) -> float:
         """Return the library's adaptive threshold [m] after the first stage, which measured the error of the guess.

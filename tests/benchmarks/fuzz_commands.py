@@ -100,6 +100,9 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
     ("observability", "truth_file"): ((("log.mcap", "--truth", "IN", *SEEN),), POSES),
     ("plan", "result"): ((("IN", "--at", "0", "--samples", "2", "--every", "1"),), ("result",)),
     ("plan", "robot_file"): ((("result", "--robot", "IN", "--at", "0", "--samples", "2"),), ("robot.toml",)),
+    ("odometry", "log"): ((("IN", "-o", "OUT.tum", "--n-scans", "4"),), ("log.mcap", "zstd.mcap", "scans")),
+    ("odometry", "model"): ((("log.mcap", "--model", "IN", "-o", "OUT.tum", "--n-scans", "4"),), MODELS),
+    ("odometry", "truth_file"): ((("scans", "--truth", "IN", "-o", "OUT.tum", "--n-scans", "4"),), POSES),
     ("report", "result"): ((("IN", "-o", "OUT.html"),), ("result", "interrupted")),
     ("export", "result"): (
         (("IN", "--to", "csv", "-o", "OUT.csv"), ("IN", "--to", "tum", "-o", "OUT.tum")),

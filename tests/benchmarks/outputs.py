@@ -45,6 +45,7 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("compare", "junit"): ("result", "result", "--gate", "rules.toml", "--junit", "OUT"),
     ("model", "output"): ("log.mcap", "-o", "OUT", "--overwrite"),
     ("model", "mesh"): ("log.mcap", "-o", "other.ply", "--mesh", "OUT", "--overwrite"),
+    ("odometry", "output"): ("log.mcap", "-o", "OUT", "--overwrite", "--n-scans", "3"),
     ("sweep", "output"): ("campaign.toml", "-o", "OUT", "--workers", "0"),
 }
 FOLDERS = {("run", "output"), ("sweep", "output")}
@@ -142,7 +143,15 @@ def is_complete(case: tuple[str, str], path: Path) -> bool:
     return text.rstrip(" ").endswith(ends[path.suffix]) or text.rstrip().endswith(ends[path.suffix])
 
 
-SUFFIX = {"record": ".mcap", "doctor": ".mcap", "report": ".html", "export": ".csv", "plan": ".csv", "model": ".ply"}
+SUFFIX = {
+    "record": ".mcap",
+    "doctor": ".mcap",
+    "report": ".html",
+    "export": ".csv",
+    "plan": ".csv",
+    "model": ".ply",
+    "odometry": ".tum",
+}
 
 
 def output_of(case: tuple[str, str], place: Path) -> Path:
