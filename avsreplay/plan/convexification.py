@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
-from avsreplay.plan.limits import CONSTRAINTS, THRUST_SHARE, Case, Margins, in_fixture, margins
+from avsreplay.plan.limits import CONSTRAINTS, THRUST_SHARE, Case, Margins, in_fixture_axes, margins
 from avsreplay.plan.path import RobotPath, StepPath, path_of
 
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
@@ -99,7 +99,7 @@ def aborted(case: Case, path: RobotPath, since_s: float = 0.0) -> Abort:
     positions = r[:, None] + v[:, None] * after + 0.5 * case.params.a_max_mps2 * away[:, None] * after**2
     times = (begin[:, None] + after[0, :, 0]).ravel()
     rho, R = case.sampled.at(times)
-    y = in_fixture(R, positions.reshape(-1, 3) - rho)
+    y = in_fixture_axes(R, positions.reshape(-1, 3) - rho)
     foot, gap = scene.surface(y)
     k = gap.reshape(len(begin), -1).argmin(axis=1) + np.arange(len(begin)) * after.size
     margins_m = gap[k] - limits.clearance_m
@@ -164,8 +164,8 @@ class _RowMaker:
         self.far_m = FAR * case.buffer_m
         self.rho, self.R = case.sampled.at(times)
         drho, dR = case.sampled.at(times, 1)
-        self.y = in_fixture(self.R, reference.r - self.rho)
-        dy = in_fixture(dR, reference.r - self.rho) - in_fixture(self.R, drho)
+        self.y = in_fixture_axes(self.R, reference.r - self.rho)
+        dy = in_fixture_axes(dR, reference.r - self.rho) - in_fixture_axes(self.R, drho)
         self.dy = dy * (reference.t * s)[:, None]  # change with the relative change of the end time
         bend = np.linalg.norm(np.diff(np.concatenate([case.begin_c[None], self.y]), 2, axis=0), axis=1) / 8.0
         self.sag = np.concatenate([bend, bend[-1:]])  # distance of the path in {C} from its chord between two points

@@ -234,7 +234,7 @@ def margin(scene: Scene, limits: Limits, r: Array, v: Array) -> float:
     return least
 
 
-def in_fixture(R: Array, vectors: Array) -> Array:
+def in_fixture_axes(R: Array, vectors: Array) -> Array:
     """Return the coordinates R' v (n, 3) in {C} of vectors (n, 3) in {A}, R (n, 3, 3)."""
     return np.asarray((vectors[:, None, :] @ R)[:, 0])
 
@@ -260,7 +260,7 @@ class SampledScene:
     def coordinates(self, times: Array, r: Array) -> Array:
         """Return the coordinates in {C} (n, 3) of positions r (n, 3) in {A}."""
         rho, R = self.at(times)
-        return in_fixture(R, r - rho)
+        return in_fixture_axes(R, r - rho)
 
     def sigma(self, times: Array) -> tuple[Array, Array] | None:
         """Return the predicted 1 sigma of position [m] and attitude [rad] at times (n,); None where unknown."""

@@ -26,11 +26,11 @@ from avsreplay.reconstruct.views import (
     Survey,
     Twist,
     averaged,
+    central_points,
     depth_behind,
     full_cloud,
     normals_of,
     sight_lines,
-    thinned,
     turn,
 )
 from avsreplay.records import Scan
@@ -226,7 +226,7 @@ def fused(
         if k not in twist:
             continue
         full = full_cloud(scan, twist[k])
-        fine, T_ca = thinned(full, 0.7 * size_m), twist[k].T_ac.inverse()
+        fine, T_ca = central_points(full, 0.7 * size_m), twist[k].T_ac.inverse()
         points.append(T_ca.apply(fine).astype(np.float32))
         normals.append((normals_of(fine, full, survey.camera) @ T_ca.R.T).astype(np.float32))
         owner.append(np.full(len(fine), k))

@@ -121,7 +121,7 @@ def thinned_view(scan: Scan, survey: Survey, size_m: float, twist: Twist | None 
         twist: motion of the target during the scan; None does not correct for it.
     """
     full = full_cloud(scan, twist)
-    points = thinned(full, size_m)
+    points = central_points(full, size_m)
     normals, lines = normals_of(points, full, survey.camera), survey.camera - points
     weight = np.einsum("ni,ni->n", normals, lines) / np.linalg.norm(lines, axis=1)
     rays = -lines / np.linalg.norm(lines, axis=1, keepdims=True)
@@ -170,7 +170,7 @@ def _camera(clouds: Sequence[Array]) -> Array:
         return np.zeros(3)
     scatter, sides = np.zeros((3, 3)), []
     for points, extent in zip(clouds, extents, strict=True):
-        thin = thinned(points, extent / 40.0)
+        thin = central_points(points, extent / 40.0)
         normals = normals_of(thin, points, points.mean(axis=0))
         scatter += normals.T @ normals
         sides.append((thin - points.mean(axis=0), normals))
@@ -179,7 +179,7 @@ def _camera(clouds: Sequence[Array]) -> Array:
     return np.asarray(np.copysign(100.0 * max(extents), bulge) * towards)
 
 
-def thinned(points: Array, size_m: float) -> Array:
+def central_points(points: Array, size_m: float) -> Array:
     """The point nearest to the mean of each voxel: a measured point, because a mean lies inside a curved surface."""
     cell = cell_of(points, size_m)
     off = np.linalg.norm(points - means(points, cell)[cell], axis=1)
