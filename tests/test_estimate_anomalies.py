@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from avsreplay.estimate import hypotheses
+from avsreplay.estimate import anomalies, hypotheses
 
 CLEAN = surprises.Case("clean", seconds=60.0)
 
@@ -189,3 +189,10 @@ def test_a_covariance_that_is_not_positive_definite_still_has_a_root() -> None:
 )
 def test_a_clean_log_fails_no_check(case: surprises.Case, seed: int) -> None:
     assert surprises.run(case, seed).violations == []
+
+
+def test_an_explanation_without_degrees_of_freedom_does_not_scale_the_odds() -> None:
+    """Its residuals say nothing about the noise."""
+    found = hypotheses.Explanation(hypotheses.Hypothesis.MANOEUVRE, 10.0, 0.0, 0, 0)
+    free = hypotheses.Explanation(hypotheses.Hypothesis.FREE_MOTION, 1.0, 300.0, 12, 0)
+    assert anomalies._odds_over_free([found, free]) == pytest.approx(9.0)

@@ -46,12 +46,12 @@ def test_closed_loop_keeps_the_track_at_48_degrees_where_open_loop_loses_scans(d
     assert passes[0] < passes[1]  # a good guess also saves work
 
 
-def test_72_degree_steps_are_kept_once_the_second_scan_is_acquired(dragon, cli):
-    kept = rows_of(cli("run", dragon, "--init", "truth", "--json", "--every-scan", 3))
-    lost = rows_of(cli("run", dragon, "--init", "truth", "--json", "--every-scan", 3, "--set", "reacquire=false"))
-    assert [r["gamma"] for r in kept] == [1] * 5
-    assert [r["guess"] for r in kept] == ["truth", "acquired", "predicted", "predicted", "predicted"]
-    assert sum(r["gamma"] for r in lost) < 5
+def test_72_degree_steps_are_kept(dragon, cli):
+    """The search that follows failed restarts finds the second scan, also where the pipeline does not acquire anew."""
+    for setting in ((), ("--set", "reacquire=false")):
+        rows = rows_of(cli("run", dragon, "--init", "truth", "--json", "--every-scan", 3, *setting))
+        assert [r["gamma"] for r in rows] == [1] * 5
+        assert max(r["pos_err_m"] for r in rows) < 1e-3
 
 
 def test_the_folder_itself_runs_without_recording_first(cli, shared_data):

@@ -299,7 +299,8 @@ def _odds_over_free(ranked: list[Explanation]) -> float:
     """
     best = ranked[0]
     free = next(e.log_evidence for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
-    return (best.log_evidence - free - PRIOR_ODDS) / max(1.0, best.chi2 / best.dof) + PRIOR_ODDS
+    scale = max(1.0, best.chi2 / best.dof) if best.dof > 0 else 1.0
+    return (best.log_evidence - free - PRIOR_ODDS) / scale + PRIOR_ODDS
 
 
 def _chi2(y: Array, C: Array) -> float:
