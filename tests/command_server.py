@@ -101,6 +101,18 @@ def serve():
                 importlib.import_module(name)
 
 
+def exit_code(args):
+    """Run a command in this process, which must be a fork that ends after it; other exceptions are not caught."""
+    sys.argv = ["avsreplay", *args]
+    from avsreplay.__main__ import main
+
+    try:
+        main()
+    except SystemExit as leaving:
+        return leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+    raise RuntimeError("the command returned in place of leaving with an exit code")
+
+
 def _child(request, pinned, learned):
     code = 1
     try:
@@ -114,12 +126,7 @@ def _child(request, pinned, learned):
         tempfile.tempdir = None
         signal.alarm(int(request["limit"]))
         before = set(sys.modules)
-        sys.argv = ["avsreplay", *request["args"]]
-        from avsreplay.__main__ import main
-
-        main()
-    except SystemExit as leaving:
-        code = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+        code = exit_code(request["args"])
     except BaseException:
         traceback.print_exc()
     finally:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import click
 
 from avsreplay.cli.options import PATH, read_options, source_options
 from avsreplay.cli.progress import tracked
-from avsreplay.errors import MissingBackend, UsageError
+from avsreplay.errors import UsageError
 
 LEAST_POINTS = 50  # a scan with fewer is left out
 
@@ -45,13 +44,12 @@ def command(log: Path, output: Path, size: float | None, no_deskew: bool, overwr
 
     from avsreplay.files import STDOUT, check_output
     from avsreplay.log import open_source
+    from avsreplay.register.backend import load_backend
     from avsreplay.register.kiss import KissOdometry
     from avsreplay.report.export import write_tum
 
     check_output(output, overwrite=overwrite)
-    if find_spec("kiss_icp") is None:
-        hint = "pip install kiss-icp"
-        raise MissingBackend("odometry needs kiss-icp, which is not installed", where="odometry", hint=hint)
+    load_backend("kiss")  # reports where the library is not installed
     odometry, poses = None, []
     with open_source(log, read_options(reading)) as source:
         for scan in tracked(source.scans(), len(source), "odometry"):

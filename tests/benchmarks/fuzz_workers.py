@@ -17,6 +17,9 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from command_server import exit_code
+
 WALL = 20  # limit of wall time per limit of processor time, because machines are shared
 
 Check = Callable[[Path], str]
@@ -193,12 +196,7 @@ class Command:
             if file_bytes is not None:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, file_bytes))
             signal.alarm(limit_s)
-            sys.argv = ["avsreplay", *args]
-            from avsreplay.__main__ import main
-
-            main()
-        except SystemExit as leaving:
-            code = leaving.code if isinstance(leaving.code, int) else int(leaving.code is not None)
+            code = exit_code(args)
         except BaseException:
             traceback.print_exc()
         finally:
