@@ -17,7 +17,7 @@ from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.covariance import (
     Evidence,
-    jackknife_covariance,
+    sandwich_covariance,
     pseudo_inverse,
     registration_covariance,
     split_nis,
@@ -180,9 +180,9 @@ def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float
 def _covariance(found: Evidence, across: Array, extent_m: float, systematic: bool) -> tuple[Array | None, float | None]:
     """Covariance of the pose, and the test of halves on both sides of the middle along ``across`` (k, 3) in {C}."""
     if not (systematic or len(across)):
-        return jackknife_covariance(found.normals, found.gradients), None
+        return sandwich_covariance(found.normals, found.gradients), None
     errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
-    P = registration_covariance(found, errors) if systematic else jackknife_covariance(found.normals, found.gradients)
+    P = registration_covariance(found, errors) if systematic else sandwich_covariance(found.normals, found.gradients)
     return P, split_nis(found, errors, across)
 
 

@@ -27,12 +27,20 @@ def _unexplained(errors: Systematic, found: Evidence) -> Array:
     return found.gradients - found.normals @ errors.fit - _coupling(found, errors) @ errors.amplitudes
 
 
-def jackknife_covariance(normals: Array, gradients: Array) -> Array:
-    """The delete-a-block jackknife covariance (6, 6)."""
-    inverse = _pseudo_inverse(normals.sum(axis=0))
-    left = (1.0 + ALONE) * np.eye(6) - normals @ inverse
-    moves = np.linalg.solve(left, gradients[:, :, None])[:, :, 0] @ inverse
-    return np.asarray(moves.T @ moves)
+def sandwich_covariance(normals: Array, gradients: Array) -> Array:
+    """The bias-reduced sandwich covariance (6, 6), shrunk towards that of independent noise."""
+    values, vectors = np.linalg.eigh(normals.sum(axis=0))
+    kept = values > len(values) * np.finfo(float).eps * values[-1]
+    W = vectors[:, kept] / np.sqrt(values[kept])
+    left, axes = np.linalg.eigh((1.0 + ALONE) * np.eye(W.shape[1]) - W.T @ normals @ W)
+    along = np.einsum("pij,pi->pj", axes, gradients @ W) / np.sqrt(np.maximum(left, ALONE))
+    y = np.einsum("pij,pj->pi", axes, along)
+    S, rank = y.T @ y, W.shape[1]
+    level = np.trace(S) / max(rank, 1)
+    spread = np.sum((S - level * np.eye(rank)) ** 2)
+    error = np.sum(np.sum(y**2, axis=1) ** 2) - np.sum(S**2) / len(y)
+    intensity = np.clip(error / spread, 0.0, 1.0) if spread > 0.0 else 1.0
+    return np.asarray(W @ ((1.0 - intensity) * S + intensity * level * np.eye(rank)) @ W.T)
 
 
 def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Systematic:
@@ -70,7 +78,7 @@ def registration_covariance(found: Evidence, errors: Systematic) -> Array:
         found: sums at the registered pose.
         errors: its systematic errors.
     """
-    P = jackknife_covariance(found.normals, _unexplained(errors, found))
+    P = sandwich_covariance(found.normals, _unexplained(errors, found))
     inverse = _pseudo_inverse(found.normals.sum(axis=0))
     X = inverse @ _summed(found.normals[:, :, 3:], _numbers(found.places, BLOCK * errors.patch_m))
     Y = inverse @ _coupling(found, errors).sum(axis=0)
@@ -105,7 +113,7 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
             if inverse is None:
                 return None
             D += sign * (inverse @ found.gradients[half].sum(axis=0))
-            C += jackknife_covariance(normals, unexplained[half])
+            C += sandwich_covariance(normals, unexplained[half])
             X += sign * (inverse @ _summed(normals[:, :, 3:], blocks[half], len(X)))
             Y += sign * (inverse @ coupling[half].sum(axis=0))
         C += errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T

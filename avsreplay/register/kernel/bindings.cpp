@@ -314,9 +314,9 @@ Numpy pseudo_inverse_of(const Patches& N) {
   return array66(pseudo_inverse(A));
 }
 
-Numpy jackknife_of(const Patches& normals, const Patches& gradients) {
+Numpy sandwich_of(const Patches& normals, const Patches& gradients) {
   check_patches(normals, gradients);
-  return array66(jackknife(normals.data(), gradients.data(), (int64_t)normals.shape(0)));
+  return array66(sandwich(normals.data(), gradients.data(), (int64_t)normals.shape(0)));
 }
 
 // The sums of patches, kept alive by the arrays in it.
@@ -405,7 +405,7 @@ NB_MODULE(_kernel, m) {
   nb::class_<Matches>(m, "Matches");
   m.def("keep_patches", &keep_patches, nb::arg("normals"), nb::arg("counts"));
   m.def("pseudo_inverse", &pseudo_inverse_of, nb::arg("N"));
-  m.def("jackknife", &jackknife_of, nb::arg("normals"), nb::arg("gradients"));
+  m.def("sandwich", &sandwich_of, nb::arg("normals"), nb::arg("gradients"));
   nb::class_<Table>(m, "Table")
       .def(nb::init<Patches, Patches, Patches, Counts, Patches, Patches, std::array<double, 3>, double, double>(),
            nb::arg("normals"), nb::arg("gradients"), nb::arg("offsets"), nb::arg("counts"), nb::arg("errors"),

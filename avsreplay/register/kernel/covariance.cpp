@@ -3,7 +3,6 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
-#include <cstring>
 #include <limits>
 #include <vector>
 
@@ -13,6 +12,8 @@ namespace {
 constexpr double DOMINANT = 0.5;            // a patch with more than this share of the information on a motion is left out
 constexpr int64_t LEAST_POINTS = 6;         // no patch is left out where fewer points would remain
 constexpr double ALONE = 1e-9;              // keeps a motion finite that only one patch determines
+constexpr double SMALL = 0.1;               // trace below which the power series of (I - A)^-1/2 is used
+constexpr int TERMS = 8;                    // of the series: an error below 1e-9
 constexpr int64_t LEAST_HALF = 12;          // patches that each half of a split needs
 constexpr double WORST_CONDITION = 1e8;     // of the scaled information of a half
 constexpr double TINY = std::numeric_limits<double>::min();
@@ -51,42 +52,61 @@ Six pseudo_root(Six N) {
   return V;
 }
 
-// x = A^-1 x by elimination with row pivots; a pivot of zero leaves its unknown zero.
-void solve(Six& M, double* x) {
-  double(&A)[6][6] = M.v;
-  for (int k = 0; k < 6; ++k) {
-    int best = k;
-    for (int i = k + 1; i < 6; ++i)
-      if (std::fabs(A[i][k]) > std::fabs(A[best][k])) best = i;
-    std::swap(A[k], A[best]), std::swap(x[k], x[best]);
-    if (A[k][k] == 0) continue;
-    for (int i = k + 1; i < 6; ++i) {
-      const double f = A[i][k] / A[k][k];
-      for (int j = k; j < 6; ++j) A[i][j] -= f * A[k][j];
-      x[i] -= f * x[k];
+// (I - A)^-1/2 x with A = W' N_p W: with residuals of independent noise, the sum of its squares over the patches has
+// the identity times the variance as its mean (bias-reduced linearisation).
+std::array<double, 6> reduced(const double* Np, const Six& W, std::array<double, 6> x) {
+  Six B, A, V;
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j)
+      for (int k = 0; k < 6; ++k) B.v[i][j] += Np[6 * i + k] * W.v[k][j];
+  double trace = 0;
+  for (int i = 0; i < 6; ++i) {
+    for (int j = 0; j <= i; ++j) {
+      for (int k = 0; k < 6; ++k) A.v[i][j] += W.v[k][i] * B.v[k][j];
+      A.v[j][i] = A.v[i][j];
     }
+    trace += A.v[i][i];
   }
-  for (int k = 5; k >= 0; --k) {
-    for (int j = k + 1; j < 6; ++j) x[k] -= A[k][j] * x[j];
-    x[k] = A[k][k] == 0 ? 0 : x[k] / A[k][k];
+  std::array<double, 6> out = x, term = x;
+  if (trace < SMALL) {
+    for (int n = 1; n <= TERMS; ++n) {
+      std::array<double, 6> next{};
+      for (size_t i = 0; i < 6; ++i) {
+        for (size_t k = 0; k < 6; ++k) next[i] += A.v[i][k] * term[k];
+        out[i] += next[i] *= (2 * n - 1) / (2.0 * n);
+      }
+      term = next;
+    }
+    return out;
   }
+  eigen(A.v, V.v, 6, 1e-32);
+  out.fill(0);
+  for (int k = 0; k < 6; ++k) {
+    double along = 0;
+    for (size_t i = 0; i < 6; ++i) along += V.v[i][k] * x[i];
+    along /= std::sqrt(std::max(1 + ALONE - A.v[k][k], ALONE));
+    for (size_t i = 0; i < 6; ++i) out[i] += V.v[i][k] * along;
+  }
+  return out;
 }
 
-// Adds m_p m_p' of one patch to P.
-void add_move(const double* Np, const double* gradient, const Six& inverse, Six& P) {
-  Six A;
+// Shrinks the sum S of the squares of `y` towards its mean eigenvalue times the identity (Ledoit and Wolf).
+void shrink(const std::vector<std::array<double, 6>>& y, int rank, Six& S) {
+  double fourth = 0, squares = 0, level = 0;
+  for (const auto& each : y) {
+    double length = 0;
+    for (const double value : each) length += value * value;
+    fourth += length * length;
+  }
+  for (int i = 0; i < 6; ++i) {
+    level += S.v[i][i] / rank;
+    for (int j = 0; j < 6; ++j) squares += S.v[i][j] * S.v[i][j];
+  }
+  const double spread = squares - rank * level * level;       // of the eigenvalues about their mean
+  const double error = fourth - squares / (double)y.size();   // of S, from the differences between the patches
+  const double intensity = spread > 0 ? std::clamp(error / spread, 0.0, 1.0) : 1.0;
   for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j) {
-      A.v[i][j] = i == j ? 1 + ALONE : 0;
-      for (int k = 0; k < 6; ++k) A.v[i][j] -= Np[6 * i + k] * inverse.v[k][j];
-    }
-  double x[6], moved[6] = {};
-  std::memcpy(x, gradient, sizeof x);
-  solve(A, x);
-  for (int i = 0; i < 6; ++i)
-    for (int k = 0; k < 6; ++k) moved[i] += inverse.v[i][k] * x[k];
-  for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j) P.v[i][j] += moved[i] * moved[j];
+    for (int j = 0; j < 6; ++j) S.v[i][j] = (1 - intensity) * S.v[i][j] + (i == j ? intensity * level : 0);
 }
 
 // The patches of one half, or all of them.
@@ -172,7 +192,7 @@ double difference(const PatchTable& t, const Systematic& errors, const std::vect
     const int64_t m = (int64_t)part.gradients.size() / 6;
     const Six N = total(part.normals.data(), m);
     if (m < LEAST_HALF || !determines(N)) return std::numeric_limits<double>::quiet_NaN();
-    const Six inverse = pseudo_inverse(N), P = jackknife(part.normals.data(), part.gradients.data(), m);
+    const Six inverse = pseudo_inverse(N), P = sandwich(part.normals.data(), part.gradients.data(), m);
     for (int i = 0; i < 6; ++i)
       for (int j = 0; j < 6; ++j) d[i] += (half ? 1 : -1) * inverse.v[i][j] * part.sum[j], C.v[i][j] += P.v[i][j];
     effect.add(part, inverse, half ? 1 : -1);
@@ -212,13 +232,32 @@ void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint
   }
 }
 
-Six jackknife(const double* normals, const double* gradients, int64_t m) {
+Six sandwich(const double* normals, const double* gradients, int64_t m) {
   const Six W = pseudo_root(total(normals, m));
-  Six inverse, P;
+  Six S, P;
+  int rank = 0;
+  for (int j = 0; j < 6; ++j) {
+    double length = 0;
+    for (int i = 0; i < 6; ++i) length += W.v[i][j] * W.v[i][j];
+    rank += length > 0;
+  }
+  if (rank == 0) return P;
+  std::vector<std::array<double, 6>> y((size_t)m);
+  for (int64_t p = 0; p < m; ++p) {
+    std::array<double, 6> x{};
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j < 6; ++j) x[(size_t)j] += W.v[i][j] * gradients[6 * p + i];
+    y[(size_t)p] = x = reduced(normals + 36 * p, W, x);
+    for (int i = 0; i < 6; ++i)
+      for (int j = 0; j < 6; ++j) S.v[i][j] += x[(size_t)i] * x[(size_t)j];
+  }
+  shrink(y, rank, S);
   for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j)
-      for (int k = 0; k < 6; ++k) inverse.v[i][j] += W.v[i][k] * W.v[j][k];
-  for (int64_t p = 0; p < m; ++p) add_move(normals + 36 * p, gradients + 6 * p, inverse, P);
+    for (int j = 0; j <= i; ++j) {
+      for (int k = 0; k < 6; ++k)
+        for (int l = 0; l < 6; ++l) P.v[i][j] += W.v[i][k] * S.v[k][l] * W.v[j][l];
+      P.v[j][i] = P.v[i][j];
+    }
   return P;
 }
 
@@ -227,7 +266,7 @@ Six covariance(const PatchTable& t, const Systematic& errors) {
   Part all;
   all.blocks.resize((size_t)number_blocks(t, block));
   for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, block[(size_t)p], all);
-  Six P = jackknife(t.normals, all.gradients.data(), t.m);
+  Six P = sandwich(t.normals, all.gradients.data(), t.m);
   Effect effect;
   effect.add(all, pseudo_inverse(total(t.normals, t.m)), 1);
   effect.add_to(errors, P);
