@@ -12,8 +12,8 @@ from oracles.residuals import summed
 
 from avsreplay.register.covariance import (
     Evidence,
-    sandwich_covariance,
     registration_covariance,
+    sandwich_covariance,
     split_nis,
     systematic_errors,
     without_dominant_patches,

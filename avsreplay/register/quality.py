@@ -17,9 +17,9 @@ from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.covariance import (
     Evidence,
-    sandwich_covariance,
     pseudo_inverse,
     registration_covariance,
+    sandwich_covariance,
     split_nis,
     systematic_errors,
     without_dominant_patches,
