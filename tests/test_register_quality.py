@@ -58,7 +58,7 @@ def test_covariance_is_right_in_the_mean_for_independent_noise(count: int) -> No
 
 
 def _normalised_errors(per_patch: float) -> np.ndarray:
-    """Squared errors of 400 fits in units of their covariance; noise of unit variance, ``per_patch`` of it in common."""
+    """Squared errors of 400 fits over their covariance; noise of unit variance, ``per_patch`` of it in common."""
     rng, values = np.random.default_rng(12), []
     for _ in range(400):
         J = rng.normal(size=(600, 6)) + 0.7 * rng.normal(size=(30, 6))[PATCH]

@@ -7,8 +7,9 @@ Random errors
     Alike within a patch (a detail that the model lacks, a stripe of a range image): the sandwich estimate with
     patches as clusters, in the form without bias for independent noise (Bell and McCaffrey, Survey Methodology 28,
     2002). From a few patches it is too small in some direction. It is therefore shrunk towards the covariance of
-    independent noise at the same mean level (Ledoit and Wolf, J. Multivariate Analysis 88, 2004). Displacements that neighbouring patches share, independent from one block of 4 patches a
-    side to the next, add a variance; it is estimated from the products of residuals of different patches of a block.
+    independent noise at the same mean level (Ledoit and Wolf, J. Multivariate Analysis 88, 2004).
+    Displacements that neighbouring patches share, independent from one block of 4 patches a side to the next, add a
+    variance; it is estimated from the products of residuals of different patches of a block.
 Systematic errors
     Errors of the model or of the ranges that vary slowly over the target: a symmetric strain and an offset of the
     surface (size, aspect, shear, calibration of the scanner, thickness of paint or of the mesh). They are fitted with
