@@ -252,7 +252,7 @@ class Run:
         counts |= {f"stamps_{name}": count for name, count in stamps.items()}
         found = replace(self._fold.result(self.truth), counts=counts)
         text = acceleration_text(self.config.estimator, self.acceleration)
-        return replace(found, acceleration=text, robot=self.config.robot_line)
+        return replace(found, acceleration=text)
 
     def facts(self) -> dict[str, Any]:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""

@@ -16,7 +16,10 @@ from hypothesis import strategies as st
 
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Pose, exp
-from avsreplay.report.columns_page import columns_page, row_schema, row_schema_text
+from avsreplay.outcome import PlanStatus
+from avsreplay.plan.supervisor import Action
+from avsreplay.records import AlignStatus, Reason, ScanStatus
+from avsreplay.report.columns_page import columns_page, descriptions, listed_values, row_schema, row_schema_text
 from avsreplay.report.export import (
     dump_document,
     row_poses,
@@ -190,6 +193,16 @@ def test_the_document_of_no_rows_is_json_too():
 def test_the_column_list_of_the_docs_is_current():
     assert (ROOT / "docs" / "columns.md").read_text(encoding="utf-8") == columns_page()
     assert (ROOT / "docs" / "rows.schema.json").read_text(encoding="utf-8") == row_schema_text()
+
+
+def test_every_column_is_described_in_the_order_of_the_row_and_every_word_of_a_column():
+    assert list(descriptions()) == [c.name for c in columns()]
+    assert all(text.endswith(".") and text[0].isalnum() for text in descriptions().values())
+    enums = {"reason": [Reason], "action": [Action], "plan_status": [PlanStatus]}
+    for name, kinds in enums.items():
+        assert set(listed_values()[name]) == {member.value for kind in kinds for member in kind}
+    scans = {member.value for member in ScanStatus} - {"ok"}
+    assert set(listed_values()["status"]) == scans | {member.value for member in AlignStatus}
 
 
 def test_the_schema_knows_every_column_and_its_type(make_rows):

@@ -127,8 +127,22 @@ def test_the_worst_moments_do_not_overlap_and_state_their_cause(make_rows):
     assert 1 <= len(found) <= 5
     spans = sorted((m.start_s, m.end_s) for m in found)
     assert all(a[1] < b[0] for a, b in itertools.pairwise(spans))
-    assert any(m.what == "position error 500 mm" and rows[m.row].seq == 70 for m in found)
+    assert any(m.what.startswith("position error 500 mm, ") and rows[m.row].seq == 70 for m in found)
     assert any(m.what.startswith("6 scans not used") and m.cause == "injected: full occlusion" for m in found)
+
+
+def test_a_moment_states_what_is_usual_and_its_cause(make_rows):
+    rows = _good(make_rows, n=60, gamma=1, reason="ok", fault=None, nis=6.0, converged=True)
+    changed = {5: {"nis": 26.0}, 20: {"nis": 60.0}, 30: {"rot_err_deg": 5.0, "guess": "acquired"}}
+    changed[40] = {"pos_err_m": 0.5, "converged": False}
+    rows = [dataclasses.replace(r, **changed.get(r.seq, {})) for r in rows]
+    found = {m.row: (m.what, m.cause) for m in worst_moments(rows)}
+    assert set(found) == {20, 30, 40}  # a NIS of 26 among 60 scans is not unusual
+    assert found[20] == ("NIS 60, above its 99.99 % point 27.9", "none known")
+    assert found[30][0].startswith("attitude error 5 deg, ")
+    assert found[30][0].endswith(" times the median")
+    assert found[30][1] == "pose found by a search"
+    assert found[40][1] == "the estimate is not converged"
 
 
 def test_a_rejected_measurement_is_no_moment_of_its_own(make_rows):

@@ -18,6 +18,7 @@ from typing import Any, Literal
 from avsreplay.errors import MissingBackend
 from avsreplay.files import output_path, output_text
 from avsreplay.geometry import Pose
+from avsreplay.report.columns_page import descriptions
 from avsreplay.report.jsonl import field_types, plain
 from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import verdict_of
@@ -112,9 +113,12 @@ def write_parquet(path: str | Path, rows: Sequence[Row]) -> None:
     except ModuleNotFoundError:
         raise MissingBackend("pyarrow is not installed", where="Parquet", hint="install avsreplay[report]") from None
     kinds = {str: pa.string(), int: pa.int64(), float: pa.float64(), bool: pa.bool_()}
-    types = field_types()
+    types, meaning = field_types(), descriptions()
     schema = pa.schema(
-        [pa.field(c.name, kinds[types[c.name][0]], types[c.name][1], {"unit": c.unit, "doc": c.doc}) for c in columns()]
+        [
+            pa.field(c.name, kinds[types[c.name][0]], types[c.name][1], {"unit": c.unit, "doc": meaning[c.name]})
+            for c in columns()
+        ]
     )
     table = {f.name: [plain(getattr(row, f.name)) for row in rows] for f in dataclasses.fields(Row)}
     with output_path(path) as part:

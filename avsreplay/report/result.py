@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
 from typing import Any
@@ -148,7 +148,6 @@ def load_result(path: str | Path) -> Result:
         raise UnreadableInput(what, where=str(rows_path), hint=_RUN_AGAIN)
     labels, truth, counts = _facts(header.get("facts") or {}, str(path))
     summary = Summary.fold(rows, labels=labels, truth=truth, counts=counts)
-    summary = replace(summary, robot=str(header.get("robot", "")))
     poses = read_tum(folder / "truth.tum") if folder and (folder / "truth.tum").is_file() else []
     view = read_view(folder / "view.npz") if folder and (folder / "view.npz").is_file() else None
     name = path.resolve().name if folder else path.name.removesuffix(".jsonl").removesuffix(".rows")

@@ -12,20 +12,23 @@ from avsreplay.report.table import Table, TableCell, ascii_only, decimals
 from avsreplay.rows import Column, Row, columns
 
 FEW = 24
-_SHORT = {
+_HEADS = {  # a line end stands where the heading may break
     "seq": "scan",
-    "iterations": "iter",
-    "inlier_ratio": "inl",
-    "converged": "conv",
-    "capture_time_s": "capt",
-    "ogm_log10_cond": "cond log10",
-    "ogm_rank": "rank",
-    "pos_err_m": "pos err",
-    "rot_err_deg": "rot err",
+    "t_s": "time",
+    "reason": "state",
+    "fault": "injected fault",
+    "nis": "NIS",
+    "inlier_ratio": "inlier\nratio",
+    "converged": "con-\nverged",
+    "capture_time_s": "planned\ncapture",
+    "ogm_log10_cond": "Gramian\nlog10 cond.",
+    "ogm_rank": "Gramian\nrank",
+    "pos_err_m": "position\nerror",
+    "rot_err_deg": "attitude\nerror",
 }
 _ORDER = (  # which columns are kept first where the width is short
-    *("seq", "t_s", "reason", "fault", "pos_err_m", "rot_err_deg", "rms_m", "iterations", "nis", "capture_time_s"),
-    *("inlier_ratio", "ogm_rank", "sigma1", "sigma2", "action", "converged", "ogm_log10_cond", "status"),
+    *("seq", "t_s", "reason", "fault", "pos_err_m", "rot_err_deg", "rms_m", "nis", "capture_time_s", "iterations"),
+    *("inlier_ratio", "action", "converged", "sigma1", "sigma2", "ogm_rank", "ogm_log10_cond", "status"),
 )
 _TEXT_COLUMNS = ("reason", "fault", "action", "status")
 
@@ -75,20 +78,17 @@ def scan_table(console: Console, rows: Sequence[Row], *, every: int | None = Non
 
 
 def head(column: Column, shown: str = "") -> str:
-    """A heading of short words with the unit on the last line; ``shown`` is the unit of the printed numbers."""
-    name = _SHORT.get(column.name, column.name)
+    """A heading of whole words with the unit on the last line; ``shown`` is the unit of the printed numbers."""
     unit = column.unit or ("s" if column.name == "capture_time_s" else "")
-    name = name.removesuffix("_" + unit.replace("/", "p")) if unit else name
-    lines = name.replace("_", " ").split(" ")
-    return "\n".join([*lines, f"[{shown or unit}]"] if unit else lines)
+    name = column.name.removesuffix("_" + unit.replace("/", "p")) if unit else column.name
+    name = _HEADS.get(column.name, name.replace("_", " "))
+    return f"{name}\n[{shown or unit}]" if unit else name
 
 
 def _head(column: Column, rows: Sequence[Row]) -> str:
-    if column.name == "reason":
-        return "state"
-    if column.name in ("pos_err_m", "rot_err_deg") and rows[0].reference == "fit":
-        return head(column, _unit(column, rows)).replace("err", "vs fit")
-    return head(column, _unit(column, rows))
+    said = head(column, _unit(column, rows))
+    fitted = column.name in ("pos_err_m", "rot_err_deg") and rows[0].reference == "fit"
+    return said.replace("error", "from fit") if fitted else said
 
 
 def _shown(rows: Sequence[Row]) -> list[Column]:

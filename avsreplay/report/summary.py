@@ -18,6 +18,7 @@ from avsreplay.report.summary_parts import Capture, CaptureFold, Drifting, Param
 from avsreplay.rows import Row
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
+NIS_LIMIT = 27.8563  # 99.99 % point of chi-square with 6 degrees of freedom, above which a pose gets a smaller weight
 BLOCK_BANDS = {2: (0.05064, 7.3778), 3: (0.2158, 9.3484)}  # the same with 2 and 3
 NEES_BAND = (9.5908, 34.1696)  # the same with 20
 
@@ -74,7 +75,6 @@ class Summary:
         weighed_down: healthy poses with a Cauchy weight below 1.  reinitialised: reinitialisations of the estimate.
         coasts: intervals of prediction without measurement.  interval_s: median between scans.
         gaps: intervals between scans longer than 1.5 times the median.
-        robot: the assumed robot in one line, "" where it is not known.
     """
 
     scans: int
@@ -111,7 +111,6 @@ class Summary:
     capture: Capture
     counts: Mapping[str, int] = field(default_factory=dict)
     acceleration: str | None = None
-    robot: str = ""
 
     @classmethod
     def fold(

@@ -52,6 +52,11 @@ class Drifting:
         return f"{' and '.join(parts)} since {self.onset_s:.0f} +- {self.onset_1s_s:.0f} s"
 
 
+def times(count: int) -> str:
+    """A number of events in words: never, once, 2 times."""
+    return {0: "never", 1: "once"}.get(count, f"{count} times")
+
+
 def events(rows: Sequence[Row], drift: Drifting | None) -> Iterator[str]:
     """Yield what happened to the target and the sensor, in words: manoeuvres, drift, bias.
 
@@ -60,8 +65,7 @@ def events(rows: Sequence[Row], drift: Drifting | None) -> Iterator[str]:
         drift: the drift of the target, None where there is none.
     """
     if rows and (count := rows[-1].manoeuvres):
-        times = "once" if count == 1 else f"{count} times"
-        yield f"the target manoeuvred {times}, the last time at {rows[-1].manoeuvre_s or 0.0:.1f} s"
+        yield f"the target manoeuvred {times(count)}, the last time at {rows[-1].manoeuvre_s or 0.0:.1f} s"
     if drift is not None:
         yield f"a constant torque or force acts on the target: {drift}"
     if biased := [row.t_s for row in rows if row.reason == "sensor_bias"]:
@@ -246,12 +250,12 @@ class CaptureFold:
 
     def result(self) -> Capture:
         """The summary of the rows so far."""
-        times = [t for _, t in self._plans if t is not None]
-        spread = Statistics.of(times)
+        instants = [t for _, t in self._plans if t is not None]
+        spread = Statistics.of(instants)
         return Capture(
-            replans=len(times),
-            first_s=times[0] if times else None,
-            last_s=times[-1] if times else None,
+            replans=len(instants),
+            first_s=instants[0] if instants else None,
+            last_s=instants[-1] if instants else None,
             std_s=spread.std if spread else None,
             range_s=spread.max - spread.min if spread else None,
             status=self._plans[-1][0] if self._plans else None,

@@ -6,10 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from rich.console import Console
 
+from avsreplay.records import BLOCKS
 from avsreplay.report.episodes import Episode
 from avsreplay.report.scan_table import print_sparks, scan_table
 from avsreplay.report.summary import Errors, Summary
-from avsreplay.report.summary_parts import Capture, Parameter, Statistics
+from avsreplay.report.summary_parts import Capture, Parameter, Statistics, times
 from avsreplay.report.table import Table, TableCell, decimals, facts_table, number, print_line, print_table
 from avsreplay.report.verdict import INSIDE_LEAST, Grade, RunVerdict
 from avsreplay.rows import Row
@@ -73,7 +74,7 @@ def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -
     for m in verdict.moments:
         span = " to ".join(dict.fromkeys((f"{m.start_s:.1f}", f"{m.end_s:.1f}")))
         rows.append((TableCell(span, scan=(place or {}).get(m.row)), m.what, m.cause))
-    return Table("Worst moments", ("t\n[s]", "what", "cause"), tuple(rows), align="l")
+    return Table("Worst moments", ("time [s]", "what", "cause"), tuple(rows), align="l")
 
 
 def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, ...]:
@@ -105,22 +106,25 @@ def _error_row(name: str, unit: str, spread: Statistics) -> tuple[str, ...]:
 
 
 def consistency_table(summary: Summary) -> Table:
-    """Normalised errors squared per degree of freedom against their two-sided 95 % chi-square bands."""
-    whole = [("NIS", summary.nis, 6), ("NEES", summary.nees, 20)]
-    blocks = [(f"NEES {name}", share, 1) for name, share in summary.nees_blocks.items()]
+    """Normalised errors squared against their degrees of freedom and two-sided 95 % chi-square bands."""
+    sizes = {f"NEES {name}": block.stop - block.start for name, block in BLOCKS.items()}
+    blocks = [(f"NEES {name}", share) for name, share in summary.nees_blocks.items()]
+    listed = [("NIS", 6, summary.nis, 1), ("NEES", 20, summary.nees, 1)]
+    listed += [(name, sizes[name], share, sizes[name]) for name, share in blocks]
     rows = tuple(
         (
             name,
             str(share.count),
-            f"{share.median / size:.2f}",
+            str(expected),
+            f"{scale * share.median:.2f}",
+            f"{scale * share.low:.2f} to {scale * share.high:.2f}",
             TableCell(f"{100.0 * share.inside:.1f}", "warn" if share.inside < INSIDE_LEAST else ""),
-            f"{share.low / size:.2f} to {share.high / size:.2f}",
         )
-        for name, share, size in (*whole, *blocks)
+        for name, expected, share, scale in listed
         if share is not None
     )
-    heads = ("statistic", "n", "median", "inside 95 % band [%]", "band")
-    return Table("Consistency (per degree of freedom; 1 is expected)", heads, rows)
+    heads = ("statistic", "scans", "expected\nmean", "median", "95 % band", "inside the\nband [%]")
+    return Table("Consistency of the covariance", heads, rows)
 
 
 def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
@@ -138,7 +142,7 @@ def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
         )
         for e in summary.faults.episodes
     )
-    return Table("Injected faults", heads, lines, align="lrrrlr")
+    return Table("Injected faults", heads, lines, align="lrrrlr", wide=True)
 
 
 def _nearest_row(episode: Episode, rows: Sequence[Row]) -> int | None:
@@ -249,16 +253,12 @@ def _fault_facts(summary: Summary) -> Iterable[tuple[str, str]]:
 
 
 def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
-    for name, share in (("NIS", summary.nis), ("NEES", summary.nees)):
-        if share is not None:
-            band = f"[{share.low:.1f}, {share.high:.1f}]"
-            yield name, f"median {share.median:.2f}; {100 * share.inside:.1f} % inside the 95 % band {band}"
     if summary.sigma_hits is not None:
-        floors = f", eigenvalue floor of R active {summary.r_floors} times" if summary.r_floors is not None else ""
-        yield "constraints", f"sigma bound active {summary.sigma_hits} times{floors}"
+        floors = f", eigenvalue floor of R active {times(summary.r_floors)}" if summary.r_floors is not None else ""
+        yield "constraints", f"sigma bound active {times(summary.sigma_hits)}{floors}"
     if summary.reinitialised is not None:
         taken = f"{summary.weighed_down} healthy poses down-weighted (NIS above its 99.99 % point)"
-        yield "outliers", f"{taken}; estimate reinitialised {summary.reinitialised} times"
+        yield "outliers", f"{taken}; estimate reinitialised {times(summary.reinitialised)}"
     if summary.manoeuvres is not None:
         yield "manoeuvres", f"{summary.manoeuvres} found; {summary.violations or 0} consistency checks failed"
     if summary.acceleration is not None:
@@ -276,7 +276,7 @@ def _filter_facts(summary: Summary) -> Iterable[tuple[str, str]]:
 def _plan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     t1, capture = summary.convergence, summary.capture
     end = "" if t1.at_end else "; not at the last scan"
-    back = f"; withdrawn {t1.withdrawn} times" if t1.withdrawn else ""
+    back = f"; withdrawn {times(t1.withdrawn)}" if t1.withdrawn else ""
     yield "t_1", "not reached" if t1.t1_s is None else f"{t1.t1_s:.2f} s{back}{end}"
     if capture.last_s is None:
         yield "capture", f"no plan ({capture.status or 'the planner was not called'})"
@@ -284,8 +284,6 @@ def _plan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
         spread = f"std {capture.std_s:.3f} s, range {capture.range_s:.3f} s"
         yield "capture", f"planned at {capture.last_s:.2f} s; {spread} over {capture.replans} plans"
     yield from _flight_facts(capture)
-    if summary.robot:
-        yield "robot", summary.robot
 
 
 def _flight_facts(capture: Capture) -> Iterable[tuple[str, str]]:

@@ -12,8 +12,8 @@ from enum import Enum
 from itertools import chain, groupby
 from typing import Any
 
-from avsreplay.report.summary import Summary
-from avsreplay.report.summary_parts import events
+from avsreplay.report.summary import NIS_LIMIT, Summary
+from avsreplay.report.summary_parts import events, times
 from avsreplay.rows import Row
 
 USED_FAIL, USED_CHECK = 0.5, 0.9  # share of the scans without an injected harmful fault that updated the filter
@@ -47,7 +47,7 @@ class Moment:
 
     Attributes:
         row: index of its worst row.  start_s, end_s: since the first scan.
-        what: what happened, with its size.  cause: injected fault or reason of the detector, "" if unknown.
+        what: what happened, with its size and what is usual.  cause: what the rows say about it.
     """
 
     row: int
@@ -204,13 +204,13 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         yield Concern(Grade.CHECK, text)
     if summary.reinitialised:
         when = next(row.t_s for row in rows if row.reinitialised)
-        text = f"the estimate was reinitialised {_times(summary.reinitialised)}, first at {when:.1f} s"
+        text = f"the estimate was reinitialised {times(summary.reinitialised)}, first at {when:.1f} s"
         yield Concern(Grade.CHECK, f"{text}, because the poses contradicted it")
     yield from (Concern(Grade.CHECK, text) for text in events(rows, summary.drift))
     yield from _failed_checks(rows, summary)
     searches = [row for row in rows[1:] if row.guess == "acquired" and row.gamma == 1]
     if searches and rows[0].gamma == 1:
-        text = f"the pose was searched again {_times(len(searches))}, first at {searches[0].t_s:.1f} s"
+        text = f"the pose was searched again {times(len(searches))}, first at {searches[0].t_s:.1f} s"
         yield Concern(Grade.CHECK, text)
     t1 = summary.convergence
     if rows and t1.t1_s is None:
@@ -242,10 +242,6 @@ def _data(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     ):
         if summary.counts.get(name):
             yield Concern(Grade.CHECK, f"{summary.counts[name]} {text}")
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
 
 
 def _plain(name: str) -> str:
@@ -286,7 +282,7 @@ def _robot(header: Mapping[str, Any]) -> str:
 
 
 def worst_moments(rows: Sequence[Row]) -> list[Moment]:
-    """The five intervals with the largest attitude error, NIS or duration without a used scan; no two overlap."""
+    """The five worst intervals: without a used scan, or with an error or NIS that stands out; no two overlap."""
     found = [moment for _, moment in sorted(_moments(rows), key=lambda item: -item[0])]
     kept: list[Moment] = []
     for moment in found:
@@ -297,34 +293,56 @@ def worst_moments(rows: Sequence[Row]) -> list[Moment]:
 
 def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
     """Candidates with a weight: flagged intervals and single scans whose error or NIS stands out."""
-    for flagged, group in groupby(enumerate(rows), key=lambda item: item[1].gamma == 0):
-        listed = list(group)
+    for flagged, group in groupby(range(len(rows)), key=lambda k: rows[k].gamma == 0):
+        places = list(group)
         if flagged:
-            yield _flagged_moment(listed)
+            yield _flagged_moment(rows, places)
+    used = [k for k, row in enumerate(rows) if row.gamma]  # the others belong to their interval
     for column, unit, factor, name in (
         ("pos_err_m", "mm", 1000.0, "position error"),
         ("rot_err_deg", "deg", 1.0, "attitude error"),
-        ("nis", "", 1.0, "NIS"),
     ):
         typical = _median(rows, column)
-        used = [(k, row) for k, row in enumerate(rows) if row.gamma]  # the others belong to their interval
-        places = [(getattr(row, column), k) for k, row in used if getattr(row, column) is not None]
-        for value, k in sorted(places, reverse=True)[:MOMENTS]:
+        for value, k in _largest(rows, used, column):
             if typical and value > 3.0 * typical:
-                text = f"{name} {factor * value:.3g} {unit}".rstrip()
-                row = rows[k]
-                yield value / typical, Moment(k, row.t_s, row.t_s, text, _cause(row))
+                text = f"{name} {factor * value:.3g} {unit}, {value / typical:.0f} times the median"
+                yield value / typical, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
+    for value, k in _largest(rows, used, "nis"):
+        if value > NIS_LIMIT:
+            text = f"NIS {value:.3g}, above its 99.99 % point {NIS_LIMIT:.1f}"
+            yield 3.0 * value / NIS_LIMIT, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
 
 
-def _flagged_moment(listed: Sequence[tuple[int, Row]]) -> tuple[float, Moment]:
-    worst, row = max(listed, key=lambda item: item[1].pos_err_m or 0.0)
-    error = "" if row.pos_err_m is None else f", error up to {1000 * row.pos_err_m:.3g} mm"
-    first, last = listed[0][1], listed[-1][1]
-    count = "1 scan" if len(listed) == 1 else f"{len(listed)} scans"
-    return 3.0 * len(listed), Moment(worst, first.t_s, last.t_s, f"{count} not used{error}", _cause(first))
+def _largest(rows: Sequence[Row], places: Sequence[int], column: str) -> list[tuple[float, int]]:
+    known = [(value, k) for k in places if (value := getattr(rows[k], column)) is not None]
+    return sorted(known, reverse=True)[:MOMENTS]
 
 
-def _cause(row: Row) -> str:
+def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, Moment]:
+    worst = max(places, key=lambda k: rows[k].pos_err_m or 0.0)
+    largest = rows[worst].pos_err_m
+    error = "" if largest is None else f", position error up to {1000 * largest:.3g} mm"
+    count = "1 scan" if len(places) == 1 else f"{len(places)} scans"
+    span = rows[places[0]].t_s, rows[places[-1]].t_s
+    return 3.0 * len(places), Moment(worst, *span, f"{count} not used{error}", _cause(rows, places[0]))
+
+
+def _cause(rows: Sequence[Row], k: int) -> str:
+    """What the rows say about a moment that begins at row k."""
+    row, before = rows[k], rows[k - 1] if k else None
     if row.fault:
         return f"injected: {_plain(row.fault)}"
-    return _plain(row.reason) if row.gamma == 0 else ""
+    if row.gamma == 0:
+        return f"rejected: {_plain(row.reason)}"
+    if before is not None:
+        if (row.reinitialised or 0) > (before.reinitialised or 0):
+            return "the estimate was reinitialised"
+        if (row.manoeuvres or 0) > (before.manoeuvres or 0):
+            return "manoeuvre of the target"
+        if before.gamma == 0:
+            return "first scan used after a time without"
+    if row.guess == "acquired":
+        return "pose found by a search"
+    if not row.converged:
+        return "the estimate is not converged"
+    return f"undetermined: {row.free_directions}" if row.free_directions else "none known"
