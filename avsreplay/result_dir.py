@@ -247,19 +247,19 @@ class ResultWriter:
         self._log.resume(folder / "result.mcap", known, rows[-1])
         return list(rows)
 
-    def finish(self, rows: Sequence[Row], record: Mapping[str, Any], *, interrupted: bool = False) -> None:
+    def finish(self, rows: Sequence[Row], record: Mapping[str, Any], *, resumable: bool = False) -> None:
         """Write what needs the whole run.
 
         Args:
             rows: one per scan.
             record: content of ``run.json``.
-            interrupted: write the checkpoint, too, from which ``resume`` continues.
+            resumable: the run was interrupted: write the checkpoint, too, from which ``resume`` continues.
         """
         self._log.close()
         self._directory.write(rows, self._beliefs)
         write_view(self._directory.file("view.npz"), self._view.view())
         write_layout(self._directory.file("result.layout.json"))
-        if interrupted:
+        if resumable:
             more = (list(rows), self._beliefs, self._view, self._log.paths)
             self._directory.file(CHECKPOINT).write_bytes(self._run.checkpoint(more))
         write_manifest(self._directory.file("run.json").parent, record, len(rows))

@@ -27,7 +27,7 @@ def replay(work, folder, count=None, resume=False):
     with Run(work) as run, ResultWriter(ResultDirectory(folder, overwrite=resume), run) as writer:
         rows = writer.resume({"config": run.facts()["config"]}) if resume else []
         rows += islice(run.rows(writer.listeners), count)
-        writer.finish(rows, {**run.facts(), "rows so far": len(rows)}, interrupted=count is not None)
+        writer.finish(rows, {**run.facts(), "rows so far": len(rows)}, resumable=count is not None)
     return len(rows)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import signal
 import subprocess
 import sys
 
@@ -62,6 +64,31 @@ def test_a_log_goes_through_a_pipe(fixtures_folder, tmp_path, cli):
     assert cli("run", tmp_path / "log.mcap", "-o", tmp_path / "direct").code == 0
     piped, direct = ((tmp_path / name / "rows.jsonl").read_bytes() for name in ("piped", "direct"))
     assert piped == direct
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_an_interrupt_keeps_the_scans_of_a_log_that_is_still_written(fixtures_folder, tmp_path):
+    """Ctrl-C neither starts a second replay nor reports the open end of the file as damage."""
+    whole = (fixtures_folder / "tumble.mcap").read_bytes()
+    log, result = tmp_path / "growing.mcap", tmp_path / "result"
+    log.write_bytes(whole[: len(whole) * 9 // 10])
+    command = [sys.executable, "-m", "avsreplay", "run", str(log), "--follow", "-o", str(result)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        seen = []
+        for line in process.stdout:  # ends only if the replay did
+            seen.append(line)
+            if line.split()[:1] == ["28"]:  # plans exist from scan 22 on
+                process.send_signal(signal.SIGINT)
+                break
+        out, err = process.communicate(timeout=120)
+    assert process.returncode == 130, err
+    assert "once more" not in err
+    assert "damaged" not in err + out
+    assert "--resume" not in err
+    rows = (result / "rows.jsonl").read_text().splitlines()
+    header = json.loads((result / "run.json").read_text())
+    assert header["interrupted_after"] == len(rows) >= 28
+    assert not (result / "resume.bin").exists()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")

@@ -208,7 +208,7 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
         growing = run.job.growing
         live = growing is not None and not wanted.as_json
         interrupted = _collect(run.rows(listeners, None if live else tracked), rows, growing, live=live)
-        if run.outdated:
+        if run.outdated and not interrupted:
             raise Outdated
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
@@ -219,12 +219,12 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
         record["preflight"] += [{"grade": "check", "text": note} for note in _model_notes(run, advice)]
         if interrupted:
             record["interrupted_after"] = len(rows)
-            how = "; add --resume to continue" if target else ""
+            how = "; add --resume to continue" if target and not growing else ""
             click.echo(
                 f"avsreplay: interrupted; the results of {len(rows)} of {len(run)} scans are kept{how}", err=True
             )
         if keeper:
-            keeper.finish(rows, record, interrupted=interrupted)
+            keeper.finish(rows, record, resumable=interrupted and not growing)
     return _Finished(rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds)
 
 

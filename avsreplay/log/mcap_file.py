@@ -70,7 +70,7 @@ class McapFile(Recording):
         self._resume: int | None = None
         self._trusted = 8  # everything before this offset is confirmed by a checksum
         self._orphans = self._seen = 0
-        self._file = ByteFile(path, upto)
+        self._file, self._open_end = ByteFile(path, upto), upto is not None
         self._size = self._file.size
         self._chunks = ChunkStore(self._file, limit)
         try:
@@ -113,7 +113,7 @@ class McapFile(Recording):
         self._settle()
         if len(self.losses) >= _MAX_LOSSES:
             self._lose(Loss("damaged at too many places: the rest is not read", at, self._size - at))
-        elif not self.closed_properly:
+        elif not (self.closed_properly or self._open_end):
             self._lose(
                 Loss("the file was not closed: messages that its recorder had not yet written are lost", self._size, 0)
             )
