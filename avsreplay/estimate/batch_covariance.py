@@ -38,7 +38,7 @@ _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem abo
 _ROUNDING = 1e-9  # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
 LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
-_DISTURBED = 12  # error states that a disturbance reaches: attitude, rate, position, velocity
+_DISTURBED = 12  # error states that a disturbance reaches: attitude to velocity; they depend on steps of these alone
 SPHERE = 3.0  # tr I / I of a sphere
 
 
@@ -289,7 +289,7 @@ def process_noise_pass(
     if pin is not None:
         k = P @ pin.row / float(pin.row @ P @ pin.row + pin.one_sigma**2)
         y, P = y - k * (pin.error(chart) * pin.one_sigma + float(pin.row @ y)), P - np.outer(k, pin.row @ P)
-    into = np.ascontiguousarray(np.linalg.inv(to_errors(chart))[:, :_DISTURBED])
+    into = np.asarray(np.linalg.inv(to_errors(chart)[:_DISTURBED, :_DISTURBED]))
     density = torque_density(to_state(chart).sigma, noise[0])
     problem.core.linearise(chart.flat)
     return problem.core.smooth(y, 0.5 * (P + P.T), into, density, noise[1] ** 2)

@@ -29,15 +29,12 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
         poses: the measurements.
         reference: initial values of a motion close to them.
         factors: (2,) noise factors of attitude and position, for the weights of outliers.
-        most: number of normal points above which poses are joined; there are about twice as many at most.
+        most: number of normal points above which poses are joined. A gap in the poses may add one point.
     """
     n, rate = len(poses), float(np.linalg.norm(reference.w_c))
     if n <= most:
         return poses
-    since = poses.times_s - poses.times_s[0]
-    turned = np.floor(rate * since / max(_SPAN_RAD, rate * float(since[-1]) / most)).astype(int)
-    place = np.arange(n) - np.searchsorted(turned, turned)
-    first = np.flatnonzero(np.diff(turned, prepend=-1) | (place % -(-n // most) == 0))
+    first = _parts(rate * (poses.times_s - poses.times_s[0]), most)
     d = poses.residuals(Problem(poses, Prior(reference, np.eye(DIM)), factors), reference)
     white = (poses.root @ (d / np.repeat(factors, 3))[:, :, None])[:, :, 0]
     weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
@@ -63,6 +60,21 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
         shares,
         within,
     )
+
+
+def _parts(turned: Array, most: int) -> NDArray[np.int64]:
+    """Index of the first pose of each normal point: it ends after a share of the rotation, or of the poses.
+
+    Args:
+        turned: (n,) rotation of the poses since the first [rad].
+        most: number of normal points.
+    """
+    n = len(turned)
+    span, size = max(_SPAN_RAD, float(turned[-1]) / most), -(-n // most)
+    out = [0]
+    while (next_ := min(int(np.searchsorted(turned, turned[out[-1]] + span)), out[-1] + size)) < n:
+        out.append(next_)
+    return np.array(out)
 
 
 def _within(

@@ -277,15 +277,15 @@ Two absorbed(const Problem& self, const Matrix<DIM, DIM>& P) {
   return out;
 }
 
-nb::tuple smooth(const Problem& self, const Vector<DIM>& y0, const Matrix<DIM, DIM>& P0, const Matrix<DIM, 12>& into,
-                 const Three& torque, double force) {
+nb::tuple smooth(const Problem& self, const Vector<DIM>& y0, const Matrix<DIM, DIM>& P0,
+                 const Matrix<MOTION, MOTION>& into, const Three& torque, double force) {
   double y[DIM];
   Square P;
   std::memcpy(y, y0.data(), sizeof y);
   std::memcpy(P, P0.data(), sizeof P);
   {
     nb::gil_scoped_release release;
-    self.smooth(y, P, *reinterpret_cast<const double(*)[DIM][12]>(into.data()), torque.data(), force);
+    self.smooth(y, P, as<double[MOTION][MOTION]>(into.data()), torque.data(), force);
   }
   return nb::make_tuple(made(y), made(P));
 }

@@ -84,12 +84,18 @@ void at_start(const Flow& flow, double out[6][6]) {
       for (int i = 0; i < 3; ++i)
         for (int j = 0; j < 3; ++j) back[r][3 + c] -= flow.S[i][r] * flow.S[i][3 + j] * rate.x[j][c];
     }
+  double half[6][6] = {}, across[6][6];
   for (int r = 0; r < 6; ++r)
-    for (int c = 0; c < 6; ++c) {
-      out[r][c] = 0;
-      for (int i = 0; i < 6; ++i)
-        for (int j = 0; j < 6; ++j) out[r][c] += back[r][i] * flow.Q[i][j] * back[c][j];
-    }
+    for (int c = 0; c < 6; ++c) across[c][r] = back[r][c];
+  for (int r = 0; r < 6; ++r)
+    for (int i = 0; i < 6; ++i)
+      for (int c = 0; c < 6; ++c) half[r][c] += back[r][i] * flow.Q[i][c];
+  for (int r = 0; r < 6; ++r) {
+    double s[6] = {};
+    for (int i = 0; i < 6; ++i)
+      for (int c = 0; c < 6; ++c) s[c] += half[r][i] * across[i][c];
+    std::memcpy(out[r], s, sizeof s);
+  }
 }
 
 }  // namespace
@@ -219,13 +225,20 @@ void Problem::normal(Square A, double b[DIM]) const {
   Rows H;
   for (size_t k = 0; k < poses.size(); ++k) {
     whitened(k, e, H);
-    for (int i = 0; i < SEEN; ++i)
-      for (int r = 0; r < DIM; ++r) {
+    for (int r = 0; r < DIM; ++r) {
+      double s[DIM];
+      const int first = r & ~3;  // the upper triangle, in groups of four
+      std::memcpy(s, B[r], sizeof s);
+      for (int i = 0; i < SEEN; ++i) {
         const double h = H[i][r];
-        for (int c = 0; c < DIM; ++c) B[r][c] += h * H[i][c];
+        for (int c = first; c < DIM; ++c) s[c] += h * H[i][c];
         g[r] -= h * e[i];
       }
+      std::memcpy(B[r], s, sizeof s);
+    }
   }
+  for (int r = 0; r < DIM; ++r)
+    for (int c = 0; c < r; ++c) B[r][c] = B[c][r];
   congruent(T, B, A);
   double off[DIM];
   minus(at, mean, off);
@@ -303,21 +316,24 @@ void Problem::absorbed(const Square P, double out[2]) const {
     }
 }
 
-void Problem::smooth(double y[DIM], Square P, const double into[DIM][12], const double torque_density[3],
+void Problem::smooth(double y[DIM], Square P, const double into[MOTION][MOTION], const double torque_density[3],
                      double force_density) const {
   const State x = state_of(at);
   double join[3][2], before[6][6] = {}, now[6][6], e[SEEN], t = 0;
   Body body = body_of(x, join);
   std::memcpy(body.push, torque_density, sizeof body.push);
   Flow flow = begin(turn_of(x));
-  Square place = {}, mixed = {}, speed = {};
-  for (int r = 0; r < DIM; ++r)
-    for (int c = 0; c < DIM; ++c)
+  double place[MOTION][MOTION] = {}, mixed[MOTION][MOTION] = {}, speed[MOTION][MOTION] = {};
+  double turned_by[6][MOTION];  // the transpose of the columns of attitude and rate
+  for (int r = 0; r < MOTION; ++r)
+    for (int c = 0; c < MOTION; ++c)
       for (int i = 6; i < 9; ++i) {
         place[r][c] += into[r][i] * into[c][i];
         mixed[r][c] += into[r][i] * into[c][i + 3] + into[r][i + 3] * into[c][i];
         speed[r][c] += into[r][i + 3] * into[c][i + 3];
       }
+  for (int i = 0; i < 6; ++i)
+    for (int r = 0; r < MOTION; ++r) turned_by[i][r] = into[r][i];
   Rows H, HT;
   for (size_t k = 0; k < poses.size(); ++k) {
     const double last = t;
@@ -326,20 +342,18 @@ void Problem::smooth(double y[DIM], Square P, const double into[DIM][12], const 
     at_start(flow, now);
     const double third = force_density * (t * t * t - last * last * last) / 3;
     const double half = -force_density * (t * t - last * last) / 2, one = force_density * (t - last);
-    Square Q;
-    for (int r = 0; r < DIM; ++r) {
-      double row[6] = {};
+    double Q[MOTION][MOTION];
+    for (int r = 0; r < MOTION; ++r) {
+      double row[6] = {}, s[MOTION] = {};
       for (int i = 0; i < 6; ++i)
         for (int c = 0; c < 6; ++c) row[c] += into[r][i] * (now[i][c] - before[i][c]);
-      for (int c = 0; c < DIM; ++c)
-        Q[r][c] = dot(row, into[c], 6) + third * place[r][c] + half * mixed[r][c] + one * speed[r][c];
+      for (int i = 0; i < 6; ++i)
+        for (int c = 0; c < MOTION; ++c) s[c] += row[i] * turned_by[i][c];
+      for (int c = 0; c < MOTION; ++c) Q[r][c] = s[c] + third * place[r][c] + half * mixed[r][c] + one * speed[r][c];
     }
     std::memcpy(before, now, sizeof before);
     whitened(k, e, H);
-    std::memset(HT, 0, sizeof HT);
-    for (int r = 0; r < SEEN; ++r)
-      for (int i = 0; i < DIM; ++i)
-        for (int c = 0; c < DIM; ++c) HT[r][c] += H[r][i] * T[i][c];
+    product<SEEN, DIM>(H, T, HT);
     pass(y, P, e, HT, Q);
   }
 }

@@ -58,8 +58,9 @@ class Problem {
   // Weighted sum of tr C^-1 J P J' over the poses, of attitude and position; P in chart steps.
   void absorbed(const Square P, double out[2]) const;
   // Kalman pass over the poses with process noise between them, from y and P in chart steps. The error states of
-  // attitude to velocity are in other coordinates than P where two moments are nearly equal; `into` takes them to steps.
-  void smooth(double y[DIM], Square P, const double into[DIM][12], const double torque_density[3],
+  // attitude to velocity are in other coordinates than P where two moments are nearly equal; `into` takes them to steps,
+  // of which they reach attitude to velocity alone.
+  void smooth(double y[DIM], Square P, const double into[MOTION][MOTION], const double torque_density[3],
               double force_density) const;
 
  private:

@@ -219,10 +219,11 @@ void piece(Flow& flow, const Body& body, double h) {
       drive[r][c] = r < 3 ? X[r][3 + c] : X[r][3 + c] / h;
     }
   carry(M, drive, flow.S);
-  carry(M, flow.Q);
-  if constexpr (N == 12)
+  if constexpr (N == 12) {
+    carry(M, flow.Q);
     for (int r = 0; r < 6; ++r)
       for (int c = 0; c < 6; ++c) flow.Q[r][c] += X[r][6 + c] / ((r < 3 ? 1 : h) * (c < 3 ? 1 : h));
+  }
 }
 
 // Calls one(length) for pieces of at most SUBSTEP rad that make up h; the rate, and so the cut, may change between them.

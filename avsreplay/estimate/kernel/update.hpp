@@ -1,9 +1,22 @@
 // The filter's update in fixed size: gain, Joseph's form, and the displacement of a state through the chart.
 #pragma once
+#include <cstring>
 
 namespace avs {
 
 constexpr int DIM = 20, SEEN = 6;  // error states, and what a pose measures
+constexpr int MOTION = 12;  // attitude, rate, position and velocity: the steps that disturbances reach
+
+// out := A B for A (N, M), B (M, DIM).
+template <int N, int M>
+void product(const double A[N][M], const double B[M][DIM], double out[N][DIM]) {
+  for (int r = 0; r < N; ++r) {
+    double s[DIM] = {};
+    for (int i = 0; i < M; ++i)
+      for (int c = 0; c < DIM; ++c) s[c] += A[r][i] * B[i][c];
+    std::memcpy(out[r], s, sizeof s);
+  }
+}
 
 // The mean that the error states surround (eq:x): attitude and rate of {B}, centre of mass, its velocity, ratios,
 // fixture in {B}, {C} to {B}.
@@ -19,8 +32,9 @@ struct Pose {
 // x and P once a pose has been seen, its noise widened by `colour` (attitude, position), through the chart: ekf.py.
 void correct(State& x, double P[DIM][DIM], const Pose& seen, const double colour[2]);
 
-// y and P once rows e + H y of unit variance have been seen, P having grown by Q before.
-void pass(double y[DIM], double P[DIM][DIM], const double e[SEEN], const double H[SEEN][DIM], const double Q[DIM][DIM]);
+// y and P once rows e + H y of unit variance have been seen, P of the motion having grown by Q before.
+void pass(double y[DIM], double P[DIM][DIM], const double e[SEEN], const double H[SEEN][DIM],
+          const double Q[MOTION][MOTION]);
 
 // x displaced by the error d through the chart, and P carried from about the one to about the other.
 void retract(State& x, double P[DIM][DIM], const double d[DIM]);
