@@ -5,9 +5,14 @@ from __future__ import annotations
 import estimate_surprises as surprises
 import numpy as np
 import pytest
+import tumbling
 from scipy.stats import multivariate_normal
 
-from avsreplay.estimate import anomalies, hypotheses
+from avsreplay.estimate import anomalies, hypotheses, noise
+from avsreplay.estimate.dynamics import propagate, propagate_state
+from avsreplay.estimate.measurement import measurement_jacobian
+from avsreplay.estimate.track import Epoch, Prediction, Track
+from avsreplay.records import Belief, Innovation
 
 CLEAN = surprises.Case("clean", seconds=60.0)
 
@@ -157,25 +162,23 @@ def test_the_covariance_of_scans_with_common_errors_is_positive_semidefinite(see
     for _ in range(6):
         axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
         R.append(axes @ np.diag(10.0 ** rng.uniform(-6.0, 2.0, size=6)) @ axes.T)
-    C = hypotheses.correlated_noise(R, rng.uniform(0.5, 1.0, size=6).tolist())
+    C = noise.correlated_noise(R, rng.uniform(0.5, 1.0, size=6).tolist())
     scale = np.sqrt(np.diag(C))
     assert np.linalg.eigvalsh(C / np.outer(scale, scale))[0] > -1e-12
     np.testing.assert_allclose(C[6:12, 6:12], R[1])
-    np.testing.assert_allclose(hypotheses.correlated_noise(R[:2], [0.0, 1.0])[:6, 6:], 0.0)
+    np.testing.assert_allclose(noise.correlated_noise(R[:2], [0.0, 1.0])[:6, 6:], 0.0)
 
 
 def test_a_covariance_that_is_not_positive_definite_still_has_a_root() -> None:
-    from avsreplay.estimate.hypotheses import cholesky_root
-
     rng = np.random.default_rng(5)
     factor = rng.normal(size=(12, 3))
     indefinite = factor @ factor.T - 1e-10 * np.eye(12)
     with pytest.raises(np.linalg.LinAlgError):
         np.linalg.cholesky(indefinite)
-    root = cholesky_root(indefinite)
+    root = noise.cholesky_root(indefinite)
     assert np.abs(root @ root.T - indefinite).max() < 1e-8 * np.trace(indefinite)
     definite = indefinite + np.eye(12)
-    np.testing.assert_array_equal(cholesky_root(definite), np.linalg.cholesky(definite))
+    np.testing.assert_array_equal(noise.cholesky_root(definite), np.linalg.cholesky(definite))
 
 
 @pytest.mark.parametrize(
@@ -196,3 +199,38 @@ def test_an_explanation_without_degrees_of_freedom_does_not_scale_the_odds() -> 
     found = hypotheses.Explanation(hypotheses.Hypothesis.MANOEUVRE, 10.0, 0.0, 0, 0)
     free = hypotheses.Explanation(hypotheses.Hypothesis.FREE_MOTION, 1.0, 300.0, 12, 0)
     assert anomalies._odds_over_free([found, free]) == pytest.approx(9.0)
+
+
+def test_the_evidence_of_changes_at_several_instants_is_that_of_the_gaussian_they_make() -> None:
+    """White innovations N(0, 1 + M diag(scale^2) M') with the columns M of the instants, against N(0, 1)."""
+    rng = np.random.default_rng(7)
+    columns, white, scale = rng.normal(size=(8, 30, 6)), 3.0 * rng.normal(size=30), rng.uniform(0.1, 2.0, size=6)
+    chosen = np.array([[1, 3, 4], [2, 5, 7]])
+    found = hypotheses._joint(columns, white, scale, chosen)
+    for instants, value in zip(chosen, found, strict=True):
+        M = np.hstack([columns[k] * scale for k in instants])
+        odds = multivariate_normal.logpdf(white, cov=np.eye(30) + M @ M.T)
+        odds += 0.5 * float(white @ white) + 15.0 * np.log(2.0 * np.pi)
+        assert value == pytest.approx(odds, rel=1e-9)
+
+
+def test_the_window_holds_the_covariance_of_its_innovations() -> None:
+    """H_i P_i Phi_ij' H_j' for scans i before j, with P propagated from scan to scan and its process noise."""
+    rng = np.random.default_rng(3)
+    world = tumbling.draw(3, seconds=4.0, hz=1.0, rate=0.3)
+    half = rng.normal(size=(20, 20)) * 1e-3
+    start = Belief(0, world.states[0], half @ half.T)
+    R, noises = np.diag(np.full(6, 1e-6)), (1e-3, 2e-3)
+    epochs, beliefs = [], [start]
+    for t_ns in (0, 10**9, 2 * 10**9, 4 * 10**9):
+        beliefs.append(propagate(beliefs[-1], t_ns, *noises)[0])
+        prediction = Prediction(beliefs[-1], np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty())
+        seen = Innovation(np.zeros(6), R, R, 0.0, 0.0, 0.0)
+        epochs.append(Epoch(Track(start, "filter"), prediction, seen, False))
+    C = hypotheses._window(epochs, start, *noises).C
+    for i, first in enumerate(beliefs[1:]):
+        for j, later in enumerate(beliefs[1:][i:], start=i):
+            _, Phi = propagate_state(first.x, (later.t_ns - first.t_ns) * 1e-9)
+            expected = measurement_jacobian(first.x) @ first.P @ Phi.T @ measurement_jacobian(later.x).T
+            expected = expected + (R if i == j else 0.0)
+            np.testing.assert_allclose(C[6 * i : 6 * i + 6, 6 * j : 6 * j + 6], expected, rtol=1e-7, atol=1e-13)

@@ -203,6 +203,21 @@ def test_the_fit_to_normal_points_is_the_fit_to_the_poses(seed: int) -> None:
     assert ratios.max() < 1.15
 
 
+@pytest.mark.parametrize(("n", "rate", "hz"), [(153, 0.1, 2.0), (1000, 0.05, 10.0), (500, 1e-6, 5.0), (300, 1.0, 2.0)])
+def test_there_are_not_more_normal_points_than_asked_for(n: int, rate: float, hz: float) -> None:
+    """153 poses at 0.05 rad per pose: four poses and 0.25 rad end at different poses; both rules split them once."""
+    world = tumbling.draw(2, rate=rate, seconds=(n - 1) / hz, hz=hz)
+    rng = np.random.Generator(np.random.PCG64(4))
+    seen = [tumbling.alignment(x.T_ac, rng, 0.002, 0.002) for x in world.states]
+    T_ac = [a.T_ac for a in seen]
+    C = np.array([a.covariance for a in seen])
+    poses = Poses(world.times, np.array([T.q for T in T_ac]), np.array([T.t for T in T_ac]), C)
+    points = normal_points(poses, to_chart(world.states[0]), np.ones(2), 40)
+    assert points.counts is not None
+    assert 20 <= len(points) <= 41
+    assert points.counts.sum() == len(poses)
+
+
 def test_few_poses_are_their_own_normal_points() -> None:
     poses = poses_of(seen(tumbling.draw(0, seconds=20.0), 0))
     assert normal_points(poses, to_chart(tumbling.draw(0, seconds=1.0).states[0]), np.ones(2)) is poses

@@ -21,10 +21,10 @@ from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.dynamics import propagate
 from avsreplay.estimate.error_state import VEL, W
-from avsreplay.estimate.hypotheses import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis, cholesky_root, explain
+from avsreplay.estimate.hypotheses import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis, explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
-from avsreplay.estimate.noise import GATE
+from avsreplay.estimate.noise import GATE, cholesky_root
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import (
     Epoch,
@@ -309,8 +309,10 @@ def _chi2(y: Array, C: Array) -> float:
 
 def _long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
     """Return whether the sum of the last whitened innovations is large, over one of several runs of scans."""
-    white = [np.linalg.solve(cholesky_root(e.innovation.S), e.innovation.alpha) for e in epochs[-_RUNS[-1] :]]
-    sums = np.cumsum(white[::-1], axis=0)
+    last = [e.innovation for e in epochs[: -_RUNS[-1] - 1 : -1]]
+    roots = cholesky_root(np.array([one.S for one in last]))
+    white = np.linalg.solve(roots, np.array([one.alpha for one in last])[:, :, None])[:, :, 0]
+    sums = np.cumsum(white, axis=0)
     for n in _RUNS:
         if n <= len(white):
             variance = n * (1.0 + (n - 1) * epochs[-1].innovation.share)

@@ -36,9 +36,10 @@ _PER_KIND = (0.0, 0.0, math.log(1e-2))  # log prior odds of each
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Linear:
-    """Residuals e (n, 6) and Jacobian J (n, 6, 20) in the chart, of unit variance.
+    """Residuals e (6n,) and Jacobian J (6n, 20) in the chart, of unit variance.
 
-    ``G`` (n, 6, 12) is the Jacobian by attitude to velocity at the epoch; ``info`` and ``off`` are those of the prior.
+    ``G`` (6n, 12) is the Jacobian by attitude to velocity at the epoch; ``info`` and ``off`` are those of the prior.
+    ``late`` (6n,) are the times of the rows.
     """
 
     e: Array
@@ -46,6 +47,7 @@ class _Linear:
     G: Array
     info: Array
     off: Array
+    late: Array
 
 
 def find_drift(
@@ -78,11 +80,12 @@ def find_drift(
     B = _equivalents(to_state(fitted.chart), np.concatenate([points.times_s, onsets]))
     here, there = B[: len(points)], B[len(points) :]
     linear = _linear(problem, fitted.chart)
+    columns = _columns(linear, here, there, onsets)
     inflation = 1.0
     for _ in range(2):  # with the claimed noise, then with that of the residuals without the drift
-        found = [_explained(linear, points, here, b, t, widths, inflation) for b, t in zip(there, onsets, strict=True)]
+        found = _explained(linear, columns, onsets, widths, inflation)
         k = int(np.argmax([f.log_odds for f in found]))
-        best, inflation = found[k], _remaining_noise(linear, points, here, there[k], found[k])
+        best, inflation = found[k], _remaining_noise(linear, columns[k], found[k])
     if best.log_odds < _FOUND or best.log_odds - _random(poses, fitted.chart, prior, factors, levels) < _CONSTANT:
         return None
     odds = np.array([f.log_odds for f in found])
@@ -136,44 +139,55 @@ def _equivalents(x: State, times_s: Array) -> Array:
 
 def _linear(problem: Problem, chart: Chart) -> _Linear:
     e, H = problem.core.rows()
-    G = H[:, :, :12]
     info = np.asarray(np.linalg.inv(problem.prior.P), dtype=np.float64)
-    return _Linear(e, H @ to_errors(chart), G, info, info @ chart.minus(problem.prior.mean))
+    J, G = (H @ to_errors(chart)).reshape(-1, H.shape[2]), H[:, :, :12].reshape(-1, 12)
+    off = info @ chart.minus(problem.prior.mean)
+    return _Linear(e.reshape(-1), J, G, info, off, np.repeat(problem.poses.times_s, e.shape[1]))
 
 
-def _columns(linear: _Linear, points: Poses, here: Array, before: Array, onset_s: float) -> Array:
-    """White columns (n, 6, 6) of the residuals by the drift since the onset."""
-    return np.asarray((linear.G @ (here - before)) * (points.times_s > onset_s)[:, None, None])
+def _columns(linear: _Linear, here: Array, there: Array, onsets: Array) -> Array:
+    """White columns (k, 6n, 6) of the residuals by the drift since each onset (k,)."""
+    now = (linear.G.reshape(len(here), -1, 12) @ here).reshape(-1, 6)
+    return np.asarray((now - linear.G @ there) * (linear.late > onsets[:, None])[:, :, None])
 
 
-def _explained(
-    linear: _Linear, points: Poses, here: Array, before: Array, onset_s: float, widths: Array, inflation: float
-) -> _Found:
-    """The drift since one onset: the kind with the greatest evidence. ``inflation`` is on the variance of the poses."""
-    M = _columns(linear, points, here, before, onset_s).reshape(-1, 6)
-    e, J = linear.e.reshape(-1), linear.J.reshape(-1, linear.J.shape[2])
+def _explained(linear: _Linear, columns: Array, onsets: Array, widths: Array, inflation: float) -> list[_Found]:
+    """The drift since each onset: the kind with the greatest evidence. ``inflation`` is on the variance of the poses.
+
+    Args:
+        linear: residuals and their Jacobian.
+        columns: of ``_columns``.
+        onsets: (k,) [s].
+        widths: (6,) prior 1 sigma of torque and force.
+        inflation: as said.
+    """
+    J, e = linear.J, linear.e
     solve = np.linalg.inv(J.T @ J / inflation + linear.info)
     g = J.T @ e / inflation + linear.off
-    cross = J.T @ M / inflation
-    precision = M.T @ M / inflation - cross.T @ solve @ cross
-    rhs = -(M.T @ e) / inflation + cross.T @ solve @ g
-    found = []
+    cross = J.T @ columns / inflation  # (k, 20, 6)
+    back = np.swapaxes(columns, 1, 2)
+    weighted = np.swapaxes(cross, 1, 2) @ solve
+    precision = back @ columns / inflation - weighted @ cross
+    rhs = weighted @ g - back @ e / inflation
+    best: list[_Found | None] = [None] * len(onsets)
     for kind, prior_odds in zip(_KINDS, _PER_KIND, strict=True):
         scaled = widths[kind]
-        own = precision[kind, kind] * np.outer(scaled, scaled) + np.eye(len(scaled))
-        v = np.linalg.solve(own, rhs[kind] * scaled)
-        odds = 0.5 * float(v @ (rhs[kind] * scaled)) - 0.5 * float(np.linalg.slogdet(own)[1]) + prior_odds
-        u, P = np.zeros(6), np.zeros((6, 6))
-        u[kind] = scaled * v
-        P[kind, kind] = np.outer(scaled, scaled) * np.linalg.inv(own)
-        found.append(_Found(odds, onset_s, u, P, -solve @ (g + cross @ u)))
-    return max(found, key=lambda f: f.log_odds)
+        own = np.linalg.inv(precision[:, kind, kind] * np.outer(scaled, scaled) + np.eye(len(scaled)))
+        b = rhs[:, kind] * scaled
+        v = (own @ b[:, :, None])[:, :, 0]
+        odds = 0.5 * (v * b).sum(axis=1) + 0.5 * np.linalg.slogdet(own)[1] + prior_odds
+        for k, known in enumerate(best):
+            if known is not None and known.log_odds >= odds[k]:
+                continue
+            u, P = np.zeros(6), np.zeros((6, 6))
+            u[kind], P[kind, kind] = scaled * v[k], np.outer(scaled, scaled) * own[k]
+            best[k] = _Found(float(odds[k]), float(onsets[k]), u, P, -solve @ (g + cross[k] @ u))
+    return [found for found in best if found is not None]
 
 
-def _remaining_noise(linear: _Linear, points: Poses, here: Array, before: Array, best: _Found) -> float:
+def _remaining_noise(linear: _Linear, columns: Array, best: _Found) -> float:
     """Variance of the white residuals with the drift removed, times their integrated autocorrelation."""
-    M = _columns(linear, points, here, before, best.onset_s)
-    left = linear.e + linear.J @ best.y + M @ best.u
+    left = (linear.e + linear.J @ best.y + columns @ best.u).reshape(-1, 6)
     dof = max(left.size - 26, 6)
     blocks = [integrated_autocorrelation(left[:, k : k + 3]) for k in (0, 3)]
     return max(float((left * left).sum()) / dof * max(blocks), 1e-3)

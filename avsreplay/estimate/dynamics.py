@@ -81,8 +81,17 @@ def flow(w: Array, sigma: Array, h: float, torque: float = 0.0) -> Flow:
     Raises:
         ValueError: a rate or time that is not finite, or a step of more than a million radians.
     """
-    q, w, S, Q = _motion.follow(IDENTITY_QUAT, w, ratios(sigma), torque_density(sigma, torque), np.array((h,)))
-    return Flow(w[0], q[0], S[0], Q[0])
+    return flows(w, sigma, np.array((h,)), torque)[0]
+
+
+def flows(w: Array, sigma: Array, times_s: Array, torque: float = 0.0) -> list[Flow]:
+    """``flow`` to each of ``times_s`` (n,) [s], each reached from the one before.
+
+    Raises:
+        ValueError: as ``flow``.
+    """
+    found = _motion.follow(IDENTITY_QUAT, w, ratios(sigma), torque_density(sigma, torque), times_s)
+    return [Flow(w, q, S, Q) for q, w, S, Q in zip(*found, strict=True)]
 
 
 def ratios(sigma: Array) -> Triple:

@@ -16,10 +16,12 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 import numpy as np
+from numpy.typing import NDArray
 
-from avsreplay.estimate.dynamics import propagate, propagate_state
-from avsreplay.estimate.error_state import VEL, W, rotation
+from avsreplay.estimate.dynamics import advance, flows, process_noise, rotation_history, transition
+from avsreplay.estimate.error_state import RHO, VEL, rotation
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
+from avsreplay.estimate.noise import cholesky_root, correlated_noise
 from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Belief
@@ -126,70 +128,27 @@ def explain(
     return sorted(found, key=lambda e: -e.log_evidence)
 
 
-def cholesky_root(C: Array) -> Array:
-    """Lower Cholesky factor of a window covariance that rounding may have made indefinite.
-
-    Args:
-        C: (n, n) covariance.
-
-    Returns:
-        (n, n) factor of C; if C is indefinite, of C plus the smallest sufficient multiple of the identity.
-
-    Raises:
-        ValueError: no multiple suffices, as with a matrix that is not finite.
-    """
-    scale = float(np.trace(C)) / len(C)
-    for k in range(-14, 1):
-        try:
-            return np.asarray(np.linalg.cholesky(C + (10.0**k * scale if k > -14 else 0.0) * np.eye(len(C))))
-        except np.linalg.LinAlgError:
-            continue
-    raise ValueError("the covariance of the window is not finite")
-
-
 def _window(epochs: Sequence[Epoch], start: Belief, torque: float, force: float) -> _Window:
-    n = len(epochs)
-    times, y = np.empty(n), np.empty((n, 6))
-    rows, back, poses = np.empty((n, 6, 20)), [], []
-    for k, epoch in enumerate(epochs):
-        prior = epoch.prediction.belief
-        times[k] = (prior.t_ns - start.t_ns) * 1e-9
-        belief, Phi = propagate(start, prior.t_ns, torque, force)
-        poses.append(measured_pose(prior.x, epoch.innovation.alpha))
-        y[k] = innovation_vector(belief.x, poses[-1])
-        rows[k] = measurement_jacobian(belief.x) @ Phi
-        half = np.linalg.solve(Phi, belief.P)
-        back.append(np.linalg.solve(Phi, half.T).T)  # P propagated back to the start, process noise included
-    C = np.zeros((n, 6, n, 6))
-    for i in range(n):
-        for j in range(i, n):
-            C[i, :, j] = rows[i] @ back[i] @ rows[j].T
-            C[j, :, i] = C[i, :, j].T
-    R_ba = tuple(rotation(propagate_state(start.x, float(t))[0].q_ab).T for t in times)
+    n, x = len(epochs), start.x
+    times = np.array([(e.prediction.belief.t_ns - start.t_ns) * 1e-9 for e in epochs])
+    y, rows, back, poses, R_ba = np.empty((n, 6)), np.empty((n, 6, 20)), np.empty((n, 20, 20)), [], []
+    for k, (epoch, step, t) in enumerate(zip(epochs, flows(x.w_b, x.sigma, times, torque), times, strict=True)):
+        then, Phi = advance(x, step, t), transition(step, x.sigma, t)
+        poses.append(measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha))
+        y[k] = innovation_vector(then, poses[-1])
+        rows[k] = measurement_jacobian(then) @ Phi
+        inverse = np.linalg.inv(Phi)
+        back[k] = start.P + inverse @ process_noise(step, t, force) @ inverse.T  # what the noise at the start would be
+        R_ba.append(rotation(then.q_ab).T)
+    C = ((rows @ back).reshape(6 * n, 20) @ rows.reshape(6 * n, 20).T).reshape(n, 6, n, 6)
+    earlier = np.arange(n)[:, None] < np.arange(n)  # scans i before j: the noise until i is what they have in common
+    C = np.where(earlier.T[:, None, :, None], C.transpose(2, 3, 0, 1), C)
     innovations = [e.innovation for e in epochs]
     R = tuple(i.R for i in innovations)
     flat = C.reshape(6 * n, 6 * n) + correlated_noise(R, [i.share for i in innovations])
     flat = 0.5 * (flat + flat.T)
     whiten = np.asarray(np.linalg.inv(cholesky_root(flat)), dtype=np.float64)
-    return _Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, R_ba)
-
-
-def correlated_noise(R: Sequence[Array], shares: Sequence[float]) -> Array:
-    """Covariance (6n, 6n) of the errors of n neighbouring scans that have a share of their variance in common.
-
-    The common part of scan k is sqrt(share_k) L_k z with one z for all scans and R_k = L_k L_k', so the covariance of
-    scans i and j is sqrt(share_i share_j) L_i L_j'. The matrix is positive semidefinite for any R and shares up to 1.
-
-    Args:
-        R: (6, 6) noise of each scan.
-        shares: common share of the variance of each scan, 0 to 1.
-    """
-    roots = [math.sqrt(share) * np.linalg.cholesky(one) for one, share in zip(R, shares, strict=True)]
-    common = np.concatenate(roots)
-    out: Array = common @ common.T
-    for k, one in enumerate(R):
-        out[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = one
-    return out
+    return _Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, tuple(R_ba))
 
 
 def _evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float, Array, Array]:
@@ -230,7 +189,7 @@ def _manoeuvre(window: _Window, start: Belief, white: Array, free: float, priors
     edges = np.concatenate([[0.0], window.times_s[: n - 1]])
     lengths = np.diff(np.append(edges, window.times_s[-1]))
     instants = (edges[:, None] + lengths[:, None] * ((np.arange(count) + 0.5) / count)).reshape(-1)
-    columns = np.array([_after_change(window, start, float(tau)) for tau in instants])
+    columns = _after_changes(window, start, instants)
     scale = np.repeat([priors.rate_radps, priors.velocity_mps], 3)
     single = free + _mixed(columns, white, scale, _CHANGES)
     k = int(np.argmax(single))
@@ -239,9 +198,13 @@ def _manoeuvre(window: _Window, start: Belief, white: Array, free: float, priors
     evidence = [_log_mean(single.tolist())]
     for m in range(1, len(_SPREAD)):
         chosen = [two[k : k + m].reshape(-1) for k in range(len(two) + 1 - m)]
-        long = [_changes(instants[c], columns[c], white, free, scale) for c in chosen]
-        evidence.append(_log_mean([f.log_evidence for f in long]) if long else -math.inf)
-        found += long
+        if not chosen:
+            evidence.append(-math.inf)
+            continue
+        values = free + _joint(columns, white, scale, np.array(chosen))
+        evidence.append(_log_mean(values.tolist()))
+        c = chosen[int(np.argmax(values))]
+        found.append(_changes(instants[c], columns[c], white, free, scale))
     best = max(found, key=lambda f: f.log_evidence)
     total = float(np.logaddexp.reduce(np.log(_SPREAD) + evidence))
     after_s, step = best.after_s, float(lengths.max())
@@ -258,12 +221,29 @@ def _manoeuvre(window: _Window, start: Belief, white: Array, free: float, priors
     return replace(best, log_evidence=total + PRIOR_ODDS, onset=onset, after_s=after_s, after_1s_s=spread)
 
 
-def _after_change(window: _Window, start: Belief, tau: float) -> Array:
-    """Derivative (6n, 6) of the whitened innovations by a change of (rate, velocity) at an instant [s]."""
-    _, Phi = propagate_state(start.x, tau)
-    columns = np.linalg.inv(Phi)[:, [*range(W.start, W.stop), *range(VEL.start, VEL.stop)]]
-    M = (window.rows @ columns) * (window.times_s > tau)[:, None, None]
-    return np.asarray(window.whiten @ M.reshape(-1, 6))
+def _after_changes(window: _Window, start: Belief, instants: Array) -> Array:
+    """Derivatives (k, 6n, 6) of the whitened innovations by a change of (rate, velocity) at each instant (k,) [s]."""
+    back = np.linalg.inv(rotation_history(start.x, instants).S[:, :, :6])[:, :, 3:]
+    tau, n = instants[:, None, None, None], len(window.times_s)
+    M = np.empty((len(instants), n, 6, 6))
+    M[..., :3] = window.rows[:, :, :6] @ back[:, None]
+    M[..., 3:] = window.rows[:, :, VEL] - tau * window.rows[:, :, RHO]
+    M *= window.times_s[:, None, None] > tau
+    return np.asarray(window.whiten @ M.reshape(-1, 6 * n, 6))
+
+
+def _joint(columns: Array, white: Array, scale: Array, chosen: NDArray[np.int64]) -> Array:
+    """(k,) log evidence over free motion of changes at several instants ``chosen`` (k, m), as in ``_changes``."""
+    first = int(chosen.min())
+    used = columns[first : int(chosen.max()) + 1] * scale
+    count, size = len(used), chosen.shape[1] * used.shape[2]
+    M = used.transpose(1, 0, 2).reshape(len(white), -1)
+    G, g = (M.T @ M).reshape(count, 6, count, 6), (M.T @ white).reshape(count, 6)
+    at = chosen - first
+    A = G[at[:, :, None], :, at[:, None, :]].transpose(0, 1, 3, 2, 4).reshape(-1, size, size) + np.eye(size)
+    b = g[at].reshape(-1, size)
+    v = np.linalg.solve(A, b[:, :, None])[:, :, 0]
+    return np.asarray(0.5 * (b * v).sum(axis=1) - 0.5 * np.linalg.slogdet(A)[1])
 
 
 def _changes(instants: Array, columns: Array, white: Array, free: float, scale: Array) -> Explanation:

@@ -13,6 +13,7 @@ weights of the updates, so that outliers do not increase R.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -155,6 +156,50 @@ def _eigen(R: Array, R0: Array) -> tuple[Array, Array]:
     inside = np.linalg.solve(root, np.linalg.solve(root, R).T)
     values, vectors = np.linalg.eigh(0.5 * (inside + inside.T))
     return values, root @ vectors
+
+
+def correlated_noise(R: Sequence[Array], shares: Sequence[float]) -> Array:
+    """Covariance (6n, 6n) of the errors of n neighbouring scans that have a share of their variance in common.
+
+    The common part of scan k is sqrt(share_k) L_k z with one z for all scans and R_k = L_k L_k', so the covariance of
+    scans i and j is sqrt(share_i share_j) L_i L_j'. The matrix is positive semidefinite for any R and shares up to 1.
+
+    Args:
+        R: (6, 6) noise of each scan.
+        shares: common share of the variance of each scan, 0 to 1.
+    """
+    roots = [math.sqrt(share) * np.linalg.cholesky(one) for one, share in zip(R, shares, strict=True)]
+    common = np.concatenate(roots)
+    out: Array = common @ common.T
+    for k, one in enumerate(R):
+        out[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = one
+    return out
+
+
+def cholesky_root(C: Array) -> Array:
+    """Lower Cholesky factor of a covariance that rounding may have made indefinite, or of several of one size.
+
+    Args:
+        C: (..., n, n) covariance.
+
+    Returns:
+        (..., n, n) factor of C; if one is indefinite, of each plus the smallest multiple of the identity, relative to
+        its mean variance, that suffices for all.
+
+    Raises:
+        ValueError: no multiple suffices, as with a matrix that is not finite.
+    """
+    try:
+        return np.asarray(np.linalg.cholesky(C))
+    except np.linalg.LinAlgError:
+        n = C.shape[-1]
+    more = np.trace(C, axis1=-2, axis2=-1)[..., None, None] / n * np.eye(n)
+    for k in range(-13, 1):
+        try:
+            return np.asarray(np.linalg.cholesky(C + 10.0**k * more))
+        except np.linalg.LinAlgError:
+            continue
+    raise ValueError("the covariance of the window is not finite")
 
 
 def line_of_sight_1s(x_position: Array, R: Array, share: float) -> Array:
