@@ -170,11 +170,11 @@ def test_an_impossible_robot_is_one_line(tmp_path, text, what):
     """Values that are allowed one by one, but not together with the planner's."""
     from click.testing import CliRunner
 
-    from avsreplay.cli.config import command
+    from avsreplay.cli.config import config_command
     from avsreplay.errors import UsageError
 
     robot = tmp_path / "robot.toml"
     robot.write_text(f"[robot]\n{text}\n")
-    ended = CliRunner().invoke(command, ["--robot", str(robot)])
+    ended = CliRunner().invoke(config_command, ["--robot", str(robot)])
     assert isinstance(ended.exception, UsageError)
     assert what in str(ended.exception)

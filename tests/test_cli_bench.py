@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from avsreplay.cli.bench import benchmark_backends, command
+from avsreplay.cli.bench import bench_command, benchmark_backends
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Pose, exp
 from avsreplay.register.contract import boxes, example_pose, view
@@ -51,7 +51,7 @@ def test_bad_input_is_one_line(tmp_path: Path) -> None:
         ("nowhere.mcap", "--backends", " , "): UsageError,
     }
     for arguments, error in asked.items():
-        assert isinstance(CliRunner().invoke(command, list(arguments)).exception, error)
+        assert isinstance(CliRunner().invoke(bench_command, list(arguments)).exception, error)
     with pytest.raises(UsageError):
         benchmark_backends(["no_such"], boxes(), [])
 

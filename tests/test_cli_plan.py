@@ -8,7 +8,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
-from avsreplay.cli.plan import command
+from avsreplay.cli.plan import plan_command
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import IDENTITY_QUAT
 from avsreplay.records import State
@@ -70,7 +70,7 @@ def result(tmp_path_factory):
 
 
 def run(*args):
-    return CliRunner().invoke(command, [str(a) for a in args], catch_exceptions=True)
+    return CliRunner().invoke(plan_command, [str(a) for a in args], catch_exceptions=True)
 
 
 def test_plan_spread_hindsight_and_flight(result):
@@ -215,6 +215,6 @@ def test_no_result_is_unreadable(tmp_path):
 def test_an_impossible_robot_is_one_line(result, tmp_path, text):
     robot = tmp_path / "robot.toml"
     robot.write_text(f"[robot]\n{text}\n")
-    ended = CliRunner().invoke(command, [str(result), "--robot", str(robot), "--at", "20"])
+    ended = CliRunner().invoke(plan_command, [str(result), "--robot", str(robot), "--at", "20"])
     assert isinstance(ended.exception, UsageError)
     assert "must be" in str(ended.exception)

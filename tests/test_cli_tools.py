@@ -82,9 +82,9 @@ def test_the_install_command_of_a_back_end_is_printed_whole(monkeypatch, capsys)
     """A bracket in a cell is text: an extra must not vanish from the command."""
     from click.testing import CliRunner
 
-    from avsreplay.cli.backends import command
+    from avsreplay.cli.backends import backends_command
     from avsreplay.register import backend
 
     state = backend.Availability("open3d", False, "", "about", "pip install 'avsreplay[open3d]'")
     monkeypatch.setattr(backend, "available", lambda: [state])
-    assert "pip install 'avsreplay[open3d]'" in CliRunner().invoke(command, []).output
+    assert "pip install 'avsreplay[open3d]'" in CliRunner().invoke(backends_command, []).output

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from avsreplay.cli.backends import command
+from avsreplay.cli.backends import backends_command
 from avsreplay.errors import CheckFailed, MissingBackend, UsageError
 from avsreplay.geometry import Pose, exp, log
 from avsreplay.records import Fit
@@ -140,17 +140,17 @@ def test_a_library_that_cannot_be_imported_is_reported(monkeypatch: pytest.Monke
 
 
 def test_command_lists_and_checks() -> None:
-    listed = CliRunner().invoke(command, ["--json"])
+    listed = CliRunner().invoke(backends_command, ["--json"])
     assert {entry["name"] for entry in json.loads(listed.stdout)} >= set(BUILT_IN)
-    assert "kiss" in CliRunner().invoke(command, []).stdout
-    checked = CliRunner().invoke(command, ["--check", "horn", "--json"])
+    assert "kiss" in CliRunner().invoke(backends_command, []).stdout
+    checked = CliRunner().invoke(backends_command, ["--check", "horn", "--json"])
     assert checked.exit_code == 0
     assert all(finding["held"] for finding in json.loads(checked.stdout)["findings"])
 
 
 def test_the_table_shows_the_extra_in_square_brackets() -> None:
     """The hint of an extra is literal text: rich must not read [open3d] as markup."""
-    table = CliRunner().invoke(command, []).stdout
+    table = CliRunner().invoke(backends_command, []).stdout
     for state in backend.available():
         extra = state.get.partition("[")[2].partition("]")[0]
         assert not extra or f"[{extra}]" in table.replace(" ", "").replace("\n", "")
@@ -158,7 +158,7 @@ def test_the_table_shows_the_extra_in_square_brackets() -> None:
 
 def test_command_fails_if_a_law_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     _install(monkeypatch, _Guesser)
-    result = CliRunner().invoke(command, ["--check", "guesser"])
+    result = CliRunner().invoke(backends_command, ["--check", "guesser"])
     assert isinstance(result.exception, CheckFailed)
     assert "recovers the exact pose" in str(result.exception)
 

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 from rich.console import Console
 
-from avsreplay.cli.compare import command
+from avsreplay.cli.compare import compare_command
 from avsreplay.errors import AvsError, CheckFailed, UnreadableInput, UsageError
 from avsreplay.records import Label
 from avsreplay.report.compare import METRICS, first_divergence, metrics
@@ -192,7 +192,7 @@ def runs(tmp_path, make_rows):
 
 
 def _run(*arguments):
-    return CliRunner().invoke(command, [str(a) for a in arguments])
+    return CliRunner().invoke(compare_command, [str(a) for a in arguments])
 
 
 def test_the_table_shows_changes_and_the_first_divergence(runs):

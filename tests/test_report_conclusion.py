@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from avsreplay.cli.compare import command
+from avsreplay.cli.compare import compare_command
 from avsreplay.errors import UsageError
 from avsreplay.report.compare import METRICS
 from avsreplay.report.conclusion import HEADLINES, conclude
@@ -141,7 +141,7 @@ def seeds(tmp_path, make_rows):
 
 
 def test_folders_of_runs_are_paired_by_name(seeds):
-    done = CliRunner().invoke(command, [str(seeds / "base"), str(seeds / "other"), "--json"])
+    done = CliRunner().invoke(compare_command, [str(seeds / "base"), str(seeds / "other"), "--json"])
     assert done.exit_code == 0, done.output
     conclusion = json.loads(done.stdout)["results"][1]["conclusion"]
     assert (conclusion["pairs"], conclusion["word"]) == (6, "worse")
@@ -149,13 +149,15 @@ def test_folders_of_runs_are_paired_by_name(seeds):
 
 def test_a_run_without_a_partner_is_a_usage_error(seeds):
     (seeds / "other" / "seed-5").rename(seeds / "other" / "seed-9")
-    done = CliRunner().invoke(command, [str(seeds / "base"), str(seeds / "other")])
+    done = CliRunner().invoke(compare_command, [str(seeds / "base"), str(seeds / "other")])
     assert isinstance(done.exception, UsageError)
     assert "seed-5, seed-9 without a partner" in str(done.exception)
 
 
 def test_markdown_is_a_heading_and_tables(seeds):
-    done = CliRunner().invoke(command, [str(seeds / "base" / "seed-0"), str(seeds / "other" / "seed-0"), "--markdown"])
+    done = CliRunner().invoke(
+        compare_command, [str(seeds / "base" / "seed-0"), str(seeds / "other" / "seed-0"), "--markdown"]
+    )
     lines = done.stdout.splitlines()
     assert lines[0].startswith("### ")
     table = [line for line in lines if line.startswith("|")]

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from avsreplay.cli.report import command
+from avsreplay.cli.report import report_command
 from avsreplay.errors import AvsError
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State
@@ -197,17 +197,17 @@ def test_a_long_run_is_thinned_in_clouds_not_in_columns(make_rows):
 def test_the_command_writes_a_page_and_keeps_what_is_there(tmp_path, make_rows):
     rows = make_rows(30)
     write_rows(tmp_path / "rows.jsonl", rows)
-    done = CliRunner().invoke(command, [str(tmp_path)])
+    done = CliRunner().invoke(report_command, [str(tmp_path)])
     assert done.exit_code == 0, done.output
     assert "<title>" in (tmp_path / "report.html").read_text(encoding="utf-8")
-    again = CliRunner().invoke(command, [str(tmp_path)])
+    again = CliRunner().invoke(report_command, [str(tmp_path)])
     assert isinstance(again.exception, AvsError)
     assert "already exists" in str(again.exception)
-    assert CliRunner().invoke(command, [str(tmp_path), "--overwrite", "--title", "x"]).exit_code == 0
+    assert CliRunner().invoke(report_command, [str(tmp_path), "--overwrite", "--title", "x"]).exit_code == 0
     (tmp_path / "none.jsonl").write_text("")
-    empty = CliRunner().invoke(command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")])
+    empty = CliRunner().invoke(report_command, [str(tmp_path / "none.jsonl"), "-o", str(tmp_path / "x.html")])
     assert "holds no row" in str(empty.exception)
-    missing = CliRunner().invoke(command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")])
+    missing = CliRunner().invoke(report_command, [str(tmp_path / "no"), "-o", str(tmp_path / "x.html")])
     assert isinstance(missing.exception, AvsError)
     assert not (tmp_path / "x.html").exists()
 

@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from avsreplay.cli import record as command
+from avsreplay.cli.record import record_command
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.record import RecordOptions, record
 from avsreplay.records import Scan, ScanStatus
@@ -148,7 +148,7 @@ def test_times_of_points_stay_with_their_points():
 )
 def test_a_wrong_fault_is_one_line(text, what, fixtures_folder, tmp_path):
     log = str(fixtures_folder / "tumble.mcap")
-    done = CliRunner().invoke(command.command, [log, "-o", str(tmp_path / "o.mcap"), "--fault", text])
+    done = CliRunner().invoke(record_command, [log, "-o", str(tmp_path / "o.mcap"), "--fault", text])
     assert done.exit_code == 2
     assert what in done.output
     assert not (tmp_path / "o.mcap").exists()

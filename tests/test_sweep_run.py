@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from avsreplay.cli import sweep as command
+from avsreplay.cli.sweep import sweep_command
 from avsreplay.errors import DataLost, MissingBackend, UnreadableInput, UsageError
 from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
 from avsreplay.sweep.execute import _crashed
@@ -59,7 +59,7 @@ def reference(tmp_path_factory):
 
 
 def sweep(path, output, *more):
-    return CliRunner().invoke(command.command, [str(path), "-o", str(output), *more])
+    return CliRunner().invoke(sweep_command, [str(path), "-o", str(output), *more])
 
 
 def results(output):
@@ -226,14 +226,14 @@ def test_recorded_logs_are_swept_as_well(tmp_path):
 
 
 def test_a_dry_run_only_prints_the_plan(campaign, tmp_path):
-    done = CliRunner().invoke(command.command, [str(campaign), "--plan"])
+    done = CliRunner().invoke(sweep_command, [str(campaign), "--plan"])
     assert done.output.startswith("small: 6 runs, 2 combinations x 3 repeats\n  scanner.noise_m=0.004\n")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["small.toml"]
 
 
 @pytest.mark.slow
 def test_bad_input_is_one_line(campaign, tmp_path, monkeypatch):
-    assert isinstance(CliRunner().invoke(command.command, [str(campaign)]).exception, UsageError)
+    assert isinstance(CliRunner().invoke(sweep_command, [str(campaign)]).exception, UsageError)
     monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "CONNECT_S", 1)
     done = sweep(campaign, tmp_path / "out", "--scheduler", "tcp://127.0.0.1:9")
     assert isinstance(done.exception, UnreadableInput)
@@ -277,14 +277,14 @@ def test_the_worst_run_is_made_again_by_one_command(campaign, reference, tmp_pat
     row = next(row for row in table if row["id"] == worst["id"])
     assert row["seed"] == worst["seed"]
     again = CliRunner().invoke(
-        command.command, [str(campaign), "--run", worst["id"][:10], "-o", str(tmp_path / "again"), "--report"]
+        sweep_command, [str(campaign), "--run", worst["id"][:10], "-o", str(tmp_path / "again"), "--report"]
     )
     assert again.exit_code == 0, again.output
     assert (tmp_path / "again" / "report.html").exists()
     rows = [json.loads(line) for line in (tmp_path / "again" / "rows.jsonl").read_text().splitlines()]
     assert len(rows) == row["scans"]
     assert max(r["pos_err_m"] for r in rows) == pytest.approx(errors[worst["id"]], rel=1e-12)
-    unknown = CliRunner().invoke(command.command, [str(campaign), "--run", "zz", "-o", str(tmp_path / "x")])
+    unknown = CliRunner().invoke(sweep_command, [str(campaign), "--run", "zz", "-o", str(tmp_path / "x")])
     assert isinstance(unknown.exception, UsageError)
 
 

@@ -1,7 +1,7 @@
-"""The command line: one file per command; no other package prints or exits.
+"""The command line; no other package prints or exits.
 
-A command is the object ``command`` in ``avsreplay/cli/<name>.py``; it is imported when it is called, so that
-``avsreplay --help`` is fast.
+A command is the object ``<name>_command`` in ``avsreplay/cli/<name>.py``, or in the module that ``HOMES`` names; it is
+imported when it is called, so that ``avsreplay --help`` is fast.
 """
 
 from __future__ import annotations
@@ -43,6 +43,8 @@ SUMMARIES = {
     "config": "Print the effective settings of a run.",
     "completion": "Print the completion script of a shell.",
 }
+
+HOMES: dict[str, str] = {}  # modules of the commands that share one
 
 EPILOG = """\b
 Examples:
@@ -94,7 +96,8 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:  # noqa: ARG002 (click names it)
         if name not in SUMMARIES:
             return None
-        command: click.Command = importlib.import_module(f"avsreplay.cli.{name}").command
+        home = importlib.import_module(f"avsreplay.cli.{HOMES.get(name, name)}")
+        command: click.Command = getattr(home, f"{name}_command")
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 (click names it)

@@ -30,7 +30,7 @@ differ: libraries that stop by their own rules may take another number of iterat
     "--check", "name", metavar="NAME", help="Check the laws of the contract on this back end; exit 1 if one fails."
 )
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
-def command(name: str | None, as_json: bool) -> None:
+def backends_command(name: str | None, as_json: bool) -> None:
     """List the registration back ends, and how to install those that are missing."""
     if name is None:
         _list(as_json)

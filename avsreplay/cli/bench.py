@@ -79,7 +79,7 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 @click.option("--topic", help="The cloud topic, where there are several.")
 @click.option("--scans", default=50, show_default=True, type=click.IntRange(1), help="How many scans, from the start.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
-def command(log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool) -> None:
+def bench_command(log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool) -> None:
     """Time registration back ends side by side on the scans of LOG, in turn.
 
     The initial guess is the pose of the previous scan: the true pose if the log has it, otherwise the pose that the

@@ -79,7 +79,7 @@ def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> 
     callback=_list_metrics,
     help="List the metrics and exit.",
 )
-def command(
+def compare_command(
     results: tuple[Path, ...],
     gate: Path | None,
     junit: Path | None,

@@ -48,7 +48,7 @@ SECTIONS = (
 @run_settings
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 @click.option("--markdown", is_flag=True, help="Print the reference page of all settings.")
-def command(log: Path | None, as_json: bool, markdown: bool, **flags: Any) -> None:
+def config_command(log: Path | None, as_json: bool, markdown: bool, **flags: Any) -> None:
     """Print the effective settings of a run as a TOML file that 'avsreplay run --config' reads.
 
     With LOG, the log's own [run] table is included. An option takes precedence over an environment variable

@@ -28,7 +28,7 @@ Examples:
 @click.option("--strict", is_flag=True, help="Exit with code 3 if any part is lost.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
 @click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message that is read [MiB].")
-def command(
+def doctor_command(
     source: Path, topic: str | None, output: Path | None, overwrite: bool, strict: bool, as_json: bool,
     max_message_mib: int,
 ) -> None:  # fmt: skip

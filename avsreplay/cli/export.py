@@ -32,7 +32,7 @@ POSE_FORMATS = ("tum", "kitti")
 )
 @click.option("-o", "--output", type=PATH, required=True, help="The file to write.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-def command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) -> None:
+def export_command(result: Path, kind: str, poses: str, output: Path, overwrite: bool) -> None:
     """Write RESULT, a directory made by 'avsreplay run -o', as CSV, Parquet, TUM or KITTI at full precision.
 
     CSV and Parquet hold every column of every scan with units in the headings; TUM and KITTI hold poses of {C} in {A}.

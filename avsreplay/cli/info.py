@@ -34,7 +34,7 @@ Examples:
 @pose_options
 @source_setting("--poses", is_flag=True)
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
-def command(source: Path, as_json: bool, **reading: Any) -> None:
+def info_command(source: Path, as_json: bool, **reading: Any) -> None:
     """Show topics, types, counts, rates, time span, model, scenario and injected faults of SOURCE.
 
     With a model (in the log or --model) it also checks what a run needs: unit of the model, background points, truth,

@@ -42,7 +42,7 @@ Examples:
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
 @source_options
-def command(
+def model_command(
     log: Path,
     output: Path,
     against: Path | None,

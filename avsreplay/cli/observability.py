@@ -46,7 +46,7 @@ each scan. The keys of the JSON document therefore end in _fitted_motion."""
     help="Number of weakly observable directions to describe.",
 )
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
-def command(log: Path, marks: int, weakest: int, as_json: bool, **flags: Any) -> None:
+def observability_command(log: Path, marks: int, weakest: int, as_json: bool, **flags: Any) -> None:
     """Show which states and parameters the measurements of LOG determine."""
     from avsreplay.run import Run
 

@@ -28,7 +28,9 @@ Examples:
 @click.option("--no-deskew", is_flag=True, help="Ignore the instants of the points.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @source_options
-def command(log: Path, output: Path, size: float | None, no_deskew: bool, overwrite: bool, **reading: Any) -> None:
+def odometry_command(
+    log: Path, output: Path, size: float | None, no_deskew: bool, overwrite: bool, **reading: Any
+) -> None:
     """Track an unknown target through the scans of LOG by KISS-ICP, without a model, and write its poses.
 
     The target takes the place of the world; crop what does not move with it. {C} is parallel to the camera frame of the

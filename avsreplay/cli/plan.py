@@ -76,7 +76,7 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
 @click.option("--export", type=click.Path(path_type=Path), help="Write t, r, v, u of the plan as CSV.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing CSV.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
-def command(
+def plan_command(
     result: Path,
     at_s: float | None,
     samples: int,

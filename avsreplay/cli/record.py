@@ -62,7 +62,7 @@ class _Fault(click.ParamType["RecordedFault"]):
 @click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
-def command(
+def record_command(
     source: Path | None,
     output: Path,
     seed: int | None,

@@ -25,7 +25,7 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 @click.option("-o", "--output", type=PATH, help="The page; report.html in RESULT by default.")
 @click.option("--title", help="Title of the page; the name of RESULT by default.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing page.")
-def command(result: Path, output: Path | None, title: str | None, overwrite: bool) -> None:
+def report_command(result: Path, output: Path | None, title: str | None, overwrite: bool) -> None:
     """Build one self-contained HTML page of RESULT, a directory written by 'avsreplay run -o'.
 
     The page needs no network and opens from disk: linked charts over time, a 3D view with a time slider, tables, and

@@ -74,7 +74,7 @@ Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
 @click.option("--plain", is_flag=True, help="Print no curves of error and gamma.")
 @click.option("--rerun", "to_rerun", metavar="FILE.rrd|view|connect", help="Show the run in Rerun (extra 'rerun').")
-def command(log: Path, **flags: Any) -> None:
+def run_command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.
 
     LOG is an MCAP file, a ROS bag or a folder of scans. A log written by 'avsreplay record' needs no option; for any

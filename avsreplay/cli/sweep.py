@@ -57,7 +57,7 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished, but runs failed or da
 )
 @click.option("--report", "page", is_flag=True, help="With --run: add the HTML report to the result directory.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
-def command(
+def sweep_command(
     campaign: Path,
     output: Path | None,
     workers: int,
@@ -138,7 +138,7 @@ def _make_again(plan: Expansion, run_id: str, output: Path, page: bool) -> None:
     """Make one run as ``avsreplay run`` does, with a result directory."""
     import tempfile
 
-    from avsreplay.cli.run import command as run_command
+    from avsreplay.cli.run import run_command
     from avsreplay.sweep.worker import log_of
 
     found = {point.task.id: point.task for point in plan.points() if point.task.id.startswith(run_id)}
