@@ -151,7 +151,7 @@ def call(*args: object) -> None:
 
 def build(folder: Path) -> None:
     """The intact seeds."""
-    from avsreplay.cli import bench
+    from avsreplay.cli import backends
     from avsreplay.cli import run as run_command
 
     bench._peak_mib = lambda *_: None  # no process of its own for each measurement of memory

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from avsreplay.cli.bench import bench_command, benchmark_backends
+from avsreplay.cli.backends import bench_command, benchmark_backends
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Pose, exp
 from avsreplay.register.contract import boxes, example_pose, view
@@ -26,7 +26,7 @@ def _scans(count: int, truth: bool = True) -> list[tuple[np.ndarray, Pose | None
 
 @pytest.mark.parametrize("truth", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_every_scan_but_the_first_is_counted(monkeypatch: pytest.MonkeyPatch, truth: bool) -> None:
-    monkeypatch.setattr("avsreplay.cli.bench._peak_mib", lambda *_: 1.0)
+    monkeypatch.setattr("avsreplay.cli.backends._peak_mib", lambda *_: 1.0)
     tallies = benchmark_backends(["horn", "small_gicp"], boxes(), _scans(4, truth))
     for tally in tallies:
         record = tally.summary()
@@ -38,7 +38,7 @@ def test_every_scan_but_the_first_is_counted(monkeypatch: pytest.MonkeyPatch, tr
 
 
 def test_a_scan_of_nothing_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avsreplay.cli.bench._peak_mib", lambda *_: None)
+    monkeypatch.setattr("avsreplay.cli.backends._peak_mib", lambda *_: None)
     scans = _scans(3)
     away = (scans[-1][0] + 100.0, scans[-1][1])
     (tally,) = benchmark_backends(["horn"], boxes(), [*scans, away])
