@@ -10,7 +10,7 @@ from avsreplay.cli.options import PATH, read_result
 from avsreplay.errors import UnreadableInput
 from avsreplay.files import STDOUT, check_output
 
-EPILOG = """\b
+REPORT_EPILOG = """\b
 Examples:
   avsreplay run tumble.mcap -o results/ --report
   avsreplay report results/ -o report.html
@@ -20,7 +20,7 @@ Examples:
 Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 
 
-@click.command("report", epilog=EPILOG)
+@click.command("report", epilog=REPORT_EPILOG)
 @click.argument("result", type=PATH)
 @click.option("-o", "--output", type=PATH, help="The page; report.html in RESULT by default.")
 @click.option("--title", help="Title of the page; the name of RESULT by default.")

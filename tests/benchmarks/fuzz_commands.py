@@ -154,7 +154,7 @@ def build(folder: Path) -> None:
     from avsreplay.cli import backends
     from avsreplay.cli import run as run_command
 
-    bench._peak_mib = lambda *_: None  # no process of its own for each measurement of memory
+    backends._peak_mib = lambda *_: None  # no process of its own for each measurement of memory
     texts = {"scenario.toml": SCENARIO, "rules.toml": RULES, "robot.toml": ROBOT,
              "campaign.toml": CAMPAIGN.replace("SCENARIO", str(folder / "scenario.toml"))}  # fmt: skip
     for name, text in texts.items():
