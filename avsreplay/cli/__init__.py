@@ -44,7 +44,7 @@ SUMMARIES = {
     "completion": "Print the completion script of a shell.",
 }
 
-HOMES = {"doctor": "info", "bench": "backends", "odometry": "model"}  # modules of the commands that share one
+HOMES = {"doctor": "info", "bench": "backends", "odometry": "model", "report": "export"}  # modules of the commands that share one
 
 EPILOG = """\b
 Examples:

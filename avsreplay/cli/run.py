@@ -271,7 +271,7 @@ def _collect(found: Generator[Row], rows: list[Row], growing: GrowingLog | None 
 
 
 def _page(result: Path) -> None:
-    from avsreplay.cli.report import write_page
+    from avsreplay.cli.export import write_page
 
     click.echo(write_page(result, result / "report.html"), err=True)
 
