@@ -20,7 +20,7 @@ from pathlib import Path
 
 import click
 
-from avsreplay import arithmetic
+from avsreplay import __version__, arithmetic
 from avsreplay.errors import AvsError, UsageError
 
 __all__ = ["entry_point"]
@@ -44,7 +44,8 @@ SUMMARIES = {
     "completion": "Print the completion script of a shell.",
 }
 
-HOMES = {"doctor": "info", "bench": "backends", "odometry": "model", "report": "export"}  # modules of the commands that share one
+# The modules of the commands that share one; completion is in this one.
+HOMES = {"doctor": "info", "bench": "backends", "odometry": "model", "report": "export", "completion": ""}
 
 EPILOG = """\b
 Examples:
@@ -96,7 +97,7 @@ class _Commands(click.Group):
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:  # noqa: ARG002 (click names it)
         if name not in SUMMARIES:
             return None
-        home = importlib.import_module(f"avsreplay.cli.{HOMES.get(name, name)}")
+        home = importlib.import_module(f"avsreplay.cli.{HOMES.get(name, name)}".rstrip("."))
         command: click.Command = getattr(home, f"{name}_command")
         return command
 
@@ -113,11 +114,32 @@ class _Commands(click.Group):
             raise click.UsageError(f"{error.message} Known: {', '.join(SUMMARIES)}.", ctx) from None
 
 
+PARTS = ("numpy", "scipy", "mcap", "rosbags", "kiss-icp", "trimesh", "embreex", "click", "rich")
+
+
+def versions() -> dict[str, str]:
+    """Versions of the package, Python and its dependencies; "missing" where one is not installed."""
+    import platform
+    from importlib import metadata
+
+    found = {"avsreplay": __version__, "python": platform.python_version()}
+    for part in PARTS:
+        try:
+            found[part] = metadata.version(part)
+        except metadata.PackageNotFoundError:
+            found[part] = "missing"
+    return found
+
+
+def version_text() -> str:
+    """Return one line for the package and one for its dependencies."""
+    own, *rest = versions().items()
+    return f"{own[0]} {own[1]}\n" + ", ".join(f"{name} {version}" for name, version in rest)
+
+
 def _print_version(ctx: click.Context, _param: click.Parameter, wanted: bool) -> None:
     if not wanted or ctx.resilient_parsing:
         return
-    from avsreplay.cli.version import version_text
-
     click.echo(version_text())
     ctx.exit()
 
@@ -137,6 +159,30 @@ def group() -> None:
     Input: point clouds of a log. Output: poses and their errors, fault flags, observability, planned capture time.
     The same input gives the same bytes.
     """
+
+
+COMPLETION_EPILOG = """\b
+Examples:
+  eval "$(avsreplay completion bash)"                              in ~/.bashrc
+  eval "$(avsreplay completion zsh)"                               in ~/.zshrc
+  avsreplay completion fish > ~/.config/fish/completions/avsreplay.fish"""
+
+
+@click.command("completion", epilog=COMPLETION_EPILOG)
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion_command(shell: str) -> None:
+    """Print the completion script for SHELL.
+
+    \f
+    Raises:
+        UsageError: the shell is not supported.
+    """  # noqa: D301
+    from click.shell_completion import get_completion_class
+
+    found = get_completion_class(shell)
+    if found is None:
+        raise UsageError(f"no completion for {shell}", where="completion", hint="use bash, zsh or fish")
+    click.echo(found(group, {}, "avsreplay", "_AVSREPLAY_COMPLETE").source())
 
 
 def _check_arithmetic() -> None:

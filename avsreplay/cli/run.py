@@ -230,7 +230,7 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
 
 def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
     """The rows of the interrupted run, whose state the open run continues from."""
-    from avsreplay.cli.version import versions
+    from avsreplay.cli import versions
 
     rows = keeper.resume({**run.facts(), "versions": versions()})
     click.echo(f"avsreplay: continuing after {len(rows)} of {len(run)} scans", err=True)
@@ -277,7 +277,7 @@ def _page(result: Path) -> None:
 
 
 def _record(run: Run, summary: Summary) -> dict[str, Any]:
-    from avsreplay.cli.version import versions
+    from avsreplay.cli import versions
     from avsreplay.report.compare import changed_settings
     from avsreplay.report.result import facts_record
     from avsreplay.settings import dump
