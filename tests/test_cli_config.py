@@ -11,8 +11,7 @@ from click.testing import CliRunner
 
 from avsreplay import settings, toml_document
 from avsreplay.cli import SUMMARIES, group
-from avsreplay.cli.config import SECTIONS, reference_page
-from avsreplay.cli.setting_options import SettingOption, declared
+from avsreplay.cli.config import SECTIONS, SettingOption, declared, reference_page
 from avsreplay.config import RunConfig, load_config
 
 ROOT = Path(__file__).resolve().parents[1]

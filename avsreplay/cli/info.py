@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.config import source_setting
 from avsreplay.cli.options import pose_options, read_options, source_options
-from avsreplay.cli.setting_options import source_setting
 
 if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss, Source

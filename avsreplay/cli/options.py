@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from avsreplay.cli.setting_options import source_setting
+from avsreplay.cli.config import source_setting
 from avsreplay.errors import AvsError, UsageError
 
 if TYPE_CHECKING:

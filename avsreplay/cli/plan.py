@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.config import robot_option, setting_option
 from avsreplay.cli.options import Numbers
-from avsreplay.cli.setting_options import robot_option, setting_option
 
 if TYPE_CHECKING:
     from avsreplay.outcome import Plan

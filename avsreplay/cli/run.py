@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from avsreplay.cli.config import run_settings, take_run_settings
 from avsreplay.cli.options import PATH, StartMode, log_file, pose_options, read_options, source_options
-from avsreplay.cli.setting_options import run_settings, take_run_settings
 from avsreplay.errors import CheckFailed, DataLost, UsageError
 from avsreplay.files import check_output
 
