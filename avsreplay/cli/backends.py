@@ -187,7 +187,7 @@ def benchmark_backends(names: list[str], surface: Surface, scans: list[TrueScan]
 
     Raises UsageError or MissingBackend for a name that cannot be built, before anything is timed.
     """
-    from avsreplay.cli.progress import tracked
+    from avsreplay.cli.options import tracked
 
     tallies, registrars = [], []
     for name in names:

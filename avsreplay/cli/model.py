@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, Numbers, read_options, source_options
-from avsreplay.cli.progress import tracked
+from avsreplay.cli.options import PATH, Numbers, read_options, source_options, tracked
 from avsreplay.errors import MissingBackend, UsageError
 
 if TYPE_CHECKING:

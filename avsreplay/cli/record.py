@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.config import source_setting
-from avsreplay.cli.options import PATH, check_binary_output, read_options, source_options
-from avsreplay.cli.progress import tracked
+from avsreplay.cli.options import PATH, check_binary_output, read_options, source_options, tracked
 from avsreplay.errors import DataLost
 
 if TYPE_CHECKING:

@@ -190,7 +190,7 @@ class _Finished:
 
 def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wanted: Wanted) -> _Finished:
     """Replay the log; ``target`` receives all results. An interrupt ends the replay and keeps what there is."""
-    from avsreplay.cli.progress import tracked
+    from avsreplay.cli.options import tracked
     from avsreplay.report.verdict import verdict_of
     from avsreplay.result_dir import ResultWriter
     from avsreplay.viewers import RerunStream
@@ -253,7 +253,7 @@ def _collect(found: Generator[Row], rows: list[Row], growing: GrowingLog | None 
     An interrupt takes effect between two scans, so that all results hold the same scans; a second one at once. With
     ``live`` a line is printed for each row.
     """
-    from avsreplay.cli.progress import interruptible, say_live
+    from avsreplay.cli.options import interruptible, say_live
 
     try:
         with closing(found), interruptible(rows, growing.stop if growing else lambda: None) as stopped:

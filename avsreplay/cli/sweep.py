@@ -163,7 +163,7 @@ def _waiting(plan: Expansion, journal: Journal) -> Iterator[Task]:
 
 
 def _tracked(items: Iterator[RunResult], total: int) -> Iterator[RunResult]:
-    from avsreplay.cli.progress import tracked
+    from avsreplay.cli.options import tracked
 
     return tracked(items, total, "runs")
 
