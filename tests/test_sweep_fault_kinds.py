@@ -12,9 +12,9 @@ from avsreplay.report.episodes import Episode, Peak
 from avsreplay.simulate import load_scenario
 from avsreplay.simulate.faults import Kind
 from avsreplay.sweep import Journal, expand, load_campaign
+from avsreplay.sweep.execute import RunResult
 from avsreplay.sweep.fault_kinds import EPISODE_COLUMNS, FaultKinds, episode_lines
 from avsreplay.sweep.statistics import Typical, typical
-from avsreplay.sweep.worker import RunResult
 
 CAMPAIGN = Path(__file__).parent.parent / "docs" / "campaigns" / "faults.toml"
 

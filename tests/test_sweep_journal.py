@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.sweep import Journal
-from avsreplay.sweep.worker import SCAN_COLUMNS, RunResult
+from avsreplay.sweep.execute import SCAN_COLUMNS, RunResult
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed")
 SCAN = (0, None, True, 1, 0.5, 0.1, 0.9, None, 20.0, 0.01, 1.0)

@@ -15,9 +15,9 @@ from avsreplay.errors import DataLost, UsageError
 
 if TYPE_CHECKING:
     from avsreplay.sweep import Expansion, Journal
+    from avsreplay.sweep.execute import RunResult
     from avsreplay.sweep.expansion import Task
     from avsreplay.sweep.summary import SweepSummary
-    from avsreplay.sweep.worker import RunResult
 
 EPILOG = """\b
 Examples:
@@ -139,7 +139,7 @@ def _make_again(plan: Expansion, run_id: str, output: Path, page: bool) -> None:
     import tempfile
 
     from avsreplay.cli.run import run_command
-    from avsreplay.sweep.worker import log_of
+    from avsreplay.sweep.execute import log_of
 
     found = {point.task.id: point.task for point in plan.points() if point.task.id.startswith(run_id)}
     if len(found) != 1:

@@ -19,8 +19,8 @@ from typing import Any, BinaryIO, TypeVar
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import output_path
+from avsreplay.sweep.execute import RunResult
 from avsreplay.sweep.parquet import read_scans, write_scans
-from avsreplay.sweep.worker import RunResult
 
 T = TypeVar("T")
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from avsreplay.errors import MissingBackend, UnreadableInput
 from avsreplay.files import output_path
-from avsreplay.sweep.worker import SCAN_COLUMNS
+from avsreplay.sweep.execute import SCAN_COLUMNS
 
 
 def arrow() -> tuple[Any, Any]:

@@ -14,12 +14,12 @@ from typing import Any
 
 from avsreplay import __version__
 from avsreplay.files import output_text
+from avsreplay.sweep.execute import RunResult
 from avsreplay.sweep.expansion import Expansion, Point
 from avsreplay.sweep.journal import Journal
 from avsreplay.sweep.page import build_sweep_page
 from avsreplay.sweep.parquet import arrow, scan_schema, write_batches
 from avsreplay.sweep.summary import CampaignFold, DetectorFold, SweepSummary
-from avsreplay.sweep.worker import RunResult
 
 BATCH = 5_000  # runs held in memory while results.parquet is written
 SCAN_BATCH = 200_000  # scans held in memory while scans.parquet is written

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 from avsreplay import settings
 from avsreplay.sweep.campaign import SuccessCriterion
+from avsreplay.sweep.execute import SCAN_COLUMNS, RunResult
 from avsreplay.sweep.expansion import Expansion, Point
 from avsreplay.sweep.fault_kinds import FaultKind, FaultKinds
 from avsreplay.sweep.statistics import (
@@ -23,7 +24,6 @@ from avsreplay.sweep.statistics import (
     quantiles,
     rate,
 )
-from avsreplay.sweep.worker import SCAN_COLUMNS, RunResult
 
 HEADLINES = {
     "pose_healthy.position_m.rmse": "position error, healthy scans [m]",

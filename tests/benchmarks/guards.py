@@ -68,7 +68,7 @@ GUARDS: tuple[tuple[str, str, str, str], ...] = (
      "test_sweep_journal.py::test_one_changed_byte_costs_at_most_the_two_runs_that_it_touches"),
     ("sweep/journal.py", "        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)", "        pass",
      "test_sweep_journal.py::test_two_campaigns_cannot_use_one_directory"),
-    ("sweep/worker.py", 'return RunResult(task.id, "lossy", what, *found)',
+    ("sweep/execute.py", 'return RunResult(task.id, "lossy", what, *found)',
      'return RunResult(task.id, "ok", None, *found)',
      "test_sweep_run.py::test_a_cut_log_is_lossy_and_exit_4_as_in_run"),
     ("cli/sweep.py", 'default="127.0.0.1:0"', 'default="0.0.0.0:0"',

@@ -25,8 +25,7 @@ from pathlib import Path
 from sweep_speed import CAMPAIGN
 
 from avsreplay.sweep import Journal, expand, load_campaign
-from avsreplay.sweep.execute import IN_FLIGHT
-from avsreplay.sweep.worker import RunResult, run_task
+from avsreplay.sweep.execute import IN_FLIGHT, RunResult, run_task
 
 SCANS = 600
 

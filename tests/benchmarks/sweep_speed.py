@@ -15,7 +15,7 @@ import time
 from pathlib import Path
 
 from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
-from avsreplay.sweep.worker import RunResult, run_task
+from avsreplay.sweep.execute import RunResult, run_task
 
 CAMPAIGN = """
 name = "speed"
