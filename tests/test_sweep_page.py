@@ -7,9 +7,8 @@ from html.parser import HTMLParser
 import pytest
 
 from avsreplay.report.episodes import Peak
-from avsreplay.sweep.fault_kinds import FaultKind
 from avsreplay.sweep.page import build_sweep_page, words
-from avsreplay.sweep.statistics import ScoreHistogram, consistency, quantiles, rate, typical
+from avsreplay.sweep.statistics import FaultKind, ScoreHistogram, consistency, quantiles, rate, typical
 from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary
 
 VOID = {"meta", "link"}

@@ -27,7 +27,7 @@ from avsreplay.rows import Row
 from avsreplay.run import Job, ReplayedScan, Run
 from avsreplay.simulate import scenario_of
 from avsreplay.sweep.expansion import Task
-from avsreplay.sweep.fault_kinds import episode_lines
+from avsreplay.sweep.statistics import episode_lines
 
 _SCORES = ("rms_m", "alpha_m", "inlier_ratio", "nis", "nees", "pos_err_m", "rot_err_deg")
 SCAN_COLUMNS = ("seq", "fault", "harmful", "gamma", *_SCORES)

@@ -11,8 +11,7 @@ from markupsafe import Markup
 from avsreplay.report.episodes import Peak
 from avsreplay.report.page import Part, Section, build_html, render
 from avsreplay.report.table import Table
-from avsreplay.sweep.fault_kinds import NONE, FaultKind
-from avsreplay.sweep.statistics import Quantiles, Rate, Roc, Typical
+from avsreplay.sweep.statistics import NONE, FaultKind, Quantiles, Rate, Roc, Typical
 from avsreplay.sweep.summary import HEADLINES, Cell, Detector, SweepSummary, WorstRun
 
 # Okabe and Ito's colours, distinguishable without colour vision, each with a dash pattern of its own

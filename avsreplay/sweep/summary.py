@@ -13,8 +13,9 @@ from avsreplay import settings
 from avsreplay.sweep.campaign import SuccessCriterion
 from avsreplay.sweep.execute import SCAN_COLUMNS, RunResult
 from avsreplay.sweep.expansion import Expansion, Point
-from avsreplay.sweep.fault_kinds import FaultKind, FaultKinds
 from avsreplay.sweep.statistics import (
+    FaultKind,
+    FaultKinds,
     Quantiles,
     Rate,
     Roc,
