@@ -1,4 +1,4 @@
-"""Statistics over runs against closed forms, and figures by kind of fault."""
+"""Statistics over runs against exact distributions and independent formulas; faults by kind against sums made by hand."""
 
 from __future__ import annotations
 

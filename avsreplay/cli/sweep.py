@@ -84,7 +84,7 @@ def sweep_command(
         DataLost: a run failed, crashed or lost data.
     """  # noqa: D301
     from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
-    from avsreplay.sweep.parquet import arrow
+    from avsreplay.sweep.journal import arrow
 
     plan = expand(load_campaign(campaign))
     if only_plan:

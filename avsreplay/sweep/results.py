@@ -16,9 +16,8 @@ from avsreplay import __version__
 from avsreplay.files import output_text
 from avsreplay.sweep.execute import RunResult
 from avsreplay.sweep.expansion import Expansion, Point
-from avsreplay.sweep.journal import Journal
+from avsreplay.sweep.journal import Journal, arrow, scan_schema, write_batches
 from avsreplay.sweep.page import build_sweep_page
-from avsreplay.sweep.parquet import arrow, scan_schema, write_batches
 from avsreplay.sweep.summary import CampaignFold, DetectorFold, SweepSummary
 
 BATCH = 5_000  # runs held in memory while results.parquet is written
