@@ -316,8 +316,8 @@ def test_results_hold_a_few_runs_in_memory(campaign, reference, tmp_path, monkey
     """Batches of 2 runs and of 1 scan give the same values."""
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr(sys.modules["avsreplay.sweep.results"], "BATCH", 2)
-    monkeypatch.setattr(sys.modules["avsreplay.sweep.results"], "SCAN_BATCH", 1)
+    monkeypatch.setattr(sys.modules["avsreplay.sweep"], "BATCH", 2)
+    monkeypatch.setattr(sys.modules["avsreplay.sweep"], "SCAN_BATCH", 1)
     assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
     for name in ("results.parquet", "scans.parquet"):
         (tmp_path / name).write_bytes(reference[name])

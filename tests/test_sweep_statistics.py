@@ -1,4 +1,4 @@
-"""Statistics over runs against exact distributions and independent formulas; faults by kind against sums made by hand."""
+"""Statistics over runs, against exact distributions and independent formulas; faults by kind, against sums by hand."""
 
 from __future__ import annotations
 
