@@ -168,9 +168,9 @@ def test_a_log_recorded_again_keeps_scans_truth_labels_and_model(tmp_path):
 
 
 def test_without_embreex_the_log_is_recorded_and_a_note_is_printed(scenario, tmp_path, monkeypatch):
-    from avsreplay.simulate import ray_casting
+    from avsreplay.simulate import rays
 
-    monkeypatch.setattr(ray_casting.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(rays.importlib.util, "find_spec", lambda name: None)
     done = CliRunner().invoke(command.command, [str(scenario), "-o", str(tmp_path / "a.mcap")])
     assert "note: embreex is not installed" in done.output
     assert len(read(tmp_path / "a.mcap")[1]) == 6

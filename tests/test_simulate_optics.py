@@ -18,7 +18,7 @@ from avsreplay.simulate import builtin_surface, scenario_of, simulate
 from avsreplay.simulate.inertia import principal
 from avsreplay.simulate.motion import Motion, MotionParams
 from avsreplay.simulate.optics import Material, beam, crosstalk, face_optics, merged
-from avsreplay.simulate.pattern import Pattern
+from avsreplay.simulate.rays import Pattern
 from avsreplay.simulate.scanner import Preset, Scanner, ScannerParams
 
 BODY = principal(np.diag([1.0, 1.1, 1.2]), np.zeros(3))

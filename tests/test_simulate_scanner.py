@@ -11,15 +11,14 @@ from scipy import stats
 from avsreplay import geometry
 from avsreplay.errors import MissingBackend
 from avsreplay.records import Surface
-from avsreplay.simulate import Shape, builtin_surface, ray_casting
+from avsreplay.simulate import Shape, builtin_surface, rays
 from avsreplay.simulate.motion import Motion, MotionParams
-from avsreplay.simulate.pattern import FieldOfView, Pattern
-from avsreplay.simulate.ray_casting import Engine, RayCaster
+from avsreplay.simulate.rays import Engine, FieldOfView, Pattern, RayCaster
 from avsreplay.simulate.scanner import Scanner, ScannerParams
 from avsreplay.simulate.target import TargetParams, body
 
 needs_embree = pytest.mark.skipif(
-    not ray_casting.importlib.util.find_spec("embreex"), reason="embreex is not installed"
+    not rays.importlib.util.find_spec("embreex"), reason="embreex is not installed"
 )
 SURFACE = builtin_surface()
 MESH = trimesh.Trimesh(SURFACE.vertices, SURFACE.faces, process=False)
@@ -98,7 +97,7 @@ def test_a_triangle_without_area_is_never_hit():
 
 @needs_embree
 def test_without_embree_the_exact_engine_takes_over(monkeypatch):
-    monkeypatch.setattr(ray_casting.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(rays.importlib.util, "find_spec", lambda name: None)
     assert RayCaster(SURFACE).engine is Engine.EXACT
     with pytest.raises(MissingBackend, match=r"embreex is not installed.*exact"):
         RayCaster(SURFACE, Engine.EMBREE)

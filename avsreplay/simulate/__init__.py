@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from avsreplay.simulate.ray_casting import Engine
+from avsreplay.simulate.rays import Engine
 from avsreplay.simulate.recorded_faults import RecordedFault, disturbed
 from avsreplay.simulate.scenario import Scenario, load_scenario, scenario_of
 from avsreplay.simulate.simulation import EPOCH_NS, Simulation, simulate

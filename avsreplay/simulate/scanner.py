@@ -31,8 +31,7 @@ from avsreplay.simulate.optics import (
     part_of,
     separated,
 )
-from avsreplay.simulate.pattern import FieldOfView, Pattern, ray_grid
-from avsreplay.simulate.ray_casting import Engine, RayCaster
+from avsreplay.simulate.rays import Engine, FieldOfView, Pattern, RayCaster, ray_grid
 from avsreplay.simulate.scene import Appendage, MovingCamera, SceneBody, appendage_faces
 
 

@@ -20,7 +20,7 @@ from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Label, Surface
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.optics import REFLECTANCE, FaceOptics, Material, face_optics
-from avsreplay.simulate.ray_casting import Engine, RayCaster
+from avsreplay.simulate.rays import Engine, RayCaster
 from avsreplay.simulate.target import box
 
 NS = 1_000_000_000

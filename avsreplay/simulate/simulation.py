@@ -16,8 +16,7 @@ from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.simulate import faults
 from avsreplay.simulate.faults import InjectedFault, Kind
 from avsreplay.simulate.motion import Motion
-from avsreplay.simulate.pattern import Pattern
-from avsreplay.simulate.ray_casting import Engine
+from avsreplay.simulate.rays import Engine, Pattern
 from avsreplay.simulate.scanner import Returns, Scanner
 from avsreplay.simulate.scenario import Scenario, belief
 from avsreplay.simulate.scene import MovingCamera, SceneBody, scene_bodies
