@@ -17,9 +17,7 @@ from avsreplay.simulate.rays import Engine, FieldOfView, Pattern, RayCaster
 from avsreplay.simulate.scanner import Scanner, ScannerParams
 from avsreplay.simulate.target import TargetParams, body
 
-needs_embree = pytest.mark.skipif(
-    not rays.importlib.util.find_spec("embreex"), reason="embreex is not installed"
-)
+needs_embree = pytest.mark.skipif(not rays.importlib.util.find_spec("embreex"), reason="embreex is not installed")
 SURFACE = builtin_surface()
 MESH = trimesh.Trimesh(SURFACE.vertices, SURFACE.faces, process=False)
 CLEAN = ScannerParams(rays=(40, 40), noise_m=0.0, outlier_ratio=0.0)

@@ -1,12 +1,27 @@
-"""Simulated scans with truth: target, motion, scanner, faults, scenario."""
+"""Simulated scans with truth: target, motion, scanner, faults, scenario. The same seed gives the same bits.
+
+Every scan has its own random streams, one per purpose, so that a fault added to a scenario does not change other scans.
+"""
 
 from __future__ import annotations
 
-from avsreplay.simulate.rays import Engine
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from avsreplay.geometry import Pose
+from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface, Truth
+from avsreplay.simulate import faults
+from avsreplay.simulate.faults import InjectedFault, Kind
+from avsreplay.simulate.motion import Motion
+from avsreplay.simulate.rays import Engine, Pattern
 from avsreplay.simulate.recorded_faults import RecordedFault, disturbed
-from avsreplay.simulate.scenario import Scenario, load_scenario, scenario_of
-from avsreplay.simulate.simulation import EPOCH_NS, Simulation, simulate
-from avsreplay.simulate.target import Shape, builtin_surface
+from avsreplay.simulate.scanner import Returns, Scanner
+from avsreplay.simulate.scenario import Scenario, belief, load_scenario, scenario_of
+from avsreplay.simulate.scene import MovingCamera, SceneBody, scene_bodies
+from avsreplay.simulate.target import Shape, body, builtin_surface
 
 __all__ = [
     "EPOCH_NS",
@@ -21,3 +36,172 @@ __all__ = [
     "scenario_of",
     "simulate",
 ]
+
+
+EPOCH_NS = (
+    1_700_000_000_000_000_000  # time of the first scan of every simulated log, fixed so that logs are reproducible
+)
+NS = 1_000_000_000
+_STREAMS = {"motion": 0, "start": 1, "noise": 2, "fault": 3, "plate": 4, "camera": 5, "camera_pose": 6}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation:
+    """A simulated log.
+
+    Attributes:
+        header: Header of the log.
+        count: Number of scans, dropped ones included.
+    """
+
+    header: LogHeader
+    count: int
+    _scenario: Scenario = field(repr=False)
+    _motion: Motion = field(repr=False)
+    _scanner: Scanner = field(repr=False)
+    _bodies: Sequence[SceneBody] = field(repr=False, default=())
+    _camera: MovingCamera | None = field(repr=False, default=None)
+
+    @property
+    def engine(self) -> Engine:
+        """The engine that casts the rays."""
+        return self._scanner.engine
+
+    def truth(self, log_ns: int) -> State:
+        """Return the true state.
+
+        Args:
+            log_ns: Instant on the clock of the log [ns].
+        """
+        return self._motion.state((log_ns - EPOCH_NS) / NS)
+
+    def truth_of(self, scan: Scan) -> Truth:
+        """Return the ground truth at one of this simulation's scans: pose, full state and injected fault.
+
+        Args:
+            scan: A scan of ``scans``.
+        """
+        state = self.truth(scan.log_ns)
+        kinds = [kind.value for kind in self._faults(scan.log_ns)]
+        kinds += [body.params.name for body in self._present(scan.log_ns) if body.params.duration_s is not None]
+        return Truth(state.T_ac, state, next(iter(kinds), None))
+
+    def camera_pose(self, scan: Scan) -> Pose | None:
+        """Return the pose of the camera in the fixed frame as its topic reports it; None for a camera at rest.
+
+        Args:
+            scan: A scan of ``scans``.
+        """
+        if self._camera is None:
+            return None
+        return self._camera.reported((scan.log_ns - EPOCH_NS) / NS, self._rng("camera_pose", scan.seq))
+
+    def _present(self, log_ns: int) -> list[SceneBody]:
+        return [body for body in self._bodies if body.params.present((log_ns - EPOCH_NS) / NS)]
+
+    def _faults(self, log_ns: int) -> dict[Kind, InjectedFault]:
+        return faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
+
+    def scans(self) -> Iterator[Scan]:
+        """The scans in the order of recording; a dropped one leaves a gap in ``seq``."""
+        last: Scan | None = None
+        for k in range(self.count):
+            scan = self._scan(k, last)
+            if scan is not None:
+                if next(iter(self._faults(scan.log_ns)), None) is not Kind.FROZEN:
+                    last = scan
+                yield scan
+
+    def _scan(self, k: int, last: Scan | None) -> Scan | None:
+        log_ns = EPOCH_NS + round(k * NS / self._scenario.params.rate_hz)
+        now = self._faults(log_ns)
+        if Kind.DROPPED in now:
+            return None
+        body_now = self.truth(log_ns)
+        returns = self._returns(k, log_ns, now, body_now)
+        timed = self._scenario.params.scanner.pattern is not Pattern.FLASH
+        jump = faults.strength(now[Kind.STAMP_JUMP]) if Kind.STAMP_JUMP in now else 0.0
+        scan = Scan(
+            seq=k,
+            t_ns=log_ns + round(jump * NS),
+            log_ns=log_ns,
+            points=returns.points,
+            times_s=returns.times_s.astype(np.float32) if timed else None,
+            status=ScanStatus.OK if len(returns.ranges) else ScanStatus.EMPTY,
+            intensities=returns.intensities.astype(np.float32) if self._scenario.params.scanner.intensity else None,
+        )
+        if Kind.FROZEN in now and last is not None:
+            scan = replace(
+                scan,
+                points=last.points,
+                times_s=last.times_s,
+                intensities=last.intensities,
+                status=last.status,
+            )
+        return scan
+
+    def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault], state: State) -> Returns:
+        """Ray casting, occlusion, noise, bias, clutter: in the order in which they act on the light."""
+        noise, wrong = self._rng("noise", k), self._rng("fault", k)
+        returns = self._scanner.cast((log_ns - EPOCH_NS) / NS, self._present(log_ns))
+        for kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
+            if kind in now:
+                returns = faults.occlude(returns, faults.strength(now[kind]), self._side(now[kind]), wrong)
+        factor = faults.strength(now[Kind.NOISE_BURST]) if Kind.NOISE_BURST in now else 1.0
+        returns = self._scanner.disturb(returns, noise, factor)
+        if Kind.RANGE_BIAS in now:
+            returns = replace(returns, ranges=returns.ranges + faults.strength(now[Kind.RANGE_BIAS]))
+        if Kind.CLUTTER in now:
+            ratio, centre = faults.strength(now[Kind.CLUTTER]), state.T_ac.apply(self._scanner.centre_c)
+            if self._camera is not None:
+                centre = self._camera.pose((log_ns - EPOCH_NS) / NS).inverse().apply(centre)
+            returns = faults.clutter(returns, ratio, centre, self._scanner.radius_m, wrong)
+        return returns.keep(np.zeros(len(returns.ranges), dtype=bool)) if Kind.EMPTY in now else returns.in_order()
+
+    def _side(self, fault: InjectedFault) -> float:
+        """Direction in the image from which the plate of a fault enters, the same for all its scans [rad]."""
+        return float(self._rng("plate", self._scenario.params.fault.index(fault)).uniform(0.0, 2.0 * math.pi))
+
+    def _rng(self, stream: str, k: int) -> np.random.Generator:
+        return _generator(self._scenario.params.seed, stream, k)
+
+
+def simulate(scenario: Scenario, surface: Surface, meshes: Mapping[str, Surface] | None = None) -> Simulation:
+    """The simulation of a scenario.
+
+    Args:
+        scenario: The scenario.
+        surface: The model in {C}.
+        meshes: Surface of every mesh that an object of the scenario names.
+
+    Raises:
+        UsageError: The model has no mass properties.
+        MissingBackend: The ray engine is not installed.
+    """
+    params = scenario.params
+    span_s = params.duration_s + params.scanner.scan_s
+    motion = Motion(body(params.target, surface), params.motion, span_s, _generator(params.seed, "motion", 0))
+    phases = _generator(params.seed, "camera", 0).uniform(0.0, 2.0 * math.pi, 6)
+    camera = None if params.camera is None else MovingCamera(params.camera, phases)
+    scanner = Scanner(params.scanner, surface, motion, params.material, params.appendage, camera)
+    first = motion.state(0.0)
+    start = None
+    if params.start is not None:
+        start = belief(params.start, first, EPOCH_NS, _generator(params.seed, "start", 0))
+    others = [each.label(EPOCH_NS) for each in params.object]
+    header = LogHeader(
+        surface=surface,
+        scenario=scenario.text,
+        seed=params.seed,
+        labels=(*(faults.label(f, EPOCH_NS) for f in params.fault), *(label for label in others if label)),
+        start=start,
+        truth=first,
+        notes={"source": "simulated", "name": params.name, "ray_engine": scanner.engine.value},
+    )
+    count = int(params.duration_s * params.rate_hz + 1e-9)
+    bodies = scene_bodies(params.object, dict(meshes or {}), params.scanner.engine)
+    return Simulation(header, count, scenario, motion, scanner, bodies, camera)
+
+
+def _generator(seed: int, stream: str, k: int) -> np.random.Generator:
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(_STREAMS[stream], k))))
