@@ -17,7 +17,7 @@ from numpy.testing import assert_allclose
 from true_scans import true_scans
 
 from avsreplay import record as recording
-from avsreplay.cli import record as command
+from avsreplay.cli.record import record_command
 from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.record import RecordOptions, record, surface_for
@@ -112,14 +112,14 @@ def test_the_builtin_scenario_needs_no_argument(monkeypatch, tmp_path):
     short = replace(short, params=replace(short.params, duration_s=2.0, fault=()))
     monkeypatch.setattr(recording, "load_scenario", lambda *_: short)
     monkeypatch.chdir(tmp_path)
-    done = CliRunner().invoke(command.command, ["-o", "tumble.mcap"])
+    done = CliRunner().invoke(record_command, ["-o", "tumble.mcap"])
     assert done.exit_code == 0
     assert done.output.startswith("tumble.mcap: 10 scans, 1.8 s, ")
     assert "model: satellite.ply, seed 1" in done.output
 
 
 def test_json_states_the_same(scenario, tmp_path):
-    done = CliRunner().invoke(command.command, [str(scenario), "-o", str(tmp_path / "a.mcap"), "--seed", "9", "--json"])
+    done = CliRunner().invoke(record_command, [str(scenario), "-o", str(tmp_path / "a.mcap"), "--seed", "9", "--json"])
     said = json.loads(done.output)
     assert (said["scans"], said["span_s"], said["seed"], said["bytes"]) == (
         6,
@@ -171,7 +171,7 @@ def test_without_embreex_the_log_is_recorded_and_a_note_is_printed(scenario, tmp
     from avsreplay.simulate import rays
 
     monkeypatch.setattr(rays.importlib.util, "find_spec", lambda name: None)
-    done = CliRunner().invoke(command.command, [str(scenario), "-o", str(tmp_path / "a.mcap")])
+    done = CliRunner().invoke(record_command, [str(scenario), "-o", str(tmp_path / "a.mcap")])
     assert "note: embreex is not installed" in done.output
     assert len(read(tmp_path / "a.mcap")[1]) == 6
 
@@ -264,7 +264,7 @@ def test_damage_in_the_source_is_reported_with_exit_4(tmp_path):
     data[len(data) // 2] ^= 0xFF
     damaged = tmp_path / "damaged.mcap"
     damaged.write_bytes(bytes(data))
-    done = CliRunner().invoke(command.command, [str(damaged), "-o", str(tmp_path / "out.mcap")])
+    done = CliRunner().invoke(record_command, [str(damaged), "-o", str(tmp_path / "out.mcap")])
     assert isinstance(done.exception, DataLost)
     assert done.exception.exit_code == 4
     assert "scans" in done.output
