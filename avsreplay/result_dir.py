@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.binary_files import read_npz
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import check_output, output_folder
 from avsreplay.geometry import Array, Pose
-from avsreplay.numpy_archive import read_npz
 from avsreplay.records import Belief, State, Surface
 from avsreplay.register import Registrar
 from avsreplay.report.export import row_poses, write_layout, write_tum

@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from avsreplay import arithmetic, pipeline, settings
+from avsreplay.binary_files import pack_state, unpack
 from avsreplay.build import first_state, stages
-from avsreplay.checkpoint import pack_state, unpack
 from avsreplay.config import Against, RunConfig, load_config, pose_text, with_acceleration
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration

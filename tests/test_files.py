@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 from avsreplay import files
+from avsreplay.binary_files import read_npz
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import check_output, output_folder, output_path, output_text
-from avsreplay.numpy_archive import read_npz
 from avsreplay.report.jsonl import parse_json
 
 posix = pytest.mark.skipif(os.name != "posix", reason="file nodes of POSIX")

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from avsreplay.binary_files import read_npz
 from avsreplay.errors import UnreadableInput
 from avsreplay.files import output_path
 from avsreplay.geometry import Array, Pose
-from avsreplay.numpy_archive import read_npz
 from avsreplay.records import Surface
 from avsreplay.report.charts import pack, values
 from avsreplay.rows import Row

@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from avsreplay.checkpoint import pack_state, unpack
+from avsreplay.binary_files import pack_state, unpack
 from avsreplay.cli.run import _collect
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
