@@ -18,7 +18,7 @@ from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, 
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.reference import Reference
 from avsreplay.log import GrowingLog, Source, SourceOptions, open_source
-from avsreplay.log.cloud_stream import ahead
+from avsreplay.log.streams import ahead
 from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, Stages
 from avsreplay.plan import Motion

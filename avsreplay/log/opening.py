@@ -12,9 +12,7 @@ import numpy as np
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage, shown
-from avsreplay.log.cloud_stream import FolderClouds, MessageClouds, PoseFile, PoseMessages
 from avsreplay.log.db3_file import SQLITE_MAGIC, Db3File
-from avsreplay.log.ground_truth import GroundTruth, TruthCollector, file_truth
 from avsreplay.log.header import HEADER_RECORD, decode_header
 from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
@@ -24,6 +22,15 @@ from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_tim
 from avsreplay.log.ros1_bag import ROS1_MAGIC, Ros1Bag
 from avsreplay.log.scan_files import by_number, scan_files
 from avsreplay.log.source import Source, refuse_losses
+from avsreplay.log.streams import (
+    FolderClouds,
+    GroundTruth,
+    MessageClouds,
+    PoseFile,
+    PoseMessages,
+    TruthCollector,
+    file_truth,
+)
 from avsreplay.log.surface import octahedron, parse_surface, read_surface, scaled
 from avsreplay.log.writer import TRUTH_TOPIC
 from avsreplay.records import LogHeader, Surface

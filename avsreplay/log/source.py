@@ -17,10 +17,9 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.clock import Placed, place
-from avsreplay.log.cloud_stream import CloudStream, ahead
-from avsreplay.log.ground_truth import GroundTruth
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import Cloud
+from avsreplay.log.streams import CloudStream, GroundTruth, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
 
 _BLOCK = 1 << 20
