@@ -17,9 +17,9 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import BadFile
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source, parse_surface, read_surface
+from avsreplay.log.header import surface_bytes
 from avsreplay.log.ply import read_ply
 from avsreplay.log.scan_files import read_pcd, unpack_lzf
-from avsreplay.log.surface import surface_bytes
 from avsreplay.records import Scan, ScanStatus
 
 SECOND = 1_000_000_000

@@ -10,8 +10,8 @@ import pytest
 
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
+from avsreplay.log.header import parse_surface, scaled, surface_bytes
 from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
-from avsreplay.log.surface import parse_surface, scaled, surface_bytes
 from avsreplay.preflight import diameter, preflight
 from avsreplay.records import Scan, ScanStatus
 from avsreplay.register.contract import boxes

@@ -64,7 +64,7 @@ def model_command(
 
     from avsreplay.files import check_output, output_path
     from avsreplay.log import open_source, read_surface
-    from avsreplay.log.surface import surface_bytes
+    from avsreplay.log.header import surface_bytes
     from avsreplay.reconstruct import at_grasp, deviations, meshed, reconstruct, reconstruction_ply
 
     for each in (output, mesh):

@@ -18,28 +18,18 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log.bytes_io import shown
+from avsreplay.log.header import parse_surface, read_surface
 from avsreplay.log.mcap_format import DATA_END, MAGIC
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions, TopicInfo
 from avsreplay.log.source import Source
-from avsreplay.log.surface import parse_surface, read_surface
 from avsreplay.log.writer import LogWriter
 from avsreplay.records import Scan, Truth
 
 __all__ = [
-    "ClockChoice",
-    "ClockSummary",
-    "GrowingLog",
-    "LogInfo",
-    "LogWriter",
-    "Loss",
-    "Source",
-    "SourceOptions",
-    "TopicInfo",
-    "open_source",
-    "parse_surface",
-    "read_surface",
-]
+    "ClockChoice", "ClockSummary", "GrowingLog", "LogInfo", "LogWriter", "Loss", "Source", "SourceOptions",
+    "TopicInfo", "open_source", "parse_surface", "read_surface",
+]  # fmt: skip
 
 
 _POLL_S = 0.05

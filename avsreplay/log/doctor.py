@@ -16,7 +16,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import check_output, output_path
 from avsreplay.geometry import Array
 from avsreplay.log.bytes_io import BadMessage, shown
-from avsreplay.log.header import HEADER_RECORD, decode_header
+from avsreplay.log.header import HEADER_RECORD, MODEL_ENDINGS, decode_header, parse_surface
 from avsreplay.log.index import CLOUD_TYPES, MAX_NS
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import Channel, is_mcap
@@ -24,7 +24,6 @@ from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import decode_cloud, read_layout
 from avsreplay.log.source import Source
-from avsreplay.log.surface import MODEL_ENDINGS, parse_surface
 from avsreplay.log.writer import LIBRARY
 from avsreplay.records import Scan, ScanStatus
 

@@ -1,19 +1,37 @@
-"""The header of a log: scenario, seed, fault labels and start state in one MCAP metadata record of JSON values.
+"""The header of a log and the model of the target that it names.
 
-Floats are written in their shortest exact form, so that a header read back equals the one written, bit for bit. MCAP
-has no checksum for metadata records; this record contains one over its own values.
+The header (scenario, seed, fault labels, start state) is one MCAP metadata record of JSON values. Floats are written in
+their shortest exact form, so that a header read back equals the one written, bit for bit. MCAP has no checksum for
+metadata records; this record contains one over its own values.
+
+The model is an attachment or a file of its own: PLY and PCD are read with the readers of this package, STL, OBJ, OFF
+and GLB with trimesh.
 """
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
+import logging
+import struct
 import zlib
 from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from avsreplay.records import Belief, Label, LogHeader, State
+from avsreplay.errors import UnreadableInput
+from avsreplay.files import BadFile
+from avsreplay.geometry import Array, frozen
+from avsreplay.log.bytes_io import shown
+from avsreplay.log.ply import read_ply
+from avsreplay.log.point_cloud2 import MAX_COORDINATE_M
+from avsreplay.log.scan_files import read_pcd
+from avsreplay.records import Belief, Label, LogHeader, State, Surface
 
 HEADER_RECORD = "avsreplay"
 FORMAT = "1"
@@ -118,3 +136,189 @@ def _to_belief(values: Any) -> Belief | None:
     if state is None:
         raise ValueError("a first belief without a state")
     return Belief(int(values["t_ns"]), state, np.array(values["P"], dtype=np.float64))
+
+
+MAX_BYTES = 512 << 20
+_SILENT = logging.NullHandler()
+_FORMATS = ("ply", "stl", "obj", "off", "glb", "pcd")
+MODEL_ENDINGS = tuple(f".{name}" for name in _FORMATS)
+# Exceptions that trimesh raises for malformed files.
+_FOREIGN = (
+    ArithmeticError, AssertionError, AttributeError, BufferError, EOFError, ImportError, LookupError, MemoryError,
+    NameError, NotImplementedError, OSError, RuntimeError, TypeError, ValueError, struct.error, zlib.error,
+)  # fmt: skip
+
+
+def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
+    """Read a model file.
+
+    Args:
+        path: PLY, STL, OBJ, OFF, GLB or (points alone) PCD file; lengths in metres, frame {C} of the model.
+        cloud_ok: accept a file without faces as a point-cloud model.
+
+    Returns:
+        The model with the bytes and the SHA-256 of its file.
+
+    Raises:
+        UnreadableInput: the file does not exist, is not a model, has vertices that are not finite, or has no faces
+            although they are needed.
+    """
+    path = Path(path)
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise UnreadableInput("larger than 512 MiB", where=shown(path), hint="decimate the model")
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise UnreadableInput("no such file", where=shown(path), hint="check the path of the model") from None
+    except OSError as error:
+        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+    return _parsed(data, path.name, shown(path), cloud_ok)
+
+
+def parse_surface(data: bytes, name: str, cloud_ok: bool = True) -> Surface:
+    """Parse the bytes of a model file.
+
+    Args:
+        data: the bytes of the file.
+        name: its name; the extension selects the format.
+        cloud_ok: accept a file without faces as a point-cloud model.
+
+    Returns:
+        The model.
+
+    Raises:
+        UnreadableInput: as for ``read_surface``.
+    """
+    return _parsed(data, PurePath(name).name, shown(name), cloud_ok)
+
+
+def scaled(surface: Surface, scale: float) -> Surface:
+    """Return the model with its coordinates multiplied by ``scale``; its bytes and SHA-256 are those of the result."""
+    if scale == 1.0:
+        return surface
+    bare = Surface(frozen(scale * surface.vertices, -1, 3), surface.faces, surface.name, "")
+    data = surface_bytes(bare)
+    return replace(bare, data=data, sha256=hashlib.sha256(data).hexdigest())
+
+
+def surface_bytes(surface: Surface) -> bytes:
+    """Return the bytes of the model's file; if it was not read from one, a binary PLY with float64 vertices."""
+    if surface.data:
+        return surface.data
+    header = (
+        f"ply\nformat binary_little_endian 1.0\nelement vertex {len(surface.vertices)}\n"
+        "property double x\nproperty double y\nproperty double z\n"
+        f"element face {len(surface.faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(surface.faces), dtype=[("n", "u1"), ("v", "<i4", (3,))])
+    faces["n"], faces["v"] = 3, surface.faces
+    return header.encode() + surface.vertices.astype("<f8").tobytes() + faces.tobytes()
+
+
+def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
+    suffix = PurePath(name).suffix.lower().lstrip(".")
+    if not data:
+        raise UnreadableInput("the model file is empty", where=where, hint="name a mesh file")
+    if data.startswith(b"ply"):
+        suffix = "ply"
+    if suffix not in _FORMATS:
+        hint = f"give a model as {', '.join(_FORMATS).upper()}"
+        raise UnreadableInput(f"'{shown(suffix)}' is not a known model format", where=where, hint=hint)
+    try:
+        vertices, faces = _OWN_READERS[suffix](data) if suffix in _OWN_READERS else _trimesh(data, suffix)
+    except _FOREIGN as error:
+        reason = shown(str(error) or type(error).__name__)[:120]
+        raise UnreadableInput(
+            f"not a readable {suffix.upper()}: {reason}", where=where, hint="check the file"
+        ) from None
+    _check(vertices, faces, where, cloud_ok)
+    vertices = frozen(vertices, -1, 3)
+    faces = _with_area(vertices, faces)
+    if not cloud_ok and not len(faces):
+        raise UnreadableInput("every triangle has zero area", where=where, hint="check the units of the model")
+    faces.flags.writeable = False
+    return Surface(vertices, faces, name, hashlib.sha256(data).hexdigest(), data)
+
+
+def _ply(data: bytes) -> tuple[Array, NDArray[np.int64]]:
+    ply = read_ply(data)
+    return ply.points().astype(np.float64), ply.faces
+
+
+def _pcd(data: bytes) -> tuple[Array, NDArray[Any]]:
+    """A PCD file is a point-cloud model; points without a return are left out."""
+    points = read_pcd(data).astype(np.float64)
+    return points[np.isfinite(points).all(axis=1)], np.zeros((0, 3), np.int32)
+
+
+_OWN_READERS = {"ply": _ply, "pcd": _pcd}
+
+
+def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
+    import trimesh
+
+    if suffix == "stl" and len(data) >= 84 and not data.lstrip().startswith(b"solid"):
+        promised = int.from_bytes(data[80:84], "little")
+        if 84 + 50 * promised > len(data):
+            raise BadFile(f"declares {promised} triangles in a file of {len(data)} bytes")
+    options: dict[str, Any] = {"skip_materials": True} if suffix in ("obj", "glb") else {}
+    # process=False keeps the vertices unchanged; force="mesh" joins the parts of a scene.
+    logging.getLogger("trimesh").addHandler(_SILENT)  # trimesh logs tracebacks before it tries another way
+    with np.errstate(all="ignore"):
+        mesh: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
+    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or (len(faces) and faces.shape[1] != 3):
+        raise BadFile("no triangles in three dimensions")
+    return _merged(vertices, faces)
+
+
+def _merged(vertices: Array, faces: NDArray[Any]) -> tuple[Array, NDArray[Any]]:
+    """Merge equal vertices, which occur in STL files and in OBJ files with normals."""
+    if not np.isfinite(vertices).all():
+        return vertices, faces
+    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
+    place = np.empty(len(first), dtype=np.int64)
+    place[np.argsort(first)] = np.arange(len(first))
+    return vertices[np.sort(first)], place[inverse.reshape(-1)][faces]
+
+
+def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> None:
+    if not len(vertices):
+        raise UnreadableInput("the model has no vertices", where=where, hint="check the file")
+    bad = int(np.count_nonzero(~np.isfinite(vertices).all(axis=1)))
+    if bad:
+        hint = "remove them in a mesh editor"
+        raise UnreadableInput(f"{bad} of {len(vertices)} vertices are not finite", where=where, hint=hint)
+    if np.abs(vertices).max() > MAX_COORDINATE_M:
+        what = f"a vertex is at {np.abs(vertices).max():.3g} m; the largest coordinate is {MAX_COORDINATE_M:.0g} m"
+        raise UnreadableInput(what, where=where, hint="check the units of the model")
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise UnreadableInput("a face refers to a vertex that does not exist", where=where, hint="check the file")
+    if not len(faces) and not cloud_ok:
+        hint = "give a mesh, or --cloud-model to use its points as the model"
+        raise UnreadableInput("the model has no faces", where=where, hint=hint)
+
+
+def _with_area(vertices: Array, faces: NDArray[Any]) -> NDArray[np.int32]:
+    """Return the triangles whose area is not zero; the others have no normal."""
+    corners = vertices[faces.reshape(-1, 3)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat = ~(np.linalg.norm(normals, axis=1) > 0.0)
+    kept: NDArray[np.int32] = np.ascontiguousarray(faces.reshape(-1, 3)[~flat], np.int32)
+    return kept
+
+
+_OCTAHEDRON = np.array(
+    [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]], dtype=np.int32
+)
+
+
+def octahedron(extent_m: float) -> Surface:
+    """Return an octahedron about the origin of {C} that stands for a target without a model.
+
+    Args:
+        extent_m: diagonal of its bounding box [m].
+    """
+    corners = 0.5 * extent_m / np.sqrt(3.0) * np.concatenate([np.eye(3), -np.eye(3)])
+    return Surface(corners, _OCTAHEDRON, "none", "")

@@ -11,9 +11,10 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
+from avsreplay.log import streams
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.db3_file import SQLITE_MAGIC, Db3File
-from avsreplay.log.header import HEADER_RECORD, decode_header
+from avsreplay.log.header import HEADER_RECORD, decode_header, octahedron, parse_surface, read_surface, scaled
 from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import MAGIC
@@ -22,16 +23,6 @@ from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_tim
 from avsreplay.log.ros1_bag import ROS1_MAGIC, Ros1Bag
 from avsreplay.log.scan_files import by_number, scan_files
 from avsreplay.log.source import Source, refuse_losses
-from avsreplay.log.streams import (
-    FolderClouds,
-    GroundTruth,
-    MessageClouds,
-    PoseFile,
-    PoseMessages,
-    TruthCollector,
-    file_truth,
-)
-from avsreplay.log.surface import octahedron, parse_surface, read_surface, scaled
 from avsreplay.log.writer import TRUTH_TOPIC
 from avsreplay.records import LogHeader, Surface
 
@@ -81,7 +72,7 @@ def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None)
 
 
 def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | None) -> Source:
-    collector = TruthCollector(options)
+    collector = streams.TruthCollector(options)
     recording = _open_recording(path, options.max_message_mib << 20, collector.sinks(transforms=inspect), upto)
     try:
         topics = recording.topics()
@@ -90,12 +81,12 @@ def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | Non
         header, lost = _header(recording, options)
         ground_truth = collector.ground_truth()
         if options.poses:
-            clouds: MessageClouds = PoseMessages(recording, topic)
+            clouds: streams.MessageClouds = streams.PoseMessages(recording, topic)
             header = _pose_header(header, options)
             if topic == (options.truth_topic or TRUTH_TOPIC):  # a measurement is not its own truth
                 ground_truth = replace(ground_truth, truth=None, track=None)
         else:
-            clouds = MessageClouds(recording, topic)
+            clouds = streams.MessageClouds(recording, topic)
     except BaseException:
         recording.close()
         raise
@@ -210,12 +201,12 @@ def _open_pose_file(path: Path, options: SourceOptions) -> Source:
     for flag, value in (("--topic", options.topic), ("--truth-topic", options.truth_topic)):
         if value is not None:
             raise UsageError("a pose file has no topics", where=f"{shown(path)}, {flag}", hint="leave it out")
-    poses = PoseFile(path, options.rate_hz)
+    poses = streams.PoseFile(path, options.rate_hz)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     header = LogHeader(surface=surface and scaled(surface, options.model_factor), notes={"source": "pose file"})
-    truth = GroundTruth()
+    truth = streams.GroundTruth()
     if options.truth_file is not None:
-        truth = GroundTruth(*file_truth(read_poses(options.truth_file), options.truth_gap_s))
+        truth = streams.GroundTruth(*streams.file_truth(read_poses(options.truth_file), options.truth_gap_s))
     return Source(path, poses, _pose_header(header, options), options, truth, files=[path])
 
 
@@ -314,7 +305,7 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     found = read_poses(pose_file) if pose_file is not None and not by_name else None
     files = scan_files(path, tuple(by_name), options.model)
     times = _times(path, files, found)
-    clouds = FolderClouds(files, options.rate_hz, options.max_message_mib << 20, times)
+    clouds = streams.FolderClouds(files, options.rate_hz, options.max_message_mib << 20, times)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     surface = surface and scaled(surface, options.model_factor)
     notes = {"source": "folder", "times": "given" if times else f"steady at {options.rate_hz!r} Hz"}
@@ -348,8 +339,10 @@ def _times(path: Path, files: list[Path], found: TimedPoses | None) -> list[int]
 
 def _ground_truth(
     files: list[Path], times: list[int], by_name: dict[str, Pose], found: TimedPoses | None, options: SourceOptions
-) -> GroundTruth:
+) -> streams.GroundTruth:
     if found is None and by_name:
         named = [(t, by_name[f.name]) for t, f in zip(times, files, strict=True)]
         found = TimedPoses(tuple(pose for _, pose in named), tuple(t for t, _ in named))
-    return GroundTruth() if found is None else GroundTruth(*file_truth(found, options.truth_gap_s))
+    if found is None:
+        return streams.GroundTruth()
+    return streams.GroundTruth(*streams.file_truth(found, options.truth_gap_s))

@@ -18,8 +18,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import STDOUT, check_output, is_stream, open_alone
 from avsreplay.geometry import Pose
 from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, transform
-from avsreplay.log.header import HEADER_RECORD, encode_header
-from avsreplay.log.surface import surface_bytes
+from avsreplay.log.header import HEADER_RECORD, encode_header, surface_bytes
 from avsreplay.records import Label, LogHeader, Scan, State
 
 CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = "/points", "/truth/pose", "/truth/body", "/faults"

@@ -24,18 +24,9 @@ from avsreplay.simulate.scene import MovingCamera, SceneBody, scene_bodies
 from avsreplay.simulate.target import Shape, body, builtin_surface
 
 __all__ = [
-    "EPOCH_NS",
-    "Engine",
-    "RecordedFault",
-    "Scenario",
-    "Shape",
-    "Simulation",
-    "builtin_surface",
-    "disturbed",
-    "load_scenario",
-    "scenario_of",
-    "simulate",
-]
+    "EPOCH_NS", "Engine", "RecordedFault", "Scenario", "Shape", "Simulation", "builtin_surface", "disturbed",
+    "load_scenario", "scenario_of", "simulate",
+]  # fmt: skip
 
 
 EPOCH_NS = (

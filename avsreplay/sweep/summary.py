@@ -10,21 +10,10 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from avsreplay import settings
+from avsreplay.sweep import statistics
 from avsreplay.sweep.campaign import SuccessCriterion
 from avsreplay.sweep.execute import SCAN_COLUMNS, RunResult
 from avsreplay.sweep.expansion import Expansion, Point
-from avsreplay.sweep.statistics import (
-    FaultKind,
-    FaultKinds,
-    Quantiles,
-    Rate,
-    Roc,
-    RunConsistency,
-    ScoreHistogram,
-    consistency,
-    quantiles,
-    rate,
-)
 
 HEADLINES = {
     "pose_healthy.position_m.rmse": "position error, healthy scans [m]",
@@ -65,10 +54,10 @@ class Cell:
     values: Mapping[str, Any]
     runs: int
     status: Mapping[str, int]
-    metrics: Mapping[str, Quantiles | None]
-    rates: Mapping[str, Rate | None]
-    nees: RunConsistency | None
-    kinds: Mapping[str, FaultKind] = field(default_factory=dict)
+    metrics: Mapping[str, statistics.Quantiles | None]
+    rates: Mapping[str, statistics.Rate | None]
+    nees: statistics.RunConsistency | None
+    kinds: Mapping[str, statistics.FaultKind] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,9 +74,9 @@ class Detector:
 
     harmful: int
     other: int
-    detected: Rate | None
-    false: Rate | None
-    curves: Mapping[str, Roc | None]
+    detected: statistics.Rate | None
+    false: statistics.Rate | None
+    curves: Mapping[str, statistics.Roc | None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +147,7 @@ class _CellFold:
         self.status: Counter[str] = Counter()
         self._numbers: dict[str, list[float]] = {name: [] for name in (*HEADLINES, "end.nees")}
         self._met: Counter[str] = Counter()
-        self._kinds = FaultKinds()
+        self._kinds = statistics.FaultKinds()
 
     def add(self, result: RunResult, criteria: Sequence[SuccessCriterion]) -> None:
         self.status[result.status] += 1
@@ -175,9 +164,9 @@ class _CellFold:
             values=values,
             runs=runs,
             status=dict(sorted(self.status.items())),
-            metrics={name: quantiles(self._numbers[name]) for name in HEADLINES},
-            rates={c.name: rate(self._met[c.name], runs) for c in criteria},
-            nees=consistency(self._numbers["end.nees"], STATES),
+            metrics={name: statistics.quantiles(self._numbers[name]) for name in HEADLINES},
+            rates={c.name: statistics.rate(self._met[c.name], runs) for c in criteria},
+            nees=statistics.consistency(self._numbers["end.nees"], STATES),
             kinds=self._kinds.result(),
         )
 
@@ -203,7 +192,7 @@ class DetectorFold:
     PLACE: ClassVar[dict[str, int]] = {name: place for place, name in enumerate(SCAN_COLUMNS)}
 
     def __init__(self) -> None:
-        self._curves = {name: ScoreHistogram() for name in SCORES}
+        self._curves = {name: statistics.ScoreHistogram() for name in SCORES}
         self._flagged: Counter[tuple[bool, bool]] = Counter()
 
     def add(self, scans: Iterable[Sequence[Any]]) -> None:
@@ -220,8 +209,8 @@ class DetectorFold:
         return Detector(
             harmful=counts[True],
             other=counts[False],
-            detected=rate(self._flagged[True, True], counts[True]),
-            false=rate(self._flagged[False, True], counts[False]),
+            detected=statistics.rate(self._flagged[True, True], counts[True]),
+            false=statistics.rate(self._flagged[False, True], counts[False]),
             curves={name: histogram.roc() for name, histogram in self._curves.items()},
         )
 

@@ -194,7 +194,7 @@ def _files(folder: Path) -> None:
 
     from avsreplay.log import open_source
     from avsreplay.log.cdr import pose_stamped
-    from avsreplay.log.surface import surface_bytes
+    from avsreplay.log.header import surface_bytes
 
     others = seeds()
     with open_source(folder / "log.mcap") as source:

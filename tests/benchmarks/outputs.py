@@ -28,7 +28,7 @@ from fuzz_workers import Command, Done
 from avsreplay.cli import SUMMARIES, group
 from avsreplay.errors import AvsError
 from avsreplay.log import open_source
-from avsreplay.log.surface import read_surface
+from avsreplay.log.header import read_surface
 from avsreplay.report.result import load_result
 
 RUN = ("log.mcap", "--init", "truth", "--n-scans", "2")
