@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import io
+import itertools
 import json
 import os
 import re
@@ -19,6 +20,7 @@ import shutil
 import sys
 import tempfile
 import warnings
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -28,8 +30,10 @@ import numpy as np
 from fuzz_inputs import in_place, mutate
 from fuzz_workers import Campaign, Check, report, run_campaign
 
+from avsreplay import log
 from avsreplay.cli import SUMMARIES, group
 from avsreplay.errors import AvsError
+from avsreplay.log import GrowingLog
 from avsreplay.report.result import write_manifest
 
 LIMIT_S, LIMIT_MIB = 20, 512
@@ -122,6 +126,10 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
     # Inputs without an option of their own.
     ("run", "measured poses"): ((("IN", *MEASURED), ("IN", *MEASURED[:-1])), ("truth.tum", "truth.csv", "poses.mcap")),
     ("run", "standard input"): ((("-", *RUN),), ("log.mcap", "zstd.mcap", "scans.mcap")),
+    ("run", "followed file"): (
+        (("IN", "--follow", *RUN), ("IN", "--follow", *NO_MODEL)),
+        ("log.mcap", "zstd.mcap", "flat.mcap"),
+    ),
     ("run", "interrupted"): ((("log.mcap", "--init", "truth", "-o", "IN", "--resume", "--json"),), ("interrupted",)),
     ("run", "cached index"): ((("log.mcap", *RUN),), ("cache",)),
     ("info", "measured poses"): ((("IN", "--poses"),), ("truth.tum", "truth.csv", "poses.mcap")),
@@ -145,6 +153,39 @@ def listed() -> list[tuple[str, str]]:
     return found + sorted(WITHOUT_OPTION)
 
 
+class WrittenLog(GrowingLog):
+    """A log that is written while it is followed: longer by a piece at each look; one in ten is shortened once.
+
+    Sizes and order of the pieces depend on the bytes alone. When all are written, nothing more is waited for, as after
+    Ctrl-C: a damaged file may have no end.
+    """
+
+    def __init__(self, path: Path, feed: BinaryIO | None = None) -> None:
+        self._rest: list[bytes] = []
+        if feed is None and path.is_file():
+            data = path.read_bytes()
+            rng = np.random.default_rng(zlib.crc32(data))
+            cuts = sorted(int(cut) for cut in rng.integers(0, len(data) + 1, size=5))
+            self._rest = [data[a:b] for a, b in itertools.pairwise([0, *cuts, len(data)])]
+            if rng.random() < 0.1:
+                self._rest.insert(3, b"")
+            path.write_bytes(self._rest.pop(0) if rng.random() < 0.9 else b"")
+        super().__init__(path, feed)
+
+    def _advance(self) -> bool:
+        if self._rest:
+            piece = self._rest.pop(0)
+            with self.path.open("r+b") as file:
+                file.seek(0, os.SEEK_END)
+                if not piece:  # the writer begins anew in the same file
+                    file.truncate(file.tell() // 2)
+                    file.seek(0, os.SEEK_END)
+                file.write(piece)
+        else:
+            self.stop()
+        return super()._advance()
+
+
 def call(*args: object) -> None:
     group.main([str(a) for a in args], standalone_mode=False, prog_name="avsreplay")
 
@@ -154,6 +195,7 @@ def build(folder: Path) -> None:
     from avsreplay.cli import backends
     from avsreplay.cli import run as run_command
 
+    log.GrowingLog, log._POLL_S, log._PER_OPENING = WrittenLog, 0.0, 0.0
     backends._peak_mib = lambda *_: None  # no process of its own for each measurement of memory
     texts = {"scenario.toml": SCENARIO, "rules.toml": RULES, "robot.toml": ROBOT,
              "campaign.toml": CAMPAIGN.replace("SCENARIO", str(folder / "scenario.toml"))}  # fmt: skip
@@ -368,9 +410,11 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--only", type=int)
     parser.add_argument("--commands", nargs="*", default=list(SUMMARIES), help="only these commands")
+    parser.add_argument("--cases", nargs="*", help='only these inputs, for example "run followed file"')
     parser.add_argument("--quick", action="store_true", help="500 mutations")
     asked = parser.parse_args()
     cases = [case for case in listed() if case[0] in asked.commands]
+    cases = [case for case in cases if not asked.cases or " ".join(case) in asked.cases]
     count = 500 if asked.quick else asked.inputs
     inputs = [asked.only] if asked.only is not None else list(range(asked.first, asked.first + count))
     with tempfile.TemporaryDirectory() as folder:
