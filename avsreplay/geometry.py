@@ -1,9 +1,8 @@
 """Poses, quaternions and rotation vectors; every function takes one or a batch (leading axes).
 
-Quaternions are ``[x y z w]``, Hamilton, active: ``matrix(q_ab)`` takes coordinates in b to
-coordinates in a. ``multiply(q_ab, q_bc)`` is ``q_ac``: the matrices multiply in the same order.
-A single value is computed with scalars, ten times faster than with arrays and with the same bits.
-The paper's product has the factors in the other order, ``a (x) b = multiply(b, a)``.
+Quaternions are ``[x y z w]``, Hamilton, active: ``matrix(q_ab)`` takes coordinates in b to coordinates in a, and
+``multiply(q_ab, q_bc)`` is ``q_ac``. The paper's product has the factors in the other order, ``a (x) b`` is
+``multiply(b, a)``. A single value is computed with scalars, ten times faster than with arrays and with the same bits.
 """
 
 from __future__ import annotations
@@ -29,14 +28,11 @@ def frozen(values: ArrayLike, *shape: int) -> Array:
         ValueError: the values have another shape.
     """
     array = np.array(values, dtype=np.float64, order="C")
-    if shape and array.shape != shape and not _fits(array.shape, shape):
+    sizes = zip(shape, array.shape, strict=False)
+    if shape and array.shape != shape and (len(shape) != array.ndim or any(s not in (-1, n) for s, n in sizes)):
         raise ValueError(f"expected shape {shape}, got {array.shape}")
     array.setflags(write=False)
     return array
-
-
-def _fits(found: tuple[int, ...], wanted: tuple[int, ...]) -> bool:
-    return len(found) == len(wanted) and all(s in (-1, n) for s, n in zip(wanted, found, strict=True))
 
 
 IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])
@@ -270,6 +266,11 @@ def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:
         (4,) unit quaternion.
     """
     return normalise(multiply(q0, exp(fraction * log(multiply(conjugate(q0), q1)))))
+
+
+def bounding_diagonal(points: ArrayLike) -> float:
+    """Return the diagonal [m] of the bounding box of points (n, 3) [m]."""
+    return float(np.linalg.norm(np.ptp(points, axis=0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -90,7 +90,7 @@ class Surface:
     @property
     def extent(self) -> float:
         """Return the diagonal of the bounding box [m]."""
-        return float(np.linalg.norm([np.ptp(self.vertices[:, k]) for k in range(3)]))
+        return geometry.bounding_diagonal(self.vertices)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -204,9 +204,8 @@ def odometry_command(
         MissingBackend: kiss-icp is not installed.
         UsageError: no scan has enough points.
     """  # noqa: D301
-    import numpy as np
-
     from avsreplay.files import STDOUT, check_output
+    from avsreplay.geometry import bounding_diagonal
     from avsreplay.log import open_source
     from avsreplay.register.backend import load_backend
     from avsreplay.register.kiss import KissOdometry
@@ -220,7 +219,7 @@ def odometry_command(
             if len(scan.points) < LEAST_POINTS:
                 continue
             if odometry is None:
-                odometry = KissOdometry(size or float(np.linalg.norm(np.ptp(scan.points, axis=0))), not no_deskew)
+                odometry = KissOdometry(size or bounding_diagonal(scan.points), not no_deskew)
             pose, after_s = odometry.add(scan.points, scan.times_s)
             poses.append((scan.t_ns + round(1e9 * after_s), pose))
     if not poses:

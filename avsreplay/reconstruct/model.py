@@ -67,7 +67,7 @@ class Reconstruction:
     @property
     def extent(self) -> float:
         """Return the diagonal of the bounding box [m]."""
-        return float(np.linalg.norm(np.ptp(self.points, axis=0)))
+        return geometry.bounding_diagonal(self.points)
 
     @property
     def mass_centre(self) -> tuple[Array, float] | None:
@@ -308,7 +308,7 @@ def _regions(kind: str, points: Array, deviation: Array, voxel_m: float) -> list
         p, known = points[group == k], deviation[group == k]
         known = known[np.isfinite(known)]
         middle = float(np.median(known)) if len(known) else float("nan")
-        size = float(np.linalg.norm(np.ptp(p, axis=0)))
+        size = geometry.bounding_diagonal(p)
         found.append(Region(kind, len(p), tuple(float(x) for x in p.mean(axis=0)), size, middle))
     return found
 

@@ -153,7 +153,7 @@ def extent_of(points: Array) -> float:
     n = len(points)
     _, group = connected_components(coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n)))
     large = np.bincount(group)[group] >= SMALL_GROUP * n
-    return float(np.linalg.norm(np.ptp(points[large] if large.any() else points, axis=0)))
+    return geometry.bounding_diagonal(points[large] if large.any() else points)
 
 
 def _camera(clouds: Sequence[Array]) -> Array:

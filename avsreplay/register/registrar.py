@@ -149,7 +149,7 @@ class Registrar:
     def _attempts(self, target: Array) -> Iterator[tuple[Array, int]]:
         """What is searched and by which round: the whole scan, its parts, then the whole scan with other starts."""
         extent = self._target.surface.extent
-        small = float(np.linalg.norm(np.ptp(target, axis=0))) <= LARGER * extent  # probably the target alone
+        small = geometry.bounding_diagonal(target) <= LARGER * extent  # probably the target alone
         yield target, 0
         if small:
             yield target, 1

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.geometry import Array
+from avsreplay.geometry import Array, bounding_diagonal
 from avsreplay.records import Surface
 
 EVEN_ROUNDS, EVEN_WITHIN = 10, (0.85, 1.2)
@@ -123,7 +123,7 @@ def _small_parts(points: Array, extent_m: float, least: int, planes: int) -> Ite
     for part in _connected(points, VOXEL_OF_EXTENT * extent_m):
         if len(part) < least:
             continue
-        if float(np.linalg.norm(np.ptp(part, axis=0))) <= LARGER * extent_m:
+        if bounding_diagonal(part) <= LARGER * extent_m:
             yield part
         elif planes:
             rest = _without_plane(part, PLANE_OF_EXTENT * extent_m)

@@ -18,7 +18,7 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.files import read_limited
-from avsreplay.geometry import Array, Pose
+from avsreplay.geometry import Array, Pose, bounding_diagonal
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.export import StampedPose
 from avsreplay.report.jsonl import read_json, read_rows
@@ -75,7 +75,7 @@ class Result:
             return float(stated)
         if self.view is None or not len(self.view.vertices):
             raise UsageError("the target's size is not known", where=str(path), hint="give it with --extent METRES")
-        return float(np.linalg.norm(np.ptp(self.view.vertices, axis=0)))
+        return bounding_diagonal(self.view.vertices)
 
     @property
     def losses(self) -> int:
