@@ -7,6 +7,7 @@ import json
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import click
 import pytest
@@ -15,7 +16,7 @@ from click.testing import CliRunner
 from avsreplay.cli import options as shared
 from avsreplay.cli.options import read_options, source_options
 from avsreplay.cli.run import _collect
-from avsreplay.errors import UsageError
+from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log import SourceOptions
 
 
@@ -156,3 +157,9 @@ def test_an_interrupt_keeps_the_scans_of_a_log_that_is_still_written(fixtures_fo
     header = json.loads((result / "run.json").read_text())
     assert header["interrupted_after"] == len(rows) >= 28
     assert not (result / "resume.bin").exists()
+
+
+def test_a_closed_standard_input_is_one_line(monkeypatch):
+    monkeypatch.setattr(sys, "stdin", None)  # as Python sets it where the descriptor is closed
+    with pytest.raises(UnreadableInput, match="standard input: it is closed"), shared.log_file(Path("-")):
+        pass

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import io
 import os
+import shutil
+import sys
 import threading
 
 import numpy as np
@@ -149,3 +152,41 @@ def test_a_log_written_to_a_pipe_has_the_bytes_of_a_file(tmp_path):
     reader.join()
     assert write(tmp_path / "file") == size == len(got[0])
     assert got[0] == (tmp_path / "file").read_bytes()
+
+
+class Broken(Pieces):
+    """A stream that cannot be read any more after some bytes."""
+
+    def read1(self, most):
+        if self.at >= len(self.data):
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return super().read1(most)
+
+
+def test_a_stream_that_breaks_off_is_a_loss_and_never_taken_for_the_end(log, tmp_path):
+    data = log.read_bytes()
+    growing = GrowingLog(tmp_path / "stream", Broken(data[: 2 * len(data) // 3], sizes(1, 5000)))
+    with Run(Job(source=growing.path, growing=growing)) as run:
+        count = len(list(run.rows()))
+        assert any("broke off" in loss.what and "Input/output error" in loss.what for loss in run.source.losses)
+    with open_source(log) as source:
+        assert 1 < count < len(source)
+
+
+def test_a_stream_that_breaks_off_before_a_scan_states_the_cause(tmp_path):
+    growing = GrowingLog(tmp_path / "stream", Broken(b"", sizes(1, 5)))
+    with pytest.raises(UnreadableInput, match="broke off: Input/output error"):
+        growing.open(SourceOptions())
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be removed there")
+def test_a_stream_whose_folder_is_removed_at_once_writes_nothing_to_the_terminal(tmp_path, monkeypatch, capfd):
+    """A command may end with an error and remove its folder before the thread that copies the stream has begun."""
+    begun = []
+    monkeypatch.setattr(threading.Thread, "start", lambda thread: begun.append(thread))
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    GrowingLog(folder / "stream", io.BytesIO(b"x" * 1000))
+    shutil.rmtree(folder)
+    begun[0].run()
+    assert capfd.readouterr().err == ""

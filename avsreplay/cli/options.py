@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from avsreplay.cli.config import source_setting
-from avsreplay.errors import AvsError, UsageError
+from avsreplay.errors import AvsError, UnreadableInput, UsageError
 
 if TYPE_CHECKING:
     from avsreplay.log import GrowingLog, SourceOptions
@@ -153,12 +153,16 @@ def log_file(log: Path, *, follow: bool = False) -> Iterator[tuple[Path, Growing
         yield log, GrowingLog(log) if follow else None
         return
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:  # Windows: the file is still open
+        if sys.stdin is None:
+            raise UnreadableInput(
+                "it is closed", where="standard input", hint="give a file, or a pipe: ... | avsreplay run -"
+            )
         path = Path(folder) / "stdin"
         try:
             yield path, GrowingLog(path, sys.stdin.buffer)
         except AvsError as error:
             error.where = (error.where or "").replace(str(path), "standard input") or None
-            if not path.stat().st_size:
+            if path.is_file() and not path.stat().st_size and "broke off" not in error.what:
                 error.what, error.hint = "no data", "see the message of the program that writes to the pipe"
             raise
 

@@ -61,14 +61,15 @@ class GrowingLog:
             UsageError: it is not an MCAP file.
         """
         self.path, self.finished = path, False
-        self._at, self._feed, self._pause_s = 0, feed, _POLL_S
+        self._at, self._fed, self._pause_s = 0, feed is not None, _POLL_S
         self._stop, self._opened = threading.Event(), False
         self._used: list[tuple[Scan, Truth]] = []
         self._poses: list[tuple[int, bytes]] = []  # at the first opening, from which plans are scored
         self._clock = (0, 0.0)  # first time and period at the first opening, from which the stages are made
+        self._broken: OSError | None = None  # the error that ended the stream before its end
         if feed is not None:
-            path.touch()
-            threading.Thread(target=self._copy, name="avsreplay-feed", daemon=True).start()
+            copy = path.open("wb", buffering=0)  # here, because the folder may be gone before the thread starts
+            threading.Thread(target=self._copy, args=(feed, copy), name="avsreplay-feed", daemon=True).start()
         elif not path.is_file() or (path.stat().st_size >= len(MAGIC) and not self._is_mcap()):
             what = "not an MCAP file" if path.exists() else "no such file"
             hint = "leave out --follow; only one MCAP file can be followed"
@@ -127,7 +128,7 @@ class GrowingLog:
             options: how to read it.
 
         Raises:
-            UnreadableInput: the log is finished and cannot be read.
+            UnreadableInput: the log or stream is finished and cannot be read.
             UsageError: an option does not fit to the log.
         """
         before = self._at
@@ -136,13 +137,17 @@ class GrowingLog:
             if self.finished or (grown and self._at > before):
                 begun = time.monotonic()
                 try:
-                    upto = self._at if self._stop.is_set() and self._feed is None else None
+                    upto = self._at if self._stop.is_set() and not self._fed else None
                     self.source = open_source(self.path, options, upto=upto if self.finished else self._at)
+                    if self.finished and self._broken is not None:
+                        self.source.add_loss(Loss(f"the stream broke off: {self._broken.strerror}", self._at, 0))
                     if not self._opened:
                         self._poses, self._opened = self._known_poses(), True
                         self._clock = self.source.first_ns, self.source.clock.period_s
                     return self.source
-                except UnreadableInput:  # it has no scan yet
+                except UnreadableInput as error:  # it has no scan yet
+                    if self.finished and self._broken is not None:
+                        error.what = f"the stream broke off: {self._broken.strerror}"
                     if self.finished:
                         raise
                 finally:
@@ -165,7 +170,7 @@ class GrowingLog:
                 head = file.read(9)
                 end = self._at + 9 + int.from_bytes(head[1:], "little")
                 if head[0] == DATA_END:  # the summary follows; a stream is read to its end
-                    ending = ending or (self._feed is None and self._closed(size))
+                    ending = ending or (not self._fed and self._closed(size))
                     break
                 if end > size:
                     break
@@ -182,12 +187,14 @@ class GrowingLog:
         with self.path.open("rb") as file:
             return file.read(len(MAGIC)) == MAGIC
 
-    def _copy(self) -> None:
-        assert self._feed is not None
+    def _copy(self, feed: BinaryIO, copy: BinaryIO) -> None:
+        read = getattr(feed, "read1", feed.read)
         try:
-            with self.path.open("wb", buffering=0) as file:
-                while block := self._feed.read1(_BLOCK) if hasattr(self._feed, "read1") else self._feed.read(_BLOCK):
-                    file.write(block)
+            with copy:
+                while block := read(_BLOCK):
+                    copy.write(block)
+        except OSError as error:  # the stream cannot be read, or the disk is full
+            self._broken = error
         finally:
             self._stop.set()
 

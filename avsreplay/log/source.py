@@ -81,6 +81,10 @@ class Source:
         """Return the parts that could not be read, in file order."""
         return [*self._clouds.losses, *self._lost]
 
+    def add_loss(self, loss: Loss) -> None:
+        """Add a part that is missing for a reason outside of the file."""
+        self._lost = (*self._lost, loss)
+
     @property
     def clock(self) -> ClockSummary:
         """Return how the times of the scans were determined."""

@@ -181,7 +181,7 @@ class WrittenLog(GrowingLog):
                     file.truncate(file.tell() // 2)
                     file.seek(0, os.SEEK_END)
                 file.write(piece)
-        else:
+        elif not self._fed:
             self.stop()
         return super()._advance()
 
