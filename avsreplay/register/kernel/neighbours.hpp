@@ -24,7 +24,7 @@ static void visit(const Store& s, const Query& q, uint32_t block, Patch& patch) 
   const float limit = patch.n < NEIGHBOURS ? 3e38f : lenient(s, std::sqrt((float)patch.worst()), 0.f);
   for (unsigned lanes = bits(Points::distance2(s, block, q) < f8(limit)); lanes; lanes &= lanes - 1) {
     const uint32_t lane = LANES * block + (uint32_t)lowest_bit(lanes);
-    if (!is_copy(s, lane)) patch.add(s, Points::foot(s, lane, q).d2, lane);
+    if (!is_copy(s, lane)) patch.add(s, Points::exact2(s, lane, q), lane);
   }
 }
 

@@ -13,7 +13,8 @@ struct Chunk {
   alignas(32) double sign[CHUNK], whole[CHUNK];  // of the stiffness
   alignas(32) double d2[CHUNK];
   alignas(32) double take[CHUNK];   // 1: an inlier, 0: not
-  double c[3][CHUNK];               // moved, in {C}
+  alignas(32) double c[3][CHUNK];   // moved, in {C}
+  int32_t lane[CHUNK];              // of the primitive that is nearest, -1: none
   const uint32_t* list[CHUNK];      // of the cell of a point that is searched for, or null
   Treat search[CHUNK];
 };
@@ -48,6 +49,7 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
     c.search[i] = finite(p) ? SEARCHED : IGNORED;
     c.list[i] = nullptr;
     if (c.search[i] == IGNORED) {
+      for (int k = 0; k < 3; ++k) c.c[k][i] = 0;
       out.v[2] += 1;
       continue;
     }
@@ -67,94 +69,101 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
 }
 
 template <class Kind>
-static inline void enter(const Store& s, Chunk& c, int i, const Best& best, bool inlier, Pass kind) {
-  const Foot& f = best.foot;
-  c.take[i] = inlier ? 1 : 0;
-  c.d2[i] = inlier ? f.d2 : 0;
-  c.p[0][i] = inlier ? c.c[0][i] - s.centre.x : 0, c.f[0][i] = inlier ? f.x - s.centre.x : 0;
-  c.p[1][i] = inlier ? c.c[1][i] - s.centre.y : 0, c.f[1][i] = inlier ? f.y - s.centre.y : 0;
-  c.p[2][i] = inlier ? c.c[2][i] - s.centre.z : 0, c.f[2][i] = inlier ? f.z - s.centre.z : 0;
-  if (kind == Pass::point) return;
-  Stiffness k{{0, 0, 0}, 0, 0};
-  if (inlier) k = kind == Pass::plane ? Stiffness{Kind::normal(s, (uint32_t)best.lane), 1, 0} : Kind::stiffness(s, (uint32_t)best.lane, f.feature);
-  c.n[0][i] = k.v.x, c.n[1][i] = k.v.y, c.n[2][i] = k.v.z, c.sign[i] = k.sign, c.whole[i] = k.whole;
-}
-
-static inline Best none() { return {{0, 0, 0, 0, 0, FACE}, -1}; }
-
-template <class Kind>
-static inline Best keep_one(const Scope& o, const Query& q, const Kept& kept, Treat treat) {
-  if (kept.lane < 0) return none();
-  if (treat == KEPT) return {Kind::foot(o.s, (uint32_t)kept.lane, q), kept.lane};
+static inline int32_t keep_one(const Scope& o, const Query& q, uint32_t block) {
   Search<Kind> search(o, q);
-  search.run_block((uint32_t)kept.lane / LANES);
-  return search.best();
+  search.run_block(block);
+  return search.lane();
 }
 
 // Square of a length, with room for rounding; negative where it is not positive.
 static inline float squared(float room) { return room > 0.f ? room * room * 0.9999f : -1.f; }
 
 template <class Kind>
-static inline Best search_one(const Scope& o, const Query& q, const uint32_t* list, int32_t seed, Kept* kept) {
+static inline int32_t search_one(const Scope& o, const Query& q, const uint32_t* list, int32_t seed, Kept* kept) {
   Search<Kind> search(o, q);
   search.run(list, seed);
   if (kept) {
     typename Search<Kind>::Room room{0.f, 0.f};
     if (o.lead > 0.f) room = search.room();
-    *kept = {q.x, q.y, q.z, squared(room.lane), squared(room.block), search.best().lane};
+    *kept = {q.x, q.y, q.z, squared(room.lane), squared(room.block), search.lane()};
   }
-  return search.best();
+  return search.lane();
 }
 
 // A kept neighbour that no longer faces the eye is searched for again.
 template <class Kind>
-static inline bool is_kept(const Scope& o, Treat treat, const Kept* kept) {
-  return treat >= IN_BLOCK && (!o.eye || kept->lane < 0 || Kind::faces(o.s, (uint32_t)kept->lane, *o.eye));
+static inline bool is_kept(const Scope& o, Treat treat, int32_t lane) {
+  if (treat < IN_BLOCK) return false;
+  if (!o.eye || lane < 0 || o.facing.sure[lane / LANES] >> lane % LANES & 1) return true;
+  return Kind::faces(o.s, (uint32_t)lane, *o.eye);
 }
 
-constexpr int AHEAD = 4;
+constexpr int AHEAD = 4, FAR_AHEAD = 16;  // points ahead of the search, and of the feet
 
 // What the search of a point will read first.
 template <class Kind>
-static inline void fetch_ahead(const Store& s, Treat treat, const uint32_t* list, const Kept* kept) {
-  if (kept && kept->lane >= 0) {
-    Kind::prefetch_exact(s, (uint32_t)kept->lane);
-    if (treat != KEPT) Kind::prefetch_block(s, (uint32_t)kept->lane / LANES);
-  }
+static inline void fetch_ahead(const Store& s, Treat treat, const uint32_t* list, int32_t lane) {
+  if (treat == IN_BLOCK && lane >= 0) Kind::prefetch_block(s, (uint32_t)lane / LANES);
   if (!list) return;
+  if (lane >= 0) Kind::prefetch_block(s, (uint32_t)lane / LANES);
   const uint32_t n = *list & (MOST_BLOCKS - 1);
   for (uint32_t k = 1; k <= n && k <= 2; ++k) Kind::prefetch_block(s, list[k] & (MOST_BLOCKS - 1));
 }
 
+// The primitive of every point of the chunk; returns how many were searched for. `remember`: where, for later passes.
 template <class Kind>
-static void search(const Scope& o, int64_t first, int n, Pass kind, Kept* kept, Chunk& c, Sums& out) {
+static int search(const Scope& o, int64_t first, int n, const Kept* kept, Kept* remember, Chunk& c) {
   int32_t last = -1;
+  int searched = 0;
+  const auto own = [&](int i) { return kept ? kept[first + i].lane : -1; };
   for (int i = 0; i < n; ++i) {
-    if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.search[i + AHEAD], c.list[i + AHEAD], kept ? kept + first + i + AHEAD : nullptr);
-    if (c.search[i] == IGNORED) {
-      enter<Kind>(o.s, c, i, none(), false, kind);
-      continue;
-    }
-    const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
-    Kept* memory = kept ? kept + first + i : nullptr;
-    Best best;
-    if (is_kept<Kind>(o, c.search[i], memory)) {
-      best = keep_one<Kind>(o, q, *memory, c.search[i]);
+    if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.search[i + AHEAD], c.list[i + AHEAD], own(i + AHEAD));
+    c.lane[i] = -1;
+    if (c.search[i] == IGNORED) continue;
+    const int32_t lane = own(i);
+    if (is_kept<Kind>(o, c.search[i], lane)) {
+      c.lane[i] = lane;
+      if (c.search[i] == KEPT || lane < 0) continue;
+      c.lane[i] = keep_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), (uint32_t)lane / LANES);
     } else {
-      const int32_t own = memory ? memory->lane : -1;
-      best = search_one<Kind>(o, q, c.list[i], own < 0 && !c.list[i] ? last : own, memory);
-      out.v[3] += 1;
+      const int32_t seed = lane < 0 && !c.list[i] ? last : lane;
+      Kept* memory = remember ? remember + first + i : nullptr;
+      c.lane[i] = search_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), c.list[i], seed, memory);
+      ++searched;
     }
-    last = best.lane;
-    enter<Kind>(o.s, c, i, best, best.lane >= 0 && best.foot.d2 < o.bound2, kind);
+    last = c.lane[i];
+  }
+  return searched;
+}
+
+// Calls put(i, points, feet, which of them are nearer than the bound) for every four points of the chunk.
+template <class Kind, class Put>
+static void each_four(const Scope& o, int n, Ask ask, Chunk& c, const Put& put) {
+  for (int i = n; i < (n + 3) / 4 * 4; ++i) {
+    c.lane[i] = -1;
+    for (int k = 0; k < 3; ++k) c.c[k][i] = 0;
+  }
+  for (int i = 0; i < n; i += 4) {
+    for (int k = i + FAR_AHEAD; k < i + FAR_AHEAD + 4 && k < n; ++k)
+      if (c.lane[k] >= 0) Kind::prefetch_exact(o.s, (uint32_t)c.lane[k]);
+    uint32_t lane[4];
+    double none[4];
+    for (int k = 0; k < 4; ++k) lane[k] = c.lane[i + k] < 0 ? 0 : (uint32_t)c.lane[i + k], none[k] = c.lane[i + k] < 0 ? 1 : 0;
+    const D4 p[3] = {load4(c.c[0] + i), load4(c.c[1] + i), load4(c.c[2] + i)};
+    const Four four = Kind::feet(o.s, lane, p, ask);
+    put(i, p, four, both(load4(none) < d4(1), four.d2 < d4(o.bound2)));
   }
 }
 
-static void clear_tail(int n, Chunk& c) {
-  for (int i = n; i < (n + 3) / 4 * 4; ++i) {
-    c.take[i] = c.d2[i] = c.sign[i] = c.whole[i] = 0;
-    for (int k = 0; k < 3; ++k) c.p[k][i] = c.f[k][i] = c.n[k][i] = 0;
-  }
+// What is not an inlier is zero.
+template <class Kind>
+static void settle(const Scope& o, int n, Ask ask, Chunk& c) {
+  const D4 zero = d4(0), centre[3] = {d4(o.s.centre.x), d4(o.s.centre.y), d4(o.s.centre.z)};
+  each_four<Kind>(o, n, ask, c, [&](int i, const D4 (&p)[3], const Four& four, D4::Mask in) {
+    const auto put = [&](double* to, D4 x) { store4(to + i, select(in, x, zero)); };
+    put(c.take, d4(1)), put(c.d2, four.d2), put(c.sign, four.sign), put(c.whole, four.whole);
+    for (int k = 0; k < 3; ++k) put(c.p[k], p[k] - centre[k]), put(c.f[k], four.foot[k] - centre[k]), put(c.n[k], four.v[k]);
+  });
 }
 
 static void sum_point(int n, const Chunk& c, Sums& out) {
@@ -223,8 +232,8 @@ static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last
   const Vec3 eye{look.T[3], look.T[7], look.T[11]};
   Scope o = scope_of(s, *look.facing, false, look.gate, look.lead);
   if (look.sided && s.mesh) o.eye = &eye;
-  search<Kind>(o, first, n, look.kind, kept, c, out);
-  clear_tail(n, c);
+  out.v[3] = search<Kind>(o, first, n, kept, kept, c);
+  settle<Kind>(o, n, look.kind == Pass::point ? Ask::FOOT : look.kind == Pass::plane ? Ask::NORMAL : Ask::STIFFNESS, c);
   look.kind == Pass::plane ? sum_plane(n, c, out) : sum_point(n, c, out);
   if (look.kind == Pass::newton) sum_newton(n, c, out);
 }
@@ -239,48 +248,35 @@ static void match_kind(const Store& s, const View& v, int64_t first, int64_t las
   const Vec3 eye{look.T[3], look.T[7], look.T[11]};
   Scope o = scope_of(s, *look.facing, false, look.gate, 0.f);
   if (look.sided && s.mesh) o.eye = &eye;
-  int32_t last_lane = -1;
+  search<Kind>(o, first, n, kept, nullptr, c);
+  settle<Kind>(o, n, Ask::NORMAL, c);
   for (int i = 0; i < n; ++i) {
-    const Kept* memory = kept ? kept + first + i : nullptr;
-    if (i + AHEAD < n) fetch_ahead<Kind>(s, c.search[i + AHEAD], c.list[i + AHEAD], memory ? memory + AHEAD : nullptr);
-    Match& m = out[first + i];
-    m.inlier = false;
-    if (c.search[i] == IGNORED) continue;
-    const Query q = query(s, c.c[0][i], c.c[1][i], c.c[2][i]);
-    const int32_t own = memory ? memory->lane : -1;
-    const Best best = is_kept<Kind>(o, c.search[i], memory)
-                          ? keep_one<Kind>(o, q, *memory, c.search[i])
-                          : search_one<Kind>(o, q, c.list[i], own < 0 && !c.list[i] ? last_lane : own, nullptr);
-    last_lane = best.lane;
-    if (best.lane < 0 || !(best.foot.d2 < o.bound2)) continue;
-    const Vec3 normal = Kind::normal(s, (uint32_t)best.lane);
-    m = {{q.x, q.y, q.z}, {normal.x, normal.y, normal.z}, 0, best.foot.d2, true};
-    m.e = normal.x * (q.x - best.foot.x) + normal.y * (q.y - best.foot.y) + normal.z * (q.z - best.foot.z);
+    const double e = c.n[0][i] * (c.p[0][i] - c.f[0][i]) + c.n[1][i] * (c.p[1][i] - c.f[1][i]) + c.n[2][i] * (c.p[2][i] - c.f[2][i]);
+    out[first + i] = {{c.c[0][i], c.c[1][i], c.c[2][i]}, {c.n[0][i], c.n[1][i], c.n[2][i]}, e, c.d2[i], c.take[i] > 0};
   }
 }
 
 template <class Kind>
 static void closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const Facing& facing, bool sided,
                          double bound, const Feet& out) {
-  const double nan = std::numeric_limits<double>::quiet_NaN();
+  const double nan = std::numeric_limits<double>::quiet_NaN(), here[12] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0};
   const Scope o = scope_of(s, facing, sided, bound, 0.f);
-  int32_t seed = -1;
-  for (int64_t i = first; i < last; ++i) {
-    double p[3];
-    read(v, i, p);
-    Best best = none();
-    if (finite(p)) {
-      const Query q = query(s, p[0], p[1], p[2]);
-      const uint32_t* list = list_of(s, word_at(s, q.x, q.y, q.z));
-      best = search_one<Kind>(o, q, list, list ? -1 : seed, nullptr);
-    }
-    seed = best.lane;
-    const bool found = best.lane >= 0;
-    const Vec3 n = found ? Kind::normal(s, (uint32_t)best.lane) : Vec3{nan, nan, nan};
-    const Vec3 f = found ? Vec3{best.foot.x, best.foot.y, best.foot.z} : Vec3{nan, nan, nan};
-    out.id[i] = found ? s.id[(size_t)best.lane] : -1;
-    out.d2[i] = found ? best.foot.d2 : std::numeric_limits<double>::infinity();
-    out.foot[3 * i] = f.x, out.foot[3 * i + 1] = f.y, out.foot[3 * i + 2] = f.z;
-    out.normal[3 * i] = n.x, out.normal[3 * i + 1] = n.y, out.normal[3 * i + 2] = n.z;
+  Chunk c;
+  Sums counts{};
+  for (int64_t at = first; at < last; at += CHUNK) {
+    const int n = (int)std::min<int64_t>(CHUNK, last - at);
+    gather(s, v, at, n, here, nullptr, c, counts);
+    search<Kind>(o, at, n, nullptr, nullptr, c);
+    each_four<Kind>(o, n, Ask::NORMAL, c, [&](int i, const D4 (&)[3], const Four& four, D4::Mask in) {
+      const D4 none = d4(nan);
+      double d2[4], v[6][4];
+      store4(d2, select(in, four.d2, d4(std::numeric_limits<double>::infinity())));
+      for (int k = 0; k < 3; ++k) store4(v[k], select(in, four.foot[k], none)), store4(v[3 + k], select(in, four.v[k], none));
+      for (int64_t j = 0; j < 4 && i + j < n; ++j) {
+        const int64_t to = at + i + j;
+        out.d2[to] = d2[j], out.id[to] = std::isfinite(d2[j]) ? s.id[(size_t)c.lane[i + j]] : -1;
+        for (int k = 0; k < 3; ++k) out.foot[3 * to + k] = v[k][j], out.normal[3 * to + k] = v[3 + k][j];
+      }
+    });
   }
 }

@@ -1,20 +1,15 @@
 // Distances to eight points or triangles at once in single precision, and to one in double.
 // Included inside a namespace named after the instruction set.
-// Where on its triangle a foot lies. The sides are ab, ac and bc.
-enum Feature : uint8_t { FACE, SIDE_AB, SIDE_AC, SIDE_BC, CORNER };
-
-struct Foot {
-  double d2, x, y, z;
-  double height;  // distance of the query from the triangle's plane: how squarely it faces
-  Feature feature;
+// The feet of four points on a primitive each.
+struct Four {
+  D4 d2, foot[3];
+  D4 height;             // distance of the point from the triangle's plane: how squarely it faces
+  D4 v[3], sign, whole;  // of the stiffness
 };
 
-// Second derivative of half the squared distance to the foot's feature: sign v v' + whole I. A face: n n'; a side of
-// direction t: I - t t'; a corner: I.
-struct Stiffness {
-  Vec3 v;
-  double sign, whole;
-};
+// What is asked of `Four` beside the foot. The stiffness is the second derivative of half the squared distance to the part
+// of the primitive where the foot is, sign v v' + whole I. A face: n n'; a side of direction t: I - t t'; a corner: I.
+enum class Ask { FOOT, NORMAL, STIFFNESS };  // NORMAL: v = n, as for a face
 
 struct Query {
   double x, y, z;    // in {C}
@@ -32,16 +27,23 @@ struct Points {
     return dx * dx + dy * dy + dz * dz;
   }
 
-  static Vec3 normal(const Store& s, uint32_t lane) { return s.normals[lane]; }
-
-  static Foot foot(const Store& s, uint32_t lane, const Query& q) {
-    const Vec3& p = s.points[lane];
-    const double dx = p.x - q.x, dy = p.y - q.y, dz = p.z - q.z;
-    return {dx * dx + dy * dy + dz * dz, p.x, p.y, p.z, 0, CORNER};
+  // The distance's second derivative is approximated by that to the tangent plane, as if the cloud were dense.
+  static Four feet(const Store& s, const uint32_t (&lane)[4], const D4 (&p)[3], Ask ask) {
+    const auto of = [&](const Many<Vec3>& all, double Vec3::*x) {
+      return d4(all[lane[0]].*x, all[lane[1]].*x, all[lane[2]].*x, all[lane[3]].*x);
+    };
+    const D4 x = of(s.points, &Vec3::x), y = of(s.points, &Vec3::y), z = of(s.points, &Vec3::z), zero = d4(0);
+    const D4 dx = x - p[0], dy = y - p[1], dz = z - p[2];
+    Four r{dx * dx + dy * dy + dz * dz, {x, y, z}, zero, {zero, zero, zero}, d4(1), zero};
+    if (ask != Ask::FOOT) r.v[0] = of(s.normals, &Vec3::x), r.v[1] = of(s.normals, &Vec3::y), r.v[2] = of(s.normals, &Vec3::z);
+    return r;
   }
 
-  // The distance's second derivative is approximated by that to the tangent plane, as if the cloud were dense.
-  static Stiffness stiffness(const Store& s, uint32_t lane, Feature) { return {s.normals[lane], 1, 0}; }
+  static double exact2(const Store& s, uint32_t lane, const Query& q) {
+    const Vec3& p = s.points[lane];
+    const double dx = p.x - q.x, dy = p.y - q.y, dz = p.z - q.z;
+    return dx * dx + dy * dy + dz * dz;
+  }
 
   // Squared distances that differ by no more are a tie.
   static double tie(const Store&, double) { return 0; }
@@ -106,20 +108,35 @@ struct Triangles {
     return squared(r.x - r.fx, r.y - r.fy) + r.z * r.z;
   }
 
-  static Vec3 normal(const Store& s, uint32_t lane) { return s.triangles[lane].n(); }
-
-  static Foot foot(const Store& s, uint32_t lane, const Query& q) {
-    const Triangle& t = s.triangles[lane];
-    const double dx = q.x - t.a.x, dy = q.y - t.a.y, dz = q.z - t.a.z;
-    const double x = dx * t.u.x + dy * t.u.y + dz * t.u.z, y = dx * t.w.x + dy * t.w.y + dz * t.w.z;
-    const Vec3 n = t.n();
-    const double z = dx * n.x + dy * n.y + dz * n.z;
-    double fx = x, fy = y, e = 0;
-    Feature feature = FACE;
-    const double bx = t.length - t.cx, rx = t.length - x;
-    if (y < 0 || x * t.cy - y * t.cx < 0 || rx * t.cy - y * bx < 0) e = on_sides(t, x, y, fx, fy, feature);
-    return {z * z + e, t.a.x + fx * t.u.x + fy * t.w.x, t.a.y + fx * t.u.y + fy * t.w.y,
-            t.a.z + fx * t.u.z + fy * t.w.z, std::fabs(z), feature};
+  static Four feet(const Store& s, const uint32_t (&lane)[4], const D4 (&p)[3], Ask ask) {
+    const Triangle *t[4] = {&s.triangles[lane[0]], &s.triangles[lane[1]], &s.triangles[lane[2]], &s.triangles[lane[3]]};
+    const auto number = [&](double Triangle::*x) { return d4(t[0]->*x, t[1]->*x, t[2]->*x, t[3]->*x); };
+    const auto part = [&](Vec3 Triangle::*v, double Vec3::*x) {
+      return d4(t[0]->*v.*x, t[1]->*v.*x, t[2]->*v.*x, t[3]->*v.*x);
+    };
+    const D4 ax = part(&Triangle::a, &Vec3::x), ay = part(&Triangle::a, &Vec3::y), az = part(&Triangle::a, &Vec3::z);
+    const D4 ux = part(&Triangle::u, &Vec3::x), uy = part(&Triangle::u, &Vec3::y), uz = part(&Triangle::u, &Vec3::z);
+    const D4 wx = part(&Triangle::w, &Vec3::x), wy = part(&Triangle::w, &Vec3::y), wz = part(&Triangle::w, &Vec3::z);
+    const D4 length = number(&Triangle::length), cx = number(&Triangle::cx), cy = number(&Triangle::cy), zero = d4(0);
+    const D4 dx = p[0] - ax, dy = p[1] - ay, dz = p[2] - az, x = dx * ux + dy * uy + dz * uz, y = dx * wx + dy * wy + dz * wz;
+    const D4 n[3] = {uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx}, z = dx * n[0] + dy * n[1] + dz * n[2];
+    const D4 bx = length - cx, rx = length - x;
+    const D4::Mask out = either(either(y < zero, x * cy - y * cx < zero), rx * cy - y * bx < zero);
+    D4 fx = x, fy = y, e = zero;
+    Four r{zero, {zero, zero, zero}, select(z < zero, zero - z, z), {n[0], n[1], n[2]}, d4(1), zero};
+    if (any(out)) {
+      const Side side = nearest_side(length, cx, cy, x, y);
+      fx = select(out, side.x, x), fy = select(out, side.y, y), e = select(out, side.e, zero);
+      if (ask == Ask::STIFFNESS) {
+        const D4 u[3] = {ux, uy, uz}, w[3] = {wx, wy, wz};
+        const auto other = [&](D4 inside, D4 between) { return select(out, select(side.between, between, zero), inside); };
+        for (int k = 0; k < 3; ++k) r.v[k] = other(n[k], side.tx * u[k] + side.ty * w[k]);
+        r.sign = other(d4(1), d4(-1)), r.whole = select(out, d4(1), zero);
+      }
+    }
+    r.d2 = z * z + e;
+    r.foot[0] = ax + fx * ux + fy * wx, r.foot[1] = ay + fx * uy + fy * wy, r.foot[2] = az + fx * uz + fy * wz;
+    return r;
   }
 
   // Rounding sets the distances to the faces of a common side apart; this is well above it.
@@ -131,34 +148,27 @@ struct Triangles {
     return (eye.x - t.a.x) * n.x + (eye.y - t.a.y) * n.y + (eye.z - t.a.z) * n.z > 0;
   }
 
-  static double unit(double t) { return t < 0 ? 0 : t > 1 ? 1 : t; }
+  // The nearest place on the three sides, its squared distance in the plane, the unit direction of its side, and whether
+  // it lies between the ends of that side.
+  struct Side {
+    D4 x, y, e, tx, ty;
+    D4::Mask between;
+  };
 
-  static double on_sides(const Triangle& t, double x, double y, double& fx, double& fy, Feature& feature) {
-    const double bx = t.length - t.cx, rx = t.length - x;
-    fx = x < 0 ? 0 : x > t.length ? t.length : x;
-    fy = 0;
-    double e = (x - fx) * (x - fx) + y * y;
-    const double p = unit((x * t.cx + y * t.cy) / (t.cx * t.cx + t.cy * t.cy));
-    const double r = unit((rx * bx + y * t.cy) / (bx * bx + t.cy * t.cy));
-    const double side[2][2] = {{p * t.cx, p * t.cy}, {t.length - r * bx, r * t.cy}};
-    double along = fx / t.length;
-    feature = SIDE_AB;
-    for (int k = 0; k < 2; ++k) {
-      const double* f = side[k];
-      const double d = (x - f[0]) * (x - f[0]) + (y - f[1]) * (y - f[1]);
-      if (d < e) e = d, fx = f[0], fy = f[1], feature = k == 0 ? SIDE_AC : SIDE_BC, along = k == 0 ? p : r;
-    }
-    if (!(along > 0 && along < 1)) feature = CORNER;
-    return e;
-  }
-
-  static Stiffness stiffness(const Store& s, uint32_t lane, Feature feature) {
-    const Triangle& t = s.triangles[lane];
-    if (feature == FACE) return {t.n(), 1, 0};
-    if (feature == CORNER) return {{0, 0, 0}, 0, 1};
-    const double x = feature == SIDE_AB ? 1 : feature == SIDE_AC ? t.cx : t.length - t.cx;
-    const double y = feature == SIDE_AB ? 0 : feature == SIDE_AC ? t.cy : -t.cy, inv = 1 / std::sqrt(x * x + y * y);
-    return {{inv * (x * t.u.x + y * t.w.x), inv * (x * t.u.y + y * t.w.y), inv * (x * t.u.z + y * t.w.z)}, -1, 1};
+  static Side nearest_side(D4 length, D4 cx, D4 cy, D4 x, D4 y) {
+    const D4 zero = d4(0), one = d4(1), bx = length - cx, rx = length - x;
+    const auto unit = [&](D4 t, D4 most) { return select(t < zero, zero, select(most < t, most, t)); };
+    const D4 p = unit((x * cx + y * cy) / (cx * cx + cy * cy), one), q = unit((rx * bx + y * cy) / (bx * bx + cy * cy), one);
+    const D4 x1 = unit(x, length), x2 = p * cx, y2 = p * cy, x3 = length - q * bx, y3 = q * cy;
+    const D4 e1 = (x - x1) * (x - x1) + y * y, e2 = (x - x2) * (x - x2) + (y - y2) * (y - y2);
+    const D4 e3 = (x - x3) * (x - x3) + (y - y3) * (y - y3);
+    const D4::Mask second = e2 < e1;
+    const D4 e12 = select(second, e2, e1);
+    const D4::Mask third = e3 < e12;
+    const auto of = [&](D4 ab, D4 ac, D4 bc) { return select(third, bc, select(second, ac, ab)); };
+    const D4 along = of(x1 / length, p, q), tx = of(one, cx, bx), ty = of(zero, cy, zero - cy);
+    const D4 inverse = one / sqrt4(tx * tx + ty * ty);
+    return {of(x1, x2, x3), of(zero, y2, y3), of(e1, e2, e3), inverse * tx, inverse * ty, both(zero < along, along < one)};
   }
 
   static void prefetch_block(const Store& s, uint32_t block) {

@@ -1,10 +1,5 @@
 // The nearest primitive of a query by branch and bound over the tree, begun at a guess.
 // Included inside a namespace named after the instruction set.
-struct Best {
-  Foot foot;
-  int32_t lane;  // 8 block + lane, -1: none within the bound
-};
-
 // What all queries of a pass have in common.
 struct Scope {
   const Store& s;
@@ -14,19 +9,6 @@ struct Scope {
   float bound;      // its root [m]
   float lead;       // other primitives are found up to this much beyond the nearest [m]; 0: only the nearest
 };
-
-// Of two at the same distance the one that faces the query more squarely wins, then the lower id.
-static inline bool wins_tie(const Store& s, const Foot& f, uint32_t lane, const Best& best) {
-  if (std::fabs(f.height - best.foot.height) > s.tie) return f.height > best.foot.height;
-  return s.id[lane] < s.id[(size_t)best.lane];
-}
-
-template <class Kind>
-static inline bool nearer(const Store& s, const Foot& f, uint32_t lane, const Best& best) {
-  const double tie = Kind::tie(s, best.foot.d2);
-  if (f.d2 < best.foot.d2 - tie) return true;
-  return f.d2 <= best.foot.d2 + tie && wins_tie(s, f, lane, best);
-}
 
 // Square of a distance and a lead, with room for the rounding of single precision.
 static inline float lenient(const Store& s, float d, float lead) {
@@ -67,7 +49,7 @@ template <class Kind>
 class Search {
  public:
   Search(const Scope& scope, const Query& q)
-      : o_(scope), s_(scope.s), q_(q), best_{{scope.bound2, 0, 0, 0, 0, FACE}, -1},
+      : o_(scope), s_(scope.s), q_(q), best_d2_(scope.bound2),
         p_{(float)(q.x - s_.centre.x), (float)(q.y - s_.centre.y), (float)(q.z - s_.centre.z)},
         exact_(lenient(s_, scope.bound, 0.f)), limit_(lenient(s_, scope.bound, scope.lead)) {}
 
@@ -81,16 +63,17 @@ class Search {
       first_ = other_ = 3e38f, waiting_ = 0;  // the tree comes to the same blocks again
       in_tree();
     }
-    resolve();
+    resolve(true);
   }
 
   // Only this block. Where it holds the nearest lane, this finds it.
   void run_block(uint32_t block) {
     visit(block);
-    resolve();
+    resolve(true);
   }
 
-  const Best& best() const { return best_; }
+  // The nearest, -1: none. Whether its distance is below the bound is not always decided yet.
+  int32_t lane() const { return lane_; }
 
   // How far the query may move before another primitive (`lane`), or one of another block (`block`), can be the nearest,
   // or one come within the bound. An eye that stays within the margin of `Facing` makes no difference.
@@ -99,16 +82,16 @@ class Search {
   };
   Room room() const {
     const float first = std::sqrt(first_), known = std::sqrt(limit_);
-    if (best_.lane < 0) {
+    if (lane_ < 0) {
       const float gap = (first < known ? first : known) - o_.bound - 3.f * s_.slack;
       return {gap, gap};
     }
-    if (first_ < least_ || (uint32_t)best_.lane / LANES != first_block_) return {0.f, 0.f};
+    if (first_ < least_ || (uint32_t)lane_ / LANES != first_block_) return {0.f, 0.f};
     const float other = std::sqrt(other_), block = half(first, other < known ? other : known);
     float lanes[LANES], second = 3e38f;
     store8(lanes, first_lanes_);
     for (int k = 0; k < LANES; ++k)
-      if (k != best_.lane % LANES && lanes[k] < second) second = lanes[k];
+      if (k != lane_ % LANES && lanes[k] < second) second = lanes[k];
     return {second < first_ ? 0.f : std::min(block, half(first, std::sqrt(second))), block};
   }
 
@@ -191,7 +174,7 @@ class Search {
       tighten(nearest);
     else
       tighten_to_facing(block, d, sure);
-    if (waiting_ == MOST_WAITING) resolve();
+    if (waiting_ == MOST_WAITING) resolve(false);
     wait_block_[waiting_] = block, wait_[waiting_++] = d;
   }
 
@@ -204,19 +187,43 @@ class Search {
     }
   }
 
-  // Measures exactly what waits and may still be the nearest.
-  void resolve() {
+  // Measures exactly what waits and may still be the nearest. What is alone at the end need not be measured.
+  void resolve(bool end) {
+    uint32_t lanes[4];
+    int n = 0;
     for (int i = 0; i < waiting_; ++i) {
       const unsigned sure = o_.facing.sure[wait_block_[i]];
-      for (unsigned lanes = bits(wait_[i] < f8(exact_)); lanes; lanes &= lanes - 1) {
-        const int k = lowest_bit(lanes);
+      for (unsigned left = bits(wait_[i] < f8(exact_)); left; left &= left - 1) {
+        const int k = lowest_bit(left);
         const uint32_t lane = LANES * wait_block_[i] + (uint32_t)k;
         if (!(sure >> k & 1) && !Kind::faces(s_, lane, *o_.eye)) continue;
-        const Foot f = Kind::foot(s_, lane, q_);
-        if (best_.lane < 0 ? f.d2 < best_.foot.d2 : nearer<Kind>(s_, f, lane, best_)) best_ = {f, (int32_t)lane};
+        if (n == 4) measure(lanes, n), n = 0;
+        lanes[n++] = lane;
       }
     }
     waiting_ = 0;
+    if (end && n == 1 && lane_ < 0)
+      lane_ = (int32_t)lanes[0];
+    else if (n)
+      measure(lanes, n);
+  }
+
+  void measure(uint32_t (&lanes)[4], int n) {
+    for (int k = n; k < 4; ++k) lanes[k] = lanes[0];
+    const Four four = Kind::feet(s_, lanes, {d4(q_.x), d4(q_.y), d4(q_.z)}, Ask::FOOT);
+    double d2[4], height[4];
+    store4(d2, four.d2), store4(height, four.height);
+    for (int k = 0; k < n; ++k)
+      if (nearer(d2[k], height[k], lanes[k])) lane_ = (int32_t)lanes[k], best_d2_ = d2[k], best_height_ = height[k];
+  }
+
+  // Of two at the same distance the one that faces the query more squarely wins, then the lower id.
+  bool nearer(double d2, double height, uint32_t lane) const {
+    if (lane_ < 0) return d2 < best_d2_;
+    const double tie = Kind::tie(s_, best_d2_);
+    if (d2 < best_d2_ - tie || d2 > best_d2_ + tie) return d2 < best_d2_ - tie;
+    if (std::fabs(height - best_height_) > s_.tie) return height > best_height_;
+    return s_.id[lane] < s_.id[(size_t)lane_];
   }
 
   void tighten(float d2) {
@@ -233,7 +240,8 @@ class Search {
   const Scope& o_;
   const Store& s_;
   const Query& q_;
-  Best best_;
+  int32_t lane_ = -1;                     // the best so far, with its exact squared distance and height
+  double best_d2_, best_height_ = 0;
   float p_[3];  // the query relative to the model's centre
   float exact_, limit_;  // squared distances under which lanes are measured exactly, and looked at
   float least_ = FAR;   // least squared distance of a lane that counts

@@ -23,8 +23,12 @@ struct F8 {
 struct D4 {
 #if AVS_VECTORS
   typedef double Raw __attribute__((vector_size(32)));
+  typedef int64_t Mask __attribute__((vector_size(32)));
   Raw v;
 #else
+  struct Mask {
+    int64_t v[4];
+  };
   double v[4];
 #endif
 };
@@ -42,6 +46,11 @@ static inline F8 select(F8::Mask m, F8 a, F8 b) { return {m ? a.v : b.v}; }
 static inline D4 operator+(D4 a, D4 b) { return {a.v + b.v}; }
 static inline D4 operator-(D4 a, D4 b) { return {a.v - b.v}; }
 static inline D4 operator*(D4 a, D4 b) { return {a.v * b.v}; }
+static inline D4 operator/(D4 a, D4 b) { return {a.v / b.v}; }
+static inline D4::Mask operator<(D4 a, D4 b) { return a.v < b.v; }
+static inline D4::Mask both(D4::Mask a, D4::Mask b) { return a & b; }
+static inline D4::Mask either(D4::Mask a, D4::Mask b) { return a | b; }
+static inline D4 select(D4::Mask m, D4 a, D4 b) { return {m ? a.v : b.v}; }
 #else
 #define AVS_LANES8(expression) \
   F8 r;                        \
@@ -55,6 +64,10 @@ static inline D4 operator*(D4 a, D4 b) { return {a.v * b.v}; }
   D4 r;                        \
   for (int k = 0; k < 4; ++k) r.v[k] = expression; \
   return r;
+#define AVS_MASK4(expression) \
+  D4::Mask r;                 \
+  for (int k = 0; k < 4; ++k) r.v[k] = (expression) ? -1 : 0; \
+  return r;
 static inline F8 f8(float x) { AVS_LANES8(x) }
 static inline F8 operator+(F8 a, F8 b) { AVS_LANES8(a.v[k] + b.v[k]) }
 static inline F8 operator-(F8 a, F8 b) { AVS_LANES8(a.v[k] - b.v[k]) }
@@ -67,9 +80,15 @@ static inline F8 select(F8::Mask m, F8 a, F8 b) { AVS_LANES8(m.v[k] ? a.v[k] : b
 static inline D4 operator+(D4 a, D4 b) { AVS_LANES4(a.v[k] + b.v[k]) }
 static inline D4 operator-(D4 a, D4 b) { AVS_LANES4(a.v[k] - b.v[k]) }
 static inline D4 operator*(D4 a, D4 b) { AVS_LANES4(a.v[k] * b.v[k]) }
+static inline D4 operator/(D4 a, D4 b) { AVS_LANES4(a.v[k] / b.v[k]) }
+static inline D4::Mask operator<(D4 a, D4 b) { AVS_MASK4(a.v[k] < b.v[k]) }
+static inline D4::Mask both(D4::Mask a, D4::Mask b) { AVS_MASK4(a.v[k] && b.v[k]) }
+static inline D4::Mask either(D4::Mask a, D4::Mask b) { AVS_MASK4(a.v[k] || b.v[k]) }
+static inline D4 select(D4::Mask m, D4 a, D4 b) { AVS_LANES4(m.v[k] ? a.v[k] : b.v[k]) }
 #undef AVS_LANES8
 #undef AVS_MASK8
 #undef AVS_LANES4
+#undef AVS_MASK4
 #endif
 
 static inline F8 load8(const float* p) {
@@ -83,6 +102,37 @@ static inline D4 load4(const double* p) {
   std::memcpy(&r, p, sizeof r);
   return r;
 }
+static inline void store4(double* p, D4 a) { std::memcpy(p, &a, sizeof a); }
+static inline D4 d4(double a, double b, double c, double d) {
+#if AVS_VECTORS
+  return {D4::Raw{a, b, c, d}};
+#else
+  return {{a, b, c, d}};
+#endif
+}
+static inline D4 d4(double x) { return d4(x, x, x, x); }
+
+static inline D4 sqrt4(D4 a) {
+#if AVS_VECTORS && defined(__AVX__)
+  return {(D4::Raw)_mm256_sqrt_pd((__m256d)a.v)};
+#else
+  double t[4];
+  store4(t, a);
+  for (int k = 0; k < 4; ++k) t[k] = std::sqrt(t[k]);
+  return load4(t);
+#endif
+}
+
+static inline bool any(D4::Mask m) {
+#if AVS_VECTORS && defined(__AVX__)
+  return _mm256_movemask_pd((__m256d)m) != 0;
+#else
+  int64_t t[4];
+  std::memcpy(t, &m, sizeof t);
+  return (t[0] | t[1] | t[2] | t[3]) != 0;
+#endif
+}
+
 // The second operand where they are equal or one is not a number, as minps and maxps do.
 static inline F8 min8(F8 a, F8 b) {
 #if AVS_VECTORS && defined(__AVX__)
