@@ -144,12 +144,15 @@ def pose_text(pose: Pose) -> str:
     return ",".join(repr(float(v)) for v in (*pose.t, *pose.q))
 
 
-def load_config(file: Path | None, log_table: Mapping[str, Any], assignments: Sequence[str]) -> RunConfig:
+def load_config(
+    file: Path | None, log_table: Mapping[str, Any], assignments: Sequence[str], log_folder: Path | None = None
+) -> RunConfig:
     """Return the effective configuration.
 
     Args:
         file: TOML file, or None.
         log_table: The log's own ``[run]`` table.
+        log_folder: Folder of the log, to which relative paths in its table refer; None: the folder of the command.
         assignments: ``a.b=value`` from options.
 
     Raises:
@@ -160,8 +163,24 @@ def load_config(file: Path | None, log_table: Mapping[str, Any], assignments: Se
     build(RunConfig, of_log)
     of_file = load(file) if file else Document("configuration", {})
     build(RunConfig, of_file)
-    merged = Document(of_file.name, _over(log_table, of_file.table), of_file.text)
+    below = with_robot_path(log_table, log_folder or Path())
+    above = with_robot_path(of_file.table, file.parent if file else Path())
+    merged = Document(of_file.name, _over(below, above), of_file.text)
     return build(RunConfig, override(merged, assignments))
+
+
+def with_robot_path(table: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return a table of settings in which the path ``robot.urdf`` refers to the folder of the command.
+
+    Args:
+        table: Settings, with a table ``robot`` or without.
+        folder: Folder of the file that states them, to which a relative path in it refers.
+    """
+    robot = table.get("robot")
+    urdf = robot.get("urdf") if isinstance(robot, Mapping) else None
+    if not isinstance(urdf, str):
+        return dict(table)
+    return {**table, "robot": {**table["robot"], "urdf": str(folder / urdf)}}
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +202,8 @@ def robot_settings(file: Path) -> tuple[str, ...]:
     """
     document = load(file)
     build(RobotFile, document)
-    return tuple(f"robot.{key}={toml_value(value)}" for key, value in document.table["robot"].items())
+    robot = with_robot_path(document.table, file.parent)["robot"]
+    return tuple(f"robot.{key}={toml_value(value)}" for key, value in robot.items())
 
 
 def check_robot(robot: RobotParams, plan: PlanParams, limits: Limits) -> None:

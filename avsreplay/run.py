@@ -101,7 +101,8 @@ class Run:
         self._made: Reconstruction | None = None
         try:
             header = self.header = self._without_model() if unknown else self.source.header
-            self.config: RunConfig = load_config(job.config_file, _run_table(header.scenario), job.assignments)
+            own = _run_table(header.scenario)
+            self.config: RunConfig = load_config(job.config_file, own, job.assignments, job.source.parent)
             if self._made is not None and self.config.init == "log" and self._made.poses[0][0] == self._first_ns:
                 self.config = replace(self.config, init=pose_text(self._made.poses[0][1]))
             self.surface: Surface = self._model()

@@ -61,6 +61,26 @@ def test_the_log_brings_its_own_table(cli, tmp_path):
     assert tomllib.loads(config())["faults"]["policy"] == "any"
 
 
+def test_a_relative_path_of_an_arm_refers_to_the_file_that_states_it(cli, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder, table = tmp_path / "robots", "urdf = 'arm.urdf'\n"
+    folder.mkdir()
+    (folder / "robot.toml").write_text(f"[robot]\n{table}", encoding="utf-8")
+    own = f"duration_s = 1.0\n[scanner]\nrays = [16, 16]\n[run.robot]\n{table}"
+    (folder / "s.toml").write_text(own, encoding="utf-8")
+    assert cli("record", folder / "s.toml", "-o", folder / "s.mcap").code == 0
+    stated = str(Path("robots") / "arm.urdf")
+    given = {
+        stated: (["--config", "robots/robot.toml"], ["--robot", "robots/robot.toml"], ["robots/s.mcap"]),
+        "arm.urdf": (["--set", "robot.urdf=arm.urdf"],),
+    }
+    for path, options in given.items():
+        for option in options:
+            assert tomllib.loads(config(*option))["robot"]["urdf"] == path, option
+    (folder / "robot.toml").write_text(f"[robot]\nurdf = '{tmp_path}/arm.urdf'\n", encoding="utf-8")
+    assert tomllib.loads(config("--robot", "robots/robot.toml"))["robot"]["urdf"] == f"{tmp_path}/arm.urdf"
+
+
 def test_json_is_the_configuration_of_a_run():
     assert json.loads(config("--json", "--policy", "all")) == settings.dump(
         load_config(None, {}, ["faults.policy=all"])

@@ -122,7 +122,7 @@ def test_files_that_are_no_manipulator_are_refused(arm: Arm, tmp_path: Path) -> 
     (tmp_path / "wrong.urdf").write_text("<robot", encoding="utf-8")
     with pytest.raises(UnreadableInput, match="no URDF"):
         Arm(tmp_path / "wrong.urdf")
-    with pytest.raises(UnreadableInput, match="no URDF"):
+    with pytest.raises(UnreadableInput, match="no such URDF"):
         Arm(tmp_path / "missing.urdf")
 
 

@@ -21,7 +21,7 @@ from avsreplay.plan import (
     closed_loop,
     rendezvous,
 )
-from avsreplay.plan.evaluation import pushed
+from avsreplay.plan.flights import disturbed, pushed
 from avsreplay.plan.limits import margin
 from avsreplay.records import Forecast
 
@@ -158,6 +158,21 @@ def test_replanning_removes_errors_of_the_thrust_as_far_as_the_last_second():
     assert all(loop(0.0, seed, latency_s) == "captured" for seed in range(3) for latency_s in (0.0, 0.3))
     assert all(loop(0.001, seed, 0.3) == "captured" for seed in range(3))
     assert any(loop(0.2, seed, 0.3) != "captured" for seed in range(3))
+
+
+def test_the_errors_of_the_thrust_over_one_second_do_not_depend_on_the_rate_of_the_scans():
+    path = StepPath(np.zeros(3), np.zeros(3), np.zeros((1, 3)), 0.0, 1.0)
+    spreads = []
+    for scans in (1, 10):
+        rng, ends = np.random.default_rng(1), []
+        for _ in range(400):
+            segment = Segment(0, path.r0, path.v0, path)
+            for k in range(scans):
+                segment = disturbed(segment, (k + 1) * 10**9 // scans, 1.0 / scans, 0.02, rng)
+            ends.append(segment.at(10**9)[1])
+        spreads.append(np.std(ends))
+    assert spreads == pytest.approx([0.02, 0.02], rel=0.06)  # m/s after 1 s; 1200 values each: 2 % is 1 sigma
+    assert disturbed(Segment(0, path.r0, path.v0), 10**9, 1.0, 0.02, rng).path is None  # a coasting robot
 
 
 def test_a_pushed_segment_keeps_its_thrust_and_moves_on_from_the_new_state():

@@ -201,7 +201,7 @@ def config_command(log: Path | None, as_json: bool, markdown: bool, **flags: Any
     if markdown:
         click.echo(reference_page(), nl=False)
         return
-    config = load_config(file, _own_table(log) if log else {}, assignments)
+    config = load_config(file, _own_table(log) if log else {}, assignments, log and log.parent)
     if as_json:
         click.echo(json.dumps(settings.dump(config), indent=1))
     else:

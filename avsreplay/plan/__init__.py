@@ -2,17 +2,8 @@
 
 from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn
 from avsreplay.plan.constrained import constrained
-from avsreplay.plan.evaluation import (
-    Execution,
-    Flights,
-    Miss,
-    Motion,
-    Tolerance,
-    closed_loop,
-    execute,
-    interpolated,
-    miss,
-)
+from avsreplay.plan.evaluation import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
+from avsreplay.plan.flights import Flights, closed_loop
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Scene, TargetGeometry, hull_vertices
 from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of

@@ -99,6 +99,9 @@ class Arm:
             raise UsageError(what, where="robot.urdf", hint=hint) from None
         try:
             self._model = self._pin.buildModelFromXML(urdf.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            hint = "a relative path refers to the file that states it; name the robot again with --robot"
+            raise UnreadableInput("no such URDF", where=str(urdf), hint=hint) from None
         except (OSError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise UnreadableInput(f"no URDF: {reason}", where=str(urdf), hint="check the file") from None

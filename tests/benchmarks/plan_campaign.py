@@ -1,11 +1,13 @@
 """Whole approaches with blackouts on a simulated estimate: captured, aborted, touched.
 
 Truth from the full inertia tensor by DOP853; poses with white noise at 5 Hz; the filter from a near start; one to three
-blackouts of 5-30 s at random moments; guidance with a delay of 0.2 s under the supervisor. The body is a ball of 0.6 of
+blackouts of 5-30 s at random moments; guidance with a delay of 0.2 s under the supervisor; errors of the thrust, 2 % of
+the largest one over 1 s, push the robot off its path. The body is a ball of 0.6 of
 the arm's length; the plans keep a clearance of 0.15 m and arrive through a corridor of 15 degrees. Registration is left
 out.
 
-python tests/benchmarks/plan_campaign.py [--quick] [--count 200] [--seed 1] [--one-at S --length S] [--free]
+python tests/benchmarks/plan_campaign.py [--quick] [--count 200] [--seed 1] [--noise 0.02] [--free]
+    [--one-at S --length S]
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ from __future__ import annotations
 import argparse
 import collections
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -37,6 +40,7 @@ from avsreplay.plan import (
     miss,
 )
 from avsreplay.plan.evaluation import closed_miss
+from avsreplay.plan.flights import disturbed
 from avsreplay.records import Alignment, AlignStatus, Belief, State
 
 EXTENT_M, RATE_HZ, SPAN_S = 8.0, 5.0, 120.0
@@ -112,7 +116,7 @@ def geometry_of(x):
     return TargetGeometry(-centre / arm, hull, closest)
 
 
-def campaign(seed, one=None, limits=LIMITS):
+def campaign(seed, one=None, limits=LIMITS, noise=0.02):
     """One campaign: (outcome, miss, rules seen, could it have captured where it first held, touched the body)."""
     rng = np.random.default_rng(seed)
     state, motion = bodies(rng)
@@ -121,7 +125,8 @@ def campaign(seed, one=None, limits=LIMITS):
     estimator = Estimator(params, near_start(state(0.0), rng), EXTENT_M)
     convergence, watch = Convergence(ConvergenceParams(), EXTENT_M), ConvergenceTrack()
     target, touched = geometry_of(state(0.0)), False
-    guidance = Guidance(PlanParams(latency_s=0.2), Supervisor(SupervisorParams().resolved(EXTENT_M)), limits, EXTENT_M)
+    robot, errors = PlanParams(latency_s=0.2), np.random.default_rng([seed, 1])
+    guidance = Guidance(robot, Supervisor(SupervisorParams().resolved(EXTENT_M)), limits, EXTENT_M)
     track, memory = estimator.initial(0, state(0.0).T_ac), guidance.initial(0)
     rules, committed, held_good = [], None, None
     for t in np.arange(1, int(SPAN_S * RATE_HZ)) / RATE_HZ:
@@ -134,6 +139,8 @@ def campaign(seed, one=None, limits=LIMITS):
         forecast = estimator.forecast(belief, convergence.params.times_s)
         watch = convergence.judge(watch, belief, forecast, True)
         known = planner_input(estimator, belief, target, gamma, watch.converged, partial(estimator.forecast, belief))
+        wrong = disturbed(memory.segment, t_ns, 1.0 / RATE_HZ, noise * robot.a_max_mps2, errors)
+        memory = replace(memory, segment=wrong)
         before, memory = memory, guidance.step(memory, known)
         for at_s in np.linspace(t, t + 1.0 / RATE_HZ, 5):
             r = memory.segment.at(round(at_s * 1e9))[0]
@@ -162,11 +169,12 @@ def main():
     args.add_argument("--seed", type=int, default=1)
     args.add_argument("--one-at", type=float)
     args.add_argument("--length", type=float, default=12.0)
+    args.add_argument("--noise", type=float, default=0.02, help="error of the thrust, as a fraction of the largest one")
     args.add_argument("--free", action="store_true", help="without limits")
     args = args.parse_args()
     one = (args.one_at, args.length) if args.one_at is not None else None
     count, begun = 10 if args.quick else args.count, time.perf_counter()
-    done = [campaign(args.seed * 10_000 + k, one, None if args.free else LIMITS) for k in range(count)]
+    done = [campaign(args.seed * 10_000 + k, one, None if args.free else LIMITS, args.noise) for k in range(count)]
     outcomes = collections.Counter(d[0] for d in done)
     rules = collections.Counter(rule for d in done for rule in set(d[2]))
     closed = [d[1] for d in done if d[1] is not None]
