@@ -1,4 +1,4 @@
-"""Whole flights in a closed loop: replanning against errors of the thrust, the delay of the planner and a true target."""
+"""Whole flights in a closed loop: replanning, errors of the thrust, the delay of the planner, and a true target."""
 
 from __future__ import annotations
 
