@@ -15,6 +15,7 @@ from avsreplay.monitor.convergence import Consistency, Convergence
 from avsreplay.monitor.faults import FaultDetector
 from avsreplay.pipeline import Monitors, PipelineState, Stages
 from avsreplay.plan import Guidance, Supervisor, TargetGeometry, hull_vertices
+from avsreplay.plan.arm import with_arm
 from avsreplay.records import LogHeader, Scan, Surface, Truth
 from avsreplay.register import POSES, Registrar
 from avsreplay.register.surface_index import SurfaceIndex
@@ -45,7 +46,8 @@ def stages(
     estimator = config.estimator
     if config.register.backend == POSES:
         estimator = estimator.at_interval(clock[1], surface.extent)
-    limits = config.robot.limited(config.limits)
+    robot, arm = with_arm(config.robot)
+    limits = robot.limited(config.limits)
     supervision = config.supervisor.resolved(surface.extent)
     return Stages(
         registrar=registrar,
@@ -53,7 +55,7 @@ def stages(
         faults=FaultDetector(config.faults, surface.extent),
         monitors=Monitors(Consistency(config.consistency), Convergence(config.convergence, surface.extent)),
         guidance=Guidance(
-            config.robot.applied(config.plan), Supervisor(supervision), limits, surface.extent, config.robot.gripper
+            robot.applied(config.plan), Supervisor(supervision), limits, surface.extent, robot.gripper, arm
         ),
         target=target_geometry(surface, config.fixture_axis_c, limits.clearance_m is not None),
         guess=config.guess,

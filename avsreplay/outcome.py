@@ -60,6 +60,8 @@ class Plan:
             without a clearance.
         steps: Number of steps of the search.
         attitude_s: Time from t_ns until the gripper has attitude and rate of the fixture [s]; NaN where not planned.
+        delayed_by: What makes the capture later than the flight alone: "attitude" (the turn of the gripper), "arm" (the
+            joints); "" where nothing does.
     """
 
     t_ns: int
@@ -79,6 +81,7 @@ class Plan:
     abort_margin_m: float = math.nan
     steps: int = 0
     attitude_s: float = math.nan
+    delayed_by: str = ""
 
     @property
     def gap_s(self) -> float:

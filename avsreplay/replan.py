@@ -19,6 +19,8 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan import Limits, PlannerInput, PlanParams, RobotParams, Scene, SupervisorParams
+from avsreplay.plan.arm import Arm, JointPath
+from avsreplay.plan.robot import slowed
 from avsreplay.records import Alignment, AlignStatus, Belief, State, Surface
 from avsreplay.report.result import load_result, motion_samples
 from avsreplay.result_dir import read_beliefs
@@ -165,7 +167,14 @@ def with_settings(saved: Saved, assignments: Sequence[str]) -> Saved:
 class Replanning:
     """Planner for a saved result with other settings."""
 
-    def __init__(self, saved: Saved, params: PlanParams, limits: Limits, supervisor: SupervisorParams) -> None:
+    def __init__(
+        self,
+        saved: Saved,
+        params: PlanParams,
+        limits: Limits,
+        supervisor: SupervisorParams,
+        arm: Arm | None = None,
+    ) -> None:
         """Create the planning.
 
         Args:
@@ -173,11 +182,12 @@ class Replanning:
             params: Parameters of robot and planner.
             limits: Constraints of every capture plan.
             supervisor: Resolved parameters of the supervisor.
+            arm: Manipulator that must be able to fly the last metres; None without.
 
         Raises:
             UsageError: A clearance is required and the result contains no model.
         """
-        self.saved, self.supervisor, self.robot = saved, supervisor, saved.robot
+        self.saved, self.supervisor, self.robot, self.arm = saved, supervisor, saved.robot, arm
         self.params = self.robot.applied(params)
         self.robot_line = self.robot.described(params, limits)
         self._radius = self.robot.radius_m
@@ -218,9 +228,30 @@ class Replanning:
 
     def _planned(self, scene: Scene, t_ns: int, warm: plan.RobotPath | None = None) -> Plan:
         turn_s = plan.turn_time(scene.attitude, self.robot.gripper, self.params, t_ns)
-        start, extent_m = None if warm is None else (warm, 0.0), self.saved.extent_m
-        problem = scene, *self.start, self.params, self.limits, t_ns, extent_m, start, turn_s or 0.0
-        return plan.with_turn(plan.constrained(*problem), turn_s)
+        begin, extent_m = None if warm is None else (warm, 0.0), self.saved.extent_m
+
+        def make(earliest_s: float, share: float) -> Plan:
+            params, limits = slowed(self.params, self.limits, share)
+            return plan.constrained(scene, *self.start, params, limits, t_ns, extent_m, begin, earliest_s)
+
+        first_s = turn_s or 0.0
+        if self.arm is None:
+            return plan.with_turn(make(first_s, 1.0), turn_s)
+        fitted = self.arm.fitted(make, self.path, scene, self.limits, first_s, self.params.horizon_s)
+        return plan.with_turn(fitted[0], turn_s)
+
+    def joints(self, index: int, made: Plan) -> JointPath | None:
+        """Return the joints of the arm during the last metres of a plan; None without arm or plan.
+
+        Args:
+            index: index of the scan from which the plan was made.
+            made: the plan.
+        """
+        if self.arm is None or not made.found:
+            return None
+        belief, estimator = self.saved.beliefs[index], self.saved.estimator
+        scene = Scene(estimator.motion(belief), estimator.attitude(belief))
+        return self.arm.last_metres(self.path(made), scene, self.limits)
 
     def path(self, made: Plan) -> plan.RobotPath:
         """Return the path of a plan from the start.
@@ -329,7 +360,7 @@ class Replanning:
 
     def _guidance(self) -> plan.Guidance:
         supervisor, extent_m = plan.Supervisor(self.supervisor), self.saved.extent_m
-        return plan.Guidance(self.params, supervisor, self.limits, extent_m, self.robot.gripper)
+        return plan.Guidance(self.params, supervisor, self.limits, extent_m, self.robot.gripper, self.arm)
 
     def execute(self) -> plan.Execution | None:
         """Simulate the approach over the whole log under the supervisor; None without truth."""

@@ -255,6 +255,8 @@ class Row:
     abort_margin_m: float | None = column(
         lambda o, s: None if o.plan is None else finite(o.plan.abort_margin_m), "m", ".4f", 0.0, 0.01
     )
+    gripper_ready_s: float | None = _seconds(if_planned(lambda o, p: finite(since_start_s(o, p.t_ns) + p.attitude_s)))
+    plan_delay: str | None = _exact(if_planned(lambda o, p: p.delayed_by or None))
     plan_miss_m: float | None = _error_m(_PLANNED[0])
     plan_miss_mps: float | None = _error_m(_PLANNED[1], "m/s")
     plan_miss_deg: float | None = _error_deg(_PLANNED[2])

@@ -11,8 +11,23 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.plan import Limits, RobotParams, Scene, StepPath
-from avsreplay.plan.arm import Arm, with_arm
+from avsreplay.outcome import Plan, PlanStatus
+from avsreplay.plan import (
+    Guidance,
+    Limits,
+    PlannerInput,
+    PlanParams,
+    RobotParams,
+    Scene,
+    StepPath,
+    Supervisor,
+    SupervisorParams,
+    constrained,
+    path_of,
+)
+from avsreplay.plan.arm import Arm, JointPath, with_arm
+from avsreplay.plan.robot import slowed
+from avsreplay.records import Forecast
 
 LENGTHS = (0.4, 1.2, 1.0, 0.3, 0.2, 0.15)
 AXES = np.array([[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 0, 1], [0, 1, 0], [0, 0, 1]], dtype=float)
@@ -98,6 +113,94 @@ def test_a_capture_out_of_reach_is_said_so(arm: Arm) -> None:
     found = arm.last_metres(*_flight((6.0, 0.3, 0.5)), LIMITS)
     assert not found.possible
     assert found.described() == [("arm", "cannot reach the pose of the capture")]
+
+
+def _turning(phase: float, rate: float) -> Scene:
+    """A grasp point 0.3 m from a centre in front of the arm; the fixture turns about z."""
+    centre, q0 = np.array([1.9, 0.0, 0.9]), Rotation.from_rotvec([0.0, 0.0, phase])
+
+    def turn(t: np.ndarray) -> Rotation:
+        return Rotation.from_rotvec(np.outer(t, [0.0, 0.0, rate])) * q0
+
+    def goal(t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        offset = turn(t).apply([0.3, 0.0, 0.0])
+        return centre + offset, np.cross([0.0, 0.0, rate], offset)
+
+    return Scene(goal, lambda t: turn(t).as_quat(), axis_c=np.array([1.0, 0.0, 0.0]))
+
+
+START, NEAR = np.array([0.8, 0.3, 1.2]), Limits(final_deg=15.0, final_range_m=0.3).resolved(2.0)
+
+
+def _fitted(arm: Arm, scene: Scene, horizon_s: float = 90.0) -> tuple[Plan, Plan, JointPath | None]:
+    """The plan without the arm, the one that the arm can fly, and its joints."""
+    limits, params = replace(NEAR, reach_max_m=arm.reach_m), PlanParams(a_max_mps2=0.05, horizon_s=horizon_s)
+
+    def make(earliest_s: float, share: float) -> Plan:
+        slower, fewer = slowed(params, limits, share)
+        return constrained(scene, START, np.zeros(3), slower, fewer, extent_m=2.0, earliest_s=earliest_s)
+
+    made, joints = arm.fitted(make, lambda p: path_of(p, START, np.zeros(3)), scene, limits, 0.0, horizon_s)
+    return make(0.0, 1.0), made, joints
+
+
+def test_a_capture_out_of_reach_is_replaced_by_a_later_one(arm: Arm) -> None:
+    scene = _turning(phase=3.6, rate=-0.05)
+    free, made, joints = _fitted(arm, scene)
+    assert free.found
+    assert not arm.last_metres(path_of(free, START, np.zeros(3)), scene, NEAR).possible
+    assert made.found
+    assert joints is not None
+    assert joints.possible
+    assert made.delayed_by == "arm"
+    assert made.t_go_s > free.t_go_s + 1.0
+    assert made.lower_bound_s == free.lower_bound_s  # nothing is certified about the joints
+    assert made.status is PlanStatus.FEASIBLE
+    position, turn = _forward(joints.joints[-1])
+    end = np.array([made.t_go_s])
+    assert np.linalg.norm(position - scene.goal(end)[0][0]) < 1e-6
+    assert (turn.inv() * Rotation.from_quat(scene.attitude(end)[0])).magnitude() < 1e-6
+
+
+def test_a_weak_arm_flies_slower(arm: Arm, tmp_path: Path) -> None:
+    scene = _turning(phase=0.0, rate=0.01)
+    free, _, joints = _fitted(arm, scene)
+    assert joints is not None
+    weak = Arm(_urdf(tmp_path / "weak.urdf", effort=50.0 * 0.7 * joints.torque_share), "gripper")
+    assert weak.last_metres(path_of(free, START, np.zeros(3)), scene, NEAR).torque_share > 1.0
+    _, made, fewer = _fitted(weak, scene)
+    assert made.found
+    assert fewer is not None
+    assert fewer.torque_share <= 1.0
+    assert made.delayed_by == "arm"
+    assert made.t_go_s > free.t_go_s
+
+
+def test_no_capture_that_the_arm_can_fly_is_none_found(arm: Arm) -> None:
+    free, made, joints = _fitted(arm, _turning(phase=3.0, rate=0.01), horizon_s=25.0)
+    assert free.found
+    assert made.status is PlanStatus.NOT_FOUND
+    assert made.delayed_by == "arm"
+    assert not np.isfinite(made.t_go_s)
+    assert joints is None or not joints.possible
+
+
+def test_guidance_flies_a_capture_that_the_arm_reaches(arm: Arm) -> None:
+    scene, start = _turning(phase=3.6, rate=-0.05), (0.8, 0.3, 1.2)
+    params = PlanParams(a_max_mps2=0.05, horizon_s=90.0, robot_position_m=start)
+    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
+    known = (PlannerInput(round(t * 1e9), 1, True, scene.after(t), exact) for t in np.arange(0.0, 90.0, 2.0))
+    limits, supervisor = replace(NEAR, reach_max_m=arm.reach_m), Supervisor(SupervisorParams().resolved(2.0))
+    state = None
+    for _, state in Guidance(params, supervisor, limits, 2.0, arm=arm).fly(known):
+        if state.captured_ns is not None:
+            break
+    assert state is not None
+    assert state.captured_ns is not None
+    assert state.plan is not None
+    assert state.plan.delayed_by == "arm"
+    flown = arm.last_metres(state.segment.path, scene.after(state.segment.t_ns * 1e-9), limits)
+    assert flown.possible
 
 
 def test_the_reach_bounds_the_distance_of_every_configuration(arm: Arm) -> None:

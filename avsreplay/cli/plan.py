@@ -117,12 +117,12 @@ def plan_command(
     for line in saved.warnings:
         click.echo(f"avsreplay: warning: {line}", err=True)
     robot, arm = with_arm(saved.robot)
-    planning = _planning(replace(saved, robot=robot), flags)
+    planning = _planning(replace(saved, robot=robot), flags, arm)
     index = saved.index_at(at_s)
     made = _usable(lambda: planning.plan_at(index))
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
     flown = _usable(lambda: planning.flights(index, flights, seed)) if made.found and flights else None
-    joints = _usable(lambda: _joints(planning, index, made, arm)) if made.found and arm else None
+    joints = _usable(lambda: planning.joints(index, made))
     period_s = every_s or (10.0 if planning.limits.any else 2.0)
     hindsight = _usable(lambda: planning.hindsight(period_s))
     execution = _usable(planning.execute)
@@ -144,7 +144,7 @@ def _usable(action: Any) -> Any:
         raise UsageError(str(error), hint="correct the option, or the setting in run.json") from None
 
 
-def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
+def _planning(saved: Saved, flags: dict[str, Any], arm: Arm | None) -> Replanning:
     from dataclasses import fields, replace
 
     from avsreplay.plan import PlanParams
@@ -154,17 +154,8 @@ def _planning(saved: Saved, flags: dict[str, Any]) -> Replanning:
     of_plan = {f.name for f in fields(PlanParams)}
     params: PlanParams = _usable(lambda: replace(saved.plan, **{k: v for k, v in given.items() if k in of_plan}))
     limits: Limits = _usable(lambda: replace(saved.limits, **{k: v for k, v in given.items() if k not in of_plan}))
-    made: Replanning = _usable(lambda: Replanning(saved, params, limits, saved.supervisor))
+    made: Replanning = _usable(lambda: Replanning(saved, params, limits, saved.supervisor, arm))
     return made
-
-
-def _joints(planning: Replanning, index: int, made: Plan, arm: Arm) -> JointPath:
-    """Return the joints of the arm during the last metres."""
-    from avsreplay.plan import Scene
-
-    belief, estimator = planning.saved.beliefs[index], planning.saved.estimator
-    scene = Scene(estimator.motion(belief), estimator.attitude(belief))
-    return arm.last_metres(planning.path(made), scene, planning.limits)
 
 
 def _document(
@@ -225,6 +216,7 @@ def _plan_record(made: Plan, since_s: float) -> dict[str, Any]:
         "limit": made.binding or None,
         "abort_margin_m": made.abort_margin_m,
         "attitude_s": made.attitude_s,
+        "delayed_by": made.delayed_by or None,
     }
 
 
@@ -271,6 +263,8 @@ def _plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str
         ]
     if abs(made.attitude_s) < float("inf"):
         facts.append(("gripper", f"attitude and rate of the fixture after {made.attitude_s:.3f} s"))
+    if made.found and made.delayed_by:
+        facts.append(("delayed by", _DELAYED[made.delayed_by]))
     basis = "certified without the limits" if planning.limits.any else "certified"
     facts.append(("no capture before", f"{made.lower_bound_s:.4f} s after planning ({basis})"))
     if made.binding:
@@ -280,12 +274,18 @@ def _plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str
     return facts
 
 
+_DELAYED = {
+    "attitude": "the turn of the gripper: its end-effector alone could be there earlier",
+    "arm": "the joints of the arm: an earlier or faster capture exceeds their limits",
+}
+
+
 def _status(made: Plan) -> str:
     """Return what is known about the plan, in words."""
     words = {
         "optimal": f"optimal within {max(made.gap_s, 0.0):.1e} s",
         "feasible": f"found; at most {made.gap_s:.2f} s later than the earliest possible capture",
-        "none_found": "none found; a capture may exist",
+        "none_found": f"none found{' that the arm can fly' if made.delayed_by == 'arm' else ''}; a capture may exist",
         "infeasible_within_horizon": "proven impossible within the horizon",
     }
     return words.get(made.status.value, made.status.value)

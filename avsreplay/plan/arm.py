@@ -1,13 +1,15 @@
 """A manipulator described by a URDF: the joint path of the last metres, through pinocchio (the extra ``arm``).
 
 The arm carries the gripper along a plan that was made for its end-effector. Its joints follow by inverse kinematics
-from the capture backwards. Limits of joints, rates and torques tell whether it can fly the plan. There is no gravity.
+from the capture backwards. A plan that exceeds limits of joints, rates or torques is replaced by a later or slower one.
+There is no gravity.
 """
 
 from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +19,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose
+from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan.limits import Scene
 from avsreplay.plan.path import RobotPath
 from avsreplay.plan.robot import Limits, RobotParams
@@ -26,6 +29,10 @@ STARTS = 32  # joint configurations from which the inverse kinematics of the cap
 ITERATIONS = 200
 POSE_ERROR = 1e-8  # in metres and radians
 DAMPING = 1e-3
+CAPTURES = 16  # plans that are tried until the joints can fly one
+STEP_S = 1.0  # spacing of the capture instants
+QUICK = 8  # joint configurations from which the inverse kinematics of a capture instant begins
+SLOWEST = 0.1  # smallest share of the largest acceleration
 JUMP_RAD = 0.5  # a larger change of a joint between two instants is another branch
 
 
@@ -57,6 +64,13 @@ class JointPath:
         """Whether the arm can fly the last metres within all limits."""
         shares = (self.range_share, self.rate_share, self.torque_share)
         return self.complete and not any(share > 1.0 + 1e-9 for share in shares)
+
+    @property
+    def slower(self) -> float:
+        """Share of the acceleration with which rates and torques may fit; 1 where another limit is exceeded."""
+        inside = self.complete and not self.range_share > 1.0 + 1e-9
+        rate, torque = (x if math.isfinite(x) else 0.0 for x in (self.rate_share, self.torque_share))
+        return min(1.0, 0.9 / max(torque, rate * rate, 0.9)) if inside else 1.0
 
     def record(self) -> dict[str, object]:
         """Return the path and its figures for a JSON document."""
@@ -164,20 +178,14 @@ class Arm:
         Raises:
             ValueError: The scene has no attitude.
         """
-        if scene.attitude is None:
-            raise ValueError("the joints of an arm need the fixture's attitude, and the scene has none")
         all_times = np.linspace(0.0, path.t_go_s, 1001)
         far = np.flatnonzero(
             np.linalg.norm(path.at(all_times)[0] - scene.goal(all_times)[0], axis=1) > (limits.final_range_m or 0.0)
         )
         begin_s = float(all_times[far[-1]]) if len(far) else 0.0
-        attitude = scene.attitude
         times = np.linspace(begin_s, path.t_go_s, INSTANTS)
-        r, q = path.at(times)[0], attitude(times)
-        turn = np.array(limits.base_attitude_xyzw)
-        back = geometry.conjugate(turn / np.linalg.norm(turn))
-        q, r_base = geometry.multiply(back, q), (r - np.array(limits.base_m)) @ geometry.matrix(back).T
-        poses = [Pose(*pose) for pose in zip(q, r_base, strict=True)]
+        r = path.at(times)[0]
+        poses = self._poses(scene, limits, times, r)
         best: list[Array] = []
         for start in self._starts():
             end = self.inverse(poses[-1], start)
@@ -189,6 +197,92 @@ class Arm:
             if len(best) == len(times):
                 break
         return self._graded(times[len(times) - len(best) :], best, r[len(times) - len(best) :], len(best) == len(times))
+
+    def fitted(
+        self,
+        make: Callable[[float, float], Plan],
+        path: Callable[[Plan], RobotPath],
+        scene: Scene,
+        limits: Limits,
+        first_s: float,
+        horizon_s: float,
+        hint_s: float = 0.0,
+    ) -> tuple[Plan, JointPath | None]:
+        """Return the earliest plan found whose last metres the joints can fly within all of their limits.
+
+        Where rates or torques are too large the acceleration is reduced; where the pose of the capture or the way to it
+        is out of reach, the next capture instant whose pose the arm reaches is tried.
+
+        Args:
+            make: Plans for an earliest capture [s] with a share of the largest acceleration.
+            path: Returns the path of a plan.
+            scene: The target after the instant of planning, with its attitude.
+            limits: Resolved limits: the pose of the base, and the length of the final approach.
+            first_s: Earliest capture [s after the instant of planning].
+            horizon_s: Latest capture.
+            hint_s: Capture of an earlier plan that the joints delayed; it is tried first, a little earlier.
+
+        Returns:
+            The plan and its joints. Without one the first plan with the status ``none_found`` and the joints of the
+            first plan; a plan that was not found, without joints.
+        """
+        if hint_s - 0.5 * STEP_S > first_s:
+            made = make(hint_s - 0.5 * STEP_S, 1.0)
+            joints = self.last_metres(path(made), scene, limits) if made.found else None
+            if joints is not None and joints.possible:
+                return _later(made, make(first_s, 1.0).lower_bound_s), joints
+        earliest_s, share, first = first_s, 1.0, None
+        for _ in range(CAPTURES):
+            made = make(earliest_s, share)
+            joints = self.last_metres(path(made), scene, limits) if made.found else None
+            if joints is not None and joints.possible:
+                return (made if first is None else _later(made, first[0].lower_bound_s)), joints
+            first = first or (made, joints)
+            least = 1.0 if joints is None else joints.slower
+            if joints is not None and least * share >= SLOWEST and least < 1.0:
+                share *= least
+                continue
+            after_s = self._next_capture(scene, limits, max(made.t_go_s if made.found else 0.0, earliest_s), horizon_s)
+            if after_s is None or (not made.found and share == 1.0):
+                break
+            earliest_s, share = after_s, 1.0
+        assert first is not None
+        made, joints = first
+        nan = math.nan
+        none = replace(
+            made,
+            status=PlanStatus.NOT_FOUND,
+            t_go_s=nan,
+            costate=np.full(6, nan),
+            thrust=None,
+            u_max=nan,
+            position_error_m=nan,
+            velocity_error_mps=nan,
+            delayed_by="arm",
+        )
+        return (none if made.found else made), joints
+
+    def _next_capture(self, scene: Scene, limits: Limits, after_s: float, horizon_s: float) -> float | None:
+        """Return the first instant later than ``after_s`` by STEP_S or more at which the arm reaches the fixture."""
+        times = np.arange(after_s + STEP_S, horizon_s, STEP_S)
+        poses, reach = self._poses(scene, limits, times, scene.goal(times)[0]), self.reach_m
+        for t, pose in zip(times, poses, strict=True):
+            near = float(np.linalg.norm(pose.t)) <= reach
+            if near and any(self.inverse(pose, start) is not None for start in self._starts()[:QUICK]):
+                return float(t)
+        return None
+
+    def _poses(self, scene: Scene, limits: Limits, times: Array, r: Array) -> list[Pose]:
+        """Return the poses of the gripper at r (n, 3) in {A}, with the attitude of the fixture, in the base's frame."""
+        if scene.attitude is None:
+            raise ValueError("the joints of an arm need the fixture's attitude, and the scene has none")
+        turn = np.array(limits.base_attitude_xyzw)
+        back = geometry.conjugate(turn / np.linalg.norm(turn))
+        q, r_base = (
+            geometry.multiply(back, scene.attitude(times)),
+            (r - np.array(limits.base_m)) @ geometry.matrix(back).T,
+        )
+        return [Pose(*pose) for pose in zip(q, r_base, strict=True)]
 
     def _starts(self) -> Array:
         low, high = self._model.lowerPositionLimit, self._model.upperPositionLimit
@@ -226,6 +320,11 @@ class Arm:
             rate_share=_share(rate, model.velocityLimit),
             torque_share=_share(torque, model.effortLimit),
         )
+
+
+def _later(made: Plan, lower_bound_s: float) -> Plan:
+    """Return a plan that the joints delay; the bound is certified without them [s]."""
+    return replace(made, status=PlanStatus.FEASIBLE, lower_bound_s=lower_bound_s, delayed_by="arm")
 
 
 def _share(values: Array, limits: Array) -> float:

@@ -193,7 +193,7 @@ def turn_time(
 
 
 def with_turn(plan: Plan, turn_s: float | None) -> Plan:
-    """Return the plan with the time of the gripper's turn; ``attitude`` is its limit where the turn decides.
+    """Return the plan with the time of the gripper's turn; it is delayed by the attitude where the turn decides.
 
     Args:
         plan: The plan of the flight.
@@ -202,5 +202,5 @@ def with_turn(plan: Plan, turn_s: float | None) -> Plan:
     """
     if turn_s is None or not plan.found:
         return plan
-    binding = "attitude" if plan.t_go_s <= turn_s + SAME_TIME_S else plan.binding
-    return replace(plan, attitude_s=turn_s, binding=binding)
+    delayed_by = "attitude" if plan.t_go_s <= turn_s + SAME_TIME_S else plan.delayed_by
+    return replace(plan, attitude_s=turn_s, delayed_by=delayed_by)

@@ -9,18 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
+from avsreplay.plan.arm import Arm
 from avsreplay.plan.attitude import Turn, next_turn, with_turn
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.limits import Scene, margin
 from avsreplay.plan.path import RobotPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
-from avsreplay.plan.robot import Limits
+from avsreplay.plan.robot import Limits, slowed
 from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
+from avsreplay.plan.withdrawal import resting, to_rest
 from avsreplay.records import Forecast
 
 SEARCH_AGAIN = 1.1  # ratio to the time to go of the latest full search from which on all initial paths are searched
@@ -126,6 +129,7 @@ class Guidance:
         limits: Limits | None = None,
         extent_m: float = 8.0,
         gripper: tuple[Array, float] | None = None,
+        arm: Arm | None = None,
     ) -> None:
         """Create the guidance of one run.
 
@@ -136,8 +140,9 @@ class Guidance:
             extent_m: Diagonal of the target's bounding box [m].
             gripper: Its attitude q_ag (4,) at the begin and its largest angular acceleration [rad/s2]; None: the
                 attitude is not planned.
+            arm: Manipulator that must be able to fly the last metres; None without.
         """
-        self.gripper = gripper
+        self.gripper, self.arm = gripper, arm
         self.params, self.supervisor = params, supervisor
         self.limits = (limits or Limits()).resolved(extent_m)
 
@@ -225,33 +230,47 @@ class Guidance:
 
         All initial paths are searched where there is none, or where the time to go exceeds that of the latest search.
         """
-        segment, draft = state.segment, state.draft
-        turn = None
-        if self.gripper is not None and segment.turn is not None and known.scene.attitude is not None:
-            turn = next_turn(segment.turn, known.scene.attitude, self.gripper[1], self.params, known.t_ns)
+        segment, draft, turn = state.segment, state.draft, self._turn(state.segment, known)
         earliest_s = 0.0 if turn is None else turn.ready_s(self.params.horizon_s)
         searched_s = math.inf if draft is None else draft.searched_s
 
-        def planner(scene: Scene, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
+        def search(problem: _Problem, earliest_s: float) -> Plan:
             nonlocal searched_s
-            if not self.limits.any:
+            scene, r0, v0, params, limits, t_ns = problem
+            if not limits.any:
                 return rendezvous(scene.goal, r0, v0, params, t_ns, earliest_s)
-            problem = scene, r0, v0, params, self.limits, t_ns
             if draft is not None and draft.path is not None:
                 since_s = (t_ns - draft.t_ns) * 1e-9 + self.params.latency_s
-                warm = (draft.path, max(since_s, 0.0))
-                plan = constrained(*problem, warm=warm, earliest_s=earliest_s)
+                plan = constrained(*problem, warm=(draft.path, max(since_s, 0.0)), earliest_s=earliest_s)
                 if plan.found and plan.t_go_s <= SEARCH_AGAIN * searched_s:
                     return plan
             plan = constrained(*problem, earliest_s=earliest_s)
             searched_s = plan.t_go_s
             return plan
 
+        def planner(scene: Scene, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
+            if self.arm is None:
+                return search((scene, r0, v0, params, self.limits, t_ns), earliest_s)
+            delayed = draft is not None and state.plan is not None and state.plan.delayed_by == "arm"
+            hint_s = (draft.end_ns - t_ns) * 1e-9 - self.params.latency_s if draft and delayed else 0.0
+
+            def make(after_s: float, share: float) -> Plan:
+                return search((scene, r0, v0, *slowed(params, self.limits, share), t_ns), after_s)
+
+            path = partial(path_of, r0=r0, v0=v0)
+            return self.arm.fitted(make, path, scene, self.limits, earliest_s, params.horizon_s, hint_s)[0]
+
         plan, made = self._plan(segment, known.scene, known.t_ns, planner)
         if made is None:
             return plan, None
         made = replace(made, capture=True, turn=turn or made.turn, searched_s=searched_s)
         return (plan if turn is None else with_turn(plan, earliest_s + self.params.latency_s)), made
+
+    def _turn(self, segment: Segment, known: PlannerInput) -> Turn | None:
+        """Return the next turn of the gripper; None where its attitude is not planned."""
+        if self.gripper is None or segment.turn is None or known.scene.attitude is None:
+            return None
+        return next_turn(segment.turn, known.scene.attitude, self.gripper[1], self.params, known.t_ns)
 
     def _plan(self, segment: Segment, scene: Scene, t_ns: int, planner: _Planner) -> tuple[Plan, Segment | None]:
         """Plan from the state that the current segment reaches when the latency is over."""
@@ -292,29 +311,11 @@ class Guidance:
         due = state.made_ns is None or (known.t_ns - state.made_ns) * 1e-9 >= self.params.replan_period_s - 1e-6
         if action is Action.STAND_STILL or not due or (action is Action.ABORT and state.made_ns is not None):
             return state
-        _, segment = self._plan(state.segment, self._refuge(state, known), known.t_ns, _unconstrained)
+        p, moving = self.supervisor.params, state.segment.at(known.t_ns)
+        least_m = (p.standoff_m if action is Action.HOLD else p.retreat_m) or 0.0
+        refuge = resting(known.scene, *moving, least_m, self.params.a_max_mps2)
+        _, segment = self._plan(state.segment, refuge, known.t_ns, to_rest)
         return replace(state, segment=segment or state.segment, made_ns=known.t_ns)
-
-    def _refuge(self, state: GuidanceState, known: PlannerInput) -> Scene:
-        """Return the rest point of a hold, a retreat or an abort, moving with the centre of mass.
-
-        The robot brakes as hard as possible. If it would stop closer to the sphere that contains the target than the
-        standoff (hold) or the retreat distance, the rest point has this distance, directly away from the target.
-        """
-        p, scene = self.supervisor.params, known.scene
-        r, v = state.segment.at(known.t_ns)
-        centre = scene.centre(np.array([0.0, 1.0]))
-        drift = centre[1] - centre[0]
-        relative = v - drift
-        away = r - centre[0]
-        distance = float(np.linalg.norm(away))
-        outward = away / distance if distance > 0.0 else np.array([1.0, 0.0, 0.0])
-        hold = state.decision.action is Action.HOLD
-        least = scene.radius_m + ((p.standoff_m if hold else p.retreat_m) or 0.0)
-        rest = away + relative * np.linalg.norm(relative) / (2.0 * self.params.a_max_mps2)
-        if float(np.linalg.norm(rest)) < least:
-            rest = outward * max(least, distance)
-        return Scene(lambda t: (centre[0] + rest + t[:, None] * drift, np.tile(drift, (len(t), 1))))
 
     def _margin(self, state: GuidanceState, scene: Scene, r: Array, v: Array) -> float:
         """Return the margin of the constraints; what the plan in force itself violates at its start is accepted."""
@@ -324,11 +325,8 @@ class Guidance:
         return margin(scene, self.limits, r, v) + accepted
 
 
+_Problem = tuple[Scene, Array, Array, PlanParams, Limits, int]
 _Planner = Callable[[Scene, Array, Array, PlanParams, int], Plan]
-
-
-def _unconstrained(scene: Scene, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
-    return rendezvous(scene.goal, r0, v0, params, t_ns)
 
 
 def _left_s(plan: Plan | None, segment: Segment | None, t_ns: int) -> float:

@@ -169,9 +169,8 @@ class RobotParams(Settings):
     )
     urdf: str | None = setting(
         None,
-        "URDF of a manipulator that carries the end-effector, relative to the file that states it: 'avsreplay plan'"
-        " states whether its joints can fly the last metres, and its reach is the workspace where reach_max_m is not"
-        " given.",
+        "URDF of a manipulator that carries the end-effector, relative to the file that states it: its joints can fly"
+        " the last metres of every plan, and its reach is the workspace where reach_max_m is not given.",
     )
     urdf_frame: str | None = setting(None, "Frame of the gripper in the URDF.", unset="its last frame")
     delay_s: float | None = setting(
@@ -275,6 +274,20 @@ class RobotParams(Settings):
             f"thrust noise {self.thrust_noise:g}",
         ]
         return f"{self.name}: {', '.join(parts)}"
+
+
+def slowed(params: PlanParams, limits: Limits, share: float) -> tuple[PlanParams, Limits]:
+    """Return the parameters and the limits with a share of the acceleration.
+
+    Args:
+        params: The planner's parameters.
+        limits: Constraints, with the largest acceleration of each axis or without.
+        share: Of the largest acceleration, above 0, at most 1.
+    """
+    axes = limits.accel_axes_mps2
+    if axes is not None:
+        limits = replace(limits, accel_axes_mps2=(share * axes[0], share * axes[1], share * axes[2]))
+    return replace(params, a_max_mps2=share * params.a_max_mps2), limits
 
 
 def _shell(limits: Limits) -> str:
