@@ -231,7 +231,7 @@ def if_innovation(get: Callable[[Innovation], float | None]) -> Value[float | No
     return lambda o, s: None if o.innovation is None else get(o.innovation)
 
 
-def if_planned(get: Callable[[Outcome, Plan], float]) -> Value[float | None]:
+def if_planned(get: Callable[[Outcome, Plan], T]) -> Value[T | None]:
     """Return a column value taken from the capture plan in force, None where there is none.
 
     Args:

@@ -2,166 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from avsreplay import geometry, plan, settings, toml_document
+from avsreplay import geometry, plan
 from avsreplay.build import target_geometry
-from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.estimate import Estimator, EstimatorParams
+from avsreplay.errors import UsageError
+from avsreplay.estimate import Estimator
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
-from avsreplay.plan import Limits, PlannerInput, PlanParams, RobotParams, Scene, SupervisorParams
+from avsreplay.plan import Limits, PlannerInput, PlanParams, Scene, SupervisorParams
 from avsreplay.plan.arm import Arm, JointPath
 from avsreplay.plan.robot import slowed
-from avsreplay.records import Alignment, AlignStatus, Belief, State, Surface
-from avsreplay.report.result import load_result, motion_samples
-from avsreplay.result_dir import read_beliefs
-from avsreplay.rows import Row
-from avsreplay.settings import Settings, setting
+from avsreplay.records import Alignment, AlignStatus, Belief, State
+from avsreplay.saved_result import Saved
 
 SIGMA_BOUND = 0.99  # inertia ratios of the draws are limited to the physical range
-
-
-@dataclass(frozen=True, slots=True)
-class PlanningConfig(Settings):
-    """The settings of a run that planning from its result may change."""
-
-    plan: PlanParams = setting(PlanParams, "Planning.")
-    robot: RobotParams = setting(RobotParams, "The robot.")
-    limits: Limits = setting(Limits, "Constraints of every capture plan.")
-    supervisor: SupervisorParams = setting(SupervisorParams, "Supervision.")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Saved:
-    """The part of a result directory that planning uses.
-
-    Attributes:
-        name: Name of the directory, for messages.
-        rows, beliefs: One per scan.
-        truth: Recorded true motion, None where there is none.
-        estimator: Estimator with the settings of the run.
-        plan, supervisor, limits, robot: Settings of the run.
-        axis_c: Outward axis of the fixture in {C}.
-        extent_m: Diagonal of the target's bounding box [m].
-        surface: Thinned model of the target, None where the result has none.
-        warnings: Known defects of the result: not verified, or made from a damaged log.
-    """
-
-    name: str
-    rows: Sequence[Row]
-    beliefs: Sequence[Belief]
-    truth: plan.Motion | None
-    estimator: Estimator
-    plan: PlanParams
-    supervisor: SupervisorParams
-    limits: Limits
-    robot: RobotParams
-    axis_c: tuple[float, float, float]
-    extent_m: float
-    surface: Surface | None
-    warnings: Sequence[str] = ()
-
-    @property
-    def since_ns(self) -> int:
-        """Instant of the first scan."""
-        return self.rows[0].t_ns
-
-    def index_at(self, at_s: float | None) -> int:
-        """Return the index of the scan from which to plan.
-
-        Args:
-            at_s: the last scan not after this time is taken [s after the first scan]; None: the first converged scan.
-
-        Raises:
-            UsageError: the time is outside the result, or the estimate never converged.
-        """
-        if at_s is None:
-            converged = [k for k, row in enumerate(self.rows) if row.converged]
-            if not converged:
-                raise UsageError("the estimate never converged", where=self.name, hint="plan all the same with --at T")
-            return converged[0]
-        before = [k for k, row in enumerate(self.rows) if row.t_s <= at_s + 1e-9]
-        if not before or at_s > self.rows[-1].t_s + 1e-9:
-            last = self.rows[-1].t_s
-            raise UsageError(f"{at_s} s is outside the result", where="--at", hint=f"it runs from 0 to {last:.2f} s")
-        return before[-1]
-
-
-def load_saved(path: Path, extent_m: float | None = None) -> Saved:
-    """Read a result directory.
-
-    Args:
-        path: the directory.
-        extent_m: diagonal of the target's bounding box [m]; that of the result if None.
-
-    Raises:
-        UnreadableInput: the path is not a complete result directory.
-        UsageError: a setting in it is invalid, or the size of the target is not known.
-    """
-    result = load_result(path)
-    beliefs = read_beliefs(path / "beliefs.npz")
-    if not result.rows or len(beliefs) != len(result.rows):
-        what = f"{len(result.rows)} rows and {len(beliefs)} beliefs"
-        raise UnreadableInput(what, where=str(path), hint="run again")
-    config = result.header.get("config", {})
-    extent = extent_m or result.extent_m(path)
-    since_ns = result.rows[0].t_ns
-    times, poses = motion_samples(result.poses, since_ns)
-    truth = plan.interpolated(times, poses) if len(poses) >= 4 else None
-    return Saved(
-        name=str(path),
-        rows=result.rows,
-        beliefs=beliefs,
-        truth=truth,
-        estimator=Estimator(_table(EstimatorParams, config, "estimator"), None, extent),
-        plan=_table(PlanParams, config, "plan"),
-        supervisor=_table(SupervisorParams, config, "supervisor").resolved(extent),
-        limits=_table(Limits, config, "limits"),
-        robot=_table(RobotParams, config, "robot"),
-        axis_c=tuple(config.get("fixture_axis_c", (1.0, 0.0, 0.0))),
-        extent_m=extent,
-        surface=result.surface,
-        warnings=result.warnings,
-    )
-
-
-def _table(cls: Any, config: Mapping[str, Any], name: str) -> Any:
-    known = {k: v for k, v in config.get(name, {}).items() if v is not None}
-    return toml_document.build(cls, toml_document.Document("run.json", {name: known}), (name,))
-
-
-def with_settings(saved: Saved, assignments: Sequence[str]) -> Saved:
-    """Return the saved result with changed settings of the planner.
-
-    Args:
-        saved: the saved result.
-        assignments: settings such as ``supervisor.sigmas=2``.
-
-    Raises:
-        UsageError: an assignment has another form, an unknown key or a wrong value.
-    """
-    tables: dict[str, Any] = {}
-    for name, values in (("plan", saved.plan), ("limits", saved.limits), ("robot", saved.robot)):
-        tables[name] = {k: v for k, v in settings.dump(values).items() if v is not None}
-    tables["supervisor"] = {k: v for k, v in settings.dump(saved.supervisor).items() if v is not None}
-    changed = toml_document.override(toml_document.Document("run.json", tables), assignments)
-    made = toml_document.build(PlanningConfig, changed)
-    return replace(
-        saved,
-        plan=made.plan,
-        limits=made.limits,
-        robot=made.robot,
-        supervisor=made.supervisor.resolved(saved.extent_m),
-    )
 
 
 class Replanning:

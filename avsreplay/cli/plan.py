@@ -12,10 +12,10 @@ from avsreplay.cli.options import Numbers
 
 if TYPE_CHECKING:
     from avsreplay.outcome import Plan
-    from avsreplay.plan import Execution, Flights, Limits, Miss, PlanParams, Spread
-    from avsreplay.plan.arm import Arm, JointPath
-    from avsreplay.replan import Replanning, Saved
-    from avsreplay.report.table import Table
+    from avsreplay.plan import Limits, PlanParams
+    from avsreplay.plan.arm import Arm
+    from avsreplay.replan import Replanning
+    from avsreplay.saved_result import Saved
 
 PLAN, LIMITS = "avsreplay.plan:PlanParams", "avsreplay.plan:Limits"
 EPILOG = """\b
@@ -101,11 +101,12 @@ def plan_command(
     """  # noqa: D301
     from dataclasses import replace
 
+    from avsreplay.cli.plan_output import Answer, document, print_answer
     from avsreplay.config import robot_settings
     from avsreplay.errors import UsageError
     from avsreplay.files import check_output
     from avsreplay.plan.arm import with_arm
-    from avsreplay.replan import load_saved, with_settings
+    from avsreplay.saved_result import load_saved, with_settings
 
     for name, value in (("--every", every_s), ("--extent", extent_m)):
         if value is not None and not 0.0 < value < float("inf"):
@@ -128,10 +129,12 @@ def plan_command(
     execution = _usable(planning.execute)
     if export:
         _export(planning, made, export)
+    at_s = saved.rows[index].t_s
+    answer = Answer(planning, at_s, made, spread, flown, joints, hindsight, execution)
     if as_json:
-        click.echo(_document(planning, index, made, spread, hindsight, execution, flown, joints), nl=False)
+        click.echo(document(answer), nl=False)
     else:
-        _print(planning, index, made, spread, hindsight, execution, flown, joints)
+        print_answer(answer)
 
 
 def _usable(action: Any) -> Any:
@@ -156,181 +159,6 @@ def _planning(saved: Saved, flags: dict[str, Any], arm: Arm | None) -> Replannin
     limits: Limits = _usable(lambda: replace(saved.limits, **{k: v for k, v in given.items() if k not in of_plan}))
     made: Replanning = _usable(lambda: Replanning(saved, params, limits, saved.supervisor, arm))
     return made
-
-
-def _document(
-    planning: Replanning,
-    index: int,
-    made: Plan,
-    spread: Spread | None,
-    hindsight: list[tuple[float, Plan, Miss | None]],
-    execution: Execution | None,
-    flown: Flights | None,
-    joints: JointPath | None,
-) -> str:
-    import json
-
-    from avsreplay import settings
-
-    rows, since_s = planning.saved.rows, planning.saved.rows[index].t_s
-    outcome = None if execution is None else execution.outcome(planning.tolerance)
-    document = {
-        "made_at_s": rows[index].t_s,
-        "plan": _plan_record(made, since_s),
-        "limits": settings.dump(planning.limits),
-        "params": settings.dump(planning.params),
-        "robot": settings.dump(planning.robot),
-        "robot_line": planning.robot_line,
-        "tolerance": settings.dump(planning.tolerance),
-        "spread": settings.dump(spread) if spread else None,
-        "flights": settings.dump(flown) if flown else None,
-        "arm": joints.record() if joints else None,
-        "hindsight": [
-            {"made_at_s": at_s, **_plan_record(p, at_s), "miss": settings.dump(m) if m else None}
-            for at_s, p, m in hindsight
-        ],
-        "execution": None
-        if execution is None
-        else {
-            "outcome": outcome,
-            "miss": settings.dump(execution.miss) if execution.miss else None,
-            "actions": [{"t_s": t, "action": a, "rule": r} for t, a, r in execution.actions],
-        },
-    }
-    return json.dumps(_without_nan(document), indent=1, allow_nan=False) + "\n"
-
-
-def _plan_record(made: Plan, since_s: float) -> dict[str, Any]:
-    return {
-        "status": made.status.value,
-        "t_go_s": made.t_go_s,
-        "capture_time_s": since_s + made.t_go_s,
-        "lower_bound_s": made.lower_bound_s,
-        "a_max_mps2": made.a_max,
-        "u_max_mps2": made.u_max,
-        "position_error_m": made.position_error_m,
-        "velocity_error_mps": made.velocity_error_mps,
-        "costate": made.costate.tolist(),
-        "violation_m": made.violation_m,
-        "margin_m": made.margin_m,
-        "limit": made.binding or None,
-        "abort_margin_m": made.abort_margin_m,
-        "attitude_s": made.attitude_s,
-        "delayed_by": made.delayed_by or None,
-    }
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {k: _without_nan(v) for k, v in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(v) for v in value]
-    return None if isinstance(value, float) and not abs(value) < float("inf") else value
-
-
-def _print(
-    planning: Replanning,
-    index: int,
-    made: Plan,
-    spread: Spread | None,
-    hindsight: list[tuple[float, Plan, Miss | None]],
-    execution: Execution | None,
-    flown: Flights | None,
-    joints: JointPath | None,
-) -> None:
-    from avsreplay.report.table import facts_table, make_console, print_line, print_table
-
-    console = make_console()
-    at_s = planning.saved.rows[index].t_s
-    facts = _plan_facts(planning, at_s, made)
-    for found in (joints, spread, flown):
-        facts += found.described() if found else []
-    print_table(console, facts_table(f"Plan made at {at_s:.2f} s", facts))
-    print_table(console, _hindsight_table(hindsight))
-    if execution is not None:
-        print_table(console, _execution_table(execution))
-        for line in _outcome_lines(execution, planning):
-            print_line(console, line)
-
-
-def _plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str, str]]:
-    facts = [("robot", planning.robot_line), ("status", _status(made))]
-    if made.found:
-        facts += [
-            ("capture", f"at {at_s + made.t_go_s:.3f} s, {made.t_go_s:.4f} s after planning"),
-            ("terminal errors", f"{made.position_error_m:.1e} m, {made.velocity_error_mps:.1e} m/s"),
-            ("largest |u|", f"{made.u_max:.6g} of {made.a_max:.6g} m/s2"),
-        ]
-    if abs(made.attitude_s) < float("inf"):
-        facts.append(("gripper", f"attitude and rate of the fixture after {made.attitude_s:.3f} s"))
-    if made.found and made.delayed_by:
-        facts.append(("delayed by", _DELAYED[made.delayed_by]))
-    basis = "certified without the limits" if planning.limits.any else "certified"
-    facts.append(("no capture before", f"{made.lower_bound_s:.4f} s after planning ({basis})"))
-    if made.binding:
-        facts.append(("smallest margin", f"{made.margin_m:.4f} m ({made.binding}); excess {made.violation_m:.1e} m"))
-    if abs(made.abort_margin_m) < float("inf"):
-        facts.append(("margin of an abort", f"{made.abort_margin_m:.3f} m of clearance, from any instant"))
-    return facts
-
-
-_DELAYED = {
-    "attitude": "the turn of the gripper: its end-effector alone could be there earlier",
-    "arm": "the joints of the arm: an earlier or faster capture exceeds their limits",
-}
-
-
-def _status(made: Plan) -> str:
-    """Return what is known about the plan, in words."""
-    words = {
-        "optimal": f"optimal within {max(made.gap_s, 0.0):.1e} s",
-        "feasible": f"found; at most {made.gap_s:.2f} s later than the earliest possible capture",
-        "none_found": f"none found{' that the arm can fly' if made.delayed_by == 'arm' else ''}; a capture may exist",
-        "infeasible_within_horizon": "proven impossible within the horizon",
-    }
-    return words.get(made.status.value, made.status.value)
-
-
-def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
-    from avsreplay.report.table import Table
-
-    rows = tuple(
-        (
-            f"{at_s:.2f}",
-            made.status.value,
-            f"{at_s + made.t_go_s:.2f}",
-            f"{found.lead_s:.2f}",
-            f"{1e3 * found.distance_m:.2f}",
-            f"{1e3 * found.speed_mps:.2f}",
-            f"{found.angle_deg:.3f}",
-        )
-        for at_s, made, found in hindsight
-        if found is not None
-    )
-    left_out = len(hindsight) - len(rows)
-    return Table(
-        "Plans against ground truth at their planned end",
-        ("made at\n[s]", "status", "capture\n[s]", "early by\n[s]", "miss\n[mm]", "speed\n[mm/s]", "angle\n[deg]"),
-        rows,
-        align="rlr",
-        note=f"{left_out} further plans end after the log or were not found" if left_out else "",
-    )
-
-
-def _execution_table(execution: Execution) -> Table:
-    from avsreplay.report.table import Table
-
-    rows = tuple((f"{t_s:.2f}", action, rule) for t_s, action, rule in execution.actions)
-    return Table("Simulated approach under the supervisor", ("from\n[s]", "action", "rule"), rows, align="rl")
-
-
-def _outcome_lines(execution: Execution, planning: Replanning) -> list[str]:
-    lines = [f"outcome: {execution.outcome(planning.tolerance)}"]
-    if execution.miss is not None:
-        m = execution.miss
-        error = f"distance {1e3 * m.distance_m:.2f} mm, {1e3 * m.speed_mps:.2f} mm/s, {m.angle_deg:.3f} deg"
-        lines.append(f"gripper closed at {m.at_s:.3f} s: {error}")
-    return lines
 
 
 def _export(planning: Replanning, made: Plan, path: Path) -> None:

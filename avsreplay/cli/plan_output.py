@@ -1,0 +1,197 @@
+"""What ``avsreplay plan`` prints: tables, or one JSON document."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from avsreplay.outcome import Plan
+    from avsreplay.plan import Execution, Flights, Miss, Spread
+    from avsreplay.plan.arm import JointPath
+    from avsreplay.replan import Replanning
+    from avsreplay.report.table import Table
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """Everything that planning from a saved result found.
+
+    Attributes:
+        planning: the planner with its settings.
+        at_s: instant of planning [s after the first scan].
+        made: the plan.
+        spread: its distribution over the belief; None without a plan.
+        flown: whole flights; None where not asked for.
+        joints: of an arm during the last metres; None without an arm.
+        hindsight: plans at regular intervals with their errors.
+        execution: the simulated approach; None without ground truth.
+    """
+
+    planning: Replanning
+    at_s: float
+    made: Plan
+    spread: Spread | None
+    flown: Flights | None
+    joints: JointPath | None
+    hindsight: list[tuple[float, Plan, Miss | None]]
+    execution: Execution | None
+
+
+def document(answer: Answer) -> str:
+    """Return the answer as one JSON document."""
+    import json
+
+    from avsreplay import settings
+
+    planning, execution = answer.planning, answer.execution
+    spread, flown, joints = answer.spread, answer.flown, answer.joints
+    outcome = None if execution is None else execution.outcome(planning.tolerance)
+    document = {
+        "made_at_s": answer.at_s,
+        "plan": _plan_record(answer.made, answer.at_s),
+        "limits": settings.dump(planning.limits),
+        "params": settings.dump(planning.params),
+        "robot": settings.dump(planning.robot),
+        "robot_line": planning.robot_line,
+        "tolerance": settings.dump(planning.tolerance),
+        "spread": settings.dump(spread) if spread else None,
+        "flights": settings.dump(flown) if flown else None,
+        "arm": joints.record() if joints else None,
+        "hindsight": [
+            {"made_at_s": at_s, **_plan_record(p, at_s), "miss": settings.dump(m) if m else None}
+            for at_s, p, m in answer.hindsight
+        ],
+        "execution": None
+        if execution is None
+        else {
+            "outcome": outcome,
+            "miss": settings.dump(execution.miss) if execution.miss else None,
+            "actions": [{"t_s": t, "action": a, "rule": r} for t, a, r in execution.actions],
+        },
+    }
+    return json.dumps(_without_nan(document), indent=1, allow_nan=False) + "\n"
+
+
+def _plan_record(made: Plan, since_s: float) -> dict[str, Any]:
+    return {
+        "status": made.status.value,
+        "t_go_s": made.t_go_s,
+        "capture_time_s": since_s + made.t_go_s,
+        "lower_bound_s": made.lower_bound_s,
+        "a_max_mps2": made.a_max,
+        "u_max_mps2": made.u_max,
+        "position_error_m": made.position_error_m,
+        "velocity_error_mps": made.velocity_error_mps,
+        "costate": made.costate.tolist(),
+        "violation_m": made.violation_m,
+        "margin_m": made.margin_m,
+        "limit": made.binding or None,
+        "abort_margin_m": made.abort_margin_m,
+        "attitude_s": made.attitude_s,
+        "delayed_by": made.delayed_by or None,
+    }
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_nan(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(v) for v in value]
+    return None if isinstance(value, float) and not abs(value) < float("inf") else value
+
+
+def print_answer(answer: Answer) -> None:
+    """Print the answer as tables."""
+    from avsreplay.report.table import facts_table, make_console, print_line, print_table
+
+    console = make_console()
+    facts = _plan_facts(answer.planning, answer.at_s, answer.made)
+    for found in (answer.joints, answer.spread, answer.flown):
+        facts += found.described() if found else []
+    print_table(console, facts_table(f"Plan made at {answer.at_s:.2f} s", facts))
+    print_table(console, _hindsight_table(answer.hindsight))
+    if answer.execution is not None:
+        print_table(console, _execution_table(answer.execution))
+        for line in _outcome_lines(answer.execution, answer.planning):
+            print_line(console, line)
+
+
+def _plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str, str]]:
+    facts = [("robot", planning.robot_line), ("status", _status(made))]
+    if made.found:
+        facts += [
+            ("capture", f"at {at_s + made.t_go_s:.3f} s, {made.t_go_s:.4f} s after planning"),
+            ("terminal errors", f"{made.position_error_m:.1e} m, {made.velocity_error_mps:.1e} m/s"),
+            ("largest |u|", f"{made.u_max:.6g} of {made.a_max:.6g} m/s2"),
+        ]
+    if abs(made.attitude_s) < float("inf"):
+        facts.append(("gripper", f"attitude and rate of the fixture after {made.attitude_s:.3f} s"))
+    if made.found and made.delayed_by:
+        facts.append(("delayed by", _DELAYED[made.delayed_by]))
+    basis = "certified without the limits" if planning.limits.any else "certified"
+    facts.append(("no capture before", f"{made.lower_bound_s:.4f} s after planning ({basis})"))
+    if made.binding:
+        facts.append(("smallest margin", f"{made.margin_m:.4f} m ({made.binding}); excess {made.violation_m:.1e} m"))
+    if abs(made.abort_margin_m) < float("inf"):
+        facts.append(("margin of an abort", f"{made.abort_margin_m:.3f} m of clearance, from any instant"))
+    return facts
+
+
+_DELAYED = {
+    "attitude": "the turn of the gripper: its end-effector alone could be there earlier",
+    "arm": "the joints of the arm: an earlier or faster capture exceeds their limits",
+}
+
+
+def _status(made: Plan) -> str:
+    """Return what is known about the plan, in words."""
+    words = {
+        "optimal": f"optimal within {max(made.gap_s, 0.0):.1e} s",
+        "feasible": f"found; at most {made.gap_s:.2f} s later than the earliest possible capture",
+        "none_found": f"none found{' that the arm can fly' if made.delayed_by == 'arm' else ''}; a capture may exist",
+        "infeasible_within_horizon": "proven impossible within the horizon",
+    }
+    return words.get(made.status.value, made.status.value)
+
+
+def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
+    from avsreplay.report.table import Table
+
+    rows = tuple(
+        (
+            f"{at_s:.2f}",
+            made.status.value,
+            f"{at_s + made.t_go_s:.2f}",
+            f"{found.lead_s:.2f}",
+            f"{1e3 * found.distance_m:.2f}",
+            f"{1e3 * found.speed_mps:.2f}",
+            f"{found.angle_deg:.3f}",
+        )
+        for at_s, made, found in hindsight
+        if found is not None
+    )
+    left_out = len(hindsight) - len(rows)
+    return Table(
+        "Plans against ground truth at their planned end",
+        ("made at\n[s]", "status", "capture\n[s]", "early by\n[s]", "miss\n[mm]", "speed\n[mm/s]", "angle\n[deg]"),
+        rows,
+        align="rlr",
+        note=f"{left_out} further plans end after the log or were not found" if left_out else "",
+    )
+
+
+def _execution_table(execution: Execution) -> Table:
+    from avsreplay.report.table import Table
+
+    rows = tuple((f"{t_s:.2f}", action, rule) for t_s, action, rule in execution.actions)
+    return Table("Simulated approach under the supervisor", ("from\n[s]", "action", "rule"), rows, align="rl")
+
+
+def _outcome_lines(execution: Execution, planning: Replanning) -> list[str]:
+    lines = [f"outcome: {execution.outcome(planning.tolerance)}"]
+    if execution.miss is not None:
+        m = execution.miss
+        error = f"distance {1e3 * m.distance_m:.2f} mm, {1e3 * m.speed_mps:.2f} mm/s, {m.angle_deg:.3f} deg"
+        lines.append(f"gripper closed at {m.at_s:.3f} s: {error}")
+    return lines
