@@ -16,8 +16,8 @@ from scipy.stats import chi2
 from avsreplay.geometry import exp
 from avsreplay.records import Label, State
 from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary, SummaryFold
-from avsreplay.report.summary_parts import Statistics
-from avsreplay.report.summary_tables import fact_lines, in_one_line
+from avsreplay.report.summary_parts import Statistics, events
+from avsreplay.report.summary_tables import fact_lines, in_one_line, manoeuvre_table
 
 STEP = 200_000_000
 
@@ -323,3 +323,34 @@ def test_moments_follow_from_the_inertia_ratios() -> None:
         sigma = np.array([(yy - zz) / xx, (zz - xx) / yy])
         x = State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, sigma, np.zeros(3), [0, 0, 0, 1.0])
         assert _moments(x) == pytest.approx(np.array([xx, yy, zz]) / 17.0)
+
+
+def test_each_manoeuvre_is_listed_as_last_reported(make_rows):
+    """The first is corrected by a later row and withdrawn by none; the second is reported five scans later."""
+    rows = make_rows(20)
+    first = {
+        "manoeuvres": 1,
+        "manoeuvre_s": 0.8,
+        "manoeuvre_1s_s": 0.3,
+        "manoeuvre_mps": 0.02,
+        "manoeuvre_1s_mps": 0.001,
+    }
+    rows[5:] = [dataclasses.replace(r, **first) for r in rows[5:]]
+    rows[6:] = [dataclasses.replace(r, manoeuvre_s=0.9, manoeuvre_mps=0.01) for r in rows[6:]]
+    rows[11:] = [dataclasses.replace(r, manoeuvres=2, manoeuvre_s=2.1, manoeuvre_mps=0.03) for r in rows[11:]]
+    found = Summary.fold(rows).velocity_changes
+    assert [(m.t_s, m.velocity_mps, m.reported_s) for m in found] == [
+        (0.9, 0.01, rows[5].t_s),
+        (2.1, 0.03, rows[11].t_s),
+    ]
+    lines = [[str(getattr(cell, "text", cell)) for cell in line] for line in manoeuvre_table(Summary.fold(rows)).rows]
+    assert [line[0] for line in lines] == ["0.90", "2.10"]
+    assert [line[2] for line in lines] == ["10", "30"]
+    (text,) = events(rows, found, None)
+    assert text == "the target's velocity changed 2 times, most significantly at 2.1 s by 30 +- 1 mm/s"
+
+
+def test_a_manoeuvre_that_is_withdrawn_is_not_listed(make_rows):
+    rows = make_rows(10)
+    rows[3] = dataclasses.replace(rows[3], manoeuvres=1, manoeuvre_s=0.3, manoeuvre_mps=0.02)
+    assert Summary.fold(rows).velocity_changes == ()

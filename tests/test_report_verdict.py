@@ -71,6 +71,17 @@ def test_the_end_of_the_log_without_a_used_scan_fails(make_rows):
     assert "no scan after 16.8 s was used" in _judged(rows).line
 
 
+PUSH = {
+    "manoeuvres": 1,
+    "manoeuvre_s": 4.0,
+    "manoeuvre_1s_s": 0.1,
+    "manoeuvre_mps": 0.01,
+    "manoeuvre_1s_mps": 0.0002,
+    "manoeuvre_radps": 1e-5,
+    "manoeuvre_1s_radps": 1e-4,
+}
+
+
 @pytest.mark.parametrize(
     ("changes", "grade", "text"),
     [
@@ -83,7 +94,7 @@ def test_the_end_of_the_log_without_a_used_scan_fails(make_rows):
         ({"nis": 40.0}, Grade.CHECK, "only 0 % of NIS inside the 95 % band"),
         ({"consistent": False}, Grade.CHECK, "the innovations are inconsistent in 100 of 100 scans, first at 0.0 s"),
         ({"reinitialised": 2}, Grade.CHECK, "the estimate was reinitialised 2 times, first at 0.0 s"),
-        ({"manoeuvres": 1, "manoeuvre_s": 4.0}, Grade.CHECK, "the target manoeuvred once, the last time at 4.0 s"),
+        (PUSH, Grade.CHECK, "the target's velocity changed at 4.0 s by 10 +- 0.2 mm/s"),
         ({"converged": False}, Grade.CHECK, "did not converge"),
     ],
 )

@@ -151,12 +151,12 @@ def build_page(
         "scans": [row.seq for row in rows],
         "scene": scene(rows, dict(poses), view),
     }
-    errors, faults, *others = summary_tables(summary, rows)
+    errors, faults, manoeuvres, *others = summary_tables(summary, rows)
     parts: list[Part] = [errors, *others, facts_table("Run", fact_lines(summary))]
     if header:
         text = json.dumps(header, indent=2, ensure_ascii=False, default=str)
         parts.append(Folded("Configuration and versions", text))
-    lead = [verdict_table(verdict), moments_table(verdict, place), faults]
+    lead = [verdict_table(verdict), moments_table(verdict, place), faults, manoeuvres]
     lines = [verdict.line, in_one_line(summary)]
     if len(rows) < len(all_rows):
         count = f"{len(rows)} of {len(all_rows)} scans"

@@ -14,7 +14,17 @@ from itertools import pairwise
 
 from avsreplay.records import BLOCKS, Label, State
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
-from avsreplay.report.summary_parts import Capture, CaptureFold, Drifting, Parameter, Statistics, median, parameters
+from avsreplay.report.summary_parts import (
+    Capture,
+    CaptureFold,
+    Drifting,
+    Parameter,
+    Statistics,
+    VelocityChange,
+    median,
+    parameters,
+    with_manoeuvre,
+)
 from avsreplay.rows import Row
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
@@ -70,7 +80,8 @@ class Summary:
         registration_healthy, registration_flagged: errors of the measured poses.
         reasons: why scans were flagged.  status: scans by the status of their registration.
         counts: losses and clock problems.  acceleration: of the target, in words.  Both are given by the caller.
-        manoeuvres: of the target.  violations: consistency checks that the estimate failed.
+        manoeuvres: number of those of the target.  velocity_changes: each of them.
+        violations: consistency checks that the estimate failed.
         drift: a constant torque or force on the target, None where none was found.
         weighed_down: healthy poses with a Cauchy weight below 1.  reinitialised: reinitialisations of the estimate.
         coasts: intervals of prediction without measurement.  interval_s: median between scans.
@@ -100,6 +111,7 @@ class Summary:
     weighed_down: int
     reinitialised: int | None
     manoeuvres: int | None
+    velocity_changes: tuple[VelocityChange, ...]
     drift: Drifting | None
     violations: int | None
     nis: Share | None
@@ -159,6 +171,7 @@ class SummaryFold:
         self._full_rank_s: float | None = None
         self._t1_s: float | None = None
         self._withdrawn = self._weighed_down = 0
+        self._changes: tuple[VelocityChange, ...] = ()
         self._capture = CaptureFold()
 
     def add(self, row: Row) -> None:
@@ -194,6 +207,7 @@ class SummaryFold:
             self._t1_s = row.t_s
         if self._last is not None and self._last.converged and not row.converged:
             self._withdrawn += 1
+        self._changes = with_manoeuvre(self._changes, row)
         self._capture.add(row)
 
     def result(self, truth: State | None = None) -> Summary:
@@ -226,6 +240,7 @@ class SummaryFold:
             weighed_down=self._weighed_down,
             reinitialised=last.reinitialised if last else None,
             manoeuvres=last.manoeuvres if last else None,
+            velocity_changes=self._changes,
             drift=Drifting.of(last) if last else None,
             violations=last.violations if last else None,
             nis=_share(self._values.get("nis/healthy", []), NIS_BAND),

@@ -18,6 +18,53 @@ from avsreplay.rows import Row
 
 
 @dataclass(frozen=True, slots=True)
+class VelocityChange:
+    """A manoeuvre of the target as last reported: instant since the first scan and size, with 1 sigma.
+
+    Attributes:
+        reported_s: instant of the first scan that reports it, since the first scan.
+    """
+
+    t_s: float
+    t_1s_s: float
+    velocity_mps: float
+    velocity_1s_mps: float
+    rate_radps: float
+    rate_1s_radps: float
+    reported_s: float
+
+    @property
+    def significance(self) -> float:
+        """Return the larger of the two changes in standard deviations."""
+        sizes = ((self.velocity_mps, self.velocity_1s_mps), (self.rate_radps, self.rate_1s_radps))
+        return max(value / sigma if sigma > 0.0 else math.inf * value if value else 0.0 for value, sigma in sizes)
+
+    def __str__(self) -> str:
+        sizes = (
+            (1000.0 * self.velocity_mps, 1000.0 * self.velocity_1s_mps, "mm/s"),
+            (math.degrees(self.rate_radps), math.degrees(self.rate_1s_radps), "deg/s"),
+        )
+        clear = [size for size in sizes if size[0] > 3.0 * size[1]] or sizes
+        return " and ".join(f"{value:.3g} +- {sigma:.2g} {unit}" for value, sigma, unit in clear)
+
+
+def with_manoeuvre(known: tuple[VelocityChange, ...], row: Row) -> tuple[VelocityChange, ...]:
+    """Return the manoeuvres reported up to a row.
+
+    Args:
+        known: those reported up to the row before.
+        row: the next row; it counts the manoeuvres and describes the last one.
+    """
+    count = row.manoeuvres or 0
+    if not count or row.manoeuvre_s is None:
+        return known[:count]
+    reported_s = known[count - 1].reported_s if len(known) >= count else row.t_s
+    sizes = (row.manoeuvre_mps, row.manoeuvre_1s_mps, row.manoeuvre_radps, row.manoeuvre_1s_radps)
+    values = (value or 0.0 for value in (row.manoeuvre_1s_s, *sizes))
+    return (*known[: count - 1], VelocityChange(row.manoeuvre_s, *values, reported_s))
+
+
+@dataclass(frozen=True, slots=True)
 class Drifting:
     """A constant torque or force on the target: onset since the first scan and accelerations, with 1 sigma."""
 
@@ -57,15 +104,18 @@ def times(count: int) -> str:
     return {0: "never", 1: "once"}.get(count, f"{count} times")
 
 
-def events(rows: Sequence[Row], drift: Drifting | None) -> Iterator[str]:
+def events(rows: Sequence[Row], manoeuvres: Sequence[VelocityChange], drift: Drifting | None) -> Iterator[str]:
     """Yield what happened to the target and the sensor, in words: manoeuvres, drift, bias.
 
     Args:
         rows: all rows of the run.
+        manoeuvres: those of the target.
         drift: the drift of the target, None where there is none.
     """
-    if rows and (count := rows[-1].manoeuvres):
-        yield f"the target manoeuvred {times(count)}, the last time at {rows[-1].manoeuvre_s or 0.0:.1f} s"
+    if manoeuvres:
+        clearest = max(manoeuvres, key=lambda m: m.significance)
+        count = "" if len(manoeuvres) == 1 else f" {times(len(manoeuvres))}, most significantly"
+        yield f"the target's velocity changed{count} at {clearest.t_s:.1f} s by {clearest}"
     if drift is not None:
         yield f"a constant torque or force acts on the target: {drift}"
     if biased := [row.t_s for row in rows if row.reason == "sensor_bias"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 
 from rich.console import Console
@@ -78,8 +79,9 @@ def moments_table(verdict: RunVerdict, place: Mapping[int, int] | None = None) -
 
 
 def summary_tables(summary: Summary, rows: Sequence[Row] = ()) -> tuple[Table, ...]:
-    """Errors, injected faults, parameters and consistency; a table without content has no rows."""
-    return error_table(summary), fault_table(summary, rows), parameter_table(summary), consistency_table(summary)
+    """Errors, injected faults, manoeuvres, parameters and consistency; a table without content has no rows."""
+    events = fault_table(summary, rows), manoeuvre_table(summary, rows)
+    return error_table(summary), *events, parameter_table(summary), consistency_table(summary)
 
 
 def error_table(summary: Summary) -> Table:
@@ -132,7 +134,7 @@ def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
     heads = ("kind", "from\n[s]", "to\n[s]", "scans\nflagged", "verdict", "delay\n[s]", "recovery\n[s]")
     lines = tuple(
         (
-            TableCell(e.kind, scan=_nearest_row(e, rows)),
+            TableCell(e.kind, scan=_nearest_row(e.start_s, rows)),
             f"{e.start_s:.1f}",
             f"{e.end_s:.1f}",
             f"{e.flagged}/{e.scans}",
@@ -145,8 +147,26 @@ def fault_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
     return Table("Injected faults", heads, lines, align="lrrrlr", wide=True)
 
 
-def _nearest_row(episode: Episode, rows: Sequence[Row]) -> int | None:
-    return min(range(len(rows)), key=lambda k: abs(rows[k].t_s - episode.start_s), default=None)
+def manoeuvre_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
+    """Changes of the target's velocity; with ``rows`` the first cell leads to the nearest scan."""
+    heads = ("t\n[s]", "1 sigma\n[s]", "velocity\n[mm/s]", "1 sigma\n[mm/s]", "rate\n[deg/s]", "1 sigma\n[deg/s]")
+    lines = tuple(
+        (
+            TableCell(f"{m.t_s:.2f}", scan=_nearest_row(m.t_s, rows)),
+            f"{m.t_1s_s:.2f}",
+            f"{1000.0 * m.velocity_mps:.3g}",
+            f"{1000.0 * m.velocity_1s_mps:.2g}",
+            f"{math.degrees(m.rate_radps):.3g}",
+            f"{math.degrees(m.rate_1s_radps):.2g}",
+            f"{m.reported_s:.1f}",
+        )
+        for m in summary.velocity_changes
+    )
+    return Table("Manoeuvres of the target: changes of its velocity", (*heads, "reported\n[s]"), lines)
+
+
+def _nearest_row(t_s: float, rows: Sequence[Row]) -> int | None:
+    return min(range(len(rows)), key=lambda k: abs(rows[k].t_s - t_s), default=None)
 
 
 def _verdict(episode: Episode) -> TableCell:

@@ -206,7 +206,7 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         when = next(row.t_s for row in rows if row.reinitialised)
         text = f"the estimate was reinitialised {times(summary.reinitialised)}, first at {when:.1f} s"
         yield Concern(Grade.CHECK, f"{text}, because the poses contradicted it")
-    yield from (Concern(Grade.CHECK, text) for text in events(rows, summary.drift))
+    yield from (Concern(Grade.CHECK, text) for text in events(rows, summary.velocity_changes, summary.drift))
     yield from _failed_checks(rows, summary)
     searches = [row for row in rows[1:] if row.guess == "acquired" and row.gamma == 1]
     if searches and rows[0].gamma == 1:
