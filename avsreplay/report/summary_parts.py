@@ -25,13 +25,13 @@ class VelocityChange:
         reported_s: instant of the first scan that reports it, since the first scan.
     """
 
+    reported_s: float
     t_s: float
     t_1s_s: float
     velocity_mps: float
     velocity_1s_mps: float
     rate_radps: float
     rate_1s_radps: float
-    reported_s: float
 
     @property
     def significance(self) -> float:
@@ -61,7 +61,7 @@ def with_manoeuvre(known: tuple[VelocityChange, ...], row: Row) -> tuple[Velocit
     reported_s = known[count - 1].reported_s if len(known) >= count else row.t_s
     sizes = (row.manoeuvre_mps, row.manoeuvre_1s_mps, row.manoeuvre_radps, row.manoeuvre_1s_radps)
     values = (value or 0.0 for value in (row.manoeuvre_1s_s, *sizes))
-    return (*known[: count - 1], VelocityChange(row.manoeuvre_s, *values, reported_s))
+    return (*known[: count - 1], VelocityChange(reported_s, row.manoeuvre_s, *values))
 
 
 @dataclass(frozen=True, slots=True)
