@@ -207,12 +207,12 @@ class Index {
     auto offsets = array<double>({m, 6}, &J), sums = array<double>({m}, &errors), middles = array<double>({m, 3}, &places);
     for (size_t k = 0; k < m; ++k) {
       const PatchSums& from = e.patches[k];
-      for (int r = 0, t = 0; r < 6; ++r)
-        for (int q = 0; q <= r; ++q, ++t) N[36 * k + 6 * r + q] = N[36 * k + 6 * q + r] = from.normals[t];
-      std::memcpy(g + 6 * k, from.gradients, sizeof from.gradients);
-      std::memcpy(J + 6 * k, from.offsets, sizeof from.offsets);
-      for (size_t a = 0; a < 3; ++a) places[3 * k + a] = from.places[a] / (double)from.points;
-      errors[k] = from.errors, count[k] = from.points;
+      for (size_t r = 0; r < 6; ++r) {
+        for (size_t q = 0; q < 6; ++q) N[36 * k + 6 * r + q] = from.rows[r][q];
+        g[6 * k + r] = from.rows[r][6], J[6 * k + r] = from.rows[r][7];
+      }
+      for (size_t a = 0; a < 3; ++a) places[3 * k + a] = from.last[a] / (double)from.points;
+      errors[k] = from.last[3], count[k] = from.points;
     }
     std::memcpy(c, e.centre, sizeof e.centre);
     return nb::make_tuple(e.points, e.inliers, e.sum_d2, e.median, centre, counts, normals, gradients, offsets, sums, middles);

@@ -38,8 +38,7 @@ class Matcher {
   int inliers(int64_t chunk, Match (&out)[CHUNK]) const {
     const int64_t first = chunk * CHUNK, last = std::min(v_.n, first + CHUNK);
     const View part{v_.data + first * v_.row, last - first, v_.row, v_.column, v_.single};
-    code_.match(s_, part, 0, part.n, look_, kept_ ? kept_ + first : nullptr, out);
-    return (int)(std::remove_if(out, out + part.n, [](const Match& m) { return !m.inlier; }) - out);
+    return code_.match(s_, part, 0, part.n, look_, kept_ ? kept_ + first : nullptr, out);
   }
 
  private:
@@ -52,28 +51,20 @@ class Matcher {
   const Kept* kept_ = nullptr;
 };
 
-Cube cube_of(const Match& m, double side) {
-  const auto cell = [&](double x) { return (int64_t)std::floor(std::min(std::max(x / side, -1e15), 1e15)); };
+Cube cube_of(const Match& m, double per_m) {
+  const auto cell = [&](double x) {
+    const double y = std::min(std::max(x * per_m, -1e15), 1e15);
+    const int64_t k = (int64_t)y;
+    return k - (y < (double)k);
+  };
   return {cell(m.p[0]), cell(m.p[1]), cell(m.p[2])};
 }
 
-void add(const Match& m, PatchSums& to) {
-  const double *p = m.p, *n = m.n;
-  const double J[6] = {p[1] * n[2] - p[2] * n[1], p[2] * n[0] - p[0] * n[2], p[0] * n[1] - p[1] * n[0], n[0], n[1], n[2]};
-  int t = 0;
-  for (int r = 0; r < 6; ++r) {
-    for (int c = 0; c <= r; ++c) to.normals[t++] += J[r] * J[c];
-    to.gradients[r] += m.e * J[r], to.offsets[r] += J[r];
-  }
-  for (int a = 0; a < 3; ++a) to.places[a] += p[a];
-  to.errors += m.e, ++to.points;
-}
-
 void add(const PatchSums& from, PatchSums& to) {
-  for (int k = 0; k < 21; ++k) to.normals[k] += from.normals[k];
-  for (int k = 0; k < 6; ++k) to.gradients[k] += from.gradients[k], to.offsets[k] += from.offsets[k];
-  for (int k = 0; k < 3; ++k) to.places[k] += from.places[k];
-  to.errors += from.errors, to.points += from.points;
+  for (int r = 0; r < 6; ++r)
+    for (int c = 0; c < 8; ++c) to.rows[r][c] += from.rows[r][c];
+  for (int k = 0; k < 4; ++k) to.last[k] += from.last[k];
+  to.points += from.points;
 }
 
 // Sums by cube, in the order in which the cubes first came.
@@ -118,15 +109,22 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
                   const Matches* matches) {
   const Matcher matcher(s, code, v, T, rule, matches);
   std::vector<Part> parts((size_t)matcher.chunks());
+  const double per_m = 1 / rule.side;
   team.each(matcher.chunks(), [&](int64_t k) {
     Match found[CHUNK];
     Part& part = parts[(size_t)k];
-    part.inliers = matcher.inliers(k, found);
-    for (int64_t i = 0; i < part.inliers; ++i) {
+    const int n = matcher.inliers(k, found);
+    part.inliers = n;
+    for (int i = 0; i < n; ++i) {
       const Match& m = found[i];
       part.sum_d2 += m.d2, part.errors[i] = std::fabs(m.e);
       for (int a = 0; a < 3; ++a) part.sum[a] += m.p[a];
-      add(m, part.patches.at(cube_of(m, rule.side)));
+    }
+    Cube next = n ? cube_of(found[0], per_m) : Cube{};
+    for (int i = 0, end; i < n; i = end) {  // points that follow each other are often in one cube
+      const Cube cube = next;
+      for (end = i + 1; end < n && (next = cube_of(found[end], per_m)) == cube;) ++end;
+      code.add(found + i, end - i, part.patches.at(cube));
     }
   });
   Evidence out;
@@ -147,7 +145,7 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
   for (int64_t k = 0; k < matcher.chunks(); ++k) {
     Match found[CHUNK];
     const int n = matcher.inliers(k, found);
-    for (int i = 0; i < n; ++i) add(found[i], out.patches.emplace_back());
+    for (int i = 0; i < n; ++i) code.add(found + i, 1, out.patches.emplace_back());
   }
   return out;
 }

@@ -4,16 +4,6 @@
 
 namespace avs {
 
-// Sums over the inliers of one patch, with J = [p x n, n] about {C}'s origin and e = n . (p - foot).
-struct PatchSums {
-  int64_t points = 0;
-  double normals[21] = {};   // lower triangle of J'J, row by row
-  double gradients[6] = {};  // e J
-  double offsets[6] = {};    // J
-  double errors = 0;         // e
-  double places[3] = {};     // p
-};
-
 struct Evidence {
   int64_t points = 0, inliers = 0;
   double sum_d2 = 0, centre[3] = {0, 0, 0};  // centroid of the inliers

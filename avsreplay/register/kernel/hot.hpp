@@ -52,11 +52,17 @@ struct Feet {
   double* normal;   // (n, 3)
 };
 
-// A point of the scan and its foot at a pose, both in {C}; `inlier`: the foot is nearer than the gate.
+// An inlier of the scan at a pose, in {C}.
 struct Match {
   double p[3], n[3];  // the point, and the normal at its foot
   double e, d2;       // n . (p - foot), and the squared distance
-  bool inlier;
+};
+
+// Sums over the inliers of one patch, with J = [p x n, n] about {C}'s origin.
+struct PatchSums {
+  int64_t points = 0;
+  double rows[6][8] = {};  // J' [J, e, 1]
+  double last[4] = {};     // [p, e]
 };
 
 // A cell near a block: the cell's number, the block, their distance in steps.
@@ -75,8 +81,10 @@ struct Code {
   void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Facing&, bool sided, double bound, const Feet&);
   void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
   void (*pass)(const Store&, const View&, int64_t first, int64_t last, const Look&, Kept*, Sums&);
-  // `kept`: where the searches begin, or null; what is said there must hold for the eye and the gate of `look`.
-  void (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out);
+  // The inliers among a chunk's points, in their order; returns how many. `kept`: where the searches begin, or null; what
+  // is said there must hold for the eye and the gate of `look`.
+  int (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out);
+  void (*add)(const Match*, int64_t n, PatchSums&);
 };
 
 const Code& code_base();

@@ -43,14 +43,15 @@ static void pass(const Store& s, const View& v, int64_t first, int64_t last, con
          : pass_kind<Points>(s, v, first, last, look, kept, out);
 }
 
-static void match(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept, Match* out) {
-  s.mesh ? match_kind<Triangles>(s, v, first, last, look, kept, out)
-         : match_kind<Points>(s, v, first, last, look, kept, out);
+static int match(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept, Match* out) {
+  return s.mesh ? match_kind<Triangles>(s, v, first, last, look, kept, out)
+                : match_kind<Points>(s, v, first, last, look, kept, out);
 }
 }  // namespace AVS_ISA
 
 const Code& AVS_CODE() {
-  static const Code code{AVS_NAME, AVS_ISA::cells, AVS_ISA::face, AVS_ISA::closest, AVS_ISA::normals, AVS_ISA::pass, AVS_ISA::match};
+  static const Code code{AVS_NAME, AVS_ISA::cells, AVS_ISA::face, AVS_ISA::closest, AVS_ISA::normals, AVS_ISA::pass, AVS_ISA::match,
+                         AVS_ISA::add};
   return code;
 }
 }  // namespace avs

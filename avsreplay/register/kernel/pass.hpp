@@ -239,8 +239,7 @@ static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last
 }
 
 template <class Kind>
-static void match_kind(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept,
-                       Match* out) {
+static int match_kind(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept, Match* out) {
   Chunk c;
   Sums counts{};
   const int n = (int)(last - first);
@@ -250,10 +249,29 @@ static void match_kind(const Store& s, const View& v, int64_t first, int64_t las
   if (look.sided && s.mesh) o.eye = &eye;
   search<Kind>(o, first, n, kept, nullptr, c);
   settle<Kind>(o, n, Ask::NORMAL, c);
+  int found = 0;
   for (int i = 0; i < n; ++i) {
-    const double e = c.n[0][i] * (c.p[0][i] - c.f[0][i]) + c.n[1][i] * (c.p[1][i] - c.f[1][i]) + c.n[2][i] * (c.p[2][i] - c.f[2][i]);
-    out[first + i] = {{c.c[0][i], c.c[1][i], c.c[2][i]}, {c.n[0][i], c.n[1][i], c.n[2][i]}, e, c.d2[i], c.take[i] > 0};
+    if (!(c.take[i] > 0)) continue;
+    const double N[3] = {c.n[0][i], c.n[1][i], c.n[2][i]};
+    const double e = N[0] * (c.p[0][i] - c.f[0][i]) + N[1] * (c.p[1][i] - c.f[1][i]) + N[2] * (c.p[2][i] - c.f[2][i]);
+    out[found++] = {{c.c[0][i], c.c[1][i], c.c[2][i]}, {N[0], N[1], N[2]}, e, c.d2[i]};
   }
+  return found;
+}
+
+static void add(const Match* matches, int64_t n, PatchSums& to) {
+  D4 rows[6][2], last = load4(to.last);
+  for (int r = 0; r < 6; ++r) rows[r][0] = load4(to.rows[r]), rows[r][1] = load4(to.rows[r] + 4);
+  for (const Match* m = matches; m != matches + n; ++m) {
+    const double *p = m->p, *v = m->n;
+    const double J[6] = {p[1] * v[2] - p[2] * v[1], p[2] * v[0] - p[0] * v[2], p[0] * v[1] - p[1] * v[0], v[0], v[1], v[2]};
+    const D4 low = d4(J[0], J[1], J[2], J[3]), high = d4(J[4], J[5], m->e, 1);
+    for (int r = 0; r < 6; ++r) rows[r][0] = rows[r][0] + d4(J[r]) * low, rows[r][1] = rows[r][1] + d4(J[r]) * high;
+    last = last + d4(p[0], p[1], p[2], m->e);
+  }
+  for (int r = 0; r < 6; ++r) store4(to.rows[r], rows[r][0]), store4(to.rows[r] + 4, rows[r][1]);
+  store4(to.last, last);
+  to.points += n;
 }
 
 template <class Kind>

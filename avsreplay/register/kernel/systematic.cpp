@@ -112,16 +112,20 @@ Equations joined(const PatchTable& t) {
 
 // What follows runs over all JOINED rows and columns; those from n on are zero.
 
+// out += the covariance of the gradients of a patch: g g' enlarged by its leverage; `first` to `last`: rows.
+void add_spread(const Row& g, double enlarge, int first, int last, Joined& out) {
+  for (int i = first; i < last; ++i)
+    for (int j = 0; j < JOINED; ++j) out.v[i][j] += g[i] * g[j] * enlarge;
+}
+
 // What the fit of pose and amplitudes adds to the sum of squares of independent gradients: K Q K' - 2 K S' of the three
-// displacements, with K their rows of N N^+ and S the same rows of the covariance of the gradients.
-double fitted(const Joined& K, const Joined& S, const Joined& Q) {
+// displacements, with K their rows of N N^+ and S the same rows of the covariance of the gradients. `squares`: K' K.
+double fitted(const Joined& K, const Joined& S, const Joined& squares, const Joined& Q) {
   double sum = 0;
-  for (int i = 3; i < 6; ++i) {
-    double along[JOINED] = {};
-    for (int k = 0; k < JOINED; ++k)
-      for (int j = 0; j < JOINED; ++j) along[j] += K.v[i][k] * Q.v[k][j];
-    for (int j = 0; j < JOINED; ++j) sum += (along[j] - 2 * S.v[i][j]) * K.v[i][j];
-  }
+  for (int i = 0; i < JOINED; ++i)
+    for (int j = 0; j < JOINED; ++j) sum += squares.v[i][j] * Q.v[i][j];
+  for (int i = 3; i < 6; ++i)
+    for (int j = 0; j < JOINED; ++j) sum -= 2 * S.v[i][j] * K.v[i][j];
   return sum;
 }
 
@@ -156,29 +160,32 @@ struct Moments {
 void add_moments(double weight, const Joined& N, const Row& g, const Joined& S, const Joined& M, const Joined& all,
                  const Joined& of_blocks, const Joined& inverse, Moments& to) {
   const Joined K = rows_of_product(N, inverse);
+  Joined both;
+  for (int i = 0; i < JOINED; ++i)
+    for (int j = 0; j < JOINED; ++j) both.v[i][j] = K.v[3][i] * K.v[3][j] + K.v[4][i] * K.v[4][j] + K.v[5][i] * K.v[5][j];
   const double own = g[3] * g[3] + g[4] * g[4] + g[5] * g[5];
-  to.found += weight * (own - fitted(K, S, all));
-  to.expected += weight * (squares(N) + fitted(K, M, of_blocks));
+  to.found += weight * (own - fitted(K, S, both, all));
+  to.expected += weight * (squares(N) + fitted(K, M, both, of_blocks));
 }
 
 // Variance of the displacements of blocks by the method of moments, and its effect M on the gradients. The products of
-// the gradients of different patches of a block, summed, have no contribution of errors within patches. S: covariances
-// of the gradients of the patches; the fit correlates them.
-double block_variance(const PatchTable& t, const Equations& q, const std::vector<Joined>& S, const Joined& inverse, Joined& M) {
+// the gradients of different patches of a block, summed, have no contribution of errors within patches. `enlarge`: see
+// add_spread; the fit correlates the gradients. `all`: the covariances of all patches, summed.
+double block_variance(const PatchTable& t, const Equations& q, const std::vector<double>& enlarge, const Joined& all,
+                      const Joined& inverse, Joined& M) {
   std::vector<int64_t> block;
   const int64_t blocks = number_blocks(t, block);
   std::vector<Joined> whole((size_t)blocks), spread((size_t)blocks);
   std::vector<Row> g((size_t)blocks, Row{});
   std::vector<double> points((size_t)blocks, 0);
-  Joined all;
   for (int64_t p = 0; p < t.m; ++p) {
     const int64_t b = block[p];
     points[b] += (double)t.counts[p];
     for (int i = 0; i < JOINED; ++i) {
       g[b][i] += q.g[p][i];
-      for (int j = 0; j < JOINED; ++j)
-        whole[b].v[i][j] += q.N[p].v[i][j], spread[b].v[i][j] += S[p].v[i][j], all.v[i][j] += S[p].v[i][j];
+      for (int j = 0; j < JOINED; ++j) whole[b].v[i][j] += q.N[p].v[i][j];
     }
+    add_spread(q.g[p], enlarge[p], 3, 6, spread[b]);
   }
   for (int64_t b = 0; b < blocks; ++b) add_outer(whole[b], whole[b], 0, JOINED, M);
   Moments of_blocks, of_patches;
@@ -190,9 +197,10 @@ double block_variance(const PatchTable& t, const Equations& q, const std::vector
     moved += squares(whole[b]) / points[b];
   }
   for (int64_t p = 0; p < t.m; ++p) {
-    Joined own;
+    Joined own, of_patch;
     add_outer(q.N[p], whole[block[p]], 3, 6, own);
-    add_moments(1 / points[block[p]], q.N[p], q.g[p], S[p], own, all, M, inverse, of_patches);
+    add_spread(q.g[p], enlarge[p], 3, 6, of_patch);
+    add_moments(1 / points[block[p]], q.N[p], q.g[p], of_patch, own, all, M, inverse, of_patches);
   }
   const double expected = of_blocks.expected - of_patches.expected;
   if (!(expected > LEAST_DETERMINED * moved)) return 0;
@@ -231,19 +239,17 @@ double common_variance(const double* values, const Joined& P, int first, int siz
   return evidence > SIGNIFICANT ? t : 0;
 }
 
-// Takes the fit from the gradients, and returns their covariances: g g' enlarged by the leverage of the patch.
-std::vector<Joined> spreads(Equations& q, const Joined& inverse, const double* fit) {
-  std::vector<Joined> S(q.N.size());
-  for (size_t p = 0; p < S.size(); ++p) {
+// Takes the fit from the gradients, and returns how much the leverage of each patch enlarges their covariance.
+std::vector<double> take_fit(Equations& q, const Joined& inverse, const double* fit) {
+  std::vector<double> enlarge(q.N.size());
+  for (size_t p = 0; p < enlarge.size(); ++p) {
     double leverage = 0;
     Row& g = q.g[p];
     for (int i = 0; i < JOINED; ++i)
       for (int j = 0; j < JOINED; ++j) g[i] -= q.N[p].v[i][j] * fit[j], leverage += q.N[p].v[i][j] * inverse.v[i][j];
-    const double enlarge = 1 / std::max(1 - leverage / q.n, 0.5);
-    for (int i = 0; i < JOINED; ++i)
-      for (int j = 0; j < JOINED; ++j) S[p].v[i][j] = g[i] * g[j] * enlarge;
+    enlarge[p] = 1 / std::max(1 - leverage / q.n, 0.5);
   }
-  return S;
+  return enlarge;
 }
 
 }  // namespace
@@ -304,11 +310,9 @@ Systematic systematic_errors(const PatchTable& t) {
   const Joined inverse = pseudo_inverse(N, n);
   for (int i = 0; i < n; ++i)
     for (int j = 0; j < n; ++j) fit[i] += inverse.v[i][j] * g[j];
-  const std::vector<Joined> S = spreads(q, inverse, fit);
-  out.block = block_variance(t, q, S, inverse, M);
-  for (const Joined& each : S)
-    for (int i = 0; i < n; ++i)
-      for (int j = 0; j < n; ++j) spread.v[i][j] += each.v[i][j];
+  const std::vector<double> enlarge = take_fit(q, inverse, fit);
+  for (int64_t p = 0; p < t.m; ++p) add_spread(q.g[p], enlarge[p], 0, JOINED, spread);
+  out.block = block_variance(t, q, enlarge, spread, inverse, M);
   Joined half;
   for (int i = 0; i < n; ++i)
     for (int k = 0; k < n; ++k)
