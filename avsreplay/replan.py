@@ -20,8 +20,10 @@ from avsreplay.plan import Limits, PlannerInput, PlanParams, Scene, SupervisorPa
 from avsreplay.plan.arm import Arm, JointPath
 from avsreplay.plan.robot import slowed
 from avsreplay.records import Alignment, AlignStatus, Belief, State
+from avsreplay.report.flight_page import Flight
 from avsreplay.saved_result import Saved
 
+FLIGHT_INSTANTS = 401  # of the flight on its page
 SIGMA_BOUND = 0.99  # inertia ratios of the draws are limited to the physical range
 
 
@@ -121,6 +123,32 @@ class Replanning:
             made: a plan that was found.
         """
         return plan.path_of(made, *self.start)
+
+    def flight(self, index: int, made: Plan) -> Flight:
+        """Return the flight of a plan in the fixture's frame {C}, as the belief predicts the fixture.
+
+        Args:
+            index: index of the scan from which the plan was made.
+            made: the plan; it must have been found.
+        """
+        scene, path = self._scene(self.saved.beliefs[index]), self.path(made)
+        times = np.linspace(0.0, made.t_go_s, FLIGHT_INSTANTS)
+        r, v = path.at(times)
+        rho, rate = scene.goal(times)
+        assert scene.attitude is not None
+        y = plan.in_fixture_axes(geometry.matrix(scene.attitude(times)), r - rho)
+        figures = {
+            "distance_m": np.linalg.norm(y, axis=1),
+            "speed_mps": np.linalg.norm(v - rate, axis=1),
+            **{f"u{axis}_mps2": u for axis, u in zip("xyz", path.thrust(times).T, strict=True)},
+        }
+        for name, margin in zip(plan.CONSTRAINTS, plan.margins(scene, self.limits, y, r).values.T, strict=True):
+            if np.isfinite(margin).all():
+                figures[f"margin_{name}_m"] = margin
+        limits, surface = self.limits, self.saved.surface
+        cones = ((limits.cone_deg, limits.cone_range_m), (limits.final_deg, limits.final_range_m))
+        required = [(deg, length) for deg, length in cones if deg is not None and length is not None]
+        return Flight(times, y, figures, np.array(self.saved.axis_c), required, limits.mouth_m or 0.0, surface)
 
     def attitude(self, belief: Belief, after_s: float) -> Array:
         """Return the predicted q_ac (4,) a time after a belief.

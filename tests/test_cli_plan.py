@@ -1,7 +1,9 @@
 """``avsreplay plan`` on a result that is made up: what it prints, exports and refuses."""
 
+import base64
 import csv
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from scipy.integrate import solve_ivp
 
 from avsreplay.cli.plan import plan_command
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.geometry import IDENTITY_QUAT
+from avsreplay.geometry import IDENTITY_QUAT, matrix
 from avsreplay.records import State
 from avsreplay.report.export import write_tum
 from avsreplay.report.jsonl import write_rows
@@ -168,6 +170,36 @@ def test_export_is_the_plan(result, tmp_path):
     assert np.allclose(np.linalg.norm(u, axis=1), 0.06)
     again = run(result, "--samples", 2, "--every", 99, "--export", path)
     assert isinstance(again.exception, UsageError)
+
+
+def test_the_page_of_the_flight_holds_the_plan_in_the_frame_of_the_fixture(result, tmp_path):
+    page, again = tmp_path / "flight.html", tmp_path / "again.html"
+    asked = ("--samples", 2, "--every", 99, "--final-deg", 15)
+    done = run(result, *asked, "--json", "--animate", page)
+    assert done.exit_code == 0, done.output
+    plan = json.loads(done.stdout)["plan"]
+    data = json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', page.read_text())[1])
+    path = np.frombuffer(base64.b64decode(data["scene"]["paths"][0]["points"]["data"]), "<f4").reshape(-1, 3)
+    assert np.linalg.norm(path[-1]) < 1e-5  # the grasp point
+    body, start_s = list(states())[10], 5.0  # the belief of the first plan, at 5 s
+    rho = body.T_ac
+    assert path[0] == pytest.approx(matrix(rho.q).T @ -rho.t, abs=1e-4)  # the robot is at the origin of {A}
+    times = np.frombuffer(base64.b64decode(data["runs"][0]["t"]["data"]), "<f8")
+    assert times[-1] == pytest.approx(plan["t_go_s"])
+    assert plan["capture_time_s"] == pytest.approx(start_s + times[-1])
+    keys = {"distance_m", "speed_mps", "ux_mps2", "uy_mps2", "uz_mps2", "margin_corridor_m"}
+    columns = data["runs"][0]["columns"]
+    assert columns.keys() == keys
+    assert np.frombuffer(base64.b64decode(columns["margin_corridor_m"]["data"]), "<f4").min() > -1e-6
+    assert run(result, *asked, "--animate", again).exit_code == 0
+    assert again.read_bytes() == page.read_bytes()
+    assert isinstance(run(result, *asked, "--animate", page).exception, UsageError)
+
+
+def test_there_is_no_page_without_a_plan(result, tmp_path):
+    done = run(result, "--horizon", 1, "--animate", tmp_path / "flight.html")
+    assert "there is no plan to show" in str(done.exception)
+    assert not (tmp_path / "flight.html").exists()
 
 
 @pytest.mark.parametrize(

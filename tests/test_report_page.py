@@ -19,8 +19,9 @@ from click.testing import CliRunner
 from avsreplay.cli.export import report_command
 from avsreplay.errors import AvsError
 from avsreplay.geometry import Pose, exp
-from avsreplay.records import Label, State
+from avsreplay.records import Label, State, Surface
 from avsreplay.report.charts import charts, derived, embed, most_telling, spans
+from avsreplay.report.flight_page import Flight, build_flight_page, cone_lines
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import build_page, render
 from avsreplay.report.result import load_result
@@ -381,6 +382,44 @@ def test_it_loads_without_a_console_message(opened, width, dark):
     assert browser.execute_script("return document.documentElement.dataset.theme") == ("dark" if dark else "light")
     assert browser.execute_script("return document.documentElement.scrollWidth") <= width
     assert len(browser.find_elements("css selector", ".chart canvas")) >= 12
+
+
+@pytest.mark.slow
+def test_the_page_of_a_flight_moves_the_gripper_with_the_slider(browser, tmp_path):
+    t = np.linspace(0.0, 20.0, 41)
+    y = np.outer(1.0 - t / 20.0, [3.0, 1.0, 0.5])
+    corners, faces = (
+        np.array([[0.0, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0]]),
+        np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+    )
+    surface = Surface(corners, faces, "m", "")
+    figures = {"distance_m": np.linalg.norm(y, axis=1), "margin_cone_m": y[:, 0]}
+    axis = np.array([1.0, 0.0, 0.0])
+    flight = Flight(t, y, figures, axis, [(30.0, 2.0), (15.0, 0.5)], 0.01, surface)
+    path = tmp_path / "flight.html"
+    path.write_text(build_flight_page("flight", ["found"], flight, [("status", "found")]), encoding="utf-8")
+    browser.get(path.as_uri())
+    _slide(browser, 10)
+    assert browser.get_log("browser") == []
+    assert _text(browser, "#now") == "5.00 s"
+    assert "gripper" in _text(browser, "#scene .legend")
+    pictures = []
+    for k in (10, 30):
+        _slide(browser, k)
+        assert browser.execute_script("return document.querySelector('#scene canvas').dataset.painted") == str(k)
+        pictures.append(browser.find_element("css selector", "#scene canvas").screenshot_as_base64)
+    assert pictures[0] != pictures[1]
+
+
+@pytest.mark.parametrize(("degrees", "length", "mouth"), [(35.0, 2.0, 0.01), (15.0, 0.48, 0.05), (80.0, 1.0, 0.0)])
+def test_the_lines_of_a_cone_lie_on_it_and_end_at_its_range(degrees, length, mouth):
+    axis = np.array([2.0, -1.0, 2.0]) / 3.0
+    points = cone_lines(axis, degrees, length, mouth)
+    along = points @ axis
+    across = np.linalg.norm(points - along[:, None] * axis, axis=1)
+    assert np.allclose(across, mouth + np.tan(np.radians(degrees)) * along)
+    assert np.linalg.norm(points, axis=1).max() == pytest.approx(length)
+    assert set(np.round(np.linalg.norm(points, axis=1), 9)) == {round(length, 9), round(mouth, 9)}
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from avsreplay.cli.config import robot_option, setting_option
 from avsreplay.cli.options import Numbers
 
 if TYPE_CHECKING:
+    from avsreplay.cli.plan_output import Answer
     from avsreplay.outcome import Plan
     from avsreplay.plan import Limits, PlanParams
     from avsreplay.plan.arm import Arm
@@ -26,6 +27,7 @@ Examples:
   avsreplay plan results/ --final-deg 15 --clearance 0.1 --set supervisor.sigmas=2 --set robot.thrust_noise=0.02
   avsreplay plan results/ --robot robot.toml
   avsreplay plan results/ --export plan.csv --json
+  avsreplay plan results/ --animate flight.html    the flight in 3D, with a slider
 
 \b
 Exit codes: 0 ok (also where no plan was found; the status says so),
@@ -74,7 +76,8 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
 )
 @click.option("--extent", "extent_m", type=float, help="Extent of the target [m], if the result does not contain it.")
 @click.option("--export", type=click.Path(path_type=Path), help="Write t, r, v, u of the plan as CSV.")
-@click.option("--overwrite", is_flag=True, help="Replace an existing CSV.")
+@click.option("--animate", type=click.Path(path_type=Path), help="Write a page with the flight in 3D as HTML.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing file.")
 @click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
 def plan_command(
     result: Path,
@@ -87,6 +90,7 @@ def plan_command(
     assignments: tuple[str, ...],
     extent_m: float | None,
     export: Path | None,
+    animate: Path | None,
     overwrite: bool,
     as_json: bool,
     **flags: Any,
@@ -111,8 +115,9 @@ def plan_command(
     for name, value in (("--every", every_s), ("--extent", extent_m)):
         if value is not None and not 0.0 < value < float("inf"):
             raise UsageError(f"{value} is not above 0", where=name, hint="give a finite number above 0")
-    if export:
-        check_output(export, overwrite=overwrite)
+    for target in (export, animate):
+        if target:
+            check_output(target, overwrite=overwrite)
     of_robot = () if robot_file is None else robot_settings(robot_file)
     saved = with_settings(load_saved(result, extent_m), (*of_robot, *assignments))
     for line in saved.warnings:
@@ -131,6 +136,8 @@ def plan_command(
         _export(planning, made, export)
     at_s = saved.rows[index].t_s
     answer = Answer(planning, at_s, made, spread, flown, joints, hindsight, execution)
+    if animate:
+        click.echo(_animate(answer, index, animate), err=True)
     if as_json:
         click.echo(document(answer), nl=False)
     else:
@@ -176,3 +183,21 @@ def _export(planning: Replanning, made: Plan, path: Path) -> None:
     with output_text(path) as stream:
         lines = [",".join(names), *(",".join(repr(float(v)) for v in row) for row in values)]
         stream.write("\n".join(lines) + "\n")
+
+
+def _animate(answer: Answer, index: int, path: Path) -> str:
+    """Write the page of the flight; return one line with the file and its size."""
+    from avsreplay.cli.plan_output import plan_facts
+    from avsreplay.errors import UsageError
+    from avsreplay.files import output_text
+    from avsreplay.report.flight_page import build_flight_page
+
+    planning, made = answer.planning, answer.made
+    if not made.found:
+        raise UsageError("there is no plan to show", where=str(path), hint=f"its status is {made.status.value}")
+    facts = plan_facts(planning, answer.at_s, made)
+    title = f"{planning.saved.name}: flight planned at {answer.at_s:.2f} s"
+    page = build_flight_page(title, [f"robot {planning.robot_line}"], planning.flight(index, made), facts)
+    with output_text(path) as stream:
+        stream.write(page)
+    return f"{path} ({len(page) / 1e6:.2f} MB)"

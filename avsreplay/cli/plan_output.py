@@ -106,7 +106,7 @@ def print_answer(answer: Answer) -> None:
     from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
     console = make_console()
-    facts = _plan_facts(answer.planning, answer.at_s, answer.made)
+    facts = plan_facts(answer.planning, answer.at_s, answer.made)
     for found in (answer.joints, answer.spread, answer.flown):
         facts += found.described() if found else []
     print_table(console, facts_table(f"Plan made at {answer.at_s:.2f} s", facts))
@@ -117,7 +117,8 @@ def print_answer(answer: Answer) -> None:
             print_line(console, line)
 
 
-def _plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str, str]]:
+def plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str, str]]:
+    """Return the figures of a plan as names and texts."""
     facts = [("robot", planning.robot_line), ("status", _status(made))]
     if made.found:
         facts += [

@@ -5,7 +5,7 @@ from avsreplay.plan.constrained import constrained
 from avsreplay.plan.evaluation import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
 from avsreplay.plan.flights import Flights, closed_loop
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
-from avsreplay.plan.limits import Scene, TargetGeometry, hull_vertices
+from avsreplay.plan.limits import CONSTRAINTS, Scene, TargetGeometry, hull_vertices, in_fixture_axes, margins
 from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits, RobotParams
@@ -21,6 +21,7 @@ from avsreplay.plan.supervisor import (
 from avsreplay.plan.uncertainty import Disturbance, Future, Spread, draws, spread
 
 __all__ = [
+    "CONSTRAINTS",
     "RULES",
     "Action",
     "CostatePath",
@@ -54,7 +55,9 @@ __all__ = [
     "draws",
     "execute",
     "hull_vertices",
+    "in_fixture_axes",
     "interpolated",
+    "margins",
     "miss",
     "path_of",
     "rendezvous",

@@ -150,6 +150,25 @@ def charts(columns: Columns, truth: State | None = None, limits: Mapping[str, fl
     return kept
 
 
+def flight_charts(columns: Columns) -> list[Chart]:
+    """The charts of one planned flight that have data.
+
+    Args:
+        columns: ``distance_m`` and ``speed_mps`` relative to the grasp point, ``ux_mps2`` to ``uz_mps2`` in {A}, and
+            ``margin_NAME_m`` of each constraint.
+    """
+    margins = [name for name in columns if name.startswith("margin_")]
+    lines = [_line(name, name[7:-2], k, dash=k % 2 == 1) for k, name in enumerate(margins)]
+    thrust = [_line(f"u{a}_mps2", a, k, dash=k == 1) for k, a in _XYZ]
+    whole = [
+        _chart("distance", "Distance to the grasp point", "m", [_line("distance_m", "distance", 0)]),
+        _chart("speed", "Speed relative to the grasp point", "m/s", [_line("speed_mps", "speed", 0)]),
+        _chart("thrust", "Acceleration of the robot in {A}", "m/s2", thrust),
+        _chart("margin", "Margin of the constraints", "m", lines, levels=[(0.0, "limit", 3)]),
+    ]
+    return [_scaled(chart, columns) for chart in whole if any(s["column"] in columns for s in chart["series"])]
+
+
 def _scaled(chart: Chart, columns: Columns) -> Chart:
     """The chart with its axis; typical values in metres below 1 m are drawn in millimetres, as in the tables."""
     sizes = [np.abs(columns[s["column"]]) for s in chart["series"]]

@@ -29,7 +29,7 @@ const Scene = (() => {
   const apply = (m, v) => [0, 1, 2].map((r) => m[r] * v[0] + m[4 + r] * v[1] + m[8 + r] * v[2] + m[12 + r]);
   const IDENTITY = new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]);
   const RAMP = [[70, 110, 200], [40, 165, 170], [120, 205, 90], [253, 231, 37]];
-  const COLOUR = { estimate: [0.34, 0.71, 0.91, 0.5], truth: [0.18, 0.76, 0.6, 1], path: [1, 0.56, 0.29, 1], sight: [0.55, 0.6, 0.68, 0.6], x: [1, 0.56, 0.29, 1], y: [0.18, 0.76, 0.6, 1], z: [0.34, 0.71, 0.91, 1] };
+  const COLOUR = { estimate: [0.34, 0.71, 0.91, 0.5], truth: [0.18, 0.76, 0.6, 1], path: [1, 0.56, 0.29, 1], sight: [0.55, 0.6, 0.68, 0.6], flown: [0.9, 0.54, 0.84, 1], cone: [0.18, 0.76, 0.6, 0.7], x: [1, 0.56, 0.29, 1], y: [0.18, 0.76, 0.6, 1], z: [0.34, 0.71, 0.91, 1] };
 
   const VERTEX = "attribute vec3 place; attribute vec3 normal; attribute vec3 tint; uniform mat4 lens, pose; uniform float bead; varying vec3 n, c; void main() { n = (pose * vec4(normal, 0.0)).xyz; c = tint; gl_Position = lens * pose * vec4(place, 1.0); gl_PointSize = bead; }";
   const FRAGMENT = "precision mediump float; uniform vec4 colour; uniform vec3 light; uniform float mode; varying vec3 n, c; void main() { if (mode > 1.5) { vec2 d = gl_PointCoord - 0.5; if (dot(d, d) > 0.25) discard; gl_FragColor = vec4(c, 1.0); } else if (mode > 0.5) { float s = 0.35 + 0.65 * abs(dot(normalize(n), light)); gl_FragColor = vec4(colour.rgb * s, colour.a); } else gl_FragColor = colour; }";
@@ -106,6 +106,7 @@ const Scene = (() => {
     const at = program(gl), vertices = Packed.unpack(scene.vertices), faces = Packed.unpack(scene.faces);
     const estimate = Packed.unpack(scene.estimate), truth = Packed.unpack(scene.truth), clouds = decode(scene);
     const mesh = model(vertices, faces), bounds = ball(vertices);
+    const flight = scene.flight ? { axis: scene.flight.axis, near: scene.flight.near_m, cones: Packed.unpack(scene.flight.cones) } : null;
     const paths = scene.paths.map((p) => ({ t: p.t_s, points: Packed.unpack(p.points) }));
     const buffer = (data) => { const b = gl.createBuffer(); gl.bindBuffer(gl.ARRAY_BUFFER, b); gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW); return b; };
     const fixed = { place: buffer(mesh.place), normal: buffer(mesh.normal), edges: buffer(mesh.edges), bare: buffer(vertices) };
@@ -115,14 +116,15 @@ const Scene = (() => {
     const note = document.createElement("span"), bar = document.createElement("div"), legend = document.createElement("ul");
     bar.className = "bar"; legend.className = "legend";
     const button = (text, act) => { const b = document.createElement("button"); b.type = "button"; b.textContent = text; b.addEventListener("click", act); bar.append(b); return b; };
-    const fit = button("Whole scene", () => { whole = !whole; zoom = 1; fit.textContent = whole ? "Target only" : "Whole scene"; draw(); });
+    const all = flight ? ball([...vertices, ...paths[0].points]) : null, [less, more] = flight ? ["Whole flight", "Last metres"] : ["Target only", "Whole scene"];
+    const fit = button(more, () => { whole = !whole; zoom = 1; fit.textContent = whole ? less : more; draw(); });
     button("Reset view", () => { yaw = 0.55; pitch = 0.35; zoom = 1; draw(); });
     bar.append(note);
     const entry = (colour, text) => { const li = document.createElement("li"), i = document.createElement("i"); i.style.background = colour; li.append(i, text); legend.append(li); };
-    if (faces.length) entry("#56b4e9", "model at the estimate");
+    if (faces.length) entry("#56b4e9", flight ? "target" : "model at the estimate");
     if (truth.some(Number.isFinite)) entry("#2fc39a", faces.length ? "model at the true pose (edges)" : "true pose");
     if (paths.length) entry("#ff8f4a", "planned path");
-    entry("#8c99ad", "line of sight");
+    if (flight) { entry("#e58ad6", "gripper and its path so far"); if (flight.cones.length) entry("#2ec299", "approach cones"); } else entry("#8c99ad", "line of sight");
     if (clouds.cap) { const li = document.createElement("li"); li.className = "ramp"; li.append("residual 0", document.createElement("b"), (clouds.cap * 1000).toPrecision(3) + " mm"); legend.append(li); }
     host.append(canvas, bar, legend);
 
@@ -156,25 +158,31 @@ const Scene = (() => {
       if (!w || !h) return;
       if (canvas.width !== w || canvas.height !== h) { canvas.width = w; canvas.height = h; }
       const pose = poseAt(estimate, chosen) || IDENTITY, real = poseAt(truth, chosen), found = cloudAt(clouds, chosen);
-      const target = apply(pose, bounds.centre), away = V.size(target) || 1, radius = bounds.radius || 0.2 * away;
-      const up = Math.abs(target[2]) > 0.7 * away ? [0, -1, 0] : [0, 0, 1];
-      const centre = whole ? V.mul(target, 0.5) : target, reach = (whole ? 0.62 * away + radius : radius) * 2.4 * zoom;
-      const back = V.unit(V.mul(target, -1)), side = V.unit(V.cross(up, back)), lift = V.cross(back, side);
+      const target = flight ? (whole ? [0, 0, 0] : all.centre) : apply(pose, bounds.centre), away = flight ? all.radius : V.size(target) || 1;
+      const radius = flight ? (whole ? 1.5 * flight.near : 1.1 * all.radius) : bounds.radius || 0.2 * away, eyes = flight ? flight.axis : V.mul(target, -1);
+      const up = Math.abs(eyes[2]) > 0.7 * V.size(eyes) ? [0, -1, 0] : [0, 0, 1];
+      const centre = whole && !flight ? V.mul(target, 0.5) : target, reach = (whole && !flight ? 0.62 * away + radius : radius) * 2.4 * zoom;
+      const back = V.unit(eyes), side = V.unit(V.cross(up, back)), lift = V.cross(back, side);
       const dir = V.add(V.mul(V.add(V.mul(back, Math.cos(yaw)), V.mul(side, Math.sin(yaw))), Math.cos(pitch)), V.mul(lift, Math.sin(pitch)));
       const eye = V.add(centre, V.mul(dir, reach));
       const lens = times(perspective(0.75, w / h, reach * 0.02, reach * 6 + 4 * away), lookAt(eye, centre, up));
       gl.viewport(0, 0, w, h); gl.clearColor(0.063, 0.082, 0.11, 1); gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
       gl.enable(gl.DEPTH_TEST); gl.enable(gl.BLEND); gl.blendFunc(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA);
       gl.uniformMatrix4fv(at.lens, false, lens); gl.uniform3fv(at.light, V.unit(V.add(dir, V.mul(side, 0.4))));
-      lines(sight(target, radius), IDENTITY, COLOUR.sight);
-      triad(IDENTITY, 0.12 * away); triad(pose, 0.6 * radius);
+      if (flight) lines(flight.cones, IDENTITY, COLOUR.cone); else { lines(sight(target, radius), IDENTITY, COLOUR.sight); triad(IDENTITY, 0.12 * away); }
+      triad(pose, (flight ? 0.25 : 0.6) * radius);
       if (real) faces.length ? shape(gl.LINES, mesh.edges.length / 3, { buffer: fixed.edges }, real, COLOUR.truth, 0) : triad(real, 0.5 * radius);
       if (!faces.length && vertices.length) shape(gl.POINTS, vertices.length / 3, { buffer: fixed.bare }, pose, COLOUR.estimate, 0, { bead: 2 * px });
       const path = paths.filter((p) => p.t <= t[chosen] + 1e-9).pop();
+      if (flight) lines(path.points.subarray(0, 3 * (chosen + 1)), IDENTITY, COLOUR.flown, gl.LINE_STRIP); // first: it hides the plan
       if (path) lines(path.points, IDENTITY, COLOUR.path, gl.LINE_STRIP);
+      if (flight) {
+        const end = 3 * (chosen + 1);
+        shape(gl.POINTS, 1, { buffer: scratch, data: path.points.slice(end - 3, end) }, IDENTITY, COLOUR.flown, 2, { tint: new Float32Array(COLOUR.flown.slice(0, 3)), bead: 11 * px });
+      }
       if (found >= 0) { const c = cloudArrays(clouds, found); shape(gl.POINTS, c.size, { buffer: scratch, data: c.place }, IDENTITY, COLOUR.sight, 2, { tint: c.tint, bead: 4 * px }); }
       if (faces.length) { gl.depthMask(false); shape(gl.TRIANGLES, mesh.place.length / 3, { buffer: fixed.place }, pose, COLOUR.estimate, 1, { normal: fixed.normal }); gl.depthMask(true); }
-      note.textContent = found >= 0 ? `${clouds.size[found]} points of scan ${clouds.scan[found]}` : "no points of this scan";
+      note.textContent = flight ? "frame of the fixture {C}" : found >= 0 ? `${clouds.size[found]} points of scan ${clouds.scan[found]}` : "no points of this scan";
       canvas.dataset.painted = String(chosen);
     }
     function draw() { if (!dirty) { dirty = true; requestAnimationFrame(paint); } }
