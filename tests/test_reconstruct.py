@@ -16,9 +16,10 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.reconstruct import at_grasp, deviations, reconstruct, true_frame
-from avsreplay.reconstruct.free_motion import free_motion
-from avsreplay.reconstruct.tracking import between
-from avsreplay.reconstruct.views import SAMPLE, Twist, extent_of, full_cloud, surveyed
+from avsreplay.reconstruct.fusion import continues, contradicting
+from avsreplay.reconstruct.registration import between
+from avsreplay.reconstruct.tracking import ReconstructionParams
+from avsreplay.reconstruct.views import SAMPLE, Twist, extent_of, free_motion, full_cloud, surveyed, thinned_view
 from avsreplay.records import Scan, Surface
 
 CORNERS = np.random.default_rng(11).normal(size=(14, 3)) * [0.5, 0.35, 0.25]
@@ -135,6 +136,38 @@ def test_a_sphere_is_refused():
         reconstruct(lambda: scans)
 
 
+def test_steps_that_are_too_large_are_refused():
+    """Neighbouring scans share hardly any surface, and no scan shows a side again."""
+    axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    rng = np.random.default_rng(4)
+    turns = [np.zeros(3), 170.0 * axes[0], 85.0 * axes[1]]
+    poses = [Pose(geometry.exp(np.radians(t)), np.array([0.0, 0.0, 4.0])) for t in turns]
+    scans = [Scan(seq=k, t_ns=k * 500_000_000, points=hull_scan(rng, T, 0.003)) for k, T in enumerate(poses)]
+    with pytest.raises(UnreadableInput, match=r"only \d of 3 scans could be registered") as refused:
+        reconstruct(lambda: scans)
+    assert "steps between scans are too large" in str(refused.value.hint)
+
+
+def test_a_scan_with_a_wrong_pose_contradicts_the_others():
+    scans, truth = turning(8, 15.0, noise_m=0.003)
+    p, survey = ReconstructionParams(), surveyed(lambda: scans, 100, 400)
+    views = [thinned_view(scan, survey, p.thin * survey.extent) for scan in scans]
+    poses = dict(enumerate(truth))
+    assert contradicting(views, poses, p, survey.extent) == []
+    poses[5] = poses[5] @ Pose(geometry.exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
+    assert contradicting(views, poses, p, survey.extent) == [5]
+
+
+def test_points_that_one_scan_only_has_seen_are_kept_where_they_continue_a_surface():
+    rng = np.random.default_rng(7)
+    plane = np.column_stack([rng.uniform(-1.0, 1.0, (2000, 2)), 0.002 * rng.normal(size=2000)])
+    stray = rng.uniform(0.2, 1.0, (40, 3))
+    normals = np.tile([0.0, 0.0, 1.0], (2040, 1))
+    kept = continues(np.vstack([plane, stray]), normals, 0.05)
+    assert kept[:2000].mean() > 0.99
+    assert kept[2000:].mean() < 0.05
+
+
 def test_too_few_scans_are_refused():
     scans, _ = turning(2, 10.0)
     with pytest.raises(UnreadableInput, match="only 2 of 2 scans"):
@@ -160,6 +193,20 @@ def test_the_dragon_is_rebuilt_from_fifteen_scans(shared_data):
         made = reconstruct(source.scans)
     assert made.used == 15
     assert made.rms_m < 0.4e-3
+
+
+@pytest.mark.slow
+def test_scans_of_the_bunny_that_were_placed_wrongly_are_left_out(shared_data):
+    """Ten views in any order: those that are used must agree with the scanner's poses up to one common displacement."""
+    folder = shared_data / "stanford-bunny"
+    with open_source(folder, SourceOptions(model=folder / "bun_zipper.ply")) as source:
+        made = reconstruct(source.scans)
+        truth = {scan.t_ns: source.truth_of(scan).pose for scan in source.scans()}
+    each = [T_ac.inverse() @ truth[t_ns] for t_ns, T_ac in made.poses]
+    assert len(each) >= 7
+    assert np.ptp([X.t for X in each], axis=0).max() < 2e-3
+    assert max(float(geometry.angle((each[0].inverse() @ X).q)) for X in each) < np.radians(1.0)
+    assert any("were left out" in note for note in made.notes)
 
 
 @pytest.mark.slow

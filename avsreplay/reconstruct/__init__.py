@@ -21,8 +21,7 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Pose
-from avsreplay.reconstruct.free_motion import FreeMotion, free_motion, twists
-from avsreplay.reconstruct.fusion import all_poses, fused, pair_rms, refined, turn_and_coverage
+from avsreplay.reconstruct.fusion import all_poses, contradicting, fused, pair_rms, refined, turn_and_coverage
 from avsreplay.reconstruct.model import (
     Deviations,
     Reconstruction,
@@ -32,8 +31,17 @@ from avsreplay.reconstruct.model import (
     reconstruction_ply,
     surface_of,
 )
-from avsreplay.reconstruct.tracking import ReconstructionParams, Tracked, track
-from avsreplay.reconstruct.views import ScanView, Survey, selected, surveyed, thinned_view
+from avsreplay.reconstruct.tracking import ReconstructionParams, Tracked, track, without
+from avsreplay.reconstruct.views import (
+    FreeMotion,
+    ScanView,
+    Survey,
+    free_motion,
+    selected,
+    surveyed,
+    thinned_view,
+    twists,
+)
 from avsreplay.records import Scan
 
 __all__ = [
@@ -52,6 +60,7 @@ __all__ = [
 WEAKEST = 1e-3  # below this ratio of the eigenvalues of a registration, a surface does not determine the pose
 AS_WELL = 1.01  # free motion replaces the refined poses if it increases the rms between scans by no more than this
 STILL_RAD = np.radians(5.0)  # a target that turned by less is at rest
+MOST_ROUNDS = 3  # times views that contradict the others are left out and the poses are refined again
 MOST_FUSED = 150  # scans whose points are averaged; more are thinned evenly
 Scans = Callable[[], Iterable[Scan]]
 
@@ -77,8 +86,16 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
         what = f"only {len(survey.chosen)} of {survey.offered} scans have {p.fewest_points} points or more"
         raise UnreadableInput(what, hint="a model needs three at least")
     views, tracked = _tracked(scans, survey, p)
-    better, keys, rms, gate = refined(views, tracked, p, survey.extent)
-    poses = all_poses(better, tracked, keys, p, survey.extent)
+    left_out = 0
+    for _ in range(MOST_ROUNDS):
+        better, keys, rms, gate = refined(views, tracked, p, survey.extent)
+        poses = all_poses(better, tracked, keys, p, survey.extent)
+        wrong = contradicting(better, poses, p, survey.extent)
+        if not wrong:
+            break
+        left_out += len(wrong)
+        tracked = without(tracked, wrong)
+        _refuse_few(tracked, views)
     turned, coverage = turn_and_coverage([views[k] for k in poses], list(poses.values()))
     _refuse_still(turned, tracked.weakest)
     motion = free_motion([views[k].t_ns for k in sorted(poses)], [poses[k] for k in sorted(poses)], survey.extent)
@@ -108,7 +125,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
         turn_deg=float(np.degrees(turned)),
         rms_m=rms,
         voxel_m=p.voxel * survey.extent,
-        notes=_notes(len(poses), len(views), coverage),
+        notes=_notes(len(poses), len(views), left_out, coverage),
         motion=motion,
         sights=tuple(sights),
         frame="origin at the centroid of the first scan, axes parallel to those of the camera at that scan",
@@ -149,11 +166,15 @@ def _tracked(scans: Scans, survey: Survey, p: ReconstructionParams) -> tuple[lis
         twist = twists(instants, tracked.poses, motion)
         views = [thinned_view(scan, survey, size_m, twist.get(k)) for k, scan in enumerate(selected(scans, survey))]
         tracked = track(views, p, survey.extent)
+    _refuse_few(tracked, views)
+    return views, tracked
+
+
+def _refuse_few(tracked: Tracked, views: Sequence[ScanView]) -> None:
     if len(tracked.poses) < 3:
         turn = f"only {len(tracked.poses)} of {len(views)} scans could be registered to one another"
         hint = "the steps between scans are too large, or too much of the target is hidden: record more scans"
         raise UnreadableInput(turn, hint=hint)
-    return views, tracked
 
 
 def _on_motion(views: Sequence[ScanView], poses: dict[int, Pose], motion: FreeMotion) -> dict[int, Pose]:
@@ -169,10 +190,12 @@ def _refuse_still(turned: float, weakest: Sequence[float]) -> None:
         raise UnreadableInput(f"{what}: {why}", hint="a model needs scans of several sides; give one with --model FILE")
 
 
-def _notes(used: int, offered: int, coverage: float) -> tuple[str, ...]:
+def _notes(used: int, offered: int, contradicting: int, coverage: float) -> tuple[str, ...]:
     notes = []
     if used < 0.8 * offered:
         notes.append(f"{offered - used} of {offered} scans could not be registered and are not part of the model")
+    if contradicting:
+        notes.append(f"{contradicting} scans do not show the surface that the other scans show there and were left out")
     if coverage < 0.5:
         notes.append(f"the target was seen from {100.0 * coverage:.0f} % of all directions only")
     return tuple(notes)

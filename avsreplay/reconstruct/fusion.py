@@ -10,16 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from avsreplay.geometry import Array, Pose
-from avsreplay.reconstruct.tracking import (
-    KEEP_RATIO,
-    SAME_SIDE,
-    ReconstructionParams,
-    Tracked,
-    between,
-    moved,
-    patchwork,
-    registered,
-)
+from avsreplay.reconstruct.registration import SAME_SIDE, between, moved, registered
+from avsreplay.reconstruct.tracking import KEEP_RATIO, ReconstructionParams, Tracked, patchwork
 from avsreplay.reconstruct.views import (
     NEIGHBOURS,
     ScanView,
@@ -44,6 +36,9 @@ FEWEST_KEYS = 40  # of a shorter log every scan is a key scan in the refinement
 MERGED = 30  # nearest points of all key scans from which a normal is estimated
 MERGED_REACH = 0.03  # their largest distance as a share of the extent
 MOST_SIGHTS = 60  # scans that are asked whether they saw through a point
+MOST_ASKED = 3000  # points of the model that are compared with one view
+LEAST_SHOWN = 0.8  # share of the model's visible points that a view must show, in units of the median of all views
+SUPPORT = 5  # of the ten nearest points that continue the surface of a point which one scan only has seen
 SPREAD_RAD = np.radians(30.0)  # a direction counts as covered if a scan was taken from within this angle of it
 
 
@@ -179,12 +174,47 @@ def all_poses(
     for k, T in sorted(tracked.poses.items()):
         if k in keys:
             continue
-        nearest = max((j for j in keys if j <= k), default=0)
+        nearest = max((j for j in keys if j <= k), default=min(keys))
         guess = keys[nearest] @ (tracked.poses[nearest].inverse() @ T)
         match = registered(views[k], model, guess, 0.03 * extent, extent)
         if match.ratio >= KEEP_RATIO:
             found[k] = match.T_ac
     return found
+
+
+def contradicting(
+    views: Sequence[ScanView], poses: dict[int, Pose], p: ReconstructionParams, extent: float
+) -> list[int]:
+    """Views that do not show what the others say they must show: their poses are wrong, or they show something else.
+
+    Points of the joint model that face a view and that nothing hides must be in it. A pose that is wrong puts the
+    surfaces of other views where this one has measured something farther away, or nothing. The share of the points that
+    are there is compared with the median over all views, because a scanner may lose returns everywhere.
+
+    Args:
+        views: of the log.
+        poses: T_ac by number of the view.
+        p: resolution.
+        extent: of the target [m].
+
+    Returns:
+        The numbers of the views with less than LEAST_SHOWN of the median share.
+    """
+    model = patchwork(views, Tracked(poses, sorted(poses), 0, 0, []), p.thin * extent)
+    every, reach = max(1, len(model.points) // MOST_ASKED), 0.03 * extent
+    shown = []
+    for k in sorted(poses):
+        q, n = poses[k].apply(model.points[::every]), model.normals[::every] @ poses[k].R.T
+        lines, measured = views[k].camera - q, np.linalg.norm(views[k].points - views[k].camera, axis=1)
+        far = np.linalg.norm(lines, axis=1)
+        facing = np.einsum("ni,ni->n", n, lines) > 0.5 * far
+        off, nearest = views[k].rays.query(-lines[facing] / far[facing, None])
+        behind = far[facing] - measured[nearest]
+        hit = np.asarray(off) * far[facing] <= reach
+        hidden, there = hit & (behind > reach), hit & (np.abs(behind) <= reach)
+        shown.append(float(there.sum()) / max(int((~hidden).sum()), 1))
+    least = LEAST_SHOWN * float(np.median(shown))
+    return [k for k, share in zip(sorted(poses), shown, strict=True) if share < least]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,7 +248,8 @@ def fused(
 ) -> tuple[Array, Array, Array, NDArray[np.int64], list[Sight]]:
     """Surface points, normals, standard errors along the normal, numbers of scans, and sights; one scan at a time.
 
-    Points seen once only, or seen through by more than a third as many scans as have seen them, are left out.
+    Points seen through by more than a third as many scans as have seen them are left out, and points that one scan only
+    has seen and that do not continue the surface of their neighbours.
     """
     points, normals, owner, sights = [], [], [], list[Sight]()
     apart = max(1, len(twist) // MOST_SIGHTS)
@@ -238,11 +269,22 @@ def fused(
     seen = np.bincount(np.unique(np.column_stack([cell, who]), axis=0)[:, 0], minlength=len(count))
     height = np.einsum("ni,ni->n", p - mean[cell], normal[cell])
     scatter = np.sqrt(np.bincount(cell, height**2) / np.maximum(count - 1, 1))
-    through = sum((s.seen_through(mean, 1.5 * size_m) > 6.0 * size_m).astype(np.float64) for s in sights)
+    wide = 1.5 * size_m  # rays of one scan are farther apart than points of all scans
+    through = sum((s.seen_through(mean, 1.5 * wide) > 6.0 * wide).astype(np.float64) for s in sights)
     keep = np.asarray(through) * (len(twist) / len(sights)) <= 0.34 * seen
-    keep &= (seen >= 2) | (len(twist) < 12)
+    keep &= (seen >= 2) | (len(twist) < 12) | continues(mean, normal, size_m)
     sigma = scatter / np.sqrt(np.maximum(count, 1))
     return mean[keep], normal[keep], np.maximum(sigma, 1e-3 * size_m)[keep], seen[keep], sights
+
+
+def continues(p: Array, n: Array, size_m: float) -> NDArray[np.bool_]:
+    """Whether at least SUPPORT of the ten points nearest to each (n, 3) have a similar normal and lie in its plane."""
+    distances, nearest = cKDTree(p).query(p, k=2 * SUPPORT + 1, distance_upper_bound=3.0 * size_m)
+    d = np.asarray(distances)[:, 1:]
+    index = np.where(np.isfinite(d), np.asarray(nearest)[:, 1:], 0)
+    near = np.isfinite(d) & (np.einsum("ni,nki->nk", n, n[index]) > SAME_SIDE)
+    near &= np.abs(np.einsum("ni,nki->nk", n, p[index] - p[:, None])) < size_m
+    return np.asarray(near.sum(axis=1) >= SUPPORT)
 
 
 def turn_and_coverage(views: Sequence[ScanView], poses: Sequence[Pose]) -> tuple[float, float]:

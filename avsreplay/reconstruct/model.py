@@ -16,8 +16,8 @@ from scipy.spatial import cKDTree
 from avsreplay import geometry
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose, frozen
-from avsreplay.reconstruct.free_motion import FreeMotion
 from avsreplay.reconstruct.fusion import Sight
+from avsreplay.reconstruct.views import FreeMotion, averaged
 from avsreplay.records import BLOCKS, Surface
 
 PATCH = 0.04  # radius of a grasp patch as a share of the extent
@@ -70,6 +70,11 @@ class Reconstruction:
         return geometry.bounding_diagonal(self.points)
 
     @property
+    def spacing_m(self) -> float:
+        """Distance up to which neighbouring points, or rays of one scan, belong to one surface [m]."""
+        return 1.5 * self.voxel_m
+
+    @property
     def mass_centre(self) -> tuple[Array, float] | None:
         """Mass centre (3,) in {C} [m] and its 1 sigma, the root of the trace [m]; None if the motion is not known."""
         if self.motion is None:
@@ -101,7 +106,7 @@ def at_grasp(made: Reconstruction, grasp: Array | None = None) -> Reconstruction
     """
     tree, chosen_by = cKDTree(made.points), "the given point" if grasp is not None else "the flattest reachable patch"
     if grasp is None:
-        grasp = _flattest(made, tree)
+        grasp = _flattest(made)
     distance, nearest = tree.query(grasp)
     if distance > 0.05 * made.extent:
         hint = "give a point of the reconstructed model, in its frame"
@@ -122,30 +127,32 @@ def at_grasp(made: Reconstruction, grasp: Array | None = None) -> Reconstruction
     )
 
 
-def _flattest(made: Reconstruction, tree: cKDTree) -> Array:
+def _flattest(made: Reconstruction) -> Array:
     """The centre of the flattest patch that can be approached; of the flattest one if none can."""
-    chosen = np.flatnonzero(made.scans >= np.median(made.scans))
+    points, normals, cell = averaged(made.points, made.normals, made.extent / 100.0)
+    scans = np.bincount(cell, made.scans) / np.bincount(cell)
+    chosen = np.flatnonzero(scans >= np.median(scans))
     chosen = chosen[:: max(1, len(chosen) // 4000)]
-    near: Any = tree.query_ball_point(made.points[chosen], PATCH * made.extent)
+    near: Any = cKDTree(points).query_ball_point(points[chosen], PATCH * made.extent)
     full = np.median([len(k) for k in near])
-    flat = np.array([float(np.linalg.norm(made.normals[k].mean(axis=0))) if len(k) >= full else 0.0 for k in near])
+    flat = np.array([float(np.linalg.norm(normals[k].mean(axis=0))) if len(k) >= full else 0.0 for k in near])
     order = np.argsort(-flat, kind="stable")
     for k in order[flat[order] > 0.0]:
-        if _reachable(made, made.points[chosen[k]], made.normals[near[k]].mean(axis=0)):
-            return np.asarray(made.points[chosen[k]])
-    return np.asarray(made.points[chosen[order[0]]])
+        if _reachable(points, made.extent, points[chosen[k]], normals[near[k]].mean(axis=0)):
+            return np.asarray(points[chosen[k]])
+    return np.asarray(points[chosen[order[0]]])
 
 
-def _reachable(made: Reconstruction, at: Array, normal: Array) -> bool:
+def _reachable(points: Array, extent: float, at: Array, normal: Array) -> bool:
     """Whether the cone about the outward normal is free of points of the model."""
-    away = made.points - at
+    away = points - at
     distance = np.linalg.norm(away, axis=1)
-    inside = (distance > PATCH * made.extent) & (distance < 0.5 * made.extent)
+    inside = (distance > PATCH * extent) & (distance < 0.5 * extent)
     return not bool(np.any(away[inside] @ _unit(normal) > APPROACH * distance[inside]))
 
 
 def _unit(v: Array) -> Array:
-    return np.asarray(v / np.linalg.norm(v))
+    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-30))
 
 
 def surface_of(made: Reconstruction) -> Surface:
@@ -179,16 +186,16 @@ def meshed(made: Reconstruction) -> tuple[Surface, float]:
         raise MissingBackend("a mesh needs Open3D, which is not installed", where="--mesh", hint=hint) from None
     cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(made.points))
     cloud.normals = open3d.utility.Vector3dVector(made.normals)
-    depth = int(np.clip(np.ceil(np.log2(1.1 * np.ptp(made.points, axis=0).max() / made.voxel_m)), 5, 9))
+    depth = int(np.clip(np.ceil(np.log2(1.1 * np.ptp(made.points, axis=0).max() / made.spacing_m)), 5, 9))
     mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
     corners = vertices[faces]
     away = np.asarray(cKDTree(made.points).query(corners.mean(axis=1))[0])
-    faces, kept = faces[away < 4.0 * made.voxel_m], away[away < 4.0 * made.voxel_m]
+    faces, kept = faces[away < 4.0 * made.spacing_m], away[away < 4.0 * made.spacing_m]
     area = np.linalg.norm(np.cross(*(vertices[faces[:, k]] - vertices[faces[:, 0]] for k in (1, 2))), axis=1)
     used, faces = np.unique(faces, return_inverse=True)
     surface = Surface(frozen(vertices[used]), faces.reshape(-1, 3).astype(np.int32), "reconstructed.ply", "")
-    return surface, float(area[kept > 1.5 * made.voxel_m].sum() / max(area.sum(), 1e-30))
+    return surface, float(area[kept > 1.5 * made.spacing_m].sum() / max(area.sum(), 1e-30))
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,11 +267,11 @@ def deviations(made: Reconstruction, cad: Surface) -> Deviations:
         raise UnreadableInput("no point lies near the CAD model", where=cad.name, hint="check model and unit")
     ratio = float(np.isfinite(signed).mean())
     median = float(np.median(known))
-    tolerance = max(4.0 * 1.4826 * median, 3.0 * made.voxel_m)
+    tolerance = max(4.0 * 1.4826 * median, 3.0 * made.spacing_m)
     extra = np.flatnonzero(~(np.abs(signed) < tolerance))
-    regions = _regions("added", p_m[extra], signed[extra], made.voxel_m)
+    regions = _regions("added", p_m[extra], signed[extra], made.spacing_m)
     for kind, found_m, away in _missing(made, cad, T_mc, tolerance):
-        regions += _regions(kind, found_m, -away, made.voxel_m)
+        regions += _regions(kind, found_m, -away, made.spacing_m)
     largest = tuple(sorted(regions, key=lambda r: (-r.size_m, r.kind, r.centre_m[0]))[:MOST_REGIONS])
     return Deviations(T_mc, signed, most, ratio, median, float(np.quantile(known, 0.95)), largest)
 
@@ -274,7 +281,7 @@ def _missing(made: Reconstruction, cad: Surface, T_mc: Pose, tolerance: float) -
     corners = cad.vertices[cad.faces]
     areas = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     rng = np.random.default_rng(0)
-    count = int(np.clip(areas.sum() / made.voxel_m**2, 1000, 40000))
+    count = int(np.clip(areas.sum() / made.spacing_m**2, 1000, 40000))
     face = rng.choice(len(areas), count, p=areas / areas.sum())
     u, v = rng.random((2, count, 1))
     u, v = np.where(u + v > 1.0, 1.0 - u, u), np.where(u + v > 1.0, 1.0 - v, v)
@@ -282,18 +289,14 @@ def _missing(made: Reconstruction, cad: Surface, T_mc: Pose, tolerance: float) -
     p_m = a + u * (b - a) + v * (c - a)
     p_c = T_mc.inverse().apply(p_m)
     away = np.asarray(cKDTree(made.points).query(p_c)[0])
-    far = away > tolerance + 2.0 * made.voxel_m
-    normals = _unit_rows(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[face[far]] @ T_mc.R
+    far = away > tolerance + 2.0 * made.spacing_m
+    normals = _unit(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[face[far]] @ T_mc.R
     through, empty = np.zeros((2, int(far.sum())))
     for sight in made.sights if far.any() else ():
-        through += sight.seen_through(p_c[far], 1.5 * made.voxel_m) > 6.0 * made.voxel_m
-        empty += sight.without_return(p_c[far], normals, 3.0 * made.voxel_m)
+        through += sight.seen_through(p_c[far], 1.5 * made.spacing_m) > 6.0 * made.spacing_m
+        empty += sight.without_return(p_c[far], normals, 3.0 * made.spacing_m)
     kinds = (("missing", through >= 2.0), ("no_return", (empty >= FEWEST_EMPTY) & (through < 2.0)))
     return [(kind, p_m[far][which], away[far][which]) for kind, which in kinds]
-
-
-def _unit_rows(v: Array) -> Array:
-    return np.asarray(v / np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-30))
 
 
 def _regions(kind: str, points: Array, deviation: Array, voxel_m: float) -> list[Region]:

@@ -1,0 +1,169 @@
+"""Registration of one scan to the model so far: ICP from one guess, and a search over many attitudes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.reconstruct.views import ScanView
+
+SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
+MOST_POINTS = 1500  # of a scan in one registration
+COARSE_POINTS, COARSE_PASSES, HALVED = 200, 8, (2, 4, 5)  # of a scan in a search over attitudes
+FINE_STARTS = 6  # poses of a search that are registered with all points
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Patchwork:
+    """The model so far: points (n, 3) [m] and unit normals (n, 3) in {C}, with a search tree over the points."""
+
+    points: Array
+    normals: Array
+    tree: cKDTree
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Match:
+    """A registered scan.
+
+    Attributes:
+        T_ac: pose of the model in the camera frame.
+        ratio: share of the points that lie on the model.
+        rms_m: root mean square of their point-to-plane distances [m].
+        weakest: smallest eigenvalue of the normal equations over the largest, in units of the extent; near 0 where the
+            surface does not determine the pose (a sphere, a plane).
+    """
+
+    T_ac: Pose
+    ratio: float
+    rms_m: float
+    weakest: float
+
+
+def registered(view: ScanView, model: Patchwork, guess: Pose, reach_m: float, extent: float, passes: int = 40) -> Match:
+    """Point-to-plane ICP of a view on the model, with Tukey's weights whose scale follows the residuals."""
+    T_ca, gate = guess.inverse(), reach_m
+    ratio = rms = weakest = 0.0
+    for _ in range(passes):
+        N, g, distances, ratio = _normal_equations(view, model, T_ca, gate)
+        if len(distances) < 12:
+            return Match(guess, 0.0, float("inf"), 0.0)
+        rms = float(np.sqrt(np.mean(distances**2)))
+        step, weakest = _solved(N, g, extent)
+        T_ca = moved(T_ca, step)
+        small = np.linalg.norm(step[:3]) * extent + np.linalg.norm(step[3:]) < 1e-5 * extent
+        tighter = max(3.0 * 1.4826 * float(np.median(np.abs(distances))), 0.01 * extent)
+        if small and tighter > 0.98 * gate:
+            break
+        gate = min(gate, tighter)
+    return Match(T_ca.inverse(), ratio, rms, weakest)
+
+
+def _normal_equations(view: ScanView, model: Patchwork, T_ca: Pose, gate: float) -> tuple[Array, Array, Array, float]:
+    """Sums J'WJ (6, 6) and J'We (6,) over corresponding points, their distances to the planes [m], and their share."""
+    every = max(1, len(view.points) // MOST_POINTS)
+    p, n_view = T_ca.apply(view.points[::every]), view.normals[::every] @ T_ca.R.T
+    d, index = model.tree.query(p, distance_upper_bound=gate)
+    near = np.isfinite(d)
+    index = np.where(near, index, 0)
+    near &= np.einsum("ni,ni->n", n_view, model.normals[index]) > SAME_SIDE
+    p, q, n = p[near], model.points[index[near]], between(n_view[near], model.normals[index[near]])
+    e = np.einsum("ni,ni->n", n, q - p)
+    w = np.maximum(1.0 - (e / gate) ** 2, 0.0) ** 2
+    J = np.hstack([np.cross(p, n), n])
+    return (J * w[:, None]).T @ J, J.T @ (w * e), e, float(near.mean())
+
+
+def between(a: Array, b: Array) -> Array:
+    """Unit vectors halfway between unit normals a and b (n, 3).
+
+    The distance along them is zero for two points of one circle, so that the curvature of a surface gives no bias
+    (S. Rusinkiewicz, A symmetric objective function for ICP, ACM Transactions on Graphics 38(4), 2019).
+    """
+    both = a + b
+    return np.asarray(both / np.linalg.norm(both, axis=1, keepdims=True))
+
+
+def _solved(N: Array, g: Array, extent: float) -> tuple[Array, float]:
+    """The step d = [theta; v] in {C}; directions that the surface does not determine are left out."""
+    scale = np.array([1.0 / extent] * 3 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
+    good = values > 1e-4 * values[-1]
+    step = vectors[:, good] @ ((vectors[:, good].T @ (g * scale)) / values[good])
+    return np.asarray(step * scale), float(values[0] / values[-1])
+
+
+def moved(T_ca: Pose, step: Array) -> Pose:
+    """The pose after a step [theta; v] in {C} [rad, m]."""
+    return Pose(geometry.exp(step[:3]), step[3:]) @ T_ca
+
+
+def best_starts(view: ScanView, model: Patchwork, attitudes: Array, gate_m: float, extent: float) -> list[Pose]:
+    """Return the FINE_STARTS poses with most points on the model, after a few passes from every attitude, all at once.
+
+    A part of the points is registered; after the passes HALVED the worse half of the poses is left out.
+
+    Args:
+        view: the scan.
+        model: the model so far.
+        attitudes: (m, 4) q_ac to start from, each where the visible side of the model is where the scan is.
+        gate_m: largest distance of corresponding points [m].
+        extent: of the target [m].
+    """
+    R_ac = geometry.matrix(attitudes)
+    every = max(1, len(view.points) // COARSE_POINTS)
+    points, normals, centre = view.points[::every], view.normals[::every], view.points.mean(axis=0)
+    R, t = R_ac.transpose(0, 2, 1), _visible_centres(model, R_ac, view.camera - centre)  # T_ca
+    t = t - R @ centre
+    gate, scale = np.full(len(R), gate_m), np.array([1.0 / extent] * 3 + [1.0] * 3)
+    for number in range(COARSE_PASSES):
+        p, n = points @ R.transpose(0, 2, 1) + t[:, None], normals @ R.transpose(0, 2, 1)
+        d, index = model.tree.query(p, distance_upper_bound=gate_m)
+        near = np.isfinite(d) & (d < gate[:, None])
+        index = np.where(near, index, 0)
+        other = model.normals[index]
+        near &= np.einsum("mki,mki->mk", n, other) > SAME_SIDE
+        both = n + other
+        along = both / np.maximum(np.linalg.norm(both, axis=2, keepdims=True), 1e-12)
+        e = np.where(near, np.einsum("mki,mki->mk", along, model.points[index] - p), np.nan)
+        w = np.nan_to_num(np.maximum(1.0 - (e / gate[:, None]) ** 2, 0.0) ** 2)
+        J = np.concatenate([np.cross(p, along), along], axis=2) * scale
+        N, g = (J * w[:, :, None]).transpose(0, 2, 1) @ J, np.einsum("mki,mk->mi", J, w * np.nan_to_num(e))
+        values, vectors = np.linalg.eigh(N)
+        inverse = np.where(values > 1e-4 * values[:, -1:], 1.0 / np.maximum(values, 1e-12), 0.0)
+        step = scale * np.einsum("mij,mj->mi", vectors, inverse * np.einsum("mji,mj->mi", vectors, g))
+        turn_ca = geometry.matrix(geometry.exp(step[:, :3]))
+        R, t = turn_ca @ R, np.einsum("mij,mj->mi", turn_ca, t) + step[:, 3:]
+        shown = (np.abs(np.nan_to_num(e, nan=gate_m)) < 0.02 * extent).mean(axis=1)
+        few = near.sum(axis=1) < 12
+        tighter = 3.0 * 1.4826 * np.nanmedian(np.where(few[:, None], gate_m, np.abs(e)), axis=1)
+        gate = np.minimum(gate, np.maximum(tighter, 0.01 * extent))
+        best = np.argsort(-shown, kind="stable")
+        if number in HALVED:
+            kept = best[: max(FINE_STARTS, len(best) // 2)]
+            R, t, gate, best = R[kept], t[kept], gate[kept], np.arange(len(kept))
+    return [Pose(geometry.quaternion(R[m]), t[m]).inverse() for m in best[:FINE_STARTS]]
+
+
+def _visible_centres(model: Patchwork, R_ac: Array, towards: Array) -> Array:
+    """Centre (m, 3) of the side of the model that faces the camera in the direction ``towards``, for every attitude."""
+    every = max(1, len(model.points) // MOST_POINTS)
+    points, normals = model.points[::every], model.normals[::every]
+    facing = (normals @ (R_ac.transpose(0, 2, 1) @ towards).T > 0.0).T
+    facing |= facing.sum(axis=1, keepdims=True) < 0.01 * len(points)
+    return np.asarray((facing @ points) / facing.sum(axis=1, keepdims=True))
+
+
+def near_attitudes(q_ac: Array) -> Array:
+    """Return (m, 4) the attitude q_ac and those 12, 24, 36 and 50 degrees from it about 13 axes, both ways."""
+    turns = [geometry.exp(np.radians(deg) * axis) for deg in (12, 24, 36, 50) for axis in _axes()]
+    return np.array([q_ac] + [geometry.multiply(q_ac, turn) for turn in turns])
+
+
+def _axes() -> list[Array]:
+    every = [np.array((x, y, z), dtype=np.float64) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
+    return [a / np.linalg.norm(a) for a in every if a.any()]
