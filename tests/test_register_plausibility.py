@@ -14,7 +14,7 @@ from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.restarts import FIXED_WORK, HEALTHY_PASSES, HEALTHY_SCANS, Budget
 from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
-from avsreplay.register.visibility import Visibility
+from avsreplay.register.visibility import Visibility, is_outward
 
 SEED = 7
 
@@ -125,3 +125,23 @@ def test_a_body_is_separated_from_the_wall_behind_it(surface: Surface) -> None:
     assert len(parts[0]) == pytest.approx(len(body), rel=0.15)
     assert parts[0][:, 2].max() <= body[:, 2].max() + 1e-9
     assert list(segments(body, surface.extent)) == []
+
+
+def test_a_mesh_whose_sheets_touch_at_edges_is_closed() -> None:
+    """Two tetrahedra with a common edge: four faces meet there, and both are closed with outward faces."""
+    apex = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
+    opposite = apex * [1.0, -1.0, -1.0]  # a half turn about the common edge
+    both = Surface(np.vstack([apex, opposite]), np.vstack([faces, faces + 4]).astype(np.int32), "two", "")
+    assert is_outward(both)
+    assert not is_outward(Surface(apex, faces[:3], "open", ""))
+    inwards = np.vstack([faces, faces[:, ::-1] + 4]).astype(np.int32)
+    assert not is_outward(Surface(both.vertices, inwards, "one of them inside out", ""))
+
+
+def test_a_complete_visible_side_is_told_from_one_with_gaps(surface: Surface) -> None:
+    index, visibility = SurfaceIndex.build(surface, 1.0), Visibility(surface)
+    test, T_ac, rng = PlausibilityTest(surface, index, visibility, 0.065), example_pose(), np.random.default_rng(SEED)
+    scan = hidden_view(surface, T_ac, 3000, rng)
+    assert test.check(scan, T_ac.inverse()).covered
+    assert not test.check(scan[scan[:, 0] < np.median(scan[:, 0])], T_ac.inverse()).covered

@@ -1,12 +1,16 @@
 """Side valleys: a far guess must not leave a pose beside the truth that a better one could replace."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar
+from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
 
 SCENARIO = """
@@ -64,3 +68,75 @@ def test_a_scan_of_scattered_points_costs_few_restarts():
     assert 0 < len(calls) <= 8
     poses = {np.round(pose.matrix, 6).tobytes() for pose in calls}
     assert len(poses) >= len(calls) - 1  # the guess begins narrow and wide
+
+
+def seen(surface: Surface, T_ac: Pose, noise: float, rng: np.random.Generator) -> Array:
+    """Points on the sides of the surface that face the camera, with noise along the ray in units of the extent."""
+    points = T_ac.apply(view(surface, 4000, T_ac.inverse().t))
+    return points * (1.0 + noise * surface.extent * rng.standard_normal((len(points), 1)) / T_ac.t[2])
+
+
+def near(T_ac: Pose, degrees: float, shift_m: float) -> Pose:
+    return T_ac @ Pose(geometry.exp(np.radians(degrees) * np.array([0.6, 0.0, 0.8])), np.array([0.0, shift_m, 0.0]))
+
+
+@pytest.mark.parametrize("noise", [0.008, 0.015])
+def test_noise_is_no_reason_for_restarts(noise, monkeypatch):
+    """A poor fit whose misfit neighbouring points do not share is registered once more, with a wider rejection."""
+    surface, T_ac = boxes(), example_pose()
+    registrar, calls, restarts = Registrar(surface), [], []
+    scan = seen(surface, T_ac, noise, np.random.default_rng(3))
+    graded, best = registrar._graded, registrar._restarter.best
+    monkeypatch.setattr(registrar, "_graded", lambda *args, **named: calls.append(1) or graded(*args, **named))
+    monkeypatch.setattr(registrar._restarter, "best", lambda *args: restarts.append(1) or best(*args))
+    found = registrar.register(scan, near(T_ac, 3.0, 0.01 * surface.extent))
+    assert found.status is AlignStatus.ALIGNED
+    assert found.inlier_ratio > 0.93
+    assert (len(calls), len(restarts)) == (2, 0)
+
+
+def test_a_misfit_that_neighbours_share_is_told_from_noise():
+    surface, T_ac = boxes(), example_pose()
+    restarter, rng = Registrar(surface)._restarter, np.random.default_rng(4)
+    noise = 0.008 * surface.extent
+    shift = Pose([0.0, 0.0, 0.0, 1.0], np.array([0.0, 0.0, noise]))
+    noisy, exact = (seen(surface, T_ac, share, rng) for share in (0.008, 0.0))
+    assert restarter.structure(noisy, T_ac.inverse()) < 0.3 * noise
+    assert restarter.structure(exact, T_ac.inverse() @ shift) > 0.4 * noise
+
+
+def test_a_pose_beside_the_truth_is_left_along_the_valley():
+    """A stage with one fin, turned about its axis: the cost is nearly flat there and has its minimum at the truth."""
+    angle = 2.0 * np.pi * np.arange(48) / 48.0
+    rim = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(48)])
+    up = np.array([0.0, 0.0, 2.0])
+    ends = [rim - up, rim + up, -up[None], up[None]]
+    k, after = np.arange(48), (np.arange(48) + 1) % 48
+    sides = [np.column_stack(f) for f in ((k, after, after + 48), (k, after + 48, k + 48))]
+    caps = [np.column_stack(f) for f in ((after, k, np.full(48, 96)), (k + 48, after + 48, np.full(48, 97)))]
+    fin = boxes()
+    low, high = fin.vertices[:8].min(axis=0), fin.vertices[:8].max(axis=0)
+    corners = (fin.vertices[:8] - low) / (high - low) * [0.4, 0.1, 0.6] + [-1.2, -0.05, -0.3]
+    faces = fin.faces[(fin.faces < 8).all(axis=1)]
+    surface = Surface(
+        np.vstack([*ends, corners]), np.vstack([*sides, *caps, faces + 98]).astype(np.int32), "stage with a fin", ""
+    )
+    T_ac = Pose(geometry.exp([0.0, -np.pi / 3, 0.0]), np.array([0.0, 0.0, 12.0]))
+    restarter = Registrar(surface)._restarter
+    scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))
+    turned = T_ac @ Pose(geometry.exp([0.0, 0.0, np.radians(3.0)]), np.zeros(3))
+    moved = restarter.along_valley(scan, turned.inverse())
+    assert np.degrees(geometry.angle((T_ac.inverse() @ moved.inverse()).q)) < 1.5
+
+
+def test_a_target_of_another_size_is_said_and_covered():
+    surface, T_ac = boxes(), example_pose()
+    grown = replace(surface, vertices=1.05 * surface.vertices)
+    registrar, rng = Registrar(surface), np.random.default_rng(6)
+    found = registrar.register(seen(grown, T_ac, 0.002, rng), T_ac)
+    error = found.T_ac.inverse() @ T_ac
+    d = np.concatenate([geometry.log(error.q), error.t])
+    assert "larger than the model" in found.message
+    assert float(found.message.split("target ")[1].split(" %")[0]) == pytest.approx(5.0, abs=0.5)
+    assert d @ np.linalg.solve(found.covariance, d) < 20.0
+    assert registrar.register(seen(surface, T_ac, 0.002, rng), T_ac).message == ""

@@ -30,19 +30,18 @@ MODEL_POINTS = 3000
 CELLS = 40  # of the grid along the diagonal of the model
 COARSE_OF_EXTENT, MIDDLE_OF_EXTENT = 0.03, 0.02  # distances beyond which a point counts as unexplained
 START_OF_EXTENT, FALL = 0.3, 0.7  # rejection distance of the first pass, and its factor from pass to pass
-FIRST_PASSES, FIRST_STRIDE, KEPT_AFTER_FIRST = (
-    2,
-    2,
-    3,
-)  # most starts are dropped after two passes with every second point
+FIRST_PASSES, KEPT_AFTER_FIRST = 2, 3  # most starts are dropped after two passes with part of the points
+FIRST_STRIDES, THINNED = (2, 3, 3), (1, 2, 2)  # every n-th point, and every n-th attitude, by the round
 SYMMETRIC, SYMMETRIES = 0.3, 6  # largest unexplained share of the surface turned onto itself; most motions tried
 TURNED_PASSES, TURNED_RIVALS = 6, 2
 RIVALS, RIVAL_WITHIN = 6, 0.15  # poses that are registered to the end: share of unexplained points over the least
 SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05  # two poses nearer than that are the same
 SIGMAS = 5.0
+REFINED_POINTS = 500  # of the fine points, with which the last poses are registered
 FINE_PASSES = 15  # from a wrong pose it can take hundreds
-LOOK_UPS = 4  # that cost as much as a search on the model
-ROUNDS = 3
+LOOK_UPS = 2  # that cost as much as a search on the model
+APART = 0.6  # usual share of the starts of the second selection that are different poses
+FAR_WORK = 4  # searches that a pass from a wrong pose costs a point
 PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
 CELL_OF_EXTENT = 0.02
 LEAST_COSINE = 0.05
@@ -106,13 +105,12 @@ class GlobalSearch:
         """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
         p = self._params
         few, some, fine = (min(points, most) for most in (p.coarse_points, p.middle_points, p.fine_points))
-        starts = p.starts * (1, SHIFTS, 7)[number]
-        looked = few * (
-            starts * (1 + FIRST_PASSES) // FIRST_STRIDE + p.starts // KEPT_AFTER_FIRST * (1 + p.coarse_passes)
-        )
-        looked += some * p.middle_starts * (1 + p.middle_passes)
+        starts, stride = p.starts * (1, SHIFTS, 7)[number] // THINNED[number], FIRST_STRIDES[number]
+        looked = few * (starts * (1 + FIRST_PASSES) // stride + p.starts // KEPT_AFTER_FIRST * (1 + p.coarse_passes))
+        looked += some * int(APART * p.middle_starts) * (1 + p.middle_passes)
         looked += some * len(self._symmetries) * (1 + TURNED_PASSES)
-        return looked // LOOK_UPS + p.fine_starts * some + 10 * (1 + RIVALS // 2) * fine
+        refined = FINE_PASSES * RIVALS * FAR_WORK // 2 * min(fine, REFINED_POINTS)
+        return looked // LOOK_UPS + p.fine_starts * some + refined + RIVALS * fine
 
     def search(self, points: NDArray[Any], number: int = 0, before: SearchResult | None = None) -> SearchResult:
         """Return the best poses for a scan by one round of the search.
@@ -130,9 +128,10 @@ class GlobalSearch:
         )
         sight = self._target.visibility.direction_to_camera(scan)
         sights, shifts, facing = self._rounds(few, sight)[number]
-        starts = self._starts(few.mean(axis=0), sights, shifts)
+        starts = self._starts(few.mean(axis=0), sights, shifts, THINNED[number])
         facing = facing and self._sided
-        found = self._refined(some, fine, self._selected(few, some, starts, facing), facing)
+        selected = self._selected(few, some, starts, facing, FIRST_STRIDES[number])
+        found = self._refined(some, fine, selected, facing)
         return self._verdict([*found, *(before.candidates if before else ())])
 
     def _rounds(self, few: Array, sight: Array | None) -> list[tuple[Sequence[Array | None], Array, bool]]:
@@ -148,9 +147,9 @@ class GlobalSearch:
             ([sight, *_axes(few)], none, False),
         ]
 
-    def _starts(self, centroid_a: Array, sights: Sequence[Array | None], shifts: Array) -> Array:
+    def _starts(self, centroid_a: Array, sights: Sequence[Array | None], shifts: Array, thinned: int = 1) -> Array:
         """Every attitude with every camera direction and shift: centroid of the scan on that of the visible surface."""
-        R_ca = geometry.matrix(attitudes(self._params.starts))
+        R_ca = geometry.matrix(attitudes(max(1, self._params.starts // thinned)))
         starts = np.tile(np.eye(4), (len(sights), len(shifts), len(R_ca), 1, 1))
         starts[..., :3, :3] = R_ca
         for k, sight in enumerate(sights):
@@ -159,18 +158,19 @@ class GlobalSearch:
                 starts[k, j, :, :3, 3] = middle - R_ca @ (centroid_a + shift)
         return starts.reshape(-1, 4, 4)
 
-    def _selected(self, few: Array, some: Array, starts: Array, facing: bool) -> list[Pose]:
+    def _selected(self, few: Array, some: Array, starts: Array, facing: bool, stride: int = 2) -> list[Pose]:
         """The best starts after passes with few points, then the best of these, all different, with more points."""
         p, L, threads = self._params, self._extent, self._target.limits.threads
         coarse = (FALL, COARSE_OF_EXTENT * L, COARSE_OF_EXTENT * L, facing, threads)
         middle = (FALL, 0.01 * L, MIDDLE_OF_EXTENT * L, facing, threads)
         narrow = START_OF_EXTENT * FALL**FIRST_PASSES
         poses, costs = self._field.refine(
-            np.ascontiguousarray(few[::FIRST_STRIDE]), starts, FIRST_PASSES, START_OF_EXTENT * L, *coarse
+            np.ascontiguousarray(few[::stride]), starts, FIRST_PASSES, START_OF_EXTENT * L, *coarse
         )
-        poses = _best(poses, costs, p.starts // KEPT_AFTER_FIRST)
+        poses = _best(poses, costs, max(1, p.starts // KEPT_AFTER_FIRST))
         poses, costs = self._field.refine(few, poses, p.coarse_passes, narrow * L, *coarse)
-        poses = _best(poses, costs, p.middle_starts)
+        apart = self._different(_best(poses, costs, 2 * p.middle_starts), p.middle_starts, 0.3)
+        poses = np.stack([pose.matrix for pose in apart])
         poses, costs = self._field.refine(some, poses, p.middle_passes, narrow * L, *middle)
         return self._different(_best(poses, costs, p.middle_starts), p.fine_starts, 0.5)
 
@@ -193,18 +193,19 @@ class GlobalSearch:
     def _refined(self, some: Array, fine: Array, poses: list[Pose], facing: bool) -> list[Candidate]:
         """The poses measured on the model; the best, and the very best by a near-symmetry, are registered to it."""
         width = MIDDLE_OF_EXTENT * self._extent
+        part = np.ascontiguousarray(fine[:: max(1, len(fine) // REFINED_POINTS)])
         found = [self._measured(some, T_ca) for T_ca in poses]
         ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         most = float(ranked[0].unexplained(width).mean()) + RIVAL_WITHIN
         best = [each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most]
-        found = [self._measured(fine, self._refine.align_within(fine, T_ca, width).T_ca) for T_ca in best]
+        found = [self._measured(fine, self._refine.align_within(part, T_ca, width).T_ca) for T_ca in best]
         first = min(found, key=lambda each: float(each.unexplained(width).mean())).T_ca
         if not len(self._symmetries):
             return found
         rule = (FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
         turned, costs = self._field.refine(some, self._symmetries @ first.matrix, TURNED_PASSES, 4.0 * width, *rule)
         rivals = [Pose.from_matrix(T) for T in _best(turned, costs, TURNED_RIVALS)]
-        return [*found, *(self._measured(fine, self._refine.align_within(fine, T_ca, width).T_ca) for T_ca in rivals)]
+        return [*found, *(self._measured(fine, self._refine.align_within(part, T_ca, width).T_ca) for T_ca in rivals)]
 
     def _near_symmetries(self, points: Array) -> Array:
         """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, without the identity: the best few."""

@@ -13,6 +13,7 @@ from avsreplay.register.backend import Target
 from avsreplay.register.surface_index import IcpParams
 
 PLANE_PASSES = 3
+MOST_WITHIN = 60  # passes of an alignment that begins near its result
 FEW_POINTS = 600  # of a scan that has many more, for the first passes
 
 
@@ -54,7 +55,11 @@ class HornBackend:
 
     def align_within(self, points: NDArray[Any], guess: Pose, gate_m: float) -> Fit:
         """Return T_ca with correspondences nearer than ``gate_m`` [m] from the first pass to the last."""
-        rules = {k: replace(rule, gate_m=gate_m, floor_m=gate_m, tighten=0.0) for k, rule in self._rules.items()}
+        most = min(self._rules[True].n_max, MOST_WITHIN)
+        rules = {
+            facing: replace(rule, n_max=most, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
+            for facing, rule in self._rules.items()
+        }
         return self._run(points, guess, rules)
 
     def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams]) -> Fit:

@@ -22,14 +22,13 @@ from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import without_scattered_points
+from avsreplay.register.size import LEAST_ERROR
 from avsreplay.register.visibility import is_outward
 
 POINTS = 1500  # points used of each scan
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
-WIDTH_OF_EXTENT = 0.02  # larger residuals are not used
-ROUNDS = 3  # times the scaled scan is matched again
 LEAST_INFORMATION = 1e-3  # least share of n . p that the pose cannot explain
-LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta|, absolute and in standard errors, that is reported
+SIGMAS = 4.0  # least |delta| in standard errors that is reported
 
 
 class ModelCheck:
@@ -105,10 +104,10 @@ class ModelCheck:
         finite = np.asarray(points[np.isfinite(points).all(axis=1)], dtype=np.float64)
         T_ca = alignment.T_ac.inverse()
         p = T_ca.apply(finite[:: max(1, len(finite) // POINTS)])
-        measured = self._registrar.scale_error(p, T_ca.t, WIDTH_OF_EXTENT * self._surface.extent, ROUNDS)
-        if measured is not None and measured[1] > LEAST_INFORMATION:
-            self._deltas.append(measured[0])
-            self._weights.append(measured[1])
+        measured = self._registrar.fitted_size(p, T_ca.t)
+        if measured is not None and measured.share > LEAST_INFORMATION:
+            self._deltas.append(measured.delta)
+            self._weights.append(measured.share)
             self._rms.append(alignment.rms_m / self._surface.extent)
 
     def _diagnosis(self, points: NDArray[Any]) -> str:

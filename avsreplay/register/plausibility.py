@@ -32,7 +32,7 @@ from avsreplay.register.sampling import sample
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
-SURFACE_POINTS = 3000
+SURFACE_POINTS = 1500
 LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance|
 NORMAL_QUANTILES = np.array([0.38532, 0.52440, 0.67449, 0.84162, 1.03643, 1.28155, 1.64485])  # for a standard normal
 REFINEMENTS = 2
@@ -56,6 +56,7 @@ class Plausibility:
         contrast: points within 3 noise_m over points between 3 and 6 noise_m.
         violated: share of the model surface that lies in free space; 0 if the camera position is unknown.
         missing: share that lies in free space or where the scan has no point; 0 if the camera position is unknown.
+        covered: enough of the model surface was compared, and little of it is missing.
         unexplained: share of the points that are not on the model.
         reason: why the pose is rejected, "" if it is plausible.
     """
@@ -64,6 +65,7 @@ class Plausibility:
     contrast: float
     violated: float
     missing: float
+    covered: bool
     unexplained: float
     reason: str
 
@@ -100,8 +102,10 @@ class PlausibilityTest:
         on, near = (int(np.count_nonzero(around < factor * width)) for factor in (1.0, 2.0))
         contrast = on / max(1, near - on)
         rays = np.asarray(points if scene is None else scene, dtype=np.float64)
-        violated, missing = (0.0, 0.0) if camera_c is None else self._not_supported(rays, T_ca, noise)
-        found = Plausibility(noise, contrast, violated, missing, 1.0 - inner / len(points), "")
+        free = None if camera_c is None else self._not_supported(rays, T_ca, noise)
+        violated, missing = free or (0.0, 0.0)
+        covered = free is not None and missing <= MOST_MISSING
+        found = Plausibility(noise, contrast, violated, missing, covered, 1.0 - inner / len(points), "")
         return replace(found, reason=self._reason(found))
 
     def measure(self, points: NDArray[Any], T_ca: Pose) -> Array:
@@ -124,8 +128,8 @@ class PlausibilityTest:
             )
         return ""
 
-    def _not_supported(self, points: Array, T_ca: Pose, noise: float) -> tuple[float, float]:
-        """Shares of the visible surface in free space (rays that end well behind it pass through it), and missing."""
+    def _not_supported(self, points: Array, T_ca: Pose, noise: float) -> tuple[float, float] | None:
+        """Shares of the visible surface that rays passed through, and missing; None with too few points to compare."""
         from scipy.spatial import cKDTree
 
         T_ac = T_ca.inverse()
@@ -133,7 +137,7 @@ class PlausibilityTest:
         surface, normals = T_ac.apply(self._points), self._normals @ T_ac.R.T
         cells, expected = self._expected(image, surface, normals)
         if not len(expected):
-            return 0.0, 0.0
+            return None
         tree = cKDTree(points)
         spacing = float(np.median(np.asarray(tree.query(points[:: max(1, len(points) // 500)], k=2)[0])[:, -1]))
         near = max(self._gate, 3.0 * noise, 3.0 * spacing)
@@ -144,7 +148,7 @@ class PlausibilityTest:
         held, violated = int(np.count_nonzero(supported)), int(np.count_nonzero(behind >= 0.5))
         absent = violated + int(np.count_nonzero(empty))
         if held + violated < LEAST_COMPARED:
-            return 0.0, 0.0
+            return None
         return violated / (held + violated), absent / (held + absent)
 
     def _expected(self, image: _Image, surface: Array, normals: Array) -> tuple[_Cells, NDArray[np.intp]]:

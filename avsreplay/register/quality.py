@@ -25,6 +25,7 @@ from avsreplay.register.covariance import (
     without_dominant_patches,
 )
 from avsreplay.register.params import RegisterParams, RegistrationLimits
+from avsreplay.register.size import LEAST_ERROR, SizeError, normal_jacobian, size_error
 from avsreplay.register.surface_index import Closest, SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
@@ -34,7 +35,6 @@ SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
 AS_MANY, AS_NEAR = 0.99, 1.02  # inliers and rms of a pose that fits as well
-LEAST_RESIDUALS = 50
 UNCHANGED = 0.06  # chi-square with 6 degrees of freedom is smaller with probability 4e-6
 ACCURACY = (0.1, 1e-3)  # deg and share of the extent, of a back end that states none of its own
 AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
@@ -78,7 +78,7 @@ def instants(
     moved, found, near = _matched(index, visibility, points, T_ca, gate_m)
     times = np.asarray(times_s, dtype=np.float64)
     mean = float(times.mean()) if len(times) else 0.0
-    J = _jacobian(moved[near], found.normal[near])
+    J = normal_jacobian(moved[near], found.normal[near])
     M: Array = mean * np.eye(6) + np.linalg.pinv(J.T @ J, hermitian=True) @ ((J.T * (times[near] - mean)) @ J)
     return M
 
@@ -90,11 +90,6 @@ def _matched(
     moved = T_ca.apply(points)
     found = index.closest(moved, camera_c=visibility.camera_c(index, points, T_ca))
     return moved, found, found.d2 < gate_m**2
-
-
-def _jacobian(p: Array, n: Array) -> Array:
-    """J (k, 6) of points p and normals n (k, 3)."""
-    return np.hstack([np.cross(p, n), n])
 
 
 def grade(
@@ -129,11 +124,18 @@ def grade(
     info = frozen(total / found.noise_m**2)
     weakest = unobservable_directions(total, int(found.counts.sum()), found.centre) if overlap else ()
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    P, split = _covariance(found, across, index.extent_m, systematic) if overlap and not weakest else (None, None)
+    P, split, strain = None, None, 0.0
+    if overlap and not weakest:
+        P, split, strain = _covariance(found, across, index.extent_m, systematic)
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
         info, P, weakest = frozen(pseudo_inverse(P)), None, unbounded
     settled = P is None or not _beyond(left, P, index.extent_m, accuracy)
+    size = None
+    if P is not None and settled and abs(strain) > LEAST_ERROR:
+        camera_c = visibility.camera_c(index, points, fit.T_ca)
+        size = size_error(index, points, fit.T_ca, camera_c, found.rms_m)
+        P = P if size is None else P + np.outer(size.shift, size.shift)
     return Alignment(
         T_ac=fit.T_ca.inverse(),
         iterations=fit.iterations,
@@ -146,10 +148,14 @@ def grade(
         covariance=None if P is None else frozen(P),
         free_directions=", ".join(weakest),
         split_nis=split,
-        message=""
-        if settled
-        else "the back end reports convergence, but its pose is not at a minimum of the distances",
+        message=_message(settled, size),
     )
+
+
+def _message(settled: bool, size: SizeError | None) -> str:
+    if not settled:
+        return "the back end reports convergence, but its pose is not at a minimum of the distances"
+    return "" if size is None else size.message
 
 
 def _same(T_ca: Pose, guess: Pose | None) -> bool:
@@ -177,13 +183,16 @@ def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float
     return bool(large and step @ pseudo_inverse(P) @ step > 9.0 * len(step))
 
 
-def _covariance(found: Evidence, across: Array, extent_m: float, systematic: bool) -> tuple[Array | None, float | None]:
-    """Covariance of the pose, and the test of halves on both sides of the middle along ``across`` (k, 3) in {C}."""
+def _covariance(
+    found: Evidence, across: Array, extent_m: float, systematic: bool
+) -> tuple[Array | None, float | None, float]:
+    """Covariance, the test of halves along ``across`` (k, 3) in {C}, and the mean strain, 0 if not significant."""
     if not (systematic or len(across)):
-        return sandwich_covariance(found.normals, found.gradients), None
+        return sandwich_covariance(found.normals, found.gradients), None, 0.0
     errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
     P = registration_covariance(found, errors) if systematic else sandwich_covariance(found.normals, found.gradients)
-    return P, split_nis(found, errors, across)
+    strain = float(errors.amplitudes[:3].mean()) / extent_m if systematic and errors.smooth_m2[0] > 0.0 else 0.0
+    return P, split_nis(found, errors, across), strain
 
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:
@@ -306,38 +315,3 @@ def _axis(vector: Array) -> str:
         return "xyz"[k]
     unit = unit * np.sign(unit[k])
     return "(" + ", ".join(f"{value + 0.0:.2f}" for value in unit) + ")"
-
-
-def scale_error(
-    index: SurfaceIndex, p: Array, camera_c: Array | None, width_m: float, rounds: int
-) -> tuple[float, float] | None:
-    """See ``Registrar.scale_error``."""
-    delta, share = 0.0, 0.0
-    moved = Pose.identity()
-    for _ in range(rounds):
-        q = moved.apply(p) / (1.0 + delta)
-        found = index.closest(q, camera_c=camera_c)
-        near = found.d2 < width_m**2
-        if np.count_nonzero(near) < LEAST_RESIDUALS:
-            return None
-        n, q = found.normal[near], q[near]
-        e = np.einsum("ij,ij->i", n, q - found.foot[near])
-        J, a = _jacobian(q - q.mean(axis=0), n), np.einsum("ij,ij->i", n, q - q.mean(axis=0))
-        J, a, e = _weighted(J, a, e)
-        of_a, of_e = np.linalg.lstsq(J, np.column_stack([a, e]), rcond=1e-6)[0].T
-        free = a - J @ of_a
-        share = float(free @ free) / max(float(a @ a), np.finfo(float).tiny)
-        step = float(free @ e) / max(float(free @ free), np.finfo(float).tiny)
-        d = of_e - step * of_a
-        turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
-        centre = q.mean(axis=0)
-        moved = Pose(turn.q, (1.0 + delta) * (centre - turn.R @ centre - d[3:])) @ moved
-        delta = (1.0 + delta) * (1.0 + step) - 1.0
-    return delta, share
-
-
-def _weighted(J: Array, a: Array, e: Array) -> tuple[Array, Array, Array]:
-    """Rows times the square root of their Cauchy weight; scale: robust standard deviation of e."""
-    noise = max(SIGMA_PER_MEDIAN * float(np.median(np.abs(e))), np.finfo(float).tiny)
-    root = 1.0 / np.sqrt(1.0 + (e / (2.0 * noise)) ** 2)
-    return J * root[:, None], a * root, e * root

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
 from itertools import islice
@@ -19,17 +18,16 @@ from avsreplay.register.backend import Target, create_backend, load_backend
 from avsreplay.register.global_search import GlobalSearch, SearchResult
 from avsreplay.register.horn import HornBackend
 from avsreplay.register.params import RegisterParams
-from avsreplay.register.plausibility import PlausibilityTest
-from avsreplay.register.restarts import Budget, Restart, Restarter
-from avsreplay.register.sampling import LARGER, segments, thin, without_scattered_points
+from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
+from avsreplay.register.restarts import SCATTER_WORK, TEST_WORK, VALLEY_WORK, Budget, Restart, Restarter
+from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
+from avsreplay.register.size import SizeError, fitted_size
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
 LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in units of the gate) a fit is close
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
 TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
-MOST_SEGMENTS = 3
-MOST_ROUNDS = MOST_SEGMENTS + 3
 LEAST_TO_TURN = 0.2  # with fewer inliers turned starts have no prospect
 SURE_RATIO = 0.9  # a search with fewer inliers is followed by another
 MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
@@ -83,10 +81,12 @@ class Registrar:
         scan = self._scan(points)
         if len(scan) == 0:
             return quality.not_measured(len(points), AlignStatus.NO_POINTS, guess)
-        first = self._graded(scan, guess, halves=seq % self.params.split_every == 0, carried=carried)
+        halves = seq % self.params.split_every == 0
+        first = self._graded(scan, guess, halves=halves, carried=carried)
         if first.status is AlignStatus.FAILED:
             return first
-        found, searched = (first, False) if self._healthy(first) else self._recovered(scan, guess, first, carried)
+        healthy = self._healthy(first)
+        found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried)
         return self._searched(scan, found, carried) if self._far(guess, found) and not searched else found
 
     def acquire(self, points: NDArray[Any]) -> Alignment:
@@ -106,24 +106,26 @@ class Registrar:
         return self._acquire(scan, Budget(len(scan)))
 
     def _acquire(
-        self, scan: NDArray[Any], budget: Budget, carried: bool = False, rounds: int = MOST_ROUNDS
+        self, scan: NDArray[Any], budget: Budget, carried: bool = False, rounds: int = MOST_ATTEMPTS
     ) -> Alignment:
         """The best plausible result of the searches that the budget allows; the first is always made."""
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
+        budget.spend(SCATTER_WORK * len(scan))
         few = self._restarter.part(target)
         whole: SearchResult | None = None
         results: list[Alignment] = []
-        for part, number in islice(self._attempts(target), rounds):
+        for part, number in islice(attempts(target, self._target.surface.extent), rounds):
             work = self._global.work(len(part), number)
             if results and not budget.allows(work):
                 break
-            budget.spend(work)
+            budget.spend(work + TEST_WORK)
             search = self._global.search(part, number, whole if part is target else None)
             whole = search if part is target else whole
-            results.append(self._acquired(scan, part, search, carried))
-            if results[-1].status is AlignStatus.FAILED:
-                return results[-1]
-            if results[-1].measured and self._sure(part, search):
+            found, alone = self._acquired(scan, part, search, budget, carried)
+            results.append(found)
+            if found.status is AlignStatus.FAILED:
+                return found
+            if found.measured and self._sure(search, alone):
                 break
         measured = [(each, self._restarter.measure(few, each.T_ac.inverse())) for each in results if each.measured]
         if measured:
@@ -135,49 +137,35 @@ class Registrar:
         message = "no pose of the model explains the scan, and no work is left for a longer search"
         return replace(first, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=message)
 
-    def _sure(self, part: Array, search: SearchResult) -> bool:
-        """Whether no other round can find a better pose: what is not on the model is little, or another object."""
+    def _sure(self, search: SearchResult, alone: bool) -> bool:
+        """Whether no other round can find a better pose: what is not on the model is little, or another object's."""
         if search.width_m > self.limits.gate_m:
             return False
-        return search.inlier_ratio >= SURE_RATIO or (not search.ambiguous and self._beside(part, search))
+        return search.inlier_ratio >= SURE_RATIO or (alone and not search.ambiguous)
 
-    def _beside(self, part: Array, search: SearchResult) -> bool:
-        """Whether the points off the model are another object's, as far as free space can tell."""
-        at = self._restarter.measure(self._restarter.part(part), search.best)
-        return self._visibility.sided and at.separate(max(self.limits.gate_m, 3.0 * at.noise_m))
+    def _acquired(
+        self, scan: NDArray[Any], part: Array, search: SearchResult, budget: Budget, carried: bool
+    ) -> tuple[Alignment, bool]:
+        """Register the result of a search of part of the scan on the whole scan, and test it.
 
-    def _attempts(self, target: Array) -> Iterator[tuple[Array, int]]:
-        """What is searched and by which round: the whole scan, its parts, then the whole scan with other starts."""
-        extent = self._target.surface.extent
-        small = geometry.bounding_diagonal(target) <= LARGER * extent  # probably the target alone
-        yield target, 0
-        if small:
-            yield target, 1
-        for part in islice(segments(target, extent), MOST_SEGMENTS):
-            yield part, 0
-        if not small:
-            yield target, 1
-        yield target, 2
-
-    def _acquired(self, scan: NDArray[Any], part: Array, search: SearchResult, carried: bool) -> Alignment:
-        """Register the result of a search of part of the scan on the whole scan, and test it."""
+        Also whether what is not on the model is another object's: well away, or the visible side is complete.
+        """
         few = self._restarter.part(part)
         start = self._restarter.measure(few, search.best)
-        width = max(self.limits.gate_m, 3.0 * start.noise_m)
-        found = self._graded(scan, search.best.inverse(), width, carried=carried)
+        found = self._regraded(scan, few, start, budget, carried=carried)
         if found.status is AlignStatus.FAILED:
-            return found
-        p = self.params.acquire
-        least = p.least_separate if self._visibility.sided and start.separate(width) else p.least_ratio
-        if search.inlier_ratio < least or not found.measured:
-            return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None)
-        reason = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan)).reason
-        if reason:
-            return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=reason)
+            return found, False
+        at, p = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan)), self.params.acquire
+        away = self._visibility.sided and start.separate(max(self.limits.gate_m, 3.0 * start.noise_m))
+        alone = away or at.covered
+        if search.inlier_ratio < (p.least_separate if alone else p.least_ratio) or not found.measured:
+            return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False
+        if at.reason:
+            return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=at.reason), False
         if search.ambiguous and search.second is not None:
             words = quality.turn_words(search.best @ search.second.inverse())
-            return replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
-        return found
+            found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
+        return found, alone
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see ``quality.instants``.
@@ -201,20 +189,14 @@ class Registrar:
         d2 = self._index.closest(T_ac.inverse().apply(points), most_m=most_m).d2
         return np.asarray(np.sqrt(np.minimum(d2, most_m**2)))
 
-    def scale_error(self, p: Array, camera_c: Array, width_m: float, rounds: int) -> tuple[float, float] | None:
-        """Return delta (target over model, less 1) from points of a registered scan, and the information on it.
+    def fitted_size(self, p: Array, camera_c: Array) -> SizeError | None:
+        """Return the size of the target by points of a registered scan, see ``size.fitted_size``.
 
         Args:
             p: (n, 3) points in {C} [m], at the registered pose.
             camera_c: (3,) camera position in {C} [m].
-            width_m: residuals beyond this distance are not used.
-            rounds: times the points are matched again.
-
-        Returns:
-            delta, and the share of n . p that no pose explains; None with fewer than 50 residuals.
         """
-        camera = camera_c if self._visibility.sided else None
-        return quality.scale_error(self._index, p, camera, width_m, rounds)
+        return fitted_size(self._index, p, camera_c if self._visibility.sided else None)
 
     def search(self, points: NDArray[Any]) -> SearchResult:
         """Return the best and the second best pose of a scan by the global search.
@@ -246,53 +228,86 @@ class Registrar:
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
-        budget = Budget(len(scan), found.iterations * len(scan))
+        budget = Budget(len(scan))
+        budget.registered(found)
         if budget.allows(self._global.work(len(scan), 0)):
             return self._acquire(scan, budget, carried)
         far = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a global search"
         return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=far)
 
     def _doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment) -> bool:
-        """A failure, or a poor fit away from the guess: possibly a local minimum next to the true pose."""
+        """A failure, a poor fit of a part of the scan, or a poor fit of all away from the guess: a local minimum?
+
+        A misfit of nearly all points of which neighbours share less than half is noise, and no reason for doubt.
+        """
         if found.status is AlignStatus.FAILED or not found.inliers:
             return True
-        moved = found.T_ac.inverse().apply(points) - guess.inverse().apply(points)
+        T_ca, poor = found.T_ac.inverse(), POOR_OF_GATE * self.limits.gate_m
+        if found.rms_m <= poor or found.inlier_ratio < LEAST_RATIO:
+            return found.rms_m > poor
+        moved = T_ca.apply(points) - guess.inverse().apply(points)
         far = float(np.linalg.norm(moved, axis=1).mean()) > self.limits.gate_m
-        return far and found.rms_m > POOR_OF_GATE * self.limits.gate_m
+        return far and self._restarter.structure(points, T_ca) > max(poor, np.sqrt(0.5) * found.rms_m)
 
-    def _recovered(self, scan: NDArray[Any], guess: Pose, first: Alignment, carried: bool) -> tuple[Alignment, bool]:
-        """Test a pose with a poor fit and restart if it is implausible; whether the result is of a global search."""
-        few = self._restarter.part(scan)
-        budget = Budget(len(scan), spent=first.iterations * len(scan))
+    def _recovered(
+        self, scan: NDArray[Any], guess: Pose, first: Alignment, halves: bool, carried: bool
+    ) -> tuple[Alignment, bool]:
+        """Register again within a distance that follows the noise; restart if implausible. Whether it was searched."""
+        few, budget = self._restarter.part(scan), Budget(len(scan))
+        budget.registered(first)
         kept = self._restarter.measure(few, first.T_ac.inverse())
-        final, reason = first, self._test.check(few, kept.T_ca).reason if first.measured else ""
-        if not (self._doubtful(few, guess, first) or reason):
-            return self._regraded(scan, kept, first, carried), False
-        before: Restart | None = None
-        for _ in range(2):
-            kept = self._restarter.best(few, guess.inverse(), first.T_ac.inverse(), budget, before)
-            final = self._regraded(scan, kept, first, carried)
-            reason = self._test.check(few, final.T_ac.inverse()).reason if final.measured else ""
+        hopeful = first.measured and kept.noise_m <= NOISE_OF_EXTENT * self._target.surface.extent
+        final = self._regraded(scan, few, kept, budget, halves, carried) if hopeful else first
+        reason = self._reason(few, final, budget)
+        if not (reason or self._doubtful(few, guess, final)):
+            return final, False
+        before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without, it may show something else
+        for step in ("restart", "search", "turn") if hopeful or not overlap else ("search", "restart", "turn"):
+            if step == "search":
+                if overlap and budget.allows(self._global.work(len(scan), 0)):
+                    found = self._acquire(scan, budget, carried, rounds=1)
+                    if found.status is AlignStatus.ALIGNED:
+                        return found, True
+                continue
+            if before and np.mean(before.distance < self.limits.gate_m) < LEAST_TO_TURN:
+                break
+            before = self._restarter.best(few, guess.inverse(), final.T_ac.inverse(), budget, before)
+            final = self._regraded(scan, few, before, budget, halves, carried)
+            reason = self._reason(few, final, budget)
             if final.measured and not reason:
                 return final, False
-            overlap = first.status is not AlignStatus.NO_OVERLAP  # without, the scan may show something else
-            if before is None and overlap and budget.allows(self._global.work(len(scan), 0)):
-                found = self._acquire(scan, budget, carried, rounds=1)
-                if found.status is AlignStatus.ALIGNED:
-                    return found, True
-            before = kept
-            if np.mean(kept.distance < self.limits.gate_m) < LEAST_TO_TURN:
-                break
         if not reason:
             return final, False
         status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason), False
 
-    def _regraded(self, scan: NDArray[Any], kept: Restart, first: Alignment, carried: bool) -> Alignment:
-        """Register from the pose of a restart with a rejection distance that follows the noise."""
-        width = max(self.limits.gate_m, 3.0 * kept.noise_m)
-        same = kept.T_ca.t.tobytes() == first.T_ac.inverse().t.tobytes() and width == self.limits.gate_m
-        return first if same else self._graded(scan, kept.T_ca.inverse(), width, carried=carried)
+    def _reason(self, few: NDArray[Any], found: Alignment, budget: Budget) -> str:
+        """Why a pose is not plausible; "" if it is, or nothing was measured."""
+        budget.spend(TEST_WORK)
+        return self._test.check(few, found.T_ac.inverse()).reason if found.measured else ""
+
+    def _regraded(
+        self,
+        scan: NDArray[Any],
+        few: NDArray[Any],
+        kept: Restart,
+        budget: Budget,
+        halves: bool = True,
+        carried: bool = False,
+    ) -> Alignment:
+        """Register with a rejection distance that follows the noise; among other objects also along the valley."""
+        width = self._restarter.width(kept)
+        found = self._graded(scan, kept.T_ca.inverse(), width, halves, carried)
+        budget.registered(found)
+        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO:
+            return found
+        budget.spend(VALLEY_WORK)
+        moved = self._restarter.along_valley(few, found.T_ac.inverse())
+        if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
+            return found
+        both = (found, self._graded(scan, moved.inverse(), width, halves, carried))
+        budget.registered(both[1])
+        return min(both, key=lambda each: self._restarter.measure(few, each.T_ac.inverse()).cost(width))
 
     def _graded(
         self, scan: NDArray[Any], guess: Pose, width_m: float | None = None, halves: bool = True, carried: bool = False

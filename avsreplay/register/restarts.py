@@ -17,18 +17,27 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
+from avsreplay.records import Alignment
 from avsreplay.register.backend import Target
-from avsreplay.register.plausibility import PlausibilityTest, robust_noise
+from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest, robust_noise
+from avsreplay.register.quality import scaled_information
+from avsreplay.register.size import LEAST_RESIDUALS
 from avsreplay.register.surface_index import IcpParams
 
-POINTS = 1500  # points of the scan used by restarts
+POINTS = 1000  # points of the scan used by restarts
 START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
+PATCH_OF_EXTENT, CELLS = 0.05, 64  # neighbouring points: those in a cube of this side; cubes along the extent, at least
+VALLEY_STEPS, VALLEY_POINTS = 8, 400  # each way along the two least certain directions, by half a gate
 BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
 PASS_WORK = 3000  # what a pass of a restart costs besides its points, in point searches
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # another object: of the points nearer than so many widths this share is on the model
+FAR_WORK, LEAST_NEAR = 4, 0.5  # searches that a pass costs a point while fewer points than this share are on the model
+SCATTER_WORK = 20  # what leaving out scattered points costs a point
+TEST_WORK = 20_000  # what a test of a pose costs
+VALLEY_WORK = 60_000  # what the search along the valley costs
 HEALTHY_PASSES = 12  # passes of an ordinary registration, over all points of the scan
 FIXED_WORK = 15_000  # what a registration costs besides its points: quality, covariance
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
@@ -49,6 +58,11 @@ class Budget:
     def spend(self, searches: int) -> None:
         """Subtract work that was done."""
         self._left -= searches
+
+    def registered(self, found: Alignment) -> None:
+        """Subtract the work of an alignment and of its quality."""
+        share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
+        self.spend(found.iterations * found.points * share + FIXED_WORK)
 
     def allows(self, searches: int) -> bool:
         """Return whether this much work is left; if not, the budget is exhausted."""
@@ -104,6 +118,69 @@ class Restarter:
         distance = self._test.measure(points, T_ca)
         return Restart(T_ca, distance, robust_noise(distance))
 
+    def width(self, at: Restart) -> float:
+        """Return the rejection distance [m] for a scan that is not clean: three standard deviations of its noise.
+
+        A wider one takes in points of other objects next to the surface, which pull the pose.
+        """
+        noise = min(at.noise_m, NOISE_OF_EXTENT * self._extent)
+        return max(min(self._target.limits.gate_m, STOP_OF_EXTENT * self._extent), 3.0 * noise)
+
+    def structure(self, points: NDArray[Any], T_ca: Pose) -> float:
+        """Return the rms [m] of the part of the residuals that neighbouring points share at a pose.
+
+        From the products of the sums of two halves of each patch: noise of single points cancels in the mean, a wrong
+        pose and errors of the model do not.
+
+        Args:
+            points: (n, 3) in {A} [m].
+            T_ca: the pose.
+
+        Returns:
+            The rms; inf for a cloud, whose normals have no sign, and with fewer than 50 points near the model.
+        """
+        target, p = self._target, T_ca.apply(points)
+        found = target.index.closest(p, camera_c=target.visibility.camera_c(target.index, points, T_ca))
+        near = found.d2 < (START_OF_EXTENT * self._extent) ** 2
+        if np.count_nonzero(near) < LEAST_RESIDUALS or not len(target.surface.faces):
+            return float("inf")
+        e = np.einsum("ij,ij->i", found.normal[near], p[near] - found.foot[near])
+        cells = np.floor((p[near] - self._middle) / (PATCH_OF_EXTENT * self._extent)).astype(np.int64) + CELLS // 2
+        patch = np.unique(cells @ np.array([CELLS * CELLS, CELLS, 1]), return_inverse=True)[1]
+        half = 2 * patch + np.arange(len(patch)) % 2
+        sums, counts = (np.bincount(half, w, 2 * (int(patch.max()) + 1)).reshape(-1, 2) for w in (e, None))
+        shared = float(sums.prod(axis=1).sum()) / max(float(counts.prod(axis=1).sum()), 1.0)
+        return float(np.sqrt(max(shared, 0.0)))
+
+    def along_valley(self, points: NDArray[Any], T_ca: Pose) -> Pose:
+        """Return the best pose along the two directions in which the scan determines it least, or the pose itself.
+
+        Points of another object next to the surface can hold a pose away from the minimum that the surface alone has,
+        and such a false minimum lies along the floor of the valley.
+
+        Args:
+            points: (n, 3) in {A} [m].
+            T_ca: registered pose.
+        """
+        index, target = self._target.index, self._target
+        few = points[:: max(1, len(points) // VALLEY_POINTS)]
+        here = self.measure(few, T_ca)
+        gate, width = target.limits.gate_m, self.width(here)
+        on = here.distance < gate
+        facing = target.visibility.camera_c(index, few, T_ca) is not None
+        sums = index.normal_equations(few, T_ca, gate, facing=facing)
+        centre = T_ca.apply(few[on]).mean(axis=0) if on.any() else self._middle
+        info, radius = scaled_information(sums.info, max(1, sums.inliers), centre)
+        floor = np.linalg.eigh(info)[1][:, :2].T
+        best, least = T_ca, here.cost(width)
+        steps = 0.5 * gate * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
+        for step in np.multiply.outer(steps, floor).reshape(-1, 6):
+            turn = geometry.exp(step[:3] / radius)
+            moved = Pose(turn, centre + step[3:] - geometry.matrix(turn) @ centre) @ T_ca
+            cost = self.measure(few, moved).cost(width)
+            best, least = (moved, cost) if cost < least else (best, least)
+        return best
+
     def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
         """Return the pose after passes with a falling rejection distance, from ``start_m`` [m] on."""
         index = self._target.index
@@ -135,6 +212,7 @@ class Restarter:
             best = self._least(found)
             if best is tested or not self._confirmed(best, found):
                 continue
+            budget.spend(TEST_WORK)
             if not self._test.check(points, best.T_ca).reason:
                 break
             tested = best

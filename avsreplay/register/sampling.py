@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.geometry import Array, bounding_diagonal
 from avsreplay.records import Surface
 
@@ -18,6 +20,8 @@ SCATTERED = 2.0  # distance to neighbour NEIGHBOUR of a scattered point over tha
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
 BIMODAL = 2.5  # ratio of the upper to the lower quartile of that distance in a scan with scattered points
 LARGER = 1.2  # a connected part larger than this many extents is not the target alone
+MOST_SEGMENTS = 3
+MOST_ATTEMPTS = MOST_SEGMENTS + 3
 VOXEL_OF_EXTENT = 0.04
 LEAST_SHARE, LEAST_POINTS = 0.05, 60  # least size of a part: share of the scan, and points
 PLANES, TRIALS, PLANE_OF_EXTENT, PLANE_SHARE = 3, 200, 0.01, 0.2
@@ -105,6 +109,24 @@ def without_scattered_points(points: Array) -> Array:
     if high < BIMODAL * low:
         return points
     return points[distance < SCATTERED * float(np.quantile(distance, DENSE_QUANTILE))]
+
+
+def attempts(target: Array, extent_m: float) -> Iterator[tuple[Array, int]]:
+    """Yield what is searched and by which round of the search: the whole scan, its parts, then with other starts.
+
+    Args:
+        target: (n, 3) the scan without scattered points.
+        extent_m: of the model.
+    """
+    small = geometry.bounding_diagonal(target) <= LARGER * extent_m  # probably the target alone
+    yield target, 0
+    if small:
+        yield target, 1
+    for part in islice(segments(target, extent_m), MOST_SEGMENTS):
+        yield part, 0
+    if not small:
+        yield target, 1
+    yield target, 2
 
 
 def segments(points: Array, extent_m: float) -> Iterator[Array]:

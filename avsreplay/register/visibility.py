@@ -35,7 +35,8 @@ class Camera(Enum):
 class Visibility:
     """The facing test for one surface.
 
-    AUTO applies it if the mesh is closed with outward faces (19 of 20 edges paired, positive volume) and the origin of
+    AUTO applies it if the mesh is closed with outward faces (19 of 20 edges used as often in one
+    direction as in the other, positive volume) and the origin of
     {A} is at least a quarter of the extent outside the bounding box of the model. If fewer than 40 % of the closest
     faces of the scan face the origin, the camera was elsewhere and both sides are matched.
 
@@ -79,7 +80,12 @@ def is_outward(surface: Surface) -> bool:
     _, merged = np.unique(surface.vertices, axis=0, return_inverse=True)
     faces = merged.reshape(-1)[surface.faces].astype(np.int64)
     start, end = faces[:, (0, 1, 2)].ravel(), faces[:, (1, 2, 0)].ravel()
-    forward, back = np.sort(start * (merged.max() + 1) + end), end * (merged.max() + 1) + start
-    paired = np.searchsorted(forward, back, side="right") - np.searchsorted(forward, back, side="left") == 1
+    there, back = start * (merged.max() + 1) + end, end * (merged.max() + 1) + start
+    ordered = np.sort(there)
+    uses, opposite = (
+        np.searchsorted(ordered, edge, side="right") - np.searchsorted(ordered, edge, side="left")
+        for edge in (there, back)
+    )
+    paired = uses == opposite  # more than one where surfaces touch at an edge
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
     return float(paired.mean()) >= PAIRED_EDGES and float(np.einsum("ij,ij->", a, np.cross(b, c))) > 0.0
