@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import TracebackType
@@ -122,8 +123,9 @@ class ViewWriter:
 
     def __call__(self, scan: ReplayedScan) -> None:
         """Take one scan of a run."""
-        thin = thin_cloud(scan.outcome.scan.seq, scan.outcome.scan.points)
-        self._clouds.append(CloudView(thin.seq, thin.points, self._residual(thin.points, scan.outcome.pose)))
+        source = scan.outcome.scan
+        thin = thin_cloud(source.seq, source.points, intensity=source.intensities)
+        self._clouds.append(replace(thin, residual_m=self._residual(thin.points, scan.outcome.pose)))
         path = self._paths.of(scan.state)
         if path is not None:
             self._plans.append(PathView(scan.row.t_ns, np.asarray(path[1], np.float32), scan.row.plan_miss_m))

@@ -144,6 +144,17 @@ def test_a_scan_far_away_or_of_one_point_can_be_packed(make_rows):
     assert packed["cap_m"] is None
 
 
+def test_intensities_are_levels_up_to_the_brightest_points(make_rows):
+    """A level for each point in the order of the points; grey (255) where the sensor gives no value."""
+    rows, points = make_rows(2), np.zeros((4, 3)) + np.arange(4.0)[:, None]
+    clouds = (thin_cloud(0, points, np.zeros(4), [0.0, 50.0, 100.0, np.nan]), thin_cloud(1, points, np.zeros(4)))
+    packed = scene(rows, {}, View(BOX, FACES, clouds))["clouds"]
+    assert packed["brightest"] == pytest.approx(np.quantile([0.0, 50.0, 100.0], 0.99))
+    assert _floats(packed["intensity"], "u1").tolist() == [0, 128, 254, 255, 255, 255, 255, 255]
+    without = scene(rows, {}, View(BOX, FACES, clouds[1:]))["clouds"]
+    assert (without["intensity"], without["brightest"]) == (None, None)
+
+
 def test_spans_are_intervals_of_equal_values(make_rows):
     found = [(s["lane"], s["word"], s["first"], s["last"]) for s in spans(make_rows(40))]
     expected = [("flagged", "no_scan", 20, 25), ("injected", "full_occlusion", 20, 25), ("action", "approach", 0, 39)]
@@ -522,6 +533,25 @@ def test_the_page_works_with_the_keyboard_alone(opened):
     scene_canvas.send_keys(Keys.ARROW_LEFT * 5)
     _settled(browser)
     assert scene_canvas.screenshot_as_png != before
+
+
+@pytest.mark.slow
+def test_points_are_coloured_by_residual_or_by_intensity(browser, make_rows, tmp_path):
+    rows = make_rows(3)
+    points = np.random.default_rng(0).normal(5.0, size=(300, 3))
+    cloud = thin_cloud(0, points, np.linspace(0, 0.01, 300), np.linspace(200, 0, 300))
+    path = tmp_path / "bright.html"
+    path.write_text(_page(rows, view=View(BOX, FACES, (cloud,))), encoding="utf-8")
+    browser.get(path.as_uri())
+    _settled(browser)
+    canvas = browser.find_element("css selector", "#scene canvas")
+    by_residual = canvas.screenshot_as_png
+    assert "residual 0" in _text(browser, "#scene")
+    (button,) = [b for b in browser.find_elements("css selector", "#scene button") if "intensity" in b.text]
+    button.click()
+    _settled(browser)
+    assert "intensity 0" in _text(browser, "#scene")
+    assert canvas.screenshot_as_png != by_residual
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ def _view():
     surface = _ball(20)
     vertices, faces = thin_surface(surface)
     clouds = [
-        thin_cloud(0, np.arange(30.0).reshape(10, 3), np.arange(10.0)),
+        thin_cloud(0, np.arange(30.0).reshape(10, 3), np.arange(10.0), 3.0 + np.arange(10.0)),
         thin_cloud(1, np.zeros((0, 3))),
         thin_cloud(2, np.ones((5, 3))),
     ]
@@ -70,7 +70,9 @@ def test_the_view_comes_back_and_its_bytes_are_stable(folder, tmp_path):
         assert one.seq == two.seq
         np.testing.assert_array_equal(one.points, two.points)
     np.testing.assert_array_equal(back.clouds[0].residual_m, np.arange(10.0))
+    np.testing.assert_array_equal(back.clouds[0].intensity, 3.0 + np.arange(10.0))
     assert back.clouds[2].residual_m is None
+    assert back.clouds[2].intensity is None
     assert [p.miss_m for p in back.paths] == [None, 0.25]
     write_view(tmp_path / "again.npz", view)
     assert (tmp_path / "again.npz").read_bytes() == (folder[0] / "view.npz").read_bytes()

@@ -27,10 +27,10 @@ _MOST_BYTES, _LARGEST = 1 << 30, 1e15
 _ARRAYS: dict[str, tuple[str, tuple[int | None, ...]]] = {
     **dict.fromkeys(("vertices", "cloud_points", "path_points"), ("f", (None, 3))),
     **dict.fromkeys(("cloud_seq", "cloud_size", "path_t_ns", "path_size"), ("i", (None,))),
-    **dict.fromkeys(("cloud_residual", "path_miss"), ("f", (None,))),
+    **dict.fromkeys(("cloud_residual", "cloud_intensity", "path_miss"), ("f", (None,))),
     "faces": ("i", (None, 3)),
 }
-_SINGLE = ("vertices", "cloud_points", "path_points", "cloud_residual")
+_SINGLE = ("vertices", "cloud_points", "path_points", "cloud_residual", "cloud_intensity")
 
 Floats = NDArray[np.float32]
 Faces = NDArray[np.int32]
@@ -38,11 +38,12 @@ Faces = NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CloudView:
-    """Some points of scan ``seq``: (n, 3) in {A} [m], and their distances to the model (n,) [m] or None."""
+    """Some points of scan ``seq``: (n, 3) in {A} [m], distances to the model (n,) [m] and intensities (n,) or None."""
 
     seq: int
     points: Floats
     residual_m: Floats | None = None
+    intensity: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,13 +66,21 @@ class View:
 
 
 def thin_cloud(
-    seq: int, points: ArrayLike, residual_m: ArrayLike | None = None, *, most: int = CLOUD_POINTS
+    seq: int,
+    points: ArrayLike,
+    residual_m: ArrayLike | None = None,
+    intensity: ArrayLike | None = None,
+    *,
+    most: int = CLOUD_POINTS,
 ) -> CloudView:
-    """At most ``most`` points at an even stride. points (n, 3) in {A} [m], residual_m (n,) [m]."""
+    """At most ``most`` points at an even stride. points (n, 3) in {A} [m], residual_m (n,) [m], intensity (n,)."""
     points = np.asarray(points)
     chosen = np.unique(np.linspace(0, max(len(points) - 1, 0), min(most, len(points))).astype(np.intp))
-    residual = None if residual_m is None else np.asarray(residual_m, dtype=np.float32)[chosen]
-    return CloudView(seq, np.asarray(points[chosen], dtype=np.float32), residual)
+    residual, seen = (
+        None if of_point is None else np.asarray(of_point, dtype=np.float32)[chosen]
+        for of_point in (residual_m, intensity)
+    )
+    return CloudView(seq, np.asarray(points[chosen], dtype=np.float32), residual, seen)
 
 
 def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, Faces]:
@@ -106,7 +115,8 @@ def write_view(path: str | Path, view: View) -> None:
         "cloud_seq": np.array([c.seq for c in view.clouds], dtype=np.int64),
         "cloud_size": np.array([len(c.points) for c in view.clouds], dtype=np.int64),
         "cloud_points": _joined([c.points for c in view.clouds]),
-        "cloud_residual": np.concatenate([np.zeros(0, np.float32), *(_residual(c) for c in view.clouds)]),
+        "cloud_residual": _each_point([(c, c.residual_m) for c in view.clouds]),
+        "cloud_intensity": _each_point([(c, c.intensity) for c in view.clouds]),
         "path_t_ns": np.array([p.t_ns for p in view.paths], dtype=np.int64),
         "path_size": np.array([len(p.points) for p in view.paths], dtype=np.int64),
         "path_points": _joined([p.points for p in view.paths]),
@@ -120,8 +130,10 @@ def _joined(parts: Sequence[Floats]) -> Floats:
     return np.concatenate([np.zeros((0, 3), np.float32), *parts]).astype(np.float32)
 
 
-def _residual(cloud: CloudView) -> Floats:
-    return np.full(len(cloud.points), np.nan, np.float32) if cloud.residual_m is None else cloud.residual_m
+def _each_point(parts: Sequence[tuple[CloudView, Floats | None]]) -> Floats:
+    """A value of each point of all clouds, NaN where a cloud has none."""
+    filled = [np.full(len(cloud.points), np.nan) if known is None else known for cloud, known in parts]
+    return np.concatenate([np.zeros(0), *filled]).astype(np.float32)
 
 
 def read_view(path: str | Path) -> View:
@@ -140,10 +152,10 @@ def read_view(path: str | Path) -> View:
 
 def _view(arrays: dict[str, NDArray[np.float32]]) -> View:
     points = _split(arrays["cloud_points"], arrays["cloud_size"])
-    residuals = _split(arrays["cloud_residual"], arrays["cloud_size"])
+    residuals, seen = (_split(arrays[f"cloud_{name}"], arrays["cloud_size"]) for name in ("residual", "intensity"))
     clouds = tuple(
-        CloudView(int(seq), p, None if np.isnan(r).any() or not len(r) else r)
-        for seq, p, r in zip(arrays["cloud_seq"], points, residuals, strict=True)
+        CloudView(int(seq), p, None if np.isnan(r).any() or not len(r) else r, None if np.isnan(i).all() else i)
+        for seq, p, r, i in zip(arrays["cloud_seq"], points, residuals, seen, strict=True)
     )
     lines = _split(arrays["path_points"], arrays["path_size"])
     paths = tuple(
@@ -170,7 +182,7 @@ def _split(joined: NDArray[np.float32], sizes: NDArray[np.float32]) -> list[NDAr
 PAGE_POINTS = 200_000
 MOST_CLOUDS = 700
 MOST_PATHS = 150
-_NO_RESIDUAL = 255
+_NO_VALUE = 255
 
 
 def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dict[str, Any]:
@@ -205,8 +217,9 @@ def _at_most(items: Sequence[Any], most: int) -> list[Any]:
 def _clouds(clouds: Sequence[CloudView], place: dict[int, int]) -> dict[str, Any]:
     clouds = [c for c in clouds if c.seq in place and len(c.points)]
     each = PAGE_POINTS // max(len(clouds), 1)
-    thinned = [_thinner(c, each) for c in clouds]
+    thinned = [thin_cloud(c.seq, c.points, c.residual_m, c.intensity, most=each) for c in clouds]
     cap = _cap([c.residual_m for c in thinned if c.residual_m is not None])
+    brightest = _brightest([c.intensity for c in thinned if c.intensity is not None])
     parts = [_quantised(c.points) for c in thinned]
     return {
         "scan": pack([place[c.seq] for c in thinned], "i4"),
@@ -214,15 +227,11 @@ def _clouds(clouds: Sequence[CloudView], place: dict[int, int]) -> dict[str, Any
         "centre": pack([p[1] for p in parts], "f4"),
         "step": pack([p[2] for p in parts], "f4"),
         "points": pack(np.concatenate([np.zeros((0, 3), np.int16), *(p[0] for p in parts)]), "i2"),
-        "residual": pack(np.concatenate([np.zeros(0, np.uint8), *(_levels(c, cap) for c in thinned)]), "u1"),
+        "residual": _levels([(c, c.residual_m) for c in thinned], cap),
+        "intensity": None if brightest is None else _levels([(c, c.intensity) for c in thinned], brightest),
         "cap_m": cap,
+        "brightest": brightest,
     }
-
-
-def _thinner(cloud: CloudView, most: int) -> CloudView:
-    chosen = np.unique(np.linspace(0, len(cloud.points) - 1, min(most, len(cloud.points))).astype(int))
-    residual = None if cloud.residual_m is None else cloud.residual_m[chosen]
-    return CloudView(cloud.seq, cloud.points[chosen], residual)
 
 
 def _quantised(points: NDArray[np.float32]) -> tuple[NDArray[np.int16], NDArray[np.float64], float]:
@@ -240,11 +249,18 @@ def _cap(residuals: Sequence[NDArray[np.float32]]) -> float | None:
     return 2.0 * float(np.median([np.quantile(r, 0.9) for r in residuals])) or 1e-9
 
 
-def _levels(cloud: CloudView, cap: float | None) -> NDArray[np.uint8]:
-    if cloud.residual_m is None or cap is None:
-        return np.full(len(cloud.points), _NO_RESIDUAL, np.uint8)
-    levels: NDArray[np.uint8] = np.round(np.clip(cloud.residual_m / cap, 0.0, 1.0) * 254.0).astype(np.uint8)
-    return levels
+def _brightest(seen: Sequence[NDArray[np.float32]]) -> float | None:
+    """Intensity at the top of the colour scale: the 99 % point of all points."""
+    known = np.concatenate([np.zeros(0, np.float32), *seen])
+    known = known[np.isfinite(known)]
+    return (float(np.quantile(known, 0.99)) or 1.0) if len(known) else None
+
+
+def _levels(parts: Sequence[tuple[CloudView, Floats | None]], top: float | None) -> dict[str, Any]:
+    """Levels 0 to 254 of the values from 0 to ``top``; 255 where there is none."""
+    share = _each_point(parts) / (top or 1.0)
+    levels = np.where(np.isfinite(share), np.round(np.clip(share, 0.0, 1.0) * 254.0), _NO_VALUE)
+    return pack(levels, "u1")
 
 
 def _paths(paths: Sequence[PathView], start_ns: int) -> list[dict[str, Any]]:

@@ -1,5 +1,5 @@
 "use strict";
-// The 3D view: model at the estimated and at the true pose, scan points coloured by residual, planned path, line of sight.
+// The 3D view: model at the estimated and at the true pose, scan points coloured by residual or intensity, planned path, line of sight.
 const Scene = (() => {
   const V = {
     add: (a, b) => [a[0] + b[0], a[1] + b[1], a[2] + b[2]], sub: (a, b) => [a[0] - b[0], a[1] - b[1], a[2] - b[2]],
@@ -74,8 +74,8 @@ const Scene = (() => {
   }
 
   function decode(scene) {
-    const c = scene.clouds, out = { cap: c.cap_m };
-    for (const name of ["scan", "size", "centre", "step", "points", "residual"]) out[name] = Packed.unpack(c[name]);
+    const c = scene.clouds, out = { cap: c.cap_m, brightest: c.brightest };
+    for (const name of ["scan", "size", "centre", "step", "points", "residual", "intensity"]) out[name] = c[name] && Packed.unpack(c[name]);
     out.start = []; let total = 0;
     for (const size of out.size) { out.start.push(total); total += size; }
     return out;
@@ -86,10 +86,10 @@ const Scene = (() => {
     const stride = clouds.scan.length > 1 ? (clouds.scan[clouds.scan.length - 1] - clouds.scan[0]) / (clouds.scan.length - 1) : 0;
     return best >= 0 && Math.abs(clouds.scan[best] - k) <= Math.max(stride / 2, 0) ? best : -1;
   }
-  function cloudArrays(clouds, i) {
+  function cloudArrays(clouds, i, levels) {
     const size = clouds.size[i], place = new Float32Array(3 * size), tint = new Float32Array(3 * size);
     for (let j = 0; j < size; j++) {
-      const at = clouds.start[i] + j, level = clouds.residual[at];
+      const at = clouds.start[i] + j, level = levels[at];
       for (let a = 0; a < 3; a++) place[3 * j + a] = clouds.centre[3 * i + a] + clouds.step[i] * clouds.points[3 * at + a];
       tint.set(level === 255 ? [0.85, 0.85, 0.85] : ramp(level), 3 * j);
     }
@@ -111,7 +111,7 @@ const Scene = (() => {
     const buffer = (data) => { const b = gl.createBuffer(); gl.bindBuffer(gl.ARRAY_BUFFER, b); gl.bufferData(gl.ARRAY_BUFFER, data, gl.STATIC_DRAW); return b; };
     const fixed = { place: buffer(mesh.place), normal: buffer(mesh.normal), edges: buffer(mesh.edges), bare: buffer(vertices) };
     const scratch = gl.createBuffer(), scratchTint = gl.createBuffer();
-    let chosen = 0, yaw = 0.55, pitch = 0.35, zoom = 1, whole = false, dirty = true;
+    let chosen = 0, yaw = 0.55, pitch = 0.35, zoom = 1, whole = false, bright = false, dirty = true;
 
     const note = document.createElement("span"), bar = document.createElement("div"), legend = document.createElement("ul");
     bar.className = "bar"; legend.className = "legend";
@@ -119,13 +119,16 @@ const Scene = (() => {
     const all = flight ? ball([...vertices, ...paths[0].points]) : null, [less, more] = flight ? ["Whole flight", "Last metres"] : ["Target only", "Whole scene"];
     const fit = button(more, () => { whole = !whole; zoom = 1; fit.textContent = whole ? less : more; draw(); });
     button("Reset view", () => { yaw = 0.55; pitch = 0.35; zoom = 1; draw(); });
+    if (clouds.cap && clouds.intensity) { const by = button("Colour by intensity", () => { bright = !bright; by.textContent = bright ? "Colour by residual" : "Colour by intensity"; rescale(); draw(); }); }
     bar.append(note);
     const entry = (colour, text) => { const li = document.createElement("li"), i = document.createElement("i"); i.style.background = colour; li.append(i, text); legend.append(li); };
     if (faces.length) entry("#56b4e9", flight ? "target" : "model at the estimate");
     if (truth.some(Number.isFinite)) entry("#2fc39a", faces.length ? "model at the true pose (edges)" : "true pose");
     if (paths.length) entry("#ff8f4a", "planned path");
     if (flight) { entry("#e58ad6", "gripper and its path so far"); if (flight.cones.length) entry("#2ec299", "approach cones"); } else entry("#8c99ad", "line of sight");
-    if (clouds.cap) { const li = document.createElement("li"); li.className = "ramp"; li.append("residual 0", document.createElement("b"), (clouds.cap * 1000).toPrecision(3) + " mm"); legend.append(li); }
+    const scale = document.createElement("li"); scale.className = "ramp";
+    const rescale = () => { const [name, top] = bright ? ["intensity", clouds.brightest.toPrecision(3)] : ["residual", (clouds.cap * 1000).toPrecision(3) + " mm"]; scale.replaceChildren(name + " 0", document.createElement("b"), top); };
+    if (clouds.cap || clouds.intensity) { bright = !clouds.cap; rescale(); legend.append(scale); }
     host.append(canvas, bar, legend);
 
     function bind(b, slot, data) {
@@ -180,7 +183,7 @@ const Scene = (() => {
         const end = 3 * (chosen + 1);
         shape(gl.POINTS, 1, { buffer: scratch, data: path.points.slice(end - 3, end) }, IDENTITY, COLOUR.flown, 2, { tint: new Float32Array(COLOUR.flown.slice(0, 3)), bead: 11 * px });
       }
-      if (found >= 0) { const c = cloudArrays(clouds, found); shape(gl.POINTS, c.size, { buffer: scratch, data: c.place }, IDENTITY, COLOUR.sight, 2, { tint: c.tint, bead: 4 * px }); }
+      if (found >= 0) { const c = cloudArrays(clouds, found, bright ? clouds.intensity : clouds.residual); shape(gl.POINTS, c.size, { buffer: scratch, data: c.place }, IDENTITY, COLOUR.sight, 2, { tint: c.tint, bead: 4 * px }); }
       if (faces.length) { gl.depthMask(false); shape(gl.TRIANGLES, mesh.place.length / 3, { buffer: fixed.place }, pose, COLOUR.estimate, 1, { normal: fixed.normal }); gl.depthMask(true); }
       note.textContent = flight ? "frame of the fixture {C}" : found >= 0 ? `${clouds.size[found]} points of scan ${clouds.scan[found]}` : "no points of this scan";
       canvas.dataset.painted = String(chosen);
