@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array
 from avsreplay.log import LogInfo, Source, SourceOptions
 from avsreplay.log.bytes_io import shown
-from avsreplay.log.options import Unit
+from avsreplay.log.options import ASSUMED_HZ, NO_TIMES, Unit
 from avsreplay.records import Surface
 from avsreplay.register import Registrar
 from avsreplay.report.table import Table, TableCell
@@ -302,6 +302,9 @@ def _clock(info: LogInfo) -> list[Advice]:
     clock = info.clock
     if clock is None:
         return []
+    if not info.topics and info.notes.get("times", "").startswith(NO_TIMES):
+        text = f"the files hold no time stamps: {ASSUMED_HZ:g} Hz is assumed, on which all velocities depend"
+        return [Advice("check", "time stamps", text, "--rate HZ")]
     problems = [
         f"{getattr(clock, name)} {name}" for name in ("unset", "jumps", "back", "equal") if getattr(clock, name)
     ]

@@ -160,6 +160,21 @@ def test_info_says_why_a_run_refuses_a_log_without_scans(cli, shared_data):
     assert scans["text"] in cli("run", bag, "--model", "auto").err
 
 
+def test_an_assumed_rate_of_scans_is_doubtful_until_it_is_given(cli, tmp_path):
+    """Files without times: every velocity depends on a rate that nobody has stated."""
+    for number in range(4):
+        np.save(tmp_path / f"scan_{number}.npy", np.random.default_rng(number).normal(size=(50, 3)))
+    assumed = json.loads(cli("info", tmp_path, "--json").out)["checks"]
+    (finding,) = [c for c in assumed if c["about"] == "time stamps"]
+    assert (finding["grade"], finding["option"]) == ("check", "--rate HZ")
+    assert "1 Hz is assumed" in finding["text"]
+    given = json.loads(cli("info", tmp_path, "--rate", 1, "--json").out)["checks"]
+    assert [c["grade"] for c in given if c["about"] == "time stamps"] == ["ok"]
+    (tmp_path / "times.txt").write_text("".join(f"{0.5 * k}\n" for k in range(4)))
+    timed = json.loads(cli("info", tmp_path, "--json").out)["checks"]
+    assert [c["grade"] for c in timed if c["about"] == "time stamps"] == ["ok"]
+
+
 def test_no_model_asks_for_one(surface):
     assert _found(preflight(Log(_seen(surface)), None), "model").option == "--model FILE or --model auto"
 

@@ -137,14 +137,15 @@ def _facts(info: LogInfo) -> list[tuple[str, str]]:
     rows = [
         ("file", info.path),
         ("kind", ", ".join(filter(None, (info.kind, info.profile, info.library)))),
-        ("size", f"{info.bytes} bytes"),
+        ("size", f"{info.bytes / 1e6:.3g} MB" if info.bytes >= 1e6 else f"{info.bytes} bytes"),
         ("log clock", " ".join(filter(None, (_time(info.start_ns), "for", span))) if span else "-"),
         ("scans", str(info.scans) + (f" on {info.cloud_topic}" if info.cloud_topic else "")),
         ("model", _model(info)),
         ("truth", "yes" if info.truth else "no"),
-        ("scenario", "yes" + ("" if info.seed is None else f", seed {info.seed}") if info.scenario else "no"),
     ]
-    if info.clock is not None and info.scans:
+    if info.scenario:
+        rows.append(("scenario", "simulated" + ("" if info.seed is None else f", seed {info.seed}")))
+    if info.clock is not None and info.scans and info.topics:  # a folder of scans has no second clock
         rows.append(("clock", _clock(info.clock)))
     return rows + [(name, value) for name, value in info.notes.items()]
 

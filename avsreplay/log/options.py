@@ -8,6 +8,9 @@ from pathlib import Path
 
 from avsreplay.settings import Settings, setting
 
+ASSUMED_HZ = 1.0  # rate of scans or poses without times
+NO_TIMES = "no time stamps in the files"
+
 
 class ClockChoice(Enum):
     """The clock of ``Scan.t_ns``."""
@@ -97,7 +100,13 @@ class SourceOptions(Settings):
     sensor_topic: str | None = setting(
         None, "Topic of the sensor's pose, with which the clouds are transformed into the fixed frame."
     )
-    rate_hz: float = setting(1.0, "Scan rate of a folder of scans.", unit="Hz", low=1e-4, high=1e6)
+    rate_hz: float | None = setting(
+        None,
+        "Rate of scans or poses whose files hold no times; 1 Hz is assumed if it is not given.",
+        unit="Hz",
+        low=1e-4,
+        high=1e6,
+    )
     strict: bool = setting(False, "Any loss of data is an error (exit code 3).")
     max_message_mib: int = setting(
         128, "Largest message, chunk or attachment that is read.", unit="MiB", low=1, high=4096

@@ -104,6 +104,7 @@ class PoseFile:
     def __init__(self, path: Path, rate_hz: float) -> None:
         found = read_measured(path)
         self._poses = found.poses
+        self.timed = found.t_ns is not None
         steady = [EPOCH_NS + round(i * 1e9 / rate_hz) for i in range(len(found.poses))]
         self.log_ns = self.publish_ns = self.header_ns = steady if found.t_ns is None else list(found.t_ns)
 
