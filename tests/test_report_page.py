@@ -538,8 +538,8 @@ def test_the_page_works_with_the_keyboard_alone(opened):
 @pytest.mark.slow
 def test_points_are_coloured_by_residual_or_by_intensity(browser, make_rows, tmp_path):
     rows = make_rows(3)
-    points = np.random.default_rng(0).normal(5.0, size=(300, 3))
-    cloud = thin_cloud(0, points, np.linspace(0, 0.01, 300), np.linspace(200, 0, 300))
+    points = _view(rows).clouds[0].points
+    cloud = thin_cloud(0, points, np.linspace(0, 0.01, len(points)), np.linspace(200, 0, len(points)))
     path = tmp_path / "bright.html"
     path.write_text(_page(rows, view=View(BOX, FACES, (cloud,))), encoding="utf-8")
     browser.get(path.as_uri())
