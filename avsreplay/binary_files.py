@@ -17,7 +17,7 @@ import pickle
 import re
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from enum import Enum
 from pathlib import Path
 from typing import Any
@@ -91,7 +91,12 @@ def read_members(data: bytes, limit: int) -> dict[str, bytes]:
 
 
 def read_npz(
-    path: Path, shapes: Mapping[str, tuple[str, tuple[int | None, ...]]], *, limit: int, hint: str
+    path: Path,
+    shapes: Mapping[str, tuple[str, tuple[int | None, ...]]],
+    *,
+    limit: int,
+    hint: str,
+    optional: Collection[str] = (),
 ) -> dict[str, NDArray[Any]]:
     """Read a numpy archive of declared content.
 
@@ -100,6 +105,7 @@ def read_npz(
         shapes: for each array the kind of its numbers ("f" or "i") and its shape; None is any length.
         limit: largest size of the file [bytes].
         hint: what to do about an unusable file.
+        optional: arrays that a file may lack.
 
     Returns:
         The arrays by name, as float64 or int64.
@@ -110,7 +116,8 @@ def read_npz(
     data = read_limited(path, limit, hint)
     try:
         members = read_members(data, max(_LEAST_ARRAYS, _MAX_RATIO * len(data)))
-        return {name: _declared(members, name, *shapes[name]) for name in shapes}
+        wanted = [name for name in shapes if name not in optional or f"{name}.npy" in members]
+        return {name: _declared(members, name, *shapes[name]) for name in wanted}
     except BadFile as error:
         raise UnreadableInput(str(error), where=str(path), hint=hint) from None
 

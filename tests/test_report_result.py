@@ -78,6 +78,16 @@ def test_the_view_comes_back_and_its_bytes_are_stable(folder, tmp_path):
     assert (tmp_path / "again.npz").read_bytes() == (folder[0] / "view.npz").read_bytes()
 
 
+def test_a_view_of_an_earlier_version_has_no_intensities(folder):
+    path = folder[0] / "view.npz"
+    with np.load(path) as found:
+        np.savez(path, **{name: found[name] for name in found.files if name != "cloud_intensity"})
+    back = read_view(path)
+    assert len(back.clouds) == 3
+    assert all(cloud.intensity is None for cloud in back.clouds)
+    np.testing.assert_array_equal(back.clouds[0].residual_m, np.arange(10.0))
+
+
 @pytest.mark.parametrize("most", [50, 300, 2000])
 def test_a_thinned_cloud_keeps_its_extremes(most):
     points = np.random.default_rng(0).normal(size=(1234, 3))

@@ -143,7 +143,7 @@ def read_view(path: str | Path) -> View:
         UnreadableInput: the file is missing or is not a view.
     """
     path, hint = Path(path), "run again with -o"
-    arrays = read_npz(path, _ARRAYS, limit=_MOST_BYTES, hint=hint)
+    arrays = read_npz(path, _ARRAYS, limit=_MOST_BYTES, hint=hint, optional=("cloud_intensity",))
     try:
         return _view({name: a.astype(np.float32) if name in _SINGLE else a for name, a in arrays.items()})
     except ValueError as error:
@@ -152,6 +152,7 @@ def read_view(path: str | Path) -> View:
 
 def _view(arrays: dict[str, NDArray[np.float32]]) -> View:
     points = _split(arrays["cloud_points"], arrays["cloud_size"])
+    arrays.setdefault("cloud_intensity", np.full(len(arrays["cloud_residual"]), np.nan, np.float32))  # earlier versions
     residuals, seen = (_split(arrays[f"cloud_{name}"], arrays["cloud_size"]) for name in ("residual", "intensity"))
     clouds = tuple(
         CloudView(int(seq), p, None if np.isnan(r).any() or not len(r) else r, None if np.isnan(i).all() else i)
