@@ -192,9 +192,11 @@ def _labels_of(marks: Sequence[Mark]) -> list[Label]:
 def _members(marks: Sequence[Mark], labels: Sequence[Label]) -> list[list[int]]:
     """Rows of each label: those of its kind to whose stamp its window is the nearest (a fault may shift stamps)."""
     out: list[list[int]] = [[] for _ in labels]
+    kinds: dict[str | None, list[int]] = {}
+    for i, label in enumerate(labels):
+        kinds.setdefault(label.kind, []).append(i)
     for k, mark in enumerate(marks):
-        same = [i for i, label in enumerate(labels) if label.kind == mark.fault]
-        if same:
+        if same := kinds.get(mark.fault):
             out[min(same, key=lambda i: _distance(labels[i], mark.t_ns))].append(k)
     return out
 
@@ -214,9 +216,9 @@ def _episode(
     own = [marks[k] for k in rows]
     flagged = [m for m in own if m.gamma == 0]
     missing = not rows and any(a <= label.end_ns and label.start_ns <= b for a, b in holes)
-    after = marks[rows[-1] + 1 if rows else bisect_right([m.t_ns for m in marks], label.end_ns) :]
-    unlabelled = [m for m in after if m.fault is None]
-    recover_scans, recover_s = _first(unlabelled, gamma=1)
+    after = marks[rows[-1] + 1 if rows else bisect_right(marks, label.end_ns, key=lambda m: m.t_ns) :]
+    recover_scans, recover_s = _first((m for m in after if m.fault is None), gamma=1)
+    lost = recover_scans is None and any(m.fault is None for m in after)
     if not flagged and not missing and recover_scans == 0:
         recover_scans = recover_s = None  # there was nothing to recover from
     delay_scans, delay_s = _first(own, gamma=0)
@@ -233,17 +235,21 @@ def _episode(
         strength=label.strength,
         delay_scans=delay_scans,
         delay_s=delay_s,
-        lost=bool(unlabelled) and not any(m.gamma == 1 for m in unlabelled),
+        lost=lost,
         peak_flagged=Peak.of(flagged),
         peak_used=Peak.of(m for m in own if m.gamma == 1),
         peak_after=Peak.of(m for m in _until_next(after, next_ns) if m.gamma == 1),
     )
 
 
-def _first(marks: Sequence[Mark], gamma: int) -> tuple[int, float] | tuple[None, None]:
+def _first(marks: Iterable[Mark], gamma: int) -> tuple[int, float] | tuple[None, None]:
     """Scans and seconds from the first of ``marks`` to the first of them with ``gamma``; None where none has it."""
-    place = next((k for k, mark in enumerate(marks) if mark.gamma == gamma), None)
-    return (None, None) if place is None else (place, (marks[place].t_ns - marks[0].t_ns) * 1e-9)
+    begin: Mark | None = None
+    for place, mark in enumerate(marks):
+        begin = begin or mark
+        if mark.gamma == gamma:
+            return place, (mark.t_ns - begin.t_ns) * 1e-9
+    return None, None
 
 
 def _until_next(marks: Sequence[Mark], next_ns: int | None) -> Iterable[Mark]:
