@@ -156,6 +156,20 @@ def test_a_moment_states_what_is_usual_and_its_cause(make_rows):
     assert found[40][1] == "the estimate is not converged"
 
 
+def test_harmful_scans_that_were_used_are_judged_by_the_error(make_rows):
+    """Some scans of the fault were flagged, so that it counts as detected, but others moved the estimate."""
+    rows = _good(make_rows)
+    labels = _labels(rows)
+    at = next(r.seq for r in rows if r.fault)
+    for share, grade in ((0.01, "PASS"), (0.03, "CHECK"), (0.4, "FAIL")):
+        used = {"gamma": 1, "reason": "ok", "pos_err_m": share * HEADER["model"]["extent_m"]}
+        changed = [dataclasses.replace(r, **used) if r.seq == at else r for r in rows]
+        found = verdict_of(changed, Summary.fold(changed, labels=labels), HEADER)
+        assert found.grade is Grade[grade], found.line
+        assert ("scans with a harmful fault were used" in found.line) == (grade != "PASS")
+    assert "1 of 6 scans with a harmful fault were used, with a position error up to " in found.line
+
+
 def test_a_rejected_measurement_is_no_moment_of_its_own(make_rows):
     rows = _good(make_rows, n=35, gamma=0, reason="fit_error", fault=None, nis=5.0)
     rows = [dataclasses.replace(r, nis=3000.0) if r.seq == 20 else r for r in rows]

@@ -39,7 +39,7 @@ def choose_rows(rows: Sequence[Row], *, every: int | None = None, show_all: bool
     With neither flag: every k-th row so that about 24 are left, the last one, and those at which gamma changes.
     """
     if show_all or (every is None and len(rows) <= FEW):
-        return list(rows), f"all {len(rows)} scans"
+        return list(rows), f"all {len(rows)} scans" if len(rows) != 1 else "1 scan"
     if every is not None:
         return list(rows[:: max(every, 1)]), f"every {_ordinal(max(every, 1))} of {len(rows)} scans"
     step = -(-len(rows) // FEW)

@@ -99,6 +99,11 @@ class Drifting:
         return f"{' and '.join(parts)} since {self.onset_s:.0f} +- {self.onset_1s_s:.0f} s"
 
 
+def length_text(metres: float) -> str:
+    """A length in millimetres, from 1 m on in metres."""
+    return f"{metres:.3g} m" if abs(metres) >= 1.0 else f"{1000 * metres:.3g} mm"
+
+
 def times(count: int) -> str:
     """A number of events in words: never, once, 2 times."""
     return {0: "never", 1: "once"}.get(count, f"{count} times")

@@ -11,7 +11,7 @@ from avsreplay.records import BLOCKS
 from avsreplay.report.episodes import Episode
 from avsreplay.report.scan_table import print_sparks, scan_table
 from avsreplay.report.summary import Errors, Summary
-from avsreplay.report.summary_parts import Capture, Parameter, Statistics, times
+from avsreplay.report.summary_parts import Capture, Parameter, Statistics, length_text, times
 from avsreplay.report.table import Table, TableCell, decimals, facts_table, number, print_line, print_table
 from avsreplay.report.verdict import INSIDE_LEAST, Grade, RunVerdict
 from avsreplay.rows import Row
@@ -208,7 +208,7 @@ def in_one_line(summary: Summary) -> str:
     parts.append("not converged" if t1 is None else f"converged at {t1:.1f} s")
     parts.append("no capture planned" if capture is None else f"capture planned at {capture:.2f} s")
     miss = summary.capture.miss
-    parts += [] if miss is None else [f"gripper closed {_mm(miss.position_m)} from the true grasp point"]
+    parts += [] if miss is None else [f"gripper closed {length_text(miss.position_m)} from the true grasp point"]
     return "; ".join(parts) + "."
 
 
@@ -216,8 +216,9 @@ def _fault_words(summary: Summary) -> list[str]:
     faults = summary.faults
     if not faults.known:
         return [f"{faults.false_alarms} flagged"] if faults.false_alarms else []
+    found = f"{faults.detected} of {faults.injected} harmful faults detected"
     return [
-        f"{faults.detected} of {faults.injected} harmful faults detected",
+        found if faults.injected else "no harmful fault injected",
         f"{faults.false_alarms} false alarms ({100 * faults.false_alarm_rate:.2f} %)",
     ]
 
@@ -226,7 +227,7 @@ def _error_words(summary: Summary) -> list[str]:
     """Errors against the truth in healthy scans; without a healthy scan, while coasting."""
     for errors, scans in ((summary.pose_healthy, "healthy scans"), (summary.pose_coasting, "coasting scans")):
         if errors.position_m is not None and errors.rotation_deg is not None:
-            rms = f"{1000 * errors.position_m.rmse:.3g} mm and {errors.rotation_deg.rmse:.3g} deg rms in {scans}"
+            rms = f"{length_text(errors.position_m.rmse)} and {errors.rotation_deg.rmse:.3g} deg rms in {scans}"
             return [f"pose error {rms}"]
     return ["no truth to compare with"]
 
@@ -250,7 +251,7 @@ def _scan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     if coast is not None:
         error = ""
         if coast.pos_err_m is not None and coast.rot_err_deg is not None:
-            error = f"; error at its end {_mm(coast.pos_err_m)}, {coast.rot_err_deg:.3f} deg"
+            error = f"; error at its end {length_text(coast.pos_err_m)}, {coast.rot_err_deg:.3f} deg"
         yield "longest coast", f"{coast.scans} scans, {coast.duration_s:.2f} s{error}"
 
 
@@ -309,14 +310,13 @@ def _plan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
 def _flight_facts(capture: Capture) -> Iterable[tuple[str, str]]:
     if capture.plan_miss_m is not None:
         found, n = capture.plan_miss_m, capture.plan_miss_m.count
-        yield "hindsight", f"{n} plans miss by {_mm(found.median)} in the median, {_mm(found.max)} at most"
+        yield (
+            "hindsight",
+            f"{n} plans miss by {length_text(found.median)} in the median, {length_text(found.max)} at most",
+        )
     if capture.miss is not None:
         speed = "" if capture.miss.speed_mps is None else f", {1000 * capture.miss.speed_mps:.3g} mm/s"
         turn = "" if capture.miss.rotation_deg is None else f", {capture.miss.rotation_deg:.3g} deg"
-        yield "gripper", f"closed {_mm(capture.miss.position_m)}{speed}{turn} from the true grasp point"
+        yield "gripper", f"closed {length_text(capture.miss.position_m)}{speed}{turn} from the true grasp point"
     if capture.actions:
         yield "actions", ", ".join(f"{action} {count} scans" for action, count in capture.actions.items())
-
-
-def _mm(metres: float) -> str:
-    return f"{1000 * metres:.3g} mm"

@@ -13,7 +13,7 @@ from itertools import chain, groupby
 from typing import Any
 
 from avsreplay.report.summary import NIS_LIMIT, Summary
-from avsreplay.report.summary_parts import events, times
+from avsreplay.report.summary_parts import events, length_text, times
 from avsreplay.rows import Row
 
 USED_FAIL, USED_CHECK = 0.5, 0.9  # share of the scans without an injected harmful fault that updated the filter
@@ -120,7 +120,7 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     found = (
         _use(rows, summary),
         _errors(rows, extent_m),
-        _faults(summary),
+        _faults(summary, extent_m),
         _filter(rows, summary),
         _data(rows, summary),
     )
@@ -171,12 +171,17 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     fit = _median([row for row in rows if row.gamma == 1], "rms_m")
     if fit is not None and extent_m and fit > FIT_CHECK * extent_m:
         share = 100 * fit / extent_m
-        text = f"the scans fit the model badly: median rms {1000 * fit:.3g} mm, {share:.1f} % of its extent"
+        text = f"the scans fit the model badly: median rms {length_text(fit)}, {share:.1f} % of its extent"
         yield Concern(Grade.CHECK, f"{text}; check unit, scale and model")
 
 
-def _faults(summary: Summary) -> Iterator[Concern]:
+def _faults(summary: Summary, extent_m: float | None) -> Iterator[Concern]:
     faults = summary.faults
+    used = max((e.peak_used.pos_err_m or 0.0 for e in faults.episodes if e.harmful), default=0.0)
+    if extent_m and used > ERROR_CHECK * extent_m:
+        grade = Grade.FAIL if used > ERROR_FAIL * extent_m else Grade.CHECK
+        text = f"{faults.missed_scans} of {faults.harmful_scans} scans with a harmful fault were used"
+        yield Concern(grade, f"{text}, with a position error up to {length_text(used)}")
     missed = [e for e in faults.episodes if e.harmful and not e.detected]
     if missed:
         first = f"{_plain(missed[0].kind)} at {missed[0].start_s:.1f} s"
@@ -207,7 +212,10 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         text = f"the estimate was reinitialised {times(summary.reinitialised)}, first at {when:.1f} s"
         yield Concern(Grade.CHECK, f"{text}, because the poses contradicted it")
     yield from (Concern(Grade.CHECK, text) for text in events(rows, summary.velocity_changes, summary.drift))
-    yield from _failed_checks(rows, summary)
+    if summary.violations:
+        when = next(row.t_s for row in rows if row.violations)
+        text = f"the estimate failed {summary.violations} consistency checks, the first at {when:.1f} s"
+        yield Concern(Grade.CHECK, text)
     searches = [row for row in rows[1:] if row.guess == "acquired" and row.gamma == 1]
     if searches and rows[0].gamma == 1:
         text = f"the pose was searched again {times(len(searches))}, first at {searches[0].t_s:.1f} s"
@@ -218,14 +226,6 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         yield Concern(Grade.CHECK, f"the estimate did not converge, so no capture is planned{blocks}")
     elif rows and not t1.at_end:
         yield Concern(Grade.CHECK, f"convergence, reached at {t1.t1_s:.1f} s, does not hold at the end")
-
-
-def _failed_checks(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
-    """Consistency checks of the estimate that need no ground truth."""
-    if summary.violations:
-        when = next(row.t_s for row in rows if row.violations)
-        text = f"the estimate failed {summary.violations} consistency checks, the first at {when:.1f} s"
-        yield Concern(Grade.CHECK, text)
 
 
 def _data(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
@@ -298,14 +298,12 @@ def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
         if flagged:
             yield _flagged_moment(rows, places)
     used = [k for k, row in enumerate(rows) if row.gamma]  # the others belong to their interval
-    for column, unit, factor, name in (
-        ("pos_err_m", "mm", 1000.0, "position error"),
-        ("rot_err_deg", "deg", 1.0, "attitude error"),
-    ):
+    for column, name in (("pos_err_m", "position error"), ("rot_err_deg", "attitude error")):
         typical = _median(rows, column)
         for value, k in _largest(rows, used, column):
             if typical and value > 3.0 * typical:
-                text = f"{name} {factor * value:.3g} {unit}, {value / typical:.0f} times the median"
+                size = length_text(value) if column == "pos_err_m" else f"{value:.3g} deg"
+                text = f"{name} {size}, {value / typical:.0f} times the median"
                 yield value / typical, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
     for value, k in _largest(rows, used, "nis"):
         if value > NIS_LIMIT:
@@ -321,7 +319,7 @@ def _largest(rows: Sequence[Row], places: Sequence[int], column: str) -> list[tu
 def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, Moment]:
     worst = max(places, key=lambda k: rows[k].pos_err_m or 0.0)
     largest = rows[worst].pos_err_m
-    error = "" if largest is None else f", position error up to {1000 * largest:.3g} mm"
+    error = "" if largest is None else f", position error up to {length_text(largest)}"
     count = "1 scan" if len(places) == 1 else f"{len(places)} scans"
     span = rows[places[0]].t_s, rows[places[-1]].t_s
     return 3.0 * len(places), Moment(worst, *span, f"{count} not used{error}", _cause(rows, places[0]))
