@@ -158,11 +158,11 @@ def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None, registrar: R
         return [Advice("check", "scans", "the examined scans hold no points")]
     scan_m = float(np.median([diameter(cloud) for cloud in clouds]))
     if surface is None:
-        text = f"there is no model; the scans measure {scan_m:.3g} m"
+        text = f"there is no model; the scans measure {_metres(scan_m)}"
         return [Advice("fail", "model", text, "--model FILE or --model auto")]
     model_m = diameter(surface.vertices, trimmed=False)
     ratio = scan_m / model_m if model_m else np.inf
-    said = f"the scans measure {scan_m:.3g} m, the model {model_m:.3g} m"
+    said = f"the scans measure {_metres(scan_m)}, the model {_metres(model_m)}"
     if _LEAST <= ratio <= _WHOLE:
         return [Advice("ok", "size", said)]
     if ratio > _MOST and _unit(ratio) is None and (crop := _crop_of_located(clouds, surface, registrar)):
@@ -232,7 +232,7 @@ def _target(cloud: NDArray[Any], model_m: float, gap: float = 0.1) -> Array | No
 
 
 def _of_size(model_m: float) -> str:
-    return f"a group of points has the size of the model ({model_m:.3g} m)"
+    return f"a group of points has the size of the model ({_metres(model_m)})"
 
 
 def _crop_of_located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Registrar | None) -> Advice | None:
@@ -285,6 +285,11 @@ def _transforms(info: LogInfo, source: Source) -> list[Advice]:
         text = f"the frame of the clouds, '{shown(frame)}', moves in '{shown(root)}'"
         return [Advice("check", "transforms", text, f"--fixed-frame {shown(root)}")]
     return [Advice("ok", "transforms", names)]
+
+
+def _metres(length: float) -> str:
+    """Three significant figures without an exponent."""
+    return f"{float(f'{length:.3g}'):.10g} m"
 
 
 def _truth(info: LogInfo) -> list[Advice]:
