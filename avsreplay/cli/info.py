@@ -161,7 +161,8 @@ def _time(t_ns: int | None) -> str:
 def _model(info: LogInfo) -> str:
     if info.model is None:
         return "none (give --model)"
-    return f"{info.model}: {info.model_vertices} vertices, {info.model_faces} triangles, diagonal {info.model_extent_m:.6g} m"
+    size = f"{info.model_vertices} vertices, {info.model_faces} triangles, diagonal {info.model_extent_m:.6g} m"
+    return f"{info.model}: {size}"
 
 
 def _clock(clock: ClockSummary) -> str:

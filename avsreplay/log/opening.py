@@ -18,7 +18,7 @@ from avsreplay.log.header import HEADER_RECORD, decode_header, octahedron, parse
 from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import MAGIC
-from avsreplay.log.options import ASSUMED_HZ, NO_TIMES, Loss, SourceOptions, TopicInfo
+from avsreplay.log.options import Loss, SourceOptions, TopicInfo
 from avsreplay.log.pose_files import TimedPoses, read_conf, read_poses, read_times, seconds_to_ns
 from avsreplay.log.ros1_bag import ROS1_MAGIC, Ros1Bag
 from avsreplay.log.scan_files import by_number, scan_files
@@ -201,25 +201,16 @@ def _open_pose_file(path: Path, options: SourceOptions) -> Source:
     for flag, value in (("--topic", options.topic), ("--truth-topic", options.truth_topic)):
         if value is not None:
             raise UsageError("a pose file has no topics", where=f"{shown(path)}, {flag}", hint="leave it out")
-    poses = streams.PoseFile(path, options.rate_hz or ASSUMED_HZ)
+    poses = streams.PoseFile(path, options.scan_rate_hz)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     header = LogHeader(
         surface=surface and scaled(surface, options.model_factor),
-        notes={"source": "pose file", "times": _times_note(poses.timed, options)},
+        notes={"source": "pose file", "times": options.times_note(poses.timed)},
     )
     truth = streams.GroundTruth()
     if options.truth_file is not None:
         truth = streams.GroundTruth(*streams.file_truth(read_poses(options.truth_file), options.truth_gap_s))
     return Source(path, poses, _pose_header(header, options), options, truth, files=[path])
-
-
-def _times_note(given: bool, options: SourceOptions) -> str:
-    """Where the times of a log without a clock come from."""
-    if given:
-        return "of the files"
-    return (
-        f"{NO_TIMES}: {ASSUMED_HZ:g} Hz is assumed" if options.rate_hz is None else f"{options.rate_hz:g} Hz, as given"
-    )
 
 
 _STORAGE = (".mcap", ".db3")
@@ -317,13 +308,12 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     found = read_poses(pose_file) if pose_file is not None and not by_name else None
     files = scan_files(path, tuple(by_name), options.model)
     times = _times(path, files, found)
-    clouds = streams.FolderClouds(files, options.rate_hz or ASSUMED_HZ, options.max_message_mib << 20, times)
+    clouds = streams.FolderClouds(files, options.scan_rate_hz, options.max_message_mib << 20, times)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     surface = surface and scaled(surface, options.model_factor)
-    notes = {"source": "folder", "times": _times_note(times is not None, options)}
     ground_truth = _ground_truth(files, clouds.header_ns, by_name, found, options)
     besides = [p for p in (pose_file, path / _TIME_FILE) if p is not None and p.is_file() and p.is_relative_to(path)]
-    header = LogHeader(surface=surface, notes=notes)
+    header = LogHeader(surface=surface, notes={"source": "folder", "times": options.times_note(times is not None)})
     return Source(path, clouds, header, options, ground_truth, files=[*files, *besides])
 
 

@@ -121,6 +121,21 @@ class SourceOptions(Settings):
             raise ValueError(f"crop_range {self.crop_range} is empty")
 
     @property
+    def scan_rate_hz(self) -> float:
+        """Return the rate of scans without times [Hz]."""
+        return self.rate_hz or ASSUMED_HZ
+
+    def times_note(self, given: bool) -> str:
+        """Return where the times of a log without a clock come from.
+
+        Args:
+            given: whether its files state them.
+        """
+        if given:
+            return "of the files"
+        return f"{NO_TIMES}: {ASSUMED_HZ:g} Hz is assumed" if self.rate_hz is None else f"{self.rate_hz:g} Hz, as given"
+
+    @property
     def model_factor(self) -> float:
         """Return the factor from the coordinates of the model to metres."""
         return self.model_unit.metres * self.model_scale
