@@ -30,11 +30,11 @@ MARKED = [page for page in PAGES if any(block["mark"] for block in _blocks(page)
 QUICK = {"docs/index.md"}
 SHORT = {"AVSREPLAY_RECORD_DURATION_S": "12", "AVSREPLAY_SWEEP_LIMIT": "2"}  # of what a page simulates itself
 ELSEWHERE = {  # command of a block that needs more than a folder: the test that runs such a command
-    "avsreplay run long.mcap": "test_checkpoint.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption",
+    "avsreplay run long.mcap": "test_binary_files.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption",
     "avsreplay run tumble.mcap --rerun": "test_run.py::test_a_run_is_written_for_rerun",
     "avsreplay sweep docs/campaigns/blackouts.toml -o": "test_sweep_run.py::test_a_worker_killed_in_the_middle",
     "avsreplay sweep docs/campaigns/blackouts.toml --run": "test_sweep_run.py::test_the_worst_run_is_made_again",
-    "avsreplay sweep docs/campaigns/faults.toml": "test_sweep_fault_kinds.py::test_",
+    "avsreplay sweep docs/campaigns/faults.toml": "test_sweep_statistics.py::test_the_campaign_of_faults_has_every_kind",
     "avsreplay run $D/stanford-dragon": "test_real.py::test_the_folder_itself_runs",
     "avsreplay run $D/primesense-bunny": "test_real.py::test_the_depth_views_of_a_figure",
     "avsreplay run toss.csv": "test_real.py::test_gravity_is_found",
