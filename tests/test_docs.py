@@ -34,7 +34,7 @@ ELSEWHERE = {  # command of a block that needs more than a folder: the test that
     "avsreplay run tumble.mcap --rerun": "test_run.py::test_a_run_is_written_for_rerun",
     "avsreplay sweep docs/campaigns/blackouts.toml -o": "test_sweep_run.py::test_a_worker_killed_in_the_middle",
     "avsreplay sweep docs/campaigns/blackouts.toml --run": "test_sweep_run.py::test_the_worst_run_is_made_again",
-    "avsreplay sweep docs/campaigns/faults.toml": "test_sweep_statistics.py::test_the_campaign_of_faults_has_every_kind",
+    "avsreplay sweep docs/campaigns/faults.toml": "test_sweep_statistics.py::test_the_campaign_of_faults_has_every",
     "avsreplay run $D/stanford-dragon": "test_real.py::test_the_folder_itself_runs",
     "avsreplay run $D/primesense-bunny": "test_real.py::test_the_depth_views_of_a_figure",
     "avsreplay run toss.csv": "test_real.py::test_gravity_is_found",
