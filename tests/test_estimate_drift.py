@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import estimate_surprises as surprises
 import numpy as np
 import pytest
@@ -9,9 +11,9 @@ import tumbling
 
 from avsreplay import geometry
 from avsreplay.estimate.chart import to_chart
-from avsreplay.estimate.drift import _equivalents, find_drift
+from avsreplay.estimate.drift import _NONE, _equivalents, _without, find_drift
 from avsreplay.estimate.dynamics import propagate_state
-from avsreplay.estimate.initialise import PoseFix
+from avsreplay.estimate.initialise import PoseFix, poses_of
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import Pose
 
@@ -81,3 +83,29 @@ def test_a_constant_torque_is_reported_and_tracked() -> None:
     assert result.track.manoeuvres == ()
     assert max(result.ratio[80:]) < 4.0
     assert result.violations == []
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_a_random_torque_and_force_are_no_drift(seed: int) -> None:
+    """3e-5 rad/s^1.5 and m/s^1.5: the rate wanders, and a constant torque would explain much of it."""
+    result = surprises.run(surprises.Case("random", random=(3e-5, 3e-5), seconds=60.0), seed)
+    assert result.track is not None
+    assert result.track.drift is None
+    assert result.track.manoeuvres == ()
+
+
+def test_removing_a_drift_gives_the_poses_of_free_motion() -> None:
+    """Against the truth of another integrator, DOP853, pushed in small steps."""
+    pushed, free = (surprises.Case("t", torque=torque, seconds=40.0) for torque in (2e-4, 0.0))
+    times, states, _, _ = surprises.world_of(pushed, 5)
+    fixes = tuple(PoseFix(round(t * 1e9), x.T_ac, np.eye(6)) for t, x in zip(times, states, strict=True))
+    straight = surprises.world_of(free, 5)[1]
+    direction = surprises._direction(np.random.Generator(np.random.PCG64([5, 5])))
+    found = replace(_NONE, u=np.concatenate([2e-4 * direction, np.zeros(3)]))
+    left = _without(poses_of(fixes), to_chart(states[0]), found)
+    moved, rest = (
+        [geometry.angle(geometry.multiply(geometry.conjugate(a.T_ac.q), q)) for a, q in zip(straight, qs, strict=True)]
+        for qs in ([x.T_ac.q for x in states], left.q)
+    )
+    assert max(moved) > 0.1
+    assert max(rest) < 0.02 * max(moved)

@@ -8,10 +8,18 @@ import tumbling
 
 from avsreplay import geometry
 from avsreplay.estimate.batch import Problem
+from avsreplay.estimate.batch_covariance import sandwich
 from avsreplay.estimate.chart import to_chart
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.noise import line_of_sight_1s
-from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, estimate_levels, sandwich
+from avsreplay.estimate.noise_levels import (
+    _DENSITIES,
+    MOST_POINTS,
+    NO_LEVELS,
+    NoiseLevels,
+    _expected,
+    estimate_levels,
+)
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import Pose
@@ -65,6 +73,24 @@ def test_the_density_of_a_random_torque_is_found_within_a_factor_of_two(seed: in
     levels, _ = levels_of(fixes(world.states, seed), world.states[0])
     assert 5e-5 < levels.torque < 2e-4
     assert levels.white == pytest.approx((1.0, 1.0), rel=0.4)
+
+
+def test_a_density_that_the_poses_cannot_tell_is_the_mean_of_what_they_allow() -> None:
+    """Poses of 4 mm over 15 s do not exclude a force of 1e-5 m/s^1.5; those of 100 s do."""
+    found = []
+    for seconds in (15.0, 100.0):
+        world = tumbling.draw(1, seconds=seconds, hz=HZ, sigma_max=0.85)
+        found.append(levels_of(fixes(world.states, 1), world.states[0])[0].force)
+    assert found[0] > 1e-5
+    assert found[1] < 5e-6
+
+
+def test_the_expected_density_is_that_of_a_certain_likelihood_and_little_of_an_equal_one() -> None:
+    peak = np.where(np.isclose(_DENSITIES, 1e-4, rtol=0.1), 0.0, -1e3) + 50.0
+    assert _expected(peak) == pytest.approx(1e-4, rel=0.1)
+    assert _expected(np.full(len(_DENSITIES), -50.0)) < 1e-12
+    bounded = np.where(_DENSITIES < 1.1e-5, 0.0, -1e3)  # anything up to 1e-5 is as likely as none
+    assert 5e-7 < _expected(bounded) < 5e-6
 
 
 def test_a_given_density_is_not_changed() -> None:

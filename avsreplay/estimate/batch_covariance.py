@@ -27,6 +27,7 @@ from avsreplay.estimate.dynamics import (
     torque_density,
 )
 from avsreplay.estimate.error_state import DIM
+from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Forecast, State
 
@@ -141,6 +142,38 @@ def _profile(
             there = fitted.chart.moved(side * axis)
     off, best = min(found, key=lambda f: f[0])
     return best if off < float(np.log(_LOST)) else None
+
+
+def sandwich(problem: Problem, points: Poses, levels: NoiseLevels) -> tuple[Array, Array]:
+    """How correlated errors change the covariance of a fit that takes the poses as independent.
+
+    Args:
+        problem: linearised at the minimum of its cost, with the noise factors of the fit.
+        points: the poses of the problem.
+        levels: variance components.
+
+    Returns:
+        M (20, 20) in chart steps: M P M' is the covariance of the estimate, P that of the fit. And the inflation (2,)
+        of independent noise of attitude and position with the same effect in the mean over the directions determined.
+    """
+    J = problem.core.rows()[1] @ to_errors(problem.chart)
+    n, scale = len(points), problem.prior.one_sigma
+    told, basis = np.linalg.eigh(problem.core.normal()[0] * np.outer(scale, scale))
+    told = np.sqrt(np.maximum(told, 1e-15 * told[-1]))
+    L, inverse = scale[:, None] * basis / told, told[:, None] * basis.T / scale  # P = L L'
+    P, total = L @ L.T, np.linalg.inv(problem.prior.P)
+    plain = levels.factors(mean_share(points))
+    V, inflation = pose_error_covariance(points, levels, problem.factors), np.ones(BLOCKS)
+    for b in range(BLOCKS):
+        rows = J[:, 3 * b : 3 * b + 3].reshape(n, -1)
+        columns = rows.reshape(-1, 20)
+        found = columns.T @ (V[b] @ rows).reshape(-1, 20)
+        total = total + found
+        alone = float(np.sum(P * (columns.T @ columns)))
+        inflation[b] = float(np.sum(P * found)) / alone * float(problem.factors[b] / plain[b]) ** 2
+    values, axes = np.linalg.eigh(L.T @ total @ L)
+    M = (L @ axes) @ (np.sqrt(np.maximum(values, 0.0))[:, None] * (axes.T @ inverse))
+    return np.asarray(M), np.maximum(inflation, 1.0)
 
 
 def final_mixture(

@@ -149,7 +149,7 @@ class BatchSchedule:
     def noise_levels(self, track: Track) -> tuple[float, float]:
         """Root densities of torque [rad/s^1.5] and force [m/s^1.5], given or estimated.
 
-        Where they are given, those of a drift apply if larger. White noise of root density q changes the rate by q
+        Those of a drift apply if larger. White noise of root density q changes the rate by q
         sqrt(T) within T, a constant acceleration a by a T; the two are equal over ``_DRIFT_S``. The torque acts on the
         rate through B(sigma), which is 3 for a sphere.
         """
@@ -158,8 +158,7 @@ class BatchSchedule:
             found[0] = _LEAST_TORQUE
         sizes = (0.0, 0.0) if drift is None else (float(np.linalg.norm(v)) for v in (drift.rate, drift.velocity))
         for k, (given, size) in enumerate(zip(self.params.disturbances, sizes, strict=True)):
-            if given is not None:
-                found[k] = max(given, size * np.sqrt(_DRIFT_S) / (SPHERE, 1.0)[k])
+            found[k] = max(found[k] if given is None else given, size * np.sqrt(_DRIFT_S) / (SPHERE, 1.0)[k])
         return found[0], found[1]
 
     def _levels(self, track: Track) -> NoiseLevels:

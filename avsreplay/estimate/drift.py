@@ -10,16 +10,17 @@ in ``hypotheses``. The noise of the poses is that of the residuals with the drif
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from avsreplay import geometry
 from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import rotation_history
+from avsreplay.estimate.dynamics import propagate_state, rotation_history
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
-from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, disturbance_evidence
+from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, disturbed_likelihood
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import Array
@@ -29,25 +30,11 @@ _ONSETS = 12  # number of onsets tried, the first at the epoch
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
 _STEP_RAD = 0.1  # step of the integral B
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
-_CONSTANT = 5.0  # log odds of a drift over random disturbances from which it is reported
+_CONSTANT = 3.0  # log odds of a drift, where random disturbances are possible, from which it is reported
+_ROUNDS = 3  # of linearisation
+_SCALES = (1.0, 0.1, 0.01)  # of the prior 1 sigma, where a drift is compared with disturbances of any density
 _KINDS = (slice(0, 3), slice(3, 6), slice(0, 6))  # torque, force, both
 _PER_KIND = (0.0, 0.0, math.log(1e-2))  # log prior odds of each
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Linear:
-    """Residuals e (6n,) and Jacobian J (6n, 20) in the chart, of unit variance.
-
-    ``G`` (6n, 12) is the Jacobian by attitude to velocity at the epoch; ``info`` and ``off`` are those of the prior.
-    ``late`` (6n,) are the times of the rows.
-    """
-
-    e: Array
-    J: Array
-    G: Array
-    info: Array
-    off: Array
-    late: Array
 
 
 def find_drift(
@@ -68,39 +55,28 @@ def find_drift(
         scale: prior 1 sigma of the angular acceleration [rad/s2] and of the acceleration [m/s2].
         levels: noise levels; random disturbances explain the poses as well, and better unless they are constant.
     """
-    poses = poses_of(fixes)
+    poses, widths = poses_of(fixes), np.repeat(scale, 3)
     prior = weak_prior(poses, params)
-    points = normal_points(poses, start, factors)
-    fitted = fit(points, start, prior, FitParams(rescale=False), factors)
-    if not fitted.converged:
-        return None
-    widths = np.repeat(scale, 3)
-    problem = Problem(points, prior, factors, fitted.chart)
-    onsets = _onsets(points.times_s)
-    B = _equivalents(to_state(fitted.chart), np.concatenate([points.times_s, onsets]))
-    here, there = B[: len(points)], B[len(points) :]
-    linear = _linear(problem, fitted.chart)
-    columns = _columns(linear, here, there, onsets)
-    inflation = 1.0
-    for _ in range(2):  # with the claimed noise, then with that of the residuals without the drift
-        found = _explained(linear, columns, onsets, widths, inflation)
-        k = int(np.argmax([f.log_odds for f in found]))
-        best, inflation = found[k], _remaining_noise(linear, columns[k], found[k])
-    if best.log_odds < _FOUND or best.log_odds - _random(poses, fitted.chart, prior, factors, levels) < _CONSTANT:
+    free = frame = _about(poses, start, prior, factors, _NONE)
+    for k in range(_ROUNDS):  # about free motion, then about the motion with the drift that was found
+        if free is None or frame is None:
+            return None
+        onsets = _onsets(frame.points.times_s)
+        found = _compared(frame, onsets, widths)
+        best = max(found, key=lambda f: f.log_odds)
+        if best.log_odds < _FOUND:
+            return None
+        if k + 1 < _ROUNDS:
+            frame = _about(poses, frame.chart, prior, factors, best)
+    if frame is None or free is None or not _constant(frame, free, levels, best, widths):
         return None
     odds = np.array([f.log_odds for f in found])
     weight = np.exp(odds - odds.max())
     mean = float(weight @ onsets / weight.sum())
-    spacing = float(np.diff(np.append(onsets, points.times_s[-1])).max())
+    spacing = float(np.diff(np.append(onsets, poses.times_s[-1])).max())
     spread = math.hypot(math.sqrt(float(weight @ (onsets - mean) ** 2 / weight.sum())), spacing / math.sqrt(12.0))
     onset_ns = fixes[0].t_ns + round(best.onset_s * 1e9)
     return Drift(onset_ns, spread, best.u[3:], best.u[:3], best.P, fixes[-1].scan_ns)
-
-
-def _random(poses: Poses, chart: Chart, prior: Prior, factors: Array, levels: NoiseLevels) -> float:
-    """Log odds of random disturbances over free motion."""
-    points = normal_points(poses, chart, factors, MOST_POINTS)
-    return disturbance_evidence(points, Problem(points, prior, factors, chart), levels)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,6 +88,99 @@ class _Found:
     u: Array
     P: Array
     y: Array
+
+
+_NONE = _Found(0.0, 0.0, np.zeros(6), np.zeros((6, 6)), np.zeros(20))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Frame:
+    """The poses about a fitted motion with a ``drift``, or without.
+
+    Attributes:
+        poses, points: with the effect of the drift removed, and normal points of them.
+        chart: of the fit.  problem: the cost of the points, linearised there.
+        e, J: white residuals (6n,), extrapolated to no drift, and their Jacobian (6n, 20) in the chart.
+        G: (n, 6, 12) Jacobian by attitude to velocity at the epoch.
+        info, off: information (20, 20) of the prior and its product with the offset from the prior's mean.
+    """
+
+    poses: Poses
+    points: Poses
+    chart: Chart
+    drift: _Found
+    problem: Problem
+    e: Array
+    J: Array
+    G: Array
+    info: Array
+    off: Array
+
+
+def _about(poses: Poses, start: Chart, prior: Prior, factors: Array, drift: _Found) -> _Frame | None:
+    """The frame of a fit to all poses with a drift; None where the fit does not converge."""
+    poses = _without(poses, start, drift) if drift.u.any() else poses
+    points = normal_points(poses, start, factors)
+    fitted = fit(points, start, prior, FitParams(rescale=False), factors)
+    if not fitted.converged:
+        return None
+    return _linearised(poses, points, Problem(points, prior, factors, fitted.chart), drift)
+
+
+def _linearised(poses: Poses, points: Poses, problem: Problem, drift: _Found) -> _Frame:
+    chart = problem.chart
+    e, H = problem.core.rows()
+    G = H[:, :, :12]
+    info = np.asarray(np.linalg.inv(problem.prior.P), dtype=np.float64)
+    if drift.u.any():
+        e = e - _columns(G, points.times_s, chart, drift.onset_s) @ drift.u
+    off = info @ chart.minus(problem.prior.mean)
+    J = (H @ to_errors(chart)).reshape(e.size, -1)
+    return _Frame(poses, points, chart, drift, problem, e.reshape(-1), J, G, info, off)
+
+
+def _without(poses: Poses, start: Chart, drift: _Found) -> Poses:
+    """The poses as they would be without the drift: it acts as two impulses in each interval."""
+    x = pushed = to_state(start)
+    q, t, then = poses.q.copy(), poses.t.copy(), 0.0
+    for k, at in enumerate(poses.times_s.tolist()):
+        h, lasts = at - then, at - max(then, drift.onset_s)
+        half = 0.5 * max(lasts, 0.0) * drift.u
+        x, _ = propagate_state(x, h)
+        pushed = replace(pushed, w_b=pushed.w_b + half[:3], v_a=pushed.v_a + half[3:])
+        pushed, _ = propagate_state(pushed, h)
+        pushed = replace(pushed, w_b=pushed.w_b + half[:3], v_a=pushed.v_a + half[3:])
+        free, drifted, then = x.T_ac, pushed.T_ac, at
+        q[k] = geometry.multiply(q[k], geometry.multiply(geometry.conjugate(drifted.q), free.q))
+        t[k] += free.t - drifted.t
+    return replace(poses, q=q, t=t)
+
+
+def _constant(frame: _Frame, free: _Frame, levels: NoiseLevels, best: _Found, widths: Array) -> bool:
+    """Return whether a constant disturbance explains the poses better than random ones, which may be there as well."""
+    return _evidence(frame, levels, best, widths) - _evidence(free, levels, best, None) >= _CONSTANT
+
+
+def _evidence(frame: _Frame, levels: NoiseLevels, drift: _Found, widths: Array | None) -> float:
+    """Log likelihood of the poses with random disturbances of the drift's kind, and with a constant one.
+
+    ``widths`` is its prior; None leaves the constant one out.
+    """
+    problem = frame.problem
+    points = normal_points(frame.poses, frame.chart, problem.factors, MOST_POINTS)
+    coarse = _linearised(
+        frame.poses, points, Problem(points, problem.prior, problem.factors, frame.chart, np.inf), _NONE
+    )
+    kinds, open_ = [k for k in (0, 1) if drift.u[3 * k : 3 * k + 3].any()], np.flatnonzero(drift.u)
+    if widths is None:
+        return min(disturbed_likelihood(points, coarse.problem, levels, k) for k in kinds)
+    unknown = (_columns(coarse.G, points.times_s, frame.chart, frame.drift.onset_s) * widths)[:, :, open_]
+    size = (frame.drift.u / widths)[open_]
+    each = [
+        [disturbed_likelihood(points, coarse.problem, levels, k, scale * unknown, size / scale) for scale in _SCALES]
+        for k in kinds
+    ]
+    return min(float(np.logaddexp.reduce(found)) - math.log(len(_SCALES)) for found in each)
 
 
 def _onsets(times_s: Array) -> Array:
@@ -137,26 +206,32 @@ def _equivalents(x: State, times_s: Array) -> Array:
     return B
 
 
-def _linear(problem: Problem, chart: Chart) -> _Linear:
-    e, H = problem.core.rows()
-    info = np.asarray(np.linalg.inv(problem.prior.P), dtype=np.float64)
-    J, G = (H @ to_errors(chart)).reshape(-1, H.shape[2]), H[:, :, :12].reshape(-1, 12)
-    off = info @ chart.minus(problem.prior.mean)
-    return _Linear(e.reshape(-1), J, G, info, off, np.repeat(problem.poses.times_s, e.shape[1]))
+def _columns(G: Array, times_s: Array, chart: Chart, onset_s: float) -> Array:
+    """White columns (n, 6, 6) of the residuals by the drift since the onset."""
+    B = _equivalents(to_state(chart), np.append(times_s, onset_s))
+    return np.asarray((G @ (B[:-1] - B[-1])) * (times_s > onset_s)[:, None, None])
 
 
-def _columns(linear: _Linear, here: Array, there: Array, onsets: Array) -> Array:
-    """White columns (k, 6n, 6) of the residuals by the drift since each onset (k,)."""
-    now = (linear.G.reshape(len(here), -1, 12) @ here).reshape(-1, 6)
-    return np.asarray((now - linear.G @ there) * (linear.late > onsets[:, None])[:, :, None])
+def _compared(frame: _Frame, onsets: Array, widths: Array) -> list[_Found]:
+    """The most likely drift from each onset on, with the claimed noise, then with that of the residuals without it."""
+    n, times = len(frame.points), frame.points.times_s
+    B = _equivalents(to_state(frame.chart), np.concatenate([times, onsets]))
+    here, late = (frame.G @ B[:n]).reshape(-1, 6), np.repeat(times, 6) > onsets[:, None]
+    columns = (here - frame.G.reshape(-1, 12) @ B[n:]) * late[:, :, None]
+    inflation = 1.0
+    for _ in range(2):
+        found = _explained(frame, columns, onsets, widths, inflation)
+        k = int(np.argmax([f.log_odds for f in found]))
+        inflation = _remaining_noise(frame, columns[k], found[k])
+    return found
 
 
-def _explained(linear: _Linear, columns: Array, onsets: Array, widths: Array, inflation: float) -> list[_Found]:
+def _explained(linear: _Frame, columns: Array, onsets: Array, widths: Array, inflation: float) -> list[_Found]:
     """The drift since each onset: the kind with the greatest evidence. ``inflation`` is on the variance of the poses.
 
     Args:
         linear: residuals and their Jacobian.
-        columns: of ``_columns``.
+        columns: (k, 6n, 6) of the drift since each onset.
         onsets: (k,) [s].
         widths: (6,) prior 1 sigma of torque and force.
         inflation: as said.
@@ -185,7 +260,7 @@ def _explained(linear: _Linear, columns: Array, onsets: Array, widths: Array, in
     return [found for found in best if found is not None]
 
 
-def _remaining_noise(linear: _Linear, columns: Array, best: _Found) -> float:
+def _remaining_noise(linear: _Frame, columns: Array, best: _Found) -> float:
     """Variance of the white residuals with the drift removed, times their integrated autocorrelation."""
     left = (linear.e + linear.J @ best.y + columns @ best.u).reshape(-1, 6)
     dof = max(left.size - 26, 6)

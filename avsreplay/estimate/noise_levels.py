@@ -9,12 +9,16 @@ The residuals of a fit are a sum of independent parts whose covariances are know
 
 Attitude and position have factors of their own, so that there are six. They are estimated from some tens of normal
 points by the average-information algorithm (Gilmour, Thompson and Cullis, Biometrics 51, 1995), which takes the degrees
-of freedom of the fit into account; a factor whose derivative is negative at zero is zero. Differences within the normal
-points give the independent part of the errors as well. The claimed noise is the prior, worth a few poses.
+of freedom of the fit into account. Differences within the normal points give the independent part of the errors as
+well. The claimed noise is the prior, worth a few poses.
+
+The poses often cannot tell a disturbance from none although it matters for the velocity. Therefore its density is not
+the most likely one, but the mean over all candidates, none among them, weighted by their likelihood.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -33,9 +37,8 @@ FEWEST = 12  # poses from which the levels are estimated
 _VIEW_RAD = 0.5  # 1 sigma of the correlation of the common errors over the direction of view
 _CLAIMED_DOF, _LAW_DOF = 6.0, 1.0  # weight of the prior of the independent and of the common errors
 _STEP = 3.0  # largest factor on a variance in one step
-_SIGNIFICANT = 1.0, 1.0  # standard deviations from which torque and force are taken as real
-_LARGEST_FALL, _NONE = 4.0, 1e-16  # of a disturbance's density from one estimate to the next; density taken as zero
-_LARGEST_SKEW = 3.0  # largest ratio of the mean of a variance to its most likely value
+_DENSITIES = np.logspace(-8.0, 0.0, 65)  # root densities of a disturbance that are compared with none
+_FREE = 0.5  # prior probability that there is none; otherwise all decades of its root density are equally likely
 _SMALL = 0.3  # part of its standard deviation below which a disturbance may become zero
 _MOST_FACTOR = 100.0  # largest factor on a claimed variance
 _WORK = 2 * MOST_POINTS**3  # sum of cubes of the numbers of points over the steps of an estimate
@@ -104,39 +107,8 @@ def _parts(points: Poses) -> tuple[Array, Array]:
     return np.diag(1.0 - share), amplitude[:, None] * view_correlation(points) * amplitude
 
 
-def sandwich(problem: Problem, points: Poses, levels: NoiseLevels) -> tuple[Array, Array]:
-    """How correlated errors change the covariance of a fit that takes the poses as independent.
-
-    Args:
-        problem: linearised at the minimum of its cost, with the noise factors of the fit.
-        points: the poses of the problem.
-        levels: variance components.
-
-    Returns:
-        M (20, 20) in chart steps: M P M' is the covariance of the estimate, P that of the fit. And the inflation (2,)
-        of independent noise of attitude and position with the same effect in the mean over the directions determined.
-    """
-    J = problem.core.rows()[1] @ to_errors(problem.chart)
-    n, scale = len(points), problem.prior.one_sigma
-    told, basis = np.linalg.eigh(problem.core.normal()[0] * np.outer(scale, scale))
-    told = np.sqrt(np.maximum(told, 1e-15 * told[-1]))
-    L, inverse = scale[:, None] * basis / told, told[:, None] * basis.T / scale  # P = L L'
-    P, total = L @ L.T, np.linalg.inv(problem.prior.P)
-    plain = levels.factors(_mean_share(points))
-    V, inflation = pose_error_covariance(points, levels, problem.factors), np.ones(BLOCKS)
-    for b in range(BLOCKS):
-        rows = J[:, 3 * b : 3 * b + 3].reshape(n, -1)
-        columns = rows.reshape(-1, 20)
-        found = columns.T @ (V[b] @ rows).reshape(-1, 20)
-        total = total + found
-        alone = float(np.sum(P * (columns.T @ columns)))
-        inflation[b] = float(np.sum(P * found)) / alone * float(problem.factors[b] / plain[b]) ** 2
-    values, axes = np.linalg.eigh(L.T @ total @ L)
-    M = (L @ axes) @ (np.sqrt(np.maximum(values, 0.0))[:, None] * (axes.T @ inverse))
-    return np.asarray(M), np.maximum(inflation, 1.0)
-
-
-def _mean_share(points: Poses) -> float:
+def mean_share(points: Poses) -> float:
+    """Mean claimed part of the variance of poses that near views have in common."""
     return 0.0 if points.shares is None else float(np.mean(points.shares))
 
 
@@ -159,69 +131,91 @@ def estimate_levels(
         theta[4 + k] = theta[4 + k] if given is None else given**2
     data, parts = _linearised(points, problem)
     for _ in range(min(_MOST_STEPS, max(1, _WORK // n**3))):
-        theta, spread = _improved(theta, open_, parts, data, points)
-    theta[4:] = [
-        value if not free else _mean(float(value), float(one), least)
-        for value, one, least, free in zip(theta[4:], spread[4:], _SIGNIFICANT, open_[4:], strict=True)
-    ]
-    before = np.array([levels.torque, levels.force]) ** 2  # one estimate may fail; disturbances do not end at once
-    theta[4:] = np.where(open_[4:], np.maximum(theta[4:], before / _LARGEST_FALL), theta[4:])
-    theta[4:] = np.where(theta[4:] > _NONE, theta[4:], 0.0)
+        theta = _improved(theta, open_, parts, data, points)
+    likely = theta.copy()
+    for k in (k for k in (4, 5) if open_[k]):
+        theta[k] = _expected(_marginal(likely, k, parts, data)[1]) ** 2
     white, common = (float(theta[0]), float(theta[1])), (float(theta[2]), float(theta[3]))
     slack = _slack(data.e, theta, parts) if theta[4] or theta[5] else 1.0
     torque, force = float(theta[4]) ** 0.5, float(theta[5]) ** 0.5
     return replace(levels, white=white, common=common, torque=torque, force=force, slack=slack)
 
 
-def _mean(variance: float, one_sigma: float, least: float) -> float:
-    """Mean of a variance component with this most likely value, 0 where it is not significant.
+def _expected(log_odds: Array) -> float:
+    """Root density q of a disturbance from the log odds (n,) of ``_DENSITIES`` over none, 0 where none is certain.
 
-    Its distribution is nearly that of the reciprocal of chi-square with as many degrees of freedom as give the standard
-    deviation; it is skew, and its mean above the most likely value.
+    The variance of a velocity that is tracked while it changes at random goes with q^1.5; its mean over all candidates
+    is that of the density returned. A single most likely value would claim too little wherever the poses cannot tell.
     """
-    if variance <= least * one_sigma:
-        return 0.0
-    return variance / max(1.0 - (one_sigma / variance) ** 2, 1.0 / _LARGEST_SKEW)
+    likelihood = np.exp(log_odds - max(float(log_odds.max()), 0.0)) * (1.0 - _FREE) / len(_DENSITIES)
+    free = _FREE * math.exp(-max(float(log_odds.max()), 0.0))
+    mean = float(likelihood @ _DENSITIES**1.5) / (free + float(likelihood.sum()))
+    return math.pow(mean, 2.0 / 3.0)
+
+
+def _marginal(theta: Array, k: int, parts: Sequence[Array], data: _Residuals) -> tuple[float, Array]:
+    """Log likelihood of the poses without disturbance k, and its increase (n,) with the squares of ``_DENSITIES``.
+
+    It is marginal over the initial values, without its constant. In the eigenvectors of what these leave of the
+    disturbance its effects are independent, so that one decomposition gives all densities.
+    """
+    without = theta.copy()
+    without[k] = 0.0
+    root = np.linalg.cholesky(_covariance(without, parts))
+    inverse, prior = np.linalg.inv(root), np.linalg.cholesky(data.info).T
+    columns = np.vstack([inverse @ parts[k], np.zeros((len(prior), parts[k].shape[1]))])
+    Q, R = np.linalg.qr(np.vstack([inverse @ data.J, prior]))
+    e = np.concatenate([inverse @ data.e, prior @ data.off])
+    left = e - Q @ (Q.T @ e)
+    values, vectors = np.linalg.eigh(columns.T @ columns - (columns.T @ Q) @ (Q.T @ columns))
+    along = vectors.T @ (columns.T @ left)
+    none = -0.5 * float(left @ left) - float(np.log(np.abs(np.diagonal(R))).sum() + np.log(np.diagonal(root)).sum())
+    gain = _DENSITIES[:, None] ** 2 * np.maximum(values, 0.0)
+    fitted = _DENSITIES[:, None] ** 2 * along**2 / (1.0 + gain)
+    return none, np.asarray(0.5 * (fitted - np.log1p(gain)).sum(axis=1))
 
 
 def _slack(e: Array, theta: Array, parts: Sequence[Array]) -> float:
     """Mean square of the residuals over that of the pose errors, with a margin for the largest."""
     n = len(e) // 6
     noise = np.concatenate([np.tile(np.diagonal(theta[b] * parts[b] + theta[2 + b] * parts[2 + b]), 3) for b in (0, 1)])
-    return max(1.0, _LARGEST * float(np.sum(e * e / noise)) / (6 * n))
+    return 1.0 + _LARGEST * max(float(np.sum(e * e / noise)) / (6 * n) - 1.0, 0.0)
 
 
-def disturbance_evidence(points: Poses, problem: Problem, levels: NoiseLevels) -> float:
-    """Log likelihood of the poses with the disturbances of ``levels`` over that of free motion.
+def disturbed_likelihood(
+    points: Poses,
+    problem: Problem,
+    levels: NoiseLevels,
+    k: int,
+    columns: Array | None = None,
+    size: Array | None = None,
+) -> float:
+    """Log likelihood of the poses with a random disturbance of unknown density, and other unknowns beside it.
 
     Args:
         points: normal points, at most ``MOST_POINTS``.
         problem: their cost, linearised at the fit.
-        levels: variance components.
+        levels: variance components; those of the errors of the poses and of the other disturbance are used.
+        k: 0 for a random torque, 1 for a random force.
+        columns: (n, 6, m) effect on the whitened residuals of each other unknown at its prior 1 sigma.
+        size: (m,) of these unknowns in the motion about which the residuals are, in 1 sigma.
     """
-    if not (levels.torque or levels.force):
-        return 0.0
     data, parts = _linearised(points, problem)
-    theta = _variances(levels)
-    free = theta.copy()
-    free[4:] = 0.0
-    return _log_likelihood(theta, parts, data) - _log_likelihood(free, parts, data)
+    if columns is not None and size is not None:
+        m = columns.shape[2]
+        J = np.hstack([data.J, np.ascontiguousarray(columns.transpose(1, 0, 2)).reshape(-1, m)])
+        info = np.block([[data.info, np.zeros((20, m))], [np.zeros((m, 20)), np.eye(m)]])
+        data = _Residuals(data.e, J, info, np.concatenate([data.off, size]))
+    none, odds = _marginal(_variances(levels), 4 + k, parts, data)
+    return none + float(np.logaddexp(math.log(_FREE), math.log(1.0 - _FREE) + _log_mean(odds)))
+
+
+def _log_mean(values: Array) -> float:
+    return float(np.logaddexp.reduce(values)) - math.log(len(values))
 
 
 def _variances(levels: NoiseLevels) -> Array:
     return np.array([*levels.white, *levels.common, levels.torque**2, levels.force**2])
-
-
-def _log_likelihood(theta: Array, parts: Sequence[Array], data: _Residuals) -> float:
-    """Of the residuals, marginal over the initial values, without its constant."""
-    V = _covariance(theta, parts)
-    inverse = np.linalg.inv(V)
-    VJ = inverse @ data.J
-    A = data.J.T @ VJ + data.info
-    step = -np.linalg.solve(A, VJ.T @ data.e + data.info @ data.off)
-    left, off = data.e + data.J @ step, data.off + step
-    square = float(left @ inverse @ left + off @ data.info @ off)
-    return -0.5 * (square + float(np.linalg.slogdet(V)[1]) + float(np.linalg.slogdet(A)[1]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -248,8 +242,11 @@ def _linearised(points: Poses, problem: Problem) -> tuple[_Residuals, Sequence[A
 
 def _covariance(theta: Array, parts: Sequence[Array]) -> Array:
     """V (6n, 6n) of the residuals."""
-    V = theta[4] * parts[4] + theta[5] * parts[5]
-    n = len(V) // 6
+    n = len(parts[0])
+    V = np.zeros((6 * n, 6 * n))
+    for density, columns in zip(theta[4:], parts[4:], strict=True):
+        if density > 0.0:
+            V += density * (columns @ columns.T)
     for axis in range(6):
         b, here = axis // 3, slice(axis * n, axis * n + n)
         V[here, here] += theta[b] * parts[b] + theta[2 + b] * parts[2 + b]
@@ -257,13 +254,17 @@ def _covariance(theta: Array, parts: Sequence[Array]) -> Array:
 
 
 def _components(points: Poses, problem: Problem, H: Array) -> Sequence[Array]:
-    """Covariances of the six components at unit factors: (n, n) per axis for the errors, (6n, 6n) for disturbances."""
+    """The six components at unit factors.
+
+    For the errors of the poses their covariance (n, n), the same for three axes; for the disturbances columns
+    (6n, 3(n - 1)), their covariance being columns columns'.
+    """
     n = len(points)
     white, common = _parts(points)
     f = problem.factors**-2.0
     torque, force = _disturbances(points.times_s, problem.chart, H)
     columns = [np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(6 * n, -1) for M in (torque, force)]
-    return (white * f[0], white * f[1], common * f[0], common * f[1], *(M @ M.T for M in columns))
+    return (white * f[0], white * f[1], common * f[0], common * f[1], *columns)
 
 
 def _disturbances(times_s: Array, chart: Chart, H: Array) -> tuple[Array, Array]:
@@ -282,10 +283,8 @@ def _disturbances(times_s: Array, chart: Chart, H: Array) -> tuple[Array, Array]
     return (turn * weight).reshape(n, 6, -1), (push * weight).reshape(n, 6, -1)
 
 
-def _improved(
-    theta: Array, open_: NDArray[np.bool_], parts: Sequence[Array], data: _Residuals, points: Poses
-) -> tuple[Array, Array]:
-    """One step of average information from variance components theta (6,), and their standard deviations (6,)."""
+def _improved(theta: Array, open_: NDArray[np.bool_], parts: Sequence[Array], data: _Residuals, points: Poses) -> Array:
+    """Variance components (6,) after one step of average information from theta (6,)."""
     n = len(points)
     inverse = np.linalg.inv(_covariance(theta, parts))
     VJ = inverse @ data.J
@@ -298,7 +297,8 @@ def _improved(
         if not open_[k]:
             continue
         if k >= 4:
-            applied[k], traces[k] = parts[k] @ Py, float(np.sum(P * parts[k]))
+            applied[k] = parts[k] @ (parts[k].T @ Py)
+            traces[k] = float(np.sum(parts[k] * (P @ parts[k])))
             continue
         for axis in range(3 * (k % 2), 3 * (k % 2) + 3):
             here = slice(axis * n, axis * n + n)
@@ -316,7 +316,7 @@ def _improved(
 def _priors(points: Poses) -> list[tuple[float, float]]:
     """Degrees of freedom and mean of what is known of the first four components besides the normal points."""
     out = []
-    share = _mean_share(points)
+    share = mean_share(points)
     for b in range(BLOCKS):
         dof, total = _CLAIMED_DOF, _CLAIMED_DOF
         if points.within is not None:
@@ -325,23 +325,22 @@ def _priors(points: Poses) -> list[tuple[float, float]]:
     return [*out, (_LAW_DOF, 1.0), (_LAW_DOF, 1.0)]
 
 
-def _stepped(theta: Array, open_: NDArray[np.bool_], score: Array, info: Array) -> tuple[Array, Array]:
-    """The components after a step, each changed by a bounded factor, and their standard deviations.
+def _stepped(theta: Array, open_: NDArray[np.bool_], score: Array, info: Array) -> Array:
+    """The components after a step, each changed by a bounded factor.
 
     A disturbance whose derivative is negative goes to zero once it is a small part of its own standard deviation.
     """
     disturbance = np.arange(6) >= 4
     free = open_ & ((theta > 0.0) | (score > 0.0)) & (np.diagonal(info) > 0.0)
-    out, spread = theta.copy(), np.zeros(6)
+    out = theta.copy()
     if not np.any(free):
-        return out, spread
+        return out
     scale = np.sqrt(np.diagonal(info)[free])
     inverse = np.linalg.pinv(info[np.ix_(free, free)] / np.outer(scale, scale), rcond=1e-9, hermitian=True)
-    spread[free] = np.sqrt(np.diagonal(inverse)) / scale
     factor = np.where(disturbance, _STEP**2, _STEP)[free]
     old, new = theta[free], theta[free] + inverse @ (score[free] / scale) / scale
     started = np.where(old > 0.0, np.clip(new, old / factor, old * factor), np.maximum(new, 0.0))
     small = disturbance[free] & (new <= 0.0) & (old * scale < _SMALL)
     out[free] = np.where(small, 0.0, started)
     out[:4] = np.clip(out[:4], 1.0 / _MOST_FACTOR, _MOST_FACTOR)
-    return out, spread
+    return out

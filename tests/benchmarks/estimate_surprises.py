@@ -22,12 +22,21 @@ import tumbling
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, Track
+from avsreplay.estimate.chart import ARM, ETA, INERTIA, RATE, to_chart, to_errors
+from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor.convergence import Consistency, ConsistencyParams, Convergence, ConvergenceParams, violations
+from avsreplay.monitor.convergence import (
+    Consistency,
+    ConsistencyParams,
+    Convergence,
+    ConvergenceParams,
+    violations,
+)
 from avsreplay.monitor.faults import FaultDetector, FaultParams
-from avsreplay.records import Alignment, AlignStatus, ScanStatus, State
+from avsreplay.records import Alignment, AlignStatus, Belief, ScanStatus, State
 
+NEES_S = (40.0, 60.0, 80.0)
 HEADS = (
     "case",
     "scans to the first flag: median, worst (bodies)",
@@ -45,6 +54,7 @@ HEADS = (
     "ms a scan",
     "worst ms",
     "grasp 1 sigma, last 10 s [mm]",
+    f"NEES at {NEES_S} s, mean: all, attitude, rate, inertia, arm, position, velocity",
 )
 EXTENT, POS_M, ROT_RAD = 4.0, 0.002, np.radians(0.1)
 
@@ -60,6 +70,7 @@ class Case:
     velocity: float = 0.0  # step [m/s]
     rate: float = 0.0  # step [rad/s]
     torque: float = 0.0  # constant, per unit inertia [rad/s2]
+    random: tuple[float, float] = (0.0, 0.0)  # root densities of random torque [rad/s^1.5] and force [m/s^1.5]
     bias: float = 0.0  # along the line of sight [m]
     noise: float = 1.0  # factor on sigma, not reported by the registration
     spin: int | None = None  # about this principal axis
@@ -75,6 +86,9 @@ CASES = (
     Case("velocity step 1 cm/s", velocity=0.01),
     Case("rate step 0.01 rad/s", rate=0.01),
     Case("constant torque 1e-4", torque=1e-4),
+    Case("random torque and force 1e-5", random=(1e-5, 1e-5)),
+    Case("random torque and force 3e-5", random=(3e-5, 3e-5)),
+    Case("random torque and force 1e-4", random=(1e-4, 1e-4)),
     Case("bias 3 cm from 40 s to the end", at_s=40.0, bias=0.03),
     Case("bias 3 cm from 60 s to the end", at_s=60.0, bias=0.03),
     Case("bias 5 cm from 40 to 55 s", at_s=40.0, until_s=55.0, bias=0.05),
@@ -99,6 +113,7 @@ class Result:
     ratio: list[float] = field(default_factory=list)
     error: list[tuple[float, float]] = field(default_factory=list)
     grasp: list[float] = field(default_factory=list)
+    nees: list[list[float]] = field(default_factory=list)
     violations: list[str] = field(default_factory=list)
     track: Track | None = None
     seconds: float = 0.0
@@ -126,6 +141,16 @@ def world_of(case: Case, seed: int) -> tuple[list[float], list[State], Array, Ar
                 )[-1]
             states.append(x)
         return list(world.times), states, dv, dw
+    if any(case.random):
+        states, x, part = [x0], x0, 4
+        sizes = case.random[0] * world.moments.sum() / world.moments, case.random[1]
+        for _ in world.times[1:]:
+            for _ in range(part):
+                dw, dv = (size * rng.normal(size=3) / np.sqrt(case.hz * part) for size in sizes)
+                pushed = replace(x, w_b=x.w_b + dw, v_a=x.v_a + dv)
+                x = tumbling.follow(np.array([0.0, 1.0 / (case.hz * part)]), world.moments, pushed)[-1]
+            states.append(x)
+        return list(world.times), states, np.zeros(3), np.zeros(3)
     if not (case.velocity or case.rate):
         return list(world.times), world.states, dv, dw
     at = case.at_s + 0.2
@@ -187,6 +212,8 @@ def run(case: Case, seed: int, tested: bool = True) -> Result:
         forecast = estimator.track_forecast(track, test.params.times_s)
         word = test.judge(word, track.belief, forecast, honest)
         score(result, t, x, track, verdict.gamma, verdict.reason.value, word.converged)
+        if any(abs(t - mark) < 0.5 / case.hz for mark in NEES_S):
+            result.nees.append(nees_of(estimator.published(track), x))
         result.grasp.append(float(forecast.pos_1s_m.max()))
     result.track = track
     return result
@@ -205,6 +232,17 @@ def score(result: Result, t: float, x: State, track: Track, gamma: int, reason: 
     result.converged.append(converged)
     result.error.append((position, np.degrees(angle)))
     result.ratio.append(max(position / claimed[0], angle / claimed[1]))
+
+
+def nees_of(belief: Belief, truth: State) -> list[float]:
+    """NEES per degree of freedom of all states, then of each block in coordinates without an order of the axes."""
+    here = to_chart(belief.x)
+    T, y = to_errors(here), to_chart(truth).minus(here)
+    P = np.linalg.solve(T, np.linalg.solve(T, belief.P).T)
+    found = [(y, P)] + [(y[b], P[b, b]) for b in (ETA, RATE, INERTIA, ARM)]
+    d = T @ y
+    found += [(d[b], belief.P[b, b]) for b in (RHO, VEL)]
+    return [float(e @ np.linalg.solve(C, e)) / len(e) for e, C in found]
 
 
 def _direction(rng: np.random.Generator) -> Array:
@@ -251,6 +289,7 @@ def line(case: Case, results: list[Result]) -> str:
         f"{1e3 * sum(r.seconds for r in results) / sum(len(r.t) for r in results):.2f}",
         f"{max(r.worst_ms for r in results):.0f}",
         f"{1e3 * np.median([max(r.grasp[-20:]) for r in results]):.0f}",
+        ", ".join(f"{v:.2f}" for v in np.mean([r.nees for r in results], axis=(0, 1))),
     ]
     return "| " + " | ".join(cells) + " |"
 
