@@ -17,8 +17,17 @@ from avsreplay.estimate.batch_schedule import chart_at, contradicted
 from avsreplay.estimate.chart import nees, to_chart, to_errors
 from avsreplay.estimate.ekf import innovation_of
 from avsreplay.estimate.error_state import boxplus
-from avsreplay.estimate.initialise import PoseFix, batch_estimate, given_prior, poses_of, rough_state, weak_prior
-from avsreplay.estimate.noise_levels import NO_LEVELS
+from avsreplay.estimate.initialise import (
+    PoseFix,
+    batch_estimate,
+    given_prior,
+    joined,
+    pose_count,
+    poses_of,
+    rough_state,
+    weak_prior,
+)
+from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import Constraint, Start
 from avsreplay.monitor.convergence import Consistency, ConsistencyParams
 from avsreplay.records import Belief, State
@@ -231,3 +240,75 @@ def test_a_correct_start_is_kept() -> None:
         assert track.reinitialised == 0
         assert track.batch is not None
         assert not track.batch.prior_rejected
+
+
+def fixes_of(world: tumbling.World, seed: int) -> tuple[PoseFix, ...]:
+    """Noisy poses of a world: 2 mm, 0.1 deg."""
+    rng = np.random.Generator(np.random.PCG64([seed, 3]))
+    seen = [tumbling.alignment(x.T_ac, rng, 0.002, np.radians(0.1)) for x in world.states]
+    assert all(a.covariance is not None for a in seen)
+    return tuple(
+        PoseFix(round(t * 1e9), a.T_ac, a.covariance)
+        for t, a in zip(world.times.tolist(), seen, strict=True)
+        if a.covariance is not None
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_joined_poses_give_the_estimate_of_all_poses(seed: int) -> None:
+    """The older half joined in pairs, twice over: the estimate changes by a small part of its standard deviation."""
+    world = tumbling.draw(seed, seconds=80.0, hz=5.0, sigma_max=0.85)
+    fixes = fixes_of(world, seed)
+    reference = to_chart(world.states[0])
+    fewer = joined(fixes[:200], reference, np.ones(2)) + fixes[200:]
+    moved = chart_at(Belief(0, world.states[0], np.eye(20)), fewer[0].t_ns)
+    fewer = joined(fewer[:200], moved, np.ones(2)) + fewer[200:]
+    assert len(fewer) <= 0.51 * len(fixes)
+    assert pose_count(fewer) == pose_count(fixes) == len(fixes)
+    assert sorted(f.t_ns for f in fewer) == [f.t_ns for f in fewer]
+    params, rules = EstimatorParams().resolved(2.0), FitParams(rescale=False)
+    whole, part = (batch_estimate(some, params, rules, NO_LEVELS, start=reference) for some in (fixes, fewer))
+    assert part.count == whole.count == len(fixes)
+    there = to_chart(whole.belief.x)
+    size = to_errors(there) @ to_chart(part.belief.x).minus(there) / np.sqrt(np.diagonal(whole.belief.P))
+    assert np.abs(size).max() < 0.2
+    ratio = np.sqrt(np.diagonal(part.belief.P) / np.diagonal(whole.belief.P))
+    np.testing.assert_allclose(ratio, 1.0, atol=0.1)
+
+
+def test_a_fit_uses_a_bounded_number_of_poses() -> None:
+    from avsreplay.estimate import batch_schedule
+
+    world = tumbling.draw(1, seconds=0.1 * 1500, hz=10.0)
+    spin = replace(world.states[0], w_b=np.array([0.1, 0.0, 0.0]))
+    states = tumbling.follow(world.times, world.moments, spin)
+    estimator = Estimator(EstimatorParams(), None, 4.0)
+    fixes = fixes_of(replace(world, states=states), 1)
+    track = replace(estimator.initial(0, states[0].T_ac), fixes=fixes[: batch_schedule.MOST_FIXES])
+    prediction = estimator.predict(track, fixes[batch_schedule.MOST_FIXES].t_ns)
+    innovation = estimator.innovate(
+        prediction, tumbling.alignment(states[1024].T_ac, np.random.default_rng(0), 0.002, 0.002)
+    )
+    after = estimator.batch._with(track, prediction, innovation)
+    assert len(after) <= 0.76 * batch_schedule.MOST_FIXES
+    assert pose_count(after) == batch_schedule.MOST_FIXES + 1
+
+
+@pytest.mark.parametrize(("seed", "axis"), [(1, 0), (4, 2)])
+def test_a_fit_to_a_long_unstable_spin_ends_with_a_covariance(seed: int, axis: int) -> None:
+    """The spin about an unstable axis for 300 rad: its covariance grows beyond what numbers can hold."""
+    world = tumbling.draw(seed, seconds=1500.0, hz=0.1, sigma_max=0.85)
+    first = replace(world.states[0], w_b=0.2 * np.eye(3)[axis])
+    world = replace(world, states=tumbling.follow(world.times, world.moments, first))
+    rng = np.random.default_rng(seed)
+    seen = [tumbling.alignment(x.T_ac, rng, 0.002, 0.002) for x in world.states]
+    fixes = tuple(
+        PoseFix(round(t * 1e9), a.T_ac, a.covariance)
+        for t, a in zip(world.times.tolist(), seen, strict=True)
+        if a.covariance is not None
+    )
+    params, levels = EstimatorParams().resolved(4.0), NoiseLevels(torque=1e-7, count=100)
+    P = batch_estimate(fixes, params, FitParams(rescale=False), levels, start=to_chart(first)).belief.P
+    assert np.all(np.isfinite(P))
+    scale = np.sqrt(np.diagonal(P))
+    assert np.linalg.eigvalsh(P / np.outer(scale, scale))[0] > -1e-9

@@ -55,7 +55,7 @@ class Poses:
     Attributes:
         times_s: (n,) since the fit's epoch [s].  q: (n, 4) q_ac.  t: (n, 3) [m].
         C: (n, 6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
-        counts: (n,) number of poses that each normal point stands for; None where they are measured poses.
+        counts: (n,) number of poses that each of them stands for; None where they are measured poses.
         shares: (n,) part of C that poses seen from nearly the same direction have in common; None for 0.
         within: squared whitened differences of poses from their normal points, of attitude and position, and their
             degrees of freedom; None where there are none.
@@ -213,12 +213,16 @@ class Problem:
         """Half chi-square of the poses alone."""
         return self.core.residuals(chart.flat)[1]
 
-    def pinned(self, start: Chart, params: FitParams, pin: Pin) -> tuple[Chart, Array]:
-        """The fit from ``start`` with one direction fixed, and its covariance (20, 20) in the chart."""
+    def pinned(self, start: Chart, params: FitParams, pin: Pin, most: int) -> tuple[Chart, Array, int]:
+        """The fit from ``start`` with one direction fixed.
+
+        Returns:
+            Its chart, its covariance (20, 20) in the chart, and the number of steps, at most ``most``.
+        """
         self.core.pin(pin.centre.flat, pin.row, pin.target, pin.one_sigma)
         self.core.linearise(start.flat)
-        self.core.descend(params.max_steps, max(params.gain_tol, _PIN_TOL))
-        found = self.chart, self.covariance
+        steps = self.core.descend(most, max(params.gain_tol, _PIN_TOL))[0]
+        found = self.chart, self.covariance, steps
         self.core.unpin()
         return found
 

@@ -22,6 +22,8 @@ from avsreplay import geometry
 from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Problem
 from avsreplay.estimate.chart import Chart, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import (
+    MOST_RAD,
+    SUBSTEP_RAD,
     grasp_prediction,
     propagate_state,
     torque_density,
@@ -34,9 +36,11 @@ from avsreplay.records import Belief, Forecast, State
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
 _TRIAL = 2.0  # distance along a direction at which the cost is compared with the Gaussian one [sigma]
 _RISE, _TRIES, _LOST = 0.5 * _NODE**2, 6, 3.0
+_PIN_STEPS, _FEWEST_STEPS, _PIN_WORK = 15, 40, 12000  # of fits with one direction fixed; steps times poses and pieces
 _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
 _ROUNDING = 1e-9  # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
+_LARGEST_MOVE = 1e3  # largest correction in chart steps, of which none has a larger unit than a metre or a radian
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
 LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
 _DISTURBED = 12  # error states that a disturbance reaches: attitude to velocity; they depend on steps of these alone
@@ -99,17 +103,28 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Batc
     """
     scale = problem.prior.one_sigma
     values, vectors = np.linalg.eigh(fitted.P_chart / np.outer(scale, scale))
-    directions, others = [], False
+    directions, others, left = [], False, _affordable_steps(problem, fitted)
     for value, vector in zip(values[::-1][: params.try_directions], vectors.T[::-1], strict=False):
         axis = vector * scale * np.sqrt(max(float(value), 0.0))
         if _non_gaussian(problem, fitted, params, axis):
             row = vector / scale / np.sqrt(value)  # row @ axis = 1
-            first, second = (_profile(problem, fitted, params, axis, row, s) for s in (_NODE, -_NODE))
-            if first is None or second is None:
-                others = True  # its part of the covariance stays that of the fit
+            points = []
+            for side in (_NODE, -_NODE):
+                point, steps = _profile(problem, fitted, params, axis, row, side, left)
+                left -= steps
+                if point is None:
+                    others = True  # its part of the covariance stays that of the fit
+                    break
+                points.append(point)
             else:
-                directions.append(NonGaussianDirection(row, (first, second)))
+                directions.append(NonGaussianDirection(row, (points[0], points[1])))
     return BatchCovariance(fitted, tuple(directions), others)
+
+
+def _affordable_steps(problem: Problem, fitted: BatchFit) -> int:
+    """Steps of the fits with one direction fixed; a step passes all poses, and the rotation between them in pieces."""
+    turned = float(np.linalg.norm(fitted.chart.w_c)) * float(np.ptp(problem.poses.times_s))
+    return max(_FEWEST_STEPS, int(_PIN_WORK / (len(problem.poses) + turned / SUBSTEP_RAD)))
 
 
 def _non_gaussian(problem: Problem, fitted: BatchFit, params: FitParams, axis: Array) -> bool:
@@ -122,17 +137,21 @@ def _non_gaussian(problem: Problem, fitted: BatchFit, params: FitParams, axis: A
 
 
 def _profile(
-    problem: Problem, fitted: BatchFit, params: FitParams, axis: Array, row: Array, side: float
-) -> ProfilePoint | None:
+    problem: Problem, fitted: BatchFit, params: FitParams, axis: Array, row: Array, side: float, most: int
+) -> tuple[ProfilePoint | None, int]:
     """The fit with the direction fixed where the cost has risen by ``_RISE``: the best of ``_TRIES``, from ``side`` on.
 
     A fit that ends far above that begins again nearer to the minimum: it did not follow the valley of the cost. None if
-    no fit came near: its covariance would not be that of a point in the valley.
+    no fit came near within ``most`` steps: its covariance would not be that of a point in the valley. Also returned is
+    the number of steps.
     """
-    there, found = fitted.chart.moved(side * axis), []
+    there, found, spent = fitted.chart.moved(side * axis), [], 0
     for _ in range(_TRIES):
+        if spent >= most:
+            break
         pin = Pin(fitted.chart, row, side, _PIN_1S)
-        there, P = problem.pinned(there, params, pin)
+        there, P, steps = problem.pinned(there, params, pin, min(_PIN_STEPS, most - spent))
+        spent += steps
         rise = problem.cost(there) - fitted.half_chi2
         found.append((abs(float(np.log(max(rise, 1e-9) / _RISE))), ProfilePoint(there, P, pin)))
         if abs(rise - _RISE) < 0.2 * _RISE:
@@ -140,8 +159,8 @@ def _profile(
         side *= float(np.clip(np.sqrt(_RISE / max(rise, 1e-9)), 0.4, 2.5))
         if rise > _LOST * _RISE:
             there = fitted.chart.moved(side * axis)
-    off, best = min(found, key=lambda f: f[0])
-    return best if off < float(np.log(_LOST)) else None
+    near = [f for f in found if f[0] < float(np.log(_LOST))]
+    return (min(near, key=lambda f: f[0])[1] if near else None), spent
 
 
 def sandwich(problem: Problem, points: Poses, levels: NoiseLevels) -> tuple[Array, Array]:
@@ -203,18 +222,25 @@ def final_mixture(
     recent = Problem(latest, problem.prior, fitted.effective)
     for weight, chart, pin in bases:
         y, P = process_noise_pass(chart, pin, problem, noise)
-        P = P if spread is None or pin is not None else spread @ P @ spread.T  # for the trajectory of the fit alone
+        if not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < _LARGEST_MOVE):  # far beyond what is linear
+            if pin is not None:
+                lost += weight
+                continue
+            y, P = np.zeros(DIM), fitted.P_chart
+        if pin is None:
+            P = _definite(P if spread is None else spread @ P @ spread.T)  # spread: for the trajectory of the fit alone
         x, step = propagate_chart(chart, after_s)
         base, move = to_chart(x), step @ y
         share = 1.0
-        if float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
+        if _least_eigenvalue(P) < _ROUNDING or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
             share = _accepted_share(base, move, recent)
         there = base.moved(share * move)
         P = P if pin is not None else _fixed(P, [d.row for d in found.directions])
         P = step @ P @ step.T + (1.0 - share) ** 2 * np.outer(move, move)
-        if pin is not None and _least_eigenvalue(P) < -_ROUNDING:
+        if pin is not None and not _least_eigenvalue(P) >= -_ROUNDING:
             lost += weight  # about an unstable spin, rounding at the epoch has grown beyond the covariance
             continue
+        P = _definite(P)
         T = to_errors(there)
         P_errors = T @ P @ T.T
         out.append(Component(weight, Belief(t_ns, to_state(there), 0.5 * (P_errors + P_errors.T)), P, share))
@@ -224,10 +250,23 @@ def final_mixture(
 def _least_eigenvalue(P: Array) -> float:
     """The least eigenvalue of P in units of its variances; minus infinity where a variance is not positive."""
     variances = np.diagonal(P)
-    if not np.all(variances > 0.0):
+    if not (np.all(variances > 0.0) and np.all(np.isfinite(P))):
         return -np.inf
     scale = np.sqrt(variances)
     return float(np.linalg.eigvalsh(P / np.outer(scale, scale))[0])
+
+
+def _definite(P: Array) -> Array:
+    """P with its eigenvalues, in units of its variances, raised to ``_ROUNDING`` where rounding made one negative.
+
+    Standard deviations are limited to ``_LARGEST_MOVE``: about an unstable spin they grow without bound.
+    """
+    if _least_eigenvalue(P) >= 0.0 and float(np.diagonal(P).max()) <= _LARGEST_MOVE**2:
+        return P
+    scale = np.sqrt(np.maximum(np.abs(np.diagonal(P)), np.finfo(float).tiny))
+    values, axes = np.linalg.eigh(0.5 * (P + P.T) / np.outer(scale, scale))
+    half = np.minimum(scale, _LARGEST_MOVE)[:, None] * axes * np.sqrt(np.maximum(values, _ROUNDING))
+    return np.asarray(half @ half.T)
 
 
 def _fixed(P: Array, rows: list[Array]) -> Array:
@@ -244,7 +283,12 @@ def _accepted_share(base: Chart, move: Array, latest: Problem) -> float:
     The correction is a Gauss-Newton step of a linearised problem; along a strongly curved direction a full step can
     be worse than none.
     """
-    costs = [latest.misfit(base.moved(share * move)) for share in _SHARES]
+    span = float(np.abs(latest.poses.times_s).max())
+    costs = []
+    for share in _SHARES:
+        there = base.moved(share * move)
+        possible = float(np.linalg.norm(there.w_c)) * span < MOST_RAD
+        costs.append(latest.misfit(there) if possible or share == 0.0 else np.inf)
     return _SHARES[int(np.argmin(costs))]
 
 

@@ -20,7 +20,15 @@ from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_char
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
 from avsreplay.estimate.drift import find_drift
 from avsreplay.estimate.dynamics import propagate_state
-from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, first_belief, improved_levels
+from avsreplay.estimate.initialise import (
+    BatchResult,
+    PoseFix,
+    batch_estimate,
+    first_belief,
+    improved_levels,
+    joined,
+    pose_count,
+)
 from avsreplay.estimate.measurement import in_fixture, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
@@ -30,6 +38,7 @@ from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation
 
 FEWEST_TO_FIT = 3
+MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does not grow with the log
 FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
 FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a test of drift, and between two tests
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
@@ -128,7 +137,7 @@ class BatchSchedule:
         At its first detection the estimate is replaced by that of a fit with process noise of the same size, and the
         filter continues with this noise. Later tests refine the reported values.
         """
-        count, last = len(track.fixes), track.batch
+        count, last = pose_count(track.fixes), track.batch
         due = max(FEWEST_TO_TEST, DRIFT_GROWTH * count)
         ready = bool(self.checked_poses) and last is not None and count >= FEWEST_WITH_DRIFT
         if not ready or last is None or track.untested < due or track.since == 0:  # never in the same scan as a fit
@@ -172,7 +181,7 @@ class BatchSchedule:
 
     def with_levels(self, track: Track) -> Track:
         """The track with new noise levels, where the poses have grown enough since they were last estimated."""
-        count, last = len(track.fixes), track.batch
+        count, last = pose_count(track.fixes), track.batch
         due = max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
         ready = bool(self.checked_poses) and last is not None and count >= FEWEST
         if not ready or last is None or track.unlevelled < due or track.since == 0:
@@ -209,9 +218,13 @@ class BatchSchedule:
         )
 
     def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
-        """The poses within the fit's memory, including this one."""
+        """The poses within the fit's memory, including this one; of many poses the older half is joined in pairs."""
         oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns(track), key=_instant)
-        return (*track.fixes[oldest:], self.fix(prediction, innovation))
+        fixes = track.fixes[oldest:]
+        if len(fixes) >= MOST_FIXES:
+            half, factors = MOST_FIXES // 2, np.array([track.window.factors[3], track.window.factors[0]])
+            fixes = joined(fixes[:half], chart_at(prediction.belief, fixes[0].t_ns), factors) + fixes[half:]
+        return (*fixes, self.fix(prediction, innovation))
 
     def fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
         """The healthy pose at its own instant: a scan deskewed by the prior's motion is moved back by it."""

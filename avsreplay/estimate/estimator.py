@@ -21,7 +21,7 @@ from avsreplay.estimate.batch_covariance import mixture_forecast
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import to_state
 from avsreplay.estimate.error_state import RHO
-from avsreplay.estimate.initialise import given_prior, guessed_belief
+from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
     innovation_vector,
     measured_pose,
@@ -151,7 +151,7 @@ class Estimator:
         Returns:
             H Phi (n, 6, 20) from the first pose on, R (n, 6, 6) and the transition (20, 20) from there to the scan.
         """
-        if track.mode != "fit" or track.batch is None or track.since or track.batch.count != len(track.fixes):
+        if track.mode != "fit" or track.batch is None or track.since or track.batch.count != pose_count(track.fixes):
             return None
         start, points = track.batch, track.batch.points
         if points is None:

@@ -53,6 +53,7 @@ class PoseFix:
         C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
         lag_ns: the instant relative to that of its scan: a scan of finite duration shows the pose at its middle.
         correlated_share: the part of C that neighbouring poses have in common.
+        count: number of poses that it stands for.
     """
 
     t_ns: int
@@ -60,6 +61,7 @@ class PoseFix:
     C: Array
     lag_ns: int = 0
     correlated_share: float = 0.0
+    count: int = 1
 
     @property
     def scan_ns(self) -> int:
@@ -129,12 +131,38 @@ def _at_pose(T_ac: Pose, w: Array, v: Array) -> State:
 def poses_of(fixes: tuple[PoseFix, ...], epoch_ns: int | None = None) -> Poses:
     """The fixes as input of the fit, times from the epoch, by default the first pose."""
     t0 = fixes[0].t_ns if epoch_ns is None else epoch_ns
+    counts = [f.count for f in fixes]
     return Poses(
         np.array([(f.t_ns - t0) * 1e-9 for f in fixes]),
         np.array([f.T_ac.q for f in fixes]),
         np.array([f.T_ac.t for f in fixes]),
         np.array([f.C for f in fixes]),
+        np.array(counts) if max(counts) > 1 else None,
         shares=np.array([f.correlated_share for f in fixes]),
+    )
+
+
+def pose_count(fixes: tuple[PoseFix, ...]) -> int:
+    """Number of poses that the fixes stand for; the oldest are joined first."""
+    return len(fixes) if not fixes or fixes[0].count == 1 else sum(fix.count for fix in fixes)
+
+
+def joined(fixes: tuple[PoseFix, ...], reference: Chart, factors: Array) -> tuple[PoseFix, ...]:
+    """Half as many poses that carry the information of these: neighbouring ones are joined about a reference motion.
+
+    Args:
+        fixes: healthy poses, oldest first.
+        reference: initial values, at the first pose, of a motion close to them.
+        factors: (2,) noise factors of attitude and position, for the weights of outliers.
+    """
+    points = normal_points(poses_of(fixes), reference, factors, len(fixes) // 2)
+    shares = np.zeros(len(points)) if points.shares is None else points.shares
+    counts = np.ones(len(points)) if points.counts is None else points.counts
+    return tuple(
+        PoseFix(fixes[0].t_ns + round(t * 1e9), Pose(q, p), C, 0, share, int(count))
+        for t, q, p, C, share, count in zip(
+            points.times_s.tolist(), points.q, points.t, points.C, shares.tolist(), counts, strict=True
+        )
     )
 
 
@@ -229,7 +257,7 @@ def batch_estimate(
     return BatchResult(
         epoch_ns=fixes[0].t_ns,
         chart=fitted.chart,
-        count=len(poses),
+        count=pose_count(fixes),
         factors=plain,
         inflation=inflation,
         belief=moments(components),
@@ -264,7 +292,7 @@ def improved_levels(
     problem.core.linearise(chart.flat)
     claimed = params.adapt is Adaptation.OFF
     found = estimate_levels(points, problem, levels, claimed, params.disturbances)
-    return replace(found, count=len(poses))
+    return replace(found, count=pose_count(fixes))
 
 
 def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior) -> bool:

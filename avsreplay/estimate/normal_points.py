@@ -38,14 +38,15 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
     d = poses.residuals(Problem(poses, Prior(reference, np.eye(DIM)), factors), reference)
     white = (poses.root @ (d / np.repeat(factors, 3))[:, :, None])[:, :, 0]
     weights = 1.0 / np.maximum((white * white).sum(axis=1) / GATE, 1.0)
-    counts = np.diff(first, append=n)
-    shifted = np.add.reduceat(weights, first) < 0.5 * counts  # the reference is off, not the poses
-    weights = np.where(np.repeat(shifted, counts), 1.0, weights)
+    sizes = np.diff(first, append=n)
+    counts = sizes if poses.counts is None else np.add.reduceat(poses.counts, first)
+    shifted = np.add.reduceat(weights, first) < 0.5 * sizes  # the reference is off, not the poses
+    weights = np.where(np.repeat(shifted, sizes), 1.0, weights)
     info = weights[:, None, None] * (np.swapaxes(poses.root, 1, 2) @ poses.root)
     C = np.linalg.inv(np.add.reduceat(info, first))
     mean = (C @ np.add.reduceat(info @ d[:, :, None], first))[:, :, 0]
-    within = _within(poses, d, weights, first, counts)
-    shares = None if poses.shares is None else np.add.reduceat(poses.shares, first) / counts
+    within = _within(poses, d, weights, first, sizes)
+    shares = None if poses.shares is None else np.add.reduceat(poses.shares, first) / sizes
     times = np.add.reduceat(weights * poses.times_s, first) / np.add.reduceat(weights, first)
     x = to_state(reference)
     q_ab = rotation_path(x).at(times)[0]

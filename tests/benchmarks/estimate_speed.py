@@ -1,8 +1,10 @@
-"""Processor time of the estimator's parts. ``python tests/benchmarks/estimate_speed.py [--quick] [--scans]``.
+"""Processor time of the estimator's parts.
 
-Each figure is the least of five repeats, so that other load on the machine matters little. ``--scans``: instead, the
-time of estimator and monitors scan by scan over whole runs with simulated poses, mean and largest, the least of three
-repeats of each scan.
+``python tests/benchmarks/estimate_speed.py [--quick] [--scans] [--long N]``. Each figure is the least of five
+repeats, so that other load on the machine matters little. ``--scans``: instead, the time of estimator and monitors scan
+by scan over whole runs with simulated poses, mean and largest, the least of three repeats of each scan. ``--long N``:
+the same over a log of N scans at 10 Hz, by part of the log, for a tumbling body (the filter takes over) and for one in
+pure spin (it stays with the fit).
 """
 
 from __future__ import annotations
@@ -11,6 +13,7 @@ import argparse
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import tumbling
@@ -113,9 +116,8 @@ def fit_s(n: int, seconds: float) -> tuple[float, float, int]:
 RUNS = ((2.0, 80.0, 0.1), (5.0, 120.0, 0.1), (10.0, 60.0, 0.1), (10.0, 100.0, 0.3))  # hz, seconds, rad/s
 
 
-def run_ms(hz: float, seconds: float, rate: float) -> np.ndarray:
+def run_ms(world: tumbling.World) -> np.ndarray:
     """(n, 2) milliseconds of estimator and monitors for each scan of a cold start."""
-    world = tumbling.draw(1, seconds=seconds, hz=hz, rate=rate, sigma_max=0.85)
     rng = np.random.Generator(np.random.PCG64(6))
     seen = [tumbling.alignment(x.T_ac, rng, 0.002, np.radians(0.1)) for x in world.states]
     estimator, detector = Estimator(EstimatorParams(correlated_share=0.1), None, 4.0), FaultDetector(FaultParams(), 4.0)
@@ -136,7 +138,8 @@ def run_ms(hz: float, seconds: float, rate: float) -> np.ndarray:
 def whole_runs() -> None:
     """Mean and largest time of a scan over whole runs."""
     for hz, seconds, rate in RUNS:
-        least_ms = np.min([run_ms(hz, seconds, rate) for _ in range(3)], axis=0)
+        world = tumbling.draw(1, seconds=seconds, hz=hz, rate=rate, sigma_max=0.85)
+        least_ms = np.min([run_ms(world) for _ in range(3)], axis=0)
         both = least_ms.sum(axis=1)
         print(
             f"{len(both)} scans at {hz:.0f} Hz, {rate} rad/s: estimator {least_ms[:, 0].mean():.2f} ms, at most"
@@ -146,11 +149,34 @@ def whole_runs() -> None:
         )
 
 
+def long_runs(scans: int, repeats: int) -> None:
+    """Mean, 99.9 % point and largest time of a scan of the estimator, by part of a long log."""
+    for name in ("tumbling", "spin about one axis"):
+        world = tumbling.draw(1, seconds=0.1 * (scans - 1), hz=10.0, sigma_max=0.85)
+        if name != "tumbling":
+            first = replace(world.states[0], w_b=np.array([0.1, 0.0, 0.0]))
+            world = replace(world, states=tumbling.follow(world.times, world.moments, first))
+        spent = np.min([run_ms(world) for _ in range(repeats)], axis=0)
+        edges = [0, *(k for k in (100, 300, 1000, 3000, 10000, 30000) if k < scans), scans]
+        for begin, end in pairwise(edges):
+            part, both = spent[begin:end, 0], spent[begin:end].sum(axis=1)
+            print(
+                f"{name}, scans {begin} to {end}: estimator {part.mean():.2f} ms,"
+                f" {np.quantile(part, 0.999):.1f} (99.9 %), at most {part.max():.1f}; with monitors {both.mean():.2f}",
+                flush=True,
+            )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer repeats, no fit over 5,000 poses")
     parser.add_argument("--scans", action="store_true", help="times scan by scan over whole runs")
+    parser.add_argument("--long", type=int, metavar="N", help="times over a log of N scans")
+    parser.add_argument("--repeats", type=int, default=1, help="repeats of --long; the least time of each scan counts")
     given = parser.parse_args()
+    if given.long:
+        long_runs(given.long, given.repeats)
+        return
     if given.scans:
         whole_runs()
         return
