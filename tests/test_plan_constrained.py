@@ -3,6 +3,7 @@
 import math
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,9 @@ from avsreplay.outcome import PlanStatus
 from avsreplay.plan import Limits, PlanParams, Scene, StepPath, constrained, path_of, rendezvous
 from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.limits import margin
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from plan_scenes import problems
 
 ORIGIN = np.zeros(3)
 PARAMS = PlanParams(a_max_mps2=0.05)
@@ -309,3 +313,14 @@ def test_a_limit_without_what_it_needs_is_named():
         constrained(body(), ORIGIN, ORIGIN, PARAMS, Limits(clearance_m=0.2, final_deg=10.0))
     with pytest.raises(ValueError, match=r"keepout_m is 3\.0, must be below"):
         constrained(body(), ORIGIN, ORIGIN, PARAMS, Limits(keepout_m=3.0))
+
+
+@pytest.mark.parametrize(("number", "known_s"), [(9, 19.776), (19, 28.902), (30, 25.119)])
+def test_plans_with_a_clearance_are_near_the_best_known(number, known_s):
+    """Times of IPOPT with 200 nodes (tests/benchmarks/plan_limits.py --kind body), whose excess is below 1 mm."""
+    problem = problems(number + 1)[number]
+    limits = Limits(final_deg=15.0, clearance_m=0.25, abort=False)
+    plan = constrained(problem.scene, problem.r0, ORIGIN, PlanParams(a_max_mps2=problem.a_max), limits)
+    assert plan.found
+    assert plan.t_go_s <= known_s + 0.1
+    assert plan.violation_m == 0.0

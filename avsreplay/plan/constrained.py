@@ -220,24 +220,25 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
             drafts.append(draft)
         if drafts and reference.t > 1.5 * min(d.t_go_s for d in drafts):
             break
-    drafts = _improved(coarse, sorted(drafts, key=lambda d: d.t_go_s))
+    drafts = _different(drafts)
+    drafts[:IMPROVED] = [_moved(coarse, draft) for draft in drafts[:IMPROVED]]
     for draft in sorted(drafts, key=lambda d: d.t_go_s):
         if best is not None and (draft.t_go_s > best.t_go_s):
             break
         refined = _converged(case, warm_reference(case, draft, 0.0))
         if refined is not None and (best is None or refined.t_go_s < best.t_go_s):
             best = refined
-    return best
+    return best if best is None else _moved(case, best)
 
 
 def _entries(case: Case, path: RobotPath) -> tuple[float, float]:
-    """Return the fractions of a flight from which it stays inside the cone and inside the corridor."""
+    """Return the fractions of a flight from which it stays inside the cone and the corridor, each from its range on."""
     s = interval_fractions(case.limits.nodes)
     times = case.wait_s + (path.t_go_s - case.wait_s) * s
     r = path.at(times)[0]
     inside = margins(case.scene, case.limits, case.sampled.coordinates(times, r), r, case.sampled.sigma(times)).inside
     found = []
-    for column in (0, 3 if case.limits.clearance_m is not None else 1):
+    for column in (0, 1):
         outside = np.flatnonzero(~inside[:-1, column])
         found.append(float(s[outside[-1] + 1]) if len(outside) else 0.0)
     return found[0], found[1]
@@ -258,35 +259,37 @@ def _expected(case: Case, path: RobotPath, since_s: float) -> float:
     return path.t_go_s - (since_s if away <= (case.limits.mouth_m or 0.0) else 0.0)
 
 
-def _same(first: StepPath, second: StepPath) -> bool:
-    """Return whether two drafts are the same local minimum, as far as their end times tell."""
-    return abs(first.t_go_s - second.t_go_s) <= SAME_PATH * second.t_go_s
+def _different(drafts: list[StepPath]) -> list[StepPath]:
+    """Return the drafts in the order of their end times without those that are the same local minimum."""
+    out: list[StepPath] = []
+    for draft in sorted(drafts, key=lambda draft: draft.t_go_s):
+        if not out or draft.t_go_s - out[-1].t_go_s > SAME_PATH * draft.t_go_s:
+            out.append(draft)
+    return out
 
 
-def _improved(case: Case, drafts: list[StepPath]) -> list[StepPath]:
-    """Return the earliest drafts with the entry into cone or corridor moved as long as the capture becomes earlier.
+def _moved(case: Case, path: StepPath) -> StepPath:
+    """Return a path with the entry into cone or corridor moved as long as the capture becomes earlier.
 
     The alternative that is required at an instant follows from the reference, so that the iterations alone cannot move
     the entry by more than they move the path.
     """
     if case.limits.cone_deg is None and case.limits.final_deg is None:
-        return drafts
+        return path
     which, step = 0 if case.limits.cone_deg is not None else 1, 0.5 / case.limits.nodes
-    out: list[StepPath] = []
-    different = [draft for k, draft in enumerate(drafts) if not any(_same(draft, other) for other in drafts[:k])]
-    for draft in different[:IMPROVED]:
-        best, start = draft, _entries(case, draft)
-        for direction in (-step, step):
-            for count in range(1, MOVES + 1):
-                entry = list(start)
-                entry[which] += count * direction
-                moved = replace(case, entry=(entry[0], entry[1]))
-                trial = _converged(moved, warm_reference(case, best, 0.0), best.t_go_s)
-                if trial is None or trial.t_go_s > best.t_go_s - TIME_TOLERANCE_S:
-                    break
-                best = trial
-        out.append(best)
-    return out
+    best, start = path, _entries(case, path)
+    for direction in (-step, step):
+        for count in range(1, MOVES + 1):
+            entry = list(start)
+            entry[which] += count * direction
+            moved = replace(case, entry=(entry[0], entry[1]))
+            trial = _converged(moved, warm_reference(case, best, 0.0), best.t_go_s)
+            if trial is None or trial.t_go_s > best.t_go_s - TIME_TOLERANCE_S:
+                break
+            best = trial
+        if best is not path:
+            break
+    return best
 
 
 def _converged(
@@ -300,7 +303,7 @@ def _converged(
     best: StepPath | None = None
     n, tolerance = case.limits.nodes, ROUGH_TOLERANCE if case.coarse or warm is not None else RELATIVE_TOLERANCE
     reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
-    off = np.zeros((2 * n, len(CONSTRAINTS)))
+    off, gain = np.zeros((2 * n, len(CONSTRAINTS))), np.array(0.6)  # doubled where an excess remains: it reacts weakly
     change, slack, settled = _trust(case, reference), math.inf, 0
     rows = () if warm is None else aborted(case, *warm).rows
     for iteration in range(ITERATIONS):
@@ -327,7 +330,8 @@ def _converged(
         if hopeless or t > case.params.horizon_s - case.wait_s:
             return best
         if abs(t - reference.t) <= NEAR_REFERENCE * t:
-            off += 1.2 * over + np.where(over > 0.0, case.buffer_m, 0.0)
+            gain = np.where(over > 0.0, np.minimum(2.0 * gain, 4.8), 0.6)
+            off += gain * over + np.where(over > 0.0, case.buffer_m, 0.0)
         slack, reference = found.slack, ReferencePath(t, path.at(case.wait_s + t * interval_fractions(n))[0])
         change = max(0.5 * change, 1e-3) if iteration >= 6 else _trust(case, reference)
     return best
