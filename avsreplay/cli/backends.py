@@ -37,9 +37,9 @@ differ: libraries that stop by their own rules may take another number of iterat
 
 @click.command("backends", epilog=EPILOG)
 @click.option(
-    "--check", "name", metavar="NAME", help="Check the laws of the contract on this back end; exit 1 if one fails."
+    "--check", "name", metavar="NAME", help="Test whether this back end keeps the contract; exit code 1 if it does not."
 )
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def backends_command(name: str | None, as_json: bool) -> None:
     """List the registration back ends, and how to install those that are missing."""
     if name is None:
@@ -145,11 +145,13 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 
 @click.command("bench", epilog=BENCH_EPILOG)
 @click.argument("log", type=click.Path(path_type=Path))
-@click.option("--backends", default="horn,kiss", show_default=True, help="Names, separated by commas.")
-@click.option("--model", type=click.Path(path_type=Path), help="The target's model, where the log has none.")
+@click.option("--backends", default="horn,kiss", show_default=True, help="Names of back ends, separated by commas.")
+@click.option("--model", type=click.Path(path_type=Path), help="Model of the target, if the log has none.")
 @click.option("--topic", help="The cloud topic, where there are several.")
-@click.option("--scans", default=50, show_default=True, type=click.IntRange(1), help="How many scans, from the start.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
+@click.option(
+    "--scans", default=50, show_default=True, type=click.IntRange(1), help="Number of scans, from the first one on."
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def bench_command(log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool) -> None:
     """Time registration back ends side by side on the scans of LOG, in turn.
 

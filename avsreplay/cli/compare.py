@@ -68,7 +68,7 @@ def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> 
     help="Write an HTML page with the charts of the runs over each other.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing page.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for the summary of a CI job.")
 @click.option("--all", "show_all", is_flag=True, help="Print the equal metrics too.")
 @click.option(

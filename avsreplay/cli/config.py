@@ -94,7 +94,9 @@ def _variable(name: str) -> str:
 def robot_option(**more: Any) -> Callable[[F], F]:
     """Decorator: the option for a robot file."""
     file = click.Path(path_type=Path)
-    return click.option("--robot", "robot_file", type=file, help="TOML file with a table [robot].", **more)
+    return click.option(
+        "--robot", "robot_file", type=file, help="TOML file that describes the robot in a table [robot].", **more
+    )
 
 
 def run_settings(command: F) -> F:
@@ -107,13 +109,18 @@ def run_settings(command: F) -> F:
     ]
     file = click.Path(path_type=Path)
     options += [
-        click.option("--no-deskew", is_flag=True, envvar=_variable("no_deskew"), help="Do not deskew scans."),
+        click.option(
+            "--no-deskew",
+            is_flag=True,
+            envvar=_variable("no_deskew"),
+            help="Do not correct scans for the motion of the target while they were taken.",
+        ),
         click.option(
             "--config",
             "config_file",
             type=file,
             envvar=_variable("config"),
-            help="TOML file as 'avsreplay config' prints.",
+            help="TOML file with settings, in the form that 'avsreplay config' prints.",
         ),
         robot_option(envvar=_variable("robot")),
         click.option(
@@ -122,7 +129,7 @@ def run_settings(command: F) -> F:
             multiple=True,
             metavar="A.B=VALUE",
             envvar=_variable("set"),
-            help="One setting by its key, see 'avsreplay config'; may be repeated.",
+            help="Change one setting; 'avsreplay config' lists the keys. May be repeated.",
         ),
     ]
     for option in reversed(options):
@@ -186,7 +193,7 @@ SECTIONS = (
 @click.command("config", epilog=EPILOG)
 @click.argument("log", type=click.Path(path_type=Path), required=False)
 @run_settings
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @click.option("--markdown", is_flag=True, help="Print the reference page of all settings.")
 def config_command(log: Path | None, as_json: bool, markdown: bool, **flags: Any) -> None:
     """Print the effective settings of a run as a TOML file that 'avsreplay run --config' reads.

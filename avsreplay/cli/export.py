@@ -22,7 +22,9 @@ POSE_FORMATS = ("tum", "kitti")
 
 @click.command("export", epilog=EPILOG)
 @click.argument("result", type=PATH)
-@click.option("--to", "kind", type=click.Choice(["csv", "parquet", *POSE_FORMATS]), required=True, help="Format.")
+@click.option(
+    "--to", "kind", type=click.Choice(["csv", "parquet", *POSE_FORMATS]), required=True, help="Format of the file."
+)
 @click.option(
     "--poses",
     type=click.Choice(["estimate", "registration", "truth"]),
@@ -79,7 +81,7 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 
 @click.command("report", epilog=REPORT_EPILOG)
 @click.argument("result", type=PATH)
-@click.option("-o", "--output", type=PATH, help="The page; report.html in RESULT by default.")
+@click.option("-o", "--output", type=PATH, help="Write the page to this file; report.html in RESULT by default.")
 @click.option("--title", help="Title of the page; the name of RESULT by default.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing page.")
 def report_command(result: Path, output: Path | None, title: str | None, overwrite: bool) -> None:

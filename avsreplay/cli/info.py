@@ -34,7 +34,7 @@ Examples:
 @source_options
 @pose_options
 @source_setting("--poses", is_flag=True)
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def info_command(source: Path, as_json: bool, **reading: Any) -> None:
     """Show topics, types, counts, rates, time span, model, scenario and injected faults of SOURCE.
 
@@ -215,7 +215,7 @@ Examples:
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @click.option("--strict", is_flag=True, help="Exit with code 3 if any part is lost.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @click.option("--max-message-mib", type=int, default=128, show_default=True, help="Largest message that is read [MiB].")
 def doctor_command(
     source: Path, topic: str | None, output: Path | None, overwrite: bool, strict: bool, as_json: bool,

@@ -39,7 +39,7 @@ Examples:
     "--mesh", type=PATH, help="Also write a triangle mesh (.ply); needs Open3D: pip install 'avsreplay[open3d]'."
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
-@click.option("--json", "as_json", is_flag=True, help="Write one JSON document to stdout.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @source_options
 def model_command(
     log: Path,
@@ -187,7 +187,7 @@ Examples:
 @click.option(
     "--size", type=click.FloatRange(min=0.0, min_open=True), help="Size of the target [m]; default: of the first scan."
 )
-@click.option("--no-deskew", is_flag=True, help="Ignore the instants of the points.")
+@click.option("--no-deskew", is_flag=True, help="Ignore the times of the points.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
 @source_options
 def odometry_command(

@@ -35,7 +35,7 @@ each scan. The keys of the JSON document therefore end in _fitted_motion."""
 @click.command("observability", epilog=EPILOG)
 @click.argument("log", type=PATH)
 @click.option("--init", metavar="log|truth|auto|POSE", help="First pose; POSE is x,y,z,qx,qy,qz,qw of {C} in {A}.")
-@click.option("--set", "assignments", multiple=True, metavar="A.B=C", help="One setting; may be repeated.")
+@click.option("--set", "assignments", multiple=True, metavar="A.B=C", help="Change one setting; may be repeated.")
 @source_options
 @click.option("--marks", type=click.IntRange(2, 200), default=12, show_default=True, help="Rows of the table.")
 @click.option(
@@ -45,7 +45,7 @@ each scan. The keys of the JSON document therefore end in _fitted_motion."""
     show_default=True,
     help="Number of weakly observable directions to describe.",
 )
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def observability_command(log: Path, marks: int, weakest: int, as_json: bool, **flags: Any) -> None:
     """Show which states and parameters the measurements of LOG determine."""
     from avsreplay.run import Run

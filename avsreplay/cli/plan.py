@@ -59,13 +59,15 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
     metavar="KEY=VALUE",
     help="Change a setting of plan, limits, robot or supervisor.",
 )
-@click.option("--samples", type=click.IntRange(1), default=64, show_default=True, help="Draws from the belief.")
+@click.option(
+    "--samples", type=click.IntRange(1), default=64, show_default=True, help="Number of draws from the belief."
+)
 @click.option(
     "--flights",
     type=click.IntRange(0),
     default=0,
     show_default=True,
-    help="Whole flights with replanning, thrust errors and delay against draws from the belief.",
+    help="Number of whole flights with replanning, thrust errors and delay, to targets drawn from the belief.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the draws.")
 @click.option(
@@ -78,7 +80,7 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
 @click.option("--export", type=click.Path(path_type=Path), help="Write t, r, v, u of the plan as CSV.")
 @click.option("--animate", type=click.Path(path_type=Path), help="Write a page with the flight in 3D as HTML.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing file.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout and nothing else.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def plan_command(
     result: Path,
     at_s: float | None,

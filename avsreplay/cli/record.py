@@ -51,7 +51,7 @@ class _Fault(click.ParamType["RecordedFault"]):
 
 @click.command("record", epilog=EPILOG)
 @click.argument("source", required=False, type=PATH)
-@click.option("-o", "--output", required=True, type=PATH, help="The log to write (.mcap); - is standard output.")
+@click.option("-o", "--output", required=True, type=PATH, help="Write this log (.mcap); - is standard output.")
 @click.option("--seed", type=click.IntRange(0), help="Seed of a simulation or of the faults.")
 @click.option(
     "--fault", "faults", type=_Fault(), multiple=True, help="Inject a fault [s after the first scan]; repeatable."
@@ -60,7 +60,7 @@ class _Fault(click.ParamType["RecordedFault"]):
 @source_options
 @click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def record_command(
     source: Path | None,
     output: Path,

@@ -38,20 +38,26 @@ Examples:
   avsreplay run long.mcap -o results/ --resume          continue after Ctrl-C
 
 \b
-Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
-            3 unreadable input, 4 finished but data was lost."""
+Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than required,
+            2 usage, 3 unreadable input, 4 finished but data was lost, 130 interrupted."""
 
 
 @click.command("run", epilog=EPILOG)
 @click.argument("log", type=PATH)
 @run_settings
 @click.option(
-    "--start", "starts", type=StartMode(), multiple=True, help="Initialisation of the estimate, or start time [s]."
+    "--start",
+    "starts",
+    type=StartMode(),
+    multiple=True,
+    help="Initialisation of the estimate (cold, near, paper), or the time after the first scan to begin at [s].",
 )
-@click.option("--paper", is_flag=True, help="The method as printed in the paper, without any addition (docs/paper.md).")
+@click.option(
+    "--paper", is_flag=True, help="Use the method as printed in the paper, without any addition (docs/paper.md)."
+)
 @source_options
 @pose_options
-@click.option("--golden", type=PATH, help="Compare with these rows; exit code 1 if they differ.")
+@click.option("--golden", type=PATH, help="Compare the rows with this golden file; exit code 1 if they differ.")
 @click.option("--update-golden", type=PATH, help="Write the rows to this golden file.")
 @click.option(
     "-o",
@@ -72,7 +78,7 @@ Exit codes: 0 ok, 1 the rows differ from the golden file, 2 usage,
 )
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
-@click.option("--plain", is_flag=True, help="Print no curves of error and gamma.")
+@click.option("--plain", is_flag=True, help="Leave out the curves of errors and flagged scans.")
 @click.option("--rerun", "to_rerun", metavar="FILE.rrd|view|connect", help="Show the run in Rerun (extra 'rerun').")
 def run_command(log: Path, **flags: Any) -> None:
     """Replay LOG through registration, filter, fault detector and planner, and print the tables.

@@ -39,9 +39,9 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished, but runs failed or da
     type=click.IntRange(0),
     default=2,
     show_default=True,
-    help="Number of processes; 0: this one, without Dask.",
+    help="Number of worker processes; 0 runs in this process, without Dask.",
 )
-@click.option("--scheduler", metavar="ADDRESS", help="A Dask scheduler, as tcp://host:port, in place of --workers.")
+@click.option("--scheduler", metavar="ADDRESS", help="Use this Dask scheduler (tcp://host:port) in place of --workers.")
 @click.option(
     "--dashboard",
     metavar="HOST:PORT",
@@ -49,14 +49,17 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished, but runs failed or da
     show_default=True,
     help="Address of the Dask dashboard of --workers; port 0: any free port.",
 )
-@click.option("--limit", type=click.IntRange(0), help="Largest number of runs to make now.")
-@click.option("--retry-failed", is_flag=True, help="Make failed and crashed runs again.")
-@click.option("--plan", "only_plan", is_flag=True, help="List the runs without making them.")
+@click.option("--limit", type=click.IntRange(0), help="Make at most this number of runs now.")
+@click.option("--retry-failed", is_flag=True, help="Repeat failed and crashed runs.")
+@click.option("--plan", "only_plan", is_flag=True, help="List the runs without starting them.")
 @click.option(
-    "--run", "run_id", metavar="ID", help="Make one run again, as 'run' does; the first characters of its id suffice."
+    "--run",
+    "run_id",
+    metavar="ID",
+    help="Repeat one run, as 'avsreplay run' does; the first characters of its id suffice.",
 )
 @click.option("--report", "page", is_flag=True, help="With --run: add the HTML report to the result directory.")
-@click.option("--json", "as_json", is_flag=True, help="One JSON document on stdout.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def sweep_command(
     campaign: Path,
     output: Path | None,

@@ -62,40 +62,43 @@ class SourceOptions(Settings):
         unset="/truth/pose",
     )
     truth_frame: str | None = setting(
-        None, "Frame whose pose, by the log's /tf tree and in the clouds' (or the fixed) frame, is the true pose."
+        None, "Frame of the /tf tree whose pose in the frame of the clouds (or in the fixed frame) is the true pose."
     )
     truth_file: Path | None = setting(None, "File of true poses beside the log (TUM, KITTI, EuRoC, Stanford .conf).")
     truth_gap_s: float = setting(
-        1.0, "Widest gap between two true poses that is interpolated across.", unit="s", low=0.0, high=1e6
+        1.0, "Largest gap between two true poses over which the pose is interpolated.", unit="s", low=0.0, high=1e6
     )
     model: Path | None = setting(
         None, "Model file; 'auto' builds the model from the scans of the log.", unset="the log's own model"
     )
-    cloud_model: bool = setting(False, "The model may be a point cloud without faces.")
+    cloud_model: bool = setting(False, "Accept a point cloud without faces as the model.")
     model_unit: Unit = setting(Unit.M, "Unit of the coordinates of the model.")
     model_scale: float = setting(
         1.0,
         "Factor on the size of the model, in addition to its unit: 1.01 for a model that is 1 % too small.",
         above=0.0,
     )
-    clock: ClockChoice = setting(ClockChoice.HEADER, "Clock of the scans' times.")
-    start_s: float | None = setting(None, "Begin, after the first scan.", unit="s")
+    clock: ClockChoice = setting(
+        ClockChoice.HEADER,
+        "Clock of the scans: stamps of the messages (header), reception by the recorder (log) or publication.",
+    )
+    start_s: float | None = setting(None, "Begin at this time after the first scan.", unit="s")
     start_offset_s: float | None = setting(None, "The same as --start.", unit="s")
-    end_s: float | None = setting(None, "End (not included), after the first scan.", unit="s", unset="the last scan")
+    end_s: float | None = setting(None, "End before this time after the first scan.", unit="s", unset="the last scan")
     duration_s: float | None = setting(None, "Length of the part that is replayed.", unit="s", unset="up to the end")
-    n_scans: int | None = setting(None, "Largest number of scans.", low=1, unset="all")
+    n_scans: int | None = setting(None, "Number of scans at most.", low=1, unset="all")
     every: int = setting(1, "Take every n-th scan, each at its own time.", low=1)
     crop_box: tuple[float, float, float, float, float, float] | None = setting(
         None,
-        "Keep points within (xmin, ymin, zmin, xmax, ymax, zmax) of the cloud's frame.",
+        "Keep the points within this box in the frame of the cloud.",
         unit="m",
         infinite=True,
     )
     crop_range: tuple[float, float] | None = setting(
-        None, "Keep points whose distance from the origin is within (min, max).", unit="m", low=0.0, infinite=True
+        None, "Keep the points at this distance from the origin of the cloud's frame.", unit="m", low=0.0, infinite=True
     )
     fixed_frame: str | None = setting(
-        None, "Frame into which the clouds are transformed by the log's /tf tree at each scan's time."
+        None, "Frame of the /tf tree into which each cloud is transformed at its own time."
     )
     sensor_topic: str | None = setting(
         None, "Topic of the sensor's pose, with which the clouds are transformed into the fixed frame."
@@ -107,7 +110,7 @@ class SourceOptions(Settings):
         low=1e-4,
         high=1e6,
     )
-    strict: bool = setting(False, "Any loss of data is an error (exit code 3).")
+    strict: bool = setting(False, "Treat any loss of data as an error (exit code 3).")
     max_message_mib: int = setting(
         128, "Largest message, chunk or attachment that is read.", unit="MiB", low=1, high=4096
     )
