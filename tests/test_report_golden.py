@@ -9,8 +9,7 @@ import json
 import pytest
 
 from avsreplay.errors import CheckFailed, UnreadableInput
-from avsreplay.report.comparison_tables import golden_table
-from avsreplay.report.golden import ABSENT, compare_golden, update_golden
+from avsreplay.report.golden import ABSENT, compare_golden, golden_table, update_golden
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.table import make_console, print_table
 from avsreplay.rows import columns

@@ -214,17 +214,18 @@ def _tables(
     *,
     show_all: bool = False,
 ) -> list[Table]:
-    from avsreplay.report import comparison_tables as tables
+    from avsreplay.report.compare import metrics_table
+    from avsreplay.report.conclusion import changes_table, settings_table
 
-    found = [tables.settings_table(c) for c in conclusions]
-    found += [tables.changes_table(groups[0].name, c, show_all=show_all) for c in conclusions]
+    found = [settings_table(c) for c in conclusions]
+    found += [changes_table(groups[0].name, c, show_all=show_all) for c in conclusions]
     if not conclusions:
-        found += [tables.metrics_table(run.name, list(metrics(run.summary).items())) for run in groups[0].runs]
-    return [*found, tables.gate_table(outcomes)]
+        found += [metrics_table(run.name, list(metrics(run.summary).items())) for run in groups[0].runs]
+    return [*found, gates.gate_table(outcomes)]
 
 
 def _divergences(groups: Sequence[_Group]) -> list[str]:
-    from avsreplay.report.comparison_tables import divergence_line
+    from avsreplay.report.golden import divergence_line
 
     base, others = groups[0], [group for group in groups[1:] if len(group.runs) == 1]
     return [

@@ -339,7 +339,7 @@ def _gate(wanted: Wanted, done: _Finished) -> None:
 
 
 def _print_differences(result: GoldenResult, verdict: RunVerdict, *, to_stderr: bool) -> None:
-    from avsreplay.report.comparison_tables import golden_table
+    from avsreplay.report.golden import golden_table
     from avsreplay.report.table import make_console, print_line, print_table
 
     console = make_console(sys.stderr if to_stderr else sys.stdout)

@@ -12,6 +12,7 @@ from avsreplay.report.golden import GoldenResult, compare_records
 from avsreplay.report.jsonl import plain
 from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Statistics
+from avsreplay.report.table import Table, number
 from avsreplay.rows import Row, columns
 
 
@@ -168,3 +169,10 @@ def changed_settings(config: Mapping[str, Any], base: Mapping[str, Any], word: s
 
 def _value(value: Any) -> str:
     return "auto" if value is None else json.dumps(value)
+
+
+def metrics_table(name: str, figures: Sequence[tuple[str, float | None]]) -> Table:
+    """The metrics of a single run."""
+    meaning = {m.name: m.doc for m in METRICS}
+    rows = tuple((metric, meaning[metric], number(value)) for metric, value in figures if value is not None)
+    return Table(name, ("metric", "meaning", "value"), rows, align="llr")

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from avsreplay.report.compare import METRICS, changed_settings, first_divergence, metrics
 from avsreplay.report.summary import Summary
+from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
 
 HEADLINES = {  # the metrics of the conclusion: words, unit and factor
@@ -37,6 +38,7 @@ _NEUTRAL = {"nis_median", "nees_median", "sigma_hits", "ogm_log10_cond", "iterat
 _MAY_BE_MISSING = ("coast_", "recovery_s")  # absent also where nothing went wrong
 _PAIRED = {"all_pos_rmse_m": "pos_err_m", "all_rot_rmse_deg": "rot_err_deg"}
 _UNCERTAIN = 0.1  # relative change of a metric without an interval that is no evidence
+_MARKS = {"better": "good", "worse": "bad"}
 _BLOCKS, _LEAST_BLOCKS, _LEAST_RUNS, _RESAMPLES = 20, 5, 5, 2000
 
 
@@ -236,3 +238,49 @@ def _said(change: Change) -> str:
     if change.note or change.base is None or change.other is None:
         return f"{words} ({change.note or 'no value'})"
     return f"{words} ({factor * change.base:.4g} to {factor * change.other:.4g}{unit})"
+
+
+def settings_table(conclusion: Conclusion) -> Table:
+    """The settings in which a run differs from the baseline."""
+    texts = conclusion.settings or ("none",)
+    return facts_table(f"Settings of {conclusion.name} that differ", [("setting", text) for text in texts])
+
+
+def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = False) -> Table:
+    """The metrics of a run against those of the baseline, with a word on each.
+
+    Without ``show_all`` the table has the main metrics and those that changed.
+    """
+    shown = [c for c in conclusion.changes if show_all or c.metric in HEADLINES or c.word != "equal"]
+    meaning = {m.name: m.doc for m in METRICS}
+    rows = tuple(
+        (
+            change.metric,
+            *((meaning[change.metric],) if show_all else ()),
+            number(change.base, ".4g"),
+            number(change.other, ".4g"),
+            change.note or _relative(change),
+            "" if change.low is None else f"{change.low:+.2g} to {change.high:+.2g}",
+            TableCell(change.word, _MARKS.get(change.word, "")),
+        )
+        for change in shown
+    )
+    runs = f", means of {conclusion.pairs} pairs" if conclusion.pairs > 1 else ""
+    left_out = len(conclusion.changes) - len(shown)
+    return Table(
+        f"{conclusion.name} against {baseline}{runs}",
+        ("metric", *(("meaning",) if show_all else ()), "baseline", "this", "change", "95 % interval", "conclusion"),
+        rows,
+        align="llrrrrl" if show_all else "lrrrrl",
+        note=f"{left_out} equal metrics are not shown" if left_out else "",
+    )
+
+
+def _relative(change: Change) -> str:
+    base, value = change.base, change.other
+    if base is None or value is None or base == value:
+        return ""
+    if base == 0:
+        return f"{value - base:+.3g}"
+    times = value / base
+    return f"x {times:.3g}" if times >= 10.0 else f"{100 * (value - base) / abs(base):+.1f} %"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from avsreplay.errors import CheckFailed, UsageError
 from avsreplay.report.compare import METRICS
+from avsreplay.report.table import Table, TableCell, number
 from avsreplay.settings import Settings, setting
 from avsreplay.toml_document import build, load
 
@@ -195,3 +196,18 @@ def _message(text: str) -> str:
 
 def _property(text: str) -> str:
     return _message(text).replace(":", "%3A").replace(",", "%2C")
+
+
+def gate_table(outcomes: Sequence[RuleOutcome]) -> Table:
+    """Every rule and its outcome."""
+    rows = tuple(
+        (
+            TableCell("holds", "good") if o.ok else TableCell("broken", "bad"),
+            o.run,
+            o.rule.text,
+            number(o.value),
+            o.why,
+        )
+        for o in outcomes
+    )
+    return Table("Gate", ("outcome", "run", "rule", "value", "why"), rows, align="lllrl")

@@ -13,6 +13,7 @@ from typing import Any
 
 from avsreplay.errors import CheckFailed, UnreadableInput
 from avsreplay.report.jsonl import plain, read_records, write_rows
+from avsreplay.report.table import Table, number
 from avsreplay.rows import Column, Row, columns
 
 ABSENT = "(absent)"
@@ -164,3 +165,34 @@ def update_golden(path: str | Path, rows: Iterable[Row], *, first: int = 20) -> 
     former = compare_golden(path, rows, first=first) if Path(path).is_file() else None
     write_rows(path, rows)
     return former
+
+
+def divergence_line(baseline: str, other: str, found: GoldenResult) -> str:
+    """Where the rows of two runs first differ, in one line."""
+    if found.ok:
+        return f"{other}: all {found.rows} rows agree with {baseline} within the columns' tolerances"
+    first = found.differences[0]
+    scan = "every scan" if first.seq is None else f"scan {first.seq}"
+    line = f"{other}: {found.count} cells differ from {baseline}, first at {scan}, column {first.column}"
+    return f"{line} ({first.expected} against {first.got})"
+
+
+def golden_table(result: GoldenResult) -> Table:
+    """The first differences from a golden file, and in the note how many there are in each column."""
+    counts = sorted(result.by_column.items(), key=lambda item: (-item[1], item[0]))
+    return Table(
+        f"Golden: first {len(result.differences)} of {result.count} differences",
+        ("scan", "column", "expected", "got", "tolerance"),
+        tuple(
+            (
+                "all" if d.seq is None else str(d.seq),
+                d.column,
+                "null" if d.expected is None else str(d.expected),
+                "null" if d.got is None else str(d.got),
+                number(d.tolerance, ".3g", "exact"),
+            )
+            for d in result.differences
+        ),
+        align="rlrrr",
+        note="by column: " + ", ".join(f"{name} {count}" for name, count in counts[:12]),
+    )

@@ -18,10 +18,9 @@ from markupsafe import Markup
 
 from avsreplay.records import State
 from avsreplay.report.charts import Chart, Columns, charts, derived, embed, most_telling, pack, spans, values
-from avsreplay.report.comparison_tables import changes_table, gate_table, settings_table
-from avsreplay.report.conclusion import ComparedRun, Conclusion
+from avsreplay.report.conclusion import ComparedRun, Conclusion, changes_table, settings_table
 from avsreplay.report.export import StampedPose
-from avsreplay.report.gate import RuleOutcome
+from avsreplay.report.gate import RuleOutcome, gate_table
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import fact_lines, in_one_line, moments_table, summary_tables, verdict_table
 from avsreplay.report.table import Table, as_cell, facts_table
