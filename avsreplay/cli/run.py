@@ -46,15 +46,9 @@ Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than require
 @click.argument("log", type=PATH)
 @run_settings
 @click.option(
-    "--start",
-    "starts",
-    type=StartMode(),
-    multiple=True,
-    help="Initialisation of the estimate (cold, near, paper), or the time after the first scan to begin at [s].",
+    "--start", "starts", type=StartMode(), multiple=True, help="Initialisation (cold, near, paper) or start time [s]."
 )
-@click.option(
-    "--paper", is_flag=True, help="Use the method as printed in the paper, without any addition (docs/paper.md)."
-)
+@click.option("--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md).")
 @source_options
 @pose_options
 @click.option("--golden", type=PATH, help="Compare the rows with this golden file; exit code 1 if they differ.")
