@@ -39,6 +39,7 @@ ELSEWHERE = {  # command of a block that needs more than a folder: the test that
     "avsreplay run $D/primesense-bunny": "test_real.py::test_the_depth_views_of_a_figure",
     "avsreplay run toss.csv": "test_real.py::test_gravity_is_found",
     "avsreplay run $D/stanford-bunny": "test_real.py::test_every_bunny_scan",
+    "avsreplay model $D/stanford-bunny": "test_reconstruct.py::test_scans_of_the_bunny_that",
     "avsreplay run milk": "test_real.py::test_a_carton_in_a_depth_scene",
     "avsreplay run $D/ros1-bags": "test_real.py::test_raw_packets_are_named",
     "pip install docs/examples/own_backend": "test_docs.py::test_the_back_end_of_the_tutorial_keeps_the_contract",

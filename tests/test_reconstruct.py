@@ -136,6 +136,7 @@ def test_a_sphere_is_refused():
         reconstruct(lambda: scans)
 
 
+@pytest.mark.slow
 def test_steps_that_are_too_large_are_refused():
     """Neighbouring scans share hardly any surface, and no scan shows a side again."""
     axes = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -148,6 +149,7 @@ def test_steps_that_are_too_large_are_refused():
     assert "steps between scans are too large" in str(refused.value.hint)
 
 
+@pytest.mark.slow
 def test_a_scan_with_a_wrong_pose_contradicts_the_others():
     scans, truth = turning(8, 15.0, noise_m=0.003)
     p, survey = ReconstructionParams(), surveyed(lambda: scans, 100, 400)
