@@ -28,7 +28,7 @@ from avsreplay.estimate.dynamics import (
     propagate_state,
     torque_density,
 )
-from avsreplay.estimate.error_state import DIM
+from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite, least_eigenvalue
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Forecast, State
@@ -39,8 +39,6 @@ _RISE, _TRIES, _LOST = 0.5 * _NODE**2, 6, 3.0
 _PIN_STEPS, _FEWEST_STEPS, _PIN_WORK = 15, 40, 12000  # of fits with one direction fixed; steps times poses and pieces
 _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
-_ROUNDING = 1e-9  # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
-_LARGEST_MOVE = 1e3  # largest correction in chart steps, of which none has a larger unit than a metre or a radian
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
 LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
 _DISTURBED = 12  # error states that a disturbance reaches: attitude to velocity; they depend on steps of these alone
@@ -222,51 +220,29 @@ def final_mixture(
     recent = Problem(latest, problem.prior, fitted.effective)
     for weight, chart, pin in bases:
         y, P = process_noise_pass(chart, pin, problem, noise)
-        if not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < _LARGEST_MOVE):  # far beyond what is linear
+        if not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < LARGEST_MOVE):  # far beyond what is linear
             if pin is not None:
                 lost += weight
                 continue
             y, P = np.zeros(DIM), fitted.P_chart
         if pin is None:
-            P = _definite(P if spread is None else spread @ P @ spread.T)  # spread: for the trajectory of the fit alone
+            P = definite(P if spread is None else spread @ P @ spread.T)  # spread: for the trajectory of the fit alone
         x, step = propagate_chart(chart, after_s)
         base, move = to_chart(x), step @ y
         share = 1.0
-        if _least_eigenvalue(P) < _ROUNDING or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
+        if least_eigenvalue(P) < ROUNDING or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
             share = _accepted_share(base, move, recent)
         there = base.moved(share * move)
         P = P if pin is not None else _fixed(P, [d.row for d in found.directions])
         P = step @ P @ step.T + (1.0 - share) ** 2 * np.outer(move, move)
-        if pin is not None and not _least_eigenvalue(P) >= -_ROUNDING:
+        if pin is not None and not least_eigenvalue(P) >= -ROUNDING:
             lost += weight  # about an unstable spin, rounding at the epoch has grown beyond the covariance
             continue
-        P = _definite(P)
+        P = definite(P)
         T = to_errors(there)
         P_errors = T @ P @ T.T
         out.append(Component(weight, Belief(t_ns, to_state(there), 0.5 * (P_errors + P_errors.T)), P, share))
     return (replace(out[0], weight=out[0].weight + lost), *out[1:])
-
-
-def _least_eigenvalue(P: Array) -> float:
-    """The least eigenvalue of P in units of its variances; minus infinity where a variance is not positive."""
-    variances = np.diagonal(P)
-    if not (np.all(variances > 0.0) and np.all(np.isfinite(P))):
-        return -np.inf
-    scale = np.sqrt(variances)
-    return float(np.linalg.eigvalsh(P / np.outer(scale, scale))[0])
-
-
-def _definite(P: Array) -> Array:
-    """P with its eigenvalues, in units of its variances, raised to ``_ROUNDING`` where rounding made one negative.
-
-    Standard deviations are limited to ``_LARGEST_MOVE``: about an unstable spin they grow without bound.
-    """
-    if _least_eigenvalue(P) >= 0.0 and float(np.diagonal(P).max()) <= _LARGEST_MOVE**2:
-        return P
-    scale = np.sqrt(np.maximum(np.abs(np.diagonal(P)), np.finfo(float).tiny))
-    values, axes = np.linalg.eigh(0.5 * (P + P.T) / np.outer(scale, scale))
-    half = np.minimum(scale, _LARGEST_MOVE)[:, None] * axes * np.sqrt(np.maximum(values, _ROUNDING))
-    return np.asarray(half @ half.T)
 
 
 def _fixed(P: Array, rows: list[Array]) -> Array:

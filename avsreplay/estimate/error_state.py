@@ -16,6 +16,9 @@ from avsreplay.records import BLOCKS, State
 DIM = 20
 DQ, W, RHO, VEL, SIGMA, VARRHO, DMU = (BLOCKS[name] for name in BLOCKS)
 
+ROUNDING = 1e-9  # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
+LARGEST_MOVE = 1e3  # largest correction in chart steps, of which none has a larger unit than a metre or a radian
+
 Quad = tuple[float, float, float, float]
 
 
@@ -88,3 +91,25 @@ def _unit(q: Quad) -> Array:
     x, y, z, w = q
     n = 1.0 / math.sqrt(x * x + y * y + z * z + w * w)
     return np.array((x * n, y * n, z * n, w * n))
+
+
+def least_eigenvalue(P: Array) -> float:
+    """The least eigenvalue of P in units of its variances; minus infinity where a variance is not positive."""
+    variances = np.diagonal(P)
+    if not (np.all(variances > 0.0) and np.all(np.isfinite(P))):
+        return -np.inf
+    scale = np.sqrt(variances)
+    return float(np.linalg.eigvalsh(P / np.outer(scale, scale))[0])
+
+
+def definite(P: Array) -> Array:
+    """P with its eigenvalues, in units of its variances, raised to ``ROUNDING`` where rounding made one negative.
+
+    Standard deviations are limited to ``LARGEST_MOVE``: about an unstable spin they grow without bound.
+    """
+    if least_eigenvalue(P) >= 0.0 and float(np.diagonal(P).max()) <= LARGEST_MOVE**2:
+        return P
+    scale = np.sqrt(np.maximum(np.abs(np.diagonal(P)), np.finfo(float).tiny))
+    values, axes = np.linalg.eigh(0.5 * (P + P.T) / np.outer(scale, scale))
+    half = np.minimum(scale, LARGEST_MOVE)[:, None] * axes * np.sqrt(np.maximum(values, ROUNDING))
+    return np.asarray(half @ half.T)
