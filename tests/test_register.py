@@ -14,8 +14,8 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.records import AlignStatus, Fit, Surface
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import boxes, example_pose, plate_scan, view
+from avsreplay.register.horn import best_motion, horn_matrix
 from avsreplay.register.quality import evidence, grade, unobservable_directions
-from avsreplay.register.reference import best_motion, horn_matrix
 from avsreplay.register.sampling import sample, thin
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Camera, Visibility, is_outward

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from avsreplay.register.backend import Availability, Backend, Target, available
+from avsreplay.register.backend import POSES, Availability, Backend, Target, available, measured_alignment
 from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.params import RegisterParams, RegistrationLimits
-from avsreplay.register.poses import POSES, measured_alignment
 from avsreplay.register.registrar import Registrar
 
 __all__ = [

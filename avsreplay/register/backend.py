@@ -2,6 +2,9 @@
 
 A back end is a class ``Backend(target)`` under the entry-point group ``avsreplay.backends``. It returns a pose, an
 iteration count and its own convergence flag, nothing more: ``quality.grade`` measures the quality of every pose.
+
+``poses`` is the entry for logs that hold poses of a tracker (markers, motion capture), of which nothing is registered:
+the pipeline takes the pose of such a scan as its alignment.
 """
 
 from __future__ import annotations
@@ -12,11 +15,12 @@ from dataclasses import dataclass
 from importlib import metadata
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import MissingBackend, UsageError
-from avsreplay.geometry import Pose
-from avsreplay.records import Fit, Surface
+from avsreplay.geometry import MeasuredPose, Pose, frozen
+from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 
 if TYPE_CHECKING:
     from avsreplay.register.params import RegistrationLimits
@@ -24,6 +28,7 @@ if TYPE_CHECKING:
     from avsreplay.register.visibility import Visibility
 
 GROUP = "avsreplay.backends"
+POSES = "poses"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +64,40 @@ class Backend(Protocol):
             T_ca, the number of iterations and whether the iteration converged. If no point has a correspondence, the
             guess and False. An exception, or a pose that is not finite, becomes the status FAILED.
         """
+
+
+def measured_alignment(found: MeasuredPose) -> Alignment:
+    """Return a measured pose as an alignment: no points, and no fit whose quality could be graded.
+
+    Args:
+        found: the pose. Where it has no covariance, the estimator uses its R0.
+    """
+    C = found.covariance
+    info = frozen(np.zeros((6, 6)) if C is None else np.linalg.inv(C))
+    return Alignment(found.T_ac, 0, True, 0, 0, 0.0, info, AlignStatus.MEASURED, C)
+
+
+class PoseBackend:
+    """The entry of ``poses`` in the list of back ends; it cannot align clouds."""
+
+    name = POSES
+    same_bytes = True
+    about = "no registration: the log holds measured poses of a tracker (pose topic, TUM, CSV)"
+
+    def __init__(self, target: Target) -> None:
+        """Take the target like every back end; it is not used."""
+
+    def align(self, points: NDArray[Any], guess: Pose) -> Fit:  # noqa: ARG002 (the protocol names them)
+        """Refuse a cloud; it becomes the status FAILED of the scan.
+
+        Args:
+            points: (n, 3) in {A} [m].
+            guess: initial T_ca.
+
+        Raises:
+            ValueError: always.
+        """
+        raise ValueError(f"the back end '{self.name}' takes the poses of the log and cannot align clouds")
 
 
 Factory = Callable[[Target], Backend]

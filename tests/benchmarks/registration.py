@@ -23,8 +23,8 @@ import numpy as np
 
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
+from avsreplay.register.horn import best_motion
 from avsreplay.register.params import RegisterParams
-from avsreplay.register.reference import best_motion
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 from avsreplay.simulate import builtin_surface
