@@ -106,7 +106,7 @@ def test_any_bytes_are_a_journal_without_a_traceback(tmp_path_factory, data):
     assert list(Journal(folder).status) == [result(1).id]
 
 
-@pytest.mark.parametrize("damage", ["missing", "cut", "flipped", "other"])
+@pytest.mark.parametrize("damage", ["missing", "cut", "flipped", "other", "name", "columns"])
 def test_damaged_scans_are_found_and_their_run_is_made_again(tmp_path, damage):
     filled(tmp_path)
     part = tmp_path / "scans" / "00" / f"{result(1).id}.parquet"
@@ -118,6 +118,13 @@ def test_damaged_scans_are_found_and_their_run_is_made_again(tmp_path, damage):
         with Journal(tmp_path / "x") as journal:
             journal.add(result(1, scans=3))
         part.write_bytes((tmp_path / "x" / "scans" / "00" / part.name).read_bytes())
+    elif damage == "name":  # of a column, which is then not UTF-8
+        assert b"gamma" in data
+        part.write_bytes(data.replace(b"gamma", b"\xffamma"))
+    elif damage == "columns":
+        parquet = pytest.importorskip("pyarrow.parquet")
+        table = parquet.read_table(part)
+        parquet.write_table(table.rename_columns([*table.column_names[:-1], "another"]), part)
     else:
         flipped = bytes([*data[:40], data[40] ^ 1, *data[41:]])
         part.write_bytes(data[:-5] if damage == "cut" else flipped)

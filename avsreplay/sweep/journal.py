@@ -75,10 +75,12 @@ def read_scans(path: Path) -> list[tuple[Any, ...]]:
     pa, pq = arrow()
     try:
         table = pq.read_table(path, page_checksum_verification=True)
-    except (OSError, pa.ArrowException) as error:
+        if table.schema != scan_schema().remove(0):
+            raise ValueError("its columns are not those of a campaign's scans")
+        return list(zip(*(column.to_pylist() for column in table.columns), strict=True))
+    except (OSError, ValueError, pa.ArrowException) as error:  # ValueError: also a name that is not UTF-8
         what = str(error).splitlines()[0]
         raise UnreadableInput(what, where=str(path), hint="run the campaign again") from None
-    return list(zip(*(column.to_pylist() for column in table.columns), strict=True))
 
 
 T = TypeVar("T")

@@ -35,6 +35,7 @@ from avsreplay.cli import SUMMARIES, group
 from avsreplay.errors import AvsError
 from avsreplay.log import GrowingLog
 from avsreplay.report.result import write_manifest
+from avsreplay.simulate import scenario
 
 LIMIT_S, LIMIT_MIB = 20, 512
 ROOT = Path(__file__).resolve().parents[2]
@@ -195,6 +196,7 @@ def build(folder: Path) -> None:
     from avsreplay.cli import backends
     from avsreplay.cli import run as run_command
 
+    scenario.MAX_SCANS = 2000  # more are refused as those above the limit are, not recorded for hours
     log.GrowingLog, log._POLL_S, log._PER_OPENING = WrittenLog, 0.0, 0.0
     backends._peak_mib = lambda *_: None  # no process of its own for each measurement of memory
     texts = {"scenario.toml": SCENARIO, "rules.toml": RULES, "robot.toml": ROBOT,
