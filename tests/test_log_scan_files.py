@@ -242,6 +242,13 @@ def test_a_model_with_a_vertex_that_is_too_far_away_is_rejected(tmp_path: Path, 
         read_surface(tmp_path / "a.obj")
 
 
+@pytest.mark.parametrize("value", ["1e-7", "1e-44", "1e-320", "0"])
+def test_a_model_that_is_too_small_is_rejected(tmp_path: Path, value: str) -> None:
+    (tmp_path / "a.obj").write_text(f"v 0 0 0\nv {value} 0 0\nv 0 {value} 0\nf 1 2 3\n")
+    with pytest.raises(UnreadableInput, match=r"the model spans|zero area"):
+        read_surface(tmp_path / "a.obj", cloud_ok=True)
+
+
 def test_a_cloud_is_accepted_as_a_model_if_requested(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(SEEDS["ascii.ply"])
     with pytest.raises(UnreadableInput, match="--cloud-model"):

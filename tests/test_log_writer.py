@@ -74,6 +74,16 @@ def test_a_label_covers_a_half_open_window(tmp_path: Path) -> None:
         assert [s.fault for s in true_scans(source)] == [None, "clutter", "clutter", None]
 
 
+def test_labels_at_times_that_ros_cannot_hold_are_cut(tmp_path: Path) -> None:
+    """The header record of a foreign log may state any whole number."""
+    head = LogHeader(labels=(Label("clutter", -(10**30), 3 * SECOND), Label("empty", 2 * SECOND, 10**30)))
+    with LogWriter(tmp_path / "a.mcap", head) as writer:
+        for k in range(4):
+            writer.write(Scan(k, k * SECOND, np.ones((1, 3), np.float32), log_ns=k * SECOND))
+    with open_source(tmp_path / "a.mcap") as source:
+        assert [s.fault for s in true_scans(source)] == ["clutter", "clutter", "empty", "empty"]
+
+
 def test_the_bytes_depend_on_the_input_alone(tmp_path: Path) -> None:
     script = (
         "import sys; sys.path.insert(0, sys.argv[2])\n"

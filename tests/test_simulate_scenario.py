@@ -250,6 +250,23 @@ def test_a_run_table_is_passed_on():
     }
 
 
+def test_a_motion_that_needs_too_many_steps_is_one_line():
+    """Fast for its length, or so fast that a step is below the resolution of the time."""
+    found = scenario()
+    for rate in (1e5, 1e300):
+        motion = replace(found.params.motion, rate_radps=(rate, 0.0, 0.0))
+        with pytest.raises(UsageError, match="steps"):
+            simulate(replace(found, params=replace(found.params, motion=motion)), SURFACE)
+
+
+def test_a_motion_that_becomes_too_fast_is_one_line(monkeypatch):
+    monkeypatch.setattr("avsreplay.simulate.motion.MOST_STEPS", 200)
+    found = scenario()
+    motion = replace(found.params.motion, torque_std_radps2=100.0, disturbance_step_s=0.1)
+    with pytest.raises(UsageError, match="steps"):
+        simulate(replace(found, params=replace(found.params, motion=motion)), SURFACE)
+
+
 @pytest.mark.parametrize(
     ("extra", "line", "words"),
     [
@@ -263,6 +280,8 @@ def test_a_run_table_is_passed_on():
         ("[target]\nshape = 'boat'\n", 12, "satellite"),
         ("[start]\nmu_std_deg = 0.0\n", 12, "mu_std_deg"),
         ("[motion.x]\ny = 1\n", 11, "unknown key"),
+        (fault("occlusion", start=1e15), 13, "start_s"),
+        (fault("occlusion", duration=1e300), 14, "duration_s"),
     ],
 )
 def test_wrong_scenarios_are_refused_with_file_and_line(extra, line, words):

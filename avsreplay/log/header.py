@@ -139,6 +139,7 @@ def _to_belief(values: Any) -> Belief | None:
 
 
 MAX_BYTES = 512 << 20
+LEAST_EXTENT_M = 1e-6  # squares of a part of it must not underflow
 _SILENT = logging.NullHandler()
 _FORMATS = ("ply", "stl", "obj", "off", "glb", "pcd")
 MODEL_ENDINGS = tuple(f".{name}" for name in _FORMATS)
@@ -291,6 +292,9 @@ def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> 
         raise UnreadableInput(f"{bad} of {len(vertices)} vertices are not finite", where=where, hint=hint)
     if np.abs(vertices).max() > MAX_COORDINATE_M:
         what = f"a vertex is at {np.abs(vertices).max():.3g} m; the largest coordinate is {MAX_COORDINATE_M:.0g} m"
+        raise UnreadableInput(what, where=where, hint="check the units of the model")
+    if np.ptp(vertices, axis=0).max() < LEAST_EXTENT_M:
+        what = f"the model spans {np.ptp(vertices, axis=0).max():.3g} m; the least is {LEAST_EXTENT_M:g} m"
         raise UnreadableInput(what, where=where, hint="check the units of the model")
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UnreadableInput("a face refers to a vertex that does not exist", where=where, hint="check the file")

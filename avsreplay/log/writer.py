@@ -19,6 +19,7 @@ from avsreplay.files import STDOUT, check_output, is_stream, open_alone
 from avsreplay.geometry import Pose
 from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.header import HEADER_RECORD, encode_header, surface_bytes
+from avsreplay.log.index import MAX_NS
 from avsreplay.records import Label, LogHeader, Scan, State
 
 CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = "/points", "/truth/pose", "/truth/body", "/faults"
@@ -262,7 +263,9 @@ class LogWriter:
             written_ns = (
                 at_ns if log_ns is not None else min(at_ns, self._last_ns)
             )  # a fault may last longer than the log
-            self._guarded(partial(self._append, FAULT_TOPIC, written_ns, diagnostic(at_ns, label, place % 2 == 0)))
+            stamp_ns = min(max(at_ns, 0), MAX_NS)  # the header record of a foreign log may state any time
+            written_ns = min(max(written_ns, 0), MAX_NS)
+            self._guarded(partial(self._append, FAULT_TOPIC, written_ns, diagnostic(stamp_ns, label, place % 2 == 0)))
 
     def _append(self, topic: str, log_ns: int, payload: bytes) -> None:
         start = self._chunk_start_ns

@@ -33,6 +33,7 @@ from avsreplay.settings import Settings, setting
 from avsreplay.simulate.scanner import Returns
 
 NS = 1_000_000_000
+LONGEST_S = 1e8  # of a log, and of a window in it: its stamps fit the 31 bits of seconds of a ROS 2 time
 PLATE_RETURN_RATIO = 0.05  # a dark plate: share of the rays it blocks that give a return
 PLATE_DEPTH_RATIO = 0.4  # range of the plate over the median range of the target
 PLATE_TILT = math.tan(math.radians(15.0))
@@ -71,8 +72,8 @@ class InjectedFault(Settings):
     """One table [[fault]]: a kind of fault over [start_s, start_s + duration_s)."""
 
     kind: Kind = setting(doc="What goes wrong.")
-    start_s: float = setting(doc="Begin of the fault, after the first scan is due.", unit="s", low=0.0)
-    duration_s: float = setting(doc="Length of the fault.", unit="s", above=0.0)
+    start_s: float = setting(doc="Begin of the fault, after the first scan is due.", unit="s", low=0.0, high=LONGEST_S)
+    duration_s: float = setting(doc="Length of the fault.", unit="s", above=0.0, high=LONGEST_S)
     strength: float | None = setting(
         None, "Strength; its meaning and range depend on the kind.", unset="the default of the kind"
     )

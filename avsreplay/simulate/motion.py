@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from avsreplay import geometry
+from avsreplay.errors import UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
 from avsreplay.settings import Settings, setting
@@ -26,6 +27,7 @@ from avsreplay.simulate.inertia import Body
 
 ORDER = 22
 STEP_RAD = 0.25
+MOST_STEPS = 100_000  # of the integration, 2 kB each: at least 4000 turns
 Vector = tuple[float, ...]
 Rows = Sequence[Sequence[float]]
 
@@ -162,12 +164,19 @@ class _Instant:
 
 
 def _integrate(body: Body, params: MotionParams, span_s: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Step starts (k,) and Taylor coefficients (k, ORDER + 1, 13) of [q_ac, w_c, r_a, v_a]."""
+    """Step starts (k,) and Taylor coefficients (k, ORDER + 1, 13) of [q_ac, w_c, r_a, v_a].
+
+    Raises:
+        UsageError: The motion is too fast for its length.
+    """
     inertia = [[float(x) for x in row] for row in body.inertia_c]
     least = min(float(m) for m in body.moments)
     now = _Instant(_unit(params.attitude_xyzw), params.rate_radps, params.position_m, params.velocity_mps)
+    fastest = max(math.hypot(*_times(inertia, now.w)) / least, params.orbit_rate_radps)
+    if span_s * fastest > MOST_STEPS * STEP_RAD:
+        raise _too_long(span_s)
     starts: list[float] = []
-    table: list[list[Vector]] = []
+    table: list[Array] = []
     for begin, until, torque, force in _windows(params, sum(inertia[i][i] for i in range(3)), span_s, rng):
         t = begin
         while t < until:
@@ -177,9 +186,16 @@ def _integrate(body: Body, params: MotionParams, span_s: float, rng: np.random.G
                 end = min(end, t + STEP_RAD / params.orbit_rate_radps)
             terms = _terms(now, inertia, torque, _translation(now, params, t, force))
             starts.append(t)
-            table.append(terms)
+            table.append(np.array(terms))
+            if len(table) > MOST_STEPS:
+                raise _too_long(span_s)
             now, t = _at_end(terms, end - t), end
     return np.array(starts), np.array(table)
+
+
+def _too_long(span_s: float) -> UsageError:
+    what = f"{span_s:g} s of this motion need more than {MOST_STEPS} steps of {STEP_RAD} rad"
+    return UsageError(what, where="motion", hint="record a shorter log, or a slower motion")
 
 
 def _windows(

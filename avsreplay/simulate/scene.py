@@ -41,9 +41,9 @@ class SceneObject(Settings):
     velocity_mps: Triple = setting((0.0, 0.0, 0.0), "Velocity of {S} in {A}.", unit="m/s")
     rate_radps: Triple = setting((0.0, 0.0, 0.0), "Constant angular rate in the axes of {A}.", unit="rad/s")
     reflectance: float = setting(REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
-    start_s: float = setting(0.0, "Begin of its presence, after the first scan is due.", unit="s", low=0.0)
+    start_s: float = setting(0.0, "Begin of its presence, after the first scan is due.", unit="s", low=0.0, high=1e8)
     duration_s: float | None = setting(
-        None, "Length of its presence.", unit="s", above=0.0, unset="to the end of the log, without a label"
+        None, "Length of its presence.", unit="s", above=0.0, high=1e8, unset="to the end of the log, without a label"
     )
     harmful: bool = setting(False, "Whether its label says that no good pose can come from such a scan.")
 
