@@ -107,7 +107,8 @@ def test_a_result_of_a_damaged_log_passes_no_gate_in_silence(fixtures_folder: Pa
     assert "its log was damaged" in read("export", tmp_path / "result").stderr
 
 
-BAD_JSON = ["", "{", "[]", '"a"', "NaN", "9" * 400, '{"facts": 1e999}', '{"facts": {"labels": [1]}}', '{"config": 3}']
+BAD_JSON = ["", "{", "[]", '"a"', "NaN", "9" * 400, '{"facts": 1e999}', '{"facts": {"labels": [1]}}', '{"config": 3}',
+            '{"limits": {"alpha_max_m": "1", "length_m": 1.0}}']  # fmt: skip
 
 
 @pytest.mark.parametrize("command", READERS)

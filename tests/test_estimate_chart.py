@@ -74,6 +74,14 @@ def test_nees_is_independent_of_the_axis_names(world: tumbling.World, naming: Ax
     assert nees(belief, x) == pytest.approx(size, rel=0.05)
 
 
+def test_a_covariance_of_zero_ends_in_no_error(world: tumbling.World) -> None:
+    """Standard deviations of 1e-200 are allowed in the settings, and their squares are 0."""
+    x, P = world.states[0], np.eye(20) * 1e-6
+    P[6:9, 6:9] = 0.0
+    named, _ = nearest_permutation(Belief(0, x, P), permute_axes(x, AXIS_PERMUTATIONS[5]))
+    assert np.abs(boxminus(named, x)).max() < 1e-12
+
+
 def test_a_wrong_inertia_is_not_explained_by_a_permutation(world: tumbling.World) -> None:
     x = world.states[0]
     other = State(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma + 0.1, x.c_b, x.q_bc)

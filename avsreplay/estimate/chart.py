@@ -174,7 +174,11 @@ def permute_covariance(P: Array, x: State, permutation: AxisPermutation) -> Arra
 def nearest_permutation(estimate: Belief, truth: State) -> tuple[State, float]:
     """``truth`` in the axis permutation nearest to the estimate by its covariance, and the NEES e' P^-1 e there."""
     errors = _errors(truth, estimate.x)
-    sizes = np.einsum("ni,in->n", errors, np.linalg.solve(estimate.P, errors.T))
+    try:
+        scaled = np.linalg.solve(estimate.P, errors.T)
+    except np.linalg.LinAlgError:  # standard deviations of the start so small that their squares are 0
+        scaled = np.linalg.pinv(estimate.P) @ errors.T
+    sizes = np.einsum("ni,in->n", errors, scaled)
     best = int(np.argmin(sizes))
     return permute_axes(truth, AXIS_PERMUTATIONS[best]), float(sizes[best])
 

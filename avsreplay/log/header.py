@@ -293,14 +293,14 @@ def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> 
     if np.abs(vertices).max() > MAX_COORDINATE_M:
         what = f"a vertex is at {np.abs(vertices).max():.3g} m; the largest coordinate is {MAX_COORDINATE_M:.0g} m"
         raise UnreadableInput(what, where=where, hint="check the units of the model")
-    if np.ptp(vertices, axis=0).max() < LEAST_EXTENT_M:
-        what = f"the model spans {np.ptp(vertices, axis=0).max():.3g} m; the least is {LEAST_EXTENT_M:g} m"
-        raise UnreadableInput(what, where=where, hint="check the units of the model")
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UnreadableInput("a face refers to a vertex that does not exist", where=where, hint="check the file")
     if not len(faces) and not cloud_ok:
         hint = "give a mesh, or --cloud-model to use its points as the model"
         raise UnreadableInput("the model has no faces", where=where, hint=hint)
+    if np.ptp(vertices, axis=0).max() < LEAST_EXTENT_M:
+        what = f"the model spans {np.ptp(vertices, axis=0).max():.3g} m; the least is {LEAST_EXTENT_M:g} m"
+        raise UnreadableInput(what, where=where, hint="check the units of the model")
 
 
 def _with_area(vertices: Array, faces: NDArray[Any]) -> NDArray[np.int32]:
