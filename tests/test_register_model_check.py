@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Surface
+from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import ModelCheck, Registrar
 from avsreplay.register.contract import boxes, view
 
@@ -73,3 +73,28 @@ def test_a_mirrored_model_and_another_object_are_told_apart() -> None:
         check = ModelCheck(registrar, model)
         check.add(points, registrar.acquire(points))
         assert word in check.notes()[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.6, 0.8, 1.3])
+def test_a_model_of_another_size_is_not_called_mirrored(factor: float) -> None:
+    model = boxes()
+    wrong = replace(model, vertices=factor * model.vertices)
+    registrar = Registrar(wrong)
+    check = ModelCheck(registrar, wrong)
+    for points, _ in scans(model, 3):
+        check.add(points, registrar.acquire(points))
+    note = check.notes()[0]
+    assert "mirror" not in note
+    assert f"the model {wrong.extent:.3g} m" in note
+
+
+@pytest.mark.parametrize("factor", [39.37, 100.0, 1000.0])
+def test_a_model_in_another_unit_accepts_no_scan(factor: float) -> None:
+    """The scan is as small as the rejection distance, which follows the size of the model."""
+    model = boxes()
+    registrar = Registrar(replace(model, vertices=factor * model.vertices))
+    points, T_ac = scans(model, 1)[0]
+    for found in (registrar.register(points, T_ac), registrar.acquire(points)):
+        assert found.status is AlignStatus.IMPLAUSIBLE
+        assert "--model-unit" in found.message

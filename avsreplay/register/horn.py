@@ -20,6 +20,8 @@ from avsreplay.register.backend import Target
 from avsreplay.register.surface_index import IcpParams
 
 PLANE_PASSES = 3
+TIGHTEN = 4.0  # rejection distance over rms: three standard deviations of a face that is seen at right angles
+LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
 FEW_POINTS = 600  # of a scan that has many more, for the first passes
 TIGHTEN = 3.0  # the gate of the reference in units of the rms of the last pass
@@ -31,8 +33,9 @@ class HornBackend:
     """Exact closest points on the model, one fused pass, identical results for any number of threads.
 
     Rejection and stopping are those of :class:`~avsreplay.register.surface_index.IcpParams`: the gate starts at
-    ``reach_m``, follows three times the rms of the last pass and never goes below ``gate_m``. Where the position of the
-    camera is known, only faces that face it are matched.
+    ``reach_m``, follows four times the rms of the last pass and never goes below 0.004 of the extent, or ``gate_m`` if
+    that is less: points beyond three standard deviations, at the edges of what is hidden, pull the pose. Where the
+    position of the camera is known, only faces that face it are matched.
     """
 
     name: ClassVar[str] = "horn"
@@ -52,7 +55,8 @@ class HornBackend:
             n_plane=min(PLANE_PASSES, limits.n_max),
             few=FEW_POINTS,
             gate_m=limits.reach_m,
-            floor_m=limits.gate_m,
+            floor_m=min(limits.gate_m, LEAST_GATE_OF_EXTENT * target.index.extent_m),
+            tighten=TIGHTEN,
             eps_rad=limits.eps_rad,
             eps_m=limits.eps_m,
             threads=limits.threads,

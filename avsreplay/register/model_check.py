@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.registrar import Registrar
@@ -28,6 +29,7 @@ from avsreplay.register.visibility import is_outward
 POINTS = 1500  # points used of each scan
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
 LEAST_INFORMATION = 1e-3  # least share of n . p that the pose cannot explain
+LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
 SIGMAS = 4.0  # least |delta| in standard errors that is reported
 
 
@@ -111,14 +113,18 @@ class ModelCheck:
             self._rms.append(alignment.rms_m / self._surface.extent)
 
     def _diagnosis(self, points: NDArray[Any]) -> str:
-        """Try the mirrored model on a scan that was not registered."""
+        """Try the mirrored model on a scan that was not registered, and compare the sizes."""
         finite = np.isfinite(points).all(axis=1)
         scan = without_scattered_points(np.asarray(points[finite], dtype=np.float64))
         mirrored = replace(self._surface, vertices=self._surface.vertices * [-1.0, 1.0, 1.0])
         if len(scan) and self._fits(replace(mirrored, faces=mirrored.faces[:, ::-1]), scan):
             return "the scans fit the mirror image of the model: is an axis of the model or of the scans inverted?"
-        return "no pose of the model explains the scans: is it the right model, in metres?"
+        measures = geometry.bounding_diagonal(scan) if len(scan) else 0.0
+        sizes = f"the first of them measures {measures:.3g} m, the model {self._surface.extent:.3g} m"
+        return f"no pose of the model explains the scans ({sizes}): is it the right model, in metres?"
 
     def _fits(self, surface: Surface, scan: Array) -> bool:
+        """Whether nearly all of a scan is on a model, in one pose only and with its size."""
         params = replace(self._registrar.params, reach_m=None, gate_m=None, eps_m=None, noise_m=None)
-        return Registrar(surface, params).acquire(scan).measured
+        found = Registrar(surface, params).acquire(scan)
+        return found.status is AlignStatus.ALIGNED and found.inlier_ratio >= LEAST_OF_MIRRORED and not found.message

@@ -66,7 +66,7 @@ class RegisterParams(Settings):
     )
     gate_m: float | None = setting(
         None,
-        "Rejection distance in the last iteration; a point closer to the model than this is an inlier.",
+        "Largest rejection distance in the last iteration; a point closer to the model than this is an inlier.",
         unit="m",
         above=0.0,
         of_extent=0.01,

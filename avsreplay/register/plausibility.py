@@ -26,8 +26,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Surface
+from avsreplay.records import Alignment, AlignStatus, Surface
+from avsreplay.register.quality import not_measured
 from avsreplay.register.sampling import sample
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
@@ -40,6 +42,7 @@ NOISE_OF_EXTENT = 0.012  # with more noise than this no pose is accepted
 LEAST_CONTRAST, LEAST_CONTRAST_OF_PART = 6.0, 15.0  # the second where more than MOST_MISSING of the points are off
 MOST_VIOLATED = 0.15  # largest violated share of the surface that is either supported or violated
 MOST_MISSING = 0.1  # largest missing share, if at least as large a share of the scan is not on the model
+LEAST_SCAN_OF_EXTENT = 0.05  # a smaller scan is about as large as the rejection distance, and any face explains it
 LEAST_COMPARED = 30  # with fewer surface points the test has no power
 LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of its incidence is larger
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
@@ -80,6 +83,25 @@ class PlausibilityTest:
         self._points, self._normals = sample(surface, SURFACE_POINTS)
         self._points = self._points[:: max(1, len(self._points) // SURFACE_POINTS)]
         self._normals = self._normals[: len(self._points)]
+
+    def refused(self, scan: NDArray[Any], points: int, guess: Pose | None = None) -> Alignment | None:
+        """Return the alignment of a scan that is not registered at all; None for others.
+
+        Args:
+            scan: (n, 3) finite points in {A} [m].
+            points: of the scan, also those that are not finite.
+            guess: T_ac.
+
+        Returns:
+            NO_POINTS; or IMPLAUSIBLE for a scan so much smaller than the model that any of its faces would explain it.
+        """
+        if len(scan) == 0:
+            return not_measured(points, AlignStatus.NO_POINTS, guess)
+        size = geometry.bounding_diagonal(scan)
+        if size >= LEAST_SCAN_OF_EXTENT * self._extent:
+            return None
+        text = f"the scan measures {size:.3g} m, the model {self._extent:.3g} m: is --model-unit right?"
+        return replace(not_measured(points, AlignStatus.IMPLAUSIBLE, guess), message=text)
 
     def check(self, points: NDArray[Any], T_ca: Pose, scene: NDArray[Any] | None = None) -> Plausibility:
         """Test the pose.

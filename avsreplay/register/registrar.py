@@ -79,8 +79,8 @@ class Registrar:
             was measured T_ac is the guess.
         """
         scan = self._scan(points)
-        if len(scan) == 0:
-            return quality.not_measured(len(points), AlignStatus.NO_POINTS, guess)
+        if refused := self._test.refused(scan, len(points), guess):
+            return refused
         halves = seq % self.params.split_every == 0
         first = self._graded(scan, guess, halves=halves, carried=carried)
         if first.status is AlignStatus.FAILED:
@@ -101,8 +101,8 @@ class Registrar:
             that pose. ``search`` gives both poses.
         """
         scan = self._scan(points)
-        if len(scan) == 0:
-            return quality.not_measured(len(points), AlignStatus.NO_POINTS)
+        if refused := self._test.refused(scan, len(points)):
+            return refused
         return self._acquire(scan, Budget(len(scan)))
 
     def _acquire(

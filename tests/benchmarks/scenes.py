@@ -7,9 +7,10 @@ Meshes: HST, Kepler, bunny and dragon from ../shared/data where it exists, the b
 cylinder with closed ends) and a box. Every view is ray-cast from a random side at three extents, with noise of 0.002 of
 the extent along the ray. The scenes add walls, outliers, occlusion, a second object, noise, an error of scale or a bad
 guess. "Correct": within 2 deg and 0.02 of the extent of the true pose, or of a pose that differs by a symmetry of the
-mesh. With an error of scale up to 10 % the pose counts, the scale being estimated along a run; with a factor of 1000
-no pose is correct. "Accepted": status aligned. Time is processor time; "x" is the ratio to the median of the clean
-scans of the same mesh. A row per scene over all meshes, and with --each one per scene and mesh.
+mesh. With an error of scale up to 10 % the pose counts; with a factor of 1000 no pose is correct. "Accepted": status
+aligned. "Wrong": accepted, not correct, and the row does not say that the scan fits a target of another size. Time is
+processor time; "x" is the ratio to the median of the clean scans of the same mesh. A row per scene over all meshes,
+and with --each one per scene and mesh.
 """
 
 from __future__ import annotations
@@ -273,6 +274,7 @@ class Score:
     right: int = 0
     accepted: int = 0
     wrong: int = 0
+    said: int = 0
     statuses: str = ""
     seconds: list = None  # type: ignore[assignment]
     ratios: list = None  # type: ignore[assignment]
@@ -329,19 +331,20 @@ def _one(
     score.cases += 1
     score.right += right
     score.accepted += accepted
-    score.wrong += accepted and not right
+    score.wrong += accepted and not right and "than the model" not in found.message
+    score.said += "than the model" in found.message
     score.statuses += " " + ("+" if right else "-") + found.status.value
     score.seconds.append(spent)
     score.ratios.append(spent / healthy)
 
 
 def _add(total: Score, score: Score) -> None:
-    for field in ("cases", "right", "accepted", "wrong", "statuses", "seconds", "ratios"):
+    for field in ("cases", "right", "accepted", "wrong", "said", "statuses", "seconds", "ratios"):
         setattr(total, field, getattr(total, field) + getattr(score, field))
 
 
 def _print(label: str, s: Score) -> None:
-    share = f"{s.right:3d} of {s.cases:3d} right, {s.accepted:3d} accepted, {s.wrong:3d} accepted but wrong"
+    share = f"{s.right:3d} of {s.cases:3d} right, {s.accepted:3d} accepted, {s.wrong:3d} wrong, {s.said:3d} other size"
     times = f"{np.median(s.seconds):7.3f} s median {max(s.seconds):7.3f} s max, x {max(s.ratios):6.1f}"
     print(f"{label:36} {share}  {times} {s.statuses if s.cases < 9 else ''}", flush=True)
 
