@@ -98,7 +98,7 @@ class ModelCheck:
         small = "small" if found[0] > 1.0 else "large"
         percent = 100.0 * abs(found[0] - 1.0)
         return (
-            f"the model is {percent:.1f} % too {small} (1 sigma {100.0 * found[1]:.1f} %): "
+            f"the model is {percent:.1f} % too {small} (1 sigma {100.0 * found[1]:.2g} %): "
             f"multiply --model-scale by {found[0]:.4f}",
         )
 
