@@ -39,7 +39,6 @@ from registration_cases import (
 
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
-from avsreplay.register.horn import best_motion
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
