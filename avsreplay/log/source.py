@@ -82,7 +82,11 @@ class Source:
         return [*self._clouds.losses, *self._lost]
 
     def add_loss(self, loss: Loss) -> None:
-        """Add a part that is missing for a reason outside of the file."""
+        """Add a part that is missing for a reason outside of the file.
+
+        Args:
+            loss: the part, as it is reported.
+        """
         self._lost = (*self._lost, loss)
 
     @property

@@ -72,7 +72,7 @@ def pushed(segment: Segment, t_ns: int, dr: Array, dv: Array) -> Segment:
     return replace(segment, r0=r0, v0=v0, path=path, previous=previous)
 
 
-def disturbed(segment: Segment, t_ns: int, span_s: float, sigma_mps2: float, rng: np.random.Generator) -> Segment:
+def with_thrust_error(segment: Segment, t_ns: int, span_s: float, sigma_mps2: float, rng: np.random.Generator) -> Segment:
     """Return the segment of a robot whose thrust was wrong since the last scan; a coasting robot has no error.
 
     Args:
@@ -126,7 +126,7 @@ def closed_loop(
         span = (known.t_ns - last_ns) * 1e-9
         touched |= body is not None and _touched(target, body, state.segment, start_ns, last_ns, known.t_ns)
         if rng is not None:
-            state = replace(state, segment=disturbed(state.segment, known.t_ns, span, noise_mps2, rng))
+            state = replace(state, segment=with_thrust_error(state.segment, known.t_ns, span, noise_mps2, rng))
         state, last_ns = guidance.step(state, known), known.t_ns
         if state.decision.action is Action.CAPTURE and aimed is None and known.scene.attitude is not None:
             aimed = known.scene.attitude(np.array([(state.segment.end_ns - known.t_ns) * 1e-9]))[0]

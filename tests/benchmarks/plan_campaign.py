@@ -40,7 +40,7 @@ from avsreplay.plan import (
     miss,
 )
 from avsreplay.plan.evaluation import closed_miss
-from avsreplay.plan.flights import disturbed
+from avsreplay.plan.flights import with_thrust_error
 from avsreplay.records import Alignment, AlignStatus, Belief, State
 
 EXTENT_M, RATE_HZ, SPAN_S = 8.0, 5.0, 120.0
@@ -139,7 +139,7 @@ def campaign(seed, one=None, limits=LIMITS, noise=0.02):
         forecast = estimator.forecast(belief, convergence.params.times_s)
         watch = convergence.judge(watch, belief, forecast, True)
         known = planner_input(estimator, belief, target, gamma, watch.converged, partial(estimator.forecast, belief))
-        wrong = disturbed(memory.segment, t_ns, 1.0 / RATE_HZ, noise * robot.a_max_mps2, errors)
+        wrong = with_thrust_error(memory.segment, t_ns, 1.0 / RATE_HZ, noise * robot.a_max_mps2, errors)
         memory = replace(memory, segment=wrong)
         before, memory = memory, guidance.step(memory, known)
         for at_s in np.linspace(t, t + 1.0 / RATE_HZ, 5):
