@@ -62,9 +62,9 @@ def test_knowing_more_never_makes_it_worse() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not LOG.exists(), reason="fixtures/tumble.mcap is not here")
 def test_the_command_prints_one_document() -> None:
-    from avsreplay.cli.observability import command
+    from avsreplay.cli.observability import observability_command
 
-    done = CliRunner().invoke(command, [str(LOG), "--json", "--marks", "3"])
+    done = CliRunner().invoke(observability_command, [str(LOG), "--json", "--marks", "3"])
     assert done.exit_code == 0, done.output
     found = json.loads(done.stdout)
     assert len(found["lines"]) == 3

@@ -98,8 +98,13 @@ class AnomalyTest:
         return self._decided(doubtful, window, ranked)
 
     def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:
-        """A scan that agrees with the prediction: the doubtful scans before it were bad."""
+        """A scan that agrees with the prediction: the doubtful scans before it were bad.
+
+        Before the estimate is ready an outlier is used with a small weight; it is no evidence on later changes.
+        """
         after = update(replace(track, doubtful=(), manoeuvres=confirmed(track), pending=False))
+        if epoch.innovation.nis > GATE * nis_scale(track):
+            return after
         return with_nis(replace(after, recent=(*track.recent, epoch)[-_RECENT:]), track, epoch.innovation.nis)
 
     def _undecidable(self, track: Track) -> tuple[Track, Verdict]:

@@ -72,7 +72,9 @@ def pushed(segment: Segment, t_ns: int, dr: Array, dv: Array) -> Segment:
     return replace(segment, r0=r0, v0=v0, path=path, previous=previous)
 
 
-def with_thrust_error(segment: Segment, t_ns: int, span_s: float, sigma_mps2: float, rng: np.random.Generator) -> Segment:
+def with_thrust_error(
+    segment: Segment, t_ns: int, span_s: float, sigma_mps2: float, rng: np.random.Generator
+) -> Segment:
     """Return the segment of a robot whose thrust was wrong since the last scan; a coasting robot has no error.
 
     Args:

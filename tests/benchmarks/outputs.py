@@ -39,6 +39,7 @@ CASES: dict[tuple[str, str], tuple[str, ...]] = {
     ("run", "update_golden"): (*RUN, "--update-golden", "OUT"),
     ("doctor", "output"): ("log.mcap", "--repair", "OUT", "--overwrite"),
     ("plan", "export"): ("result", "--at", "0", "--samples", "1", "--every", "1", "--export", "OUT", "--overwrite"),
+    ("plan", "animate"): ("result", "--at", "0", "--samples", "1", "--every", "1", "--animate", "OUT", "--overwrite"),
     ("report", "output"): ("result", "-o", "OUT", "--overwrite"),
     ("export", "output"): ("result", "--to", "csv", "-o", "OUT", "--overwrite"),
     ("compare", "output"): ("result", "result", "-o", "OUT", "--overwrite"),
@@ -156,7 +157,8 @@ SUFFIX = {
 
 def output_of(case: tuple[str, str], place: Path) -> Path:
     """Name of an output in a folder."""
-    suffixes = {("compare", "output"): ".html", ("compare", "junit"): ".xml", ("run", "update_golden"): ".jsonl"}
+    suffixes = {("compare", "output"): ".html", ("compare", "junit"): ".xml", ("run", "update_golden"): ".jsonl",
+                ("plan", "animate"): ".html"}  # fmt: skip
     return place / f"out{'' if case in FOLDERS else suffixes.get(case) or SUFFIX[case[0]]}"
 
 
