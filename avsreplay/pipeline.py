@@ -29,7 +29,7 @@ from avsreplay.outcome import MonitorReport, Outcome
 from avsreplay.plan import Guidance, GuidanceState, PlannerInput, Scene, TargetGeometry
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Scan, Verdict
-from avsreplay.register import Registrar, measured_alignment
+from avsreplay.register import Registrar, allowed_scans, measured_alignment
 
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
 
@@ -130,9 +130,7 @@ class Monitors:
     ) -> tuple[str, ...]:
         """The consistency checks that the estimate fails after a healthy scan."""
         found = None if healthy is None else estimator.residual_after(track, prior, healthy)
-        if healthy is None or found is None:
-            return ()
-        return violations(track.belief, estimator.pose_covariance(track.belief), *found)
+        return () if found is None else violations(track.belief, estimator.pose_covariance(track.belief), *found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -163,9 +161,8 @@ class PipelineState:
     """What is carried from scan to scan.
 
     Attributes:
-        monitors: state of the monitors.  guidance: plan in force and robot, None before the first scan.
-        track: the estimate, None before the first scan.
-        last_pose: last healthy measured pose, None before one.
+        guidance: plan in force and robot.  track: the estimate.  Both are None before the first scan.
+        last_pose: last healthy measured pose, None before one.  failed: scans with points before that pose.
         origin: where the first pose came from.  start_ns: instant of the first scan.
     """
 
@@ -175,6 +172,7 @@ class PipelineState:
     last_pose: Pose | None = None
     origin: str = ""
     start_ns: int = 0
+    failed: int = 0
 
     @property
     def captured_ns(self) -> int | None:
@@ -193,15 +191,14 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     Returns:
         The state after the scan and the outcome of the scan.
     """
-    state, track, measurement = _track(stages, state, scan)
+    state, track, acquired = _track(stages, state, scan)
     predicted = stages.estimator.predict(track, scan.t_ns)
-    measurement = measurement or _register(stages, state, scan, predicted)
+    measurement = acquired or _register(stages, state, scan, predicted)
     prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
-    if not verdict.gamma and _prediction_lost(stages, scan, predicted):
-        measurement = _acquire(stages, scan, _deskewed(stages, state, scan, predicted), "acquired")
+    if acquired is None and not verdict.gamma and _prediction_lost(stages, scan, predicted):
+        measurement = _acquire(stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired")
         prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
-    converged = state.monitors.convergence.converged
-    track, verdict = stages.estimator.step(track, prior, innovation, verdict, converged)
+    track, verdict = stages.estimator.step(track, prior, innovation, verdict, state.monitors.convergence.converged)
     gamma = verdict.gamma
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, innovation, gamma, track)
     forecast = partial(stages.estimator.track_forecast, track)
@@ -231,7 +228,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         plan=guidance.plan,
     )
     last_pose = measurement.alignment.T_ac if gamma else state.last_pose
-    return replace(state, monitors=monitors, guidance=guidance, track=track, last_pose=last_pose), outcome
+    failed = state.failed + (measurement.alignment.points > 0) if last_pose is None else 0
+    state = replace(state, monitors=monitors, guidance=guidance, track=track, last_pose=last_pose, failed=failed)
+    return state, outcome
 
 
 def fold(stages: Stages, state: PipelineState, scans: Iterable[Scan]) -> Iterator[tuple[PipelineState, Outcome]]:
@@ -260,7 +259,7 @@ def _track(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineSt
     pose, origin = stages.initialise(scan)
     measurement = None
     if pose is None:
-        measurement = _acquire(stages, scan, scan.points, origin)
+        measurement = _acquire(stages, state, scan, scan.points, origin)
         pose = measurement.alignment.T_ac
     start_ns = scan.t_ns if state.track is None else state.start_ns
     return replace(state, origin=origin, start_ns=start_ns), stages.estimator.initial(scan.t_ns, pose), measurement
@@ -276,13 +275,14 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
         origin = state.origin
     elif stages.guess is Guess.LAST:
         guess, origin = state.last_pose, "last"
-    found = stages.registrar.register(points, guess, scan.seq, carried=points is not scan.points)
+    effort, carried = allowed_scans(state.failed), points is not scan.points
+    found = stages.registrar.register(points, guess, scan.seq, carried, effort)
     return _measurement(stages, scan, points, found, origin)
 
 
-def _acquire(stages: Stages, scan: Scan, points: NDArray[Any], origin: str) -> Measurement:
+def _acquire(stages: Stages, state: PipelineState, scan: Scan, points: NDArray[Any], origin: str) -> Measurement:
     """Register the scan without a guess."""
-    return _measurement(stages, scan, points, stages.registrar.acquire(points), origin)
+    return _measurement(stages, scan, points, stages.registrar.acquire(points, allowed_scans(state.failed)), origin)
 
 
 def _measurement(stages: Stages, scan: Scan, points: NDArray[Any], alignment: Alignment, origin: str) -> Measurement:

@@ -8,7 +8,7 @@ import pytest
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
-from avsreplay.register import Registrar
+from avsreplay.register import Registrar, allowed_scans
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.restarts import FIXED_WORK, HEALTHY_PASSES, HEALTHY_SCANS, Budget
@@ -96,13 +96,34 @@ def test_what_is_called_aligned_is_right(registrar: Registrar, surface: Surface,
 
 
 def test_the_budget_counts_work() -> None:
-    budget = Budget(1000, spent=HEALTHY_PASSES * 1000)
+    budget = Budget(1000)
+    budget.spend(HEALTHY_PASSES * 1000)
     left = (HEALTHY_SCANS - 1) * HEALTHY_PASSES * 1000 + HEALTHY_SCANS * FIXED_WORK
     budget.spend(left - 500)
     assert budget.allows(500)
     assert not budget.exhausted
     assert not budget.allows(501)
     assert budget.exhausted
+
+
+def test_searches_become_rare_where_none_finds_a_pose() -> None:
+    """Five in a row, then after delays of at most half of the scans so far: 13 in 100 scans."""
+    searched = [failed for failed in range(100) if allowed_scans(failed) == HEALTHY_SCANS]
+    assert searched == [0, 1, 2, 3, 4, 6, 9, 13, 19, 28, 42, 63, 94]
+
+
+def test_with_the_work_of_one_registration_nothing_is_searched(registrar: Registrar) -> None:
+    scan = np.random.default_rng(SEED).normal(size=(2000, 3)) + np.array([0.0, 0.0, 9.0])
+    found = registrar.acquire(scan, effort=1)
+    assert found.status is AlignStatus.BUDGET_EXHAUSTED
+    assert not found.measured
+    assert "postponed" in found.message
+    assert registrar.register(
+        scan, Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, 9.0])), effort=1
+    ).status not in (
+        AlignStatus.ALIGNED,
+        AlignStatus.MEASURED,
+    )
 
 
 def test_scattered_points_are_left_out_and_a_clean_scan_is_not_changed() -> None:

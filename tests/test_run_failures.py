@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from avsreplay.geometry import IDENTITY_QUAT, Pose
 from avsreplay.log import SourceOptions
 from avsreplay.records import Fit
+from avsreplay.register import Registrar
+from avsreplay.register.registrar import POSTPONED
 from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import Grade, verdict_of
 from avsreplay.run import Job, Run
@@ -61,3 +65,20 @@ def test_a_back_end_that_returns_its_guess_is_no_sensor():
 def test_a_healthy_scan_has_no_message():
     with Run(Job(source=LOG, options=SourceOptions(n_scans=2))) as run:
         assert [row.message for row in run.rows()] == [None] * 2
+
+
+def test_a_wrong_model_is_searched_for_ever_more_rarely(monkeypatch, tmp_path):
+    """Without a pose of the log: five searches in a row, then after 6, 9, 13 and 19 scans; the rows say so."""
+    made = []
+    search = Registrar._acquire
+    monkeypatch.setattr(Registrar, "_acquire", lambda *args, **flags: made.append(1) or search(*args, **flags))
+    model = tmp_path / "other.ply"
+    trimesh.creation.torus(1.5, 0.5).export(model)
+    with Run(Job(source=LOG, options=SourceOptions(n_scans=24, model=model))) as run:
+        run._stages = replace(run._stages, initialise=lambda scan: (None, "acquired"))
+        rows = list(run.rows())
+    points = [row for row in rows if row.points]
+    postponed = [row for row in points if row.message == POSTPONED]
+    assert not any(row.gamma for row in rows)
+    assert len(made) == len(points) - len(postponed) == 9
+    assert {row.status for row in postponed} == {"budget_exhausted"}

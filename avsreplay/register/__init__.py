@@ -6,6 +6,7 @@ from avsreplay.register.backend import POSES, Availability, Backend, Target, ava
 from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
+from avsreplay.register.restarts import allowed_scans
 
 __all__ = [
     "POSES",
@@ -16,6 +17,7 @@ __all__ = [
     "Registrar",
     "RegistrationLimits",
     "Target",
+    "allowed_scans",
     "available",
     "measured_alignment",
 ]

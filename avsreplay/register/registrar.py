@@ -19,7 +19,7 @@ from avsreplay.register.global_search import GlobalSearch, SearchResult
 from avsreplay.register.horn import HornBackend
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
-from avsreplay.register.restarts import SCATTER_WORK, TEST_WORK, VALLEY_WORK, Budget, Restart, Restarter
+from avsreplay.register.restarts import HEALTHY_SCANS, SCATTER_WORK, TEST_WORK, VALLEY_WORK, Budget, Restart, Restarter
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
 from avsreplay.register.size import SizeError, fitted_size
 from avsreplay.register.surface_index import SurfaceIndex
@@ -30,6 +30,7 @@ FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verifie
 TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 LEAST_TO_TURN = 0.2  # with fewer inliers turned starts have no prospect
 SURE_RATIO = 0.9  # a search with fewer inliers is followed by another
+POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
 MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
 
 
@@ -63,7 +64,9 @@ class Registrar:
         self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
         self._restarter = Restarter(self._target, self._test)
 
-    def register(self, points: NDArray[Any], guess: Pose, seq: int = 0, carried: bool = False) -> Alignment:
+    def register(
+        self, points: NDArray[Any], guess: Pose, seq: int = 0, carried: bool = False, effort: int = HEALTHY_SCANS
+    ) -> Alignment:
         """Register a scan from a guess (eq:ICP).
 
         Args:
@@ -73,6 +76,7 @@ class Registrar:
             carried: the points were carried to one instant by the predicted motion. An error of this motion distorts
                 the scan like a systematic error, but the estimator models it (``Alignment.instants``): the covariance
                 then leaves it out, so that it is not counted twice.
+            effort: most work, in ordinary registrations; with 1 an implausible pose is neither restarted nor searched.
 
         Returns:
             The pose T_ac with its quality. A failure is reported as its status, never as an exception. Where nothing
@@ -86,24 +90,26 @@ class Registrar:
         if first.status is AlignStatus.FAILED:
             return first
         healthy = self._healthy(first)
-        found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried)
-        return self._searched(scan, found, carried) if self._far(guess, found) and not searched else found
+        found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried, effort)
+        return self._searched(scan, found, carried, effort) if self._far(guess, found) and not searched else found
 
-    def acquire(self, points: NDArray[Any]) -> Alignment:
+    def acquire(self, points: NDArray[Any], effort: int = HEALTHY_SCANS) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
 
         Args:
             points: as for :meth:`register`.
+            effort: most work, in ordinary registrations; with 1 nothing is measured, because a search costs more.
 
         Returns:
             The pose T_ac with its quality. The status is NO_OVERLAP if no pose explains enough of the scan, and
-            AMBIGUOUS if a second, different pose explains it as well: ``free_directions`` then names the rotation to
-            that pose. ``search`` gives both poses.
+            AMBIGUOUS if a second, different pose explains it as well: ``free_directions`` names the rotation to it.
         """
         scan = self._scan(points)
         if refused := self._test.refused(scan, len(points)):
             return refused
-        return self._acquire(scan, Budget(len(scan)))
+        if effort <= 1:
+            return replace(quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED)
+        return self._acquire(scan, Budget(len(scan), effort))
 
     def _acquire(
         self, scan: NDArray[Any], budget: Budget, carried: bool = False, rounds: int = MOST_ATTEMPTS
@@ -198,14 +204,6 @@ class Registrar:
         """
         return fitted_size(self._index, p, camera_c if self._visibility.sided else None)
 
-    def search(self, points: NDArray[Any]) -> SearchResult:
-        """Return the best and the second best pose of a scan by the global search.
-
-        Args:
-            points: (n, 3) finite, n >= 1, in {A} [m].
-        """
-        return self._global.search(points)
-
     @cached_property
     def _global(self) -> GlobalSearch:
         return GlobalSearch(self._target, self.params.acquire)
@@ -226,9 +224,9 @@ class Registrar:
             return False
         return angle > FAR_RAD or self._global.near_symmetric
 
-    def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool) -> Alignment:
+    def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, effort: int) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
-        budget = Budget(len(scan))
+        budget = Budget(len(scan), effort)
         budget.registered(found)
         if budget.allows(self._global.work(len(scan), 0)):
             return self._acquire(scan, budget, carried)
@@ -250,10 +248,10 @@ class Registrar:
         return far and self._restarter.structure(points, T_ca) > max(poor, np.sqrt(0.5) * found.rms_m)
 
     def _recovered(
-        self, scan: NDArray[Any], guess: Pose, first: Alignment, halves: bool, carried: bool
+        self, scan: NDArray[Any], guess: Pose, first: Alignment, halves: bool, carried: bool, effort: int
     ) -> tuple[Alignment, bool]:
         """Register again within a distance that follows the noise; restart if implausible. Whether it was searched."""
-        few, budget = self._restarter.part(scan), Budget(len(scan))
+        few, budget = self._restarter.part(scan), Budget(len(scan), effort)
         budget.registered(first)
         kept = self._restarter.measure(few, first.T_ac.inverse())
         hopeful = first.measured and kept.noise_m <= NOISE_OF_EXTENT * self._target.surface.extent

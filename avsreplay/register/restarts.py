@@ -43,16 +43,31 @@ FIXED_WORK = 15_000  # what a registration costs besides its points: quality, co
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
 
+def allowed_scans(failed: int) -> int:
+    """Return the work allowed for a scan, in units of an ordinary registration, before the first accepted pose.
+
+    Restarts and searches are made on the first five scans and then after delays of at most half of the scans so far:
+    where no pose of the model explains any scan, because it is the wrong model, their total work stays small.
+
+    Args:
+        failed: scans before this one on which no pose was accepted.
+    """
+    due = 0
+    while due < failed:
+        due += max(1, due // 2)
+    return HEALTHY_SCANS if due == failed else 1
+
+
 class Budget:
     """Point searches left for one scan: counted work, so that results do not depend on the machine.
 
     Args:
         points: points of the scan.
-        spent: point searches made so far.
+        scans: most work in units of an ordinary registration.
     """
 
-    def __init__(self, points: int, spent: int = 0) -> None:
-        self._left = HEALTHY_SCANS * (HEALTHY_PASSES * points + FIXED_WORK) - spent
+    def __init__(self, points: int, scans: int = HEALTHY_SCANS) -> None:
+        self._left = scans * (HEALTHY_PASSES * points + FIXED_WORK)
         self.exhausted = False
 
     def spend(self, searches: int) -> None:
