@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 from avsreplay.estimate import anomalies, hypotheses, noise
 from avsreplay.estimate.dynamics import propagate, propagate_state
 from avsreplay.estimate.measurement import measurement_jacobian
-from avsreplay.estimate.track import Epoch, Prediction, Track
+from avsreplay.estimate.track import Epoch, Prediction, Track, ready
 from avsreplay.records import Belief, Innovation
 
 CLEAN = surprises.Case("clean", seconds=60.0)
@@ -87,6 +87,22 @@ def test_a_new_start_fails_no_check() -> None:
     """The scans of a new start are used again with their own noise, without the factors of the estimate it replaces."""
     case = surprises.Case("early", at_s=0.0, until_s=10.0, bias=0.15, seconds=16.0)
     assert [v for seed in range(3) for v in surprises.run(case, seed).violations] == []
+
+
+@pytest.mark.parametrize("seconds", [5.0, 12.0, 20.0])
+def test_free_motion_explains_the_recent_scans_as_their_predictions_did(seconds: float) -> None:
+    """Of a linear system the chi-square of the joint innovations is the sum of the NIS; poor early estimates are not
+    linear and are left out of the window."""
+    for seed in range(4):
+        result = surprises.run(surprises.Case("clean", seconds=seconds), seed)
+        assert result.track is not None
+        window = result.track.recent
+        assert window
+        assert all(ready(epoch.track) for epoch in window)
+        priors = hypotheses.ChangePriors(0.01, 0.02, 0.2, 0.05)
+        ranked = hypotheses.explain(window, len(window) - 1, priors, 1e-6, 0.0)
+        free = next(e.chi2 for e in ranked if e.hypothesis is hypotheses.Hypothesis.FREE_MOTION)
+        assert 0.4 < free / sum(epoch.innovation.nis for epoch in window) < 2.0
 
 
 def test_three_poses_that_agree_replace_the_first_ones() -> None:

@@ -1,11 +1,10 @@
 """What the estimator does with a large innovation: it defers the scan, decides over the next ones, and acts.
 
 A scan whose NIS is above the 99.99 % point, scaled by the median NIS of the accepted scans, or whose pose jumps, is
-doubtful. It does not change the estimate. After
-three to five doubtful scans ``hypotheses`` decides. Free motion: the scans are used after all. Manoeuvre: rate and
-velocity are fitted anew from its instant on, with inertia, axes and centre of mass kept. Sensor bias: the estimate
-coasts while the offset lasts. Before the estimate has converged, the poses before a jump may as well be the biased
-ones: it is then initialised anew from the later poses, if these agree with one another.
+doubtful. It does not change the estimate. After three to five doubtful scans ``hypotheses`` decides. Free motion: the
+scans are used after all. Manoeuvre: rate and velocity are fitted anew from its instant on, with inertia, axes and
+centre of mass kept. Sensor bias: the estimate coasts while the offset lasts. Before the estimate has converged, the
+poses before a jump may as well be the biased ones: it is then initialised anew from the later poses, if these agree.
 """
 
 from __future__ import annotations
@@ -44,6 +43,7 @@ _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decisio
 _OVER_FREE, _OVER_NEXT = 3.0, 2.0  # log odds over free motion, and over the next hypothesis, of an early decision
 _RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
+_NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _LEAST = 1e-9  # of the eigenvalues of the prior after a manoeuvre
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, in its spread, that tells which poses are biased
 _SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
@@ -93,6 +93,7 @@ class AnomalyTest:
         ranked = explain(window, first, self._priors, *self.batch.noise_levels(track))
         best = ranked[0].hypothesis
         changed = best is Hypothesis.MANOEUVRE and _odds_over_free(ranked) >= _OVER_FREE
+        changed = changed and (bool(track.doubtful) or _linear(window, ranked))
         if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
             return self._accepted(track, epoch, update), verdict
         return self._decided(doubtful, window, ranked)
@@ -100,12 +101,12 @@ class AnomalyTest:
     def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:
         """A scan that agrees with the prediction: the doubtful scans before it were bad.
 
-        Before the estimate is ready an outlier is used with a small weight; it is no evidence on later changes.
+        The hypotheses are linear about the prediction from the first recent scan. This one must be from an estimate
+        that is based on enough poses: before, its errors are too large for the linearisation.
         """
         after = update(replace(track, doubtful=(), manoeuvres=confirmed(track), pending=False))
-        if epoch.innovation.nis > GATE * nis_scale(track):
-            return after
-        return with_nis(replace(after, recent=(*track.recent, epoch)[-_RECENT:]), track, epoch.innovation.nis)
+        after = with_nis(after, track, epoch.innovation.nis)
+        return replace(after, recent=(*track.recent, epoch)[-_RECENT:]) if ready(track) else after
 
     def _undecidable(self, track: Track) -> tuple[Track, Verdict]:
         """Too few scans were accepted for the hypotheses to be compared: the doubtful ones may agree by themselves."""
@@ -308,6 +309,15 @@ def _odds_over_free(ranked: list[Explanation]) -> float:
     return (best.log_evidence - free - PRIOR_ODDS) / scale + PRIOR_ODDS
 
 
+def _linear(window: tuple[Epoch, ...], ranked: list[Explanation]) -> bool:
+    """Return whether the linearisation about the first prediction holds over scans that were all used.
+
+    Of a linear system the chi-square of free motion is then the sum of the NIS, whatever moved the target.
+    """
+    free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
+    return free < _NONLINEAR * sum(e.innovation.nis for e in window)
+
+
 def _chi2(y: Array, C: Array) -> float:
     return float(y @ np.linalg.solve(C, y))
 
@@ -318,12 +328,8 @@ def _long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
     roots = cholesky_root(np.array([one.S for one in last]))
     white = np.linalg.solve(roots, np.array([one.alpha for one in last])[:, :, None])[:, :, 0]
     sums = np.cumsum(white, axis=0)
-    for n in _RUNS:
-        if n <= len(white):
-            variance = n * (1.0 + (n - 1) * epochs[-1].innovation.share)
-            if float(sums[n - 1] @ sums[n - 1]) > _RUN_GATE * scale * variance:
-                return True
-    return False
+    share, lengths = epochs[-1].innovation.share, [n for n in _RUNS if n <= len(white)]
+    return any(sums[n - 1] @ sums[n - 1] > _RUN_GATE * scale * n * (1.0 + (n - 1) * share) for n in lengths)
 
 
 def _definite(root: Array) -> Array:
@@ -336,8 +342,7 @@ def _definite(root: Array) -> Array:
 
 def _after(window: tuple[Epoch, ...], found: Explanation) -> int:
     """Number of scans of the window after a manoeuvre."""
-    t_ns = _last_change_ns(window, found)
-    return sum(e.prediction.belief.t_ns > t_ns for e in window)
+    return sum(e.prediction.belief.t_ns > _last_change_ns(window, found) for e in window)
 
 
 def _last_change_ns(window: tuple[Epoch, ...], found: Explanation) -> int:
