@@ -21,7 +21,7 @@ from avsreplay.plan import (
     closed_loop,
     rendezvous,
 )
-from avsreplay.plan.flights import disturbed, pushed
+from avsreplay.plan.flights import with_thrust_error, pushed
 from avsreplay.plan.limits import margin
 from avsreplay.records import Forecast
 
@@ -168,11 +168,11 @@ def test_the_errors_of_the_thrust_over_one_second_do_not_depend_on_the_rate_of_t
         for _ in range(400):
             segment = Segment(0, path.r0, path.v0, path)
             for k in range(scans):
-                segment = disturbed(segment, (k + 1) * 10**9 // scans, 1.0 / scans, 0.02, rng)
+                segment = with_thrust_error(segment, (k + 1) * 10**9 // scans, 1.0 / scans, 0.02, rng)
             ends.append(segment.at(10**9)[1])
         spreads.append(np.std(ends))
     assert spreads == pytest.approx([0.02, 0.02], rel=0.06)  # m/s after 1 s; 1200 values each: 2 % is 1 sigma
-    assert disturbed(Segment(0, path.r0, path.v0), 10**9, 1.0, 0.02, rng).path is None  # a coasting robot
+    assert with_thrust_error(Segment(0, path.r0, path.v0), 10**9, 1.0, 0.02, rng).path is None  # a coasting robot
 
 
 def test_a_pushed_segment_keeps_its_thrust_and_moves_on_from_the_new_state():
