@@ -1,6 +1,8 @@
 #include "fit.hpp"
 
 #include <cstring>
+#include <limits>
+#include <stdexcept>
 
 namespace avs {
 namespace {
@@ -162,6 +164,15 @@ double Problem::cost_at(const Chart& chart, double* residuals, double* misfit) c
   return 0.5 * sum + penalty(chart);
 }
 
+// The cost at a trial, infinite where its motion cannot be computed (an inertia or a rate beyond all bounds).
+double Problem::trial_cost(const Chart& chart, double* residuals) const {
+  try {
+    return cost_at(chart, residuals);
+  } catch (const std::invalid_argument&) {
+    return std::numeric_limits<double>::infinity();
+  }
+}
+
 void Problem::linearise(const Chart& chart) {
   const size_t n = poses.size();
   at = chart;
@@ -274,7 +285,7 @@ bool Problem::descend(int most, double gain_tol, int& steps) {
     const bool tried = change <= LARGEST_RADPS + turning;
     const Chart there = tried ? moved(at, step) : at;
     const bool last = std::fabs(expected) < gain_tol && tried;
-    const double gain = tried ? cost - cost_at(there, last ? trial.data() : nullptr) : 0;
+    const double gain = tried ? cost - trial_cost(there, last ? trial.data() : nullptr) : 0;
     ++steps;
     if (last) {  // so short a step that the Jacobian is kept
       if (gain > 0) {

@@ -47,6 +47,7 @@ class Problem {
   void linearise(const Chart& chart);
   // Cost at another chart, from the residuals alone; `misfit`: its part without the prior.
   double cost_at(const Chart& chart, double* residuals = nullptr, double* misfit = nullptr) const;
+  double trial_cost(const Chart& chart, double* residuals) const;
   // Weights and cost of the present residuals, with the present factors.
   void reweigh();
   // Normal equations A step = b in chart steps.
