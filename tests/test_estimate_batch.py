@@ -434,3 +434,14 @@ def test_a_pure_spin_stays_predictable(axis: int) -> None:
     assert late.max() < 0.01 * surprises.EXTENT
     assert result.converged[-1]
     assert max(result.ratio[60:]) < 4.0
+
+
+@pytest.mark.parametrize("count", [3, 6])
+def test_a_fit_without_any_prior_knowledge_ends_although_first_trials_are_absurd(count: int) -> None:
+    """A few poses and a prior of a thousand times the usual width: trials have inertias beyond all bounds."""
+    fixes = seen(tumbling.draw(0, mu_deg=80.0, seconds=4.0), 0, pos_m=0.05)[:count]
+    poses = poses_of(fixes)
+    prior = weak_prior(poses, WHITE)
+    fitted = fit(poses, to_chart(rough_state(fixes)), Prior(prior.mean, 1e6 * prior.P), FitParams())
+    assert np.isfinite(fitted.half_chi2)
+    assert fitted.half_chi2 < 10.0 * len(fixes)
