@@ -15,7 +15,6 @@ from avsreplay.estimate.batch import FitParams, Problem, fit
 from avsreplay.estimate.batch_covariance import memory_s, process_noise_pass
 from avsreplay.estimate.batch_schedule import chart_at, contradicted
 from avsreplay.estimate.chart import nees, to_chart, to_errors
-from avsreplay.estimate.ekf import innovation_of
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.initialise import (
     PoseFix,
@@ -27,6 +26,7 @@ from avsreplay.estimate.initialise import (
     rough_state,
     weak_prior,
 )
+from avsreplay.estimate.measurement import innovation_of
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import Constraint, Start
 from avsreplay.monitor.convergence import Consistency, ConsistencyParams

@@ -10,11 +10,16 @@ import tumbling
 from scipy.stats import chi2
 
 from avsreplay import geometry
-from avsreplay.estimate import Estimator, EstimatorParams, ekf, noise
+from avsreplay.estimate import Estimator, EstimatorParams, noise
 from avsreplay.estimate.chart import nees
-from avsreplay.estimate.ekf import sigma_bounds
 from avsreplay.estimate.error_state import boxminus
-from avsreplay.estimate.measurement import measurement_jacobian
+from avsreplay.estimate.measurement import (
+    constrained_update,
+    gain,
+    innovation_of,
+    measurement_jacobian,
+    sigma_bounds,
+)
 from avsreplay.estimate.params import Adaptation, Constraint, NoiseSource
 from avsreplay.geometry import Pose
 from avsreplay.records import Belief, Innovation, Reason, State, Verdict
@@ -50,8 +55,8 @@ def test_update_is_bayes_where_nothing_binds() -> None:
     x = tumbling.draw(1, seconds=1.0).states[0]
     x = State(x.q_ab, x.w_b, x.r_a, x.v_a, np.zeros(2), x.c_b, x.q_bc)
     P, R, H = spread(rng) * 1e-3, spread(rng, 6), measurement_jacobian(x)
-    seen = ekf.innovation_of(P, H, rng.normal(size=6) * 1e-3, R)
-    posterior, hits = ekf.constrained_update(Belief(0, x, P), H, seen, 0.01, WHITE)
+    seen = innovation_of(P, H, rng.normal(size=6) * 1e-3, R)
+    posterior, hits = constrained_update(Belief(0, x, P), H, seen, 0.01, WHITE)
     info = np.linalg.inv(np.linalg.inv(P) + H.T @ np.linalg.inv(R) @ H)
     assert hits == 0
     assert np.abs(posterior.P - info).max() < 1e-9 * np.abs(info).max()
@@ -64,9 +69,9 @@ def test_constrained_update_stays_symmetric_and_positive() -> None:
     x = tumbling.draw(2, seconds=1.0).states[0]
     x = State(x.q_ab, x.w_b, x.r_a, x.v_a, [0.95, -0.9], x.c_b, x.q_bc)
     P, R, H = spread(rng), 1e-4 * np.eye(6), measurement_jacobian(x)
-    K = ekf.gain(P, H, H @ P @ H.T + R)
+    K = gain(P, H, H @ P @ H.T + R)
     alpha = np.linalg.pinv(K[12:14]) @ np.array([0.5, -0.8])
-    posterior, hits = ekf.constrained_update(Belief(0, x, P), H, ekf.innovation_of(P, H, alpha, R), 0.01, WHITE)
+    posterior, hits = constrained_update(Belief(0, x, P), H, innovation_of(P, H, alpha, R), 0.01, WHITE)
     assert hits == 2
     assert posterior.x.sigma == pytest.approx([0.99, -0.99])
     assert np.array_equal(posterior.P, posterior.P.T)
@@ -307,7 +312,7 @@ def test_auto_lengths_scale_with_the_target(extent: float) -> None:
 
 
 def test_innovation_angle_is_the_full_angle() -> None:
-    seen: Innovation = ekf.innovation_of(
+    seen: Innovation = innovation_of(
         np.eye(20), np.zeros((6, 20)), np.array([3.0, 4.0, 0, np.sin(0.3), 0, 0]), np.eye(6)
     )
     assert seen.distance_m == pytest.approx(5.0)

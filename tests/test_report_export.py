@@ -19,10 +19,14 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.supervisor import Action
 from avsreplay.records import AlignStatus, Reason, ScanStatus
-from avsreplay.report.columns_page import columns_page, descriptions, listed_values, row_schema, row_schema_text
 from avsreplay.report.export import (
+    columns_page,
+    descriptions,
     dump_document,
+    listed_values,
     row_poses,
+    row_schema,
+    row_schema_text,
     run_document,
     stamp_text,
     write_csv,

@@ -75,7 +75,7 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
     inside = [row for row in rows if reference.epoch_ns <= row.t_ns <= reference.end_ns]
     lines, ends = _summed(inside, reference, run)
     keep = sorted({round(k * (len(lines) - 1) / (marks - 1)) for k in range(marks)})
-    from avsreplay.estimate.parameter_sets import BLOCKS_OF
+    from avsreplay.estimate.measurement import BLOCKS_OF
     from avsreplay.monitor.observability import weakest as in_words
 
     return {
@@ -88,15 +88,15 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
 
 def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[str, Any]], dict[str, Gramian]]:
     """A record per scan, and the Gramians at the end."""
-    from avsreplay.estimate import parameter_sets
+    from avsreplay.estimate.measurement import prior_1s, step_of_sets
     from avsreplay.monitor.observability import gramian, measure, observe
 
     x, t_ns = reference.at(reference.epoch_ns), reference.epoch_ns
     one_sigma = run.config.estimator.resolved(run.surface.extent).start_1s
-    folds = {name: gramian(scale) for name, scale in parameter_sets.prior_1s(one_sigma, x.sigma).items()}
+    folds = {name: gramian(scale) for name, scale in prior_1s(one_sigma, x.sigma).items()}
     lines = []
     for row in rows:
-        x, steps = parameter_sets.step_of_sets(x, (row.t_ns - t_ns) * 1e-9)
+        x, steps = step_of_sets(x, (row.t_ns - t_ns) * 1e-9)
         t_ns = row.t_ns
         line: dict[str, Any] = {"t_s": row.t_s, "gamma": row.gamma}
         for name, (Phi, H) in steps.items():

@@ -22,8 +22,8 @@ from avsreplay.estimate.dynamics import propagate
 from avsreplay.estimate.error_state import VEL, W
 from avsreplay.estimate.hypotheses import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis, explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
-from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
-from avsreplay.estimate.noise import GATE, cholesky_root
+from avsreplay.estimate.measurement import GATE, innovation_vector, measured_pose, measurement_jacobian
+from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import (
     Epoch,

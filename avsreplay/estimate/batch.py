@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.noise import GATE, integrated_autocorrelation
+from avsreplay.estimate.measurement import GATE
+from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.geometry import Array
 from avsreplay.records import State
 from avsreplay.settings import Settings, setting

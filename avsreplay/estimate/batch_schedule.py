@@ -14,7 +14,6 @@ from operator import attrgetter
 
 import numpy as np
 
-from avsreplay.estimate import ekf
 from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_chart
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
@@ -29,7 +28,7 @@ from avsreplay.estimate.initialise import (
     joined,
     pose_count,
 )
-from avsreplay.estimate.measurement import in_fixture, measured_pose, measurement_jacobian
+from avsreplay.estimate.measurement import chart_update, in_fixture, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
@@ -86,7 +85,7 @@ class BatchSchedule:
             remembers = forgot and track.levels.slack > 1.0  # the filter remembers what later fits cannot use
             return self._adopted(track, result, result.gaussian and (converged or remembers))
         if last.gaussian:
-            belief = ekf.chart_update(prediction.belief, prediction.H, innovation, last.inflation)
+            belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
             return replace(track, belief=belief)
         return replace(track, belief=prediction.belief)
 
@@ -198,7 +197,7 @@ class BatchSchedule:
         """The belief after the first poses, too few for a fit."""
         if self.start is None:
             return first_belief(track.fixes, self.params)
-        return ekf.chart_update(prediction.belief, prediction.H, innovation, NO_INFLATION)
+        return chart_update(prediction.belief, prediction.H, innovation, NO_INFLATION)
 
     def _given(self, track: Track) -> Prior | None:
         """The track's prior, propagated to the first pose; None where disturbances or time have made it useless."""

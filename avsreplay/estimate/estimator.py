@@ -14,7 +14,7 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.errors import UsageError
-from avsreplay.estimate import dynamics, ekf
+from avsreplay.estimate import dynamics
 from avsreplay.estimate.acceleration import FreeFall, accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_covariance import mixture_forecast
@@ -23,6 +23,9 @@ from avsreplay.estimate.chart import to_state
 from avsreplay.estimate.error_state import RHO
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
+    chart_update,
+    constrained_update,
+    innovation_of,
     innovation_vector,
     measured_pose,
     measurement_jacobian,
@@ -101,7 +104,7 @@ class Estimator:
         R = self.noise.of(alignment, x, prediction.window)
         T_ac = alignment.T_ac if self.fall is None else self.fall.pose_into(alignment.T_ac, prediction.belief.t_ns)
         alpha, share = innovation_vector(x, T_ac), self.noise.correlated_share(alignment)
-        found = ekf.innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
+        found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
         return replace(found, rms_m=alignment.rms_m)
 
     def step(
@@ -195,7 +198,7 @@ class Estimator:
         alpha = innovation_vector(prediction.belief.x, pose)
         R = self.noise.rescaled(epoch.innovation.R, epoch.prediction.window, track.window)
         P, share = prediction.belief.P, epoch.innovation.share
-        innovation = ekf.innovation_of(P, prediction.H, alpha, R, self._robust, share)
+        innovation = innovation_of(P, prediction.H, alpha, R, self._robust, share)
         innovation = replace(innovation, rms_m=epoch.innovation.rms_m)
         used = Epoch(replace(track, recent=(), doubtful=(), previous=None), prediction, innovation, epoch.converged)
         return self.update(track, prediction, innovation, 1, epoch.converged), used
@@ -305,9 +308,9 @@ class Estimator:
         mean = 0.0 if track.batch is None else track.batch.share
         inflation = self.noise.inflation(track.inflation, mean, prior.x.w_b, dt_ns, innovation.share)
         if self._by_gain and track.batch is None:
-            belief, hits = ekf.constrained_update(prior, prediction.H, innovation, self.params.sigma_margin, inflation)
+            belief, hits = constrained_update(prior, prediction.H, innovation, self.params.sigma_margin, inflation)
         else:
-            belief, hits = ekf.chart_update(prior, prediction.H, innovation, inflation), 0
+            belief, hits = chart_update(prior, prediction.H, innovation, inflation), 0
         return replace(
             track,
             belief=belief,

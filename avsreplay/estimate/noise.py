@@ -23,8 +23,7 @@ from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource, 
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import Alignment, Belief, Innovation, State
 
-GATE = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom: a pose above it is an outlier
-BOUND = 52.4  # the same with 20 degrees of freedom, for a state
+BOUND = 52.4  # 99.99 % point of chi-square with 20 degrees of freedom, for a state
 NO_INFLATION = frozen(np.ones(2))
 _ONES = frozen(np.ones(6))
 _FREE_RAD = 1.0  # standard deviation of an attitude direction that a degenerate view does not determine

@@ -10,7 +10,7 @@ from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.chart import Chart, to_state
 from avsreplay.estimate.dynamics import rotation_path
 from avsreplay.estimate.error_state import DIM
-from avsreplay.estimate.noise import GATE
+from avsreplay.estimate.measurement import GATE
 from avsreplay.geometry import Array
 
 _POINTS, _SPAN_RAD = 128, 0.25  # normal points, and least rotation over which poses are joined [rad]

@@ -1,7 +1,8 @@
-"""Rows, poses and the summary in formats that other tools open: TUM, KITTI, CSV, Parquet, JSON.
+"""Rows, poses and the summary in formats that other tools open: TUM, KITTI, CSV, Parquet, JSON; the schema of a row.
 
 Time stamps are written from integer nanoseconds, never through a float; values as the shortest text that reads back
-as the same float64.
+as the same float64. Run as a script, it prints docs/columns.md, or docs/rows.schema.json with ``--schema``, from the
+declaration of ``Row`` and from columns.toml.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from importlib import import_module
 from importlib.resources import files
 from pathlib import Path
@@ -18,11 +21,10 @@ from typing import Any, Literal
 from avsreplay.errors import MissingBackend
 from avsreplay.files import output_path, output_text
 from avsreplay.geometry import Pose
-from avsreplay.report.columns_page import descriptions
 from avsreplay.report.jsonl import field_types, plain
 from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import verdict_of
-from avsreplay.rows import Row, columns
+from avsreplay.rows import Column, Row, columns
 from avsreplay.settings import dump
 
 FORMAT = "avsreplay-run/1"
@@ -165,3 +167,92 @@ def write_layout(path: str | Path) -> None:
     """Write the layout with which Foxglove and Lichtblick show ``result.mcap``: 3D view, plots, diagnostics."""
     with output_text(path) as stream:
         stream.write((files("avsreplay.report") / "assets" / "layout.json").read_text(encoding="utf-8"))
+
+
+_HEAD = """# Columns of a row
+
+Each scan gives one row in `rows.jsonl`, CSV, Parquet and `--json`. A value is null where it does not apply, for example
+an error without ground truth. Frames, units and symbols are defined under [conventions](conventions.md), terms in the
+[glossary](glossary.md).
+
+The tables state the tolerance of a [golden file](ci.md) for each column: a value passes if it differs from the expected
+one by at most the absolute tolerance plus the relative tolerance times the expected value; *exact* columns are equal.
+[rows.schema.json](rows.schema.json) is the JSON schema of a row.
+
+`python -m avsreplay.report.export` makes this page (with `--schema` the schema) from `avsreplay/rows.py` and
+`avsreplay/columns.toml`; a test compares them.
+"""
+
+
+@cache
+def _sections() -> list[dict[str, Any]]:
+    text = (files("avsreplay") / "columns.toml").read_text(encoding="utf-8")
+    found: list[dict[str, Any]] = tomllib.loads(text)["sections"]
+    return found
+
+
+@cache
+def descriptions() -> dict[str, str]:
+    """Meaning of each column by its name."""
+    return {name: text for section in _sections() for name, text in section["columns"].items()}
+
+
+@cache
+def listed_values() -> dict[str, dict[str, str]]:
+    """Meaning of every value of the columns that hold one of a few words, by column and value."""
+    return {name: words for section in _sections() for name, words in section.get("values", {}).items()}
+
+
+def columns_page() -> str:
+    """Return the Markdown page."""
+    types, declared = field_types(), {c.name: c for c in columns()}
+    parts = [_HEAD]
+    for section in _sections():
+        parts.append(f"\n## {section['title']}\n\n")
+        parts += [f"{section['text']}\n\n"] if "text" in section else []
+        parts.append("| column | type | unit | golden | meaning |\n|---|---|---|---|---|\n")
+        parts += [_line(declared[name], *types[name]) for name in section["columns"]]
+        for name, words in section.get("values", {}).items():
+            parts.append(f"\n| value of `{name}` | meaning |\n|---|---|\n")
+            parts += [f"| `{word}` | {meaning} |\n" for word, meaning in words.items()]
+    return "".join(parts)
+
+
+def _line(column: Column, kind: type, nullable: bool) -> str:
+    tolerance = " + ".join(
+        text for value, text in ((column.atol, f"{column.atol:g}"), (column.rtol, f"{column.rtol:g} relative")) if value
+    )
+    word = kind.__name__ + (" or null" if nullable else "")
+    meaning = descriptions()[column.name].replace("|", "\\|")
+    return f"| `{column.name}` | {word} | {column.unit} | {tolerance or 'exact'} | {meaning} |\n"
+
+
+def row_schema() -> dict[str, Any]:
+    """JSON schema (draft 2020-12) of one line of ``rows.jsonl``."""
+    names = {str: "string", int: "integer", float: "number", bool: "boolean"}
+    properties = {}
+    for column in columns():
+        kind, nullable = field_types()[column.name]
+        properties[column.name] = {
+            "type": [names[kind], "null"] if nullable else names[kind],
+            "description": descriptions()[column.name] + (f" [{column.unit}]" if column.unit else ""),
+        }
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "avsreplay row",
+        "type": "object",
+        "properties": properties,
+        "required": list(properties),
+        "additionalProperties": False,
+    }
+
+
+def row_schema_text() -> str:
+    """Return the schema as text."""
+    return json.dumps(row_schema(), indent=1, ensure_ascii=False) + "\n"
+
+
+if __name__ == "__main__":
+    import sys
+
+    sys.stdout.write(row_schema_text() if "--schema" in sys.argv else columns_page())
