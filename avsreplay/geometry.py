@@ -136,21 +136,11 @@ def matrix(q_ab: ArrayLike) -> Array:
     R = np.empty((*q.shape[:-1], 3, 3))
     x, y, z, w = q.tolist() if q.ndim == 1 else (q[..., 0], q[..., 1], q[..., 2], q[..., 3])
     square, w2 = x * x + y * y + z * z, 2.0 * w
-    R[..., 0, 0], R[..., 0, 1], R[..., 0, 2] = (
-        1.0 + 2.0 * (x * x - square),
-        2.0 * (x * y) - w2 * z,
-        w2 * y + 2.0 * (x * z),
-    )
-    R[..., 1, 0], R[..., 1, 1], R[..., 1, 2] = (
-        w2 * z + 2.0 * (x * y),
-        1.0 + 2.0 * (y * y - square),
-        2.0 * (y * z) - w2 * x,
-    )
-    R[..., 2, 0], R[..., 2, 1], R[..., 2, 2] = (
-        2.0 * (x * z) - w2 * y,
-        w2 * x + 2.0 * (y * z),
-        1.0 + 2.0 * (z * z - square),
-    )
+    R[..., 0, 0], R[..., 1, 1] = 1.0 + 2.0 * (x * x - square), 1.0 + 2.0 * (y * y - square)
+    R[..., 2, 2] = 1.0 + 2.0 * (z * z - square)
+    R[..., 0, 1], R[..., 1, 0] = 2.0 * (x * y) - w2 * z, w2 * z + 2.0 * (x * y)
+    R[..., 0, 2], R[..., 2, 0] = w2 * y + 2.0 * (x * z), 2.0 * (x * z) - w2 * y
+    R[..., 1, 2], R[..., 2, 1] = 2.0 * (y * z) - w2 * x, w2 * x + 2.0 * (y * z)
     return R
 
 
@@ -266,6 +256,13 @@ def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:
         (4,) unit quaternion.
     """
     return normalise(multiply(q0, exp(fraction * log(multiply(conjugate(q0), q1)))))
+
+
+def across(axis: Array) -> Array:
+    """Return a unit vector (3,) at right angles to a unit vector (3,): the part of a coordinate axis across it."""
+    side = np.eye(3)[int(np.abs(axis).argmin())]
+    side = side - (side @ axis) * axis
+    return np.asarray(side / np.linalg.norm(side))
 
 
 def bounding_diagonal(points: ArrayLike) -> float:

@@ -146,9 +146,7 @@ class Replanning:
             if np.isfinite(margin).all():
                 figures[f"margin_{name}_m"] = margin
         limits, surface = self.limits, self.saved.surface
-        cones = ((limits.cone_deg, limits.cone_range_m), (limits.final_deg, limits.final_range_m))
-        required = [(deg, length) for deg, length in cones if deg is not None and length is not None]
-        return Flight(times, y, figures, np.array(self.saved.axis_c), required, limits.mouth_m or 0.0, surface)
+        return Flight(times, y, figures, np.array(self.saved.axis_c), limits.cones, limits.mouth_m or 0.0, surface)
 
     def attitude(self, belief: Belief, after_s: float) -> Array:
         """Return the predicted q_ac (4,) a time after a belief.

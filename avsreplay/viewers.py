@@ -21,6 +21,7 @@ from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief
 from avsreplay.report.export import row_poses
+from avsreplay.report.flight_page import cone_lines
 from avsreplay.rows import Row, columns
 from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump
@@ -29,7 +30,6 @@ PATH_POINTS = 41
 RESIDUAL_REACH = 0.05  # of the model's extent: larger residuals in the viewer log are cut to this
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 _COLUMNS = tuple(column.name for column in columns())
-CONE_EDGES = 24
 RERUN_PORT = 9876  # on which a Rerun viewer listens
 
 
@@ -116,20 +116,10 @@ def approach_cones(run: Run) -> Array | None:
     Args:
         run: its configuration gives angles, lengths and the axis of the fixture.
     """
-    extent = run.surface.extent
-    limits = run.config.robot.limited(run.config.limits).resolved(extent)
-    axis = np.asarray(run.config.fixture_axis_c, dtype=np.float64)
-    across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    across /= np.linalg.norm(across)
-    turn = np.linspace(0.0, 2.0 * np.pi, CONE_EDGES + 1)[:, None]
-    circle = np.cos(turn) * across + np.sin(turn) * np.cross(axis, across)
-    pieces = []
-    for degrees, length in ((limits.cone_deg, limits.cone_range_m), (limits.final_deg, limits.final_range_m)):
-        if degrees is not None and length is not None:
-            half = np.radians(degrees)
-            rim = length * (np.cos(half) * axis + np.sin(half) * circle)
-            pieces += [np.stack([np.zeros_like(rim), rim], axis=1), np.stack([rim[:-1], rim[1:]], axis=1)]
-    return np.concatenate(pieces).reshape(-1, 3) if pieces else None
+    limits = run.config.robot.limited(run.config.limits).resolved(run.surface.extent)
+    axis = np.array(run.config.fixture_axis_c)
+    pieces = [cone_lines(axis, *cone, limits.mouth_m or 0.0) for cone in limits.cones]
+    return np.concatenate(pieces) if pieces else None
 
 
 class RerunStream:

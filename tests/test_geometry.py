@@ -128,3 +128,10 @@ def test_a_single_product_equals_the_row_of_the_batch_bit_for_bit():
 def test_a_single_skew_matrix_equals_the_row_of_the_batch_bit_for_bit():
     v = batch(50)[:, :3]
     assert np.array_equal([geometry.skew(one) for one in v], geometry.skew(v))
+
+
+@pytest.mark.parametrize("axis", [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.6, 0.0, 0.8], [2 / 3, -1 / 3, 2 / 3]])
+def test_the_vector_across_an_axis_has_unit_length_and_a_right_angle(axis):
+    side = geometry.across(np.array(axis))
+    assert np.linalg.norm(side) == pytest.approx(1.0, abs=1e-15)
+    assert side @ axis == pytest.approx(0.0, abs=1e-15)

@@ -206,19 +206,20 @@ def test_the_viewers_own_decoder_reads_every_message(result):
 def test_the_cones_of_the_approach_are_in_the_viewer_log(fixtures_folder, tmp_path, cli):
     from rosbags.highlevel import AnyReader
 
-    angle, length = 20.0, 0.5
-    limits = [
-        word for text in (f"final_deg={angle}", f"final_range_m={length}") for word in ("--set", f"limits.{text}")
-    ]
+    angle, length, mouth = 20.0, 0.5, 0.03
+    values = {"final_deg": angle, "final_range_m": length, "mouth_m": mouth}
+    limits = [word for name, value in values.items() for word in ("--set", f"limits.{name}={value}")]
     done = cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 3, *limits, "-o", tmp_path / "r")
     assert done.code == 0, done.err
     with AnyReader([tmp_path / "r" / "result.mcap"]) as reader:
         (found,) = [reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages() if c.topic == "/plan/cone"]
     points = np.array([(p.x, p.y, p.z) for p in found.points])
     away = np.linalg.norm(points, axis=1)
-    rim = points[away > 1e-9]
-    np.testing.assert_allclose(away[away > 1e-9], length, rtol=1e-12)
-    np.testing.assert_allclose(np.degrees(np.arccos(rim[:, 0] / length)), angle, rtol=1e-9)
+    across = np.linalg.norm(points[:, 1:], axis=1)
+    np.testing.assert_allclose(across, mouth + np.tan(np.radians(angle)) * points[:, 0], rtol=1e-9)
+    rim = points[:, 0] > 1e-9
+    np.testing.assert_allclose(away[rim], length, rtol=1e-12)
+    np.testing.assert_allclose(away[~rim], mouth, rtol=1e-12)
     assert found.header.frame_id == "target"
 
 

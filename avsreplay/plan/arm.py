@@ -22,6 +22,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan.limits import Scene
 from avsreplay.plan.path import RobotPath
+from avsreplay.plan.rendezvous import no_plan
 from avsreplay.plan.robot import Limits, RobotParams
 
 INSTANTS = 81  # of the last metres
@@ -248,19 +249,8 @@ class Arm:
             earliest_s, share = after_s, 1.0
         assert first is not None
         made, joints = first
-        nan = math.nan
-        none = replace(
-            made,
-            status=PlanStatus.NOT_FOUND,
-            t_go_s=nan,
-            costate=np.full(6, nan),
-            thrust=None,
-            u_max=nan,
-            position_error_m=nan,
-            velocity_error_mps=nan,
-            delayed_by="arm",
-        )
-        return (none if made.found else made), joints
+        none = no_plan(made.t_ns, PlanStatus.NOT_FOUND, made.a_max, made.lower_bound_s)
+        return (replace(none, delayed_by="arm") if made.found else made), joints
 
     def _next_capture(self, scene: Scene, limits: Limits, after_s: float, horizon_s: float) -> float | None:
         """Return the first instant later than ``after_s`` by STEP_S or more at which the arm reaches the fixture."""

@@ -33,7 +33,7 @@ from avsreplay.plan.convexification import (
 )
 from avsreplay.plan.limits import CONSTRAINTS, Case, SampledScene, Scene, largest_acceleration, margins
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
-from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.rendezvous import PlanParams, no_plan, rendezvous
 from avsreplay.plan.robot import Limits
 
 ITERATIONS = 14  # largest number of iterations of one initial path
@@ -107,8 +107,7 @@ def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: 
     the goal moves by at most half the spacing times its largest speed, times 1.5. Where no time remains the problem is
     proven infeasible.
     """
-    nan = math.nan
-    proven = Plan(free.t_ns, PlanStatus.INFEASIBLE, nan, np.full(6, nan), free.a_max, params.horizon_s, nan, nan, nan)
+    proven = no_plan(free.t_ns, PlanStatus.INFEASIBLE, free.a_max, params.horizon_s)
     if _closed_off(scene, r0, limits):
         return proven
     if limits.speed_max_mps is None and limits.reach_max_m is None and limits.reach_min_m is None:
@@ -166,17 +165,15 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
 
 
 def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
-    nan, none = math.nan, np.full(6, math.nan)
     if found is None:
-        status = PlanStatus.NOT_FOUND
-        return Plan(t_ns, status, nan, none, free.a_max, free.lower_bound_s, nan, nan, nan)
+        return no_plan(t_ns, PlanStatus.NOT_FOUND, free.a_max, free.lower_bound_s)
     position, velocity = found.terminal_errors(case.scene.goal)
     worst, name = _worst(case, found)
     return Plan(
         t_ns=t_ns,
         status=PlanStatus.OPTIMAL if found.t_go_s - free.lower_bound_s <= SAME_TIME_S else PlanStatus.FEASIBLE,
         t_go_s=found.t_go_s,
-        costate=none,
+        costate=np.full(6, math.nan),
         a_max=case.a_max,
         lower_bound_s=free.lower_bound_s,
         position_error_m=position,

@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
@@ -271,9 +272,7 @@ class _RowMaker:
 def _cone_rows(axis: tuple[float, float, float], degrees: float) -> Array:
     """Return the rows (1, 3, 3) of a cone about an axis in {C}: its radius, and the coordinates across the axis."""
     e = np.array(axis)
-    side = np.eye(3)[int(np.abs(e).argmin())]
-    side = side - (side @ e) * e
-    side /= np.linalg.norm(side)
+    side = geometry.across(e)
     return np.stack([math.tan(math.radians(degrees)) * e, side, np.cross(e, side)])[None]
 
 

@@ -22,8 +22,7 @@ from avsreplay.plan.limits import Scene, margin
 from avsreplay.plan.path import RobotPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits, slowed
-from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory
-from avsreplay.plan.withdrawal import resting, to_rest
+from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, SupervisorMemory, resting
 from avsreplay.records import Forecast
 
 SEARCH_AGAIN = 1.1  # ratio to the time to go of the latest full search from which on all initial paths are searched
@@ -314,6 +313,7 @@ class Guidance:
         p, moving = self.supervisor.params, state.segment.at(known.t_ns)
         least_m = (p.standoff_m if action is Action.HOLD else p.retreat_m) or 0.0
         refuge = resting(known.scene, *moving, least_m, self.params.a_max_mps2)
+        to_rest: _Planner = lambda scene, *problem: rendezvous(scene.goal, *problem)  # noqa: E731
         _, segment = self._plan(state.segment, refuge, known.t_ns, to_rest)
         return replace(state, segment=segment or state.segment, made_ns=known.t_ns)
 

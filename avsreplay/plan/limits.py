@@ -184,12 +184,10 @@ def margins(scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array
         r: (n, 3) the same positions in {A} [m].
         sigma: Predicted 1 sigma of position [m] and attitude [rad] at each point, each (n,).
     """
-    n = len(y)
+    n, distance = len(y), np.linalg.norm(y, axis=1)
     first, second = np.full((n, 5), -math.inf), np.full((n, 5), math.inf)
     foot, gap, clearance = np.zeros((n, 3)), np.full(n, math.inf), np.zeros(n)
-    distance = np.linalg.norm(y, axis=1)
-    mouth, reach = limits.mouth_m or 0.0, limits.final_range_m or 0.0
-    corridor = np.full(n, -math.inf)
+    mouth, reach, corridor = limits.mouth_m or 0.0, limits.final_range_m or 0.0, np.full(n, -math.inf)
     if scene.axis_c is not None:
         along = y @ scene.axis_c
         across = np.linalg.norm(y - along[:, None] * scene.axis_c, axis=1)
@@ -209,10 +207,8 @@ def margins(scene: Scene, limits: Limits, y: Array, r: Array, sigma: tuple[Array
         first[:, 3], second[:, 3] = corridor, gap - clearance
     if limits.reach_max_m is not None or limits.reach_min_m is not None:
         from_base = np.linalg.norm(r - np.array(limits.base_m), axis=1)
-        second[:, 4] = np.minimum(
-            math.inf if limits.reach_max_m is None else limits.reach_max_m - from_base,
-            math.inf if limits.reach_min_m is None else from_base - limits.reach_min_m,
-        )
+        shell = limits.reach_min_m or -math.inf, limits.reach_max_m or math.inf
+        second[:, 4] = np.minimum(from_base - shell[0], shell[1] - from_base)
     return Margins(first, second, foot, gap, clearance)
 
 
@@ -235,7 +231,12 @@ def margin(scene: Scene, limits: Limits, r: Array, v: Array) -> float:
 
 
 def in_fixture_axes(R: Array, vectors: Array) -> Array:
-    """Return the coordinates R' v (n, 3) in {C} of vectors (n, 3) in {A}, R (n, 3, 3)."""
+    """Return the coordinates (n, 3) in {C} of vectors in {A}, R_ac' v.
+
+    Args:
+        R: (n, 3, 3) rotation matrices R_ac.
+        vectors: (n, 3) vectors in {A}.
+    """
     return np.asarray((vectors[:, None, :] @ R)[:, 0])
 
 

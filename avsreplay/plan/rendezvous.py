@@ -111,7 +111,7 @@ def _not_before(goal: Trajectory, r0: Array, v0: Array, params: PlanParams, plan
             first = float(end) == earliest_s
             graded = _grade(path, goal, plan.t_ns, _Search(earliest_s - params.latency_s, True, found, plan.steps))
             return graded if first or not graded.found else replace(graded, status=PlanStatus.FEASIBLE)
-    return replace(_no_plan(plan.t_ns, params, _Search(earliest_s, False, None, 0)), status=PlanStatus.NOT_FOUND)
+    return no_plan(plan.t_ns, PlanStatus.NOT_FOUND, params.a_max_mps2, params.latency_s + earliest_s)
 
 
 def _earliest(goal: Trajectory, r0: Array, v0: Array, params: PlanParams, t_ns: int) -> Plan:
@@ -124,12 +124,12 @@ def _earliest(goal: Trajectory, r0: Array, v0: Array, params: PlanParams, t_ns: 
             CostatePath(r0, v0, params.a_max_mps2, wait, wait, np.concatenate([0.0 * here, here])), goal, t_ns, search
         )
     if not search.reached or search.normal is None:
-        return _no_plan(t_ns, params, search)
+        return _unreached(t_ns, params, search)
     t, found, bound = _polish(goal, r0, v0, params, sampled, search, search.normal)
     if t - bound > GAP_LIMIT_S:  # a* is nearly tangent to a_max: take certified steps to the root
         search, sampled = _first_feasible(goal, r0, v0, params, near=False)
         if not search.reached or search.normal is None:
-            return _no_plan(t_ns, params, search)
+            return _unreached(t_ns, params, search)
         t, found, bound = _polish(goal, r0, v0, params, sampled, search, search.normal)
     path = CostatePath.from_normal(r0, v0, params.a_max_mps2, params.latency_s, t, found.P0, found.P1)
     return _grade(path, goal, t_ns, replace(search, t=bound))
@@ -142,11 +142,24 @@ def _finite(name: str, value: Array) -> Array:
     return array
 
 
-def _no_plan(t_ns: int, params: PlanParams, search: _Search) -> Plan:
+def no_plan(t_ns: int, status: PlanStatus, a_max: float, lower_bound_s: float) -> Plan:
+    """Return the answer that there is no plan to fly.
+
+    Args:
+        t_ns: Instant of planning.
+        status: Why there is none.
+        a_max: Bound on the thrust [m/s2].
+        lower_bound_s: Certified lower bound of the time to go [s].
+    """
+    nan = math.nan
+    return Plan(t_ns, status, nan, np.full(6, nan), a_max, lower_bound_s, nan, nan, nan)
+
+
+def _unreached(t_ns: int, params: PlanParams, search: _Search) -> Plan:
+    """Return the answer of a search that found no feasible time."""
     ended = search.t >= params.horizon_s - params.latency_s
     status = PlanStatus.INFEASIBLE if ended else PlanStatus.NO_CONVERGENCE
-    nan, bound = math.nan, params.latency_s + search.t
-    return Plan(t_ns, status, nan, np.full(6, nan), params.a_max_mps2, bound, nan, nan, nan, steps=search.steps)
+    return replace(no_plan(t_ns, status, params.a_max_mps2, params.latency_s + search.t), steps=search.steps)
 
 
 def _grade(path: CostatePath, goal: Trajectory, t_ns: int, search: _Search) -> Plan:

@@ -97,6 +97,12 @@ class Limits(Settings):
         return self.geometric or any(value is not None for value in others)
 
     @property
+    def cones(self) -> list[tuple[float, float]]:
+        """Half-angle [deg] and length [m] of every cone that is required."""
+        both = (self.cone_deg, self.cone_range_m), (self.final_deg, self.final_range_m)
+        return [(degrees, length) for degrees, length in both if degrees is not None and length is not None]
+
+    @property
     def base_axes(self) -> Array:
         """Matrix (3, 3) whose columns are the axes of the robot's base in {A}."""
         q = np.array(self.base_attitude_xyzw)

@@ -14,6 +14,10 @@ from dataclasses import dataclass, fields, replace
 from enum import Enum
 from types import MappingProxyType
 
+import numpy as np
+
+from avsreplay.geometry import Array
+from avsreplay.plan.limits import Scene
 from avsreplay.settings import Settings, setting
 
 
@@ -302,3 +306,28 @@ class Supervisor:
     def _holds(self, condition: Condition, measures: Mapping[str, float]) -> bool:
         bound = float(getattr(self.params, condition.bound)) if isinstance(condition.bound, str) else condition.bound
         return _COMPARE[condition.compare](measures[condition.measure], bound)
+
+
+def resting(scene: Scene, r: Array, v: Array, least_m: float, a_max: float) -> Scene:
+    """Return the rest point of a hold, a retreat or an abort as the goal of a rendezvous.
+
+    The robot brakes as hard as possible relative to the centre of mass. If it would stop closer to the sphere that
+    contains the target than asked for, the rest point has this distance, directly away from the target.
+
+    Args:
+        scene: The target now.
+        r: (3,) position of the robot in {A} [m].
+        v: (3,) its velocity [m/s].
+        least_m: Smallest distance to the sphere that contains the target in every attitude [m].
+        a_max: Largest acceleration [m/s2].
+    """
+    centre = scene.centre(np.array([0.0, 1.0]))
+    drift = centre[1] - centre[0]
+    relative, away = v - drift, r - centre[0]
+    distance = float(np.linalg.norm(away))
+    outward = away / distance if distance > 0.0 else np.array([1.0, 0.0, 0.0])
+    least = scene.radius_m + least_m
+    rest = away + relative * np.linalg.norm(relative) / (2.0 * a_max)
+    if float(np.linalg.norm(rest)) < least:
+        rest = outward * max(least, distance)
+    return Scene(lambda t: (centre[0] + rest + t[:, None] * drift, np.tile(drift, (len(t), 1))))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
 from avsreplay.report.charts import flight_charts, pack
@@ -53,9 +54,7 @@ def cone_lines(axis: Array, degrees: float, length: float, mouth: float) -> Arra
         length: Distance of the rim from the grasp point [m].
         mouth: Radius at the grasp point [m].
     """
-    side = np.eye(3)[int(np.abs(axis).argmin())]
-    side = side - (side @ axis) * axis
-    side /= np.linalg.norm(side)
+    side = geometry.across(axis)
     turn = np.linspace(0.0, 2.0 * math.pi, RING + 1)
     ring = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(axis, side)
     slope = math.tan(math.radians(degrees))
