@@ -1,4 +1,4 @@
-"""Objects beside the target: what they hide, what they return, how they move, and their labels."""
+"""Objects, plumes and the Earth: what they hide and return, how they move, and their labels."""
 
 import math
 from dataclasses import replace
@@ -6,6 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from scipy import stats
+from scipy.integrate import quad
+from scipy.spatial import cKDTree
 
 from avsreplay import geometry, toml_document
 from avsreplay.errors import UsageError
@@ -14,6 +17,7 @@ from avsreplay.record import RecordOptions, record_scenario
 from avsreplay.records import Scan
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.simulate import EPOCH_NS, builtin_surface, load_scenario, scenario_of, simulate
+from avsreplay.simulate.rays import FieldOfView, Pattern, ray_grid
 from avsreplay.simulate.scene import SceneObject
 from avsreplay.simulate.target import ply_bytes
 
@@ -123,7 +127,7 @@ def test_a_mesh_is_read_from_the_scenario_s_folder_and_recorded(tmp_path):
     [
         ("size_m = [1.0, 1.0, 0.0]", "object.0.size_m"),
         ("attitude_xyzw = [0.0, 0.0, 0.0, 2.0]", "unit quaternion"),
-        ("shape = 'wall'", "unknown key"),
+        ("shape = 'wall'", "one of: box, adapter"),
         ("duration_s = 0.0", "above 0"),
     ],
 )
@@ -136,6 +140,148 @@ def test_presence_is_half_open():
     thing = SceneObject("x", start_s=1.0, duration_s=2.0)
     assert [thing.present(t) for t in (0.999, 1.0, 2.999, 3.0)] == [False, True, True, False]
     assert replace(thing, duration_s=None).present(math.inf)
+
+
+def test_a_launcher_adapter_is_a_hollow_cone():
+    """Every point that is not on the target is on the cone's wall, whose two surfaces are 5 % of a radius apart."""
+    text = "[[object]]\nname = 'adapter'\nshape = 'adapter'\nsize_m = [4.0, 3.0, 1.0]\nposition_m = [0.0, 0.0, 9.0]\n"
+    _, _, alone = scans_of("range_max_m = 20.0\n")
+    _, _, both = scans_of("range_max_m = 20.0\n" + text)
+    for target, scene in zip(alone, both, strict=True):
+        rest = scene[scene[:, 2] > 8.4]
+        assert len(rest) > 100
+        assert {tuple(p) for p in scene[scene[:, 2] <= 8.4]} == {tuple(p) for p in target}
+        radius, height = np.hypot(rest[:, 0], rest[:, 1]), rest[:, 2] - 8.5
+        outer = 2.0 - 0.5 * height
+        chord = 1.0 - math.cos(math.pi / 48.0)  # of the polygon in place of the circle
+        assert np.all(radius <= outer + 1e-5)
+        assert np.all(radius >= (outer - 0.075) * (1.0 - chord) - 1e-5)
+        assert radius.min() > 1.3  # open in the middle
+
+
+PLUME = """[[plume]]
+nozzle_m = [0.0, -0.3, 0.1]
+direction = [0.0, 0.6, 0.8]
+half_angle_deg = 25.0
+density_per_m = 0.6
+"""
+OPEN = BASE.replace("position_m = [0.0, 0.0, 5.0]", "position_m = [0.0, 0.0, -50.0]")  # the target out of view
+
+
+def plume_depth(params, ray, end):
+    """Mean number of particles on a ray from the camera to a range, by adaptive quadrature."""
+
+    def density(s):
+        r = s * ray - np.array(params.nozzle_m)
+        d = np.linalg.norm(r)
+        angle = math.acos(np.clip(r @ np.array(params.direction) / d, -1.0, 1.0))
+        spread = math.exp(-((angle / math.radians(params.half_angle_deg)) ** 2))
+        return params.density_per_m * spread / max(d, 0.1) ** 2
+
+    return quad(density, 0.0, end, limit=200)[0]
+
+
+def test_particles_of_a_plume_have_the_stated_density():
+    """Shares of hit rays and ranges of particles against the integral of the density along the rays."""
+    params = scenario_of(toml_document.parse(PLUME, "p.toml")).params.plume[0]
+    many = 20000
+    for aim in ([0.0, 0.0, 1.0], [0.0, 0.3, 1.0], [0.2, 0.1, 1.0]):
+        ray = np.array(aim) / np.linalg.norm(aim)
+        drawn = params.particles(np.tile(ray, (many, 1)), np.full(many, 6.0), np.random.default_rng(4))
+        hit = 1.0 - math.exp(-plume_depth(params, ray, 6.0))
+        share = np.isfinite(drawn).mean()
+        assert abs(share - hit) < 4.0 * math.sqrt(hit * (1.0 - hit) / many) + 0.003
+        for end in (0.8, 2.0):
+            before = 1.0 - math.exp(-plume_depth(params, ray, end))
+            assert abs((drawn < end).mean() - before) < 4.0 * math.sqrt(before / many) + 0.003
+
+
+def test_particles_hide_the_target_and_are_drawn_anew_for_every_scan():
+    simulation, scans, with_plume = scans_of(PLUME + "start_s = 1.0\nduration_s = 2.0\n")
+    _, _, alone = scans_of()
+    (label,) = simulation.header.labels
+    assert (label.kind, label.harmful) == ("plume", False)
+    assert [simulation.truth_of(scan).fault for scan in scans] == [None, "plume", "plume", None]
+    added = []
+    for k, (target, scene) in enumerate(zip(alone, with_plume, strict=True)):
+        clean, seen = {tuple(p) for p in target}, {tuple(p) for p in scene}
+        if k in (0, 3):
+            assert np.array_equal(target, scene)
+            continue
+        assert len(clean - seen) > 50  # hidden by particles
+        added.append(seen - clean)
+        assert len(added[-1]) > 100
+    assert not added[0] & added[1]
+    assert all(np.array_equal(a, b) for a, b in zip(with_plume, scans_of(PLUME + "start_s = 1.0\nduration_s = 2.0\n")[2],
+                                                    strict=True))  # fmt: skip
+
+
+LIMB = """[[limb]]
+centre_a = [0.0, 1.0, 0.0]
+radius_deg = 80.0
+false_ratio = 0.3
+"""
+
+
+def angle_from(points, centre):
+    return np.degrees(np.arccos(points @ np.array(centre) / np.linalg.norm(points, axis=1)))
+
+
+def test_false_returns_come_from_the_beams_that_look_at_the_earth():
+    """Their share of those beams, and their ranges, are as stated; beams on the target or to the sky have none."""
+    _, _, alone = scans_of("max_incidence_deg = 90.0\n")
+    simulation, _, scenes = scans_of("max_incidence_deg = 90.0\n" + LIMB)
+    assert simulation.header.labels == ()
+    ranges, beams = [], 0
+    rays = ray_grid(Pattern.FLASH, FieldOfView.RECTANGLE, (44.0, 44.0), (60, 60), (1, 1), 0.0)[0]
+    toward = rays[angle_from(rays, [0.0, 1.0, 0.0]) < 80.0]
+    for target, scene in zip(alone, scenes, strict=True):
+        assert np.array_equal(scene[: len(target)], target)
+        false = scene[len(target) :]
+        assert angle_from(false, [0.0, 1.0, 0.0]).max() < 80.0 + 1e-3
+        directions = target / np.linalg.norm(target, axis=1)[:, None]
+        taken, _ = cKDTree(directions).query(toward)
+        beams += int((taken > 1e-5).sum())
+        ranges.extend(np.linalg.norm(false, axis=1))
+    assert abs(len(ranges) - 0.3 * beams) < 4.0 * math.sqrt(0.21 * beams)
+    assert stats.kstest(ranges, stats.uniform(0.5, 11.5).cdf).pvalue > 1e-3
+
+
+def test_the_earth_moves_with_its_rate_and_with_the_camera():
+    turning = LIMB + "rate_radps = [0.0, 0.0, 0.7853981633974483]\n"  # towards -x
+    text = OPEN.replace("duration_s = 4.0", "duration_s = 3.0")
+    scans = list(simulate(scenario_of(toml_document.parse(text + turning, "s.toml")), SURFACE).scans())
+    for k, scan in enumerate(scans):
+        phase = math.pi / 4.0 * k
+        points = scan.points.astype(np.float64)
+        assert len(points) > 100
+        assert angle_from(points, [-math.sin(phase), math.cos(phase), 0.0]).max() < 80.0 + 1e-3
+    camera = "[camera]\nrate_radps = [0.0, 0.0, 0.7853981633974483]\n"
+    scans = list(simulate(scenario_of(toml_document.parse(text + LIMB + camera, "s.toml")), SURFACE).scans())
+    for k, scan in enumerate(scans):
+        phase = -math.pi / 4.0 * k
+        assert angle_from(scan.points.astype(np.float64), [-math.sin(phase), math.cos(phase), 0.0]).max() < 80.0 + 1e-3
+
+
+@pytest.mark.parametrize(("centre", "share"), [([0.0, 0.0, 1.0], 1.0), ([0.0, 1.0, 0.0], 0.5), ([0.0, 0.0, -1.0], 0.0)])
+def test_glare_of_the_earth_adds_to_the_variance_of_the_ranges(centre, share):
+    wall = "[[object]]\nname = 'wall'\nsize_m = [20.0, 20.0, 0.1]\nposition_m = [0.0, 0.0, 6.0]\nreflectance = 1.0\n"
+    text = OPEN.replace("noise_m = 0.0", "noise_m = 0.01").replace("duration_s = 4.0", "duration_s = 2.0") + wall
+    limb = f"[[limb]]\ncentre_a = {centre}\nradius_deg = 90.0\nglare = 3.0\nstart_s = 1.0\nduration_s = 1.0\n"
+    simulation = simulate(scenario_of(toml_document.parse(text + limb, "s.toml")), SURFACE)
+    noises = []
+    for scan in simulation.scans():
+        points = scan.points.astype(np.float64)
+        reach = np.linalg.norm(points, axis=1)
+        noises.append(np.std(reach - 5.95 * reach / points[:, 2]))
+    assert [label.kind for label in simulation.header.labels] == ["limb"]
+    assert_allclose(noises, [0.01, 0.01 * math.sqrt(1.0 + share * 8.0)], rtol=0.05)
+
+
+@pytest.mark.parametrize("text", ["[[plume]]\ndirection = [0.0, 0.0, 2.0]\n", "[[limb]]\ncentre_a = [0.0, 0.0, 0.0]\n"])
+def test_directions_of_plume_and_earth_are_unit_vectors(text):
+    with pytest.raises(UsageError, match="unit vector"):
+        scenario_of(toml_document.parse(text, "s.toml"))
 
 
 def test_an_appendage_swings_about_its_hinge_and_the_rest_stays():

@@ -33,7 +33,7 @@ EPOCH_NS = (
     1_700_000_000_000_000_000  # time of the first scan of every simulated log, fixed so that logs are reproducible
 )
 NS = 1_000_000_000
-_STREAMS = {"motion": 0, "start": 1, "noise": 2, "fault": 3, "plate": 4, "camera": 5, "camera_pose": 6}
+_STREAMS = {"motion": 0, "start": 1, "noise": 2, "fault": 3, "plate": 4, "camera": 5, "camera_pose": 6, "plume": 7, "limb": 8}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +74,9 @@ class Simulation:
         """
         state = self.truth(scan.log_ns)
         kinds = [kind.value for kind in self._faults(scan.log_ns)]
-        kinds += [body.params.name for body in self._present(scan.log_ns) if body.params.duration_s is not None]
+        t_s, params = (scan.log_ns - EPOCH_NS) / NS, self._scenario.params
+        others = [each for each in (*params.object, *params.plume, *params.limb) if each.present(t_s)]
+        kinds += [each.name for each in others if each.duration_s is not None]
         return Truth(state.T_ac, state, next(iter(kinds), None))
 
     def camera_pose(self, scan: Scan) -> Pose | None:
@@ -86,9 +88,6 @@ class Simulation:
         if self._camera is None:
             return None
         return self._camera.reported((scan.log_ns - EPOCH_NS) / NS, self._rng("camera_pose", scan.seq))
-
-    def _present(self, log_ns: int) -> list[SceneBody]:
-        return [body for body in self._bodies if body.params.present((log_ns - EPOCH_NS) / NS)]
 
     def _faults(self, log_ns: int) -> dict[Kind, InjectedFault]:
         return faults.active(self._scenario.params.fault, EPOCH_NS, log_ns)
@@ -133,19 +132,24 @@ class Simulation:
 
     def _returns(self, k: int, log_ns: int, now: dict[Kind, InjectedFault], state: State) -> Returns:
         """Ray casting, occlusion, noise, bias, clutter: in the order in which they act on the light."""
-        noise, wrong = self._rng("noise", k), self._rng("fault", k)
-        returns = self._scanner.cast((log_ns - EPOCH_NS) / NS, self._present(log_ns))
+        noise, wrong, t_s = self._rng("noise", k), self._rng("fault", k), (log_ns - EPOCH_NS) / NS
+        bodies = [body for body in self._bodies if body.params.present(t_s)]
+        plume_rng, limb_rng = self._rng("plume", k), self._rng("limb", k)
+        plumes = [(each, plume_rng) for each in self._scenario.params.plume if each.present(t_s)]
+        limbs = [(each, limb_rng) for each in self._scenario.params.limb if each.present(t_s)]
+        returns = self._scanner.cast(t_s, bodies, plumes, limbs)
         for kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
             if kind in now:
                 returns = faults.occlude(returns, faults.strength(now[kind]), self._side(now[kind]), wrong)
         factor = faults.strength(now[Kind.NOISE_BURST]) if Kind.NOISE_BURST in now else 1.0
+        factor *= self._scanner.glare(t_s, [limb for limb, _ in limbs])
         returns = self._scanner.disturb(returns, noise, factor)
         if Kind.RANGE_BIAS in now:
             returns = replace(returns, ranges=returns.ranges + faults.strength(now[Kind.RANGE_BIAS]))
         if Kind.CLUTTER in now:
             ratio, centre = faults.strength(now[Kind.CLUTTER]), state.T_ac.apply(self._scanner.centre_c)
             if self._camera is not None:
-                centre = self._camera.pose((log_ns - EPOCH_NS) / NS).inverse().apply(centre)
+                centre = self._camera.pose(t_s).inverse().apply(centre)
             returns = faults.clutter(returns, ratio, centre, self._scanner.radius_m, wrong)
         return returns.keep(np.zeros(len(returns.ranges), dtype=bool)) if Kind.EMPTY in now else returns.in_order()
 
@@ -179,7 +183,7 @@ def simulate(scenario: Scenario, surface: Surface, meshes: Mapping[str, Surface]
     start = None
     if params.start is not None:
         start = belief(params.start, first, EPOCH_NS, _generator(params.seed, "start", 0))
-    others = [each.label(EPOCH_NS) for each in params.object]
+    others = [each.label(EPOCH_NS) for each in (*params.object, *params.plume, *params.limb)]
     header = LogHeader(
         surface=surface,
         scenario=scenario.text,

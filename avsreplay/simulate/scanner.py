@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,6 @@ from scipy.spatial import cKDTree
 
 from avsreplay.geometry import Array, frozen, rotate
 from avsreplay.records import Surface
-from avsreplay.settings import Settings, setting
 from avsreplay.simulate.motion import Motion
 from avsreplay.simulate.optics import (
     FaceOptics,
@@ -31,116 +29,9 @@ from avsreplay.simulate.optics import (
     part_of,
     separated,
 )
-from avsreplay.simulate.rays import Engine, FieldOfView, Pattern, RayCaster, ray_grid
-from avsreplay.simulate.scene import Appendage, MovingCamera, SceneBody, appendage_faces
-
-
-class Preset(Enum):
-    """Classes of instruments; their figures and sources are in presets.toml."""
-
-    NONE = "none"
-    FLASH_TOF = "flash_tof"
-    FLASH_TOF_SMALL = "flash_tof_small"
-    RASTER_TRIANGULATION = "raster_triangulation"
-    LISSAJOUS_LIDAR = "lissajous_lidar"
-    SPINNING_LIDAR = "spinning_lidar"
-
-
-@dataclass(frozen=True, slots=True)
-class ScannerParams(Settings):
-    """The table [scanner]: rays, field of view and noise. The camera looks along +z of {A}, x to the right."""
-
-    preset: Preset = setting(
-        Preset.NONE, "Class of instrument, which sets the defaults of this table (docs/scenario.md, Scanner)."
-    )
-    pattern: Pattern = setting(
-        Pattern.FLASH,
-        "All rays at the stamp (flash), row by row (raster), along a Lissajous figure (lissajous), or column by column"
-        " with all rays of a column at once (spinning); the last three over scan_s.",
-    )
-    fov_deg: tuple[float, float] = setting(
-        (44.0, 44.0), "Full angles of the field of view, horizontal and vertical.", unit="deg", above=0.0, below=170.0
-    )
-    view: FieldOfView = setting(
-        FieldOfView.RECTANGLE, "Outline of the field of view: the rectangle, or the cone inscribed in it."
-    )
-    rays: tuple[int, int] = setting((128, 128), "Rays horizontally and vertically.", low=1, high=4096)
-    lissajous: tuple[int, int] = setting(
-        (73, 101), "Periods of the two mirrors in a Lissajous scan, horizontal and vertical.", low=1, high=4096
-    )
-    scan_s: float = setting(0.0, "Duration of a scan that is not a flash; it begins at its stamp.", unit="s", low=0.0)
-    divergence_mrad: float = setting(
-        0.0,
-        "Full angle of the beam; on an edge the returns of one beam merge into a mixed pixel.",
-        unit="mrad",
-        low=0.0,
-        below=100.0,
-    )
-    merge_m: float = setting(
-        math.inf,
-        "Returns of one beam that differ by less in range merge, weighted by intensity; else the strongest counts.",
-        unit="m",
-        low=0.0,
-        infinite=True,
-    )
-    noise_m: float = setting(
-        0.008, "1 sigma of the range, along the ray, at the reference range and normal incidence.", unit="m", low=0.0
-    )
-    noise_growth: float = setting(
-        0.0, "The 1 sigma of the range is proportional to the range to this power.", low=0.0, high=4.0
-    )
-    noise_incidence: float = setting(
-        0.0, "The 1 sigma of the range is proportional to 1 / cos(incidence) to this power.", low=0.0, high=4.0
-    )
-    reference_m: float = setting(1.0, "Reference range of noise and intensity.", unit="m", above=0.0)
-    quantisation_m: float = setting(0.0, "Ranges are rounded to multiples of this; 0: not rounded.", unit="m", low=0.0)
-    intensity_min: float = setting(
-        0.0,
-        "Smallest intensity of a return, over that of a white diffuse surface at normal incidence and reference range.",
-        low=0.0,
-    )
-    outlier_ratio: float = setting(
-        0.02, "Share of the returns with a range anywhere between range_min_m and range_max_m.", low=0.0, high=1.0
-    )
-    dropout_ratio: float = setting(0.0, "Share of the returns that are lost.", low=0.0, high=1.0)
-    max_incidence_deg: float = setting(
-        85.0,
-        "Largest angle between the ray and the surface normal at which there is a return.",
-        unit="deg",
-        above=0.0,
-        high=90.0,
-    )
-    range_min_m: float = setting(0.5, "Smallest range of a return.", unit="m", low=0.0)
-    range_max_m: float = setting(12.0, "Largest range of a return.", unit="m", above=0.0)
-    intensity: bool = setting(False, "Write the intensity of each return to the log.")
-    returns: int = setting(
-        1, "Most returns of one beam, strongest first; more than one needs a divergence and merge_m.", low=1, high=7
-    )
-    range_walk_m: float = setting(
-        0.0, "Error of the range by which it grows for each factor of ten that the intensity is below 1.", unit="m"
-    )
-    crosstalk_ratio: float = setting(
-        0.0, "Share of the strongest return of a scan that is added to every return as stray light.", low=0.0, below=1.0
-    )
-    saturation: float = setting(
-        math.inf, "Intensity from which a return saturates the detector and blooms.", above=0.0, infinite=True
-    )
-    bloom_deg: float = setting(
-        0.0, "Rays within this angle of a saturated return give its range instead of their own.", unit="deg", low=0.0
-    )
-    sun_a: tuple[float, float, float] | None = setting(
-        None, "Unit vector to the sun in {A}; specular faces that mirror it return nothing.", unset="no sun"
-    )
-    engine: Engine = setting(Engine.AUTO, "Ray casting: embree, exact (numpy), or embree where it is installed (auto).")
-
-    def check(self) -> None:
-        """Raise ValueError where the ranges, or pattern and duration, do not go together."""
-        if self.range_min_m >= self.range_max_m:
-            raise ValueError(f"range_min_m = {self.range_min_m} must be below range_max_m = {self.range_max_m}")
-        if self.sun_a is not None and not math.isclose(math.hypot(*self.sun_a), 1.0, abs_tol=1e-6):
-            raise ValueError(f"sun_a = {list(self.sun_a)} is not a unit vector")
-        if (self.pattern is not Pattern.FLASH) != (self.scan_s > 0.0):
-            raise ValueError(f"scan_s = {self.scan_s}: 0 for a flash, positive for any other pattern")
+from avsreplay.simulate.rays import Engine, Pattern, RayCaster, ray_grid
+from avsreplay.simulate.scanner_params import ScannerParams
+from avsreplay.simulate.scene import Appendage, Limb, MovingCamera, Plume, SceneBody, appendage_faces
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,12 +117,20 @@ class Scanner:
         """The engine that casts the rays."""
         return self._caster.engine
 
-    def cast(self, t_s: float, bodies: Sequence[SceneBody] = ()) -> Returns:
+    def cast(
+        self,
+        t_s: float,
+        bodies: Sequence[SceneBody] = (),
+        plumes: Sequence[tuple[Plume, np.random.Generator]] = (),
+        limbs: Sequence[tuple[Limb, np.random.Generator]] = (),
+    ) -> Returns:
         """The returns of a scan without noise; beams without a return are left out.
 
         Args:
             t_s: Time of the scan [s].
             bodies: Objects beside the target that are present.
+            plumes: Plumes that are present, each with the generator of its particles.
+            limbs: Sunlit Earth, where it is present, with the generator of its false returns.
         """
         times = np.array([t_s]) if self.params.pattern is Pattern.FLASH else t_s + self._times
         target = self._motion.poses(times)
@@ -247,11 +146,48 @@ class Scanner:
             placed = self._seen(body.params.poses(times), times)
             for k, rays in enumerate(self._rays):
                 found[k] = found[k].nearer(self._traced(body.caster, body.optics, placed, rays, every))
-        if bodies or self.params.bloom_deg > 0.0:
+        for plume, rng in plumes:
+            found = [each.nearer(self._particles(plume, each, rays, rng)) for each, rays in zip(found, self._rays)]
+        if bodies or plumes or self.params.bloom_deg > 0.0:
             near = every
         returns = self._beams([each.chosen(near) for each in found], near)
         returns = returns.keep(np.isfinite(returns.ranges) & (returns.intensities >= self.params.intensity_min))
+        for limb, rng in limbs:
+            free = np.all([np.isinf(each.ranges) for each in found], axis=0) & self._behind(limb, times)
+            returns = returns.joined(self._false(np.flatnonzero(free), limb.false_ratio, rng))
         return self._stray(returns)
+
+    def glare(self, t_s: float, limbs: Sequence[Limb]) -> float:
+        """Factor on the 1 sigma of the ranges by stray light of the Earth at a time [s].
+
+        The variance grows in proportion to the share of the beams that look at it.
+        """
+        times = np.array([t_s])
+        return math.sqrt(1.0 + sum((limb.glare**2 - 1.0) * float(self._behind(limb, times).mean()) for limb in limbs))
+
+    def _behind(self, limb: Limb, times: Array) -> NDArray[np.bool_]:
+        """Whether each beam looks at the Earth."""
+        R_wa = np.eye(3)[None] if self._camera is None else self._camera.poses(times)[0]
+        return limb.behind(self._rays[0], times, R_wa)
+
+    def _false(self, beams: NDArray[np.intp], ratio: float, rng: np.random.Generator) -> Returns:
+        """False returns of some of these beams (n,), with the least intensity at any range."""
+        p = self.params
+        beams = beams[rng.random(len(beams)) < ratio]
+        n = len(beams)
+        ranges, least = rng.uniform(p.range_min_m, p.range_max_m, n), np.full(n, p.intensity_min)
+        return Returns(self._rays[0][beams], ranges, self._times[beams], np.ones(n), least, np.zeros(n))
+
+    def _particles(self, plume: Plume, met: TracedRays, rays: Array, rng: np.random.Generator) -> TracedRays:
+        """Rays (n, 3) on the particles of a plume in front of what they meet."""
+        p = self.params
+        ranges = plume.particles(rays, np.minimum(met.ranges, p.range_max_m), rng)
+        seen = np.isfinite(ranges) & (ranges >= p.range_min_m)
+        found = TracedRays.empty(len(rays))
+        found.ranges[:], found.cosines[seen] = ranges, 1.0
+        found.returned[seen] = ranges[seen]
+        found.intensities[seen] = plume.reflectance * np.square(p.reference_m / ranges[seen])
+        return found
 
     def _stray(self, returns: Returns) -> Returns:
         """Returns with stray light of the strongest one, and with the bloom of saturated ones."""

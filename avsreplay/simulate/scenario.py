@@ -19,8 +19,8 @@ from avsreplay.settings import Settings, setting
 from avsreplay.simulate.faults import LONGEST_S, InjectedFault
 from avsreplay.simulate.motion import MotionParams
 from avsreplay.simulate.optics import Material
-from avsreplay.simulate.scanner import Preset, ScannerParams
-from avsreplay.simulate.scene import Appendage, CameraParams, SceneObject
+from avsreplay.simulate.scanner_params import Preset, ScannerParams
+from avsreplay.simulate.scene import Appendage, CameraParams, Limb, Plume, SceneObject
 from avsreplay.simulate.target import TargetParams
 
 MAX_SCANS = 10_000_000
@@ -72,6 +72,8 @@ class ScenarioParams(Settings):
         None, "Motion of the camera, whose pose the log then holds.", unset="at rest at the origin of {A}"
     )
     object: tuple[SceneObject, ...] = setting((), "Objects beside the target, one table each.")
+    plume: tuple[Plume, ...] = setting((), "Particles from thrusters, one table each.")
+    limb: tuple[Limb, ...] = setting((), "The sunlit Earth behind the target, one table each.")
     fault: tuple[InjectedFault, ...] = setting((), "The injected faults, one table [[fault]] each.")
     start: StartParams | None = setting(
         None, "The initial belief.", unset="the log has none, and the estimator starts cold"

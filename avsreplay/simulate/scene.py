@@ -1,8 +1,9 @@
-"""Objects beside the target: a wall, a second object, the robot's own arm, or a moving occluder.
+"""What is in the scene beside the target: objects, plume particles, and the sunlit Earth behind.
 
-Each is a box or a mesh in its own frame {S}, which moves in {A} with constant velocity and angular rate. It blocks the
-rays to what is behind it and returns points itself. An object that is present in part of the log only is labelled in
-the log like a fault.
+An object is a box, a launcher adapter or a mesh in its own frame {S}, which moves in {A} with constant velocity and
+angular rate. It blocks the rays to what is behind it and returns points itself. Particles of a plume do the same at
+random places. The Earth is too far for a return; its light causes false returns and noise. What is present in part of
+the log only is labelled in the log like a fault.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,26 +23,19 @@ from avsreplay.records import Label, Surface
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.optics import REFLECTANCE, FaceOptics, Material, face_optics
 from avsreplay.simulate.rays import Engine, RayCaster
-from avsreplay.simulate.target import box
+from avsreplay.simulate.target import adapter, box
 
 NS = 1_000_000_000
+_STATIONS = 64  # of the sum along a ray through a plume
+_NEAREST_M = 0.1  # distance from the nozzle below which the density of the particles is constant
 Triple = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
-class SceneObject(Settings):
-    """One table [[object]]: something else than the target in the field of view."""
+class Presence(Settings):
+    """Something that is in the scene for the whole log or for a part of it."""
 
-    name: str = setting(doc="Name of the object, which is the kind of its label.")
-    size_m: Triple = setting((1.0, 1.0, 1.0), "Edge lengths of a box, centred in {S}.", unit="m", above=0.0)
-    model: str = setting(
-        "", "Mesh file in metres in {S} in place of the box (STL, OBJ or PLY), relative to the scenario file."
-    )
-    position_m: Triple = setting((0.0, 0.0, 8.0), "Position of {S} in {A} at the time 0.", unit="m")
-    attitude_xyzw: tuple[float, float, float, float] = setting((0.0, 0.0, 0.0, 1.0), "q_as, attitude at the time 0.")
-    velocity_mps: Triple = setting((0.0, 0.0, 0.0), "Velocity of {S} in {A}.", unit="m/s")
-    rate_radps: Triple = setting((0.0, 0.0, 0.0), "Constant angular rate in the axes of {A}.", unit="rad/s")
-    reflectance: float = setting(REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
+    name: str = setting(doc="Its name, which is the kind of its label.")
     start_s: float = setting(0.0, "Begin of its presence, after the first scan is due.", unit="s", low=0.0, high=1e8)
     duration_s: float | None = setting(
         None, "Length of its presence.", unit="s", above=0.0, high=1e8, unset="to the end of the log, without a label"
@@ -48,21 +43,13 @@ class SceneObject(Settings):
     harmful: bool = setting(False, "Whether its label says that no good pose can come from such a scan.")
 
     def check(self) -> None:
-        """Raise ValueError where the attitude is not a unit quaternion, or the name is empty."""
+        """Raise ValueError where the name is empty."""
         if not self.name:
-            raise ValueError("an object needs a name")
-        if not math.isclose(math.hypot(*self.attitude_xyzw), 1.0, abs_tol=1e-3):
-            raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
+            raise ValueError("it needs a name")
 
     def present(self, t_s: float) -> bool:
-        """Return whether the object is present at a time [s after the instant of the first scan]."""
+        """Return whether it is present at a time [s after the instant of the first scan]."""
         return self.start_s <= t_s and (self.duration_s is None or t_s < self.start_s + self.duration_s)
-
-    def poses(self, times_s: Array) -> tuple[Array, Array]:
-        """Rotations R_as (n, 3, 3) and positions (n, 3) in {A} [m] at times (n,) [s]."""
-        turn = geometry.exp(times_s[:, None] * np.array(self.rate_radps))
-        R_as = geometry.matrix(geometry.multiply(turn, geometry.normalise(np.array([self.attitude_xyzw]))))
-        return R_as, np.array(self.position_m) + times_s[:, None] * np.array(self.velocity_mps)
 
     def label(self, epoch_ns: int) -> Label | None:
         """Its label on a log clock that begins at ``epoch_ns``; None where it stays to the end of the log."""
@@ -70,6 +57,140 @@ class SceneObject(Settings):
             return None
         start, end = (epoch_ns + round(t * NS) for t in (self.start_s, self.start_s + self.duration_s))
         return Label(self.name, start, end, self.harmful)
+
+
+class ObjectShape(Enum):
+    """Shape of an object without a mesh."""
+
+    BOX = "box"
+    ADAPTER = "adapter"  # a launcher's payload adapter: a hollow truncated cone about z, open at both ends
+
+
+@dataclass(frozen=True, slots=True)
+class SceneObject(Presence):
+    """One table [[object]]: something else than the target in the field of view."""
+
+    shape: ObjectShape = setting(
+        ObjectShape.BOX,
+        "A box, or a launcher adapter: a hollow truncated cone about the z axis of {S}, open at both ends.",
+    )
+    size_m: Triple = setting(
+        (1.0, 1.0, 1.0),
+        "Edge lengths of a box; outer diameters of an adapter at -z and +z, and its height. Centred in {S}.",
+        unit="m",
+        above=0.0,
+    )
+    model: str = setting(
+        "", "Mesh file in metres in {S} in place of the shape (STL, OBJ or PLY), relative to the scenario file."
+    )
+    position_m: Triple = setting((0.0, 0.0, 8.0), "Position of {S} in {A} at the time 0.", unit="m")
+    attitude_xyzw: tuple[float, float, float, float] = setting((0.0, 0.0, 0.0, 1.0), "q_as, attitude at the time 0.")
+    velocity_mps: Triple = setting((0.0, 0.0, 0.0), "Velocity of {S} in {A}.", unit="m/s")
+    rate_radps: Triple = setting((0.0, 0.0, 0.0), "Constant angular rate in the axes of {A}.", unit="rad/s")
+    reflectance: float = setting(REFLECTANCE, "Diffuse reflectance.", low=0.0, high=1.0)
+
+    def check(self) -> None:
+        """Raise ValueError where the attitude is not a unit quaternion, or the name is empty."""
+        Presence.check(self)
+        if not math.isclose(math.hypot(*self.attitude_xyzw), 1.0, abs_tol=1e-3):
+            raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
+
+    def poses(self, times_s: Array) -> tuple[Array, Array]:
+        """Rotations R_as (n, 3, 3) and positions (n, 3) in {A} [m] at times (n,) [s]."""
+        turn = geometry.exp(times_s[:, None] * np.array(self.rate_radps))
+        R_as = geometry.matrix(geometry.multiply(turn, geometry.normalise(np.array([self.attitude_xyzw]))))
+        return R_as, np.array(self.position_m) + times_s[:, None] * np.array(self.velocity_mps)
+
+
+@dataclass(frozen=True, slots=True)
+class Plume(Presence):
+    """One table [[plume]]: particles from a thruster, drawn anew for every scan because they cross the view within it.
+
+    The mean number of particles that a ray meets on a path dl at the distance d from the nozzle and the angle theta
+    from the axis is density_per_m (1 m / d)^2 exp(-(theta / half angle)^2) dl: a constant flow that spreads from a point.
+    """
+
+    name: str = setting("plume", "Its name, which is the kind of its label.")
+    nozzle_m: Triple = setting((0.0, -0.5, 0.0), "Position of the nozzle in the frame of the camera.", unit="m")
+    direction: Triple = setting((0.0, 0.0, 1.0), "Unit vector of the flow in the frame of the camera.")
+    half_angle_deg: float = setting(
+        20.0, "Angle from the axis at which the density has fallen to 1/e.", unit="deg", above=0.0, high=90.0
+    )
+    density_per_m: float = setting(
+        0.05, "Mean number of particles per metre of a ray on the axis 1 m from the nozzle.", unit="1/m", low=0.0
+    )
+    reflectance: float = setting(REFLECTANCE, "Diffuse reflectance of a particle.", low=0.0, high=1.0)
+
+    def check(self) -> None:
+        """Raise ValueError where the direction is not a unit vector, or the name is empty."""
+        Presence.check(self)
+        if not math.isclose(math.hypot(*self.direction), 1.0, abs_tol=1e-6):
+            raise ValueError(f"direction = {list(self.direction)} is not a unit vector")
+
+    def particles(self, rays: Array, ends_m: Array, rng: np.random.Generator) -> Array:
+        """Range (n,) of the first particle on each ray [m], inf without one.
+
+        Args:
+            rays: (n, 3) unit directions in the frame of the camera.
+            ends_m: (n,) length of each ray [m].
+            rng: draws the particles.
+        """
+        depth_at_hit = rng.exponential(size=len(rays))
+        spacing = ends_m / _STATIONS
+        depth, found = np.zeros(len(rays)), np.full(len(rays), np.inf)
+        for k in range(_STATIONS):  # the midpoint rule
+            there = (k + 0.5) * spacing[:, None] * rays - np.array(self.nozzle_m)
+            away = np.maximum(np.linalg.norm(there, axis=1), _NEAREST_M)
+            angle = np.arccos(np.clip(there @ np.array(self.direction) / away, -1.0, 1.0))
+            spread = np.exp(-np.square(angle / math.radians(self.half_angle_deg)))
+            added = self.density_per_m * spread / np.square(away) * spacing
+            hit = np.isinf(found) & (depth + added >= depth_at_hit)
+            found[hit] = (k + (depth_at_hit - depth)[hit] / added[hit]) * spacing[hit]
+            depth += added
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Limb(Presence):
+    """One table [[limb]]: the sunlit Earth behind the target, a disc with the Earth's limb as its edge.
+
+    A beam that meets nothing and looks at it gives a false return with some probability, at any range: the detector
+    triggers on background light. Its stray light in the optics adds to the variance of all ranges, in proportion to the
+    share of the field of view that it fills.
+    """
+
+    name: str = setting("limb", "Its name, which is the kind of its label.")
+    centre_a: Triple = setting((0.0, 0.0, 1.0), "Unit vector to the Earth's centre in {A} at the time 0.")
+    rate_radps: Triple = setting(
+        (0.0, 0.0, 0.0), "Constant angular rate of that vector, in the axes of {A}.", unit="rad/s"
+    )
+    radius_deg: float = setting(
+        70.2, "Angular radius of the Earth; 70.2 at an altitude of 400 km.", unit="deg", above=0.0, high=90.0
+    )
+    false_ratio: float = setting(
+        0.01, "Share of the beams toward it without a surface that give a false return.", low=0.0, high=1.0
+    )
+    glare: float = setting(
+        1.0, "Factor on the 1 sigma of all ranges where it fills the whole field of view.", low=1.0, high=100.0
+    )
+
+    def check(self) -> None:
+        """Raise ValueError where the centre is not a unit vector, or the name is empty."""
+        Presence.check(self)
+        if not math.isclose(math.hypot(*self.centre_a), 1.0, abs_tol=1e-6):
+            raise ValueError(f"centre_a = {list(self.centre_a)} is not a unit vector")
+
+    def behind(self, rays: Array, times_s: Array, R_wa: Array) -> NDArray[np.bool_]:
+        """Whether each beam (n,) looks at the Earth, nothing being in front.
+
+        Args:
+            rays: (n, 3) unit directions in the frame of the camera.
+            times_s: (n,) or (1,) [s].
+            R_wa: (n, 3, 3) or (1, 3, 3) attitude of the camera in the fixed frame.
+        """
+        turn = geometry.matrix(geometry.exp(times_s[:, None] * np.array(self.rate_radps)))
+        centre = geometry.rotate(np.swapaxes(R_wa, -1, -2) @ turn, np.array(self.centre_a))
+        return np.asarray(np.sum(rays * centre, axis=1) > math.cos(math.radians(self.radius_deg)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,8 +295,10 @@ def scene_bodies(objects: Sequence[SceneObject], meshes: dict[str, Surface], eng
     bodies = []
     for params in objects:
         half = 0.5 * np.array(params.size_m)
-        solid = box(-half, half)
-        surface = meshes[params.model] if params.model else Surface(frozen(solid.vertices), solid.faces, "box", "")
+        is_box = params.shape is ObjectShape.BOX
+        solid = box(-half, half) if is_box else adapter(*half.tolist())
+        name = params.shape.value
+        surface = meshes[params.model] if params.model else Surface(frozen(solid.vertices), solid.faces, name, "")
         optics = face_optics(surface, [Material(params.name, reflectance=params.reflectance)])
         bodies.append(SceneBody(params, RayCaster(surface, engine), optics))
     return bodies
