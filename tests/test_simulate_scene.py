@@ -197,7 +197,8 @@ def test_particles_of_a_plume_have_the_stated_density():
 
 
 def test_particles_hide_the_target_and_are_drawn_anew_for_every_scan():
-    simulation, scans, with_plume = scans_of(PLUME + "start_s = 1.0\nduration_s = 2.0\n")
+    text = PLUME + "start_s = 1.0\nduration_s = 2.0\n"
+    simulation, scans, with_plume = scans_of(text)
     _, _, alone = scans_of()
     (label,) = simulation.header.labels
     assert (label.kind, label.harmful) == ("plume", False)
@@ -212,8 +213,7 @@ def test_particles_hide_the_target_and_are_drawn_anew_for_every_scan():
         added.append(seen - clean)
         assert len(added[-1]) > 100
     assert not added[0] & added[1]
-    assert all(np.array_equal(a, b) for a, b in zip(with_plume, scans_of(PLUME + "start_s = 1.0\nduration_s = 2.0\n")[2],
-                                                    strict=True))  # fmt: skip
+    assert all(np.array_equal(a, b) for a, b in zip(with_plume, scans_of(text)[2], strict=True))
 
 
 LIMB = """[[limb]]

@@ -33,7 +33,8 @@ EPOCH_NS = (
     1_700_000_000_000_000_000  # time of the first scan of every simulated log, fixed so that logs are reproducible
 )
 NS = 1_000_000_000
-_STREAMS = {"motion": 0, "start": 1, "noise": 2, "fault": 3, "plate": 4, "camera": 5, "camera_pose": 6, "plume": 7, "limb": 8}
+_NAMES = "motion", "start", "noise", "fault", "plate", "camera", "camera_pose", "plume", "limb"
+_STREAMS = {name: k for k, name in enumerate(_NAMES)}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -147,7 +147,8 @@ class Scanner:
             for k, rays in enumerate(self._rays):
                 found[k] = found[k].nearer(self._traced(body.caster, body.optics, placed, rays, every))
         for plume, rng in plumes:
-            found = [each.nearer(self._particles(plume, each, rays, rng)) for each, rays in zip(found, self._rays)]
+            for k, rays in enumerate(self._rays):
+                found[k] = found[k].nearer(self._particles(plume, found[k], rays, rng))
         if bodies or plumes or self.params.bloom_deg > 0.0:
             near = every
         returns = self._beams([each.chosen(near) for each in found], near)

@@ -176,7 +176,7 @@ def shell(x0: float, r0: float, x1: float, r1: float, wall: float, floor: float,
 
 
 def adapter(r0: float, r1: float, half_height: float) -> Solid:
-    """A hollow truncated cone about z, open at both ends, from radius r0 to r1 [m]; the wall is 5 % of the smaller one."""
+    """A hollow truncated cone about z, open at both ends, from radius r0 to r1 [m]; wall 5 % of the smaller one."""
     wall, low, high = 0.05 * min(r0, r1), -half_height, half_height
     outer, inner = _ring(low, r0, 48), _ring(low, r0 - wall, 48)
     ring = _tube([outer, _ring(high, r1, 48), _ring(high, r1 - wall, 48), inner, outer])
