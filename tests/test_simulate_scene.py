@@ -163,7 +163,7 @@ PLUME = """[[plume]]
 nozzle_m = [0.0, -0.3, 0.1]
 direction = [0.0, 0.6, 0.8]
 half_angle_deg = 25.0
-density_per_m = 0.6
+particles_per_metre = 0.6
 """
 OPEN = BASE.replace("position_m = [0.0, 0.0, 5.0]", "position_m = [0.0, 0.0, -50.0]")  # the target out of view
 
@@ -176,7 +176,7 @@ def plume_depth(params, ray, end):
         d = np.linalg.norm(r)
         angle = math.acos(np.clip(r @ np.array(params.direction) / d, -1.0, 1.0))
         spread = math.exp(-((angle / math.radians(params.half_angle_deg)) ** 2))
-        return params.density_per_m * spread / max(d, 0.1) ** 2
+        return params.particles_per_metre * spread / max(d, 0.1) ** 2
 
     return quad(density, 0.0, end, limit=200)[0]
 

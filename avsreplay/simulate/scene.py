@@ -107,7 +107,7 @@ class Plume(Presence):
     """One table [[plume]]: particles from a thruster, drawn anew for every scan because they cross the view within it.
 
     The mean number of particles that a ray meets on a path dl at the distance d from the nozzle and the angle theta
-    from the axis is density_per_m (1 m / d)^2 exp(-(theta / half angle)^2) dl, as in a constant flow from a point.
+    from the axis is particles_per_metre (1 m / d)^2 exp(-(theta / half angle)^2) dl, as in a constant flow from a point.
     """
 
     name: str = setting("plume", "Its name, which is the kind of its label.")
@@ -116,7 +116,7 @@ class Plume(Presence):
     half_angle_deg: float = setting(
         20.0, "Angle from the axis at which the density has fallen to 1/e.", unit="deg", above=0.0, high=90.0
     )
-    density_per_m: float = setting(
+    particles_per_metre: float = setting(
         0.05, "Mean number of particles per metre of a ray on the axis 1 m from the nozzle.", unit="1/m", low=0.0
     )
     reflectance: float = setting(REFLECTANCE, "Diffuse reflectance of a particle.", low=0.0, high=1.0)
@@ -143,7 +143,7 @@ class Plume(Presence):
             away = np.maximum(np.linalg.norm(there, axis=1), _NEAREST_M)
             angle = np.arccos(np.clip(there @ np.array(self.direction) / away, -1.0, 1.0))
             spread = np.exp(-np.square(angle / math.radians(self.half_angle_deg)))
-            added = self.density_per_m * spread / np.square(away) * spacing
+            added = self.particles_per_metre * spread / np.square(away) * spacing
             hit = np.isinf(found) & (depth + added >= depth_at_hit)
             found[hit] = (k + (depth_at_hit - depth)[hit] / added[hit]) * spacing[hit]
             depth += added
