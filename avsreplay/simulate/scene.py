@@ -107,7 +107,7 @@ class Plume(Presence):
     """One table [[plume]]: particles from a thruster, drawn anew for every scan because they cross the view within it.
 
     The mean number of particles that a ray meets on a path dl at the distance d from the nozzle and the angle theta
-    from the axis is particles_per_metre (1 m / d)^2 exp(-(theta / half angle)^2) dl, as in a constant flow from a point.
+    from the axis is particles_per_metre (1 m / d)^2 exp(-(theta / half angle)^2) dl, as in a steady flow from a point.
     """
 
     name: str = setting("plume", "Its name, which is the kind of its label.")
