@@ -256,6 +256,15 @@ def test_every_setting_is_declared_with_its_meaning(cls):
         assert unit is None or entry.declared.unit == unit, entry.key
 
 
+@pytest.mark.parametrize("cls", PARAMETER_CLASSES, ids=lambda c: c.__name__)
+def test_every_setting_is_read_by_the_program(cls):
+    package = Path(avsreplay.__file__).parent
+    code = "\n".join(path.read_text(encoding="utf-8") for path in sorted(package.rglob("*.py")))
+    for entry in settings.entries(cls):
+        name = entry.key.rpartition(".")[2]
+        assert re.search(rf"\.{name}\b|[\"']{name}[\"']", code), entry.key
+
+
 def test_no_parameter_class_validates_by_hand():
     for module in pkgutil.walk_packages(avsreplay.__path__, "avsreplay."):
         if ".cli." in module.name or "kernel" in module.name or "__main__" in module.name:

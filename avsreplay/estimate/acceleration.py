@@ -28,6 +28,7 @@ from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.reference import r0_covariance
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, Belief, State, Trajectory
+from avsreplay.settings import given
 
 _FEWEST = 8  # poses of the first fit; the noise is estimated from its residuals
 _CONFIRM = 3  # successive poses that contradict the fit end it
@@ -150,7 +151,7 @@ def fit_acceleration(measured: Sequence[tuple[int, Alignment]], params: Estimato
     times = np.array([(t_ns - measured[0][0]) * 1e-9 for t_ns, _ in measured])
     poses = [found.T_ac for _, found in measured]
     covariances = [r0_covariance(params) if found.covariance is None else found.covariance for _, found in measured]
-    arm_1s_m = params.length("start_varrho_1s_m")
+    arm_1s_m = given(params.start_varrho_1s_m)
     count = _consistent(times, poses, covariances, arm_1s_m)
     mean, P, noise = _System(times[:count], poses[:count], covariances[:count], arm_1s_m).solved()
     return AccelerationFit(mean[6:9], P[6:9, 6:9], count, float(times[count - 1]), noise)

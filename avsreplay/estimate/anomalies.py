@@ -27,7 +27,6 @@ from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import (
     Epoch,
-    Prediction,
     SensorBias,
     Track,
     confirmed,
@@ -37,7 +36,8 @@ from avsreplay.estimate.track import (
     with_nis,
 )
 from avsreplay.geometry import Array
-from avsreplay.records import Belief, Innovation, Manoeuvre, Reason, Verdict
+from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
+from avsreplay.settings import given
 
 _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decision; accepted scans kept
 _OVER_FREE, _OVER_NEXT = 3.0, 2.0  # log odds over free motion, and over the next hypothesis, of an early decision
@@ -50,7 +50,6 @@ _SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a sma
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
 
-Update = Callable[[Track, Prediction, Innovation, int, bool], Track]
 Replay = Callable[[Track, Epoch], tuple[Track, Epoch]]
 
 
@@ -67,7 +66,7 @@ class AnomalyTest:
     def __init__(self, params: EstimatorParams, extent_m: float, batch: BatchSchedule, replay: Replay) -> None:
         self.params, self.batch, self._replay = params, batch, replay
         self.enabled = params.robust and params.start is not Start.PAPER
-        speed = 0.2 * params.length("start_vel_1s_mps")
+        speed = 0.2 * given(params.start_vel_1s_mps)
         self._priors = ChangePriors(0.1 * params.start_rate_1s_radps, speed, 0.05 * extent_m, 0.05)
 
     def step(

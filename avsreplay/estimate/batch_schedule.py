@@ -35,6 +35,7 @@ from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import Prediction, Track
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation
+from avsreplay.settings import given
 
 FEWEST_TO_FIT = 3
 MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does not grow with the log
@@ -64,7 +65,8 @@ class BatchSchedule:
         self.params, self.noise, self.start = params, noise, start
         self.checked_poses = 0 if params.start is Start.PAPER else params.audit_poses
         self._rules = FitParams(rescale=False)
-        self._drift_scale = (1e-3, _DRIFT_OF_SPEED * params.length("start_vel_1s_mps"))
+        self._given_levels = params.disturbances
+        self._drift_scale = (1e-3, _DRIFT_OF_SPEED * given(params.start_vel_1s_mps))
 
     def initialised(self, track: Track, prediction: Prediction, innovation: Innovation, converged: bool) -> Track:
         """The track after a healthy pose while the fit is in use: a new fit if enough poses have come since the last.
@@ -165,8 +167,8 @@ class BatchSchedule:
         if track.levels.count == 0:  # not yet estimated
             found[0] = _LEAST_TORQUE
         sizes = (0.0, 0.0) if drift is None else (float(np.linalg.norm(v)) for v in (drift.rate, drift.velocity))
-        for k, (given, size) in enumerate(zip(self.params.disturbances, sizes, strict=True)):
-            found[k] = max(found[k] if given is None else given, size * np.sqrt(_DRIFT_S) / (SPHERE, 1.0)[k])
+        for k, (fixed, size) in enumerate(zip(self._given_levels, sizes, strict=True)):
+            found[k] = max(found[k] if fixed is None else fixed, size * np.sqrt(_DRIFT_S) / (SPHERE, 1.0)[k])
         return found[0], found[1]
 
     def _levels(self, track: Track) -> NoiseLevels:

@@ -73,7 +73,6 @@ def _basis() -> Array:
 
 AXIS_PERMUTATIONS = _axis_permutations()
 _BASIS = _basis()
-_R_BN = np.array([p.R_bn for p in AXIS_PERMUTATIONS])
 _R_NB = np.array([p.R_bn.T for p in AXIS_PERMUTATIONS])
 _Q_BN = np.array([p.q_bn for p in AXIS_PERMUTATIONS])
 _Q_NB = geometry.conjugate(_Q_BN)

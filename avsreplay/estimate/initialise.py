@@ -38,6 +38,7 @@ from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import Adaptation, EstimatorParams
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
+from avsreplay.settings import given
 
 _PAIR_RAD = 0.7
 _DRAWS, _EDGE = 500, 0.99
@@ -172,8 +173,8 @@ def weak_prior(poses: Poses, params: EstimatorParams) -> Prior:
     The centre of the sphere is at the fixture.
     """
     mean = Chart(poses.q[0], np.zeros(3), poses.t[0], np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.eye(3))
-    arm = params.length("start_varrho_1s_m")
-    speed = params.length("start_vel_1s_mps") + params.start_rate_1s_radps * arm
+    arm = given(params.start_varrho_1s_m)
+    speed = given(params.start_vel_1s_mps) + params.start_rate_1s_radps * arm
     widths = [2.0, params.start_rate_1s_radps, 4.0 * arm, speed, params.start_log_inertia_1s, arm]
     return Prior(mean, np.diag(np.repeat(widths, [3, 3, 3, 3, 5, 3]) ** 2))
 

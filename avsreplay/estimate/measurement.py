@@ -252,7 +252,6 @@ def inflated(R: Array, inflation: Array) -> Array:
     return np.asarray(R * np.outer(c, c))
 
 
-SETS = ("two", "three", "known")
 _MOTION = 12
 _THREE = {"sigma": slice(12, 15), "varrho": slice(15, 18), "mu": slice(18, 21)}
 BLOCKS_OF: Mapping[str, Mapping[str, slice]] = MappingProxyType(

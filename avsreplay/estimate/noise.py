@@ -31,6 +31,8 @@ _MANY_OUTLIERS = 0.1  # outliers are many if they lose more than this share of t
 _LEVEL_DOF = 10.0  # degrees of freedom that the level of the last fit is worth in the window
 _LINE_OF_SIGHT = 0.5  # variance of an error that all views have in common over that of the common errors
 _LAGS = (5, 10, 20, 40)
+_EDGE_LEAN = 20.0  # from tests/benchmarks/estimate_noise.py, which gives 9 to 33 on five meshes
+_MOST_ALIKE = 50.0  # largest number of scans with correlated errors, reached where the view does not turn
 
 
 def integrated_autocorrelation(e: Array) -> float:
@@ -258,20 +260,31 @@ class Noise:
         return at_floor(R, self._R0, self.params.r_floor)
 
     def correlated_share(self, alignment: Alignment) -> float:
-        """The share of R that the poses of neighbouring scans have in common."""
-        return self.params.share(alignment.inliers, alignment.rms_m / self._extent_m)
+        """The share of R, from 0 to 1, that poses from nearly the same view have in common.
+
+        The variance from independent errors of the points falls with the number of inliers; that from the bias of
+        points near edges does not. Their ratio is K inliers (rms / extent)^2, whatever the target's size. K was fitted
+        to simulated scans of five meshes.
+        """
+        if self.params.correlated_share is not None:
+            return self.params.correlated_share
+        lean = _EDGE_LEAN * alignment.inliers * (alignment.rms_m / self._extent_m) ** 2
+        return lean / (1.0 + lean)
 
     def inflation(self, known: Array | None, mean: float, w_b: Array, dt_ns: int, correlated_share: float) -> Array:
         """(2,) factor on R for errors correlated in time: that of the last fit, else from the rotation between scans.
 
-        That of the fit holds for the ``mean`` share of its poses. The paper's filter assumes white errors.
+        That of the fit holds for the ``mean`` share of its poses. Without it, neighbours have ``correlated_share`` of
+        their variance in common over ``correlated_rad``: 1 + 2 sum of correlations. The paper's filter assumes white
+        errors.
         """
         if known is not None:
             return 1.0 + (known - 1.0) * (correlated_share / mean if mean > 0.0 else 1.0)
         if self.params.start is Start.PAPER:
             return NO_INFLATION
-        turn = float(np.linalg.norm(w_b)) * dt_ns * 1e-9
-        return np.full(2, self.params.colour(turn, correlated_share))
+        turn, alike = float(np.linalg.norm(w_b)) * dt_ns * 1e-9, self.params.correlated_rad
+        scans = alike / max(turn, alike / _MOST_ALIKE)
+        return np.full(2, 1.0 + 2.0 * correlated_share * scans)
 
     def updated(
         self, window: NoiseWindow, prior: State, H: Array, innovation: Innovation, posterior: Belief, inflation: Array

@@ -13,9 +13,7 @@ from avsreplay.settings import Settings, given, setting
 
 __all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
-_MOST_ALIKE = 50.0  # largest number of scans with correlated errors, reached where the view does not turn
 _PER_POSE = 0.25  # largest motion expected between two poses of a tracker: radian, or part of the extent
-_EDGE_LEAN = 20.0  # from tests/benchmarks/estimate_noise.py, which gives 9 to 33 on five meshes
 
 
 class NoiseSource(Enum):
@@ -160,37 +158,6 @@ class EstimatorParams(Settings):
         20.0, "With start paper: 1 sigma of the unknown misalignment about each axis.", unit="deg", above=0.0
     )
 
-    def share(self, inliers: int, rms_of_extent: float) -> float:
-        """Return the share of a registered pose's variance that poses from nearly the same view have in common.
-
-        The variance from independent errors of the points falls with the number of inliers; that from the bias of
-        points near edges does not. Their ratio is K inliers (rms / extent)^2, whatever the target's size. K was fitted
-        to simulated scans of five meshes.
-
-        Args:
-            inliers: number of inliers of the registration.
-            rms_of_extent: rms residual of the registration over the target's extent.
-
-        Returns:
-            The share, from 0 to 1; ``correlated_share`` where it is given.
-        """
-        if self.correlated_share is not None:
-            return self.correlated_share
-        lean = _EDGE_LEAN * inliers * rms_of_extent**2
-        return lean / (1.0 + lean)
-
-    def colour(self, turn_rad: float, share: float) -> float:
-        """Return the factor on the variance of poses with correlated errors.
-
-        Neighbours have ``share`` of their variance in common over ``correlated_rad``: 1 + 2 sum of correlations.
-
-        Args:
-            turn_rad: rotation of the view between two scans [rad].
-            share: share of the variance in common, as from ``share``.
-        """
-        scans = self.correlated_rad / max(turn_rad, self.correlated_rad / _MOST_ALIKE)
-        return 1.0 + 2.0 * share * scans
-
     def at_interval(self, period_s: float, extent_m: float) -> EstimatorParams:
         """Return the settings with start and changes of the motion that fit to poses at short intervals.
 
@@ -220,17 +187,6 @@ class EstimatorParams(Settings):
     def by_gain(self) -> bool:
         """Whether the gain is constrained as in the paper; always so with the paper's start."""
         return self.constraint is Constraint.GAIN or self.start is Start.PAPER
-
-    def length(self, name: str) -> float:
-        """Return a length that may be automatic.
-
-        Args:
-            name: name of the setting.
-
-        Returns:
-            Its value [m], or [m/s] for a velocity; the parameters must be resolved.
-        """
-        return given(getattr(self, name))
 
     @property
     def disturbances(self) -> tuple[float | None, float | None]:

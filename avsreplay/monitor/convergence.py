@@ -175,14 +175,12 @@ class ConsistencyReport:
     Attributes:
         consistent: the mean NIS is not above its band.  nis_mean: mean NIS.  band: its two-sided chi-square band.
         autocorrelation: of the whitened innovations one healthy epoch apart, 0 where white.
-        autocorrelation_band: half width of the band that it stays in where white.
     """
 
     consistent: bool | None
     nis_mean: float | None = None
     band: tuple[float, float] | None = None
     autocorrelation: float | None = None
-    autocorrelation_band: float | None = None
 
 
 class Consistency:
@@ -225,17 +223,12 @@ class Consistency:
         band = self._band(n)
         mean = float(np.einsum("ij,ij->", track.white, track.white)) / n
         lag = float(np.einsum("ij,ij->", track.white[1:], track.white[:-1]) / (mean * (n - 1)))
-        return ConsistencyReport(mean <= self.params.slack * band[1], mean, band, lag, self._autocorrelation_band(n))
+        return ConsistencyReport(mean <= self.params.slack * band[1], mean, band, lag)
 
     def _band(self, n: int) -> tuple[float, float]:
         if n not in self._bands:
             self._bands[n] = mean_band(6, n, self.params.level)
         return self._bands[n]
-
-    def _autocorrelation_band(self, n: int) -> float:
-        from scipy.special import ndtri
-
-        return float(ndtri(0.5 * (1.0 + self.params.level))) / math.sqrt(6.0 * (n - 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +259,8 @@ class Convergence:
 
     def __init__(self, params: ConvergenceParams, extent_m: float) -> None:
         self.params = params.resolved(extent_m)
-        self._limits = self.params.block_limits
+        self._limits, p = self.params.block_limits, self.params
+        self._grasp_limits = (given(p.grasp_pos_m), given(p.grasp_vel_mps), math.radians(p.grasp_rot_deg))
 
     def initial(self) -> ConvergenceTrack:
         """Return the state before the first scan."""
@@ -295,7 +289,5 @@ class Convergence:
         return ConvergenceTrack(converged, t1, since, not unknown, predictive, unknown)
 
     def _predicted(self, forecast: Forecast) -> bool:
-        p = self.params
-        limits = (given(p.grasp_pos_m), given(p.grasp_vel_mps), math.radians(p.grasp_rot_deg))
         predicted = (forecast.pos_1s_m, forecast.vel_1s_mps, forecast.rot_1s_rad)
-        return all(bool(np.all(values <= limit)) for values, limit in zip(predicted, limits, strict=True))
+        return all(bool(np.all(values <= limit)) for values, limit in zip(predicted, self._grasp_limits, strict=True))

@@ -40,7 +40,6 @@ class AcquireParams(Settings):
     middle_passes: int = setting(12, "Point-to-plane iterations per attitude in the second selection.", low=1)
     fine_starts: int = setting(10, "Different poses that are registered on the model itself.", low=1)
     fine_points: int = setting(1500, "Points of the scan with which these are registered and ranked.", low=1)
-    enough_ratio: float = setting(0.95, "Inlier ratio that ends the search after the first effort.", low=0.0, high=1.0)
     least_ratio: float = setting(0.7, "With a smaller inlier ratio no pose was found.", low=0.0, high=1.0)
     least_separate: float = setting(
         0.4,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import IO
 
 from rich import box
@@ -150,14 +150,6 @@ def escaped(text: str) -> str:
 def facts_table(title: str, facts: Iterable[tuple[str, str]], heads: tuple[str, str] = ("what", "value")) -> Table:
     """A table of names and values."""
     return Table(title, heads, tuple(facts), align="l")
-
-
-def without_empty_columns(table: Table) -> Table:
-    """The table without the columns in which no row has a text."""
-    kept = [k for k in range(len(table.heads)) if any(as_cell(row[k]).text for row in table.rows)]
-    rows = tuple(tuple(row[k] for k in kept) for row in table.rows)
-    align = "".join("r" if table.right(k) else "l" for k in kept)
-    return replace(table, heads=tuple(table.heads[k] for k in kept), rows=rows, align=align or "l")
 
 
 def number(value: float | None, spec: str = ".5g", none: str = "-") -> str:
