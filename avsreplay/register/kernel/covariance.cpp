@@ -18,21 +18,34 @@ constexpr int64_t LEAST_HALF = 12;          // patches that each half of a split
 constexpr double WORST_CONDITION = 1e8;     // of the scaled information of a half
 constexpr double TINY = std::numeric_limits<double>::min();
 
-// Largest eigenvalue of W' N_p W, if its trace exceeds DOMINANT; the trace bounds it.
-double share(const double* Np, const Six& W) {
-  Six B, A, V;
-  double trace = 0;
+// N_p W.
+Six product(const double* Np, const Six& W) {
+  Six B;
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j < 6; ++j)
       for (int k = 0; k < 6; ++k) B.v[i][j] += Np[6 * i + k] * W.v[k][j];
-  for (int j = 0; j < 6; ++j)
-    for (int k = 0; k < 6; ++k) trace += W.v[k][j] * B.v[k][j];
-  if (!(trace > DOMINANT)) return trace;
+  return B;
+}
+
+// W' B, which is symmetric for B = N_p W: its lower triangle is computed, and copied to the upper one.
+Six congruence(const Six& W, const Six& B) {
+  Six A;
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j <= i; ++j) {
       for (int k = 0; k < 6; ++k) A.v[i][j] += W.v[k][i] * B.v[k][j];
       A.v[j][i] = A.v[i][j];
     }
+  return A;
+}
+
+// Largest eigenvalue of W' N_p W, if its trace exceeds DOMINANT; the trace bounds it.
+double share(const double* Np, const Six& W) {
+  const Six B = product(Np, W);
+  double trace = 0;
+  for (int j = 0; j < 6; ++j)
+    for (int k = 0; k < 6; ++k) trace += W.v[k][j] * B.v[k][j];
+  if (!(trace > DOMINANT)) return trace;
+  Six A = congruence(W, B), V;
   eigen(A.v, V.v, 6, 1e-32);
   double largest = 0;
   for (int k = 0; k < 6; ++k) largest = std::max(largest, A.v[k][k]);
@@ -55,18 +68,9 @@ Six pseudo_root(Six N) {
 // (I - A)^-1/2 x with A = W' N_p W: with residuals of independent noise, the sum of its squares over the patches has
 // the identity times the variance as its mean (bias-reduced linearisation).
 std::array<double, 6> reduced(const double* Np, const Six& W, std::array<double, 6> x) {
-  Six B, A, V;
-  for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j)
-      for (int k = 0; k < 6; ++k) B.v[i][j] += Np[6 * i + k] * W.v[k][j];
+  Six A = congruence(W, product(Np, W)), V;
   double trace = 0;
-  for (int i = 0; i < 6; ++i) {
-    for (int j = 0; j <= i; ++j) {
-      for (int k = 0; k < 6; ++k) A.v[i][j] += W.v[k][i] * B.v[k][j];
-      A.v[j][i] = A.v[i][j];
-    }
-    trace += A.v[i][i];
-  }
+  for (int i = 0; i < 6; ++i) trace += A.v[i][i];
   std::array<double, 6> out = x, term = x;
   if (trace < SMALL) {
     for (int n = 1; n <= TERMS; ++n) {
