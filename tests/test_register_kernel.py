@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import ast
+import re
 import threading
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -489,3 +492,41 @@ def test_input_of_the_wrong_shape_or_type_is_refused() -> None:
         index.closest(np.zeros((4, 3), dtype=np.int64))
     with pytest.raises((ValueError, TypeError)):
         index.icp(np.zeros((4, 3)), np.zeros((3, 3)), 5, 0, 1.0, 3.0, 0.1, 1e-5, 1e-5)
+
+
+def stub_arguments(function: ast.FunctionDef) -> list[tuple[str, bool]]:
+    """Name of every argument, and whether it has a default."""
+    names = [argument.arg for argument in function.args.args]
+    required = len(names) - len(function.args.defaults)
+    return [(name, k >= required) for k, name in enumerate(names)]
+
+
+def bound_arguments(text: str) -> list[tuple[str, bool]]:
+    """The same from the signature that nanobind writes; a default is ``\\0``, ``\\1``, and types are not in Python."""
+    while "[" in text:
+        text = re.sub(r"\[[^\[\]]*\]", "", text)
+    return stub_arguments(ast.parse(text.replace("= \\", "= ") + ": ...").body[0])
+
+
+def signatures(space: object) -> dict[str, list[list[tuple[str, bool]]]]:
+    """The arguments of every bound function of a module or class, of each overload."""
+    own = {name: value for name, value in vars(space).items() if hasattr(value, "__nb_signature__")}
+    functions = {name: value for name, value in own.items() if not isinstance(value, type)}
+    return {name: [bound_arguments(each[0]) for each in f.__nb_signature__] for name, f in functions.items()}
+
+
+def test_the_stub_states_the_functions_and_arguments_of_the_extension() -> None:
+    stub = ast.parse(Path(kernel.__file__).with_name("_kernel.pyi").read_text())
+    spaces = {"": (stub.body, kernel)}
+    spaces |= {c.name: (c.body, getattr(kernel, c.name)) for c in stub.body if isinstance(c, ast.ClassDef)}
+    assert set(spaces) == {"", *(name for name, value in vars(kernel).items() if isinstance(value, type))}
+    for name, (body, space) in spaces.items():
+        stated: dict[str, list[list[tuple[str, bool]]]] = {}
+        properties = set()
+        for each in (entry for entry in body if isinstance(entry, ast.FunctionDef)):
+            if any(getattr(d, "id", "") == "property" for d in each.decorator_list):
+                properties.add(each.name)
+            else:
+                stated.setdefault(each.name, []).append(stub_arguments(each))
+        assert stated == signatures(space), name
+        assert properties == {key for key, value in vars(space).items() if isinstance(value, property)}, name

@@ -27,6 +27,7 @@ from avsreplay.reconstruct.views import (
 )
 from avsreplay.records import Scan
 from avsreplay.register import global_search
+from avsreplay.register.size import normal_jacobian
 
 PAIR_TURN_RAD = np.radians(90.0)  # key scans seen from directions closer than this are compared in the refinement
 PAIRS = 12  # most key scans with which one is compared
@@ -141,7 +142,7 @@ def _normal_equations(
     along = between(n[a], n[b])
     e = np.einsum("ni,ni->n", along, p[b] - p[a])
     w = np.maximum(1.0 - (e / gate) ** 2, 0.0) ** 2 * weight[a] * weight[b]
-    J = np.hstack([np.cross(p[a], along), along])
+    J = normal_jacobian(p[a], along)
     begin = np.flatnonzero(np.diff(pair, prepend=-1))
     M = np.add.reduceat((J * w[:, None])[:, :, None] * J[:, None, :], begin, axis=0)
     r = np.add.reduceat(J * (w * e)[:, None], begin, axis=0)

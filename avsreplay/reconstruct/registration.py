@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.views import ScanView
+from avsreplay.register.size import normal_jacobian
 
 SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
 MOST_POINTS = 1500  # of a scan in one registration
@@ -74,7 +75,7 @@ def _normal_equations(view: ScanView, model: Patchwork, T_ca: Pose, gate: float)
     p, q, n = p[near], model.points[index[near]], between(n_view[near], model.normals[index[near]])
     e = np.einsum("ni,ni->n", n, q - p)
     w = np.maximum(1.0 - (e / gate) ** 2, 0.0) ** 2
-    J = np.hstack([np.cross(p, n), n])
+    J = normal_jacobian(p, n)
     return (J * w[:, None]).T @ J, J.T @ (w * e), e, float(near.mean())
 
 

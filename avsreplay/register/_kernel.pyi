@@ -1,3 +1,4 @@
+from collections.abc import Sequence
 from typing import Any, overload
 
 import numpy as np
@@ -5,12 +6,53 @@ from numpy.typing import NDArray
 
 LAYOUT: int
 
-def keep_patches(
-    normals: NDArray[np.float64], counts: NDArray[np.int64], most: float, least: int
-) -> NDArray[np.bool_]: ...
-def sandwich(normals: NDArray[np.float64], gradients: NDArray[np.float64], alone: float) -> NDArray[np.float64]: ...
+def checksum(payload: NDArray[np.uint8]) -> int: ...
+def keep_patches(normals: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.bool_]: ...
+def pseudo_inverse(N: NDArray[np.float64]) -> NDArray[np.float64]: ...
+def sandwich(normals: NDArray[np.float64], gradients: NDArray[np.float64]) -> NDArray[np.float64]: ...
 
 class Matches: ...
+
+class Table:
+    def __init__(
+        self,
+        normals: NDArray[np.float64],
+        gradients: NDArray[np.float64],
+        offsets: NDArray[np.float64],
+        counts: NDArray[np.int64],
+        errors: NDArray[np.float64],
+        places: NDArray[np.float64],
+        centre: Sequence[float],
+        extent_m: float,
+        side_m: float,
+    ) -> None: ...
+    def systematic(self) -> tuple[float, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]: ...
+    def covariance(
+        self, block: float, smooth: Sequence[float], amplitudes: Sequence[float], fit: Sequence[float]
+    ) -> NDArray[np.float64]: ...
+    def split(
+        self,
+        block: float,
+        smooth: Sequence[float],
+        amplitudes: Sequence[float],
+        fit: Sequence[float],
+        across: NDArray[np.float64],
+    ) -> float: ...
+
+class Field:
+    def __init__(self, points: NDArray[np.float64], normals: NDArray[np.float64], across: int) -> None: ...
+    def refine(
+        self,
+        points: NDArray[np.float64],
+        T_ca: NDArray[np.float64],
+        passes: int,
+        gate_m: float,
+        fall: float,
+        floor_m: float,
+        beyond_m: float,
+        facing: bool,
+        threads: int = 1,
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]: ...
 
 class Index:
     @overload
@@ -24,12 +66,14 @@ class Index:
         portable: bool = False,
     ) -> None: ...
     @overload
-    def __init__(
-        self, saved: NDArray[np.uint8], primitives: int, ids: int, mesh: bool, portable: bool = False
-    ) -> None: ...
+    def __init__(self, saved: NDArray[np.uint8], ids: int, mesh: bool, portable: bool = False) -> None: ...
     def save(self) -> bytes: ...
     def closest(
-        self, points: NDArray[Any], threads: int = 1, camera_c: tuple[float, ...] | None = None
+        self,
+        points: NDArray[Any],
+        threads: int = 1,
+        camera_c: Sequence[float] | None = None,
+        most_m: float = ...,
     ) -> tuple[Any, ...]: ...
     def icp(
         self,
@@ -68,6 +112,8 @@ class Index:
         matches: Matches | None = None,
     ) -> tuple[Any, ...]: ...
     def looks(self, points: NDArray[Any], T_ca: NDArray[np.float64], stride: int) -> tuple[int, int]: ...
+    @property
+    def primitives(self) -> int: ...
     @property
     def nbytes(self) -> int: ...
     @property

@@ -327,7 +327,7 @@ class Registrar:
         return found
 
     def _align(self, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | str:
-        """Run the back end; what it raises, or a result of another type, becomes the status FAILED with this text."""
+        """Run the back end. An exception, or a result of a wrong type, is returned as the text of a failure."""
         name = f"back end '{self.params.backend}'"
         try:
             if width_m is not None and isinstance(self._backend, HornBackend):

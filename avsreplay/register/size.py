@@ -26,7 +26,7 @@ WIDTH_OF_EXTENT, ROUNDS, POINTS = 0.02, 3, 600  # larger residuals are not used;
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SizeError:
-    """What one scan says of the size of its target.
+    """Size of the target estimated from one scan.
 
     Attributes:
         delta: size of the target over that of the model, less 1.
@@ -40,7 +40,7 @@ class SizeError:
 
     @property
     def message(self) -> str:
-        """What a row says of it."""
+        """The text of the row's message."""
         larger = "larger" if self.delta > 0.0 else "smaller"
         return f"the scan fits a target {100.0 * abs(self.delta):.1f} % {larger} than the model"
 
