@@ -43,6 +43,7 @@ LEAST_CONTRAST, LEAST_CONTRAST_OF_PART = 6.0, 15.0  # the second where more than
 MOST_VIOLATED = 0.15  # largest violated share of the surface that is either supported or violated
 MOST_MISSING = 0.1  # largest missing share, if at least as large a share of the scan is not on the model
 LEAST_SCAN_OF_EXTENT = 0.05  # a smaller scan is about as large as the rejection distance, and any face explains it
+SIZED_POINTS = 200  # of the scan, which are enough to tell for nearly every scan that it is not that small
 LEAST_COMPARED = 30  # with fewer surface points the test has no power
 LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of its incidence is larger
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
@@ -97,8 +98,11 @@ class PlausibilityTest:
         """
         if len(scan) == 0:
             return not_measured(points, AlignStatus.NO_POINTS, guess)
+        least = LEAST_SCAN_OF_EXTENT * self._extent
+        if geometry.bounding_diagonal(scan[:: max(1, len(scan) // SIZED_POINTS)]) >= least:
+            return None
         size = geometry.bounding_diagonal(scan)
-        if size >= LEAST_SCAN_OF_EXTENT * self._extent:
+        if size >= least:
             return None
         text = f"the scan measures {size:.3g} m, the model {self._extent:.3g} m: is --model-unit right?"
         return replace(not_measured(points, AlignStatus.IMPLAUSIBLE, guess), message=text)
