@@ -37,7 +37,7 @@ def test_a_closed_pipe_is_not_a_failed_check(args: tuple[object, ...], fixtures_
 
 @posix
 def test_a_full_standard_output_is_one_line(fixtures_folder: Path) -> None:
-    with Path("/dev/full").open("w") as full:
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
         code, err = with_stdout(full.fileno(), "info", fixtures_folder / "tumble.mcap")
     assert code == 3
     assert err.strip() == "avsreplay: standard output: No space left on device"

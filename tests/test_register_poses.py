@@ -35,7 +35,7 @@ def motion() -> tuple[list[int], list[Pose], list[Pose]]:
 
 def tum(path: Path, times: list[int], poses: list[Pose]) -> Path:
     lines = [" ".join(map(repr, [t * 1e-9, *p.t.tolist(), *p.q.tolist()])) for t, p in zip(times, poses, strict=True)]
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 
@@ -45,7 +45,7 @@ def csv(path: Path, times: list[int], poses: list[Pose]) -> Path:
     for t, p in zip(times, poses, strict=True):
         x, y, z, w = p.q.tolist()
         lines.append(",".join(map(str, [w, x, y, z, "a", *p.t[::-1].tolist(), t])))
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     return path
 
 

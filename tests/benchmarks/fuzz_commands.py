@@ -372,7 +372,7 @@ def check_seeds(seeds: Path, cases: list[tuple[str, str]]) -> None:
 
 def _run(command: str, args: list[object], feed: BinaryIO | None) -> tuple[str, str]:
     out, err = io.StringIO(), io.StringIO()
-    sys.stdin = io.TextIOWrapper(feed) if feed else sys.__stdin__
+    sys.stdin = io.TextIOWrapper(feed, encoding="utf-8") if feed else sys.__stdin__
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # as main does
         try:
