@@ -230,7 +230,7 @@ class Replanning:
 
     def _measured(self, belief: Belief, drawn: Belief, rng: np.random.Generator) -> Iterator[PlannerInput]:
         """What guidance knows after each scan of a drawn target: the filter with poses of its own noise."""
-        estimator = Estimator(self.saved.estimator.params, belief, self.saved.extent_m)
+        estimator = Estimator(self.saved.estimator.params, belief, self.saved.extent_m, self.saved.since_ns)
         motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)
         track = estimator.initial(belief.t_ns, belief.x.T_ac)
         step_ns = int(np.median(np.diff([row.t_ns for row in self.saved.rows])))

@@ -18,7 +18,6 @@ from avsreplay.estimate.batch import FitParams, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import LATEST, BatchCovariance, final_mixture, moments
 from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
-from avsreplay.estimate.dynamics import propagate
 from avsreplay.estimate.error_state import VEL, W
 from avsreplay.estimate.hypotheses import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis, explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
@@ -89,7 +88,7 @@ class AnomalyTest:
         if not (large or track.doubtful or _long_run((*track.recent, epoch), nis_scale(track))):
             return self._accepted(track, epoch, update), verdict
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
-        ranked = explain(window, first, self._priors, *self.batch.noise_levels(track))
+        ranked = explain(window, first, self._priors, *self.batch.noise_levels(track), self.batch.orbit)
         best = ranked[0].hypothesis
         changed = best is Hypothesis.MANOEUVRE and _odds_over_free(ranked) >= _OVER_FREE
         changed = changed and (bool(track.doubtful) or _linear(window, ranked))
@@ -166,7 +165,7 @@ class AnomalyTest:
         if best.onset >= first:
             return replace(with_history(track, track), bias=bias)
         then = window[best.onset].track
-        belief, _ = propagate(then.belief, last.prediction.belief.t_ns, *self.batch.noise_levels(track))
+        belief, _ = self.batch.propagated(track, then.belief, last.prediction.belief.t_ns)
         return replace(with_history(then, track), belief=belief, recent=track.recent[: best.onset], bias=bias)
 
     def _by_agreement(self, track: Track) -> tuple[Track, Verdict]:
@@ -187,7 +186,7 @@ class AnomalyTest:
             return False
         for epoch in track.doubtful:
             prior, seen = epoch.prediction.belief, epoch.innovation
-            belief, _ = propagate(old.belief, prior.t_ns, *self.batch.noise_levels(old))
+            belief, _ = self.batch.propagated(old, old.belief, prior.t_ns)
             H = measurement_jacobian(belief.x)
             S = H @ belief.P @ H.T + seen.R
             alpha = innovation_vector(belief.x, measured_pose(prior.x, seen.alpha))
@@ -216,7 +215,7 @@ class AnomalyTest:
         at = window[best.onset].track.belief  # of all scans before the first change
         for after_s in best.changes_s:
             then_ns = start_ns + round(after_s * 1e9)
-            at, _ = propagate(at, then_ns, *self.batch.noise_levels(track))
+            at, _ = self.batch.propagated(track, at, then_ns)
             P = at.P.copy()
             P[W, W] += self._priors.rate_radps**2 * np.eye(3)
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)

@@ -21,6 +21,7 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.measurement import GATE
 from avsreplay.estimate.noise import integrated_autocorrelation
+from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.geometry import Array
 from avsreplay.records import State
 from avsreplay.settings import Settings, setting
@@ -60,6 +61,7 @@ class Poses:
         shares: (n,) part of C that poses seen from nearly the same direction have in common; None for 0.
         within: squared whitened differences of poses from their normal points, of attitude and position, and their
             degrees of freedom; None where there are none.
+        arc: the orbit from the epoch on; None for free motion.
         root: (n, 6, 6) lower triangular with root C root' = 1.
         info: (n, 2, 3, 3) inverse covariance of the attitude and of the position by itself.
     """
@@ -71,6 +73,7 @@ class Poses:
     counts: Array | None = None
     shares: Array | None = None
     within: tuple[tuple[float, float], float] | None = None
+    arc: OrbitArc | None = None
     root: Array = field(init=False)
     info: Array = field(init=False)
 
@@ -96,11 +99,13 @@ class Poses:
             self.t[:count],
             self.C[:count],
             shares=None if self.shares is None else self.shares[:count],
+            arc=self.arc,
         )
 
     def latest(self, count: int, epoch_s: float) -> Poses:
         """The last ``count`` poses, with times from ``epoch_s``."""
-        return Poses(self.times_s[-count:] - epoch_s, self.q[-count:], self.t[-count:], self.C[-count:])
+        arc = None if self.arc is None else self.arc.shifted(epoch_s)
+        return Poses(self.times_s[-count:] - epoch_s, self.q[-count:], self.t[-count:], self.C[-count:], arc=arc)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -197,6 +202,9 @@ class Problem:
             poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, _inverse(prior.P)
         )
         self.core = core
+        if poses.arc is not None:
+            moved = poses.arc.transitions(poses.times_s)
+            core.paths(np.stack([moved[:, :3, :3], moved[:, :3, 3:]], axis=1))
         self.reweigh(factors)
         if start is not None:
             core.linearise(start.flat)

@@ -30,6 +30,7 @@ from avsreplay.estimate.dynamics import (
 )
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite, least_eigenvalue
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
+from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Forecast, State
 
@@ -227,7 +228,7 @@ def final_mixture(
             y, P = np.zeros(DIM), fitted.P_chart
         if pin is None:
             P = definite(P if spread is None else spread @ P @ spread.T)  # spread: for the trajectory of the fit alone
-        x, step = propagate_chart(chart, after_s)
+        x, step = propagate_chart(chart, after_s, problem.poses.arc)
         base, move = to_chart(x), step @ y
         share = 1.0
         if least_eigenvalue(P) < ROUNDING or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
@@ -315,9 +316,9 @@ def mixture_forecast(
     return Forecast(times, position, velocity, 2.0 * half_angle)
 
 
-def propagate_chart(chart: Chart, h: float) -> tuple[State, Array]:
+def propagate_chart(chart: Chart, h: float, arc: OrbitArc | None = None) -> tuple[State, Array]:
     """The state h seconds later, and the transition matrix (20, 20) in chart coordinates."""
-    there, Phi = propagate_state(to_state(chart), h)
+    there, Phi = propagate_state(to_state(chart), h, arc)
     return there, np.asarray(np.linalg.solve(to_errors(to_chart(there)), Phi @ to_errors(chart)))
 
 

@@ -18,7 +18,7 @@ from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_chart
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
 from avsreplay.estimate.drift import find_drift
-from avsreplay.estimate.dynamics import propagate_state
+from avsreplay.estimate.dynamics import propagate, propagate_state
 from avsreplay.estimate.initialise import (
     BatchResult,
     PoseFix,
@@ -32,6 +32,7 @@ from avsreplay.estimate.measurement import chart_update, in_fixture, measured_po
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
+from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Prediction, Track
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation
@@ -59,10 +60,13 @@ class BatchSchedule:
         params: settings, auto values filled in.
         noise: the measurement noise model.
         start: the given belief, None where there is none. It is left out once the poses contradict it.
+        orbit: the relative orbit of the target; None for free motion.
     """
 
-    def __init__(self, params: EstimatorParams, noise: Noise, start: Belief | None) -> None:
-        self.params, self.noise, self.start = params, noise, start
+    def __init__(
+        self, params: EstimatorParams, noise: Noise, start: Belief | None, orbit: RelativeOrbit | None = None
+    ) -> None:
+        self.params, self.noise, self.start, self.orbit = params, noise, start, orbit
         self.checked_poses = 0 if params.start is Start.PAPER else params.audit_poses
         self._rules = FitParams(rescale=False)
         self._given_levels = params.disturbances
@@ -79,7 +83,7 @@ class BatchSchedule:
         last = track.batch
         if last is None or track.since >= max(1.0, self._growth(last) * last.count):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
-            start = chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
+            start = self._chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
             given = self._given(track)
             result = batch_estimate(track.fixes, self.params, self._rules, self._levels(track), last, start, given)
             rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
@@ -114,7 +118,7 @@ class BatchSchedule:
             return track
         epoch_ns = track.fixes[0].t_ns
         rejected = track.batch is not None and track.batch.prior_rejected
-        begin, given = chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
+        begin, given = self._chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
         last = track.batch if track.batch is not None and track.batch.epoch_ns == epoch_ns else None
         result = batch_estimate(
             track.fixes, self.params, self._rules, self._levels(track), last, start=begin, given=given
@@ -145,7 +149,7 @@ class BatchSchedule:
             return replace(track, untested=track.untested + 1)
         track = replace(track, untested=0)
         epoch_ns = track.fixes[0].t_ns
-        start = last.chart if last.epoch_ns == epoch_ns else chart_at(track.belief, epoch_ns)
+        start = last.chart if last.epoch_ns == epoch_ns else self._chart_at(track.belief, epoch_ns)
         factors = np.array([track.window.factors[3], track.window.factors[0]])
         found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels)
         if found is None:
@@ -188,7 +192,7 @@ class BatchSchedule:
         if not ready or last is None or track.unlevelled < due or track.since == 0:
             return replace(track, unlevelled=track.unlevelled + 1)
         epoch_ns = track.fixes[0].t_ns
-        start = last.chart if last.epoch_ns == epoch_ns else chart_at(track.belief, epoch_ns)
+        start = last.chart if last.epoch_ns == epoch_ns else self._chart_at(track.belief, epoch_ns)
         levels = improved_levels(track.fixes, last, start, self.params, track.levels)
         used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
         more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
@@ -206,7 +210,8 @@ class BatchSchedule:
         t_ns = track.fixes[0].t_ns
         if track.prior is None or t_ns - track.prior_ns > _RECENT * self._memory_ns(track):
             return None
-        x, step = propagate_chart(track.prior.mean, (t_ns - track.prior_ns) * 1e-9)
+        arc = None if self.orbit is None else self.orbit.at(track.prior_ns)
+        x, step = propagate_chart(track.prior.mean, (t_ns - track.prior_ns) * 1e-9, arc)
         P = step @ track.prior.P @ step.T
         return Prior(to_chart(x), P) if float(np.sqrt(np.trace(P[:3, :3]))) < _GAUSSIAN_HALF_RAD else None
 
@@ -224,7 +229,7 @@ class BatchSchedule:
         fixes = track.fixes[oldest:]
         if len(fixes) >= MOST_FIXES:
             half, factors = MOST_FIXES // 2, np.array([track.window.factors[3], track.window.factors[0]])
-            fixes = joined(fixes[:half], chart_at(prediction.belief, fixes[0].t_ns), factors) + fixes[half:]
+            fixes = joined(fixes[:half], self._chart_at(prediction.belief, fixes[0].t_ns), factors) + fixes[half:]
         return (*fixes, self.fix(prediction, innovation))
 
     def fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
@@ -237,13 +242,17 @@ class BatchSchedule:
         if lag_ns:
             then, _ = propagate_state(x, lag_ns * 1e-9)
             pose = then.T_ac @ x.T_ac.inverse() @ pose
-        return PoseFix(prediction.belief.t_ns + lag_ns, pose, C, lag_ns, innovation.share)
+        return PoseFix(prediction.belief.t_ns + lag_ns, pose, C, lag_ns, innovation.share, orbit=self.orbit)
 
+    def propagated(self, track: Track, belief: Belief, t_ns: int) -> tuple[Belief, Array]:
+        """A belief at another instant with the disturbances of a track, and the transition matrix (20, 20)."""
+        return propagate(belief, t_ns, *self.noise_levels(track), self.orbit)
 
-def chart_at(belief: Belief, t_ns: int) -> Chart:
-    """The belief's mean propagated to another instant, as a starting point of a fit."""
-    there, _ = propagate_state(belief.x, (t_ns - belief.t_ns) * 1e-9)
-    return to_chart(there)
+    def _chart_at(self, belief: Belief, t_ns: int) -> Chart:
+        """The belief's mean propagated to another instant, as a starting point of a fit."""
+        arc = None if self.orbit is None else self.orbit.at(belief.t_ns)
+        there, _ = propagate_state(belief.x, (t_ns - belief.t_ns) * 1e-9, arc)
+        return to_chart(there)
 
 
 def _better_than_measured(belief: Belief, R: Array) -> bool:

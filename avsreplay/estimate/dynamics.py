@@ -16,6 +16,7 @@ from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import _motion
 from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W, hamilton
+from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.geometry import IDENTITY_QUAT, Array, skew
 from avsreplay.records import Belief, Forecast, State, Trajectory
 
@@ -35,6 +36,7 @@ def _diagonal(rows: slice, columns: slice) -> slice:
 
 _POSITION, _MIXED, _VELOCITY = _diagonal(RHO, RHO), _diagonal(RHO, VEL), _diagonal(VEL, VEL)
 _MIXED_MIRROR = _diagonal(VEL, RHO)
+_TRANSLATION = slice(RHO.start, VEL.stop)
 
 
 def sigma3(sigma: Array) -> float:
@@ -108,12 +110,15 @@ def torque_density(sigma: Array, torque: float) -> Triple:
     return (torque * x) ** 2, (torque * y) ** 2, (torque * z) ** 2
 
 
-def transition(step: Flow, sigma: Array, h: float) -> Array:
-    """State transition matrix Phi (20, 20) of a step of h seconds from a state with ``sigma``."""
+def transition(step: Flow, sigma: Array, h: float, arc: OrbitArc | None = None) -> Array:
+    """State transition matrix Phi (20, 20) of a step of h seconds from a state with ``sigma``; ``arc``: the orbit."""
     Phi = _I20.copy()
     Phi[:6, :6] = step.S[:, :6]
     Phi[:6, SIGMA] = step.S[:, 6:] @ sigma_join(sigma)
-    Phi.reshape(-1)[_MIXED] = h
+    if arc is None:
+        Phi.reshape(-1)[_MIXED] = h
+    else:
+        Phi[_TRANSLATION, _TRANSLATION] = arc.transitions(np.array([h]))[0]
     return Phi
 
 
@@ -129,19 +134,30 @@ def process_noise(step: Flow, h: float, force: float) -> Array:
     return Q
 
 
-def advance(x: State, step: Flow, h: float) -> State:
-    """The state after a step of h seconds."""
+def translated(x: State, times_s: Array, arc: OrbitArc | None = None) -> tuple[Array, Array]:
+    """Centre of mass and its velocity, (n, 3) each, ``times_s`` (n,) [s] after ``x``: free, or on an orbit."""
+    if arc is None:
+        return x.r_a + times_s[:, None] * x.v_a, np.broadcast_to(x.v_a, (len(times_s), 3))
+    found = arc.transitions(times_s) @ np.concatenate([x.r_a, x.v_a])
+    return found[:, :3], found[:, 3:]
+
+
+def advance(x: State, step: Flow, h: float, arc: OrbitArc | None = None) -> State:
+    """The state after a step of h seconds; ``arc``: the orbit from the instant of ``x`` on, None for free motion."""
     q_ab = np.array(hamilton(x.q_ab.tolist(), step.q.tolist()))
-    return State(q_ab, step.w, x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+    centre, velocity = translated(x, np.array([h]), arc)
+    return State(q_ab, step.w, centre[0], velocity[0], x.sigma, x.c_b, x.q_bc)
 
 
-def propagate_state(x: State, h: float) -> tuple[State, Array]:
+def propagate_state(x: State, h: float, arc: OrbitArc | None = None) -> tuple[State, Array]:
     """The state h seconds later (either sign) without disturbance, and Phi (20, 20) of the step."""
     step = flow(x.w_b, x.sigma, h)
-    return advance(x, step, h), transition(step, x.sigma, h)
+    return advance(x, step, h, arc), transition(step, x.sigma, h, arc)
 
 
-def propagate(belief: Belief, t_ns: int, torque: float, force: float) -> tuple[Belief, Array]:
+def propagate(
+    belief: Belief, t_ns: int, torque: float, force: float, orbit: RelativeOrbit | None = None
+) -> tuple[Belief, Array]:
     """Belief at t_ns and Phi of the step (eq:state-prop, eq:cov-prop). A step back in time adds no noise.
 
     Raises:
@@ -153,11 +169,12 @@ def propagate(belief: Belief, t_ns: int, torque: float, force: float) -> tuple[B
         what = f"a scan comes {h:.4g} s after the one before, too far to predict its pose"
         raise UsageError(what, where=f"stamp {t_ns}", hint="leave out what is beyond the gap with --start or --end")
     step = flow(x.w_b, x.sigma, h, torque)
-    Phi = transition(step, x.sigma, h)
+    arc = None if orbit is None else orbit.at(belief.t_ns)
+    Phi = transition(step, x.sigma, h, arc)
     P = Phi @ belief.P @ Phi.T
     if h > 0.0:
         P += process_noise(step, h, force)
-    return Belief(t_ns, advance(x, step, h), 0.5 * (P + P.T)), Phi
+    return Belief(t_ns, advance(x, step, h, arc), 0.5 * (P + P.T)), Phi
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -191,11 +208,12 @@ def rotation_path(x: State) -> _motion.Path:
     return _motion.Path(x.q_ab, x.w_b, ratios(x.sigma))
 
 
-def grasp_trajectory(x: State) -> Trajectory:
+def grasp_trajectory(x: State, arc: OrbitArc | None = None) -> Trajectory:
     """Positions and velocities of the undisturbed grasp point.
 
     Args:
         x: the state now.
+        arc: the orbit from now on; None for free motion.
 
     Returns:
         Function of times (n,) >= 0 [s after now]: positions (n, 3) [m] and velocities (n, 3) [m/s] in {A}.
@@ -211,8 +229,9 @@ def grasp_trajectory(x: State) -> Trajectory:
             raise ValueError("times must be finite and not before now")
         q, w = path.at(times)
         A = geometry.matrix(q)
-        position = x.r_a + times[:, None] * x.v_a + A @ x.c_b
-        velocity = x.v_a + (A @ (w @ arm)[:, :, None])[:, :, 0]
+        centre, speed = translated(x, times, arc)
+        position = centre + A @ x.c_b
+        velocity = speed + (A @ (w @ arm)[:, :, None])[:, :, 0]
         return position, velocity
 
     return at
@@ -261,13 +280,16 @@ def grasp_prediction(belief: Belief, times_s: Array, torque: float, force: float
     return _motion.forecast(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, P, density, force**2, times_s)
 
 
-def pose_rows(x: State, times_s: Array) -> Array:
+def pose_rows(x: State, times_s: Array, arc: OrbitArc | None = None) -> Array:
     """H Phi (n, 6, 20) of a pose measured at each of ``times_s`` (n,) [s], with respect to the error states at 0."""
     path = rotation_history(x, times_s)
     J = grasp_jacobian(geometry.matrix(path.q), path.w, x.c_b)[:, [0, 1, 2, 6, 7, 8]]
     rows, rotational = J.copy(), J[:, :, :6]
     rows[:, :, :6], rows[:, :, SIGMA] = rotational @ path.S[:, :, :6], rotational @ path.S[:, :, 6:]
-    rows[:, :, VEL] += np.asarray(times_s)[:, None, None] * J[:, :, RHO]
+    if arc is None:
+        rows[:, :, VEL] += np.asarray(times_s)[:, None, None] * J[:, :, RHO]
+    else:
+        rows[:, :, _TRANSLATION] = J[:, :, RHO] @ arc.transitions(np.asarray(times_s))[:, :3]
     return rows
 
 

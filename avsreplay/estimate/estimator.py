@@ -33,6 +33,7 @@ from avsreplay.estimate.measurement import (
 )
 from avsreplay.estimate.noise import NO_INFLATION, Noise, line_of_sight_1s
 from avsreplay.estimate.params import EstimatorParams, Start
+from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Epoch, Prediction, Track
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory, Verdict
@@ -48,7 +49,8 @@ class Estimator:
             params: settings; lengths left out are taken from ``extent_m``.
             start: the first belief where one is given.
             extent_m: the target's bounding diagonal [m].
-            epoch_ns: instant near the scans at which the falling frame of a known acceleration coincides with {A}.
+            epoch_ns: instant at which the falling frame of a known acceleration coincides with {A}, and to which the
+                directions of a relative orbit belong: that of the first scan.
 
         Raises:
             UsageError: a near start is requested and none is given.
@@ -61,7 +63,7 @@ class Estimator:
         self.fall = FreeFall(known, epoch_ns) if known.any() else None
         self.start = self._into(start) if start is not None and params.start in (Start.AUTO, Start.NEAR) else None
         self.noise = Noise(self.params, extent_m)
-        self.batch = BatchSchedule(self.params, self.noise, self.start)
+        self.batch = BatchSchedule(self.params, self.noise, self.start, RelativeOrbit.of(params, epoch_ns))
         self.anomalies = AnomalyTest(self.params, extent_m, self.batch, self._replayed)
         self._prior = None if self.start is None else given_prior(self.start)
         self._robust = params.robust and params.start is not Start.PAPER
@@ -90,7 +92,7 @@ class Estimator:
         Raises:
             UsageError: the instant is too far from the last scan to predict the rotation.
         """
-        belief, Phi = dynamics.propagate(track.belief, t_ns, *self.batch.noise_levels(track))
+        belief, Phi = self.batch.propagated(track, track.belief, t_ns)
         return Prediction(belief, Phi, measurement_jacobian(belief.x), track.window)
 
     def innovate(self, prediction: Prediction, alignment: Alignment) -> Innovation:
@@ -163,8 +165,8 @@ class Estimator:
         J = np.zeros((len(points), 6, 6))  # from d = [theta; v] in {C}, as in ``measurement.to_camera``
         J[:, :3, 3:], J[:, 3:, :3] = geometry.matrix(points.q), 0.5 * geometry.matrix(x.q_bc)
         R = J @ points.C @ np.swapaxes(J, 1, 2)
-        _, Phi = dynamics.propagate_state(x, (track.belief.t_ns - start.epoch_ns) * 1e-9)
-        rows = dynamics.pose_rows(x, points.times_s)
+        _, Phi = dynamics.propagate_state(x, (track.belief.t_ns - start.epoch_ns) * 1e-9, points.arc)
+        rows = dynamics.pose_rows(x, points.times_s, points.arc)
         if points.counts is not None:  # each normal point stands for several poses
             each = np.sqrt(points.counts)[:, None, None]
             rows, R = each * rows, each**2 * R
@@ -265,7 +267,8 @@ class Estimator:
             Function of times (n,) >= 0 [s after the belief's instant]: positions (n, 3) [m] and velocities (n, 3) [m/s]
             in {A}. It raises ValueError for a time that is negative or not finite.
         """
-        free = dynamics.grasp_trajectory(belief.x)
+        orbit = self.batch.orbit
+        free = dynamics.grasp_trajectory(belief.x, None if orbit is None else orbit.at(belief.t_ns))
         return free if self.fall is None else accelerated(free, self.fall.acceleration)
 
     def attitude(self, belief: Belief) -> Callable[[Array], Array]:

@@ -22,6 +22,7 @@ from avsreplay.estimate.dynamics import advance, flows, process_noise, rotation_
 from avsreplay.estimate.error_state import RHO, VEL, rotation
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import cholesky_root, correlated_noise
+from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Belief
@@ -102,7 +103,12 @@ class _Window:
 
 
 def explain(
-    epochs: Sequence[Epoch], first_doubtful: int, priors: ChangePriors, torque: float, force: float
+    epochs: Sequence[Epoch],
+    first_doubtful: int,
+    priors: ChangePriors,
+    torque: float,
+    force: float,
+    orbit: RelativeOrbit | None = None,
 ) -> list[Explanation]:
     """All hypotheses on a window of scans, most likely first.
 
@@ -112,9 +118,10 @@ def explain(
         priors: 1 sigma of the size of a change.
         torque: root density of the angular disturbance [rad/s^1.5].
         force: root density of the linear disturbance [m/s^1.5].
+        orbit: the relative orbit of the target; None for free motion.
     """
     start = epochs[0].track.belief
-    window = _window(epochs, start, torque, force)
+    window = _window(epochs, start, torque, force, None if orbit is None else orbit.at(start.t_ns))
     white = window.whiten @ window.y
     free = -0.5 * float(white @ white) + float(np.log(np.diagonal(window.whiten)).sum())
     n = len(epochs)
@@ -128,12 +135,12 @@ def explain(
     return sorted(found, key=lambda e: -e.log_evidence)
 
 
-def _window(epochs: Sequence[Epoch], start: Belief, torque: float, force: float) -> _Window:
+def _window(epochs: Sequence[Epoch], start: Belief, torque: float, force: float, arc: OrbitArc | None) -> _Window:
     n, x = len(epochs), start.x
     times = np.array([(e.prediction.belief.t_ns - start.t_ns) * 1e-9 for e in epochs])
     y, rows, back, poses, R_ba = np.empty((n, 6)), np.empty((n, 6, 20)), np.empty((n, 20, 20)), [], []
     for k, (epoch, step, t) in enumerate(zip(epochs, flows(x.w_b, x.sigma, times, torque), times, strict=True)):
-        then, Phi = advance(x, step, t), transition(step, x.sigma, t)
+        then, Phi = advance(x, step, t, arc), transition(step, x.sigma, t, arc)
         poses.append(measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha))
         y[k] = innovation_vector(then, poses[-1])
         rows[k] = measurement_jacobian(then) @ Phi

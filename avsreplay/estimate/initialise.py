@@ -36,6 +36,7 @@ from avsreplay.estimate.noise import BOUND
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import Adaptation, EstimatorParams
+from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
 from avsreplay.settings import given
@@ -55,6 +56,7 @@ class PoseFix:
         lag_ns: the instant relative to that of its scan: a scan of finite duration shows the pose at its middle.
         correlated_share: the part of C that neighbouring poses have in common.
         count: number of poses that it stands for.
+        orbit: the relative orbit that the target is on; None for free motion.
     """
 
     t_ns: int
@@ -63,6 +65,7 @@ class PoseFix:
     lag_ns: int = 0
     correlated_share: float = 0.0
     count: int = 1
+    orbit: RelativeOrbit | None = None
 
     @property
     def scan_ns(self) -> int:
@@ -132,7 +135,7 @@ def _at_pose(T_ac: Pose, w: Array, v: Array) -> State:
 def poses_of(fixes: tuple[PoseFix, ...], epoch_ns: int | None = None) -> Poses:
     """The fixes as input of the fit, times from the epoch, by default the first pose."""
     t0 = fixes[0].t_ns if epoch_ns is None else epoch_ns
-    counts = [f.count for f in fixes]
+    counts, orbit = [f.count for f in fixes], fixes[0].orbit
     return Poses(
         np.array([(f.t_ns - t0) * 1e-9 for f in fixes]),
         np.array([f.T_ac.q for f in fixes]),
@@ -140,6 +143,7 @@ def poses_of(fixes: tuple[PoseFix, ...], epoch_ns: int | None = None) -> Poses:
         np.array([f.C for f in fixes]),
         np.array(counts) if max(counts) > 1 else None,
         shares=np.array([f.correlated_share for f in fixes]),
+        arc=None if orbit is None else orbit.at(t0),
     )
 
 
@@ -160,7 +164,7 @@ def joined(fixes: tuple[PoseFix, ...], reference: Chart, factors: Array) -> tupl
     shares = np.zeros(len(points)) if points.shares is None else points.shares
     counts = np.ones(len(points)) if points.counts is None else points.counts
     return tuple(
-        PoseFix(fixes[0].t_ns + round(t * 1e9), Pose(q, p), C, 0, share, int(count))
+        PoseFix(fixes[0].t_ns + round(t * 1e9), Pose(q, p), C, 0, share, int(count), fixes[0].orbit)
         for t, q, p, C, share, count in zip(
             points.times_s.tolist(), points.q, points.t, points.C, shares.tolist(), counts, strict=True
         )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.chart import Chart, to_state
-from avsreplay.estimate.dynamics import rotation_path
+from avsreplay.estimate.dynamics import rotation_path, translated
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import GATE
 from avsreplay.geometry import Array
@@ -51,7 +51,7 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
     x = to_state(reference)
     q_ab = rotation_path(x).at(times)[0]
     q = geometry.multiply(geometry.multiply(q_ab, x.q_bc), geometry.exp(-mean[:, :3]))
-    t = x.r_a + times[:, None] * x.v_a + geometry.matrix(q_ab) @ x.c_b
+    t = translated(x, times, poses.arc)[0] + geometry.matrix(q_ab) @ x.c_b
     return Poses(
         times,
         q,
@@ -60,6 +60,7 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
         counts,
         shares,
         within,
+        poses.arc,
     )
 
 

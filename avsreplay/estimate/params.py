@@ -73,6 +73,18 @@ class EstimatorParams(Settings):
         "Fit that acceleration in a first pass to the poses up to the first manoeuvre; acceleration_mps2 is then not"
         " used.",
     )
+    orbit_rate_radps: float = setting(
+        0.0,
+        "Mean motion of the camera's circular orbit: the centre of mass moves by the equations of Clohessy and"
+        " Wiltshire; 0: free motion.",
+        unit="rad/s",
+        low=0.0,
+        high=0.1,
+    )
+    orbit_radial_a: tuple[float, float, float] = setting(
+        (1.0, 0.0, 0.0), "Unit vector from the centre of the Earth to the camera in {A}, at the first scan."
+    )
+    orbit_normal_a: tuple[float, float, float] = setting((0.0, 1.0, 0.0), "Unit normal of the orbit in {A}.")
     noise: NoiseSource = setting(
         NoiseSource.REGISTRATION,
         "Source of the measurement noise: the covariance that registration reports, or the fixed R0.",
@@ -157,6 +169,15 @@ class EstimatorParams(Settings):
     start_mu_1s_deg: float = setting(
         20.0, "With start paper: 1 sigma of the unknown misalignment about each axis.", unit="deg", above=0.0
     )
+
+    def check(self) -> None:
+        """Raise ValueError where the axes of the orbit are not orthonormal, or it has an acceleration beside it."""
+        axes = self.orbit_radial_a, self.orbit_normal_a
+        units = [math.isclose(math.hypot(*axis), 1.0, abs_tol=1e-6) for axis in axes]
+        if not all(units) or abs(sum(a * b for a, b in zip(*axes, strict=True))) > 1e-6:
+            raise ValueError("orbit_radial_a and orbit_normal_a must be unit vectors at right angles to each other")
+        if self.orbit_rate_radps > 0.0 and (any(self.acceleration_mps2) or self.fit_acceleration):
+            raise ValueError("orbit_rate_radps cannot be combined with acceleration_mps2 or fit_acceleration")
 
     def at_interval(self, period_s: float, extent_m: float) -> EstimatorParams:
         """Return the settings with start and changes of the motion that fit to poses at short intervals.

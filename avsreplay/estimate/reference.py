@@ -10,9 +10,10 @@ import numpy as np
 from avsreplay.errors import UsageError
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, fit
 from avsreplay.estimate.chart import Chart, to_chart
-from avsreplay.estimate.dynamics import rotation_path
+from avsreplay.estimate.dynamics import rotation_path, translated
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.estimate.track import Track
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
@@ -50,14 +51,16 @@ def reference_fit(
         poses: T_ac.
         covariances: (6, 6) each, of d = [theta; v] in {C} [rad, m]; None takes R0 for all (the residuals rescale it).
         extent_m: bounding diagonal of the target [m].
-        params: the estimator's; None is the default.
+        params: the estimator's; None is the default. The axes of an orbit are those at the first pose.
 
     Raises:
         UsageError: fewer than four poses.
     """
     settings = (params or EstimatorParams()).resolved(extent_m)
     given = covariances or [r0_covariance(settings)] * len(poses)
-    return reference_of([PoseFix(t, pose, C) for t, pose, C in zip(t_ns, poses, given, strict=True)], settings)
+    orbit = RelativeOrbit.of(settings, t_ns[0]) if len(t_ns) else None
+    fixes = [PoseFix(t, pose, C, orbit=orbit) for t, pose, C in zip(t_ns, poses, given, strict=True)]
+    return reference_of(fixes, settings)
 
 
 def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference:
@@ -72,7 +75,8 @@ def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference
     fixes = tuple(poses)
     fitted = _grown(poses_of(fixes), to_chart(rough_state(fixes)), params)
     first_ns, last_ns = fixes[0].t_ns, fixes[-1].t_ns
-    return Reference(fitted, first_ns, last_ns, _motion(fitted.x, first_ns, last_ns))
+    arc = None if fixes[0].orbit is None else fixes[0].orbit.at(first_ns)
+    return Reference(fitted, first_ns, last_ns, _motion(fitted.x, first_ns, last_ns, arc))
 
 
 def healthy_pose(track: Track, t_ns: int, T_ac: Pose, params: EstimatorParams) -> PoseFix:
@@ -112,7 +116,7 @@ def _windows(poses: Poses, start: Chart) -> list[int]:
     return counts
 
 
-def _motion(x: State, first_ns: int, last_ns: int) -> Callable[[int], State]:
+def _motion(x: State, first_ns: int, last_ns: int, arc: OrbitArc | None) -> Callable[[int], State]:
     path = rotation_path(x)
 
     def at(t_ns: int) -> State:
@@ -121,6 +125,7 @@ def _motion(x: State, first_ns: int, last_ns: int) -> Callable[[int], State]:
         if not 0 <= t_ns - first_ns <= last_ns - first_ns:
             raise ValueError(f"t_ns is {t_ns}, outside the reference's span {first_ns} to {last_ns}")
         q, w = path.at(np.array([h]))
-        return State(q[0], w[0], x.r_a + h * x.v_a, x.v_a, x.sigma, x.c_b, x.q_bc)
+        centre, velocity = translated(x, np.array([h]), arc)
+        return State(q[0], w[0], centre[0], velocity[0], x.sigma, x.c_b, x.q_bc)
 
     return at

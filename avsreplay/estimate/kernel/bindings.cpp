@@ -214,6 +214,7 @@ void create(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<
   for (size_t k = 0; k < n; ++k) {
     Measured& pose = self->poses[k];
     pose.t = t(k);
+    pose.speed = {{{pose.t, 0, 0}, {0, pose.t, 0}, {0, 0, pose.t}}};
     std::memcpy(&pose.q, q.data() + 4 * k, sizeof pose.q);
     std::memcpy(&pose.p, p.data() + 3 * k, sizeof pose.p);
     std::memcpy(pose.root, root.data() + SEEN * SEEN * k, sizeof pose.root);
@@ -221,6 +222,15 @@ void create(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<
   }
   self->mean = chart(mean);
   std::memcpy(self->prior_info, prior_info.data(), sizeof self->prior_info);
+}
+
+// The centre of mass at each pose by position and by velocity at the epoch, in place of those of free motion.
+void set_paths(Problem& self, const Matrix<-1, 2, 3, 3>& paths) {
+  if (paths.shape(0) != self.poses.size()) throw std::invalid_argument("paths and poses must be equally many");
+  for (size_t k = 0; k < self.poses.size(); ++k) {
+    std::memcpy(&self.poses[k].place, paths.data() + 18 * k, sizeof(M3));
+    std::memcpy(&self.poses[k].speed, paths.data() + 18 * k + 9, sizeof(M3));
+  }
 }
 
 void set_pin(Problem& self, const Flat& centre, const Vector<DIM>& row, double target, double one_sigma) {
@@ -308,6 +318,7 @@ NB_MODULE(_motion, m) {
   nb::class_<Problem>(m, "Problem")
       .def("__init__", &create, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),
            nb::arg("mean"), nb::arg("prior_info"))
+      .def("paths", &set_paths, nb::arg("paths"))
       .def("pin", &set_pin, nb::arg("centre"), nb::arg("row"), nb::arg("target"), nb::arg("one_sigma"))
       .def("unpin", [](Problem& self) { self.pinned = false; })
       .def("noise", &set_noise, nb::arg("factors"), nb::arg("redescend"), nb::arg("slack"))

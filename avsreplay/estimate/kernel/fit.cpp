@@ -119,7 +119,8 @@ Body body_of(const State& x, double join[3][2]) {
 // d = [theta; v] in {C}: estimated relative to measured pose. Returns chi-square.
 double Problem::residual(const Measured& pose, const State& x, const Turn& turn, double d[SEEN]) const {
   const V3 theta = rotation_vector(conjugate(pose.q) * (quad(turn.q) * quad(x.q_bc)));
-  const V3 off = vector(x.r_a) + pose.t * vector(x.v_a) + matrix(quad(turn.q)) * vector(x.c_b) - pose.p;
+  const V3 centre = pose.place * vector(x.r_a) + pose.speed * vector(x.v_a);
+  const V3 off = centre + matrix(quad(turn.q)) * vector(x.c_b) - pose.p;
   const V3 v = transposed(matrix(pose.q)) * off;
   std::memcpy(d, theta.x, sizeof theta.x);
   std::memcpy(d + 3, v.x, sizeof v.x);
@@ -193,8 +194,8 @@ void Problem::linearise(const Chart& chart) {
     turned(A_cb, 2, flow.S, join, rows);
     put(A_cb, 2, 17, rows);
     turned(R_cb * arm, -2, flow.S, join, rows + 3);
-    put(R_ca, 1, 6, rows + 3);
-    put(R_ca, t, 9, rows + 3);
+    put(R_ca * pose.place, 1, 6, rows + 3);
+    put(R_ca * pose.speed, 1, 9, rows + 3);
     put(R_cb, 1, 14, rows + 3);
   }
   reweigh();

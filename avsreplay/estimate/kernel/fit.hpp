@@ -14,6 +14,7 @@ using Rows = double[SEEN][DIM];
 // attitude and of its position by themselves.
 struct Measured {
   double t;
+  M3 place = {{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}}, speed = {};  // centre of mass by position and velocity at the epoch
   Quad q;
   V3 p;
   double root[SEEN][SEEN];
