@@ -184,3 +184,19 @@ def test_a_pushed_segment_keeps_its_thrust_and_moves_on_from_the_new_state():
         (r, v), (s, w) = segment.at(t_ns), moved.at(t_ns)
         assert np.allclose(s - r, dr + (t_ns - 3 * 10**9) * 1e-9 * dv, atol=1e-12)
         assert np.allclose(w - v, dv, atol=1e-12)
+
+
+@pytest.mark.parametrize(("off_m", "made_s"), [(0.0, [4.0]), (0.01, [4.0, 8.0])])
+def test_without_measurements_a_plan_is_renewed_only_where_the_robot_has_left_its_path(off_m, made_s):
+    target, planned, state = scene(np.random.default_rng(3)), [], None
+    guidance = Guidance(ROBOT, Supervisor(PARAMS))
+    exact = lambda dt: Forecast(dt, *(1e-5 * np.ones((3, len(dt)))))  # noqa: E731
+    for t in np.arange(0.0, 12.0, 0.5):
+        t_ns = round(t * 1e9)
+        state = state or guidance.initial(t_ns)
+        if t == 8.0:
+            state = replace(state, segment=pushed(state.segment, t_ns, np.array([off_m, 0.0, 0.0]), np.zeros(3)))
+        state = guidance.step(state, PlannerInput(t_ns, int(t < 4.0), True, target.after(t), exact))
+        planned += [state.plan.t_ns * 1e-9] if t > 4.0 else []
+    assert state.decision.action is Action.APPROACH_ON_PREDICTION
+    assert sorted(set(planned)) == made_s

@@ -19,6 +19,7 @@ from avsreplay.geometry import Array
 from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan.cone_programme import solve
 from avsreplay.plan.convexification import (
+    ABORT_S,
     BETWEEN,
     COARSE_NODES,
     ReferencePath,
@@ -28,10 +29,11 @@ from avsreplay.plan.convexification import (
     excess,
     initial_references,
     interval_fractions,
+    margins_at,
     turn_rate,
     warm_reference,
 )
-from avsreplay.plan.limits import CONSTRAINTS, Case, SampledScene, Scene, largest_acceleration, margins
+from avsreplay.plan.limits import CONSTRAINTS, Case, SampledScene, Scene, largest_acceleration
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, no_plan, rendezvous
 from avsreplay.plan.robot import Limits
@@ -92,7 +94,8 @@ def constrained(
     free = _necessary(scene, free, np.asarray(r0, float), params, limits)
     if not free.found:
         return free
-    sampled = SampledScene(scene, params.horizon_s, params.grid_s)
+    span_s = 1.5 * free.t_go_s + (0.0 if limits.clearance_m is None else ABORT_S)
+    sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
     case = Case(
         sampled, limits, params, np.asarray(r0, float), np.asarray(v0, float), 1e-5 * extent_m, earliest_s=earliest_s
     )
@@ -148,15 +151,15 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
     times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * limits.nodes + 1)
     if not case.within_axes(path.thrust(times)):
         return None
-    if limits.speed_max_mps is not None:
-        speed = np.linalg.norm(path.at(times)[1], axis=1)
-        if speed.max() > limits.speed_max_mps:
-            return None
+    if float(np.linalg.norm(path.at(times)[1], axis=1).max()) > (limits.speed_max_mps or math.inf):
+        return None
     if limits.contact_accel_mps2 is not None:
         rate = case.scene.goal(np.array([path.t_go_s, path.t_go_s - 1e-4]))[1]
         relative = path.thrust(times[-1:])[0] - (rate[0] - rate[1]) / 1e-4
         if float(np.linalg.norm(relative)) > limits.contact_accel_mps2:
             return None
+    if margins_at(case, path, times[::BETWEEN]).values.min() < 0.0:  # few instants show most violations
+        return None
     worst, name = _worst(case, path)
     abort = aborted(case, path)
     if worst < 0.0 or abort.short > 0.0:
@@ -232,8 +235,7 @@ def _entries(case: Case, path: RobotPath) -> tuple[float, float]:
     """Return the fractions of a flight from which it stays inside the cone and the corridor, each from its range on."""
     s = interval_fractions(case.limits.nodes)
     times = case.wait_s + (path.t_go_s - case.wait_s) * s
-    r = path.at(times)[0]
-    inside = margins(case.scene, case.limits, case.sampled.coordinates(times, r), r, case.sampled.sigma(times)).inside
+    inside = margins_at(case, path, times).inside
     found = []
     for column in (0, 1):
         outside = np.flatnonzero(~inside[:-1, column])

@@ -48,10 +48,15 @@ def turn_rate(case: Case, t: float) -> float:
 def dense_margins(case: Case, path: RobotPath) -> tuple[Array, Margins]:
     """Return the instants of the check and the margins there."""
     times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * case.limits.nodes + 1)
+    return times, margins_at(case, path, times)
+
+
+def margins_at(case: Case, path: RobotPath, times: Array) -> Margins:
+    """Return the margins at instants (n,) of a path [s]; its end is the grasp point itself."""
     r = path.at(times)[0]
     y = case.sampled.coordinates(times, r)
-    y[-1] = 0.0  # the grasp point itself
-    return times, margins(case.scene, case.limits, y, r, case.sampled.sigma(times))
+    y[times >= path.t_go_s] = 0.0
+    return margins(case.scene, case.limits, y, r, case.sampled.sigma(times))
 
 
 def excess(case: Case, path: StepPath) -> Array:

@@ -26,6 +26,7 @@ from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, Super
 from avsreplay.records import Forecast
 
 SEARCH_AGAIN = 1.1  # ratio to the time to go of the latest full search from which on all initial paths are searched
+UNCHANGED = 0.01  # of the capture tolerance: a plan whose end moved by less, without a measurement, is not renewed
 
 _CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 
@@ -201,23 +202,28 @@ class Guidance:
             return state.plan, flown
         age_s = math.inf if state.plan is None else (known.t_ns - state.plan.t_ns) * 1e-9
         left_s = (state.segment.end_ns - known.t_ns) * 1e-9 if closing else math.inf
-        if not self._due(age_s, left_s):
+        if not self._due(age_s, left_s) or (flown is not None and self._unchanged(state, flown, known)):
             return state.plan, flown
         plan, segment = self._capture_plan(state, known)
         if segment is None and flown is not None and self._still_valid(flown, known):
             return state.plan, flown
         return plan, segment or flown
 
-    def _still_valid(self, flown: Segment, known: PlannerInput) -> bool:
-        """Return whether the end of the segment agrees with the present estimate within the capture tolerance."""
+    def _unchanged(self, state: GuidanceState, flown: Segment, known: PlannerInput) -> bool:
+        """Return whether no measurement was used since the latest plan and the robot has not left its path."""
+        made_s, seen_s = -math.inf if state.plan is None else state.plan.t_ns * 1e-9, state.supervisor.seen_s
+        return known.gamma == 0 and (seen_s or 0.0) <= made_s and self._still_valid(flown, known, UNCHANGED)
+
+    def _still_valid(self, flown: Segment, known: PlannerInput, share: float = 1.0) -> bool:
+        """Return whether the end of the segment agrees with the estimate within a share of the capture tolerance."""
         left_s = (flown.end_ns - known.t_ns) * 1e-9
         if left_s <= 0.0:
             return False
         r, v = flown.at(flown.end_ns)
         rho, rate = known.scene.goal(np.array([left_s]))
         p = self.supervisor.params
-        near = float(np.linalg.norm(r - rho[0])) <= (p.capture_pos_m or 0.0)
-        return near and float(np.linalg.norm(v - rate[0])) <= (p.capture_speed_mps or 0.0)
+        near = float(np.linalg.norm(r - rho[0])) <= share * (p.capture_pos_m or 0.0)
+        return near and float(np.linalg.norm(v - rate[0])) <= share * (p.capture_speed_mps or 0.0)
 
     def _due(self, age_s: float, left_s: float) -> bool:
         """Return whether to replan: at the period, at every scan near the end, not where a plan would come too late."""
@@ -235,11 +241,8 @@ class Guidance:
 
         def search(problem: _Problem, earliest_s: float) -> Plan:
             nonlocal searched_s
-            scene, r0, v0, params, limits, t_ns = problem
-            if not limits.any:
-                return rendezvous(scene.goal, r0, v0, params, t_ns, earliest_s)
             if draft is not None and draft.path is not None:
-                since_s = (t_ns - draft.t_ns) * 1e-9 + self.params.latency_s
+                since_s = (known.t_ns - draft.t_ns) * 1e-9 + self.params.latency_s
                 plan = constrained(*problem, warm=(draft.path, max(since_s, 0.0)), earliest_s=earliest_s)
                 if plan.found and plan.t_go_s <= SEARCH_AGAIN * searched_s:
                     return plan
@@ -313,8 +316,7 @@ class Guidance:
         p, moving = self.supervisor.params, state.segment.at(known.t_ns)
         least_m = (p.standoff_m if action is Action.HOLD else p.retreat_m) or 0.0
         refuge = resting(known.scene, *moving, least_m, self.params.a_max_mps2)
-        to_rest: _Planner = lambda scene, *problem: rendezvous(scene.goal, *problem)  # noqa: E731
-        _, segment = self._plan(state.segment, refuge, known.t_ns, to_rest)
+        _, segment = self._plan(state.segment, refuge, known.t_ns, lambda s, *rest: rendezvous(s.goal, *rest))
         return replace(state, segment=segment or state.segment, made_ns=known.t_ns)
 
     def _margin(self, state: GuidanceState, scene: Scene, r: Array, v: Array) -> float:

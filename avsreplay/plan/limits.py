@@ -243,8 +243,8 @@ def in_fixture_axes(R: Array, vectors: Array) -> Array:
 class SampledScene:
     """Motion of {C} sampled on a grid and interpolated by cubic splines; the grid is extended when needed."""
 
-    def __init__(self, scene: Scene, horizon_s: float, step_s: float) -> None:
-        self.scene, self._horizon_s, self._step_s = scene, horizon_s, step_s
+    def __init__(self, scene: Scene, horizon_s: float, step_s: float, span_s: float) -> None:
+        self.scene, self._horizon_s, self._step_s, self._span_s = scene, horizon_s, step_s, span_s
         self._end_s = 0.0
         self._spline: Callable[..., Array] | None = None
         self._sigma: tuple[Array, Array, Array] | None = None
@@ -253,7 +253,7 @@ class SampledScene:
         """Return rho (n, 3) and R_ac (n, 3, 3), or their derivatives of an order, at times (n,) [s]."""
         last = float(times.max())
         if self._spline is None or last > self._end_s:
-            self._end_s = min(max(1.5 * last, 8.0 * self._step_s), max(self._horizon_s, last))
+            self._end_s = min(max(1.5 * last, self._span_s), max(self._horizon_s, last))
             self._spline = self._joined(self._end_s)
         values = self._spline(times, order)
         return values[:, :3], values[:, 3:].reshape(-1, 3, 3)
