@@ -284,8 +284,3 @@ def columns() -> tuple[Column, ...]:
     """Every column in order."""
     names = [f.name for f in dataclasses.fields(Column) if f.name != "name"]
     return tuple(Column(f.name, **{n: f.metadata[n] for n in names}) for f in dataclasses.fields(Row))
-
-
-def numeric_columns() -> tuple[str, ...]:
-    """Names of the columns whose values are numbers or truth values, in order."""
-    return tuple(f.name for f in dataclasses.fields(Row) if "str" not in str(f.type))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import socket
 import sys
@@ -23,14 +22,14 @@ from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief
 from avsreplay.report.export import row_poses
 from avsreplay.report.flight_page import cone_lines
-from avsreplay.rows import Row, numeric_columns
+from avsreplay.rows import Row, columns
 from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump
 
 PATH_POINTS = 41
 RESIDUAL_REACH = 0.05  # of the model's extent: larger residuals in the viewer log are cut to this
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
-_COLUMNS = numeric_columns()
+_COLUMNS = tuple(column.name for column in columns())
 RERUN_PORT = 9876  # on which a Rerun viewer listens
 
 
@@ -70,7 +69,7 @@ class ResultLogWriter:
         settings = dump(run.config)
         del settings["register"]["threads"]  # the file is the same for any number of threads
         facts = {"configuration": json.dumps(settings, sort_keys=True), "version": __version__}
-        self._log, self.paths = ResultLog(path, run.surface, facts, approach_cones(run), _COLUMNS), NewPaths()
+        self._log, self.paths = ResultLog(path, run.surface, facts, approach_cones(run)), NewPaths()
         self._registrar, self._reach_m = run.registrar, RESIDUAL_REACH * run.surface.extent
 
     def resume(self, written: Path, paths: NewPaths, last: Row) -> None:
@@ -106,9 +105,9 @@ class ResultLogWriter:
 
 
 def _numbers(row: Row) -> dict[str, float]:
-    """The numeric columns of a row, NaN where one has no value."""
+    """The numeric columns of a row that have a value."""
     found = ((name, getattr(row, name)) for name in _COLUMNS)
-    return {name: math.nan if value is None else float(value) for name, value in found}
+    return {name: float(value) for name, value in found if isinstance(value, (int, float))}
 
 
 def approach_cones(run: Run) -> Array | None:
@@ -178,8 +177,7 @@ class RerunStream:
         if path is not None:
             rr.log("camera/plan", rr.LineStrips3D([path[1]]))
         for name, value in _numbers(row).items():
-            if not math.isnan(value):
-                rr.log(f"rows/{name}", rr.Scalars(value))
+            rr.log(f"rows/{name}", rr.Scalars(value))
         if row.gamma == 0:
             rr.log("rows/reason", rr.TextLog(row.reason))
 

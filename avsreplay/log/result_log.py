@@ -3,12 +3,13 @@
 Frames: ``map`` over ``camera`` (identity, so that a viewer finds a root) and ``target`` under ``camera`` at each
 estimate, ``target_true`` at each true pose. The cloud is given in ``target``: if the estimate is right, it lies on the
 model; its field ``residual`` is the distance to it [m]. ``/plan/cone`` holds the cones in which the planned approach
-stays. ``/rows`` has one message a scan with a field for each numeric column of its row, NaN where it has no value.
+stays. Each numeric column has a topic ``/rows/NAME``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import struct
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -37,9 +38,9 @@ _TOPICS = {
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/truth/model": "visualization_msgs/msg/Marker",
     "/rosout": "rcl_interfaces/msg/Log",
-    "/rows": "avsreplay_msgs/msg/Row",
 }
-_ROWS = "/rows"
+_ROWS = "/rows/"
+_FLOAT64 = struct.Struct("<xBxxd")  # encapsulation of little-endian CDR, then the value
 _INFO, _WARN = 20, 30  # levels of rcl_interfaces/msg/Log
 
 
@@ -59,7 +60,7 @@ class ResultFrame:
         values: scalars by name.
         residuals: (n,) distances of the points to the model at the estimate [m].
         intensities: (n,) of the points, None if the scanner gives none.
-        columns: numeric columns of the row by name, NaN where one has no value.
+        columns: numeric columns of the row by name.
     """
 
     t_ns: int
@@ -81,12 +82,7 @@ class ResultLog:
     """Writer of ``result.mcap``; ``close`` finishes the file. The bytes depend only on what is written."""
 
     def __init__(
-        self,
-        path: Path,
-        surface: Surface,
-        metadata: Mapping[str, str] | None = None,
-        cone: Array | None = None,
-        columns: Iterable[str] = (),
+        self, path: Path, surface: Surface, metadata: Mapping[str, str] | None = None, cone: Array | None = None
     ) -> None:
         """Create the file and write the model.
 
@@ -95,7 +91,6 @@ class ResultLog:
             surface: the target model, written as a marker.
             metadata: of the run, by name, for example its configuration as JSON.
             cone: (m, 3) ends of line pieces in {C} [m] that show the cones of the approach; None without a cone.
-            columns: names of the columns that each frame has.
 
         Raises:
             UnreadableInput: the file cannot be written.
@@ -114,8 +109,8 @@ class ResultLog:
         if metadata:
             self._writer.add_metadata("avsreplay", dict(metadata))
         self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
+        self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._columns = tuple(columns)
 
     def close(self) -> None:
         """Finish the file; a second call does nothing."""
@@ -151,8 +146,8 @@ class ResultLog:
         if frame.path is not None:
             self._append("/plan", t, _path(t, *frame.path))
         self._append("/diagnostics", t, _status(frame))
-        if self._columns:
-            self._append(_ROWS, t, Packer().f64s(*(frame.columns[name] for name in self._columns)).bytes())
+        for name, value in frame.columns.items():
+            self._append(_ROWS + name, t, _FLOAT64.pack(1, value))
         if frame.message != self._state:
             self._append("/rosout", t, _said(frame))
         self._state = frame.message
@@ -174,13 +169,12 @@ class ResultLog:
 
     def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
         if topic not in self._channels:
-            kind = _TOPICS[topic]
-            if topic == _ROWS:
-                text = "".join(f"float64 {name}\n" for name in self._columns)
-            else:
+            kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
+            if kind not in self._schemas:
                 text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
-            schema = self._writer.register_schema(kind, "ros2msg", text.encode())
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, {"offered_qos_profiles": ""})
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
+            qos = {"offered_qos_profiles": ""}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
         self._writer.add_message(self._channels[topic], t_ns, payload, t_ns, self._count)
 
 
