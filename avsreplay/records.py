@@ -118,9 +118,8 @@ class State:
     @property
     def T_ac(self) -> Pose:
         """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho."""
-        return Pose(
-            geometry.multiply(self.q_ab, self.q_bc), self.r_a + geometry.rotate(geometry.matrix(self.q_ab), self.c_b)
-        )
+        position = self.r_a + geometry.rotate(geometry.matrix(self.q_ab), self.c_b)
+        return Pose(geometry.multiply(self.q_ab, self.q_bc), position)
 
     @property
     def fixture_velocity(self) -> Array:
@@ -179,8 +178,7 @@ class LogHeader:
 
     Attributes:
         surface: model of the target.  scenario: its TOML text, "" for a recorded log.  seed: of the simulation.
-        labels: injected faults.  start: initial belief (mean and covariance).
-        truth: the true state at the first scan.  notes: free text by name (source, units, clock).
+        labels: injected faults.  start: initial belief.  truth: at the first scan.  notes: free text by name.
     """
 
     surface: Surface | None = None
@@ -214,7 +212,7 @@ class Alignment:
     Attributes:
         T_ac: measured pose of {C} in {A} (ICP iterates its inverse).
         info: (6, 6) information of d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d); possibly singular.
-        covariance: (6, 6) calibrated covariance of the same d, systematic errors included; None if degenerate.
+        covariance: (6, 6) of d, systematic errors included; None if degenerate.  dof: of this estimate, inf if known.
         message: why the back end failed or the pose is not accepted.  free_directions: not determined, in words.
         split_nis: normalised squared difference of the poses from two halves of the scan, the larger of two splits.
     """
@@ -231,6 +229,7 @@ class Alignment:
     free_directions: str = ""
     message: str = ""
     split_nis: float | None = None
+    dof: float = float("inf")
 
     @property
     def measured(self) -> bool:
@@ -267,17 +266,20 @@ class Innovation:
     Attributes:
         alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.  nis: alpha' S^-1 alpha.  distance_m: |d rho|.
         angle_rad: rotation.  weight: Cauchy weight.  share: correlated part of R.  rms_m: of the registration [m].
+        dof: degrees of freedom of R as an estimate, inf if known.  chi2: the NIS, T^2 of Hotelling, as chi-square.
     """
 
     alpha: Array
     S: Array
     R: Array
     nis: float
+    chi2: float
     distance_m: float
     angle_rad: float
     weight: float = 1.0
     share: float = 0.0
     rms_m: float = float("nan")
+    dof: float = float("inf")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -293,9 +295,8 @@ class Manoeuvre:
     """A change of the target's velocity that free motion does not explain.
 
     Attributes:
-        t_ns: its most likely instant.  t_1s_s: standard deviation of the instant [s].
+        t_ns, t_1s_s: most likely instant, 1 sigma [s].  detected_ns: of the decision.  P: (6, 6) of (rate, velocity).
         velocity, rate: (3,) change of the mass centre's velocity in {A} [m/s], and of the angular rate in {B} [rad/s].
-        P: (6, 6) covariance of (rate, velocity).  detected_ns: instant of the scan at which it was decided.
     """
 
     t_ns: int
@@ -346,5 +347,4 @@ class Forecast:
     rot_1s_rad: Array
 
 
-Trajectory = Callable[[Array], tuple[Array, Array]]
-"""Times (n,) [s after now] -> positions (n, 3) [m] and velocities (n, 3) [m/s] of the grasp point in {A}."""
+Trajectory = Callable[[Array], tuple[Array, Array]]  # times (n,) [s] -> r (n, 3) [m], v (n, 3) [m/s] of {C} in {A}

@@ -131,6 +131,7 @@ class Row:
     rms_m: float | None = column(if_points(lambda o: finite(o.alignment.rms_m)), "m", ".5f", 0.0001, 1e-07, table=True)
     free_directions: str | None = _exact(lambda o, s: o.alignment.free_directions or None)
     split_nis: float | None = _number(if_points(lambda o: finite(o.alignment.split_nis)), fmt=".1f")
+    reg_dof: float | None = _number(if_points(lambda o: finite(o.alignment.dof)), fmt=".0f")
     reg_x_m: float | None = _metres(if_measured(lambda T: T.t[0]))
     reg_y_m: float | None = _metres(if_measured(lambda T: T.t[1]))
     reg_z_m: float | None = _metres(if_measured(lambda T: T.t[2]))
@@ -138,7 +139,7 @@ class Row:
     reg_qy: float | None = _number(if_measured(lambda T: T.q[1]))
     reg_qz: float | None = _number(if_measured(lambda T: T.q[2]))
     reg_qw: float | None = _number(if_measured(lambda T: T.q[3]))
-    nis: float | None = column(if_innovation(lambda i: finite(i.nis)), "", ".2f", 0.001, 0.0001, table=True)
+    nis: float | None = column(if_innovation(lambda i: finite(i.chi2)), "", ".2f", 0.001, 0.0001, table=True)
     cauchy_weight: float | None = _number(if_innovation(lambda i: i.weight), atol=0.0001)
     innov_m: float | None = _metres(if_innovation(lambda i: finite(i.distance_m)))
     innov_deg: float | None = column(

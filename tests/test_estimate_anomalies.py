@@ -249,7 +249,7 @@ def test_the_window_holds_the_covariance_of_its_innovations() -> None:
     for t_ns in (0, 10**9, 2 * 10**9, 4 * 10**9):
         beliefs.append(propagate(beliefs[-1], t_ns, *noises)[0])
         prediction = Prediction(beliefs[-1], np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty())
-        seen = Innovation(np.zeros(6), R, R, 0.0, 0.0, 0.0)
+        seen = Innovation(np.zeros(6), R, R, 0.0, 0.0, 0.0, 0.0)
         epochs.append(Epoch(Track(start, "filter"), prediction, seen, False))
     C = hypotheses._window(epochs, start, *noises).C
     for i, first in enumerate(beliefs[1:]):

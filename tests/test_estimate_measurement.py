@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import tumbling
 from click.testing import CliRunner
+from scipy.stats import chi2, f, wishart
 
 from avsreplay import geometry
 from avsreplay.estimate import _motion, measurement
@@ -184,7 +185,7 @@ def aimed(x: State, size: float, rng: np.random.Generator, colour: np.ndarray = 
     wide = inflated(R, colour)
     K = gain(P, H, S + (wide - R))
     want, P_want = retract(x, joseph(P, H, K, wide), K @ alpha)
-    got = chart_update(Belief(0, x, P), H, Innovation(alpha, S, R, 0.0, 0.0, 0.0), colour)
+    got = chart_update(Belief(0, x, P), H, Innovation(alpha, S, R, 0.0, 0.0, 0.0, 0.0), colour)
     assert np.array_equal(got.P, got.P.T)
     s = np.sqrt(np.diag(P_want))
     signs = max(np.abs(got.x.q_ab - want.q_ab).max(), np.abs(got.x.q_bc - want.q_bc).max())
@@ -268,7 +269,7 @@ def test_values_that_are_not_numbers_terminate() -> None:
     P, H, S = spread_of(x, rng), measurement_jacobian(x), np.eye(6)
     bad = replace(x, w_b=np.array([np.nan, 0.0, 0.0]), sigma=np.array([np.nan, 1.0]))
     for state, covariance, alpha in ((bad, P, np.ones(6)), (x, P * np.nan, np.ones(6)), (x, P, np.ones(6) * np.inf)):
-        got = chart_update(Belief(0, state, covariance), H, Innovation(alpha, S, S, 0.0, 0.0, 0.0), WHITE)
+        got = chart_update(Belief(0, state, covariance), H, Innovation(alpha, S, S, 0.0, 0.0, 0.0, 0.0), WHITE)
         assert not np.all(np.isfinite(got.P))
     with pytest.raises(TypeError):
         _motion.correct(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, P, H[:5], np.ones(6), S, S, (1.0, 1.0))
@@ -289,6 +290,43 @@ def test_an_innovation_covariance_is_definite_also_where_rounding_has_spoilt_the
     good = innovation_of(P, H, np.full(6, 1e-3), R)
     expected = H @ P @ H.T + R
     np.testing.assert_array_equal(good.S, 0.5 * (expected + expected.T))
+
+
+@pytest.mark.parametrize("dof", [40.0, 120.0])
+def test_the_gate_on_an_estimated_noise_is_that_of_hotelling(dof: float) -> None:
+    """With R drawn from Wishart's distribution and P zero, NIS is T^2, whose law is an F distribution."""
+    rng, H, n = np.random.default_rng(6), np.zeros((6, 20)), 2000
+    noise = wishart(dof, np.eye(6) / dof).rvs(n, random_state=rng)
+    alphas = np.clip(0.01 * rng.normal(size=(n, 6)), -1.0, 1.0)
+    none = np.zeros((20, 20))
+    seen = [innovation_of(none, H, a, 1e-4 * R, True, 0.0, dof) for a, R in zip(alphas, noise, strict=True)]
+    exact = f.sf([s.nis * (dof - 5.0) / (6.0 * dof) for s in seen], 6, dof - 5.0)
+    converted = np.array([s.chi2 for s in seen])
+    for probability in (0.05, 0.01):
+        rate = np.mean(converted > chi2.isf(probability, 6))
+        assert rate == pytest.approx(np.mean(exact < probability), rel=0.05, abs=1e-9)
+        assert rate == pytest.approx(probability, abs=3.0 * np.sqrt(probability / n))
+        assert np.mean([s.nis > chi2.isf(probability, 6) for s in seen]) > probability + 3.0 * np.sqrt(probability / n)
+
+
+def test_the_weight_of_a_pose_begins_at_the_gate_of_its_degrees_of_freedom() -> None:
+    """A pose at twice the 99.99 % point of T^2 has half the weight; a known noise has the point of chi-square."""
+    H, R = np.zeros((6, 20)), np.eye(6)
+    for dof, point in ((50.0, 6.0 * 50.0 / 45.0 * f.isf(1e-4, 6, 45)), (np.inf, chi2.isf(1e-4, 6))):
+        alpha = np.array([np.sqrt(2.0 * point), 0.0, 0.0, 0.0, 0.0, 0.0])
+        assert innovation_of(np.zeros((20, 20)), H, alpha, R, True, 0.0, dof).weight == pytest.approx(0.5, rel=0.01)
+        assert innovation_of(np.zeros((20, 20)), H, 0.69 * alpha, R, True, 0.0, dof).weight == 1.0
+
+
+def test_a_noise_that_is_a_small_part_of_the_innovation_counts_as_known() -> None:
+    """The variance of z' S z, with S the sum of a known part and of a Wishart matrix, by simulation."""
+    rng, dof = np.random.default_rng(7), 15.0
+    R, known = np.diag([1.0, 2.0, 0.5, 1.0, 1.0, 1.0]), np.diag([9.0, 4.0, 2.0, 1.0, 0.0, 3.0])
+    root = np.diag(np.diagonal(R + known) ** -0.5)
+    draws = root @ (wishart(dof, R / dof).rvs(20000, random_state=rng) + known) @ root
+    squared = np.mean(np.sum((draws - np.eye(6)) ** 2, axis=(1, 2)))
+    assert measurement.dof_of_sum(dof, R, R + known) == pytest.approx(42.0 / squared, rel=0.05)
+    assert measurement.dof_of_sum(np.inf, R, R + known) == np.inf
 
 
 LOG = Path(__file__).parent.parent / "fixtures" / "tumble.mcap"

@@ -16,7 +16,8 @@ def watch(alphas: np.ndarray, S: np.ndarray, params: ConsistencyParams = STRICT,
     watcher = Consistency(params)
     track = watcher.initial()
     for k, alpha in enumerate(alphas):
-        seen = Innovation(alpha, S, S, float(alpha @ np.linalg.solve(S, alpha)), 0.0, 0.0)
+        nis = float(alpha @ np.linalg.solve(S, alpha))
+        seen = Innovation(alpha, S, S, nis, nis, 0.0, 0.0)
         track = watcher.observe(track, seen, 1 if gammas is None else gammas[k])
     return watcher.judge(track)
 
@@ -92,11 +93,11 @@ def belief_of(P: np.ndarray, sigma: tuple[float, float] = (0.1, 0.2)) -> Belief:
 def test_each_check_of_the_estimate_fails_where_it_should() -> None:
     R, good, none = 1e-4 * np.eye(6), 1e-4 * np.eye(20), np.ones(2)
     pose = 0.5 * R
-    assert violations(belief_of(good), pose, np.zeros(6), R, none) == ()
+    assert violations(belief_of(good), pose, np.zeros(6), R, none, 27.86) == ()
     bad = good.copy()
     bad[0, 0] = -1e-4
-    assert "covariance" in violations(belief_of(bad), pose, np.zeros(6), R, none)
-    assert violations(belief_of(good, (1.2, 0.0)), pose, np.zeros(6), R, none) == ("sigma",)
-    assert violations(belief_of(good), 1.3 * R, np.zeros(6), R, none) == ("worse_than_measured",)
-    assert violations(belief_of(good), 1.3 * R, np.zeros(6), R, 2.0 * none) == ()
-    assert violations(belief_of(good), pose, np.full(6, 0.1), R, none) == ("outside_gate",)
+    assert "covariance" in violations(belief_of(bad), pose, np.zeros(6), R, none, 27.86)
+    assert violations(belief_of(good, (1.2, 0.0)), pose, np.zeros(6), R, none, 27.86) == ("sigma",)
+    assert violations(belief_of(good), 1.3 * R, np.zeros(6), R, none, 27.86) == ("worse_than_measured",)
+    assert violations(belief_of(good), 1.3 * R, np.zeros(6), R, 2.0 * none, 27.86) == ()
+    assert violations(belief_of(good), pose, np.full(6, 0.1), R, none, 27.86) == ("outside_gate",)

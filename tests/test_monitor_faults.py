@@ -18,7 +18,8 @@ SMALL = np.eye(6) * 1e-8
 
 def seen(distance: float = 0.0, angle: float = 0.0, S: np.ndarray = SMALL) -> Innovation:
     alpha = np.array([distance, 0, 0, np.sin(angle / 2), 0, 0])
-    return Innovation(alpha, S, S, float(alpha @ np.linalg.solve(S, alpha)), distance, angle)
+    nis = float(alpha @ np.linalg.solve(S, alpha))
+    return Innovation(alpha, S, S, nis, nis, distance, angle)
 
 
 def judge(alignment: Alignment | None = GOOD, innovation: Innovation | None = None, status=ScanStatus.OK, **params):
@@ -110,7 +111,7 @@ def test_false_alarms_of_the_pose_test_are_below_a_percent() -> None:
         S = root @ root.T
         alpha = root @ rng.normal(size=6)
         angle = 2 * np.arcsin(min(1.0, float(np.linalg.norm(alpha[3:]))))
-        one = Innovation(alpha, S, S, 6.0, float(np.linalg.norm(alpha[:3])), angle)
+        one = Innovation(alpha, S, S, 6.0, 6.0, float(np.linalg.norm(alpha[:3])), angle)
         alarms += judge(innovation=one, alpha_max_m=1e-9).gamma == 0
     assert alarms < 20
 

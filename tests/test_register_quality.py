@@ -9,6 +9,7 @@ import pytest
 from oracles import covariance as oracle_of
 from oracles.covariance import difference_covariance
 from oracles.residuals import summed
+from scipy.stats import chi2, f
 
 from avsreplay.register.covariance import (
     Evidence,
@@ -35,7 +36,7 @@ PATCH = np.arange(600) // 20
 
 
 def _sandwich(found: Evidence) -> np.ndarray:
-    return sandwich_covariance(found.normals, found.gradients)
+    return sandwich_covariance(found.normals, found.gradients)[0]
 
 
 def _rows(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -136,8 +137,8 @@ def _nis(strain: float) -> tuple[float, float, float]:
         none = replace(errors, block_m2=0.0, smooth_m2=np.zeros(7), amplitudes=np.zeros(7), fit=np.zeros(6))
         values.append(split_nis(found, errors, np.eye(3)[:1]))
         bare.append(split_nis(found, none, np.eye(3)[:1]))
-        sandwich = sandwich_covariance(found.normals, found.gradients)
-        sigma.append(np.trace(registration_covariance(found, errors)) / np.trace(sandwich))
+        sandwich, _ = sandwich_covariance(found.normals, found.gradients)
+        sigma.append(np.trace(registration_covariance(found, errors)[0]) / np.trace(sandwich))
     return float(np.mean(values)) / 6.0, float(np.mean(bare)) / 6.0, float(np.median(sigma))
 
 
@@ -177,8 +178,9 @@ def test_covariance_and_test_of_halves_are_those_of_the_oracle(strain: float, se
     errors, oracle = systematic_errors(found, 2.0, 0.1), oracle_of.systematic_errors(found, 2.0, 0.1)
     for name in ("block_m2", "smooth_m2", "amplitudes", "fit"):
         np.testing.assert_allclose(getattr(errors, name), getattr(oracle, name), rtol=1e-7, atol=1e-12)
-    P, Q = registration_covariance(found, errors), oracle_of.registration_covariance(found, oracle)
+    (P, dof), (Q, expected) = registration_covariance(found, errors), oracle_of.registration_covariance(found, oracle)
     np.testing.assert_allclose(P, Q, rtol=1e-7, atol=1e-9 * np.abs(Q).max())
+    assert dof == pytest.approx(expected, rel=1e-6)
     across = np.eye(3)[:2]
     np.testing.assert_allclose(split_nis(found, errors, across), oracle_of.split_nis(found, oracle, across), rtol=1e-7)
 
@@ -202,3 +204,25 @@ def test_parts_of_the_same_patches_have_only_their_own_errors() -> None:
         step = d[1] - d[0]
         values.append(step @ np.linalg.solve(difference_covariance(*parts, errors), step) / 6.0)
     assert 0.6 < np.mean(values) < 1.5
+
+
+def test_degrees_of_freedom_give_the_gate_its_false_alarm_rate() -> None:
+    """Hotelling's T^2 of 3,000 fits with errors common to a patch, whose size differs from patch to patch by half.
+
+    Taken for chi-square, the squared error exceeds the 95 % and 99 % points too often.
+    """
+    rng, values, squares = np.random.default_rng(4), [], []
+    for _ in range(3000):
+        size = np.exp(0.5 * rng.normal(size=60))[:, None]
+        J = rng.normal(size=(60, 6, 6)) + 5.0 * rng.normal(size=(60, 1, 6))
+        e = size * (np.sqrt(0.1) * rng.normal(size=(60, 6)) + np.sqrt(0.9) * rng.normal(size=(60, 1)))
+        d = np.linalg.lstsq(J.reshape(-1, 6), e.reshape(-1), rcond=None)[0]
+        normals, gradients = np.einsum("pki,pkj->pij", J, J), np.einsum("pk,pki->pi", e - J @ d, J)
+        P, dof = sandwich_covariance(normals, gradients)
+        squares.append(d @ np.linalg.solve(P, d))
+        values.append((squares[-1], dof))
+    taken = [f.sf(square * (dof - 5.0) / (6.0 * dof), 6, dof - 5.0) for square, dof in values]
+    for probability in (0.05, 0.01):
+        spread = np.sqrt(probability / 3000)
+        assert np.mean(np.array(taken) < probability) == pytest.approx(probability, abs=3.0 * spread)
+        assert np.mean(np.array(squares) > chi2.isf(probability, 6)) > probability + 3.0 * spread

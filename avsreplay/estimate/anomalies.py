@@ -21,7 +21,7 @@ from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.error_state import VEL, W
 from avsreplay.estimate.hypotheses import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis, explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
-from avsreplay.estimate.measurement import GATE, innovation_vector, measured_pose, measurement_jacobian
+from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import (
@@ -82,9 +82,9 @@ class AnomalyTest:
         doubtful = replace(track, belief=epoch.prediction.belief, doubtful=(*track.doubtful, epoch))
         large = verdict.reason is Reason.POSE_JUMP
         if not (ready(track) and track.recent):
-            large = large or (ready(track) and epoch.innovation.nis > GATE * nis_scale(track))
+            large = large or (ready(track) and epoch.innovation.chi2 > GATE * nis_scale(track))
             return self._undecidable(doubtful) if large else (self._accepted(track, epoch, update), verdict)
-        large = large or epoch.innovation.nis > GATE * nis_scale(track)
+        large = large or epoch.innovation.chi2 > GATE * nis_scale(track)
         if not (large or track.doubtful or _long_run((*track.recent, epoch), nis_scale(track))):
             return self._accepted(track, epoch, update), verdict
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
@@ -103,7 +103,7 @@ class AnomalyTest:
         that is based on enough poses: before, its errors are too large for the linearisation.
         """
         after = update(replace(track, doubtful=(), manoeuvres=confirmed(track), pending=False))
-        after = with_nis(after, track, epoch.innovation.nis)
+        after = with_nis(after, track, epoch.innovation.chi2)
         return replace(after, recent=(*track.recent, epoch)[-_RECENT:]) if ready(track) else after
 
     def _undecidable(self, track: Track) -> tuple[Track, Verdict]:
@@ -190,7 +190,8 @@ class AnomalyTest:
             H = measurement_jacobian(belief.x)
             S = H @ belief.P @ H.T + seen.R
             alpha = innovation_vector(belief.x, measured_pose(prior.x, seen.alpha))
-            if _chi2(alpha, S) > GATE or _chi2(seen.alpha, S) < GATE:
+            limit = gate_of(seen.dof, seen.R, S)
+            if _chi2(alpha, S) > limit or _chi2(seen.alpha, S) < limit:
                 return False
         return True
 

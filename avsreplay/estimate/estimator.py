@@ -25,6 +25,7 @@ from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_coun
 from avsreplay.estimate.measurement import (
     chart_update,
     constrained_update,
+    gate_of,
     innovation_of,
     innovation_vector,
     measured_pose,
@@ -106,7 +107,8 @@ class Estimator:
         R = self.noise.of(alignment, x, prediction.window)
         T_ac = alignment.T_ac if self.fall is None else self.fall.pose_into(alignment.T_ac, prediction.belief.t_ns)
         alpha, share = innovation_vector(x, T_ac), self.noise.correlated_share(alignment)
-        found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share)
+        dof = self.noise.dof(alignment)
+        found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share, dof)
         return replace(found, rms_m=alignment.rms_m)
 
     def step(
@@ -174,8 +176,10 @@ class Estimator:
 
     def residual_after(
         self, track: Track, prediction: Prediction, innovation: Innovation
-    ) -> tuple[Array, Array, Array] | None:
-        """Residual (6,) of the measured pose after the update, its noise R (6, 6) by now, and its inflation (2,).
+    ) -> tuple[Array, Array, Array, float] | None:
+        """Residual (6,) of the measured pose after the update, its noise R (6, 6) by now, inflation (2,) and gate.
+
+        The gate is the 99.99 % point of the residual's square in the metric of R plus the covariance of the pose.
 
         None where the scan did not change the estimate: before the first fit, and between two fits with a
         non-Gaussian likelihood.
@@ -190,7 +194,8 @@ class Estimator:
             return None
         left = residual(track.belief.x, prediction.belief.x, innovation.alpha)
         R = self.noise.rescaled(innovation.R, prediction.window, track.window)
-        return left, R, NO_INFLATION if track.inflation is None else track.inflation
+        gate = gate_of(innovation.dof, R, R + self.pose_covariance(track.belief))
+        return left, R, NO_INFLATION if track.inflation is None else track.inflation, gate
 
     def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
         """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""
@@ -199,9 +204,9 @@ class Estimator:
         pose = measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha)
         alpha = innovation_vector(prediction.belief.x, pose)
         R = self.noise.rescaled(epoch.innovation.R, epoch.prediction.window, track.window)
-        P, share = prediction.belief.P, epoch.innovation.share
-        innovation = innovation_of(P, prediction.H, alpha, R, self._robust, share)
-        innovation = replace(innovation, rms_m=epoch.innovation.rms_m)
+        seen = epoch.innovation
+        innovation = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, seen.share, seen.dof)
+        innovation = replace(innovation, rms_m=seen.rms_m)
         used = Epoch(replace(track, recent=(), doubtful=(), previous=None), prediction, innovation, epoch.converged)
         return self.update(track, prediction, innovation, 1, epoch.converged), used
 

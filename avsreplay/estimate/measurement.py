@@ -153,7 +153,13 @@ _LEAST = 1e-12  # least eigenvalue of a repaired covariance, in units of its var
 
 
 def innovation_of(
-    P: Array, H: Array, alpha: Array, R: Array, robust: bool = False, correlated_share: float = 0.0
+    P: Array,
+    H: Array,
+    alpha: Array,
+    R: Array,
+    robust: bool = False,
+    correlated_share: float = 0.0,
+    dof: float = math.inf,
 ) -> Innovation:
     """The innovation alpha (6,) with its covariance S = H P H' + R, its NIS and its Cauchy weight.
 
@@ -162,16 +168,64 @@ def innovation_of(
         H: (6, 20) measurement Jacobian.
         alpha: (6,) innovation [m, half-angle].
         R: (6, 6) measurement noise.
-        robust: give a pose whose NIS is above the 99.99 % point the Cauchy weight GATE / NIS; otherwise it is 1.
+        robust: give a pose whose NIS is above its 99.99 % point the Cauchy weight point / NIS; otherwise it is 1.
         correlated_share: the part of R that neighbouring scans have in common.
+        dof: degrees of freedom of R as an estimate, inf if it is known.
     """
     unsymmetric = H @ P @ H.T + R
     S = _definite(np.asarray(0.5 * (unsymmetric + unsymmetric.T), dtype=np.float64), R)
     half = min(1.0, float(np.sqrt(alpha[3:] @ alpha[3:])))
     distance = float(np.sqrt(alpha[:3] @ alpha[:3]))
     nis = float(alpha @ np.linalg.solve(S, alpha))
-    weight = GATE / nis if robust and nis > GATE else 1.0
-    return Innovation(alpha, S, R, nis, distance, 2.0 * float(np.arcsin(half)), weight, correlated_share)
+    of_S = dof_of_sum(dof, R, S)
+    chi2, limit = as_chi2(nis, of_S), from_chi2(GATE, of_S)
+    weight = limit / nis if robust and nis > limit else 1.0
+    angle = 2.0 * float(np.arcsin(half))
+    return Innovation(alpha, S, R, nis, chi2, distance, angle, weight, correlated_share, dof=dof)
+
+
+def dof_of_sum(dof: float, part: Array, total: Array) -> float:
+    """Degrees of freedom of a covariance of which a part is an estimate and the rest is known (Welch, Satterthwaite).
+
+    With B = total^-1 part they are dof p (p + 1) / (tr B^2 + (tr B)^2), by Nel and van der Merwe (1986).
+
+    Args:
+        dof: degrees of freedom of the part, inf if it is known.
+        part: (p, p) the estimated part.
+        total: (p, p) the sum.
+    """
+    if not math.isfinite(dof):
+        return dof
+    B, p = np.linalg.solve(total, part), len(part)
+    return dof * p * (p + 1) / max(float(np.sum(B * B.T)) + float(np.trace(B)) ** 2, 1e-9)
+
+
+def as_chi2(square: float, dof: float) -> float:
+    """Hotelling's T^2 of six variables, with an estimated covariance, as chi-square with 6 degrees of freedom.
+
+    Args:
+        square: T^2 >= 0.
+        dof: degrees of freedom of the covariance, above 3; inf if it is known.
+
+    Returns:
+        (dof - 3) log(1 + T^2 / dof), Bartlett's approximation. At dof = 40, 0.95e-4 exceed the 99.99 % point.
+    """
+    return (dof - 3.0) * math.log1p(square / dof) if math.isfinite(dof) else square
+
+
+def from_chi2(value: float, dof: float) -> float:
+    """The inverse of ``as_chi2``: the limit on T^2 for a limit on chi-square.
+
+    Args:
+        value: of chi-square with 6 degrees of freedom.
+        dof: degrees of freedom of the covariance, above 3; inf if it is known.
+    """
+    return dof * math.expm1(value / (dof - 3.0)) if math.isfinite(dof) else value
+
+
+def gate_of(dof: float, part: Array, total: Array) -> float:
+    """The 99.99 % point of T^2 in the metric of a sum of which a part is an estimate (``dof_of_sum``)."""
+    return from_chi2(GATE, dof_of_sum(dof, part, total))
 
 
 def _definite(S: Array, R: Array) -> Array:

@@ -255,6 +255,11 @@ class Noise:
         s = after.factors / before.factors
         return np.asarray(R * (s[:, None] * s))
 
+    def dof(self, alignment: Alignment) -> float:
+        """Degrees of freedom of the base R as an estimate from the residuals of the scan, inf where it is none."""
+        own = self.params.noise is NoiseSource.R0 or self.params.adapt is Adaptation.MATRIX
+        return math.inf if own or alignment.covariance is None else alignment.dof
+
     def floors(self, R: Array) -> int:
         """How many eigenvalues of R lie on the floor."""
         return at_floor(R, self._R0, self.params.r_floor)

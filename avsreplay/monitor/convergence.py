@@ -19,7 +19,6 @@ from avsreplay.geometry import Array, frozen
 from avsreplay.records import BLOCKS, Belief, Forecast, Innovation
 from avsreplay.settings import Settings, given, setting
 
-_GATE = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom
 _NOT_WORSE = 1.05  # a posterior 1 sigma may exceed that of the measurement by this factor
 
 
@@ -129,7 +128,9 @@ def block_1s(P: Array) -> dict[str, float]:
     return {name: float(np.sqrt(np.maximum(variances[where].sum(), 0.0))) for name, where in BLOCKS.items()}
 
 
-def violations(belief: Belief, pose_covariance: Array, residual: Array, R: Array, inflation: Array) -> tuple[str, ...]:
+def violations(
+    belief: Belief, pose_covariance: Array, residual: Array, R: Array, inflation: Array, gate: float
+) -> tuple[str, ...]:
     """The checks that an estimate after a healthy scan fails; a correct one passes all.
 
     Args:
@@ -138,6 +139,7 @@ def violations(belief: Belief, pose_covariance: Array, residual: Array, R: Array
         residual: (6,) measured minus estimated pose, in the same units.
         R: (6, 6) noise of the measured pose.
         inflation: (2,) factor on R, attitude and position, by which the update allowed for correlated errors.
+        gate: 99.99 % point of the squared residual in the metric of R plus ``pose_covariance``.
 
     Returns:
         Names of the failed checks: ``covariance`` (not positive semidefinite, or not finite), ``sigma`` (an inertia
@@ -156,14 +158,17 @@ def violations(belief: Belief, pose_covariance: Array, residual: Array, R: Array
         if not float(np.trace(pose_covariance[block, block])) <= limit:
             found.append("worse_than_measured")
             break
-    if not float(residual @ np.linalg.solve(R + pose_covariance, residual)) <= _GATE:
+    if not float(residual @ np.linalg.solve(R + pose_covariance, residual)) <= gate:
         found.append("outside_gate")
     return tuple(found)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConsistencyTrack:
-    """Whitened innovations L^-1 alpha of the last healthy epochs, (n, 6), oldest first, each with its Cauchy weight."""
+    """Whitened innovations L^-1 alpha of the last healthy epochs, (n, 6), oldest first.
+
+    Each has its Cauchy weight, and the length that its NIS has as a chi-square value.
+    """
 
     white: Array
 
@@ -208,7 +213,8 @@ class Consistency:
         """
         if innovation is None or gamma == 0:
             return track
-        white = np.sqrt(innovation.weight) * np.linalg.solve(np.linalg.cholesky(innovation.S), innovation.alpha)
+        share = innovation.weight * (innovation.chi2 / innovation.nis if innovation.nis > 0.0 else 1.0)
+        white = np.sqrt(share) * np.linalg.solve(np.linalg.cholesky(innovation.S), innovation.alpha)
         kept = track.white[max(0, len(track.white) + 1 - self.params.window) :]
         return ConsistencyTrack(frozen(np.vstack([kept, white])))
 

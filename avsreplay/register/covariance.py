@@ -16,6 +16,12 @@ Systematic errors
     the pose; the amplitudes of the strain are taken as draws of one normal distribution, that of the offset of
     another. Their variances are maximum likelihood estimates (empirical Bayes), 0 if not significant.
 
+The covariance is an estimate from some hundred patches: the squared error of a pose in its metric is Hotelling's T^2,
+not chi-square. Its degrees of freedom are those of a Wishart matrix with the same mean and the same expected
+squared error, which Ledoit and Wolf estimate from the differences between the patches; for the sum with the systematic
+errors they follow from Welch and Satterthwaite, for matrices by Nel and van der Merwe (Communications in Statistics,
+Theory and Methods 15, 1986).
+
 ``split_nis`` tests the result: pose from one half of the patches against the other, normalised with the covariance of
 their difference, in which common errors cancel. For normal errors it is chi-square with 6 degrees of freedom.
 
@@ -105,19 +111,19 @@ def without_dominant_patches(found: Evidence) -> Evidence:
     return found if keep.all() else found.only(keep)
 
 
-def sandwich_covariance(normals: Array, gradients: Array) -> Array:
-    """Return the cluster-robust sandwich covariance (6, 6) of d = [theta; v], with patches of the model as clusters.
+def sandwich_covariance(normals: Array, gradients: Array) -> tuple[Array, float]:
+    """Return the cluster-robust sandwich covariance (6, 6) of d = [theta; v] and its degrees of freedom.
 
-    Errors within a patch may be correlated, patches are taken as independent. With N the sum of N_p = J'J,
-    g_p = sum of e J and N^-1 = W W', patch p adds the square of (I - W' N_p W)^-1/2 W' g_p. The
-    sum S is shrunk towards trace(S) / 6 times the identity; the covariance is W S W'.
+    Clusters are patches of the model: errors within one may be correlated, patches are taken as independent. With N the
+    sum of N_p = J'J, g_p = sum of e J and N^-1 = W W', patch p adds the square of (I - W' N_p W)^-1/2 W' g_p. The sum S
+    is shrunk towards trace(S) / 6 times the identity; the covariance is W S W'.
 
     Args:
         normals: (m, 6, 6) sums of J'J.
         gradients: (m, 6) sums of e J.
     """
-    P: Array = kernel_module().sandwich(*_contiguous(normals, gradients))
-    return P
+    found: tuple[Array, float] = kernel_module().sandwich(*_contiguous(normals, gradients))
+    return found
 
 
 def pseudo_inverse(N: Array) -> Array:
@@ -141,15 +147,15 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     return Systematic(extent_m, patch_m, block_m2, smooth_m2, amplitudes, fit, found.centre)
 
 
-def registration_covariance(found: Evidence, errors: Systematic) -> Array:
-    """Return the covariance (6, 6) of the registered pose, systematic errors included.
+def registration_covariance(found: Evidence, errors: Systematic) -> tuple[Array, float]:
+    """Return the covariance (6, 6) of the registered pose, systematic errors included, and its degrees of freedom.
 
     Args:
         found: sums at the registered pose.
         errors: its systematic errors.
     """
-    P: Array = _table_of(found, errors).covariance(*errors.values)
-    return P
+    estimate: tuple[Array, float] = _table_of(found, errors).covariance(*errors.values)
+    return estimate
 
 
 def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | None:

@@ -124,9 +124,9 @@ def grade(
     info = frozen(total / found.noise_m**2)
     weakest = unobservable_directions(total, int(found.counts.sum()), found.centre) if overlap else ()
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    P, split, strain = None, None, 0.0
+    P, dof, split, strain = None, np.inf, None, 0.0
     if overlap and not weakest:
-        P, split, strain = _covariance(found, across, index.extent_m, systematic)
+        P, dof, split, strain = _covariance(found, across, index.extent_m, systematic)
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
         info, P, weakest = frozen(pseudo_inverse(P)), None, unbounded
@@ -149,6 +149,7 @@ def grade(
         free_directions=", ".join(weakest),
         split_nis=split,
         message=_message(settled, size),
+        dof=np.inf if P is None else dof,
     )
 
 
@@ -185,14 +186,18 @@ def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float
 
 def _covariance(
     found: Evidence, across: Array, extent_m: float, systematic: bool
-) -> tuple[Array | None, float | None, float]:
-    """Covariance, the test of halves along ``across`` (k, 3) in {C}, and the mean strain, 0 if not significant."""
+) -> tuple[Array | None, float, float | None, float]:
+    """Covariance, its degrees of freedom, the test of halves along ``across`` (k, 3) in {C}, and the mean strain.
+
+    The strain is 0 if it is not significant.
+    """
     if not (systematic or len(across)):
-        return sandwich_covariance(found.normals, found.gradients), None, 0.0
+        return *sandwich_covariance(found.normals, found.gradients), None, 0.0
     errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
-    P = registration_covariance(found, errors) if systematic else sandwich_covariance(found.normals, found.gradients)
+    bare = not systematic
+    P, dof = sandwich_covariance(found.normals, found.gradients) if bare else registration_covariance(found, errors)
     strain = float(errors.amplitudes[:3].mean()) / extent_m if systematic and errors.smooth_m2[0] > 0.0 else 0.0
-    return P, split_nis(found, errors, across), strain
+    return P, dof, split_nis(found, errors, across), strain
 
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:

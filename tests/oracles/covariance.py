@@ -27,8 +27,13 @@ def _unexplained(errors: Systematic, found: Evidence) -> Array:
     return found.gradients - found.normals @ errors.fit - _coupling(found, errors) @ errors.amplitudes
 
 
-def sandwich_covariance(normals: Array, gradients: Array) -> Array:
-    """The bias-reduced sandwich covariance (6, 6), shrunk towards that of independent noise."""
+def _error_of_one(A: Array) -> float:
+    """Expected squared error of the entries of A, estimated with one degree of freedom."""
+    return float(np.trace(A @ A) + np.trace(A) ** 2)
+
+
+def sandwich_covariance(normals: Array, gradients: Array) -> tuple[Array, float]:
+    """The bias-reduced sandwich covariance (6, 6), shrunk towards that of independent noise; its degrees of freedom."""
     values, vectors = np.linalg.eigh(normals.sum(axis=0))
     kept = values > len(values) * np.finfo(float).eps * values[-1]
     W = vectors[:, kept] / np.sqrt(values[kept])
@@ -40,7 +45,10 @@ def sandwich_covariance(normals: Array, gradients: Array) -> Array:
     spread = np.sum((S - level * np.eye(rank)) ** 2)
     error = np.sum(np.sum(y**2, axis=1) ** 2) - np.sum(S**2) / len(y)
     intensity = np.clip(error / spread, 0.0, 1.0) if spread > 0.0 else 1.0
-    return np.asarray(W @ ((1.0 - intensity) * S + intensity * level * np.eye(rank)) @ W.T)
+    shrunk = (1.0 - intensity) * S + intensity * level * np.eye(rank)
+    trace_error = (np.sum(np.sum(y**2, axis=1) ** 2) - np.trace(S) ** 2 / len(y)) / rank
+    left = trace_error + (1.0 - intensity) * max(error - trace_error, 0.0)
+    return np.asarray(W @ shrunk @ W.T), float(np.clip(_error_of_one(shrunk) / left, 12.0, 1e6))
 
 
 def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Systematic:
@@ -71,19 +79,19 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     return Systematic(extent_m, patch_m, block, smooth, basis @ fit[6:], fit[:6], found.centre)
 
 
-def registration_covariance(found: Evidence, errors: Systematic) -> Array:
-    """Return the covariance (6, 6) of the registered pose, systematic errors included.
+def registration_covariance(found: Evidence, errors: Systematic) -> tuple[Array, float]:
+    """Return the covariance (6, 6) of the registered pose, systematic errors included, and its degrees of freedom.
 
     Args:
         found: sums at the registered pose.
         errors: its systematic errors.
     """
-    P = sandwich_covariance(found.normals, _unexplained(errors, found))
+    random, dof = sandwich_covariance(found.normals, _unexplained(errors, found))
     inverse = _pseudo_inverse(found.normals.sum(axis=0))
     X = inverse @ _summed(found.normals[:, :, 3:], _numbers(found.places, BLOCK * errors.patch_m))
     Y = inverse @ _coupling(found, errors).sum(axis=0)
-    P = P + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
-    return np.asarray(0.5 * (P + P.T))
+    P = random + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
+    return np.asarray(0.5 * (P + P.T)), dof * max(42.0 / _error_of_one(np.linalg.solve(P, random)), 1.0)
 
 
 def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | None:
@@ -113,7 +121,7 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
             if inverse is None:
                 return None
             D += sign * (inverse @ found.gradients[half].sum(axis=0))
-            C += sandwich_covariance(normals, unexplained[half])
+            C += sandwich_covariance(normals, unexplained[half])[0]
             X += sign * (inverse @ _summed(normals[:, :, 3:], blocks[half], len(X)))
             Y += sign * (inverse @ coupling[half].sum(axis=0))
         C += errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T

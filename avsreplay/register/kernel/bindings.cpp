@@ -314,9 +314,10 @@ Numpy pseudo_inverse_of(const Patches& N) {
   return array66(pseudo_inverse(A));
 }
 
-Numpy sandwich_of(const Patches& normals, const Patches& gradients) {
+nb::tuple sandwich_of(const Patches& normals, const Patches& gradients) {
   check_patches(normals, gradients);
-  return array66(sandwich(normals.data(), gradients.data(), (int64_t)normals.shape(0)));
+  const Estimated found = sandwich(normals.data(), gradients.data(), (int64_t)normals.shape(0));
+  return nb::make_tuple(array66(found.P), found.dof);
 }
 
 // The sums of patches, kept alive by the arrays in it.
@@ -357,8 +358,9 @@ nb::tuple systematic_of(const Table& t) {
   return nb::make_tuple(e.block, a, b, c);
 }
 
-Numpy covariance_of(const Table& t, double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit) {
-  return array66(covariance(t.table, errors_of(block, smooth, amplitudes, fit)));
+nb::tuple covariance_of(const Table& t, double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit) {
+  const Estimated found = covariance(t.table, errors_of(block, smooth, amplitudes, fit));
+  return nb::make_tuple(array66(found.P), found.dof);
 }
 
 double split_of(const Table& t, double block, const Seven& smooth, const Seven& amplitudes, const std::array<double, 6>& fit,

@@ -16,6 +16,7 @@ constexpr double SMALL = 0.1;               // trace below which the power serie
 constexpr int TERMS = 8;                    // of the series: an error below 1e-9
 constexpr int64_t LEAST_HALF = 12;          // patches that each half of a split needs
 constexpr double WORST_CONDITION = 1e8;     // of the scaled information of a half
+constexpr double LEAST_DOF = 12, MOST_DOF = 1e6;  // of an estimated covariance
 constexpr double TINY = std::numeric_limits<double>::min();
 
 // N_p W.
@@ -94,8 +95,19 @@ std::array<double, 6> reduced(const double* Np, const Six& W, std::array<double,
   return out;
 }
 
-// Shrinks the sum S of the squares of `y` towards its mean eigenvalue times the identity (Ledoit and Wolf).
-void shrink(const std::vector<std::array<double, 6>>& y, int rank, Six& S) {
+// tr A^2 + (tr A)^2: the expected squared error of the entries of A, estimated with one degree of freedom.
+double unit_error(const Six& A) {
+  double trace = 0, square = 0;
+  for (int i = 0; i < 6; ++i) {
+    trace += A.v[i][i];
+    for (int j = 0; j < 6; ++j) square += A.v[i][j] * A.v[j][i];
+  }
+  return square + trace * trace;
+}
+
+// Shrinks the sum S of the squares of `y` towards its mean eigenvalue times the identity (Ledoit and Wolf). Returns the
+// degrees of freedom of the result: those of a Wishart matrix with the same mean and the same expected squared error.
+double shrink(const std::vector<std::array<double, 6>>& y, int rank, Six& S) {
   double fourth = 0, squares = 0, level = 0;
   for (const auto& each : y) {
     double length = 0;
@@ -106,11 +118,30 @@ void shrink(const std::vector<std::array<double, 6>>& y, int rank, Six& S) {
     level += S.v[i][i] / rank;
     for (int j = 0; j < 6; ++j) squares += S.v[i][j] * S.v[i][j];
   }
-  const double spread = squares - rank * level * level;       // of the eigenvalues about their mean
-  const double error = fourth - squares / (double)y.size();   // of S, from the differences between the patches
+  const double n = (double)y.size(), trace = rank * level;
+  const double spread = squares - rank * level * level;  // of the eigenvalues about their mean
+  const double error = fourth - squares / n;             // of S, from the differences between the patches
   const double intensity = spread > 0 ? std::clamp(error / spread, 0.0, 1.0) : 1.0;
   for (int i = 0; i < 6; ++i)
-    for (int j = 0; j < 6; ++j) S.v[i][j] = (1 - intensity) * S.v[i][j] + (i == j ? intensity * level : 0);
+    for (int j = 0; j < 6; ++j) S.v[i][j] = (1 - intensity) * S.v[i][j] + (i == j && S.v[i][i] > 0 ? intensity * level : 0);
+  const double of_level = std::max(fourth - trace * trace / n, 0.0) / rank;
+  const double left = of_level + (1 - intensity) * std::max(error - of_level, 0.0);
+  return left > 0 ? std::clamp(unit_error(S) / left, LEAST_DOF, MOST_DOF) : MOST_DOF;
+}
+
+// Degrees of freedom of a sum, of which only `part` is an estimate, over those of this part (Welch and Satterthwaite, for
+// matrices by Nel and van der Merwe).
+double diluted(const Six& part, const Six& sum) {
+  const Six inverse = pseudo_inverse(sum);
+  Six A;
+  int rank = 0;
+  for (int i = 0; i < 6; ++i) {
+    rank += sum.v[i][i] > 0;
+    for (int j = 0; j < 6; ++j)
+      for (int k = 0; k < 6; ++k) A.v[i][j] += inverse.v[i][k] * part.v[k][j];
+  }
+  const double own = unit_error(A);
+  return own > 0 ? std::max(rank * (rank + 1) / own, 1.0) : 1.0;
 }
 
 // The patches of one half, or all of them.
@@ -196,7 +227,7 @@ double difference(const PatchTable& t, const Systematic& errors, const std::vect
     const int64_t m = (int64_t)part.gradients.size() / 6;
     const Six N = total(part.normals.data(), m);
     if (m < LEAST_HALF || !determines(N)) return std::numeric_limits<double>::quiet_NaN();
-    const Six inverse = pseudo_inverse(N), P = sandwich(part.normals.data(), part.gradients.data(), m);
+    const Six inverse = pseudo_inverse(N), P = sandwich(part.normals.data(), part.gradients.data(), m).P;
     for (int i = 0; i < 6; ++i)
       for (int j = 0; j < 6; ++j) d[i] += (half ? 1 : -1) * inverse.v[i][j] * part.sum[j], C.v[i][j] += P.v[i][j];
     effect.add(part, inverse, half ? 1 : -1);
@@ -236,16 +267,18 @@ void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint
   }
 }
 
-Six sandwich(const double* normals, const double* gradients, int64_t m) {
+Estimated sandwich(const double* normals, const double* gradients, int64_t m) {
   const Six W = pseudo_root(total(normals, m));
-  Six S, P;
+  Six S;
+  Estimated out{{}, LEAST_DOF};
+  Six& P = out.P;
   int rank = 0;
   for (int j = 0; j < 6; ++j) {
     double length = 0;
     for (int i = 0; i < 6; ++i) length += W.v[i][j] * W.v[i][j];
     rank += length > 0;
   }
-  if (rank == 0) return P;
+  if (rank == 0) return out;
   std::vector<std::array<double, 6>> y((size_t)m);
   for (int64_t p = 0; p < m; ++p) {
     std::array<double, 6> x{};
@@ -255,28 +288,31 @@ Six sandwich(const double* normals, const double* gradients, int64_t m) {
     for (int i = 0; i < 6; ++i)
       for (int j = 0; j < 6; ++j) S.v[i][j] += x[(size_t)i] * x[(size_t)j];
   }
-  shrink(y, rank, S);
+  out.dof = shrink(y, rank, S);
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j <= i; ++j) {
       for (int k = 0; k < 6; ++k)
         for (int l = 0; l < 6; ++l) P.v[i][j] += W.v[i][k] * S.v[k][l] * W.v[j][l];
       P.v[j][i] = P.v[i][j];
     }
-  return P;
+  return out;
 }
 
-Six covariance(const PatchTable& t, const Systematic& errors) {
+Estimated covariance(const PatchTable& t, const Systematic& errors) {
   std::vector<int64_t> block;
   Part all;
   all.blocks.resize((size_t)number_blocks(t, block));
   for (int64_t p = 0; p < t.m; ++p) add(t, errors, p, block[(size_t)p], all);
-  Six P = sandwich(t.normals, all.gradients.data(), t.m);
+  Estimated out = sandwich(t.normals, all.gradients.data(), t.m);
+  const Six random = out.P;
+  Six& P = out.P;
   Effect effect;
   effect.add(all, pseudo_inverse(total(t.normals, t.m)), 1);
   effect.add_to(errors, P);
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j < i; ++j) P.v[i][j] = P.v[j][i] = 0.5 * (P.v[i][j] + P.v[j][i]);
-  return P;
+  out.dof *= diluted(random, P);
+  return out;
 }
 
 double split(const PatchTable& t, const Systematic& errors, const double* across, int64_t k) {

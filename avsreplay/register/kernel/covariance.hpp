@@ -29,13 +29,19 @@ struct Systematic {
 // is none. Stops, with `keep` as it was, where too few points would be left.
 void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint8_t* keep);
 
+// A covariance and the degrees of freedom of the estimate.
+struct Estimated {
+  Six P;
+  double dof = 0;
+};
+
 // P = sum over the patches p of m_p m_p', m_p = N^+ ((1 + ALONE) I - N_p N^+)^-1 g_p with N the sum of all N_p.
-Six sandwich(const double* normals, const double* gradients, int64_t m);
+Estimated sandwich(const double* normals, const double* gradients, int64_t m);
 
 Systematic systematic_errors(const PatchTable& patches);
 
 // The sandwich of what `errors` leave unexplained, and their variances.
-Six covariance(const PatchTable& patches, const Systematic& errors);
+Estimated covariance(const PatchTable& patches, const Systematic& errors);
 
 // The largest normalised squared difference of the poses of two halves, over the k directions `across` (k, 3); NaN where
 // a half does not determine a pose.
