@@ -14,8 +14,10 @@ from true_scans import true_scans
 from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.records import ScanStatus
+from avsreplay.report.charts import KINDS
 from avsreplay.simulate import EPOCH_NS, builtin_surface, load_scenario, scenario_of, simulate
 from avsreplay.simulate.faults import InjectedFault, Kind, active, label
+from avsreplay.simulate.recorded_faults import RECORDED_KINDS
 from avsreplay.simulate.scenario import StartParams, belief
 
 SURFACE = builtin_surface()
@@ -338,3 +340,10 @@ def test_the_three_strengths_of_faults_hold_every_kind():
     for level in ("weak", "medium", "strong"):
         params = load_scenario(Path(__file__).parent.parent / "docs" / "scenarios" / f"faults-{level}.toml").params
         assert {f.kind for f in params.fault} == set(Kind)
+
+
+def test_every_kind_of_fault_has_its_colour_and_its_line_in_the_documentation():
+    page = (Path(__file__).parent.parent / "docs" / "scenario.md").read_text(encoding="utf-8")
+    for kind in RECORDED_KINDS:
+        assert kind in KINDS["injected"], "add it to KINDS in avsreplay/report/charts.py"
+        assert f"| `{kind}` |" in page, "add it to the tables in docs/scenario.md"

@@ -50,7 +50,7 @@ _DIRECT = (
 )
 _WINDOW = 10
 WIDE = 20.0  # largest over typical value from which an axis is logarithmic
-_KINDS = {  # place: colour and pattern
+KINDS = {  # place: colour and pattern
     "flagged": (
         *("not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged"),
         "halves_differ",
@@ -280,7 +280,7 @@ def spans(rows: Sequence[Row], episodes: Sequence[Episode] = ()) -> list[dict[st
 
 def _style(lane: str, word: str) -> dict[str, int]:
     """Colour and pattern of a kind, the same on every page."""
-    known = _KINDS[lane]
+    known = KINDS[lane]
     place = known.index(word) if word in known else zlib.crc32(word.encode())
     return {"colour": place % 6, "pattern": (place // 6 + _FIRST_PATTERN[lane]) % 6}
 
