@@ -20,7 +20,7 @@ from avsreplay.plan import Limits, PlannerInput, PlanParams, Scene, SupervisorPa
 from avsreplay.plan.arm import Arm, JointPath
 from avsreplay.plan.robot import slowed
 from avsreplay.records import Alignment, AlignStatus, Belief, State
-from avsreplay.report.flight_page import Flight
+from avsreplay.report.page import Flight
 from avsreplay.saved_result import Saved
 
 FLIGHT_INSTANTS = 401  # of the flight on its page

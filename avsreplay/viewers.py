@@ -21,7 +21,7 @@ from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief
 from avsreplay.report.export import row_poses
-from avsreplay.report.flight_page import cone_lines
+from avsreplay.report.view import cone_lines
 from avsreplay.rows import Row, columns
 from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump

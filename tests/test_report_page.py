@@ -21,12 +21,11 @@ from avsreplay.errors import AvsError
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.charts import charts, derived, embed, most_telling, spans
-from avsreplay.report.flight_page import Flight, build_flight_page, cone_lines
 from avsreplay.report.jsonl import write_rows
-from avsreplay.report.page import build_page, render
+from avsreplay.report.page import Flight, build_flight_page, build_page, render
 from avsreplay.report.result import load_result
 from avsreplay.report.summary import Summary
-from avsreplay.report.view import PathView, View, scene, thin_cloud
+from avsreplay.report.view import PathView, View, cone_lines, scene, thin_cloud
 
 ROOT = Path(__file__).resolve().parents[1]
 TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.3, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))

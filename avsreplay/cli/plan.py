@@ -192,7 +192,7 @@ def _animate(answer: Answer, index: int, path: Path) -> str:
     from avsreplay.cli.plan_output import plan_facts
     from avsreplay.errors import UsageError
     from avsreplay.files import output_text
-    from avsreplay.report.flight_page import build_flight_page
+    from avsreplay.report.page import build_flight_page
 
     planning, made = answer.planning, answer.made
     if not made.found:

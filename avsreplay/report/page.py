@@ -1,4 +1,4 @@
-"""One builder for every HTML page: of a run, of a comparison, of a campaign. Self-contained, no network, no server.
+"""One builder for every HTML page: of a run, a comparison, a campaign, a flight. Self-contained, no network, no server.
 
 Text reaches a page through Jinja templates with autoescape. Charts are drawn by uPlot (50 kB, MIT, bundled) and the
 3D view by plain WebGL, so that a page is its data plus 0.1 MB.
@@ -13,11 +13,24 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from avsreplay.records import State
-from avsreplay.report.charts import Chart, Columns, charts, derived, embed, most_telling, pack, spans, values
+from avsreplay.geometry import Array
+from avsreplay.records import State, Surface
+from avsreplay.report.charts import (
+    Chart,
+    Columns,
+    charts,
+    derived,
+    embed,
+    flight_charts,
+    most_telling,
+    pack,
+    spans,
+    values,
+)
 from avsreplay.report.conclusion import ComparedRun, Conclusion, changes_table, settings_table
 from avsreplay.report.export import StampedPose
 from avsreplay.report.gate import RuleOutcome, gate_table
@@ -25,7 +38,7 @@ from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import fact_lines, in_one_line, moments_table, summary_tables, verdict_table
 from avsreplay.report.table import Table, as_cell, facts_table
 from avsreplay.report.verdict import verdict_of
-from avsreplay.report.view import View, scene
+from avsreplay.report.view import View, cone_lines, scene, thin_surface
 from avsreplay.rows import Row
 
 MOST_ROWS = 20_000
@@ -224,3 +237,68 @@ def _overlaid(runs: Sequence[ComparedRun], columns: Sequence[Columns]) -> list[C
             levels = chart["levels"] if alone else []
             out.append(chart | {"key": line["column"], "title": title, "series": series, "bands": [], "levels": levels})
     return out
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Flight:
+    """A planned flight in {C}.
+
+    Attributes:
+        t_s: (n,) instants [s after the instant of planning].
+        position_c: (n, 3) position of the gripper [m]; the grasp point is the origin.
+        figures: Names of columns (see ``flight_charts``) and their values (n,).
+        axis_c: (3,) outward axis of the fixture, unit.
+        cones: Half-angle [deg] and length [m] of each approach cone that is required.
+        mouth_m: Radius of the cones at the grasp point.
+        surface: Model of the target in {C}; None where the result has none.
+    """
+
+    t_s: Array
+    position_c: Array
+    figures: Mapping[str, Array]
+    axis_c: Array
+    cones: Sequence[tuple[float, float]] = ()
+    mouth_m: float = 0.0
+    surface: Surface | None = None
+
+
+def build_flight_page(title: str, lines: Sequence[str], flight: Flight, facts: Iterable[tuple[str, str]]) -> str:
+    """Return the page of a flight as text; the same arguments give the same bytes.
+
+    Args:
+        title: Of the page.
+        lines: Under the title, the verdict first.
+        flight: The flight.
+        facts: Figures of the plan, as names and texts.
+    """
+    columns = {name: np.asarray(values, dtype=np.float64) for name, values in flight.figures.items()}
+    data = {
+        "runs": [{"name": title, "t": pack(flight.t_s, "f8"), "columns": _packed(columns)}],
+        "charts": flight_charts(columns),
+        "spans": [],
+        "marks": [],
+        "states": None,
+        "scene": _scene(flight),
+    }
+    note = (
+        "3D view: frame of the fixture {C}, in which the target is at rest. Time counts from the instant of planning."
+    )
+    return build_html(title, [*lines, note], [facts_table("Plan", facts)], data)
+
+
+def _scene(flight: Flight) -> dict[str, Any]:
+    """Data for ``scene.js``: the model at rest, the path in {C}, the gripper at every instant, the cones."""
+    view = None if flight.surface is None else View(*thin_surface(flight.surface))
+    still = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(flight.t_s), 1))
+    cones = [cone_lines(flight.axis_c, *cone, flight.mouth_m) for cone in flight.cones]
+    nearest = min((length for _, length in flight.cones), default=0.5)
+    return scene([], {}, view) | {
+        "estimate": pack(still, "f4"),
+        "truth": pack(np.full_like(still, np.nan), "f4"),
+        "paths": [{"t_s": 0.0, "points": pack(flight.position_c, "f4"), "miss_m": None}],
+        "flight": {
+            "axis": flight.axis_c.tolist(),
+            "cones": pack(np.concatenate([np.zeros((0, 3)), *cones]), "f4"),
+            "near_m": nearest,
+        },
+    }

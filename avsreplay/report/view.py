@@ -5,6 +5,7 @@ Decimation is deterministic: clouds by an even stride, the model by clustering i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from avsreplay import geometry
 from avsreplay.binary_files import read_npz
 from avsreplay.errors import UnreadableInput
 from avsreplay.files import output_path
@@ -184,6 +186,7 @@ PAGE_POINTS = 200_000
 MOST_CLOUDS = 700
 MOST_PATHS = 150
 _NO_VALUE = 255
+RING = 48  # lines of a cone
 
 
 def scene(rows: Sequence[Row], truth: dict[int, Pose], view: View | None) -> dict[str, Any]:
@@ -266,3 +269,25 @@ def _levels(parts: Sequence[tuple[CloudView, Floats | None]], top: float | None)
 
 def _paths(paths: Sequence[PathView], start_ns: int) -> list[dict[str, Any]]:
     return [{"t_s": (p.t_ns - start_ns) * 1e-9, "points": pack(p.points, "f4"), "miss_m": p.miss_m} for p in paths]
+
+
+def cone_lines(axis: Array, degrees: float, length: float, mouth: float) -> Array:
+    """Return line segments (2 n, 3) of a cone about an axis: its rim, the rim of its mouth, and lines between them.
+
+    The rim lies where the cone meets the ball of radius ``length`` about the grasp point.
+
+    Args:
+        axis: (3,) unit.
+        degrees: Half-angle.
+        length: Distance of the rim from the grasp point [m].
+        mouth: Radius at the grasp point [m].
+    """
+    side = geometry.across(axis)
+    turn = np.linspace(0.0, 2.0 * math.pi, RING + 1)
+    ring = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(axis, side)
+    slope = math.tan(math.radians(degrees))
+    a, b = 1.0 + slope * slope, slope * mouth  # along^2 + (mouth + slope along)^2 = length^2
+    along = (math.sqrt(max(b * b - a * (mouth * mouth - length * length), 0.0)) - b) / a
+    rim, inner = along * axis + (mouth + slope * along) * ring, mouth * ring
+    around = [np.stack([r[:-1], r[1:]], axis=1).reshape(-1, 3) for r in (rim, inner)]
+    return np.concatenate([*around, np.stack([inner[:-1:6], rim[:-1:6]], axis=1).reshape(-1, 3)])
