@@ -18,7 +18,6 @@ from avsreplay.estimate.batch_covariance import (
     BatchCovariance,
     covariance_of,
     final_mixture,
-    moments,
     process_noise_pass,
 )
 from avsreplay.estimate.chart import Chart, nees, to_chart, to_errors, to_state
@@ -26,6 +25,7 @@ from avsreplay.estimate.dynamics import advance, flow, process_noise, rotation_h
 from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import measurement_jacobian, to_fixture
+from avsreplay.estimate.mixture import moments
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.reference import reference_fit

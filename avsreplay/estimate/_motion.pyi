@@ -39,6 +39,20 @@ def moved(chart: Array, y: Array) -> Array: ...
 def minus(chart: Array, other: Array) -> Array: ...
 def state(chart: Array) -> tuple[Array, Array, Array, Array, Array, Array, Array]: ...
 def errors(chart: Array) -> Array: ...
+def transition(chart: Array, h: float, path: Array) -> tuple[Array, Array]: ...
+def carry(
+    chart: Array,
+    P: Array,
+    h: float,
+    path: Array,
+    torque: tuple[float, float, float],
+    force: float,
+    q: Array,
+    t: Array,
+    root: Array,
+    factors: tuple[float, float],
+    weight: float,
+) -> tuple[Array, Array, float, float]: ...
 
 class Problem:
     def __init__(

@@ -15,13 +15,14 @@ from dataclasses import replace
 import numpy as np
 
 from avsreplay.estimate.batch import FitParams, Prior, Problem, fit
-from avsreplay.estimate.batch_covariance import LATEST, BatchCovariance, final_mixture, moments
+from avsreplay.estimate.batch_covariance import LATEST, BatchCovariance, final_mixture
 from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.error_state import VEL, W
 from avsreplay.estimate.hypotheses import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis, explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
+from avsreplay.estimate.mixture import moments
 from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.track import (

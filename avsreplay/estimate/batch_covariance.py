@@ -18,21 +18,20 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from avsreplay import geometry
+from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Problem
-from avsreplay.estimate.chart import Chart, to_chart, to_errors, to_state
+from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.dynamics import (
     MOST_RAD,
     SUBSTEP_RAD,
-    grasp_prediction,
-    propagate_state,
     torque_density,
+    translation,
 )
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite, least_eigenvalue
+from avsreplay.estimate.mixture import Component
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
 from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.geometry import Array
-from avsreplay.records import Belief, Forecast, State
 
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
 _TRIAL = 2.0  # distance along a direction at which the cost is compared with the Gaussian one [sigma]
@@ -53,21 +52,6 @@ class ProfilePoint:
     chart: Chart
     P: Array
     pin: Pin
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Component:
-    """One Gaussian of a mixture: its weight, and mean and covariance at the last pose.
-
-    ``P_chart`` (20, 20) is the covariance in the chart: where two moments are nearly equal, rounding of the much larger
-    error states of mu would spoil that of the other states. ``share`` is the part of the correction by process noise
-    that the mean contains.
-    """
-
-    weight: float
-    belief: Belief
-    P_chart: Array
-    share: float = 1.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -228,8 +212,8 @@ def final_mixture(
             y, P = np.zeros(DIM), fitted.P_chart
         if pin is None:
             P = definite(P if spread is None else spread @ P @ spread.T)  # spread: for the trajectory of the fit alone
-        x, step = propagate_chart(chart, after_s, problem.poses.arc)
-        base, move = to_chart(x), step @ y
+        base, step = propagate_chart(chart, after_s, problem.poses.arc)
+        move = step @ y
         share = 1.0
         if least_eigenvalue(P) < ROUNDING or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
             share = _accepted_share(base, move, recent)
@@ -239,11 +223,9 @@ def final_mixture(
         if pin is not None and not least_eigenvalue(P) >= -ROUNDING:
             lost += weight  # about an unstable spin, rounding at the epoch has grown beyond the covariance
             continue
-        P = definite(P)
-        T = to_errors(there)
-        P_errors = T @ P @ T.T
-        out.append(Component(weight, Belief(t_ns, to_state(there), 0.5 * (P_errors + P_errors.T)), P, share))
-    return (replace(out[0], weight=out[0].weight + lost), *out[1:])
+        out.append(Component(weight, weight, t_ns, there, definite(P), share))
+    first = out[0].weight + lost
+    return (replace(out[0], weight=first, quadrature=first), *out[1:])
 
 
 def _fixed(P: Array, rows: list[Array]) -> Array:
@@ -269,57 +251,10 @@ def _accepted_share(base: Chart, move: Array, latest: Problem) -> float:
     return _SHARES[int(np.argmin(costs))]
 
 
-def moments(components: tuple[Component, ...]) -> Belief:
-    """Mean of the first component and the second moments of all about it."""
-    first = components[0].belief
-    if len(components) == 1:
-        return first
-    here = to_chart(first.x)
-    T = to_errors(here)
-    P = np.zeros((DIM, DIM))
-    for component in components:
-        y = to_chart(component.belief.x).minus(here)
-        P += component.weight * (np.outer(y, y) + component.P_chart)
-    P = T @ P @ T.T
-    return Belief(first.t_ns, first.x, 0.5 * (P + P.T))
-
-
-def mixture_forecast(
-    components: tuple[Component, ...], t_ns: int, times_s: Array, torque: float, force: float
-) -> Forecast:
-    """Predicted 1 sigma of the grasp point, each component propagated about its own trajectory.
-
-    About the mean alone the propagation would be wrong by orders of magnitude where the components differ in inertia:
-    a spin that is stable for one of them is unstable for another.
-
-    Args:
-        components: at the last fit, the first with the mean that is published.
-        t_ns: the present instant [ns].
-        times_s: (n,) >= 0, ascending [s after the present].
-        torque: root density of the angular disturbance [rad/s^1.5].
-        force: root density of the linear disturbance [m/s^1.5].
-    """
-    times = np.asarray(times_s, dtype=np.float64)
-    total, centre = np.zeros((len(times), 3)), None
-    for component in components:
-        ahead = times + (t_ns - component.belief.t_ns) * 1e-9
-        predicted = grasp_prediction(component.belief, ahead, torque, force)
-        if predicted is None:
-            return Forecast(times, *np.full((3, len(times)), np.inf))
-        variances, motion = predicted
-        centre = motion if centre is None else centre
-        position, velocity = ((motion[:, k : k + 3] - centre[:, k : k + 3]) for k in (0, 3))
-        turn = geometry.multiply(geometry.conjugate(centre[:, 6:]), motion[:, 6:])[:, :3]
-        off = np.stack([(d * d).sum(axis=1) for d in (position, velocity, turn)], axis=1)
-        total += component.weight * (variances + off)
-    position, velocity, half_angle = np.sqrt(np.maximum(total, 0.0)).T
-    return Forecast(times, position, velocity, 2.0 * half_angle)
-
-
-def propagate_chart(chart: Chart, h: float, arc: OrbitArc | None = None) -> tuple[State, Array]:
-    """The state h seconds later, and the transition matrix (20, 20) in chart coordinates."""
-    there, Phi = propagate_state(to_state(chart), h, arc)
-    return there, np.asarray(np.linalg.solve(to_errors(to_chart(there)), Phi @ to_errors(chart)))
+def propagate_chart(chart: Chart, h: float, arc: OrbitArc | None = None) -> tuple[Chart, Array]:
+    """The motion h seconds later, and the transition matrix (20, 20) of steps of the chart."""
+    there, step = _motion.transition(chart.flat, h, translation(h, arc))
+    return Chart.of(there), step
 
 
 def memory_s(torque: float, pose_rad: float = _LINEAR_RAD**2) -> float:

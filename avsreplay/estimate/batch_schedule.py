@@ -29,6 +29,7 @@ from avsreplay.estimate.initialise import (
     pose_count,
 )
 from avsreplay.estimate.measurement import chart_update, in_fixture, measured_pose, measurement_jacobian
+from avsreplay.estimate.mixture import carried, moments, worn
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
@@ -41,14 +42,14 @@ from avsreplay.settings import given
 FEWEST_TO_FIT = 3
 MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does not grow with the log
 FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
-FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a test of drift, and between two tests
+FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.15  # poses for a test of drift, and between two tests
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
 _DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
 _RECENT = 0.1  # largest age of a given start over the fit's memory; until then disturbances change it little
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
 _LEAST_TORQUE = 1e-6  # a fit looks back as far as this torque noise allows, even without disturbances [rad/s^1.5]
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
-LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
+LEVEL_GROWTH = 0.3  # share by which the poses grow between two estimates of the noise levels
 _LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
 _instant = attrgetter("t_ns")
 
@@ -75,13 +76,14 @@ class BatchSchedule:
     def initialised(self, track: Track, prediction: Prediction, innovation: Innovation, converged: bool) -> Track:
         """The track after a healthy pose while the fit is in use: a new fit if enough poses have come since the last.
 
-        Between fits the filter's update is applied only if the likelihood is Gaussian; otherwise the fit is propagated.
+        Between fits the filter's update is applied if the likelihood is Gaussian; otherwise every component of the
+        mixture is updated by itself.
         """
         track = replace(track, fixes=self._with(track, prediction, innovation), R=innovation.R, since=track.since + 1)
         if len(track.fixes) < FEWEST_TO_FIT:
             return replace(track, belief=self._first(track, prediction, innovation))
         last = track.batch
-        if last is None or track.since >= max(1.0, self._growth(last) * last.count):
+        if last is None or track.since >= max(1.0, self._growth(last) * last.count) or worn(last.components):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
             start = self._chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
             given = self._given(track)
@@ -93,7 +95,11 @@ class BatchSchedule:
         if last.gaussian:
             belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
             return replace(track, belief=belief)
-        return replace(track, belief=prediction.belief)
+        fix, factors = track.fixes[-1], last.factors * np.sqrt(last.inflation)
+        noise = self.noise_levels(track)
+        mixture = carried(last.components, fix.t_ns, fix.T_ac, fix.C, factors, innovation.weight, noise, self.orbit)
+        belief, _ = self.propagated(track, moments(mixture), prediction.belief.t_ns)
+        return replace(track, belief=belief, batch=replace(last, components=mixture))
 
     def _growth(self, last: BatchResult) -> float:
         """The share by which the poses grow until the next fit; a Gaussian likelihood is propagated well in between."""
@@ -107,6 +113,8 @@ class BatchSchedule:
         """The filter's track, or the fit's where a fit to the same poses contradicts it.
 
         A fit with a non-Gaussian likelihood replaces the filter only where the poses themselves contradict the filter.
+        The noise window stays, since the noise of the last scans may differ from the level of all poses; with many
+        outliers its residuals are errors of the estimate.
         """
         enough = max(FEWEST_TO_CHECK, CHECK_GROWTH * len(track.fixes))
         many_outliers = track.window.many_outliers
@@ -125,9 +133,10 @@ class BatchSchedule:
         )
         sound = result.gaussian and _better_than_measured(result.belief, track.R)
         if (sound or many_outliers) and contradicted(track.belief, result.belief):
-            return replace(self._adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
+            adopted = replace(self._adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
+            return adopted if many_outliers else replace(adopted, window=track.window)
         whole = last is not None and result.components[0].share == 1.0  # the fit has all poses of the filter
-        if sound and whole:  # the noise of the last scans may differ from the level of all poses
+        if sound and whole:
             return replace(self._adopted(track, result, to_filter=True), window=track.window)
         return replace(track, since=0)
 
@@ -211,9 +220,9 @@ class BatchSchedule:
         if track.prior is None or t_ns - track.prior_ns > _RECENT * self._memory_ns(track):
             return None
         arc = None if self.orbit is None else self.orbit.at(track.prior_ns)
-        x, step = propagate_chart(track.prior.mean, (t_ns - track.prior_ns) * 1e-9, arc)
+        mean, step = propagate_chart(track.prior.mean, (t_ns - track.prior_ns) * 1e-9, arc)
         P = step @ track.prior.P @ step.T
-        return Prior(to_chart(x), P) if float(np.sqrt(np.trace(P[:3, :3]))) < _GAUSSIAN_HALF_RAD else None
+        return Prior(mean, P) if float(np.sqrt(np.trace(P[:3, :3]))) < _GAUSSIAN_HALF_RAD else None
 
     def _adopted(self, track: Track, result: BatchResult, to_filter: bool) -> Track:
         """The track with the estimate of a fit; ``to_filter``: the filter continues from it."""

@@ -134,6 +134,15 @@ def process_noise(step: Flow, h: float, force: float) -> Array:
     return Q
 
 
+def translation(h: float, arc: OrbitArc | None = None) -> Array:
+    """(6, 6) position and velocity of the centre of mass h seconds later, by those now: free, or on an orbit."""
+    if arc is not None:
+        return np.ascontiguousarray(arc.transitions(np.array([h]))[0])
+    path = np.eye(6)
+    path[[0, 1, 2], [3, 4, 5]] = h
+    return path
+
+
 def translated(x: State, times_s: Array, arc: OrbitArc | None = None) -> tuple[Array, Array]:
     """Centre of mass and its velocity, (n, 3) each, ``times_s`` (n,) [s] after ``x``: free, or on an orbit."""
     if arc is None:

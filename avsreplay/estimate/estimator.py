@@ -17,7 +17,6 @@ from avsreplay.errors import UsageError
 from avsreplay.estimate import dynamics
 from avsreplay.estimate.acceleration import FreeFall, accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
-from avsreplay.estimate.batch_covariance import mixture_forecast
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import to_state
 from avsreplay.estimate.error_state import RHO
@@ -32,6 +31,7 @@ from avsreplay.estimate.measurement import (
     measurement_jacobian,
     residual,
 )
+from avsreplay.estimate.mixture import mixture_forecast
 from avsreplay.estimate.noise import NO_INFLATION, Noise, line_of_sight_1s
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.relative_orbit import RelativeOrbit
@@ -181,16 +181,14 @@ class Estimator:
 
         The gate is the 99.99 % point of the residual's square in the metric of R plus the covariance of the pose.
 
-        None where the scan did not change the estimate: before the first fit, and between two fits with a
-        non-Gaussian likelihood.
+        None before the first fit.
 
         Args:
             track: after a healthy scan.
             prediction: of that scan.
             innovation: of that scan.
         """
-        between = track.mode == "fit" and track.since > 0 and not (track.batch is not None and track.batch.gaussian)
-        if between or track.mode not in ("fit", "filter"):
+        if track.mode not in ("fit", "filter"):
             return None
         left = residual(track.belief.x, prediction.belief.x, innovation.alpha)
         R = self.noise.rescaled(innovation.R, prediction.window, track.window)

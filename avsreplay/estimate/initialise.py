@@ -22,16 +22,15 @@ from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem,
 from avsreplay.estimate.batch_covariance import (
     LATEST,
     BatchCovariance,
-    Component,
     covariance_of,
     final_mixture,
-    moments,
     sandwich,
 )
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.error_state import DIM, boxplus, hamilton
 from avsreplay.estimate.measurement import in_camera, measurement_jacobian
+from avsreplay.estimate.mixture import Component, moments
 from avsreplay.estimate.noise import BOUND
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import normal_points

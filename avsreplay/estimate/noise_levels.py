@@ -32,7 +32,7 @@ from avsreplay.estimate.dynamics import rotation_history, torque_density
 from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.geometry import Array
 
-MOST_POINTS = 40  # normal points of an estimate
+MOST_POINTS = 24  # normal points of an estimate
 FEWEST = 12  # poses from which the levels are estimated
 _VIEW_RAD = 0.5  # 1 sigma of the correlation of the common errors over the direction of view
 _CLAIMED_DOF, _LAW_DOF = 6.0, 1.0  # weight of the prior of the independent and of the common errors

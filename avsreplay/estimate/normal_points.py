@@ -13,7 +13,8 @@ from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import GATE
 from avsreplay.geometry import Array
 
-_POINTS, _SPAN_RAD = 128, 0.25  # normal points, and least rotation over which poses are joined [rad]
+_POINTS, _SPAN_RAD = 128, 0.25  # most normal points, and least rotation over which poses are joined [rad]
+_FEW = 48  # poses up to which none are joined
 
 
 def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _POINTS) -> Poses:
@@ -29,10 +30,10 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
         poses: the measurements.
         reference: initial values of a motion close to them.
         factors: (2,) noise factors of attitude and position, for the weights of outliers.
-        most: number of normal points above which poses are joined. A gap in the poses may add one point.
+        most: largest number of normal points. A gap in the poses may add one point.
     """
     n, rate = len(poses), float(np.linalg.norm(reference.w_c))
-    if n <= most:
+    if n <= min(most, _FEW):
         return poses
     first = _parts(rate * (poses.times_s - poses.times_s[0]), most)
     d = poses.residuals(Problem(poses, Prior(reference, np.eye(DIM)), factors), reference)
@@ -72,7 +73,7 @@ def _parts(turned: Array, most: int) -> NDArray[np.int64]:
         most: number of normal points.
     """
     n = len(turned)
-    span, size = max(_SPAN_RAD, float(turned[-1]) / most), -(-n // most)
+    span, size = max(_SPAN_RAD, float(turned[-1]) / most), -(-n // min(most, _FEW))
     out = [0]
     while (next_ := min(int(np.searchsorted(turned, turned[out[-1]] + span)), out[-1] + size)) < n:
         out.append(next_)

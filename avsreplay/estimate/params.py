@@ -124,7 +124,7 @@ class EstimatorParams(Settings):
         " from zero (paper); auto is near where a belief is given and cold otherwise.",
     )
     refit_growth: float = setting(
-        0.05,
+        0.2,
         "The batch fit is repeated when the number of healthy poses has grown by this share, until its likelihood is"
         " close to Gaussian.",
         low=0.0,

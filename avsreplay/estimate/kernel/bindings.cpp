@@ -300,6 +300,30 @@ nb::tuple smooth(const Problem& self, const Vector<DIM>& y0, const Matrix<DIM, D
   return nb::make_tuple(made(y), made(P));
 }
 
+// The chart h seconds later, and the transition (20, 20) of its steps.
+nb::tuple transition_of(const Flat& from, double h, const Matrix<6, 6>& path) {
+  Chart c = chart(from);
+  Square F;
+  transition(c, h, as<double[6][6]>(path.data()), nullptr, 0, F, nullptr);
+  return nb::make_tuple(flat(c), made(F));
+}
+
+// Chart and P (20, 20) h seconds later and corrected by a pose; its chi-square and the log determinant.
+nb::tuple carry_of(const Flat& from, const Matrix<DIM, DIM>& P0, double h, const Matrix<6, 6>& path,
+                   const Three& torque, double force, const Vector<4>& q, const Vector<3>& p, const Matrix<SEEN, SEEN>& root, const Two& factors,
+                   double weight) {
+  Chart c = chart(from);
+  Square P;
+  std::memcpy(P, P0.data(), sizeof P);
+  Measured pose = {};
+  std::memcpy(&pose.q, q.data(), sizeof pose.q);
+  std::memcpy(&pose.p, p.data(), sizeof pose.p);
+  std::memcpy(pose.root, root.data(), sizeof pose.root);
+  double told[2];
+  carry(c, P, h, as<double[6][6]>(path.data()), torque.data(), force, pose, factors.data(), weight, told);
+  return nb::make_tuple(flat(c), made(P), told[0], told[1]);
+}
+
 }  // namespace
 
 NB_MODULE(_motion, m) {
@@ -315,6 +339,9 @@ NB_MODULE(_motion, m) {
   m.def("minus", &minus_of, nb::arg("chart"), nb::arg("other"));
   m.def("state", &state, nb::arg("chart"));
   m.def("errors", &errors, nb::arg("chart"));
+  m.def("transition", &transition_of, nb::arg("chart"), nb::arg("h"), nb::arg("path"));
+  m.def("carry", &carry_of, nb::arg("chart"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
+        nb::arg("force"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("factors"), nb::arg("weight"));
   nb::class_<Problem>(m, "Problem")
       .def("__init__", &create, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),
            nb::arg("mean"), nb::arg("prior_info"))

@@ -71,6 +71,16 @@ class Problem {
   double penalty(const Chart& chart) const;
 };
 
+// A chart h seconds later, the transition F of its steps, and the noise Q that disturbances of these densities add to
+// them. `path` takes position and velocity of the centre of mass there. Without densities and Q it is the motion alone.
+void transition(Chart& chart, double h, const double path[6][6], const double* torque_density, double force_density,
+                Square F, double (*Q)[MOTION]);
+
+// A Gaussian in chart steps h seconds later, corrected by a pose there, whose time does not matter. `told`: chi-square of
+// the pose and log determinant of its covariance, both before the correction and relative to the noise of the pose.
+void carry(Chart& chart, Square P, double h, const double path[6][6], const double torque_density[3],
+           double force_density, const Measured& pose, const double factors[2], double weight, double told[2]);
+
 // The rotation of a state, and its body with the derivative of sigma1..3 by the two that are states.
 Turn turn_of(const State& x);
 Body body_of(const State& x, double join[3][2]);

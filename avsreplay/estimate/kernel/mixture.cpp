@@ -1,0 +1,157 @@
+// A Gaussian in chart steps that is carried on through time and corrected by a pose (mixture.py).
+#include <cstring>
+#include <limits>
+#include <utility>
+
+#include "fit.hpp"
+
+namespace avs {
+namespace {
+
+// B := A^-1 B for A (N, N), B (N, M), by elimination with the largest pivot of each column; A is overwritten.
+template <int N, int M>
+void divide(double A[N][N], double B[N][M]) {
+  for (int k = 0; k < N; ++k) {
+    int best = k;
+    for (int r = k + 1; r < N; ++r)
+      if (std::fabs(A[r][k]) > std::fabs(A[best][k])) best = r;
+    if (best != k) {
+      for (int c = 0; c < N; ++c) std::swap(A[k][c], A[best][c]);
+      for (int c = 0; c < M; ++c) std::swap(B[k][c], B[best][c]);
+    }
+    for (int r = k + 1; r < N; ++r) {
+      const double f = A[r][k] / A[k][k];
+      if (f == 0) continue;
+      for (int c = k; c < N; ++c) A[r][c] -= f * A[k][c];
+      for (int c = 0; c < M; ++c) B[r][c] -= f * B[k][c];
+    }
+  }
+  for (int k = N - 1; k >= 0; --k)
+    for (int c = 0; c < M; ++c) {
+      double s = B[k][c];
+      for (int i = k + 1; i < N; ++i) s -= A[k][i] * B[i][c];
+      B[k][c] = s / A[k][k];
+    }
+}
+
+// A B A' for symmetric B, exactly symmetric.
+template <int N>
+void congruent(const double A[N][N], const double B[N][N], double out[N][N]) {
+  double AB[N][N], At[N][N];
+  for (int r = 0; r < N; ++r) {
+    double s[N] = {};
+    for (int i = 0; i < N; ++i)
+      for (int c = 0; c < N; ++c) s[c] += A[r][i] * B[i][c];
+    std::memcpy(AB[r], s, sizeof s);
+    for (int c = 0; c < N; ++c) At[c][r] = A[r][c];
+  }
+  for (int r = 0; r < N; ++r) {
+    double s[N] = {};
+    for (int i = 0; i < N; ++i)
+      for (int c = 0; c < N; ++c) s[c] += AB[r][i] * At[i][c];
+    std::memcpy(out[r], s, sizeof s);
+  }
+  for (int r = 0; r < N; ++r)
+    for (int c = 0; c < r; ++c) out[r][c] = out[c][r] = 0.5 * (out[r][c] + out[c][r]);
+}
+
+// chi-square and log determinant of off ~ N(0, 1 + H P H').
+void evidence(const double off[SEEN], const double H[SEEN][DIM], const Square P, double out[2]) {
+  double HP[SEEN][DIM], L[SEEN][SEEN], D[SEEN], left[SEEN], det = 1;
+  product<SEEN, DIM>(H, P, HP);
+  out[0] = 0;
+  for (int r = 0; r < SEEN; ++r) {
+    left[r] = off[r];
+    for (int c = 0; c <= r; ++c) {
+      double s = c == r;
+      for (int i = 0; i < DIM; ++i) s += HP[r][i] * H[c][i];
+      for (int i = 0; i < c; ++i) s -= L[r][i] * D[i] * L[c][i];
+      if (c < r) L[r][c] = s / D[c];
+      else D[r] = s;
+    }
+    for (int i = 0; i < r; ++i) left[r] -= L[r][i] * left[i];
+    out[0] += left[r] * left[r] / D[r];
+    det *= D[r];
+  }
+  out[1] = det > 1 ? log_of(det) : 0;  // of 1 and a positive semidefinite matrix
+}
+
+}  // namespace
+
+void transition(Chart& chart, double h, const double path[6][6], const double* torque_density, double force_density,
+                Square F, double (*Q)[MOTION]) {
+  State x = state_of(chart);
+  double join[3][2];
+  Body body = body_of(x, join);
+  body.tail = 1e-12;
+  if (torque_density) std::memcpy(body.push, torque_density, sizeof body.push);
+  Flow flow = begin(turn_of(x));
+  avs::advance(flow, body, h);
+  Square T, Phi = {};
+  errors_of(chart, T);
+  for (int r = 0; r < DIM; ++r) Phi[r][r] = 1;
+  for (int r = 0; r < 6; ++r) {
+    std::memcpy(Phi[r], flow.S[r], 6 * sizeof(double));
+    for (int c = 0; c < 2; ++c)
+      Phi[r][12 + c] = flow.S[r][6] * join[0][c] + flow.S[r][7] * join[1][c] + flow.S[r][8] * join[2][c];
+  }
+  double centre[6];
+  for (int r = 0; r < 6; ++r) {
+    std::memcpy(&Phi[6 + r][6], path[r], sizeof path[r]);
+    centre[r] = 0;
+    for (int c = 0; c < 3; ++c) centre[r] += path[r][c] * x.r_a[c] + path[r][3 + c] * x.v_a[c];
+  }
+  std::memcpy(x.r_a, centre, sizeof x.r_a);
+  std::memcpy(x.v_a, centre + 3, sizeof x.v_a);
+  std::memcpy(x.q_ab, flow.at.q, sizeof x.q_ab);
+  std::memcpy(x.w_b, flow.at.w, sizeof x.w_b);
+  chart = chart_of(x);
+  product<DIM, DIM>(Phi, T, F);
+  errors_of(chart, T);
+  if (Q) {
+    double noise[MOTION][MOTION] = {}, into[MOTION][MOTION] = {}, first[MOTION][MOTION];
+    for (int r = 0; r < MOTION; ++r) {
+      into[r][r] = 1;
+      std::memcpy(first[r], T[r], sizeof first[r]);
+    }
+    divide<MOTION, MOTION>(first, into);
+    for (int r = 0; r < 6; ++r) std::memcpy(noise[r], flow.Q[r], sizeof flow.Q[r]);
+    const double d = std::fabs(h);
+    for (int r = 6; r < 9; ++r) {
+      noise[r][r] = force_density * d * d * d / 3;
+      noise[r][r + 3] = noise[r + 3][r] = force_density * d * d / 2;
+      noise[r + 3][r + 3] = force_density * d;
+    }
+    congruent<MOTION>(into, noise, Q);
+  }
+  divide<DIM, DIM>(T, F);
+}
+
+void carry(Chart& chart, Square P, double h, const double path[6][6], const double torque_density[3],
+           double force_density, const Measured& pose, const double factors[2], double weight, double told[2]) {
+  Square F, moved_on, T;
+  double Q[MOTION][MOTION], y[DIM] = {}, e[SEEN];
+  transition(chart, h, path, torque_density, force_density, F, Q);
+  congruent<DIM>(F, P, moved_on);
+  std::memcpy(P, moved_on, sizeof(Square));
+  Problem one;
+  one.poses = {pose};
+  one.mean = chart;
+  std::memset(one.prior_info, 0, sizeof one.prior_info);
+  one.factors[0] = factors[0], one.factors[1] = factors[1];
+  one.slack = std::numeric_limits<double>::infinity();
+  one.linearise(chart);
+  one.weights[0] = weight;
+  Rows H, HT;
+  one.whitened(0, e, H);
+  errors_of(chart, T);
+  product<SEEN, DIM>(H, T, HT);
+  for (int r = 0; r < MOTION; ++r)
+    for (int c = 0; c < MOTION; ++c) P[r][c] += Q[r][c];
+  const double none[MOTION][MOTION] = {};
+  evidence(e, HT, P, told);
+  pass(y, P, e, HT, none);
+  chart = moved(chart, y);
+}
+
+}  // namespace avs

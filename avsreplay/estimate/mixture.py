@@ -1,0 +1,139 @@
+"""The result of a fit as a mixture of Gaussians, carried on from scan to scan until the next fit.
+
+Each component is linearised about its own trajectory: a pose corrects its mean and covariance as in the filter, and its
+weight by the likelihood of the pose. No new fit is needed while the weights are still those of a quadrature.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.estimate import _motion
+from avsreplay.estimate.chart import Chart, to_errors, to_state
+from avsreplay.estimate.dynamics import grasp_prediction, torque_density, translation
+from avsreplay.estimate.error_state import DIM
+from avsreplay.estimate.relative_orbit import RelativeOrbit
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Belief, Forecast
+
+_MOVED = 0.5  # sum of the changes of the weights from which the mixture is no longer a quadrature
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Component:
+    """One Gaussian of a mixture.
+
+    The covariance is in the chart: where two moments are nearly equal, rounding of the much larger error states of mu
+    would spoil that of the other states.
+
+    Attributes:
+        weight: by now.  quadrature: its weight at the fit.
+        t_ns: instant of ``chart``, its mean, and of ``P`` (20, 20), its covariance in the chart.
+        share: part of the correction by process noise that the mean contains.
+    """
+
+    weight: float
+    quadrature: float
+    t_ns: int
+    chart: Chart
+    P: Array
+    share: float = 1.0
+
+    @property
+    def belief(self) -> Belief:
+        """Mean, and covariance of the error states."""
+        T = to_errors(self.chart)
+        P = T @ self.P @ T.T
+        return Belief(self.t_ns, to_state(self.chart), 0.5 * (P + P.T))
+
+
+def moments(components: tuple[Component, ...]) -> Belief:
+    """Mean and second moments about it: the mean of the first component, and what the weights have moved it since."""
+    first = components[0]
+    if len(components) == 1:
+        return first.belief
+    off = np.array([c.chart.minus(first.chart) for c in components])
+    shift = np.array([c.weight - c.quadrature for c in components]) @ off
+    P = np.zeros((DIM, DIM))
+    for component, y in zip(components, off - shift, strict=True):
+        P += component.weight * (np.outer(y, y) + component.P)
+    return replace(first, chart=first.chart.moved(shift), P=P).belief
+
+
+def worn(components: tuple[Component, ...]) -> bool:
+    """Return whether the poses since the fit have changed the weights so much that another fit is due."""
+    return sum(abs(c.weight - c.quadrature) for c in components) > _MOVED
+
+
+def carried(
+    components: tuple[Component, ...],
+    t_ns: int,
+    pose: Pose,
+    C: Array,
+    factors: Array,
+    weight: float,
+    noise: tuple[float, float],
+    orbit: RelativeOrbit | None = None,
+) -> tuple[Component, ...]:
+    """The mixture at a later pose, and corrected by it.
+
+    Args:
+        components: after an earlier pose.
+        t_ns: instant of the pose [ns].
+        pose: measured T_ac.
+        C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
+        factors: (2,) on the standard deviations of attitude and position.
+        weight: Cauchy weight of the pose.
+        noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
+        orbit: the relative orbit that the target is on; None for free motion.
+    """
+    root, pair = np.linalg.inv(np.linalg.cholesky(C)), (float(factors[0]), float(factors[1]))
+    found = []
+    for c in components:
+        density = torque_density(to_state(c.chart).sigma, noise[0])
+        h = (t_ns - c.t_ns) * 1e-9
+        path = translation(h, None if orbit is None else orbit.at(c.t_ns))
+        chart, P, chi2, log_det = _motion.carry(
+            c.chart.flat, c.P, h, path, density, noise[1] ** 2, pose.q, pose.t, root, pair, weight
+        )
+        found.append((replace(c, t_ns=t_ns, chart=Chart.of(chart), P=P), -0.5 * (chi2 + log_det)))
+    best = max(value for _, value in found)
+    weights = [c.weight * math.exp(value - best) for c, value in found]
+    total = sum(weights)
+    return tuple(replace(c, weight=w / total) for (c, _), w in zip(found, weights, strict=True))
+
+
+def mixture_forecast(
+    components: tuple[Component, ...], t_ns: int, times_s: Array, torque: float, force: float
+) -> Forecast:
+    """Predicted 1 sigma of the grasp point, each component propagated about its own trajectory.
+
+    About the mean alone the propagation would be wrong by orders of magnitude where the components differ in inertia:
+    a spin that is stable for one of them is unstable for another.
+
+    Args:
+        components: at the last pose, the first with the mean that is published.
+        t_ns: the present instant [ns].
+        times_s: (n,) >= 0, ascending [s after the present].
+        torque: root density of the angular disturbance [rad/s^1.5].
+        force: root density of the linear disturbance [m/s^1.5].
+    """
+    times = np.asarray(times_s, dtype=np.float64)
+    total, centre = np.zeros((len(times), 3)), None
+    for component in components:
+        ahead = times + (t_ns - component.t_ns) * 1e-9
+        predicted = grasp_prediction(component.belief, ahead, torque, force)
+        if predicted is None:
+            return Forecast(times, *np.full((3, len(times)), np.inf))
+        variances, motion = predicted
+        centre = motion if centre is None else centre
+        position, velocity = ((motion[:, k : k + 3] - centre[:, k : k + 3]) for k in (0, 3))
+        turn = geometry.multiply(geometry.conjugate(centre[:, 6:]), motion[:, 6:])[:, :3]
+        off = np.stack([(d * d).sum(axis=1) for d in (position, velocity, turn)], axis=1)
+        total += component.weight * (variances + off)
+    position, velocity, half_angle = np.sqrt(np.maximum(total, 0.0)).T
+    return Forecast(times, position, velocity, 2.0 * half_angle)
