@@ -147,6 +147,21 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     return Systematic(extent_m, patch_m, block_m2, smooth_m2, amplitudes, fit, found.centre)
 
 
+def patch_size(found: Evidence, extent_m: float, patch_m: float) -> tuple[float, float]:
+    """Return the size of the target over that of the model, less 1, and its standard error, from the sums of patches.
+
+    The size is fitted with the pose by linear least squares, with a patch as one point for the size. The standard
+    error is the cluster-robust one over the patches. Both are 0 where a pose explains any size.
+
+    Args:
+        found: sums at the registered pose.
+        extent_m: diagonal of the model's bounding box.
+        patch_m: side of a patch.
+    """
+    delta, sigma = _table(found, found.centre, extent_m, patch_m).size_error()
+    return float(delta), float(sigma)
+
+
 def registration_covariance(found: Evidence, errors: Systematic) -> tuple[Array, float]:
     """Return the covariance (6, 6) of the registered pose, systematic errors included, and its degrees of freedom.
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
+from avsreplay.records import Surface
 
 MAGIC = b"AVSINDEX"
 HEADER = 64  # the arrays of the payload are aligned to this in the file and in memory
@@ -37,6 +38,12 @@ def user_folder() -> Path | None:
         return Path.home() / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "avsreplay"
     except RuntimeError:  # no home folder
         return None
+
+
+def folder_for(surface: Surface) -> Path | None:
+    """Return the cache folder if the surface is large enough for a file; else None."""
+    large = max(len(surface.vertices), len(surface.faces)) >= LEAST_PRIMITIVES
+    return user_folder() if large else None
 
 
 def cache_path(folder: Path, layout: int, vertices: Array, faces: NDArray[np.int32], reach_m: float) -> Path:

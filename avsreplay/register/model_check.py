@@ -2,9 +2,9 @@
 
 Size: along a run, the factor between target and model is estimated from the residuals of registered scans. With
 T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
-n . (p - c) = J d + delta n . p. Least squares per scan give delta after the pose is eliminated; scans are weighted by
-the information on delta, and their spread gives the standard error (jackknife over scans). Noise makes thin parts
-appear thicker, so errors below the rms fit error in units of the extent are not reported.
+n . (p - c) = J d + delta n . p. Least squares per scan give delta after the pose is eliminated (``size``); scans are
+weighted by the inverse of its variance, and their spread gives the standard error (jackknife over scans). The bias that
+noise causes is found on a few of the scans and subtracted; half of it counts as a standard error.
 
 Shape: if no scan was registered, the global search is repeated with the mirrored model. The unit of the model is
 checked before a run (``preflight``).
@@ -23,14 +23,14 @@ from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import without_scattered_points
-from avsreplay.register.size import LEAST_ERROR
+from avsreplay.register.size import LEAST_ERROR, SIGMAS
 from avsreplay.register.visibility import is_outward
 
 POINTS = 1500  # points used of each scan
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
-LEAST_INFORMATION = 1e-3  # least share of n . p that the pose cannot explain
+BIAS_SCANS = 4  # scans on which the bias of the noise is found
+MOST_WEIGHT = 4.0  # of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
-SIGMAS = 4.0  # least |delta| in standard errors that is reported
 
 
 class ModelCheck:
@@ -47,7 +47,7 @@ class ModelCheck:
         self._seen, self._aligned = 0, 0
         self._deltas: list[float] = []
         self._weights: list[float] = []
-        self._rms: list[float] = []
+        self._points: list[tuple[Array, Array]] = []  # of each scan that was measured, and the camera, in {C}
         self._unmatched: NDArray[Any] | None = None
 
     def add(self, points: NDArray[Any], found: Alignment | None) -> None:
@@ -71,11 +71,15 @@ class ModelCheck:
         if len(self._deltas) < LEAST_SCANS:
             return None
         delta, weight = np.array(self._deltas), np.array(self._weights)
-        weight = np.minimum(weight, 4.0 * np.median(weight))
+        weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
         mean = float(weight @ delta / weight.sum())
         without = (weight @ delta - weight * delta) / (weight.sum() - weight)
         n = len(delta)
-        return 1.0 + mean, float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+        spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+        tried = np.linspace(0, n - 1, BIAS_SCANS).astype(np.intp)
+        bias = [self._registrar.size_bias(*self._points[k]) for k in tried]
+        mean_bias = float(weight[tried] @ np.array(bias) / weight[tried].sum())
+        return 1.0 + mean - mean_bias, float(np.hypot(spread, 0.5 * mean_bias))
 
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there are none."""
@@ -92,8 +96,7 @@ class ModelCheck:
         found = self.scale()
         if found is None:
             return ()
-        least = max(LEAST_ERROR + float(np.median(self._rms)), SIGMAS * found[1])
-        if abs(found[0] - 1.0) < least:
+        if abs(found[0] - 1.0) < max(LEAST_ERROR, SIGMAS * found[1]):
             return ()
         small = "small" if found[0] > 1.0 else "large"
         percent = 100.0 * abs(found[0] - 1.0)
@@ -107,10 +110,10 @@ class ModelCheck:
         T_ca = alignment.T_ac.inverse()
         p = T_ca.apply(finite[:: max(1, len(finite) // POINTS)])
         measured = self._registrar.fitted_size(p, T_ca.t)
-        if measured is not None and measured.share > LEAST_INFORMATION:
+        if measured is not None and measured.sigma > 0.0:
             self._deltas.append(measured.delta)
-            self._weights.append(measured.share)
-            self._rms.append(alignment.rms_m / self._surface.extent)
+            self._weights.append(1.0 / measured.sigma**2)
+            self._points.append((p, T_ca.t))
 
     def _diagnosis(self, points: NDArray[Any]) -> str:
         """Try the mirrored model on a scan that was not registered, and compare the sizes."""

@@ -17,6 +17,7 @@ from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.covariance import (
     Evidence,
+    patch_size,
     pseudo_inverse,
     registration_covariance,
     sandwich_covariance,
@@ -35,6 +36,8 @@ SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
 FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
 AS_MANY, AS_NEAR = 0.99, 1.02  # inliers and rms of a pose that fits as well
+SUGGESTED, SUGGESTED_SIGMAS = 0.4, 2.5  # an error of size by the sums of patches: share of the least one, and sigmas
+MANY_INLIERS = 0.9  # with a smaller share the sums of the inliers alone do not show the size
 UNCHANGED = 0.06  # chi-square with 6 degrees of freedom is smaller with probability 4e-6
 ACCURACY = (0.1, 1e-3)  # deg and share of the extent, of a back end that states none of its own
 AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
@@ -124,17 +127,16 @@ def grade(
     info = frozen(total / found.noise_m**2)
     weakest = unobservable_directions(total, int(found.counts.sum()), found.centre) if overlap else ()
     across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    P, dof, split, strain = None, np.inf, None, 0.0
+    P, dof, split = None, np.inf, None
     if overlap and not weakest:
-        P, dof, split, strain = _covariance(found, across, index.extent_m, systematic)
+        P, dof, split = _covariance(found, across, index.extent_m, systematic)
     unbounded = () if P is None else unbounded_directions(P, index.extent_m)
     if P is not None and unbounded:
         info, P, weakest = frozen(pseudo_inverse(P)), None, unbounded
     settled = P is None or not _beyond(left, P, index.extent_m, accuracy)
     size = None
-    if P is not None and settled and abs(strain) > LEAST_ERROR:
-        camera_c = visibility.camera_c(index, points, fit.T_ca)
-        size = size_error(index, points, fit.T_ca, camera_c, found.rms_m)
+    if P is not None and settled and systematic and _other_size(found, index.extent_m):
+        size = size_error(index, points, fit.T_ca, visibility.camera_c(index, points, fit.T_ca))
         P = P if size is None else P + np.outer(size.shift, size.shift)
     return Alignment(
         T_ac=fit.T_ca.inverse(),
@@ -151,6 +153,14 @@ def grade(
         message=_message(settled, size),
         dof=np.inf if P is None else dof,
     )
+
+
+def _other_size(found: Evidence, extent_m: float) -> bool:
+    """Whether another size is worth a fit: the sums of patches suggest one, or many points are not on the model."""
+    if found.inliers < MANY_INLIERS * found.points:
+        return True
+    delta, sigma = patch_size(found, extent_m, PATCH_OF_EXTENT * extent_m)
+    return abs(delta) > max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * sigma)
 
 
 def _message(settled: bool, size: SizeError | None) -> str:
@@ -186,18 +196,14 @@ def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float
 
 def _covariance(
     found: Evidence, across: Array, extent_m: float, systematic: bool
-) -> tuple[Array | None, float, float | None, float]:
-    """Covariance, its degrees of freedom, the test of halves along ``across`` (k, 3) in {C}, and the mean strain.
-
-    The strain is 0 if it is not significant.
-    """
+) -> tuple[Array | None, float, float | None]:
+    """Covariance, its degrees of freedom, and the test of halves along ``across`` (k, 3) in {C}."""
     if not (systematic or len(across)):
-        return *sandwich_covariance(found.normals, found.gradients), None, 0.0
+        return *sandwich_covariance(found.normals, found.gradients), None
     errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
     bare = not systematic
     P, dof = sandwich_covariance(found.normals, found.gradients) if bare else registration_covariance(found, errors)
-    strain = float(errors.amplitudes[:3].mean()) / extent_m if systematic and errors.smooth_m2[0] > 0.0 else 0.0
-    return P, dof, split_nis(found, errors, across), strain
+    return P, dof, split_nis(found, errors, across)
 
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:

@@ -21,7 +21,7 @@ from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import HEALTHY_SCANS, SCATTER_WORK, TEST_WORK, VALLEY_WORK, Budget, Restart, Restarter
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
-from avsreplay.register.size import SizeError, fitted_size
+from avsreplay.register.size import SizeError, fitted_size, noise_bias
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
@@ -56,7 +56,8 @@ class Registrar:
         self.params = params or RegisterParams()
         self.limits = self.params.limits(surface.extent)
         factory = load_backend(self.params.backend)  # before the index, so that a wrong name is reported at once
-        self._index = _indexed(surface, self.limits.reach_m, self.params)
+        cache_dir = index_cache.folder_for(surface) if self.params.index_cache else None
+        self._index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
         self._visibility = Visibility(surface, self.params.camera)
         self._target = Target(surface, self._index, self.limits, self._visibility)
         self._accuracy: tuple[float, float] = getattr(factory, "accuracy", quality.ACCURACY)
@@ -204,6 +205,10 @@ class Registrar:
         """
         return fitted_size(self._index, p, camera_c if self._visibility.sided else None)
 
+    def size_bias(self, p: Array, camera_c: Array) -> float:
+        """Return the size, less 1, that the noise of a scan causes, see ``size.noise_bias``; arguments as above."""
+        return noise_bias(self._index, p, camera_c if self._visibility.sided else None)
+
     @cached_property
     def _global(self) -> GlobalSearch:
         return GlobalSearch(self._target, self.params.acquire)
@@ -340,9 +345,3 @@ class Registrar:
         except Exception as error:  # an error of a library is a status of this scan, not the end of a replay
             return f"{name} failed: {type(error).__name__}: {error}".splitlines()[0][:MESSAGE_LENGTH]
         return fit if finite else f"{name} returned a pose that is not finite"
-
-
-def _indexed(surface: Surface, reach_m: float, params: RegisterParams) -> SurfaceIndex:
-    large = max(len(surface.vertices), len(surface.faces)) >= index_cache.LEAST_PRIMITIVES
-    cache_dir = index_cache.user_folder() if params.index_cache and large else None
-    return SurfaceIndex.build(surface, reach_m, threads=params.threads, cache_dir=cache_dir)

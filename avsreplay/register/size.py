@@ -3,11 +3,22 @@
 With T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
 n . (p - c) = J d + delta n . p. Robust least squares give pose and delta; the points are matched again a few times,
 because the closest points move with both.
+
+Standard error: of the weighted residuals, which are correlated within a patch of the model (cluster-robust sandwich),
+and of other slowly varying errors of model and ranges, an anisotropic strain and an offset of the surface. Their
+amplitudes are fitted to what pose and size leave, and their variances enter with the change of delta that they cause.
+
+Bias: the closest point is a nonlinear function of the measured one, so that noise makes curved and thin parts appear
+larger. The same fit to the closest points with artificial noise of the same size along the rays, with both signs, gives
+this bias; it is subtracted, and half of it counts as a standard error (indirect inference: Gourieroux, Monfort and
+Renault, J. Applied Econometrics 8, 1993).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -19,9 +30,14 @@ from avsreplay.register.surface_index import SurfaceIndex
 
 LEAST_RESIDUALS = 50
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
-LEAST_ERROR = 0.005  # least |delta| that is reported, to which the rms over the extent is added
-LEAST_INFORMATION = 1e-2  # least share of n . p that the pose cannot explain
+LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta| that is reported, by itself and in standard errors
 WIDTH_OF_EXTENT, ROUNDS, POINTS = 0.02, 3, 600  # larger residuals are not used; times that the points are matched
+LARGEST_ERROR = 0.3  # a fit that goes further has not converged
+LEAST_INFORMATION = 1e-3  # least share of n . p that the pose cannot explain: three faces of a box tell no size
+PATCHES_OF_EXTENT = (0.05, 0.15)  # sides of the patches; the larger of the two standard errors counts
+LEAST_LEFT = 0.2  # a leverage above 0.8 enlarges the residual of a patch no further
+OBSERVABLE = 0.05  # an amplitude that the pose and the size explain to all but this share of its norm is not fitted
+CAUCHY, CAUCHY_VARIANCE = 2.0, 1.56  # width of the weights in standard deviations; variance over the weighted one
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,13 +46,18 @@ class SizeError:
 
     Attributes:
         delta: size of the target over that of the model, less 1.
-        share: share of n . p that no pose explains: the information on delta.
+        sigma: standard error of delta.
         shift: (6,) change d of the pose if the size is fitted with it, T_ac Exp(d).
     """
 
     delta: float
-    share: float
+    sigma: float
     shift: Array
+
+    @property
+    def significant(self) -> bool:
+        """Whether delta is larger than 0.5 % and than four standard errors."""
+        return abs(self.delta) > max(LEAST_ERROR, SIGMAS * self.sigma)
 
     @property
     def message(self) -> str:
@@ -45,9 +66,7 @@ class SizeError:
         return f"the scan fits a target {100.0 * abs(self.delta):.1f} % {larger} than the model"
 
 
-def size_error(
-    index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, camera_c: Array | None, rms_m: float
-) -> SizeError | None:
+def size_error(index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, camera_c: Array | None) -> SizeError | None:
     """Return the error of size that a registered scan shows.
 
     Args:
@@ -55,16 +74,46 @@ def size_error(
         points: (n, 3) in {A} [m].
         T_ca: registered pose.
         camera_c: (3,) position of the camera in {C} [m] if only faces towards it are matched.
-        rms_m: of the inliers; noise makes thin parts appear thicker, so an error of size below it is not reported.
 
     Returns:
-        The error; None if it is too small, or if a pose explains it.
+        The error without the bias of the noise; None if it is not significant.
     """
     p = T_ca.apply(points[:: max(1, len(points) // POINTS)])
     found = fitted_size(index, p, camera_c)
-    if found is None or found.share < LEAST_INFORMATION:
+    if found is None or not found.significant:
         return None
-    return found if abs(found.delta) > LEAST_ERROR + rms_m / index.extent_m else None
+    bias = noise_bias(index, p, camera_c)
+    both = SizeError(found.delta - bias, float(np.hypot(found.sigma, 0.5 * bias)), found.shift)
+    return both if both.significant else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Rows:
+    """The weighted rows of the last round, and the result.
+
+    Attributes:
+        p, foot, normal: (k, 3) points used, in the model's size, their closest points and normals, {C} [m].
+        J: (k, 6) Jacobian of the pose about the mean of p.
+        free: (k,) effect of a unit of size that no pose explains.
+        left: (k,) residual.
+        weight: (k,) square root of the weight.
+        noise_m: standard deviation of the residual.
+    """
+
+    p: Array
+    foot: Array
+    normal: Array
+    J: Array
+    free: Array
+    left: Array
+    weight: Array
+    noise_m: float
+    delta: float
+    moved: Pose
+
+    @property
+    def information(self) -> float:
+        return max(float(self.free @ self.free), np.finfo(float).tiny)
 
 
 def fitted_size(index: SurfaceIndex, p: Array, camera_c: Array | None) -> SizeError | None:
@@ -76,31 +125,39 @@ def fitted_size(index: SurfaceIndex, p: Array, camera_c: Array | None) -> SizeEr
         camera_c: (3,) camera position in {C} [m], or None: both sides of a face are matched.
 
     Returns:
-        The fit; None with fewer than 50 residuals.
+        The fit, with the bias of the noise; None with fewer than 50 residuals, or if a pose explains any size.
     """
-    delta, share, moved = 0.0, 0.0, Pose.identity()
-    for _ in range(ROUNDS):
-        q = moved.apply(p) / (1.0 + delta)
-        found = index.closest(q, camera_c=camera_c)
-        near = found.d2 < (WIDTH_OF_EXTENT * index.extent_m) ** 2
-        if np.count_nonzero(near) < LEAST_RESIDUALS:
-            return None
-        n, q = found.normal[near], q[near]
-        e = np.einsum("ij,ij->i", n, q - found.foot[near])
-        J, a = normal_jacobian(q - q.mean(axis=0), n), np.einsum("ij,ij->i", n, q - q.mean(axis=0))
-        J, a, e = _weighted(J, a, e)
-        of_a, of_e = np.linalg.lstsq(J, np.column_stack([a, e]), rcond=1e-6)[0].T
-        free = a - J @ of_a
-        share = float(free @ free) / max(float(a @ a), np.finfo(float).tiny)
-        step = float(free @ e) / max(float(free @ free), np.finfo(float).tiny)
-        d = of_e - step * of_a
-        turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
-        centre = q.mean(axis=0)
-        about = centre - turn.R @ centre - d[3:] + step * centre
-        moved = Pose(turn.q, (1.0 + delta) * about) @ moved
-        delta = (1.0 + delta) * (1.0 + step) - 1.0
-    back = moved.inverse()
-    return SizeError(delta, share, np.concatenate([geometry.log(back.q), back.t]))
+    rows = _fitted(index, p, camera_c)
+    if rows is None:
+        return None
+    sigma = max(_clustered(rows, side * index.extent_m) for side in PATCHES_OF_EXTENT)
+    back = rows.moved.inverse()
+    shift = np.concatenate([geometry.log(back.q), back.t])
+    return SizeError(rows.delta, float(np.hypot(sigma, _systematic(rows, index.extent_m))), shift)
+
+
+def noise_bias(index: SurfaceIndex, p: Array, camera_c: Array | None) -> float:
+    """Return the size, less 1, that the noise of a scan makes a target of the right size appear to have.
+
+    Args:
+        index: of the model.
+        p: (n, 3) points in {C} [m], at the registered pose.
+        camera_c: (3,) camera position in {C} [m]; None: the noise is taken along the normals.
+
+    Returns:
+        The mean over noise of both signs, in which terms linear in the noise cancel. A fit that the noise prevents
+        counts with the largest error; 0 if there is no fit without it.
+    """
+    rows = _fitted(index, p, camera_c)
+    if rows is None:
+        return 0.0
+    rays = rows.normal if camera_c is None else rows.foot - np.asarray(camera_c)
+    rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    along = np.einsum("ij,ij->i", rays, rows.normal) * rows.weight
+    noise_m = float(np.sqrt(CAUCHY_VARIANCE * (rows.left @ rows.left) / (along @ along)))
+    moved = noise_m * _normal_numbers(len(rays))[:, None] * rays
+    found = [_fitted(index, rows.foot + sign * moved, camera_c) for sign in (1.0, -1.0)]
+    return float(np.mean([LARGEST_ERROR if each is None else each.delta for each in found]))
 
 
 def normal_jacobian(p: Array, n: Array) -> Array:
@@ -108,8 +165,83 @@ def normal_jacobian(p: Array, n: Array) -> Array:
     return np.hstack([np.cross(p, n), n])
 
 
-def _weighted(J: Array, a: Array, e: Array) -> tuple[Array, Array, Array]:
-    """Rows times the square root of their Cauchy weight; scale: robust standard deviation of e."""
+def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> _Rows | None:
+    delta, moved, rows = 0.0, Pose.identity(), None
+    for _ in range(ROUNDS):
+        q = moved.apply(p) / (1.0 + delta)
+        found = index.closest(q, camera_c=camera_c)
+        near = found.d2 < (WIDTH_OF_EXTENT * index.extent_m) ** 2
+        if np.count_nonzero(near) < LEAST_RESIDUALS:
+            return None
+        n, q, foot = found.normal[near], q[near], found.foot[near]
+        centre = q.mean(axis=0)
+        e = np.einsum("ij,ij->i", n, q - foot)
+        weight, noise = _weights(e)
+        J, a = weight[:, None] * normal_jacobian(q - centre, n), weight * np.einsum("ij,ij->i", n, q - centre)
+        of_a, of_e = np.linalg.lstsq(J, np.column_stack([a, weight * e]), rcond=1e-6)[0].T
+        free = a - J @ of_a
+        if free @ free < LEAST_INFORMATION * (a @ a):
+            return None
+        step = float(free @ (weight * e)) / max(float(free @ free), np.finfo(float).tiny)
+        d = of_e - step * of_a
+        turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
+        about = centre - turn.R @ centre - d[3:] + step * centre
+        moved = Pose(turn.q, (1.0 + delta) * about) @ moved
+        delta = (1.0 + delta) * (1.0 + step) - 1.0
+        if abs(delta) > LARGEST_ERROR:
+            return None
+        left = weight * e - J @ of_e - step * free
+        rows = _Rows(q, foot, n, J, free, left, weight, noise, delta, moved)
+    return rows
+
+
+def _weights(e: Array) -> tuple[Array, float]:
+    """The square roots (k,) of the Cauchy weights, and the robust standard deviation of e."""
     noise = max(float(np.median(np.abs(e))) / NORMAL_QUANTILE, np.finfo(float).tiny)
-    root = 1.0 / np.sqrt(1.0 + (e / (2.0 * noise)) ** 2)
-    return J * root[:, None], a * root, e * root
+    return 1.0 / np.sqrt(1.0 + (e / (CAUCHY * noise)) ** 2), noise
+
+
+def _clustered(rows: _Rows, side_m: float) -> float:
+    """Standard error of delta from the sums over patches, each enlarged by its leverage."""
+    cell = np.floor(rows.p / side_m).astype(np.int64)
+    span = cell.max(axis=0) - cell.min(axis=0) + 1
+    cell = cell - cell.min(axis=0)
+    patch = np.unique((cell[:, 0] * span[1] + cell[:, 1]) * span[2] + cell[:, 2], return_inverse=True)[1]
+    leverage = np.bincount(patch, rows.free**2) / rows.information
+    score = np.bincount(patch, rows.free * rows.left) / np.maximum(1.0 - leverage, LEAST_LEFT)
+    return float(np.sqrt(score @ score)) / rows.information
+
+
+def _systematic(rows: _Rows, extent_m: float) -> float:
+    """Standard deviation of delta from an anisotropic strain and from an offset of the surface, see the module."""
+    q, n = (rows.p - rows.p.mean(axis=0)) / extent_m, rows.normal
+    xx, yy, zz = (n * q).T
+    shears = [n[:, i] * q[:, j] + n[:, j] * q[:, i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    strain = np.column_stack([xx - yy, (xx + yy - 2.0 * zz) / np.sqrt(3.0), *shears])
+    of_strain, of_offset = (_effect(rows, rows.weight[:, None] * B) for B in (strain, np.ones((len(q), 1))))
+    return float(np.hypot(of_strain, of_offset))
+
+
+def _effect(rows: _Rows, B: Array) -> float:
+    """Standard deviation of delta from amplitudes of B (k, m) that are draws of one normal distribution."""
+    change = rows.free @ B / rows.information
+    own = B - np.outer(rows.free, change)
+    own = own - rows.J @ np.linalg.lstsq(rows.J, own, rcond=1e-6)[0]
+    U, s, Vt = np.linalg.svd(own, full_matrices=False)
+    kept = s > OBSERVABLE * max(float(np.linalg.norm(B)) / np.sqrt(B.shape[1]), np.finfo(float).tiny)
+    if not kept.any():
+        return 0.0
+    amplitudes = (U.T @ rows.left)[kept] / s[kept]
+    random = float(rows.left @ rows.left) / len(rows.left) / s[kept] ** 2
+    variance = max(0.0, float(np.mean(amplitudes**2 - random)))
+    return float(np.sqrt(variance * np.sum((change @ Vt.T[:, kept]) ** 2)))
+
+
+@lru_cache(maxsize=4)
+def _normal_numbers(count: int) -> Array:
+    """Quantiles (count,) of the normal distribution in an order without a pattern; read-only."""
+    quantiles = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
+    order = np.argsort(np.arange(count) * (0.5 * (np.sqrt(5.0) - 1.0)) % 1.0, kind="stable")
+    numbers: Array = quantiles[order]
+    numbers.flags.writeable = False
+    return numbers

@@ -413,6 +413,7 @@ NB_MODULE(_kernel, m) {
            nb::arg("normals"), nb::arg("gradients"), nb::arg("offsets"), nb::arg("counts"), nb::arg("errors"),
            nb::arg("places"), nb::arg("centre"), nb::arg("extent_m"), nb::arg("side_m"))
       .def("systematic", &systematic_of)
+      .def("size_error", [](const Table& t) { return size_error(t.table); })
       .def("covariance", &covariance_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"))
       .def("split", &split_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"), nb::arg("across"));
   nb::class_<Field>(m, "Field")

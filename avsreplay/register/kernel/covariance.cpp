@@ -17,6 +17,8 @@ constexpr int TERMS = 8;                    // of the series: an error below 1e-
 constexpr int64_t LEAST_HALF = 12;          // patches that each half of a split needs
 constexpr double WORST_CONDITION = 1e8;     // of the scaled information of a half
 constexpr double LEAST_DOF = 12, MOST_DOF = 1e6;  // of an estimated covariance
+constexpr double LEAST_OF_SIZE = 1e-6;      // least share of the effect of a size that the pose cannot explain
+constexpr double LEAST_LEFT = 0.2;          // a leverage above 0.8 enlarges the residual of a patch no further
 constexpr double TINY = std::numeric_limits<double>::min();
 
 // N_p W.
@@ -313,6 +315,49 @@ Estimated covariance(const PatchTable& t, const Systematic& errors) {
     for (int j = 0; j < i; ++j) P.v[i][j] = P.v[j][i] = 0.5 * (P.v[i][j] + P.v[j][i]);
   out.dof *= diluted(random, P);
   return out;
+}
+
+std::array<double, 2> size_error(const PatchTable& t) {
+  const Six inverse = pseudo_inverse(total(t.normals, t.m));
+  std::vector<std::array<double, 6>> a((size_t)t.m);  // sums of J times the residual per unit of size
+  std::vector<double> f((size_t)t.m), e((size_t)t.m);  // sums of its square, and of its product with the residual
+  double A[6] = {}, g[6] = {}, pose_of_size[6] = {}, pose[6] = {}, F = 0, free = 0, size = 0, squares = 0;
+  for (int64_t p = 0; p < t.m; ++p) {
+    const size_t k = (size_t)p;
+    const double *N = t.normals + 36 * p, *of_p = t.gradients + 6 * p;
+    double x[3];
+    for (int c = 0; c < 3; ++c) x[c] = t.places[3 * p + c] - t.centre[c];
+    for (int i = 0; i < 6; ++i) {
+      a[k][(size_t)i] = N[6 * i + 3] * x[0] + N[6 * i + 4] * x[1] + N[6 * i + 5] * x[2];
+      A[i] += a[k][(size_t)i], g[i] += of_p[i];
+    }
+    for (int c = 0; c < 3; ++c) f[k] += x[c] * a[k][(size_t)(3 + c)], e[k] += x[c] * of_p[3 + c];
+    F += f[k], size += e[k];
+  }
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) pose_of_size[i] += inverse.v[i][j] * A[j];
+  free = F;
+  for (int i = 0; i < 6; ++i) free -= pose_of_size[i] * A[i], size -= pose_of_size[i] * g[i];
+  if (!(free > LEAST_OF_SIZE * F)) return {0, 0};
+  size /= free;
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) pose[i] += inverse.v[i][j] * (g[j] - size * A[j]);
+  for (int64_t p = 0; p < t.m; ++p) {
+    const size_t k = (size_t)p;
+    double score = e[k] - size * f[k], leverage = f[k];
+    for (int i = 0; i < 6; ++i) {
+      double left = t.gradients[6 * p + i] - size * a[k][(size_t)i], moved = 0;
+      for (int j = 0; j < 6; ++j) {
+        left -= t.normals[36 * p + 6 * i + j] * pose[j];
+        moved += t.normals[36 * p + 6 * i + j] * pose_of_size[j];
+      }
+      score -= a[k][(size_t)i] * pose[i] + pose_of_size[i] * left;
+      leverage += pose_of_size[i] * (moved - 2 * a[k][(size_t)i]);
+    }
+    score /= std::max(1 - leverage / free, LEAST_LEFT);
+    squares += score * score;
+  }
+  return {size, std::sqrt(squares) / free};
 }
 
 double split(const PatchTable& t, const Systematic& errors, const double* across, int64_t k) {
