@@ -195,9 +195,9 @@ def odometry_command(
 ) -> None:
     """Track an unknown target through the scans of LOG by KISS-ICP, without a model, and write its poses.
 
-    The target takes the place of the world; crop what does not move with it. {C} is parallel to the camera frame of the
-    first scan, its origin at the centroid of that scan. Errors accumulate: 'avsreplay model' builds a model with closed
-    loops, and a registration to a model does not drift. The voxel is a hundredth of the size, as in kiss-icp.
+    The odometry is relative to the target; crop everything that does not move with it. {C} is parallel to the camera
+    frame of the first scan, its origin at the centroid of that scan. Errors accumulate: 'avsreplay model' builds a
+    model with closed loops, and a registration to a model does not drift. The voxel is a hundredth of the size.
 
     \f
     Raises:

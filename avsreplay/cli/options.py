@@ -204,7 +204,7 @@ def _with_lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
 
 @contextmanager
 def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Yield a function that tells whether Ctrl-C was pressed; a second Ctrl-C interrupts at once.
+    """Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts at once.
 
     Args:
         rows: results so far; before the first one Ctrl-C interrupts at once.

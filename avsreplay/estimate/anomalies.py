@@ -4,7 +4,7 @@ A scan whose NIS is above the 99.99 % point, scaled by the median NIS of the acc
 doubtful. It does not change the estimate. After three to five doubtful scans ``hypotheses`` decides. Free motion: the
 scans are used after all. Manoeuvre: rate and velocity are fitted anew from its instant on, with inertia, axes and
 centre of mass kept. Sensor bias: the estimate coasts while the offset lasts. Before the estimate has converged, the
-poses before a jump may as well be the biased ones: it is then initialised anew from the later poses, if these agree.
+poses before a jump may be the biased ones: it is then initialised again from the later poses, if these agree.
 """
 
 from __future__ import annotations

@@ -234,7 +234,7 @@ def _explained(linear: _Frame, columns: Array, onsets: Array, widths: Array, inf
         columns: (k, 6n, 6) of the drift since each onset.
         onsets: (k,) [s].
         widths: (6,) prior 1 sigma of torque and force.
-        inflation: as said.
+        inflation: factor on the variance of the poses for errors that are correlated in time.
     """
     J, e = linear.J, linear.e
     solve = np.linalg.inv(J.T @ J / inflation + linear.info)

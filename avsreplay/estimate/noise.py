@@ -5,9 +5,9 @@ accumulate. Two rules. ``matrix`` is the paper's: R = Sigma + H P+ H', Sigma the
 shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
 attitude: s^2 = sum of r' R_b^-1 r over the sum of the degrees of freedom that the update leaves, 3 - tr(R_b^-1 H P+ H')
 / s^2 for a block, which is where the derivative of the likelihood of the innovations vanishes. The level of the last
-fit is its prior, worth a few scans: where the disturbances are large, the residuals say little about R. It estimates
-two numbers from a window instead of 21, so the scatter of the factors hardly affects the consistency. The sums use the
-weights of the updates, so that outliers do not increase R.
+fit is its prior, with the weight of a few scans: under large disturbances the residuals hardly determine R. Two numbers
+are estimated from a window instead of 21, so that the scatter of the factors hardly affects the consistency. The sums
+use the weights of the updates, so that outliers do not increase R.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ The residuals of a fit are a sum of independent parts whose covariances are know
 Attitude and position have factors of their own, so that there are six. They are estimated from some tens of normal
 points by the average-information algorithm (Gilmour, Thompson and Cullis, Biometrics 51, 1995), which takes the degrees
 of freedom of the fit into account. Differences within the normal points give the independent part of the errors as
-well. The claimed noise is the prior, worth a few poses.
+well. The claimed noise is the prior, with the weight of a few poses.
 
 The poses often cannot tell a disturbance from none although it matters for the velocity. Therefore its density is not
 the most likely one, but the mean over all candidates, none among them, weighted by their likelihood.
@@ -144,8 +144,8 @@ def estimate_levels(
 def _expected(log_odds: Array) -> float:
     """Root density q of a disturbance from the log odds (n,) of ``_DENSITIES`` over none, 0 where none is certain.
 
-    The variance of a velocity that is tracked while it changes at random goes with q^1.5; its mean over all candidates
-    is that of the density returned. A single most likely value would claim too little wherever the poses cannot tell.
+    The variance of a tracked velocity that changes at random is proportional to q^1.5; its mean over all candidates is
+    that of the density returned. The most likely value alone is too small wherever the poses do not determine q.
     """
     likelihood = np.exp(log_odds - max(float(log_odds.max()), 0.0)) * (1.0 - _FREE) / len(_DENSITIES)
     free = _FREE * math.exp(-max(float(log_odds.max()), 0.0))

@@ -141,7 +141,7 @@ class EstimatorParams(Settings):
     bias_s: float = setting(
         20.0,
         "A step of the measured pose is the end of a sensor error before the estimate has lasted for this time, and the"
-        " beginning of one later, if the residuals of the registration do not tell.",
+        " beginning of one later, if the residuals of the registration do not distinguish them.",
         unit="s",
         low=0.0,
     )

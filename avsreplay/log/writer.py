@@ -43,7 +43,7 @@ _LATCHED = (  # keep last, reliable, transient local; complete, because readers 
 
 
 class _Pipe(io.BufferedIOBase):
-    """A pipe, FIFO or device, which cannot tell its position; each write passes through at once."""
+    """A pipe, FIFO or device, which has no position; each write passes through at once."""
 
     def __init__(self, raw: BinaryIO) -> None:
         self._raw, self._at = raw, 0

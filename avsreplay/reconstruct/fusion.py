@@ -186,7 +186,7 @@ def all_poses(
 def contradicting(
     views: Sequence[ScanView], poses: dict[int, Pose], p: ReconstructionParams, extent: float
 ) -> list[int]:
-    """Views that do not show what the others say they must show: their poses are wrong, or they show something else.
+    """Views without the surface that faces them by all other views: their poses are wrong, or they show another object.
 
     Points of the joint model that face a view and that nothing hides must be in it. A pose that is wrong puts the
     surfaces of other views where this one has measured something farther away, or nothing. The share of the points that

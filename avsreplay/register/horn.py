@@ -34,7 +34,7 @@ class HornBackend:
 
     Rejection and stopping are those of :class:`~avsreplay.register.surface_index.IcpParams`: the gate starts at
     ``reach_m``, follows four times the rms of the last pass and never goes below 0.004 of the extent, or ``gate_m`` if
-    that is less: points beyond three standard deviations, at the edges of what is hidden, pull the pose. Where the
+    that is less: points beyond three standard deviations, at the edges of hidden surface, bias the pose. Where the
     position of the camera is known, only faces that face it are matched.
     """
 

@@ -67,7 +67,7 @@ Checksum = Callable[[NDArray[np.uint8]], int]
 
 
 def header(payload: bytes | NDArray[np.uint8], checksum: Checksum) -> bytes:
-    """Return what stands in the file before a payload."""
+    """Return the bytes of the file before a payload."""
     value = checksum(np.frombuffer(payload, np.uint8))
     return (MAGIC + value.to_bytes(8, sys.byteorder)).ljust(HEADER, b"\0")
 

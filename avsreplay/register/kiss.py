@@ -109,7 +109,7 @@ class KissBackend:
 
 
 class KissOdometry:
-    """KISS-ICP as its users know it: the target takes the place of the world, and no model is needed.
+    """The odometry of KISS-ICP relative to the target instead of the surroundings; it needs no model.
 
     Adaptive threshold, constant velocity, deskewing and the thinning by voxels are the library's. Lengths are given to
     it in voxels, so that its defaults (voxel 1, threshold 2, least motion 0.1, range 100) hold for a target of any

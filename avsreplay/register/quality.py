@@ -109,10 +109,10 @@ def grade(
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
-    Too few inliers give NO_OVERLAP whatever the convergence flag of the back end says. ``halves``: compare the poses
+    Too few inliers give NO_OVERLAP, whatever the convergence flag of the back end is. ``halves``: compare the poses
     from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
     ``systematic``: the covariance includes errors that vary slowly over the target. ``guess``: T_ca from which the back
-    end began; a pose that is this guess to the last bit, while the scan asks for another, is FAILED.
+    end began; a pose that equals this guess, although the residuals require a step, is FAILED.
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
@@ -174,12 +174,12 @@ def _same(T_ca: Pose, guess: Pose | None) -> bool:
 
 
 def remaining_step(found: Evidence) -> Array:
-    """Return the least-squares step (6,) that the residuals at a pose ask for; zero at a converged pose."""
+    """Return the least-squares step (6,) of the residuals at a pose; zero at a converged pose."""
     return np.asarray(pseudo_inverse(found.normals.sum(axis=0)) @ found.gradients.sum(axis=0))
 
 
 def unchanged_without_reason(found: Evidence) -> bool:
-    """Return whether the residuals at a pose, which a back end returned exactly as it got it, ask for a step.
+    """Return whether the residuals at a guess, which a back end returned unchanged, require a step.
 
     At the true pose their statistic g' N^-1 g / noise^2 is chi-square with 6 degrees of freedom; at a minimum of the
     distances it is zero.

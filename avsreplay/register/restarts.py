@@ -136,7 +136,7 @@ class Restarter:
     def width(self, at: Restart) -> float:
         """Return the rejection distance [m] for a scan that is not clean: three standard deviations of its noise.
 
-        A wider one takes in points of other objects next to the surface, which pull the pose.
+        A larger distance would include points of other objects next to the surface, which bias the pose.
         """
         noise = min(at.noise_m, NOISE_OF_EXTENT * self._extent)
         return max(min(self._target.limits.gate_m, STOP_OF_EXTENT * self._extent), 3.0 * noise)

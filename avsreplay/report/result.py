@@ -94,7 +94,7 @@ class Result:
 def facts_record(
     *, labels: Sequence[Label] | None = None, truth: State | None = None, counts: Mapping[str, int] | None = None
 ) -> dict[str, Any]:
-    """What ``Summary.fold`` was told beside the rows, as JSON values to stand under ``facts`` in ``run.json``."""
+    """What ``Summary.fold`` received beside the rows, as JSON values for the key ``facts`` of ``run.json``."""
     return {
         "labels": None if labels is None else [_label_record(label) for label in labels],
         "truth": None if truth is None else {name: getattr(truth, name).tolist() for name in _STATE},

@@ -43,11 +43,11 @@ class Concern:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """An interval that deserves a look.
+    """An interval with a large error or without a used scan.
 
     Attributes:
         row: index of its worst row.  start_s, end_s: since the first scan.
-        what: what happened, with its size and what is usual.  cause: what the rows say about it.
+        what: what happened, with its size and what is usual.  cause: its cause by the rows.
     """
 
     row: int
@@ -326,7 +326,7 @@ def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, 
 
 
 def _cause(rows: Sequence[Row], k: int) -> str:
-    """What the rows say about a moment that begins at row k."""
+    """The cause, by the rows, of a moment that begins at row k."""
     row, before = rows[k], rows[k - 1] if k else None
     if row.fault:
         return f"injected: {_plain(row.fault)}"
