@@ -19,7 +19,7 @@ from avsreplay import geometry
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
 from avsreplay.estimate.chart import body_parameters
-from avsreplay.estimate.deskew import deskew, with_scan_duration
+from avsreplay.estimate.track import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor import observability
 from avsreplay.monitor.convergence import Consistency, ConsistencyTrack, Convergence, ConvergenceTrack, violations

@@ -15,7 +15,7 @@ from true_scans import true_scans
 from avsreplay import geometry, toml_document
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.chart import nees
-from avsreplay.estimate.deskew import deskew, with_scan_duration
+from avsreplay.estimate.track import deskew, with_scan_duration
 from avsreplay.monitor.faults import FaultDetector, FaultParams
 from avsreplay.records import AlignStatus
 from avsreplay.register import RegisterParams, Registrar

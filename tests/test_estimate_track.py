@@ -8,9 +8,9 @@ import tumbling
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.estimate.deskew import deskew, with_scan_duration
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.measurement import innovation_vector
+from avsreplay.estimate.track import deskew, with_scan_duration
 from avsreplay.geometry import Pose
 from avsreplay.records import Belief
 
