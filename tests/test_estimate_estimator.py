@@ -10,7 +10,7 @@ import tumbling
 from scipy.stats import chi2
 
 from avsreplay import geometry
-from avsreplay.estimate import Estimator, EstimatorParams, noise
+from avsreplay.estimate import Estimator, EstimatorParams, noise, noise_levels
 from avsreplay.estimate.chart import nees
 from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.measurement import (
@@ -129,6 +129,34 @@ def test_consistent_from_a_near_start_over_many_runs(constraint: Constraint) -> 
     assert low < np.mean(last) / 20 < high
     low, high = chi2.ppf([0.0005, 0.9995], 6 * len(nis)) / (6 * len(nis))
     assert low < np.mean(nis) / 6 < high
+
+
+def test_one_noisy_scan_does_not_change_the_error_that_all_poses_have_in_common() -> None:
+    """The error along the line of sight is that of the poses behind the estimate, not of the last scan alone."""
+    world, rng = tumbling.draw(5, seconds=15.0, hz=2.0), np.random.Generator(np.random.PCG64(2))
+    estimator = Estimator(EstimatorParams(correlated_share=0.4), None, 4.0)
+    track, variances = estimator.initial(0, world.states[0].T_ac), []
+    for t, x in zip(world.times, world.states, strict=True):
+        prediction = estimator.predict(track, round(t * 1e9))
+        noise_1s = 0.02 if t == world.times[-1] else 0.002
+        seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, noise_1s, np.radians(0.1)))
+        track, _ = estimator.step(track, prediction, seen, Verdict(1, Reason.OK), True)
+        track = replace(track, levels=noise_levels.NO_LEVELS)  # common errors as claimed
+        variances.append(float(np.trace(estimator.published(track).P - track.belief.P)))
+    assert np.trace(track.R[:3, :3]) > 50.0 * 3.0 * 0.002**2
+    assert 0.0 < variances[-1] < 1.2 * variances[-2]
+
+
+def test_no_attitude_is_less_certain_than_an_arbitrary_one() -> None:
+    """The rotation angle of a random attitude, drawn uniformly, bounds the forecast from the first scan on."""
+    rng = np.random.Generator(np.random.PCG64(1))
+    q = rng.normal(size=(200000, 4))
+    angle = 2.0 * np.arccos(np.abs(q[:, 3]) / np.linalg.norm(q, axis=1))
+    world = tumbling.draw(5, seconds=1.0, hz=2.0)
+    estimator = Estimator(EstimatorParams(), None, 4.0)
+    track = estimator.initial(0, world.states[0].T_ac)
+    forecast = estimator.track_forecast(track, np.array([5.0, 30.0]))
+    assert forecast.rot_1s_rad == pytest.approx(np.sqrt(np.mean(angle**2)), rel=0.01)
 
 
 def test_gamma_zero_leaves_the_prior_exactly() -> None:

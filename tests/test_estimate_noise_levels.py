@@ -111,7 +111,7 @@ def test_errors_that_near_views_share_are_found_and_widen_the_covariance() -> No
         for share in (0.0, 0.4):
             levels, problem = levels_of(fixes(world.states, seed, share=share, claimed=0.1), world.states[0])
             _, inflation = sandwich(problem, problem.poses, levels)
-            found.append((*levels.common_share(0.1), *inflation))
+            found.append((*(0.1 * np.array(levels.common) / levels.factors(0.1) ** 2), *inflation))
     white, shared = np.mean(found[::2], axis=0), np.mean(found[1::2], axis=0)
     assert np.all(white[:2] < 0.12)
     assert shared[:2] == pytest.approx([0.4, 0.4], abs=0.15)

@@ -36,7 +36,7 @@ from avsreplay.records import Belief, BodyParameters, State
 
 ETA, RATE, POSITION, VELOCITY = (slice(k, k + 3) for k in (0, 3, 6, 9))
 INERTIA, ARM = slice(12, 17), slice(17, 20)
-_ANY_HALF_RAD = 0.5 * float(np.sqrt(np.pi**2 / 3.0 + 2.0))  # rms half angle of a uniformly distributed attitude
+ANY_HALF_RAD = 0.5 * float(np.sqrt(np.pi**2 / 3.0 + 2.0))  # rms half angle of a uniformly distributed attitude
 _LARGEST_1S = 3.0  # largest 1 sigma of the logarithm of the mass moments; above it the inertia is undetermined
 
 
@@ -247,7 +247,7 @@ def _limited_1s(belief: Belief, arm_variance: float) -> tuple[float, float, floa
     x, variance = belief.x, np.maximum(np.diagonal(belief.P), 0.0)
     sigma = np.sqrt(np.minimum(variance[SIGMA], 1.0 / 3.0 + x.sigma**2))
     varrho = min(float(variance[VARRHO].sum()), arm_variance + 2.0 * float(x.c_b @ x.c_b))
-    return float(sigma[0]), float(sigma[1]), float(np.sqrt(varrho)), min(_root(variance[DMU]), _ANY_HALF_RAD)
+    return float(sigma[0]), float(sigma[1]), float(np.sqrt(varrho)), min(_root(variance[DMU]), ANY_HALF_RAD)
 
 
 def _root(variances: Array) -> float:

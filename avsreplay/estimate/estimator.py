@@ -18,7 +18,7 @@ from avsreplay.estimate import dynamics
 from avsreplay.estimate.acceleration import FreeFall, accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
-from avsreplay.estimate.chart import to_state
+from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
 from avsreplay.estimate.error_state import RHO
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
@@ -147,7 +147,8 @@ class Estimator:
             found = dynamics.grasp_forecast(track.belief, times_s, *noise)
         else:
             found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise)
-        return replace(found, pos_1s_m=np.hypot(found.pos_1s_m, float(np.linalg.norm(b))))
+        turn = np.minimum(found.rot_1s_rad, 2.0 * ANY_HALF_RAD)  # no attitude is less certain than an arbitrary one
+        return replace(found, pos_1s_m=np.hypot(found.pos_1s_m, float(np.linalg.norm(b))), rot_1s_rad=turn)
 
     def refitted_rows(self, track: Track) -> tuple[Array, Array, Array] | None:
         """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no new fit.
@@ -243,10 +244,10 @@ class Estimator:
 
     def _common_1s(self, track: Track) -> Array:
         """(3,) 1 sigma of that error in {A} [m]."""
-        if track.batch is None or track.batch.share == 0.0:
+        if track.batch is None or track.batch.share == 0.0 or track.batch.position_m2 is None:
             return np.zeros(3)
-        share = float(track.levels.common_share(track.batch.share)[1])
-        return line_of_sight_1s(self.in_camera(track.belief).x.T_ac.t, track.R[:3, :3], share)
+        share = track.levels.common[1] * track.batch.share
+        return line_of_sight_1s(self.in_camera(track.belief).x.T_ac.t, track.batch.position_m2, share)
 
     def in_camera(self, belief: Belief) -> Belief:
         """The belief of a track or a prediction in {A}; it differs only where an acceleration is known.

@@ -84,6 +84,7 @@ class BatchResult:
         prior_rejected: the poses contradict the given start, and it was left out.
         points: the poses of the fit, or their normal points.
         share: mean claimed part of the variance of the poses that near views have in common.
+        position_m2: (3, 3) claimed covariance of the position of a pose in {A}, the inverse of the mean information.
     """
 
     epoch_ns: int
@@ -97,6 +98,7 @@ class BatchResult:
     prior_rejected: bool = False
     points: Poses | None = None
     share: float = 0.0
+    position_m2: Array | None = None
 
 
 def guessed_belief(t_ns: int, T_ac: Pose, params: EstimatorParams) -> Belief:
@@ -270,7 +272,15 @@ def batch_estimate(
         prior_rejected=rejected,
         points=points,
         share=share,
+        position_m2=_position_noise(points),
     )
+
+
+def _position_noise(points: Poses) -> Array:
+    """Covariance (3, 3) in {A} that each pose would have for the sum of their information on the position."""
+    R = geometry.matrix(points.q)
+    info = np.sum(R @ np.linalg.inv(points.C[:, 3:, 3:]) @ np.swapaxes(R, 1, 2), axis=0)
+    return np.asarray(np.linalg.inv(info) * (len(points) if points.counts is None else float(points.counts.sum())))
 
 
 def improved_levels(

@@ -70,10 +70,6 @@ class NoiseLevels:
         """(2,) factors on the claimed standard deviations of poses with this claimed share of common errors."""
         return np.sqrt([w * (1.0 - share) + c * share for w, c in zip(self.white, self.common, strict=True)])
 
-    def common_share(self, share: float) -> Array:
-        """(2,) part of the variance that near views have in common, where the claimed part is ``share``."""
-        return np.array(self.common) * share / self.factors(share) ** 2
-
 
 NO_LEVELS = NoiseLevels()
 """The prior: noise as claimed, no disturbances."""
