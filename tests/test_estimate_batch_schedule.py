@@ -13,7 +13,7 @@ from scipy.stats import chi2
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.batch import FitParams, Problem, fit
 from avsreplay.estimate.batch_covariance import memory_s, process_noise_pass
-from avsreplay.estimate.batch_schedule import chart_at, contradicted
+from avsreplay.estimate.batch_schedule import contradicted
 from avsreplay.estimate.chart import nees, to_chart, to_errors
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.initialise import (
@@ -182,7 +182,9 @@ def test_contradiction_counts_in_the_fits_own_spread() -> None:
 
 def test_the_fit_begins_where_the_belief_came_from() -> None:
     world = tumbling.draw(3, seconds=60.0)
-    chart = chart_at(Belief(round(world.times[-1] * 1e9), world.states[-1], np.eye(20)), 0)
+    chart = Estimator(EstimatorParams(), None, 2.0).batch.chart_at(
+        Belief(round(world.times[-1] * 1e9), world.states[-1], np.eye(20)), 0
+    )
     assert np.abs(chart.minus(to_chart(world.states[0]))).max() < 1e-7
 
 
@@ -261,7 +263,9 @@ def test_joined_poses_give_the_estimate_of_all_poses(seed: int) -> None:
     fixes = fixes_of(world, seed)
     reference = to_chart(world.states[0])
     fewer = joined(fixes[:200], reference, np.ones(2)) + fixes[200:]
-    moved = chart_at(Belief(0, world.states[0], np.eye(20)), fewer[0].t_ns)
+    moved = Estimator(EstimatorParams(), None, 2.0).batch.chart_at(
+        Belief(0, world.states[0], np.eye(20)), fewer[0].t_ns
+    )
     fewer = joined(fewer[:200], moved, np.ones(2)) + fewer[200:]
     assert len(fewer) <= 0.51 * len(fixes)
     assert pose_count(fewer) == pose_count(fixes) == len(fixes)

@@ -85,7 +85,7 @@ class BatchSchedule:
         last = track.batch
         if last is None or track.since >= max(1.0, self._growth(last) * last.count) or worn(last.components):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
-            start = self._chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
+            start = self.chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
             given = self._given(track)
             result = batch_estimate(track.fixes, self.params, self._rules, self._levels(track), last, start, given)
             rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
@@ -126,7 +126,7 @@ class BatchSchedule:
             return track
         epoch_ns = track.fixes[0].t_ns
         rejected = track.batch is not None and track.batch.prior_rejected
-        begin, given = self._chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
+        begin, given = self.chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
         last = track.batch if track.batch is not None and track.batch.epoch_ns == epoch_ns else None
         result = batch_estimate(
             track.fixes, self.params, self._rules, self._levels(track), last, start=begin, given=given
@@ -158,7 +158,7 @@ class BatchSchedule:
             return replace(track, untested=track.untested + 1)
         track = replace(track, untested=0)
         epoch_ns = track.fixes[0].t_ns
-        start = last.chart if last.epoch_ns == epoch_ns else self._chart_at(track.belief, epoch_ns)
+        start = last.chart if last.epoch_ns == epoch_ns else self.chart_at(track.belief, epoch_ns)
         factors = np.array([track.window.factors[3], track.window.factors[0]])
         found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels)
         if found is None:
@@ -201,7 +201,7 @@ class BatchSchedule:
         if not ready or last is None or track.unlevelled < due or track.since == 0:
             return replace(track, unlevelled=track.unlevelled + 1)
         epoch_ns = track.fixes[0].t_ns
-        start = last.chart if last.epoch_ns == epoch_ns else self._chart_at(track.belief, epoch_ns)
+        start = last.chart if last.epoch_ns == epoch_ns else self.chart_at(track.belief, epoch_ns)
         levels = improved_levels(track.fixes, last, start, self.params, track.levels)
         used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
         more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
@@ -238,7 +238,7 @@ class BatchSchedule:
         fixes = track.fixes[oldest:]
         if len(fixes) >= MOST_FIXES:
             half, factors = MOST_FIXES // 2, np.array([track.window.factors[3], track.window.factors[0]])
-            fixes = joined(fixes[:half], self._chart_at(prediction.belief, fixes[0].t_ns), factors) + fixes[half:]
+            fixes = joined(fixes[:half], self.chart_at(prediction.belief, fixes[0].t_ns), factors) + fixes[half:]
         return (*fixes, self.fix(prediction, innovation))
 
     def fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
@@ -257,7 +257,7 @@ class BatchSchedule:
         """A belief at another instant with the disturbances of a track, and the transition matrix (20, 20)."""
         return propagate(belief, t_ns, *self.noise_levels(track), self.orbit)
 
-    def _chart_at(self, belief: Belief, t_ns: int) -> Chart:
+    def chart_at(self, belief: Belief, t_ns: int) -> Chart:
         """The belief's mean propagated to another instant, as a starting point of a fit."""
         arc = None if self.orbit is None else self.orbit.at(belief.t_ns)
         there, _ = propagate_state(belief.x, (t_ns - belief.t_ns) * 1e-9, arc)
