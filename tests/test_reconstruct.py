@@ -11,16 +11,18 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial import ConvexHull, cKDTree
 
-from avsreplay import geometry
+from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.reconstruct import at_grasp, deviations, reconstruct, true_frame
 from avsreplay.reconstruct.fusion import continues, contradicting
+from avsreplay.reconstruct.motion import free_motion
 from avsreplay.reconstruct.registration import between
 from avsreplay.reconstruct.tracking import ReconstructionParams
-from avsreplay.reconstruct.views import SAMPLE, Twist, extent_of, free_motion, full_cloud, surveyed, thinned_view
+from avsreplay.reconstruct.views import SAMPLE, Twist, extent_of, full_cloud, surveyed, thinned_view
 from avsreplay.records import Scan, Surface
+from avsreplay.simulate import builtin_surface, scenario_of, simulate
 
 CORNERS = np.random.default_rng(11).normal(size=(14, 3)) * [0.5, 0.35, 0.25]
 HULL = ConvexHull(CORNERS)
@@ -315,6 +317,39 @@ def test_free_motion_gives_mass_centre_and_smooths_poses():
     raw = [float(geometry.angle(geometry.multiply(geometry.conjugate(T.q), N.q)))
            for T, N in zip(exact, noisy, strict=True)]  # fmt: skip
     assert np.sqrt(np.mean(np.square(off))) < 0.7 * np.sqrt(np.mean(np.square(raw)))
+
+
+WEAK = """
+seed = 4
+duration_s = 48.0
+rate_hz = 0.5
+[target]
+shape = "stage"
+[motion]
+attitude_xyzw = [0.1, 0.7, -0.1, 0.7]
+rate_radps = [0.06, 0.05, -0.04]
+position_m = [0.0, 0.0, 7.0]
+[scanner]
+rays = [72, 72]
+noise_m = 0.01
+outlier_ratio = 0.0
+"""
+
+
+@pytest.mark.slow
+def test_the_motion_is_fitted_to_the_distances_where_the_poses_are_weakly_determined():
+    """A rocket stage hardly shows its turn about its axis: single poses are degrees off, one motion of all is not."""
+    scenario = scenario_of(toml_document.parse(WEAK, "s.toml"))
+    simulation = simulate(scenario, builtin_surface(scenario.params.target.shape))
+    scans = list(simulation.scans())
+    made = reconstruct(lambda: scans)
+    true = {scan.t_ns: simulation.truth_of(scan).pose for scan in scans}
+    X = true_frame(made, true.items())
+    turns = [float(geometry.angle(geometry.multiply(geometry.conjugate((true[t] @ X).q), T.q))) for t, T in made.poses]
+    shifts = [float(np.linalg.norm((true[t] @ X).t - T.t)) for t, T in made.poses]
+    assert made.used >= 20
+    assert np.degrees(np.sqrt(np.mean(np.square(turns)))) < 0.3  # 2.9 deg with equal weights of all directions
+    assert np.sqrt(np.mean(np.square(shifts))) < 0.003  # 7.6 mm
 
 
 def test_poses_without_a_common_free_motion_are_not_smoothed():

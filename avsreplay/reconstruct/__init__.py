@@ -21,7 +21,15 @@ import numpy as np
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Pose
-from avsreplay.reconstruct.fusion import all_poses, contradicting, fused, pair_rms, refined, turn_and_coverage
+from avsreplay.reconstruct.fusion import (
+    all_poses,
+    contradicting,
+    fused,
+    joint_motion,
+    pair_rms,
+    refined,
+    turn_and_coverage,
+)
 from avsreplay.reconstruct.model import (
     Deviations,
     Reconstruction,
@@ -31,17 +39,9 @@ from avsreplay.reconstruct.model import (
     reconstruction_ply,
     surface_of,
 )
+from avsreplay.reconstruct.motion import FreeMotion, free_motion, twists
 from avsreplay.reconstruct.tracking import ReconstructionParams, Tracked, track, without
-from avsreplay.reconstruct.views import (
-    FreeMotion,
-    ScanView,
-    Survey,
-    free_motion,
-    selected,
-    surveyed,
-    thinned_view,
-    twists,
-)
+from avsreplay.reconstruct.views import ScanView, Survey, selected, surveyed, thinned_view
 from avsreplay.records import Scan
 
 __all__ = [
@@ -100,6 +100,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
     _refuse_still(turned, tracked.weakest)
     motion = free_motion([views[k].t_ns for k in sorted(poses)], [poses[k] for k in sorted(poses)], survey.extent)
     if motion is not None:
+        motion = joint_motion(better, sorted(keys), motion, gate, survey.extent)
         moved = _on_motion(views, poses, motion)
         used = {k: moved[k] for k in keys if k in moved}
         if len(used) > 2 and pair_rms(better, used, gate) < AS_WELL * pair_rms(

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from avsreplay.estimate.chart import to_chart, to_state
 from avsreplay.geometry import Array, Pose
+from avsreplay.reconstruct.motion import FreeMotion
 from avsreplay.reconstruct.registration import SAME_SIDE, between, moved, registered
 from avsreplay.reconstruct.tracking import KEEP_RATIO, ReconstructionParams, Tracked, patchwork
 from avsreplay.reconstruct.views import (
@@ -39,6 +41,8 @@ MERGED_REACH = 0.03  # their largest distance as a share of the extent
 MOST_SIGHTS = 60  # scans that are asked whether they saw through a point
 MOST_ASKED = 3000  # points of the model that are compared with one view
 LEAST_SHOWN = 0.8  # share of the model's visible points that a view must show, in units of the median of all views
+MOST_STEPS = 10  # evaluations of the motion that minimises the distances between views
+LEAST_DAMPING, LEAST_GAIN = 1e-3, 1e-4  # of these steps; share of the rms by which the last one improves it
 SUPPORT = 5  # of the ten nearest points that continue the surface of a point which one scan only has seen
 SPREAD_RAD = np.radians(30.0)  # a direction counts as covered if a scan was taken from within this angle of it
 
@@ -107,6 +111,46 @@ def _with_merged_normals(views: Sequence[ScanView], poses: dict[int, Pose], exte
     normals = np.where((count >= NEIGHBOURS)[:, None], normals, n)
     ends = np.cumsum([len(views[k].points) for k in keys])[:-1]
     return {k: replace(views[k], normals=m @ poses[k].R.T) for k, m in zip(keys, np.split(normals, ends), strict=True)}
+
+
+def joint_motion(
+    views: Sequence[ScanView], keys: Sequence[int], start: FreeMotion, gate: float, extent: float
+) -> FreeMotion:
+    """The free motion that minimises the distances between overlapping pairs of key views.
+
+    The distances determine some directions of a pose much better than others: the turn of a cylinder about its axis is
+    hardly seen. A motion that is fitted to the poses with equal weights spreads the errors of the bad directions over
+    the good ones; fitted to the distances it uses what all scans together say about each direction.
+
+    Args:
+        views: with the normals of all key views together.
+        keys: numbers of the key views, ascending.
+        start: the motion fitted to the poses, whose covariance is kept.
+        gate: largest distance that counts [m].
+        extent: of the target [m].
+
+    Returns:
+        The motion after Levenberg-Marquardt steps in the 20 initial values.
+    """
+    instants, chart, damping = [views[k].t_ns for k in keys], to_chart(start.state), LEAST_DAMPING
+    best, best_rms = start, np.inf
+    for _ in range(MOST_STEPS):
+        tried = replace(start, state=to_state(chart))
+        poses = [tried.at(t_ns) for t_ns in instants]
+        N, g, every = _normal_equations(views, keys, [T.inverse() for T in poses], gate)
+        rms = float(np.sqrt(np.mean(every**2)))
+        if rms < best_rms:
+            small = rms > (1.0 - LEAST_GAIN) * best_rms
+            best, best_rms, damping = tried, rms, max(0.1 * damping, LEAST_DAMPING)
+            J, prior = start.pose_jacobian(chart, instants, poses, extent)
+            A, b = J.T @ N @ J / rms**2 + prior, -J.T @ g / rms**2
+            if small:
+                break
+        else:
+            damping *= 30.0
+        step = np.linalg.solve(A + damping * np.diag(np.diagonal(A)), b)
+        chart = to_chart(best.state).moved(np.asarray(step))
+    return best
 
 
 def pair_rms(views: Sequence[ScanView], poses: dict[int, Pose], gate: float) -> float:

@@ -17,7 +17,8 @@ from avsreplay import geometry
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.reconstruct.fusion import Sight
-from avsreplay.reconstruct.views import FreeMotion, averaged
+from avsreplay.reconstruct.motion import FreeMotion
+from avsreplay.reconstruct.views import averaged
 from avsreplay.records import BLOCKS, Surface
 
 PATCH = 0.04  # radius of a grasp patch as a share of the extent
@@ -162,8 +163,7 @@ def surface_of(made: Reconstruction) -> Surface:
         made: the reconstruction.
     """
     data = reconstruction_ply(made)
-    none = np.zeros((0, 3), dtype=np.int32)
-    return Surface(made.points, none, "reconstructed.ply", hashlib.sha256(data).hexdigest(), data)
+    return Surface(made.points, np.zeros((0, 3), np.int32), "reconstructed.ply", hashlib.sha256(data).hexdigest(), data)
 
 
 def meshed(made: Reconstruction) -> tuple[Surface, float]:

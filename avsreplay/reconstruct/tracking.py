@@ -10,8 +10,9 @@ from scipy.spatial import cKDTree
 
 from avsreplay import geometry
 from avsreplay.geometry import Pose
+from avsreplay.reconstruct.motion import free_motion
 from avsreplay.reconstruct.registration import Match, Patchwork, best_starts, near_attitudes, registered
-from avsreplay.reconstruct.views import ScanView, averaged, depth_behind, free_motion, turn
+from avsreplay.reconstruct.views import ScanView, averaged, depth_behind, turn
 from avsreplay.register import global_search
 
 KEEP_RATIO = 0.4  # share of the points of a scan that must lie on the model so far
