@@ -240,7 +240,7 @@ def test_selection(tmp_path: Path) -> None:
 
     assert times(every=3) == [0.0, 1.5, 3.0, 4.5]
     assert times(start_s=1.0, end_s=2.0) == [1.0, 1.5]
-    assert times(start_offset_s=4.5) == [4.5, 5.0, 5.5]
+    assert times(start_s=4.5) == [4.5, 5.0, 5.5]
     assert times(start_s=1.0, duration_s=2.0, every=2, n_scans=2) == [1.0, 2.0]
     assert times(n_scans=1) == [0.0]
     assert times(start_s=100.0) == []

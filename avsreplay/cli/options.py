@@ -73,7 +73,7 @@ def added(*options: Callable[[F], F]) -> Callable[[F], F]:
     return decorate
 
 
-source_options = added(
+run_source_options = added(
     source_setting("--model", type=PATH),
     source_setting("--cloud-model", is_flag=True),
     source_setting("--model-unit"),
@@ -89,7 +89,6 @@ source_options = added(
     source_setting("--crop-range", type=Numbers(2), metavar="MIN,MAX"),
     source_setting("--rate", "rate_hz", type=float),
     source_setting("--every-scan", "every", type=int),
-    source_setting("--start-offset", "start_offset_s", type=float),
     source_setting("--end", "end_s", type=float),
     source_setting("--duration", "duration_s", type=float),
     source_setting("--n-scans", type=int),
@@ -98,6 +97,8 @@ source_options = added(
     source_setting("--strict", is_flag=True),
 )
 """Options for reading a log; each has the name of its field in ``log.SourceOptions`` and is None by default."""
+source_options = added(source_setting("--start", "start_s", type=float), run_source_options)
+"""The same with the begin; the ``--start`` of ``run`` also takes the initialisation of the estimate."""
 pose_options = added(
     source_setting("--pose-sigma", type=Numbers(2), metavar="MM,DEG"),
     source_setting("--grasp", type=Numbers(3), metavar="X,Y,Z"),

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.config import source_setting
 from avsreplay.cli.options import PATH, check_binary_output, read_options, source_options, tracked
 from avsreplay.errors import DataLost
 
@@ -56,7 +55,6 @@ class _Fault(click.ParamType["RecordedFault"]):
 @click.option(
     "--fault", "faults", type=_Fault(), multiple=True, help="Inject a fault [s after the first scan]; repeatable."
 )
-@source_setting("--start", "start_s", type=float)
 @source_options
 @click.option("--compression", type=click.Choice(["zstd", "lz4", "none"]), default="zstd", show_default=True)
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")

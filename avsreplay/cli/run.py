@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.config import run_settings, take_run_settings
-from avsreplay.cli.options import PATH, StartMode, log_file, pose_options, read_options, source_options
+from avsreplay.cli.options import PATH, StartMode, log_file, pose_options, read_options, run_source_options
 from avsreplay.errors import CheckFailed, DataLost, UsageError
 from avsreplay.files import check_output
 
@@ -49,7 +49,7 @@ Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than require
     "--start", "starts", type=StartMode(), multiple=True, help="Initialisation (cold, near, paper) or start time [s]."
 )
 @click.option("--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md).")
-@source_options
+@run_source_options
 @pose_options
 @click.option("--golden", type=PATH, help="Compare the rows with this golden file; exit code 1 if they differ.")
 @click.option("--update-golden", type=PATH, help="Write the rows to this golden file.")

@@ -83,7 +83,6 @@ class SourceOptions(Settings):
         "Clock of the scans: stamps of the messages (header), reception by the recorder (log) or publication.",
     )
     start_s: float | None = setting(None, "Begin at this time after the first scan.", unit="s")
-    start_offset_s: float | None = setting(None, "The same as --start.", unit="s")
     end_s: float | None = setting(None, "End before this time after the first scan.", unit="s", unset="the last scan")
     duration_s: float | None = setting(None, "Length of the part that is replayed.", unit="s", unset="up to the end")
     n_scans: int | None = setting(None, "Number of scans at most.", low=1, unset="all")
@@ -146,7 +145,7 @@ class SourceOptions(Settings):
     @property
     def window_s(self) -> tuple[float, float]:
         """Return the window [start, end) after the first scan [s]."""
-        start = self.start_s if self.start_s is not None else (self.start_offset_s or 0.0)
+        start = self.start_s or 0.0
         end = float("inf") if self.end_s is None else self.end_s
         return start, min(end, start + self.duration_s) if self.duration_s is not None else end
 
