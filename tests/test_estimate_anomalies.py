@@ -8,7 +8,7 @@ import pytest
 import tumbling
 from scipy.stats import multivariate_normal
 
-from avsreplay.estimate import anomalies, hypotheses, noise
+from avsreplay.estimate import anomalies, hypotheses, noise, scan_window
 from avsreplay.estimate.dynamics import propagate, propagate_state
 from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.estimate.track import Epoch, Prediction, Track, ready
@@ -26,7 +26,7 @@ def test_the_evidence_is_the_marginal_likelihood() -> None:
     root = np.linalg.cholesky(C)
     white = np.linalg.solve(root, y)
     free = -0.5 * white @ white - np.log(np.diag(root)).sum()
-    value, u, P = hypotheses._evidence(white, free, np.linalg.solve(root, M), scale)
+    value, u, P = scan_window.evidence(white, free, np.linalg.solve(root, M), scale)
     want = multivariate_normal.logpdf(y, np.zeros(18), C + M @ np.diag(scale**2) @ M.T)
     assert value - 9.0 * np.log(2.0 * np.pi) == pytest.approx(want, rel=1e-10)
     gain = np.diag(scale**2) @ M.T @ np.linalg.inv(C + M @ np.diag(scale**2) @ M.T)
@@ -99,9 +99,9 @@ def test_free_motion_explains_the_recent_scans_as_their_predictions_did(seconds:
         window = result.track.recent
         assert window
         assert all(ready(epoch.track) for epoch in window)
-        priors = hypotheses.ChangePriors(0.01, 0.02, 0.2, 0.05)
+        priors = scan_window.ChangePriors(0.01, 0.02, 0.2, 0.05)
         ranked = hypotheses.explain(window, len(window) - 1, priors, 1e-6, 0.0)
-        free = next(e.chi2 for e in ranked if e.hypothesis is hypotheses.Hypothesis.FREE_MOTION)
+        free = next(e.chi2 for e in ranked if e.hypothesis is scan_window.Hypothesis.FREE_MOTION)
         assert 0.4 < free / sum(epoch.innovation.nis for epoch in window) < 2.0
 
 
@@ -220,8 +220,8 @@ def test_a_clean_log_fails_no_check(case: surprises.Case, seed: int) -> None:
 
 def test_an_explanation_without_degrees_of_freedom_does_not_scale_the_odds() -> None:
     """Its residuals say nothing about the noise."""
-    found = hypotheses.Explanation(hypotheses.Hypothesis.MANOEUVRE, 10.0, 0.0, 0, 0)
-    free = hypotheses.Explanation(hypotheses.Hypothesis.FREE_MOTION, 1.0, 300.0, 12, 0)
+    found = scan_window.Explanation(scan_window.Hypothesis.MANOEUVRE, 10.0, 0.0, 0, 0)
+    free = scan_window.Explanation(scan_window.Hypothesis.FREE_MOTION, 1.0, 300.0, 12, 0)
     assert anomalies._odds_over_free([found, free]) == pytest.approx(9.0)
 
 
@@ -251,10 +251,32 @@ def test_the_window_holds_the_covariance_of_its_innovations() -> None:
         prediction = Prediction(beliefs[-1], np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty())
         seen = Innovation(np.zeros(6), R, R, 0.0, 0.0, 0.0, 0.0)
         epochs.append(Epoch(Track(start, "filter"), prediction, seen, False))
-    C = hypotheses._window(epochs, start, *noises).C
+    C = scan_window.window_of(epochs, start, *noises).C
     for i, first in enumerate(beliefs[1:]):
         for j, later in enumerate(beliefs[1:][i:], start=i):
             _, Phi = propagate_state(first.x, (later.t_ns - first.t_ns) * 1e-9)
             expected = measurement_jacobian(first.x) @ first.P @ Phi.T @ measurement_jacobian(later.x).T
             expected = expected + (R if i == j else 0.0)
             np.testing.assert_allclose(C[6 * i : 6 * i + 6, 6 * j : 6 * j + 6], expected, rtol=1e-7, atol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("at_s", "step"), [(44.8, {"velocity": 0.01}), (44.93, {"velocity": 0.01}), (44.8, {"rate": 0.01})]
+)
+def test_size_and_time_of_a_manoeuvre_are_as_precise_as_they_claim_with_precise_poses(
+    monkeypatch: pytest.MonkeyPatch, at_s: float, step: dict[str, float]
+) -> None:
+    """Poses of 0.1 mm determine the instant to some 10 ms, and the size depends on it."""
+    monkeypatch.setattr(surprises, "POS_M", 1e-4)
+    monkeypatch.setattr(surprises, "ROT_RAD", np.radians(0.005))
+    monkeypatch.setattr(surprises, "NEES_S", (47.0, 50.0))
+    result = surprises.run(surprises.Case("push", at_s=at_s, seconds=52.0, **step), 1)
+    assert result.track is not None
+    (found,) = result.track.manoeuvres  # a size that is wrong by many of its sigma caused a second report
+    assert abs(found.t_ns * 1e-9 - at_s - 0.2) < 3.0 * found.t_1s_s
+    assert found.t_1s_s < 0.03
+    off = found.velocity - result.true_velocity
+    assert off @ np.linalg.solve(found.P[3:, 3:], off) < 16.3  # 99.9 % point, 3 degrees of freedom
+    if result.true_rate.any():
+        assert abs(float(np.linalg.norm(found.rate)) - 0.01) < 3.0 * float(np.sqrt(np.trace(found.P[:3, :3])))
+    assert np.max(np.array(result.nees)[:, 0]) < 2.0

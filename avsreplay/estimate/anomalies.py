@@ -19,17 +19,19 @@ from avsreplay.estimate.batch_covariance import LATEST, BatchCovariance, final_m
 from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.error_state import VEL, W
-from avsreplay.estimate.hypotheses import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis, explain
+from avsreplay.estimate.hypotheses import explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.mixture import moments
 from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.params import EstimatorParams, Start
+from avsreplay.estimate.scan_window import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis
 from avsreplay.estimate.track import (
     Epoch,
     SensorBias,
     Track,
     confirmed,
+    long_run,
     nis_scale,
     ready,
     with_history,
@@ -41,7 +43,6 @@ from avsreplay.settings import given
 
 _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decision; accepted scans kept
 _OVER_FREE, _OVER_NEXT = 3.0, 2.0  # log odds over free motion, and over the next hypothesis, of an early decision
-_RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 _NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _LEAST = 1e-9  # of the eigenvalues of the prior after a manoeuvre
@@ -86,7 +87,7 @@ class AnomalyTest:
             large = large or (ready(track) and epoch.innovation.chi2 > GATE * nis_scale(track))
             return self._undecidable(doubtful) if large else (self._accepted(track, epoch, update), verdict)
         large = large or epoch.innovation.chi2 > GATE * nis_scale(track)
-        if not (large or track.doubtful or _long_run((*track.recent, epoch), nis_scale(track))):
+        if not (large or track.doubtful or long_run((*track.recent, epoch), nis_scale(track))):
             return self._accepted(track, epoch, update), verdict
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
         ranked = explain(window, first, self._priors, *self.batch.noise_levels(track), self.batch.orbit)
@@ -320,16 +321,6 @@ def _linear(window: tuple[Epoch, ...], ranked: list[Explanation]) -> bool:
 
 def _chi2(y: Array, C: Array) -> float:
     return float(y @ np.linalg.solve(C, y))
-
-
-def _long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
-    """Return whether the sum of the last whitened innovations is large, over one of several runs of scans."""
-    last = [e.innovation for e in epochs[: -_RUNS[-1] - 1 : -1]]
-    roots = cholesky_root(np.array([one.S for one in last]))
-    white = np.linalg.solve(roots, np.array([one.alpha for one in last])[:, :, None])[:, :, 0]
-    sums = np.cumsum(white, axis=0)
-    share, lengths = epochs[-1].innovation.share, [n for n in _RUNS if n <= len(white)]
-    return any(sums[n - 1] @ sums[n - 1] > _RUN_GATE * scale * n * (1.0 + (n - 1) * share) for n in lengths)
 
 
 def _definite(root: Array) -> Array:

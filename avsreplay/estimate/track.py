@@ -19,13 +19,14 @@ from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.dynamics import propagate_state, rotation_path
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.measurement import measurement_jacobian, to_camera, to_fixture
-from avsreplay.estimate.noise import NoiseWindow
+from avsreplay.estimate.noise import NoiseWindow, cholesky_root
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import Belief, Drift, Innovation, Manoeuvre, State
 
 _FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
 _READY, _READY_AFTER_MANOEUVRE = 8, 3  # least number of poses of an estimate whose prediction can be tested
+_RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 _NO_NOISE = frozen(np.zeros((6, 6)))
 
 
@@ -167,6 +168,16 @@ def ready(track: Track) -> bool:
     """
     least = _READY_AFTER_MANOEUVRE if track.manoeuvres else _READY
     return track.mode == "filter" or (track.mode == "fit" and track.batch is not None and track.batch.count >= least)
+
+
+def long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
+    """Return whether the sum of the last whitened innovations is large, over one of several runs of scans."""
+    last = [e.innovation for e in epochs[: -_RUNS[-1] - 1 : -1]]
+    roots = cholesky_root(np.array([one.S for one in last]))
+    white = np.linalg.solve(roots, np.array([one.alpha for one in last])[:, :, None])[:, :, 0]
+    sums = np.cumsum(white, axis=0)
+    share, lengths = epochs[-1].innovation.share, [n for n in _RUNS if n <= len(white)]
+    return any(sums[n - 1] @ sums[n - 1] > _RUN_GATE * scale * n * (1.0 + (n - 1) * share) for n in lengths)
 
 
 _KNOTS = 65  # instants at which the motion is computed; in between, rotation and position are interpolated linearly

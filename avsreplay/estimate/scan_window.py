@@ -1,0 +1,148 @@
+"""A run of scans about the predicted trajectory, and the evidence of unknowns that are linear in their innovations.
+
+All hypotheses about large innovations (``hypotheses``) are linear in their unknowns, so that their
+marginal likelihood is Gaussian in closed form: the generalised likelihood ratio of Willsky and Jones (IEEE Trans.
+Automatic Control 21, 1976) with a Gaussian prior on the size of the change, which makes hypotheses with different
+numbers of unknowns comparable (Basseville and Nikiforov, Detection of Abrupt Changes, 1993).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+
+import numpy as np
+
+from avsreplay.estimate.dynamics import advance, flows, process_noise, transition
+from avsreplay.estimate.error_state import rotation
+from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
+from avsreplay.estimate.noise import cholesky_root, correlated_noise
+from avsreplay.estimate.relative_orbit import OrbitArc
+from avsreplay.estimate.track import Epoch
+from avsreplay.geometry import Array, Pose, frozen
+from avsreplay.records import Belief
+
+PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
+_SCALES = (1.0, 0.1)  # of the prior standard deviations: a large or a small change
+_ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
+
+
+class Hypothesis(Enum):
+    """What explains a run of scans."""
+
+    FREE_MOTION = "free_motion"
+    MANOEUVRE = "manoeuvre"
+    SENSOR_BIAS = "sensor_bias"
+    FROZEN = "frozen"  # the sensor repeats an old scan
+    BAD_SCANS = "bad_scans"
+
+
+@dataclass(frozen=True, slots=True)
+class ChangePriors:
+    """1 sigma of the size of a change: rate [rad/s], velocity [m/s], position [m] and half angle of a sensor error."""
+
+    rate_radps: float
+    velocity_mps: float
+    position_m: float
+    half_angle: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Explanation:
+    """A hypothesis with its most likely parameters.
+
+    Attributes:
+        log_evidence: log of the marginal likelihood times the prior odds.
+        chi2: squared norm of the whitened residuals of the innovations, ``dof`` of them.
+        onset: index of the first affected scan.
+        after_s: instant of a manoeuvre after the first scan's prior belief [s], with its standard deviation.
+        size, P: (6,) (rate, velocity) of a manoeuvre or the offset of a sensor bias, with its covariance (6, 6).
+        changes_s: instants of free changes of the velocity: the ends of the 90 % interval of the instant, or two in
+            each interval between scans over which a manoeuvre extends.
+    """
+
+    hypothesis: Hypothesis
+    log_evidence: float
+    chi2: float
+    dof: int
+    onset: int
+    after_s: float = 0.0
+    after_1s_s: float = 0.0
+    size: Array = field(default_factory=lambda: _ZERO)
+    P: Array = field(default_factory=lambda: _NO_COVARIANCE)
+    changes_s: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Window:
+    """Innovations y (6n,) about the trajectory predicted from the belief before the window.
+
+    ``C`` (6n, 6n) is their covariance without a change, ``whiten`` the inverse of its Cholesky factor.
+    """
+
+    times_s: Array
+    y: Array
+    C: Array
+    whiten: Array
+    rows: Array  # (n, 6, 20) H Phi from the start of the window
+    poses: tuple[Pose, ...]
+    R: tuple[Array, ...]
+    R_ba: tuple[Array, ...]
+
+
+def window_of(epochs: Sequence[Epoch], start: Belief, torque: float, force: float, arc: OrbitArc | None) -> Window:
+    """The scans about the trajectory from ``start``, with disturbances of these root densities."""
+    n, x = len(epochs), start.x
+    times = np.array([(e.prediction.belief.t_ns - start.t_ns) * 1e-9 for e in epochs])
+    y, rows, back, poses, R_ba = np.empty((n, 6)), np.empty((n, 6, 20)), np.empty((n, 20, 20)), [], []
+    for k, (epoch, step, t) in enumerate(zip(epochs, flows(x.w_b, x.sigma, times, torque), times, strict=True)):
+        then, Phi = advance(x, step, t, arc), transition(step, x.sigma, t, arc)
+        poses.append(measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha))
+        y[k] = innovation_vector(then, poses[-1])
+        rows[k] = measurement_jacobian(then) @ Phi
+        inverse = np.linalg.inv(Phi)
+        back[k] = start.P + inverse @ process_noise(step, t, force) @ inverse.T  # what the noise at the start would be
+        R_ba.append(rotation(then.q_ab).T)
+    C = ((rows @ back).reshape(6 * n, 20) @ rows.reshape(6 * n, 20).T).reshape(n, 6, n, 6)
+    earlier = np.arange(n)[:, None] < np.arange(n)  # scans i before j: the noise until i is what they have in common
+    C = np.where(earlier.T[:, None, :, None], C.transpose(2, 3, 0, 1), C)
+    innovations = [e.innovation for e in epochs]
+    R = tuple(i.R for i in innovations)
+    flat = C.reshape(6 * n, 6 * n) + correlated_noise(R, [i.share for i in innovations])
+    flat = 0.5 * (flat + flat.T)
+    whiten = np.asarray(np.linalg.inv(cholesky_root(flat)), dtype=np.float64)
+    return Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, tuple(R_ba))
+
+
+def evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float, Array, Array]:
+    """Log evidence, mean and covariance of the unknowns u ~ N(0, scale^2) in white = M u + N(0, 1)."""
+    A, b = M.T @ M * np.outer(scale, scale) + np.eye(len(scale)), scale * (M.T @ white)
+    inverse = np.linalg.inv(A)
+    v = inverse @ b
+    value = free + 0.5 * float(b @ v) - 0.5 * float(np.linalg.slogdet(A)[1])
+    return value, scale * v, np.outer(scale, scale) * (0.5 * (inverse + inverse.T))
+
+
+def mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice]) -> Array:
+    """(k,) log evidence over free motion of unknowns with columns M (k, m, n), the mean over kinds and prior widths.
+
+    A single prior that is wide in all directions would hide a small change of the velocity alone from few scans.
+    """
+    Mt = np.swapaxes(M, 1, 2)
+    G, g = Mt @ M, Mt @ white
+    found = []
+    for kind in kinds:
+        for factor in _SCALES:
+            s = factor * scale[kind]
+            A = G[:, kind, kind] * np.outer(s, s) + np.eye(len(s))
+            b = g[:, kind] * s
+            v = np.linalg.solve(A, b[:, :, None])[:, :, 0]
+            found.append(0.5 * (b * v).sum(axis=1) - 0.5 * np.linalg.slogdet(A)[1])
+    return np.asarray(np.logaddexp.reduce(found, axis=0) - math.log(len(found)))
+
+
+def log_mean(values: Sequence[float]) -> float:
+    """Logarithm of the mean of the exponentials."""
+    return float(np.logaddexp.reduce(values)) - math.log(len(values))
