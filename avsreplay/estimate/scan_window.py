@@ -92,7 +92,9 @@ class Window:
     R_ba: tuple[Array, ...]
 
 
-def window_of(epochs: Sequence[Epoch], start: Belief, torque: float, force: float, arc: OrbitArc | None) -> Window:
+def window_of(
+    epochs: Sequence[Epoch], start: Belief, torque: float, force: float, arc: OrbitArc | None = None
+) -> Window:
     """The scans about the trajectory from ``start``, with disturbances of these root densities."""
     n, x = len(epochs), start.x
     times = np.array([(e.prediction.belief.t_ns - start.t_ns) * 1e-9 for e in epochs])
