@@ -27,6 +27,9 @@ from avsreplay.register.sampling import sample, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 
 MODEL_POINTS = 3000
+COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # of the scan: first and second selection, final ranking
+COARSE_PASSES, MIDDLE_PASSES = 8, 12  # point-to-plane iterations for each attitude in the two selections
+MIDDLE_STARTS, FINE_STARTS = 50, 10  # attitudes kept for the second selection, and poses registered on the model
 CELLS = 40  # of the grid along the diagonal of the model
 COARSE_OF_EXTENT, MIDDLE_OF_EXTENT = 0.03, 0.02  # distances beyond which a point counts as unexplained
 START_OF_EXTENT, FALL = 0.3, 0.7  # rejection distance of the first pass, and its factor from pass to pass
@@ -92,7 +95,7 @@ class GlobalSearch:
         self._field = kernel_module().Field(points, np.ascontiguousarray(planes), CELLS)
         self._centroids = VisibleCentroids(points, normals if self._sided else np.zeros_like(normals), self._extent)
         self._middle = points.mean(axis=0)
-        self._symmetries = self._near_symmetries(thin_to(points, params.middle_points))
+        self._symmetries = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
         brief = replace(target.limits, n_max=min(FINE_PASSES, target.limits.n_max))
         self._refine = HornBackend(replace(target, limits=brief))
 
@@ -104,13 +107,13 @@ class GlobalSearch:
     def work(self, points: int, number: int) -> int:
         """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
         p = self._params
-        few, some, fine = (min(points, most) for most in (p.coarse_points, p.middle_points, p.fine_points))
+        few, some, fine = (min(points, most) for most in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS))
         starts, stride = p.starts * (1, SHIFTS, 7)[number] // THINNED[number], FIRST_STRIDES[number]
-        looked = few * (starts * (1 + FIRST_PASSES) // stride + p.starts // KEPT_AFTER_FIRST * (1 + p.coarse_passes))
-        looked += some * int(APART * p.middle_starts) * (1 + p.middle_passes)
+        looked = few * (starts * (1 + FIRST_PASSES) // stride + p.starts // KEPT_AFTER_FIRST * (1 + COARSE_PASSES))
+        looked += some * int(APART * MIDDLE_STARTS) * (1 + MIDDLE_PASSES)
         looked += some * len(self._symmetries) * (1 + TURNED_PASSES)
         refined = FINE_PASSES * RIVALS * FAR_WORK // 2 * min(fine, REFINED_POINTS)
-        return looked // LOOK_UPS + p.fine_starts * some + refined + RIVALS * fine
+        return looked // LOOK_UPS + FINE_STARTS * some + refined + RIVALS * fine
 
     def search(self, points: NDArray[Any], number: int = 0, before: SearchResult | None = None) -> SearchResult:
         """Return the best poses for a scan by one round of the search.
@@ -122,9 +125,8 @@ class GlobalSearch:
             before: result of another round for the same points, whose poses take part.
         """
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
-        p = self._params
         few, some, fine = (
-            np.ascontiguousarray(thin_to(scan, count)) for count in (p.coarse_points, p.middle_points, p.fine_points)
+            np.ascontiguousarray(thin_to(scan, count)) for count in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS)
         )
         sight = self._target.visibility.direction_to_camera(scan)
         sights, shifts, facing = self._rounds(few, sight)[number]
@@ -168,11 +170,11 @@ class GlobalSearch:
             np.ascontiguousarray(few[::stride]), starts, FIRST_PASSES, START_OF_EXTENT * L, *coarse
         )
         poses = _best(poses, costs, max(1, p.starts // KEPT_AFTER_FIRST))
-        poses, costs = self._field.refine(few, poses, p.coarse_passes, narrow * L, *coarse)
-        apart = self._different(_best(poses, costs, 2 * p.middle_starts), p.middle_starts, 0.3)
+        poses, costs = self._field.refine(few, poses, COARSE_PASSES, narrow * L, *coarse)
+        apart = self._different(_best(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
         poses = np.stack([pose.matrix for pose in apart])
-        poses, costs = self._field.refine(some, poses, p.middle_passes, narrow * L, *middle)
-        return self._different(_best(poses, costs, p.middle_starts), p.fine_starts, 0.5)
+        poses, costs = self._field.refine(some, poses, MIDDLE_PASSES, narrow * L, *middle)
+        return self._different(_best(poses, costs, MIDDLE_STARTS), FINE_STARTS, 0.5)
 
     def _different(self, poses: Array, most: int, scale: float) -> list[Pose]:
         """The first few of (k, 4, 4) that are different poses."""
@@ -210,7 +212,7 @@ class GlobalSearch:
     def _near_symmetries(self, points: Array) -> Array:
         """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, without the identity: the best few."""
         starts = self._starts(self._middle, [None], np.zeros((1, 3)))
-        few = np.ascontiguousarray(points[:: max(1, len(points) // self._params.coarse_points)])
+        few = np.ascontiguousarray(points[:: max(1, len(points) // COARSE_POINTS)])
         poses = np.stack([pose.matrix for pose in self._selected(few, points, starts, False)])
         rule = (FALL, 0.01 * self._extent, COARSE_OF_EXTENT * self._extent, False, 1)
         poses, costs = self._field.refine(points, poses, 0, self._extent, *rule)

@@ -33,13 +33,6 @@ class AcquireParams(Settings):
     """Parameters of the global search: registration without an initial guess."""
 
     starts: int = setting(600, "Attitudes tried; the second effort tries seven times as many.", low=1)
-    coarse_points: int = setting(100, "Points of the scan used in the first selection.", low=1)
-    coarse_passes: int = setting(8, "Point-to-plane iterations per attitude in the first selection.", low=1)
-    middle_starts: int = setting(50, "Attitudes kept for the second selection.", low=1)
-    middle_points: int = setting(300, "Points of the scan used in the second selection.", low=1)
-    middle_passes: int = setting(12, "Point-to-plane iterations per attitude in the second selection.", low=1)
-    fine_starts: int = setting(10, "Different poses that are registered on the model itself.", low=1)
-    fine_points: int = setting(1500, "Points of the scan with which these are registered and ranked.", low=1)
     least_ratio: float = setting(0.7, "With a smaller inlier ratio no pose was found.", low=0.0, high=1.0)
     least_separate: float = setting(
         0.4,
