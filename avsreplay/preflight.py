@@ -83,7 +83,12 @@ def preflight(source: Source, surface: Surface | None, registrar: Registrar | No
     if source.options.poses:
         return [*_poses(source, surface), *_transforms(info, source), *_truth(info), *_clock(info)]
     clouds = _sampled_clouds(source)
-    found = [*_sizes(clouds, surface, registrar), *_transforms(info, source), *_truth(info), *_clock(info)]
+    found = [
+        *_sizes(clouds, surface, registrar, source.options),
+        *_transforms(info, source),
+        *_truth(info),
+        *_clock(info),
+    ]
     share = None if registrar is None else _share_on_model(source, registrar)
     if share is not None:
         text = f"{100 * share:.0f} % of the points of the first scan are on the model at the first pose"
@@ -153,9 +158,17 @@ def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
     return float(np.linalg.norm(points - second, axis=1).max())
 
 
-def _sizes(clouds: Sequence[NDArray[Any]], surface: Surface | None, registrar: Registrar | None) -> list[Advice]:
+def _sizes(
+    clouds: Sequence[NDArray[Any]], surface: Surface | None, registrar: Registrar | None, options: SourceOptions
+) -> list[Advice]:
     if not clouds:
-        return [Advice("check", "scans", "the examined scans hold no points")]
+        cropped = options.crop_range is not None or options.crop_box is not None
+        text = (
+            "no points are left in the examined scans; widen the crop"
+            if cropped
+            else "the examined scans hold no points"
+        )
+        return [Advice("check", "scans", text)]
     scan_m = float(np.median([diameter(cloud) for cloud in clouds]))
     if surface is None:
         text = f"there is no model; the scans measure {_metres(scan_m)}"

@@ -130,6 +130,11 @@ class ViewWriter:
         if path is not None:
             self._plans.append(PathView(scan.row.t_ns, np.asarray(path[1], np.float32), scan.row.plan_miss_m))
 
+    def correct(self, rows: Sequence[Row]) -> None:
+        """Take the errors of the plans from corrected rows."""
+        misses = {row.t_ns: row.plan_miss_m for row in rows}
+        self._plans = [replace(plan, miss_m=misses[plan.t_ns]) for plan in self._plans]
+
     def _residual(self, points: NDArray[np.float32], T_ac: Pose) -> NDArray[np.float32]:
         """Distance (n,) [m] of points (n, 3) in {A} to the model at the estimated pose."""
         return self._registrar.distance(points, T_ac, VIEW_REACH * self._surface.extent).astype(np.float32)
@@ -248,6 +253,20 @@ class ResultWriter:
         rows, self._beliefs, self._view, known = self._run.restore(folder / CHECKPOINT)
         self._log.resume(folder / "result.mcap", known, rows[-1])
         return list(rows)
+
+    def correct(self, rows: Sequence[Row], changed: Sequence[int]) -> None:
+        """Replace rows whose scans were taken before the true poses after them were recorded.
+
+        Args:
+            rows: all rows.
+            changed: indices of those that have other values than the scans that were taken.
+        """
+        self._log.close()
+        first = self._directory.file("result.mcap").rename(self._directory.file("result.first.mcap"))
+        self._log = ResultLogWriter(self._directory.file("result.mcap"), self._run)
+        self._log.take_over(first, rows, changed)
+        first.unlink()
+        self._view.correct(rows)
 
     def finish(self, rows: Sequence[Row], record: Mapping[str, Any], *, resumable: bool = False) -> None:
         """Write what needs the whole run.

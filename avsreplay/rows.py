@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
@@ -276,6 +276,19 @@ class Row:
             score: its comparison with the ground truth.
         """
         return cls(**{name: value(outcome, score) for name, value in _VALUES})
+
+    def rescored(self, score: Score) -> Row:
+        """Return the row with the errors of planned and flown captures of another score.
+
+        Args:
+            score: its ``planned`` and ``captured``.
+        """
+        values: dict[str, Any] = {
+            f"{kind}_miss_{unit}": None if error is None else finite(getattr(error, name))
+            for kind, error in (("plan", score.planned), ("capture", score.captured))
+            for unit, name in (("m", "distance_m"), ("mps", "speed_mps"), ("deg", "angle_deg"))
+        }
+        return dataclasses.replace(self, **values)
 
 
 _VALUES = tuple((f.name, f.metadata["value"]) for f in dataclasses.fields(Row))

@@ -17,6 +17,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.reference import Reference
+from avsreplay.geometry import Pose
 from avsreplay.log import GrowingLog, Source, SourceOptions, open_source
 from avsreplay.log.streams import ahead
 from avsreplay.outcome import Outcome
@@ -101,7 +102,7 @@ class Run:
         self._made: Reconstruction | None = None
         try:
             header = self.header = self._without_model() if unknown else self.source.header
-            own = _run_table(header.scenario)
+            own: Mapping[str, Any] = tomllib.loads(header.scenario).get("run", {}) if header.scenario else {}
             self.config: RunConfig = load_config(job.config_file, own, job.assignments, job.source.parent)
             if self._made is not None and self.config.init == "log" and self._made.poses[0][0] == self._first_ns:
                 self.config = replace(self.config, init=pose_text(self._made.poses[0][1]))
@@ -202,11 +203,11 @@ class Run:
             self._state, self.done = state, self.done + 1
             yield row
 
-    @property
-    def outdated(self) -> bool:
-        """Whether a log that has grown must be replayed again, because what came later changes rows before it."""
-        planned = self._scored is not None and self._scored.planned
-        return self.job.growing is not None and self.job.growing.outdated(planned=planned)
+    def rescore(self, rows: list[Row]) -> list[int]:
+        """Score the plans of a log that has grown with the true poses recorded after them; see ``Scorer.rescore``."""
+        changed = [] if self._scored is None else self._scored.rescore(rows, self._true_poses())
+        self._fold = self._fold.anew(rows)
+        return changed
 
     def checkpoint(self, more: Any) -> bytes:
         """Return the state after the last row, from which ``restore`` continues with the same bits.
@@ -299,14 +300,17 @@ class Run:
             scans.close()
 
     def _scorer(self) -> Scorer:
-        """Against the truth of the log, or against the reference within its span."""
-        reference, poses = self._reference, self.source.truth_poses()
+        return Scorer(self.estimator, self._true_poses(), self.config.reference.value, growing=bool(self.job.growing))
+
+    def _true_poses(self) -> list[tuple[int, Pose]]:
+        """True poses of the log, or of the reference within its span."""
+        reference, poses = self._reference, list(self.source.truth_poses())
         if self._made is not None:
             poses = [] if self._T_cr is None else [(t_ns, pose @ self._T_cr) for t_ns, pose in poses]
         if reference is not None:
             inside = [t for t in self._reference_instants if reference.epoch_ns <= t <= reference.end_ns]
             poses = [(t_ns, reference.at(t_ns).T_ac) for t_ns in inside]
-        return Scorer(self.estimator, poses, self.config.reference.value)
+        return poses
 
     def _truth_of(self, scan: Scan) -> Truth:
         """Return the truth at a scan; the pose is that of the reference motion if one was fitted."""
@@ -341,8 +345,3 @@ class Run:
         if surface is None:
             raise UsageError("the log holds no model", where=str(self.job.source), hint="name one with --model FILE")
         return surface
-
-
-def _run_table(scenario: str) -> Mapping[str, Any]:
-    """The ``[run]`` table of the log's own scenario."""
-    return dict(tomllib.loads(scenario).get("run", {})) if scenario else {}

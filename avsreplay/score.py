@@ -16,13 +16,14 @@ from avsreplay.estimate.chart import nearest_permutation, nees
 from avsreplay.estimate.error_state import boxminus
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import block_nees
 from avsreplay.outcome import CaptureError, Outcome, PoseError, Score
 from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan import Motion, interpolated, miss
 from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief, State, Truth
+from avsreplay.rows import Row
 
 
 class Scorer:
@@ -32,28 +33,54 @@ class Scorer:
         motion: interpolation of the true poses, None where plans cannot be scored.
     """
 
-    def __init__(self, estimator: Estimator, poses: Sequence[tuple[int, Pose]], reference: str) -> None:
+    def __init__(
+        self, estimator: Estimator, poses: Sequence[tuple[int, Pose]], reference: str, *, growing: bool = False
+    ) -> None:
         """Interpolate the true poses.
 
         Args:
             estimator: predicts the attitude at the end of a planned flight.
             poses: true poses T_ac by instant, ascending; with fewer than four, plans are not scored.
             reference: what the errors are taken against, "truth" or "fit".
+            growing: keep the flights for ``rescore``, because true poses are recorded after them.
         """
         self._estimator, self._reference = estimator, reference
+        self._interpolate(poses)
+        self._segment: Segment | None = None
+        self._planned: CaptureError | None = None
+        self._captured_ns: int | None = None
+        self._flights: list[tuple[int, Segment, Array | None]] | None = [] if growing else None
+        self._captures: list[tuple[int, int]] = []  # scan, number of flights that had begun before
+        self._count = 0
+
+    def _interpolate(self, poses: Sequence[tuple[int, Pose]]) -> None:
         self._epoch_ns = poses[0][0] if poses else 0
         self.motion: Motion | None = None
         if len(poses) >= 4:
             times = np.array([(t_ns - self._epoch_ns) * 1e-9 for t_ns, _ in poses])
             self.motion = interpolated(times, [pose for _, pose in poses])
-        self._segment: Segment | None = None
-        self._planned: CaptureError | None = None
-        self._captured_ns: int | None = None
 
-    @property
-    def planned(self) -> bool:
-        """Whether a capture was planned so far."""
-        return self._segment is not None
+    def rescore(self, rows: list[Row], poses: Sequence[tuple[int, Pose]]) -> list[int]:
+        """Compare the flights of a log that grew with all its true poses.
+
+        Args:
+            rows: all rows; those whose errors of planned or flown captures change are replaced.
+            poses: true poses T_ac by instant, ascending.
+
+        Returns:
+            Indices of the rows that have changed.
+        """
+        self._interpolate(poses)
+        flights = self._flights or []
+        errors = [self._error_of(segment, attitude) for _, segment, attitude in flights]
+        planned = {at: error for (at, _, _), error in zip(flights, errors, strict=True)}
+        captured = {at: errors[number - 1] for at, number in self._captures if number}
+        scores = {at: Score(planned=planned.get(at), captured=captured.get(at)) for at in {*planned, *captured}}
+        found = {at: rows[at].rescored(score) for at, score in sorted(scores.items())}
+        changed = [at for at, row in found.items() if row != rows[at]]
+        for at in changed:
+            rows[at] = found[at]
+        return changed
 
     def score(self, state: PipelineState, outcome: Outcome, truth: Truth) -> Score:
         """Compare an outcome with the truth at its scan.
@@ -64,8 +91,11 @@ class Scorer:
             truth: ground truth at the scan.
         """
         captured = self._planned if state.captured_ns != self._captured_ns else None
+        if self._flights is not None and state.captured_ns != self._captured_ns:
+            self._captures.append((self._count, len(self._flights)))
         self._captured_ns = state.captured_ns
         planned = self._new_plan(state)
+        self._count += 1
         if truth.pose is None:
             return Score(fault=truth.fault, planned=planned, captured=captured)
         total, blocks = _nees(outcome, truth.state)
@@ -85,13 +115,18 @@ class Scorer:
         segment = planned_segment(state)
         if segment is None or segment is self._segment:
             return None
-        self._segment, self._planned = segment, self._capture_error(state, segment)
+        attitude = None
+        if state.track is not None and (self.motion is not None or self._flights is not None):
+            attitude = self._estimator.predict(state.track, segment.end_ns).belief.x.T_ac.q
+        if self._flights is not None:
+            self._flights.append((self._count, segment, attitude))
+        self._segment, self._planned = segment, self._error_of(segment, attitude)
         return self._planned
 
-    def _capture_error(self, state: PipelineState, segment: Segment) -> CaptureError | None:
-        if self.motion is None or segment.path is None or state.track is None:
+    def _error_of(self, segment: Segment, attitude: Array | None) -> CaptureError | None:
+        """The error of a flight whose attitude at its end is predicted as ``attitude`` (4,)."""
+        if self.motion is None or segment.path is None or attitude is None:
             return None
-        attitude = self._estimator.predict(state.track, segment.end_ns).belief.x.T_ac.q
         found = miss(segment.path, (segment.t_ns - self._epoch_ns) * 1e-9, self.motion, attitude)
         if not np.isfinite(found.distance_m):
             return None

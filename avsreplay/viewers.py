@@ -6,6 +6,7 @@ import json
 import os
 import socket
 import sys
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,10 @@ class ResultLogWriter:
         """Take over the messages of the log of an interrupted run, the plans that it has seen and its last row."""
         self._log.copy(written, last.reason)
         self.paths = paths
+
+    def take_over(self, written: Path, rows: Sequence[Row], changed: Iterable[int]) -> None:
+        """Take over the messages of a complete log of the same run, with the columns of the rows that have changed."""
+        self._log.copy(written, rows[-1].reason, {k: _numbers(rows[k]) for k in changed})
 
     def close(self) -> None:
         """Complete the file."""
@@ -180,6 +185,13 @@ class RerunStream:
             rr.log(f"rows/{name}", rr.Scalars(value))
         if row.gamma == 0:
             rr.log("rows/reason", rr.TextLog(row.reason))
+
+    def correct(self, rows: Sequence[Row], changed: Iterable[int]) -> None:
+        """Send the columns of rows again that had other values when their scans were shown."""
+        for row in (rows[k] for k in changed):
+            self._rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
+            for name, value in _numbers(row).items():
+                self._rr.log(f"rows/{name}", self._rr.Scalars(value))
 
     def close(self) -> None:
         """Send what is still buffered."""

@@ -69,9 +69,9 @@ def test_a_difference_fails_and_is_shown(change, column, cli, fixtures_folder, t
     assert "Traceback" not in done.err
 
 
-def test_a_missing_golden_fails(cli, fixtures_folder, tmp_path):
+def test_a_missing_golden_is_named_before_the_replay(cli, fixtures_folder, tmp_path):
     done = cli("run", fixtures_folder / "tumble.mcap", "--golden", tmp_path / "none.jsonl")
-    assert done.code == 1
+    assert (done.code, done.out) == (3, "")
     assert "no such golden file" in done.err
 
 

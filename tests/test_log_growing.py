@@ -16,6 +16,7 @@ import pytest
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.log import GrowingLog, LogWriter, SourceOptions, open_source
 from avsreplay.records import LogHeader, Scan
+from avsreplay.result_dir import ResultDirectory, ResultWriter
 from avsreplay.run import Job, Run
 
 OPTIONS = SourceOptions(n_scans=9)
@@ -64,7 +65,7 @@ def test_a_stream_gives_the_rows_of_the_whole_log(log, tmp_path, step):
     growing = grown(log, tmp_path, step)
     with Run(Job(source=growing.path, growing=growing)) as run:
         rows = list(run.rows())
-        assert not run.outdated
+        assert not growing.outdated()
         facts = run.facts()
     assert rows == expected
     assert facts["log"]["sha256"] == record["log"]["sha256"]
@@ -116,10 +117,48 @@ def test_a_clock_that_steps_later_makes_the_rows_outdated(tmp_path):
     growing.open(SourceOptions())
     for scan in growing.scans():
         growing.take(scan, growing.source.truth_of(scan))
-    outdated = growing.outdated(planned=False)
+    outdated = growing.outdated()
     with open_source(path) as whole:
         same = [scan.t_ns for scan in whole.scans()] == [used.t_ns for used, _ in growing._used]
     assert outdated != same
+
+
+class Written(GrowingLog):
+    """A file that is longer by a piece at each look."""
+
+    def __init__(self, path, data, count):
+        self.pieces = [bytes(piece) for piece in np.array_split(np.frombuffer(data, np.uint8), count)]
+        path.write_bytes(self.pieces.pop(0))
+        super().__init__(path)
+
+    def _advance(self):
+        if self.pieces:
+            with self.path.open("ab") as file:
+                file.write(self.pieces.pop(0))
+        return super()._advance()
+
+
+def test_plans_are_scored_with_the_true_poses_after_them_without_a_second_replay(fixtures_folder, tmp_path):
+    """A strong robot arrives before the log ends; the true poses at its arrival come after the plan."""
+    log, settings = fixtures_folder / "tumble.mcap", ("plan.a_max_mps2=5",)
+    growing = Written(tmp_path / "log.mcap", log.read_bytes(), 20)
+    job = Job(source=log, assignments=settings)
+    folders = {}
+    for name, wanted in (("whole", job), ("grown", dataclasses.replace(job, growing=growing))):
+        folders[name] = tmp_path / name
+        with Run(wanted) as run, ResultWriter(ResultDirectory(folders[name]), run) as writer:
+            rows = list(run.rows(writer.listeners))
+            missed = [row.plan_miss_m for row in rows]
+            if run.job.growing:
+                assert not run.job.growing.outdated()
+                changed = run.rescore(rows)
+                assert [row.plan_miss_m for row in rows] != missed
+                writer.correct(rows, changed)
+            summary = dataclasses.asdict(run.summary())
+            writer.finish(rows, {"summary": repr(summary)})
+    files = {path.name: path.read_bytes() for path in folders["whole"].iterdir()}
+    assert {path.name: path.read_bytes() for path in folders["grown"].iterdir()} == files
+    assert any(row.capture_miss_m is not None for row in rows)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a log at all, but long enough"])

@@ -183,6 +183,20 @@ def test_empty_scans_are_said():
     assert _found(preflight(Log([np.zeros((0, 3))] * 3), None), "scans").grade == "check"
 
 
+def test_a_selection_without_a_scan_is_one_line(cli, fixtures_folder):
+    done = cli("run", fixtures_folder / "tumble.mcap", "--start", "99")
+    assert done.code == 3
+    assert done.err.splitlines() == [
+        f"avsreplay: {fixtures_folder / 'tumble.mcap'}: no scan to replay; widen the selection, or see 'avsreplay info'"
+    ]
+
+
+def test_a_crop_that_leaves_no_point_is_named(cli, fixtures_folder):
+    done = cli("run", fixtures_folder / "tumble.mcap", "--crop-range", "500,600", "--n-scans", "3", "--json")
+    assert "no points are left in the examined scans; widen the crop" in done.err
+    assert "mostly no points" in done.err
+
+
 def test_a_pose_topic_is_offered_as_truth(surface):
     topics = (TopicInfo("/mocap/pose", "geometry_msgs/msg/PoseStamped", "cdr", 9, 0, 1),)
     assert _found(preflight(Log(_seen(surface), topics), surface), "truth").option == "--truth-topic /mocap/pose"

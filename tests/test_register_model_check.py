@@ -11,6 +11,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import ModelCheck, Registrar
 from avsreplay.register.contract import boxes, view
+from avsreplay.register.params import RegisterParams
 
 SEED = 3
 
@@ -54,6 +55,17 @@ def test_a_correct_model_raises_no_note() -> None:
 def test_few_scans_say_nothing_of_the_size() -> None:
     check = checked(boxes(), boxes(), count=4)
     assert check.scale() is None
+    assert check.notes() == ()
+
+
+def test_poses_that_did_not_converge_on_the_model_say_nothing_of_its_shape() -> None:
+    """The limit of iterations ends the registration with nearly all points on the model."""
+    model = boxes()
+    registrar = Registrar(model, RegisterParams(n_max=1))
+    check = ModelCheck(registrar, model)
+    for points, T_ac in scans(model, 3):
+        start = Pose(T_ac.q, T_ac.t + 0.003 * model.extent)
+        check.add(points, registrar.register(points, start))
     assert check.notes() == ()
 
 

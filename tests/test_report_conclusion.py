@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 from dataclasses import dataclass, field
 
@@ -13,9 +14,10 @@ from click.testing import CliRunner
 from avsreplay.cli.compare import compare_command
 from avsreplay.errors import UsageError
 from avsreplay.report.compare import METRICS
-from avsreplay.report.conclusion import HEADLINES, conclude
+from avsreplay.report.conclusion import HEADLINES, changes_table, conclude
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.summary import Summary
+from avsreplay.report.table import make_console, print_table
 
 
 @dataclass
@@ -63,6 +65,73 @@ def test_errors_that_differ_by_chance_are_no_evidence(make_rows):
         for k in range(20)
     ]
     assert words.count("no evidence") >= 16  # 95 % intervals: one in twenty is expected to exclude 0
+
+
+def _series(rng, count, phi):
+    """A first-order autoregressive series of unit variance."""
+    out = [rng.normal()]
+    for _ in range(count - 1):
+        out.append(phi * out[-1] + np.sqrt(1 - phi**2) * rng.normal())
+    return np.array(out)
+
+
+@pytest.mark.parametrize(("count", "phi", "least"), [(35, 0.0, 0.86), (100, 0.8, 0.82)])
+def test_intervals_cover_zero_where_the_runs_do_not_differ(make_rows, count, phi, least):
+    """Errors of equal size, correlated from scan to scan: 3 sigma of 60 trials below 95 % and 91 %."""
+    rng, rows, inside = np.random.default_rng(7), make_rows(count), 0
+    for _ in range(60):
+        runs = [
+            Saved(
+                name,
+                [
+                    dataclasses.replace(r, pos_err_m=abs(float(0.01 + 0.003 * v)))
+                    for r, v in zip(rows, _series(rng, count, phi), strict=True)
+                ],
+            )
+            for name in "ab"
+        ]
+        change = _changes(conclude("b", [tuple(runs)]))["all_pos_rmse_m"]
+        inside += change.low <= 0.0 <= change.high
+    assert inside / 60 >= least
+
+
+def test_a_figure_without_an_interval_is_changed_and_mentioned(make_rows):
+    base = make_rows(35)
+    first = next(k for k, r in enumerate(base) if r.converged)
+    later = [dataclasses.replace(r, converged=r.converged and k >= first + 8) for k, r in enumerate(base)]
+    found = conclude("b", [(Saved("a", base), Saved("b", later))])
+    assert _changes(found)["t1_s"].word == "changed"
+    assert found.word == "no evidence"
+    assert "changed, without an interval: time of convergence" in found.sentence
+
+
+def test_a_median_of_one_pair_is_neither_better_nor_worse(make_rows):
+    pair = Saved("a", _noisy(make_rows(35), 1.0)), Saved("b", _noisy(make_rows(35), 1.04, seed=6))
+    found = _changes(conclude("b", [pair]))
+    assert {found[f"{kind}_pos_median_m"].word for kind in ("all", "pose", "coast")} == {"changed"}
+
+
+def test_four_percent_on_35_scans_are_no_evidence(make_rows):
+    """Errors that are correlated from scan to scan, as those of a filter: 20 pairs, two of which may be decided."""
+    words = []
+    for k in range(20):
+        rng, base = np.random.default_rng(k), make_rows(35)
+        sizes = (scale * np.abs(1 + 0.3 * _series(rng, 35, 0.5)) for scale in (0.01, 0.0096))
+        runs = [
+            Saved("x", [dataclasses.replace(r, pos_err_m=float(e)) for r, e in zip(base, size, strict=True)])
+            for size in sizes
+        ]
+        words.append(_changes(conclude("b", [tuple(runs)]))["all_pos_rmse_m"].word)
+    assert words.count("no evidence") >= 18
+
+
+def test_metric_names_are_not_broken_at_80_columns(make_rows):
+    pair = Saved("a", _noisy(make_rows(60), 1.0)), Saved("b", _noisy(make_rows(60), 3.0, seed=6))
+    out = io.StringIO()
+    print_table(make_console(out, width=80), changes_table("a", conclude("b", [pair]), show_all=False))
+    lines = out.getvalue().splitlines()
+    names = {line.split()[0] for line in lines[3:] if line.strip() and "metrics are not shown" not in line}
+    assert names <= {m.name for m in METRICS}
 
 
 def test_errors_of_coasting_scans_count(make_rows):

@@ -124,8 +124,8 @@ def test_all_are_counted_and_the_first_kept(golden, make_rows):
     assert caught.value.exit_code == 1
 
 
-def test_a_missing_golden_file_fails_the_check(tmp_path, make_rows):
-    with pytest.raises(CheckFailed, match="--update-golden"):
+def test_a_missing_golden_file_cannot_be_read(tmp_path, make_rows):
+    with pytest.raises(UnreadableInput, match="--update-golden"):
         compare_golden(tmp_path / "none.jsonl", make_rows(2))
 
 

@@ -96,7 +96,7 @@ def compare_command(
     several results (one per seed) is compared run by run with the baseline's runs of the same names.
 
     Errors cover all scans, coasting included; a missing value counts as worse. Intervals are 95 % bootstrap
-    intervals of the paired difference. The conclusion on a metric without one needs a change above 10 %.
+    intervals of the paired difference. A figure of two runs that has no interval is neither better nor worse.
 
     \f
     Raises:

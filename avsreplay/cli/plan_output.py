@@ -109,6 +109,8 @@ def print_answer(answer: Answer) -> None:
     facts = plan_facts(answer.planning, answer.at_s, answer.made)
     for found in (answer.joints, answer.spread, answer.flown):
         facts += found.described() if found else []
+    if not answer.made.found:
+        facts.append(("spread over belief", "not computed, because there is no plan"))
     print_table(console, facts_table(f"Plan made at {answer.at_s:.2f} s", facts))
     print_table(console, _hindsight_table(answer.hindsight))
     if answer.execution is not None:
@@ -147,8 +149,9 @@ _DELAYED = {
 
 def _status(made: Plan) -> str:
     """Return what is known about the plan, in words."""
+    gap = f"; no capture is earlier by more than {made.gap_s:.0e} s" if made.gap_s > 0.0 else ""
     words = {
-        "optimal": f"optimal within {max(made.gap_s, 0.0):.1e} s",
+        "optimal": f"optimal{gap}",
         "feasible": f"found; at most {made.gap_s:.2f} s later than the earliest possible capture",
         "none_found": f"none found{' that the arm can fly' if made.delayed_by == 'arm' else ''}; a capture may exist",
         "infeasible_within_horizon": "proven impossible within the horizon",
@@ -175,7 +178,7 @@ def _hindsight_table(hindsight: list[tuple[float, Plan, Miss | None]]) -> Table:
     left_out = len(hindsight) - len(rows)
     return Table(
         "Plans against ground truth at their planned end",
-        ("made at\n[s]", "status", "capture\n[s]", "early by\n[s]", "miss\n[mm]", "speed\n[mm/s]", "angle\n[deg]"),
+        ("made at\n[s]", "status", "capture\n[s]", "time to\ngo [s]", "miss\n[mm]", "speed\n[mm/s]", "angle\n[deg]"),
         rows,
         align="rlr",
         note=f"{left_out} further plans end after the log or were not found" if left_out else "",
@@ -190,7 +193,8 @@ def _execution_table(execution: Execution) -> Table:
 
 
 def _outcome_lines(execution: Execution, planning: Replanning) -> list[str]:
-    lines = [f"outcome: {execution.outcome(planning.tolerance)}"]
+    outcome = execution.outcome(planning.tolerance)
+    lines = [f"outcome: {outcome}" if execution.miss is not None else f"action at the end of the log: {outcome}"]
     if execution.miss is not None:
         m = execution.miss
         error = f"distance {1e3 * m.distance_m:.2f} mm, {1e3 * m.speed_mps:.2f} mm/s, {m.angle_deg:.3f} deg"

@@ -13,7 +13,7 @@ import click
 
 from avsreplay.cli.config import run_settings, take_run_settings
 from avsreplay.cli.options import PATH, StartMode, log_file, pose_options, read_options, run_source_options
-from avsreplay.errors import CheckFailed, DataLost, UsageError
+from avsreplay.errors import CheckFailed, DataLost, UnreadableInput, UsageError
 from avsreplay.files import check_output
 
 if TYPE_CHECKING:
@@ -99,8 +99,7 @@ def run_command(log: Path, **flags: Any) -> None:
         try:
             _whole(replace(job, growing=growing if streamed else None), target, wanted)
         except Outdated:
-            why = "the end of the log changes rows before it (true poses, clock)"
-            click.echo(f"avsreplay: {why}: it is replayed once more", err=True)
+            click.echo("avsreplay: later records change times or true poses: the log is replayed once more", err=True)
             _whole(job, target, wanted)
 
 
@@ -113,7 +112,9 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
         done = _replayed(run, advice, target, wanted)
         _print(wanted, done)
         if wanted.page and wanted.output:
-            _page(wanted.output)
+            from avsreplay.cli.export import write_page
+
+            click.echo(write_page(wanted.output, wanted.output / "report.html"), err=True)
         click.echo(f"verdict {done.verdict.line}", err=True)
         _gate(wanted, done)
         _report_losses(run)
@@ -138,7 +139,7 @@ class Wanted:
     least: str | None
 
     def check(self) -> None:
-        """Raise UsageError if two options contradict each other."""
+        """Raise UsageError if two options contradict each other, UnreadableInput without the golden file."""
         if self.golden and self.update_golden:
             raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
         if self.page and self.output is None:
@@ -147,6 +148,8 @@ class Wanted:
             raise UsageError("--resume needs the result directory of the interrupted run", hint="add -o DIR")
         if self.update_golden:
             check_output(self.update_golden)
+        if self.golden and not self.golden.is_file():
+            raise UnreadableInput("no such golden file", where=str(self.golden), hint="--update-golden writes it")
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Job:
@@ -167,7 +170,8 @@ def _checked(run: Run) -> list[Advice]:
     """Check the log before the replay: findings are printed on stderr, and are reasons of the verdict."""
     from avsreplay.preflight import preflight
 
-    found = [advice for advice in preflight(run.source, run.surface, run.registrar) if advice.grade != "ok"]
+    checked = preflight(run.source, run.surface, run.registrar) if len(run.source) else []
+    found = [advice for advice in checked if advice.grade != "ok"]
     for advice in found:
         click.echo(f"avsreplay: {advice.about}: {advice.sentence}", err=True)
     return found
@@ -208,8 +212,12 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
         growing = run.job.growing
         live = growing is not None and not wanted.as_json
         interrupted = _collect(run.rows(listeners, None if live else tracked), rows, growing, live=live)
-        if run.outdated and not interrupted:
+        if growing and not interrupted and growing.outdated():
             raise Outdated
+        changed = run.rescore(rows) if growing else []
+        for taker in (viewer, keeper) if changed else ():
+            if taker:
+                taker.correct(rows, changed)
         seconds = max(time.perf_counter() - begun, 1e-9)
         if viewer:
             viewer.close()
@@ -268,12 +276,6 @@ def _collect(found: Generator[Row], rows: list[Row], growing: GrowingLog | None 
         if not rows:
             raise
         return True
-
-
-def _page(result: Path) -> None:
-    from avsreplay.cli.export import write_page
-
-    click.echo(write_page(result, result / "report.html"), err=True)
 
 
 def _record(run: Run, summary: Summary) -> dict[str, Any]:
@@ -342,7 +344,6 @@ def _print_differences(result: GoldenResult, verdict: RunVerdict, *, to_stderr: 
 
 
 def _report_losses(run: Run) -> None:
-    losses = run.source.losses
-    if losses:
+    if losses := run.source.losses:
         what = f"{len(losses)} damaged places were left out, the first: {losses[0].what}"
         raise DataLost(what, where=str(run.job.source), hint="see 'avsreplay doctor'")

@@ -64,7 +64,6 @@ class GrowingLog:
         self._at, self._fed, self._pause_s = 0, feed is not None, _POLL_S
         self._stop, self._opened = threading.Event(), False
         self._used: list[tuple[Scan, Truth]] = []
-        self._poses: list[tuple[int, bytes]] = []  # at the first opening, from which plans are scored
         self._clock = (0, 0.0)  # first time and period at the first opening, from which the stages are made
         self._broken: OSError | None = None  # the error that ended the stream before its end
         if feed is not None:
@@ -98,13 +97,9 @@ class GrowingLog:
         """
         self._used.append((replace(scan, points=_NO_POINTS, times_s=None), truth))
 
-    def outdated(self, *, planned: bool) -> bool:
-        """Return whether the finished log gives another time, note or truth for a scan than was used.
-
-        Args:
-            planned: whether there were plans, which are compared with the true poses after them.
-        """
-        if len(self._used) != len(self.source) or (planned and self._poses != self._known_poses()):
+    def outdated(self) -> bool:
+        """Return whether the finished log gives another time, note or truth for a scan than was used."""
+        if len(self._used) != len(self.source):
             return True
         if self._clock != (self.source.first_ns, self.source.clock.period_s):
             return True
@@ -117,9 +112,6 @@ class GrowingLog:
         if (truth.pose is None, truth.state is None) != (true.pose is None, true.state is None):
             return True
         return _bytes(truth) != _bytes(true)
-
-    def _known_poses(self) -> list[tuple[int, bytes]]:
-        return [(t_ns, pose.matrix.tobytes()) for t_ns, pose in self.source.truth_poses()]
 
     def open(self, options: SourceOptions) -> Source:
         """Open the log as far as it is complete; waits until it has a scan that was not there at the last opening.
@@ -142,7 +134,7 @@ class GrowingLog:
                     if self.finished and self._broken is not None:
                         self.source.add_loss(Loss(f"the stream broke off: {self._broken.strerror}", self._at, 0))
                     if not self._opened:
-                        self._poses, self._opened = self._known_poses(), True
+                        self._opened = True
                         self._clock = self.source.first_ns, self.source.clock.period_s
                     return self.source
                 except UnreadableInput as error:  # it has no scan yet

@@ -146,26 +146,34 @@ class ResultLog:
         if frame.path is not None:
             self._append("/plan", t, _path(t, *frame.path))
         self._append("/diagnostics", t, _status(frame))
-        for name, value in frame.columns.items():
-            self._append(_ROWS + name, t, _FLOAT64.pack(1, value))
+        self._append_columns(frame.columns, t)
         if frame.message != self._state:
             self._append("/rosout", t, _said(frame))
         self._state = frame.message
 
-    def copy(self, written: Path, state: str) -> None:
+    def copy(self, written: Path, state: str, changed: Mapping[int, Mapping[str, float]] | None = None) -> None:
         """Append all messages of another log of this kind, so that this one continues it.
 
         Args:
             written: the other log.
             state: message of its last scan.
+            changed: numeric columns of the rows that have other values than in that log, by the index of the scan.
         """
         from mcap.reader import NonSeekingReader
 
         self._state = state
         with written.open("rb") as stream:
             for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
-                self._count = message.sequence
-                self._append(channel.topic, message.log_time, message.data)
+                columns = (changed or {}).get(message.sequence - 1) if channel.topic.startswith(_ROWS) else None
+                if columns is None:
+                    self._count = message.sequence
+                    self._append(channel.topic, message.log_time, message.data)
+                elif channel.topic == _ROWS + next(iter(columns)):  # the first of the row stands for all
+                    self._append_columns(columns, message.log_time)
+
+    def _append_columns(self, columns: Mapping[str, float], t_ns: int) -> None:
+        for name, value in columns.items():
+            self._append(_ROWS + name, t_ns, _FLOAT64.pack(1, value))
 
     def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
         if topic not in self._channels:

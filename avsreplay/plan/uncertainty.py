@@ -72,7 +72,7 @@ class Spread:
         out = [
             (
                 "t_go over belief",
-                f"mean {t.mean:.3f} s, 5-95 % {t.p05:.3f} to {t.p95:.3f} s; {self.infeasible} without a plan",
+                f"mean {t.mean:.3f} s, 5-95 % {t.p05:.3f} to {t.p95:.3f} s; no plan in {self.infeasible} of the draws",
             ),
             ("miss over belief", _text(self.miss_m, 1e3, "mm", 2)),
             ("speed over belief", _text(self.speed_mps, 1e3, "mm/s", 2)),

@@ -31,6 +31,7 @@ EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
 MOST_WEIGHT = 4.0  # of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
+LEAST_OF_UNFINISHED = 0.9  # least share of the points on the model at a pose that has not converged
 
 
 class ModelCheck:
@@ -49,6 +50,7 @@ class ModelCheck:
         self._weights: list[float] = []
         self._points: list[tuple[Array, Array]] = []  # of each scan that was measured, and the camera, in {C}
         self._unmatched: NDArray[Any] | None = None
+        self._unfinished = False
 
     def add(self, points: NDArray[Any], found: Alignment | None) -> None:
         """Use one scan.
@@ -59,6 +61,8 @@ class ModelCheck:
         """
         if found is None or not len(points):
             return
+        if found.status is AlignStatus.NOT_CONVERGED and found.inlier_ratio >= LEAST_OF_UNFINISHED:
+            self._unfinished = True  # the iteration ended on the model: its limits are the cause, not the shape
         if found.status is not AlignStatus.ALIGNED:
             self._unmatched = points if self._unmatched is None else self._unmatched
             return
@@ -84,7 +88,7 @@ class ModelCheck:
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there are none."""
         if not self._aligned:
-            return () if self._unmatched is None else (self._diagnosis(self._unmatched),)
+            return () if self._unmatched is None or self._unfinished else (self._diagnosis(self._unmatched),)
         return (*self._inverted(), *self._size())
 
     def _inverted(self) -> tuple[str, ...]:

@@ -1,15 +1,19 @@
 """The conclusion of a comparison: better, worse or no evidence, metric by metric and in one sentence.
 
-A value that is missing in one run counts as worse; it is never skipped. Where both runs have errors at the same
-instants, the difference of their RMSE gets a 95 % interval by a paired bootstrap over blocks of consecutive scans
-(successive errors are correlated). For groups of at least five runs, paired by name, every metric gets the interval of
-its mean paired difference.
+A value that is missing in one run counts as worse; it is never skipped. A difference is better or worse only where its
+95 % interval excludes zero. For two runs, means over scans (RMSE, shares) get an interval by a paired bootstrap over
+blocks of consecutive scans, because successive errors are correlated. For groups of at least five runs, paired by name,
+every metric gets the interval of its mean paired difference. Counts of events need no interval; any other figure
+without one is reported as changed.
+
+Few blocks make the percentile interval too narrow; its level is that of the expanded percentile interval of T. C.
+Hesterberg, "What Teachers Should Know About the Bootstrap", The American Statistician 69 (2015), section 4.3.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -17,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.report.compare import METRICS, changed_settings, first_divergence, metrics
-from avsreplay.report.summary import Summary
+from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
 
@@ -36,10 +40,37 @@ HEADLINES = {  # the metrics of the conclusion: words, unit and factor
 _MORE = {"scans", "healthy", "healthy_ratio", "nis_inside", "nees_inside", "ogm_rank"}
 _NEUTRAL = {"nis_median", "nees_median", "sigma_hits", "ogm_log10_cond", "iterations_median", "weighed_down"}
 _MAY_BE_MISSING = ("coast_", "recovery_s")  # absent also where nothing went wrong
-_PAIRED = {"all_pos_rmse_m": "pos_err_m", "all_rot_rmse_deg": "rot_err_deg"}
-_UNCERTAIN = 0.1  # relative change of a metric without an interval that is no evidence
+_COUNTS = {"scans", "healthy", "faults_missed", "scans_missed", "false_alarms", "reinitialised", "withdrawn", "gaps",
+           "losses", "ogm_rank"}  # fmt: skip
+_MENTIONED = 0.1  # relative change of a main metric without an interval that the sentence mentions
 _MARKS = {"better": "good", "worse": "bad"}
-_BLOCKS, _LEAST_BLOCKS, _LEAST_RUNS, _RESAMPLES = 20, 5, 5, 2000
+_BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS, _RESAMPLES = 10, 5, 5, 5, 9999
+
+
+def _scanwise(
+    column: str, of: Callable[[float], float] = lambda v: v * v, *, healthy: bool = False
+) -> Callable[[Row], float | None]:
+    def value(row: Row) -> float | None:
+        found = getattr(row, column) if row.gamma or not healthy else None
+        return None if found is None else float(of(found))
+
+    return value
+
+
+_ROOTS = {  # metrics that are the root of a mean over scans
+    "all_pos_rmse_m": _scanwise("pos_err_m"),
+    "all_rot_rmse_deg": _scanwise("rot_err_deg"),
+    "pose_pos_rmse_m": _scanwise("pos_err_m", healthy=True),
+    "pose_rot_rmse_deg": _scanwise("rot_err_deg", healthy=True),
+    "reg_pos_rmse_m": _scanwise("reg_pos_err_m", healthy=True),
+    "reg_rot_rmse_deg": _scanwise("reg_rot_err_deg", healthy=True),
+}
+_MEANS = {  # metrics that are a mean over scans
+    "healthy_ratio": lambda row: float(row.gamma),
+    "false_alarm_rate": lambda row: None if row.fault else 1.0 - row.gamma,
+    "nis_inside": _scanwise("nis", lambda v: NIS_BAND[0] <= v <= NIS_BAND[1], healthy=True),
+    "nees_inside": _scanwise("nees", lambda v: NEES_BAND[0] <= v <= NEES_BAND[1]),
+}
 
 
 class ComparedRun(Protocol):
@@ -70,7 +101,8 @@ class Change:
         metric: its name.
         base, other: values; means over the runs of a group that have one; None where none has.
         low, high: 95 % interval of the difference other - base; None without enough pairs.
-        word: "better", "worse", "no evidence", "equal", or "changed" for a metric without a direction.
+        word: "better", "worse", "no evidence" (the interval contains 0, or there are too few pairs), "equal", or
+            "changed" for a metric without a direction or without an interval.
         note: "lost" or "new" where one side has no value.
     """
 
@@ -147,9 +179,9 @@ def _change(
     if lost or new:
         return Change(name, base, other, None, None, _word_of_loss(name, lost - new), "lost" if lost else "new")
     differences = [b - a for a, b in values if a is not None and b is not None]
-    interval = _interval(name, pairs, differences)
+    interval = _interval(name, pairs, differences) if any(differences) else None
     low, high = interval or (None, None)
-    return Change(name, base, other, low, high, _word(name, base or 0.0, differences, interval))
+    return Change(name, base, other, low, high, _word(name, differences, interval))
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -163,17 +195,15 @@ def _word_of_loss(name: str, lost: int) -> str:
     return "worse" if lost > 0 else "better" if lost < 0 else "no evidence"
 
 
-def _word(name: str, base: float, differences: Sequence[float], interval: tuple[float, float] | None) -> str:
+def _word(name: str, differences: Sequence[float], interval: tuple[float, float] | None) -> str:
     mean = math.fsum(differences) / len(differences)
     if not any(differences):
         return "equal"
     if name in _NEUTRAL:
         return "changed"
-    if interval is not None:
-        sure = interval[0] > 0.0 or interval[1] < 0.0
-    else:
-        whole = all(float(d).is_integer() for d in differences) and float(base).is_integer()
-        sure = len(differences) == 1 and (whole or abs(mean) > _UNCERTAIN * abs(base))
+    if interval is None and len(differences) == 1 and name not in _COUNTS:
+        return "changed"
+    sure = len(differences) == 1 if interval is None else interval[0] > 0.0 or interval[1] < 0.0
     if not sure:
         return "no evidence"
     return "better" if (mean > 0.0) == (name in _MORE) else "worse"
@@ -182,44 +212,58 @@ def _word(name: str, base: float, differences: Sequence[float], interval: tuple[
 def _interval(
     name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]], differences: Sequence[float]
 ) -> tuple[float, float] | None:
+    """95 % interval of the mean difference; None with too few pairs of runs or of scans."""
     if len(pairs) >= _LEAST_RUNS:
-        return _bootstrap(np.array(differences), np.zeros(len(differences)), np.mean) if any(differences) else None
-    if len(pairs) == 1 and name in _PAIRED:
-        blocks = _blocks(pairs[0], _PAIRED[name])
-        if blocks is not None and not np.array_equal(*blocks):
-            return _bootstrap(blocks[1], blocks[0], lambda squares, axis: np.sqrt(np.mean(squares, axis=axis)))
-    return None
+        return _bootstrap(np.array(differences))
+    if len(pairs) > 1 or not (name in _ROOTS or name in _MEANS):
+        return None
+    found = _blocks(pairs[0], _ROOTS.get(name) or _MEANS[name])
+    if found is None:
+        return None
+    blocks, base, other = found
+    if name in _ROOTS:  # sqrt(other) - sqrt(base) = (other - base) / (sqrt(other) + sqrt(base))
+        blocks = blocks / max(math.sqrt(base) + math.sqrt(other), 1e-300)
+    return _bootstrap(blocks, correlated=True)
 
 
 def _blocks(
-    pair: tuple[ComparedRun, ComparedRun], column: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Mean squares over blocks of consecutive scans that both runs have; None for too few."""
-    base, other = ({row.t_ns: v for row in run.rows if (v := getattr(row, column)) is not None} for run in pair)
+    pair: tuple[ComparedRun, ComparedRun], value: Callable[[Row], float | None]
+) -> tuple[NDArray[np.float64], float, float] | None:
+    """Mean differences in blocks of consecutive scans that both runs have, and both means; None for too few scans."""
+    base, other = ({row.t_ns: v for row in run.rows if (v := value(row)) is not None} for run in pair)
     shared = sorted(base.keys() & other.keys())
-    count = min(_BLOCKS, len(shared) // 5)
+    count = min(_BLOCKS, len(shared) // _IN_BLOCK)
     if count < _LEAST_BLOCKS:
         return None
-    found = [
-        np.array([np.mean(np.square(part)) for part in np.array_split([side[t] for t in shared], count)])
-        for side in (base, other)
-    ]
-    return found[0], found[1]
+    left, right = (np.array([side[t] for t in shared]) for side in (base, other))
+    blocks = np.array([part.mean() for part in np.array_split(right - left, count)])
+    return blocks, float(left.mean()), float(right.mean())
 
 
-def _bootstrap(other: NDArray[np.float64], base: NDArray[np.float64], statistic: Any) -> tuple[float, float]:
-    """95 % interval of ``statistic(other) - statistic(base)`` by a paired bootstrap with a fixed seed."""
-    from scipy.stats import bootstrap
+def _bootstrap(differences: NDArray[np.float64], *, correlated: bool = False) -> tuple[float, float]:
+    """95 % interval of the mean by a bootstrap with a fixed seed; ``correlated``: the differences are a time series.
 
+    The half widths are then multiplied by sqrt((1 + r) / (1 - r)), the factor of a first-order autoregressive series
+    with the lag-1 autocorrelation r of the differences (r is corrected for its bias of -1/n and limited to 0 to 0.8).
+    """
+    from scipy.stats import bootstrap, norm, t
+
+    n, mean = len(differences), float(np.mean(differences))
+    away = differences - mean
+    if not away.any():
+        return mean, mean
+    tail = float(norm.cdf(-math.sqrt(n / (n - 1)) * t.ppf(0.975, n - 1)))
     found = bootstrap(
-        (other, base),
-        lambda a, b, axis=-1: statistic(a, axis=axis) - statistic(b, axis=axis),
-        paired=True,
+        (differences,),
+        np.mean,
+        confidence_level=1.0 - 2.0 * tail,
         n_resamples=_RESAMPLES,
         method="percentile",
         rng=np.random.default_rng(0),
-    )
-    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+    ).confidence_interval
+    r = float((away[1:] * away[:-1]).sum() / np.square(away).sum()) + 1.0 / n if correlated else 0.0
+    factor = math.sqrt((1.0 + min(max(r, 0.0), 0.8)) / (1.0 - min(max(r, 0.0), 0.8)))
+    return mean + factor * (float(found.low) - mean), mean + factor * (float(found.high) - mean)
 
 
 def _overall(changes: Sequence[Change], *, same: bool, rows: int) -> tuple[str, str]:
@@ -227,10 +271,17 @@ def _overall(changes: Sequence[Change], *, same: bool, rows: int) -> tuple[str, 
         return "same", f"no difference; all {rows} rows agree within the tolerances of their columns"
     found = {word: [c for c in changes if c.word == word and c.metric in HEADLINES] for word in ("worse", "better")}
     said = [f"{word} in {', '.join(map(_said, listed))}" for word, listed in found.items() if listed]
-    if not said:
-        return "no evidence", "no evidence of a difference in the main metrics"
-    word = "mixed" if len(said) == 2 else "worse" if found["worse"] else "better"
+    word = ("mixed" if len(said) == 2 else "worse" if found["worse"] else "better") if said else "no evidence"
+    said = said or ["no evidence of a difference in the main metrics"]
+    changed = [c for c in changes if c.metric in HEADLINES and c.word == "changed" and _mentioned(c)]
+    if changed:
+        said.append(f"changed, without an interval: {', '.join(map(_said, changed))}")
     return word, "; ".join(said)
+
+
+def _mentioned(change: Change) -> bool:
+    base, other = change.base or 0.0, change.other or 0.0
+    return abs(other - base) > _MENTIONED * abs(base)
 
 
 def _said(change: Change) -> str:
@@ -260,7 +311,7 @@ def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = Fal
             number(change.base, ".4g"),
             number(change.other, ".4g"),
             change.note or _relative(change),
-            "" if change.low is None else f"{change.low:+.2g} to {change.high:+.2g}",
+            _interval_text(change),
             TableCell(change.word, _MARKS.get(change.word, "")),
         )
         for change in shown
@@ -271,9 +322,19 @@ def changes_table(baseline: str, conclusion: Conclusion, *, show_all: bool = Fal
         f"{conclusion.name} against {baseline}{runs}",
         ("metric", *(("meaning",) if show_all else ()), "baseline", "this", "change", "95 % interval", "conclusion"),
         rows,
-        align="llrrrrl" if show_all else "lrrrrl",
+        align="nlrrrrn" if show_all else "nrrrrn",
         note=f"{left_out} equal metrics are not shown" if left_out else "",
     )
+
+
+def _interval_text(change: Change) -> str:
+    """The interval of a difference in percent of the baseline, where that is not zero."""
+    if change.low is None or change.high is None:
+        return ""
+    if not change.base:
+        return f"{change.low:+.2g} to {change.high:+.2g}"
+    low, high = (100.0 * end / abs(change.base) for end in (change.low, change.high))
+    return f"{low:+.0f} to {high:+.0f} %" if max(abs(low), abs(high)) >= 10.0 else f"{low:+.1f} to {high:+.1f} %"
 
 
 def _relative(change: Change) -> str:

@@ -160,7 +160,7 @@ def check_gate(outcomes: Sequence[RuleOutcome]) -> None:
     broken = [o for o in outcomes if not o.ok]
     if broken:
         o = broken[0]
-        what = f"{len(broken)} of {len(outcomes)} rules broken, the first by {o.run}: {o.rule.metric} {o.why}"
+        what = f"{len(broken)} of {len(outcomes)} rules broken, the first by {o.run}: {o.rule.metric}: {o.why}"
         raise CheckFailed(what, where="--gate", hint=o.rule.note or None)
 
 

@@ -1,7 +1,7 @@
 """Comparison with golden rows in both directions: numbers within their column's tolerance, flags and states exactly.
 
-A value passes where ``|got - expected| <= atol + rtol |expected|``. A row, a column or a file that is missing
-on one side is a difference; so is null against a value.
+A value passes where ``|got - expected| <= atol + rtol |expected|``. A row or a column that is missing on one side is a
+difference; so is null against a value.
 """
 
 from __future__ import annotations
@@ -67,12 +67,11 @@ def compare_golden(expected_path: str | Path, rows: Iterable[Row], *, first: int
     """Compare rows with a golden file; ``first`` differences are kept, all are counted.
 
     Raises:
-        CheckFailed: the file does not exist.
-        UnreadableInput: it does not hold rows.
+        UnreadableInput: the file does not exist, or does not hold rows.
     """
     path = Path(expected_path)
     if not path.is_file():
-        raise CheckFailed("no such golden file", where=str(path), hint="--update-golden writes it")
+        raise UnreadableInput("no such golden file", where=str(path), hint="--update-golden writes it")
     expected = _by_seq(read_records(path))
     names = [c.name for c in columns()]
     got = {row.seq: {name: plain(getattr(row, name)) for name in names} for row in rows}
@@ -180,6 +179,7 @@ def divergence_line(baseline: str, other: str, found: GoldenResult) -> str:
 def golden_table(result: GoldenResult) -> Table:
     """The first differences from a golden file, and in the note how many there are in each column."""
     counts = sorted(result.by_column.items(), key=lambda item: (-item[1], item[0]))
+    more = f", and {len(counts) - 12} further columns" if len(counts) > 12 else ""
     return Table(
         f"Golden: first {len(result.differences)} of {result.count} differences",
         ("scan", "column", "expected", "got", "tolerance"),
@@ -194,5 +194,5 @@ def golden_table(result: GoldenResult) -> Table:
             for d in result.differences
         ),
         align="rlrrr",
-        note="by column: " + ", ".join(f"{name} {count}" for name, count in counts[:12]),
+        note="by column: " + ", ".join(f"{name} {count}" for name, count in counts[:12]) + more,
     )

@@ -174,6 +174,13 @@ class SummaryFold:
         self._changes: tuple[VelocityChange, ...] = ()
         self._capture = CaptureFold()
 
+    def anew(self, rows: Iterable[Row]) -> SummaryFold:
+        """A fold with the same labels and truth over other rows."""
+        fold = SummaryFold(labels=self._labels, truth=self._truth, counts=self._counts)
+        for row in rows:
+            fold.add(row)
+        return fold
+
     def add(self, row: Row) -> None:
         """Take the next row."""
         self._marks.append(Mark(row.t_ns, row.gamma, row.fault, row.pos_err_m, row.rot_err_deg))

@@ -246,7 +246,7 @@ def _scan_facts(summary: Summary) -> Iterable[tuple[str, str]]:
     yield "scans", f"{summary.scans} in {summary.duration_s:.2f} s{interval}"
     yield "used", f"{summary.healthy} healthy (gamma 1), {summary.coasting} coasting{_counted(summary.reasons)}"
     if summary.gaps:
-        yield "gaps", f"{summary.gaps} intervals longer than 1.5 x the median"
+        yield "gaps", f"{summary.gaps} interval{'s' * (summary.gaps != 1)} longer than 1.5 x the median"
     coast = summary.longest_coast
     if coast is not None:
         error = ""

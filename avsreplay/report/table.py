@@ -10,7 +10,7 @@ import math
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import IO
+from typing import IO, Literal
 
 from rich import box
 from rich.console import Console
@@ -50,7 +50,8 @@ class Table:
         title: one line.
         heads: column headings; a line end in one is kept.
         rows: cells in the order of the headings.
-        align: a letter per column, "l" (text, may wrap) or "r" (numbers); the last letter holds for all further ones.
+        align: a letter per column, "l" (text, may wrap), "n" (names, one line) or "r" (numbers); the last letter holds
+            for all further ones.
         note: one line under the table.
         wide: whether a page gives it the whole width.
     """
@@ -64,7 +65,11 @@ class Table:
 
     def right(self, column: int) -> bool:
         """Whether a column is aligned to the right."""
-        return self.align[min(column, len(self.align) - 1)] == "r"
+        return self.letter(column) == "r"
+
+    def letter(self, column: int) -> str:
+        """The letter of a column in ``align``."""
+        return self.align[min(column, len(self.align) - 1)]
 
 
 def as_cell(cell: str | TableCell) -> TableCell:
@@ -116,9 +121,9 @@ def _rich(console: Console, table: Table, tight: bool) -> RichTable:
         header_style="",
     )
     for k, head in enumerate(table.heads):
-        right = table.right(k)
-        justify = "right" if right else "left"
-        drawn.add_column(Text(head), justify=justify, no_wrap=right or tight, overflow="fold", vertical="top")  # type: ignore[arg-type]
+        one_line = tight or table.letter(k) != "l"
+        justify: Literal["left", "right"] = "right" if table.right(k) else "left"
+        drawn.add_column(Text(head), justify=justify, no_wrap=one_line, overflow="fold", vertical="top")
     for row in table.rows:
         drawn.add_row(*(_text(as_cell(cell), console) for cell in row))
     return drawn

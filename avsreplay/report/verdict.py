@@ -245,7 +245,7 @@ def _data(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
 
 
 def _plain(name: str) -> str:
-    return name.replace("_", " ")
+    return "no points" if name == "no_scan" else name.replace("_", " ")
 
 
 def _median(rows: Sequence[Row], column: str) -> float | None:

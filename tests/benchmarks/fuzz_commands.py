@@ -118,7 +118,7 @@ CASES: dict[tuple[str, str], tuple[Lines, tuple[str, ...]]] = {
     ("sweep", "campaign"): ((("IN", "--plan"),), ("campaign.toml",)),
     ("sweep", "output"): ((("campaign.toml", "-o", "IN", "--limit", "0", "--workers", "0"),), ("sweep",)),
     ("model", "log"): ((("IN", "-o", "OUT.ply", "--n-scans", "4"),), ("log.mcap", "zstd.mcap", "scans")),
-    ("model", "against"): ((("log.mcap", "--against", "IN", "-o", "OUT.ply", "--n-scans", "4"),), MODELS),
+    ("model", "against"): ((("dense.mcap", "--against", "IN", "-o", "OUT.ply", "--n-scans", "4"),), MODELS),
     ("model", "model"): ((("log.mcap", "--model", "IN", "-o", "OUT.ply", "--n-scans", "4"),), MODELS),
     ("model", "truth_file"): ((("scans", "--truth", "IN", "-o", "OUT.ply", "--n-scans", "4"),), POSES),
     ("config", "log"): ((("IN",),), ("log.mcap", "zstd.mcap")),
@@ -200,6 +200,7 @@ def build(folder: Path) -> None:
     log.GrowingLog, log._POLL_S, log._PER_OPENING = WrittenLog, 0.0, 0.0
     backends._peak_mib = lambda *_: None  # no process of its own for each measurement of memory
     texts = {"scenario.toml": SCENARIO, "rules.toml": RULES, "robot.toml": ROBOT,
+             "dense.toml": SCENARIO.replace("[40, 40]", "[80, 80]"),
              "campaign.toml": CAMPAIGN.replace("SCENARIO", str(folder / "scenario.toml"))}  # fmt: skip
     for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
@@ -209,6 +210,7 @@ def build(folder: Path) -> None:
         (folder / "config.toml").write_text(out.getvalue(), encoding="utf-8")
         call("record", folder / "scenario.toml", "-o", folder / "log.mcap", "--compression", "none")
         call("record", folder / "scenario.toml", "-o", folder / "zstd.mcap", "--compression", "zstd")
+        call("record", folder / "dense.toml", "-o", folder / "dense.mcap")
         with cached(folder / "cache"):
             call("run", folder / "log.mcap", "--init", "truth", "-o", folder / "result")
         run_command._collect = lambda found, rows, *_, **__: rows.append(next(found)) or True
