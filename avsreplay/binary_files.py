@@ -171,21 +171,41 @@ def pack_state(value: Any, named: Mapping[str, object]) -> bytes:
     return stream.getvalue()
 
 
-def unpack(path: Path, named: Mapping[str, object]) -> Any:
+def unpack(path: Path, named: Mapping[str, object], like: object = None) -> Any:
     """Read a value that ``pack_state`` made.
 
     Args:
         path: the file.
         named: objects in place of their names.
+        like: a value of the same structure, whose types and names of attributes it must have; None for any.
 
     Raises:
         UnreadableInput: the file is missing, damaged, of another version, or contains what a checkpoint never contains.
     """
     try:
-        return _Unpacker(io.BytesIO(path.read_bytes()), named).load()
+        found = _Unpacker(io.BytesIO(path.read_bytes()), named).load()
+        _check_alike(found, like)
+        return found
     except Exception as error:  # a damaged pickle raises almost any error
         what = f"the checkpoint cannot be read: {error}".splitlines()[0][:200]
         raise UnreadableInput(what, where=str(path), hint=_HINT) from None
+
+
+def _check_alike(found: Any, like: Any) -> None:
+    """Raise ValueError where the types or the attributes of two values differ; None is like everything."""
+    if like is None:
+        return
+    if type(found) is not type(like) or (isinstance(like, tuple) and len(found) != len(like)):
+        raise ValueError(f"a {type(found).__name__} in place of a {type(like).__name__}")
+    if isinstance(like, tuple):
+        for one, other in zip(found, like, strict=True):
+            _check_alike(one, other)
+    elif (type(like).__module__, type(like).__name__) in _ACCUMULATORS:
+        if vars(found).keys() != vars(like).keys():
+            raise ValueError(f"a {type(like).__name__} with other attributes")
+        for name, own in vars(like).items():
+            if (type(own).__module__, type(own).__name__) in _ACCUMULATORS:
+                _check_alike(vars(found)[name], own)
 
 
 class _Unpacker(pickle.Unpickler):

@@ -219,22 +219,25 @@ class Run:
         motion = None if self._scored is None else self._scored.motion
         return pack_state((*own, self._fixes, self._reference_instants, more), self._named(motion))
 
-    def restore(self, path: Path) -> Any:
+    def restore(self, path: Path, more: Any = None) -> Any:
         """Continue from a checkpoint; returns what was stored with it.
 
         Args:
             path: file with the bytes of ``checkpoint``.
+            more: what is stored with it must have the structure of this.
 
         Raises:
             UnreadableInput: the file is missing or damaged.
         """
-        found = unpack(path, self._named(None))
+        scored = self._scorer()
+        like = (None, 0, self._fold, self.model_check, None, scored, [], [], more)
+        found = unpack(path, self._named(None), like)
         self._state, self.done, self._fold, self.model_check, self._end, self._scored, *rest = found
-        self._fixes, self._reference_instants, more = rest
+        self._fixes, self._reference_instants, stored = rest
         if self._fixes:
             self._reference = reference_motion(self._fixes, self.estimator)
-        self._scored.motion = self._scorer().motion
-        return more
+        self._scored.motion = self._scorer().motion if self._fixes else scored.motion
+        return stored
 
     def _named(self, motion: Motion | None) -> dict[str, object]:
         """Objects that a checkpoint refers to by name; the interpolation of the truth is made again."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import signal
 from itertools import islice
@@ -14,6 +15,7 @@ from avsreplay.cli.run import _collect
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions
+from avsreplay.report.result import write_manifest
 from avsreplay.result_dir import CHECKPOINT, ResultDirectory, ResultWriter
 from avsreplay.run import Job, Run
 
@@ -118,6 +120,22 @@ def test_classes_that_act_when_created_are_refused(tmp_path):
     with pytest.raises(UnreadableInput, match="not allowed"):
         unpack(path, {})
     assert victim.read_text() == "x"
+
+
+@pytest.mark.parametrize("name", [b"_withdrawn", b"_hindsight", b"_unmatched", b"_captured_ns", b"_clouds", b"_known"])
+def test_a_checkpoint_with_another_attribute_is_one_line(fixtures_folder, tmp_path, name):
+    """The bytes of one name are changed, and the SHA-256 of the file is made to fit."""
+    work = job(fixtures_folder / "tumble.mcap", n_scans=4)
+    replay(work, tmp_path / "r", 2)
+    path = tmp_path / "r" / CHECKPOINT
+    data = path.read_bytes()
+    assert name in data
+    path.write_bytes(data.replace(name, name[:-1] + b"X"))
+    record = json.loads((tmp_path / "r" / "run.json").read_text())
+    (tmp_path / "r" / "run.json").unlink()
+    write_manifest(tmp_path / "r", record, 2)
+    with pytest.raises(UnreadableInput, match="the checkpoint cannot be read"):
+        replay(work, tmp_path / "r", resume=True)
 
 
 @pytest.mark.parametrize("cut", [0, 1, 20, -1])

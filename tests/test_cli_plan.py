@@ -103,7 +103,7 @@ def test_tables_name_what_they_show(result):
     text = run(result, "--samples", 4, "--every", 20, "--at", 12).stdout
     for words in (
         "Plan made at 12.00 s",
-        "optimal within",
+        "optimal",
         "capture probability",
         "Plans against ground truth",
         "outcome: captured",
