@@ -250,7 +250,7 @@ class ResultWriter:
             hint = "give the same options as at first, or start anew with --overwrite"
             what = f"the interrupted run differs in: {', '.join(different)}"
             raise UsageError(what, where=f"--resume {folder}", hint=hint)
-        more = ([], self._beliefs, self._view, self._log.paths)
+        more: Any = ([], self._beliefs, self._view, self._log.paths)
         rows, self._beliefs, self._view, known = self._run.restore(folder / CHECKPOINT, more)
         self._log.resume(folder / "result.mcap", known, rows[-1])
         return list(rows)

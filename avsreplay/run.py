@@ -230,7 +230,7 @@ class Run:
             UnreadableInput: the file is missing or damaged.
         """
         scored = self._scorer()
-        like = (None, 0, self._fold, self.model_check, None, scored, [], [], more)
+        like: Any = (None, 0, self._fold, self.model_check, None, scored, [], [], more)
         found = unpack(path, self._named(None), like)
         self._state, self.done, self._fold, self.model_check, self._end, self._scored, *rest = found
         self._fixes, self._reference_instants, stored = rest
