@@ -26,7 +26,7 @@ def test_the_evidence_is_the_marginal_likelihood() -> None:
     root = np.linalg.cholesky(C)
     white = np.linalg.solve(root, y)
     free = -0.5 * white @ white - np.log(np.diag(root)).sum()
-    value, u, P = scan_window.evidence(white, free, np.linalg.solve(root, M), scale)
+    value, u, P = scan_window.log_evidence(white, free, np.linalg.solve(root, M), scale)
     want = multivariate_normal.logpdf(y, np.zeros(18), C + M @ np.diag(scale**2) @ M.T)
     assert value - 9.0 * np.log(2.0 * np.pi) == pytest.approx(want, rel=1e-10)
     gain = np.diag(scale**2) @ M.T @ np.linalg.inv(C + M @ np.diag(scale**2) @ M.T)

@@ -24,7 +24,7 @@ from avsreplay.estimate.scan_window import (
     Explanation,
     Hypothesis,
     Window,
-    evidence,
+    log_evidence,
     log_mean,
     mixed,
     window_of,
@@ -142,7 +142,7 @@ def _located(
     share = weight / weight.sum()
     after_s, k = float(share @ instants), int(np.argmax(single))
     spread = math.hypot(math.sqrt(float(share @ (instants - after_s) ** 2)), (last - first) / _FINE / math.sqrt(12.0))
-    used = [(share[i], *evidence(white, free, columns[i], scale)[1:]) for i in np.flatnonzero(share > _NO_WEIGHT)]
+    used = [(share[i], *log_evidence(white, free, columns[i], scale)[1:]) for i in np.flatnonzero(share > _NO_WEIGHT)]
     total = sum(w for w, _, _ in used)
     size = np.sum([w * u for w, u, _ in used], axis=0) / total
     P = np.sum([w * (C + np.outer(u - size, u - size)) for w, u, C in used], axis=0) / total
@@ -183,7 +183,7 @@ def _changes(instants: Array, columns: Array, white: Array, free: float, scale: 
     """Changes at given instants; size and P are those of their sum, ``after_s`` their mean weighted by size."""
     m = len(columns)
     M = np.hstack(list(columns))
-    value, u, P = evidence(white, free, M, np.tile(scale, m))
+    value, u, P = log_evidence(white, free, M, np.tile(scale, m))
     left = white - M @ u
     joined = np.tile(np.eye(6), m)
     share = np.linalg.norm(u.reshape(m, 6) / scale, axis=1)
@@ -216,7 +216,7 @@ def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors
     values = free + mixed(columns, white, scale, _OFFSETS)
     onset = int(np.argmax(values)) + 1
     whitened = columns[onset - 1][:, :6]
-    _, u, P = evidence(white, free, whitened, scale[:6])
+    _, u, P = log_evidence(white, free, whitened, scale[:6])
     left = white - whitened @ u
     odds = log_mean(values.tolist()) + PRIOR_ODDS
     return Explanation(Hypothesis.SENSOR_BIAS, odds, float(left @ left), 6 * n - 6, onset, size=u, P=P)

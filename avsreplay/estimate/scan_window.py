@@ -118,7 +118,7 @@ def window_of(
     return Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, tuple(R_ba))
 
 
-def evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float, Array, Array]:
+def log_evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float, Array, Array]:
     """Log evidence, mean and covariance of the unknowns u ~ N(0, scale^2) in white = M u + N(0, 1)."""
     A, b = M.T @ M * np.outer(scale, scale) + np.eye(len(scale)), scale * (M.T @ white)
     inverse = np.linalg.inv(A)
