@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -276,6 +277,15 @@ def test_glare_of_the_earth_adds_to_the_variance_of_the_ranges(centre, share):
         noises.append(np.std(reach - 5.95 * reach / points[:, 2]))
     assert [label.kind for label in simulation.header.labels] == ["limb"]
     assert_allclose(noises, [0.01, 0.01 * math.sqrt(1.0 + share * 8.0)], rtol=0.05)
+
+
+def test_the_tables_of_the_documentation_are_valid():
+    page = (Path(__file__).parents[1] / "docs" / "scenario.md").read_text("utf-8")
+    blocks = [block.partition("```")[0] for block in page.split("```toml\n")[1:]]
+    tables = [block for block in blocks if "[[plume]]" in block or "[[limb]]" in block]
+    assert len(tables) == 2
+    params = scenario_of(toml_document.parse("\n".join(tables), "s.toml")).params
+    assert [params.plume[0].duration_s, params.limb[0].duration_s] == [2.0, 20.0]
 
 
 @pytest.mark.parametrize("text", ["[[plume]]\ndirection = [0.0, 0.0, 2.0]\n", "[[limb]]\ncentre_a = [0.0, 0.0, 0.0]\n"])

@@ -124,7 +124,7 @@ class Plume(Presence):
     def check(self) -> None:
         """Raise ValueError where the direction is not a unit vector, or the name is empty."""
         Presence.check(self)
-        if not math.isclose(math.hypot(*self.direction), 1.0, abs_tol=1e-6):
+        if not math.isclose(math.hypot(*self.direction), 1.0, abs_tol=1e-3):
             raise ValueError(f"direction = {list(self.direction)} is not a unit vector")
 
     def particles(self, rays: Array, ends_m: Array, rng: np.random.Generator) -> Array:
@@ -136,12 +136,12 @@ class Plume(Presence):
             rng: draws the particles.
         """
         depth_at_hit = rng.exponential(size=len(rays))
-        spacing = ends_m / _STATIONS
+        spacing, axis = ends_m / _STATIONS, np.array(self.direction) / math.hypot(*self.direction)
         depth, found = np.zeros(len(rays)), np.full(len(rays), np.inf)
         for k in range(_STATIONS):  # the midpoint rule
             there = (k + 0.5) * spacing[:, None] * rays - np.array(self.nozzle_m)
             away = np.maximum(np.linalg.norm(there, axis=1), _NEAREST_M)
-            angle = np.arccos(np.clip(there @ np.array(self.direction) / away, -1.0, 1.0))
+            angle = np.arccos(np.clip(there @ axis / away, -1.0, 1.0))
             spread = np.exp(-np.square(angle / math.radians(self.half_angle_deg)))
             added = self.particles_per_metre * spread / np.square(away) * spacing
             hit = np.isinf(found) & (depth + added >= depth_at_hit)
@@ -177,7 +177,7 @@ class Limb(Presence):
     def check(self) -> None:
         """Raise ValueError where the centre is not a unit vector, or the name is empty."""
         Presence.check(self)
-        if not math.isclose(math.hypot(*self.centre_a), 1.0, abs_tol=1e-6):
+        if not math.isclose(math.hypot(*self.centre_a), 1.0, abs_tol=1e-3):
             raise ValueError(f"centre_a = {list(self.centre_a)} is not a unit vector")
 
     def behind(self, rays: Array, times_s: Array, R_wa: Array) -> NDArray[np.bool_]:
@@ -189,7 +189,8 @@ class Limb(Presence):
             R_wa: (n, 3, 3) or (1, 3, 3) attitude of the camera in the fixed frame.
         """
         turn = geometry.matrix(geometry.exp(times_s[:, None] * np.array(self.rate_radps)))
-        centre = geometry.rotate(np.swapaxes(R_wa, -1, -2) @ turn, np.array(self.centre_a))
+        towards = np.array(self.centre_a) / math.hypot(*self.centre_a)
+        centre = geometry.rotate(np.swapaxes(R_wa, -1, -2) @ turn, towards)
         return np.asarray(np.sum(rays * centre, axis=1) > math.cos(math.radians(self.radius_deg)))
 
 
