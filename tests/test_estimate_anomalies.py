@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import estimate_surprises as surprises
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from scipy.stats import multivariate_normal
 
 from avsreplay.estimate import anomalies, hypotheses, noise, scan_window
 from avsreplay.estimate.dynamics import propagate, propagate_state
-from avsreplay.estimate.measurement import measurement_jacobian
+from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.track import Epoch, Prediction, Track, ready
 from avsreplay.records import Belief, Innovation
 
@@ -280,3 +282,51 @@ def test_size_and_time_of_a_manoeuvre_are_as_precise_as_they_claim_with_precise_
     if result.true_rate.any():
         assert abs(float(np.linalg.norm(found.rate)) - 0.01) < 3.0 * float(np.sqrt(np.trace(found.P[:3, :3])))
     assert np.max(np.array(result.nees)[:, 0]) < 2.0
+
+
+def test_random_disturbances_are_no_manoeuvre(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses of 0.2 mm show a random torque and force before their levels are estimated."""
+    monkeypatch.setattr(surprises, "POS_M", 2e-4)
+    monkeypatch.setattr(surprises, "ROT_RAD", np.radians(0.01))
+    case = surprises.Case("random", random=(3e-5, 3e-5), seconds=45.0)
+    result = surprises.run(case, 3)
+    assert result.track is not None
+    assert result.track.manoeuvres == ()
+    assert max(r for t, r in zip(result.t, result.ratio, strict=True) if t > 20.0) < 4.0
+
+
+@pytest.mark.parametrize(("density", "kind"), [(3e-3, 0), (3e-2, 3)])
+def test_changes_in_every_interval_and_a_single_change_are_told_apart(density: float, kind: int) -> None:
+    """Innovations drawn from one hypothesis: it is the more likely one, and the density is found."""
+    rng, n = np.random.Generator(np.random.PCG64(8)), 12
+    world = tumbling.draw(2, seconds=0.5 * n, hz=2.0)
+    start = Belief(0, world.states[0], np.eye(20) * 1e-12)
+    R = np.eye(6) * 1e-8
+    for single in (False, True):
+        x, epochs, drawn = world.states[0], [], []
+        free = world.states[0]
+        for k in range(n):
+            push = np.zeros(6)
+            if not single or k == n // 2:
+                push[kind : kind + 3] = (
+                    density * np.sqrt(0.5) * (rng.normal(size=3) if not single else 3.0 * np.ones(3))
+                )
+            x = replace(propagate_state(x, 0.25)[0])
+            x = propagate_state(replace(x, w_b=x.w_b + push[:3], v_a=x.v_a + push[3:]), 0.25)[0]
+            free = propagate_state(free, 0.5)[0]
+            alpha = innovation_vector(free, x.T_ac) + 1e-4 * rng.normal(size=6)
+            prediction = Prediction(
+                Belief(round((k + 1) * 5e8), free, start.P), np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty()
+            )
+            epochs.append(Epoch(Track(start, "filter"), prediction, Innovation(alpha, R, R, 0.0, 0.0, 0.0, 0.0), False))
+            drawn.append(push)
+        priors = scan_window.ChangePriors(0.05, 0.2, 0.2, 0.05)
+        ranked = hypotheses.explain(epochs, n - 1, priors, 0.0, 0.0)
+        found = {e.hypothesis: e for e in ranked}
+        disturbed, change = found[scan_window.Hypothesis.DISTURBED], found[scan_window.Hypothesis.MANOEUVRE]
+        if single:
+            assert change.log_evidence > disturbed.log_evidence + 3.0
+        else:
+            assert disturbed.log_evidence > change.log_evidence + 3.0
+            assert disturbed.size[kind] == pytest.approx(density, rel=0.8)
+            assert not disturbed.size[3 - kind : 6 - kind].any()

@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from avsreplay.estimate.batch import FitParams, Prior, Problem, fit
-from avsreplay.estimate.batch_covariance import LATEST, BatchCovariance, final_mixture
+from avsreplay.estimate.batch_covariance import LATEST, SPHERE, BatchCovariance, final_mixture
 from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.error_state import VEL, W
@@ -94,6 +94,8 @@ class AnomalyTest:
         best = ranked[0].hypothesis
         changed = best is Hypothesis.MANOEUVRE and _odds_over_free(ranked) >= _OVER_FREE
         changed = changed and (bool(track.doubtful) or _linear(window, ranked))
+        if best is Hypothesis.DISTURBED and _odds_over_free(ranked) >= _OVER_FREE:
+            track, doubtful = self._disturbed(track, ranked[0]), self._disturbed(doubtful, ranked[0])
         if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
             return self._accepted(track, epoch, update), verdict
         return self._decided(doubtful, window, ranked)
@@ -130,14 +132,21 @@ class AnomalyTest:
                 return reported, Verdict(0, Reason.DOUBTFUL)
         if doubtful < _FEWEST:
             return in_doubt
-        if best.hypothesis is Hypothesis.FREE_MOTION:
-            before = replace(with_history(track.doubtful[0].track, track), recent=track.recent)
+        if best.hypothesis in (Hypothesis.FREE_MOTION, Hypothesis.DISTURBED):
+            before = replace(with_history(track.doubtful[0].track, track), recent=track.recent, levels=track.levels)
             return self._used(before, track.doubtful), Verdict(1, Reason.OK)
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):
             return self._biased(track, window, best), Verdict(0, Reason.SENSOR_BIAS)
         if best.hypothesis is not Hypothesis.FROZEN or not explained:
             return self._by_agreement(track)
         return with_history(track, track), Verdict(0, Reason.POSE_JUMP)
+
+    def _disturbed(self, track: Track, found: Explanation) -> Track:
+        """The track with levels of the disturbances that explain the scans, until they are estimated from all poses."""
+        rate, velocity = float(found.size[0]), float(found.size[3])
+        torque, force = self.batch.noise_levels(track)
+        levels = replace(track.levels, torque=max(torque, rate / SPHERE), force=max(force, velocity))
+        return replace(track, levels=replace(levels, count=max(levels.count, 1)))
 
     def _bias_began(self, track: Track) -> bool:
         """Return whether a step in the pose is the beginning of a sensor error; it may as well be the end of one.

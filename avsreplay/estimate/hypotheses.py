@@ -33,6 +33,7 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief
 
+_DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
 _PER_BAD_SCAN = math.log(1e-2)
 _INSTANTS, _FEWER, _LONG = 8, 4, 9  # instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
 _LONGEST_SPREAD = 6  # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
@@ -69,6 +70,7 @@ def explain(
     found = [
         Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), 6 * n, n),
         _manoeuvre(window, start, white, free, priors, n),
+        _disturbed(window, start, white, free, n),
         _sensor_bias(window, white, free, priors, n),
         _bad_scans(window, priors, first_doubtful, n),
         _frozen(window, first_doubtful, n),
@@ -111,6 +113,29 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
         best = replace(best, after_1s_s=math.hypot(best.after_1s_s, float(lengths.max()) / math.sqrt(12.0)))
     onset = int(np.searchsorted(window.times_s, best.changes_s[0], side="right"))
     return replace(best, log_evidence=odds, onset=onset)
+
+
+def _disturbed(window: Window, start: Belief, white: Array, free: float, n: int) -> Explanation:
+    """Random torque or force beyond what is allowed for: an impulse between every two scans.
+
+    ``size`` holds the most likely root density of the rate [rad/s^1.5] or of the velocity [m/s^1.5], three times each.
+    A constant torque changes the velocity in every interval as well, unlike a manoeuvre.
+    """
+    edges = np.concatenate([[0.0], window.times_s])
+    columns = _after_changes(window, start, 0.5 * (edges[1:] + edges[:-1])) * np.sqrt(np.diff(edges))[:, None, None]
+    found = []
+    for kind in _CHANGES[:2]:
+        A = columns[:, :, kind].transpose(1, 0, 2).reshape(6 * n, -1)
+        values, vectors = np.linalg.eigh(A.T @ A)
+        along = vectors.T @ (A.T @ white)
+        gain = _DENSITIES[:, None] ** 2 * np.maximum(values, 0.0)
+        fitted = _DENSITIES[:, None] ** 2 * along**2 / (1.0 + gain)
+        odds, left = 0.5 * (fitted - np.log1p(gain)).sum(axis=1), float(white @ white) - fitted.sum(axis=1)
+        k, size = int(np.argmax(odds)), np.zeros(6)
+        size[kind] = _DENSITIES[k]
+        value = free + log_mean(odds.tolist()) + PRIOR_ODDS
+        found.append(Explanation(Hypothesis.DISTURBED, value, float(left[k]), 6 * n, n, size=size))
+    return max(found, key=lambda f: f.log_evidence)
 
 
 def _located(

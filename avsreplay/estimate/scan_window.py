@@ -34,6 +34,7 @@ class Hypothesis(Enum):
 
     FREE_MOTION = "free_motion"
     MANOEUVRE = "manoeuvre"
+    DISTURBED = "disturbed"  # the velocity changes all the time
     SENSOR_BIAS = "sensor_bias"
     FROZEN = "frozen"  # the sensor repeats an old scan
     BAD_SCANS = "bad_scans"
