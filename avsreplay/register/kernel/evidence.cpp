@@ -18,15 +18,17 @@ struct CubeHash {
   }
 };
 
+constexpr double NEARER = 0.999;  // of the gate of an alignment: neighbours this near are the nearest whatever the gate
+
 // The closest points of a scan at a pose, a chunk at a time.
 class Matcher {
  public:
   Matcher(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, const Matches* matches)
       : s_(s), code_(code), v_(v), sided_(rule.facing && s.mesh) {
     const Vec3 eye{T[3], T[7], T[11]};
-    const bool hold = matches && matches->hold(v.n, eye, rule.gate, sided_);
+    const bool hold = matches && matches->hold(v.n, eye, sided_);
     if (!hold) code.face(s, sided_ ? &eye : nullptr, 0, own_);
-    look_ = {T, rule.gate, 0.f, Pass::plane, sided_, hold ? &matches->facing : &own_};
+    look_ = {T, rule.gate, 0.f, Pass::plane, sided_, hold ? &matches->facing : &own_, hold ? NEARER * matches->gate : 0};
     kept_ = hold ? matches->kept.data() : nullptr;
   }
   Matcher(const Matcher&) = delete;

@@ -24,6 +24,7 @@ struct Look {
   Pass kind;
   bool sided;       // only primitives that face the camera count
   const Facing* facing;
+  double known = 0;  // what is kept holds for neighbours nearer than this [m]; read by `match` only
 };
 
 // Sums over a chunk or a scan; p, foot relative to the model's centre, e = n . (foot - p), J = [p x n, n].
@@ -82,7 +83,7 @@ struct Code {
   void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
   void (*pass)(const Store&, const View&, int64_t first, int64_t last, const Look&, Kept*, Sums&);
   // The inliers among a chunk's points, in their order; returns how many. `kept`: where the searches begin, or null; what
-  // is said there must hold for the eye and the gate of `look`.
+  // is said there must hold for the eye of `look`, and below its `known`.
   int (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out);
   void (*add)(const Match*, int64_t n, PatchSums&);
 };

@@ -204,8 +204,8 @@ constexpr int64_t MANY = 4;  // times the few points: a scan from which they are
 
 }  // namespace
 
-bool Matches::hold(int64_t n, const Vec3& eye, double most, bool looks) const {
-  if ((int64_t)kept.size() != n || looks != sided || most > gate) return false;
+bool Matches::hold(int64_t n, const Vec3& eye, bool looks) const {
+  if ((int64_t)kept.size() != n || looks != sided) return false;
   const Vec3 d{eye.x - facing.eye.x, eye.y - facing.eye.y, eye.z - facing.eye.z};
   return !sided || std::sqrt(d.x * d.x + d.y * d.y + d.z * d.z) <= facing.margin;
 }

@@ -27,11 +27,11 @@ struct Outcome {
 struct Matches {
   std::vector<Kept> kept;
   Facing facing;
-  double gate = 0;     // [m]
+  double gate = 0;     // below which neighbours were searched for [m]
   bool sided = false;
 
-  // Whether what is kept holds for n points seen from `eye`, with feet up to `gate`.
-  bool hold(int64_t n, const Vec3& eye, double gate, bool sided) const;
+  // Whether what is kept holds for n points seen from `eye`, with feet nearer than `gate`.
+  bool hold(int64_t n, const Vec3& eye, bool sided) const;
 };
 
 Sums run_pass(const Store& store, const Code& code, const View& points, const Look& look, Kept* kept, Team& team);

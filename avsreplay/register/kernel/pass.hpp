@@ -238,6 +238,21 @@ static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last
   if (look.kind == Pass::newton) sum_newton(n, c, out);
 }
 
+// Searches for the points whose kept neighbour is not nearer than `known`: what is kept says nothing of places farther
+// than the gate under which it was found. Returns whether there were any.
+template <class Kind>
+static bool search_beyond(const Scope& o, int n, double known, Chunk& c) {
+  if (known >= o.bound) return false;
+  bool any = false;
+  for (int i = 0; i < n; ++i) {
+    if (c.search[i] < IN_BLOCK || (c.take[i] > 0 && c.d2[i] < known * known)) continue;
+    const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
+    c.lane[i] = search_one<Kind>(o, q, list_of(o.s, word_at(o.s, q.x, q.y, q.z)), c.lane[i], nullptr);
+    any = true;
+  }
+  return any;
+}
+
 template <class Kind>
 static int match_kind(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept, Match* out) {
   Chunk c;
@@ -249,6 +264,7 @@ static int match_kind(const Store& s, const View& v, int64_t first, int64_t last
   if (look.sided && s.mesh) o.eye = &eye;
   search<Kind>(o, first, n, kept, nullptr, c);
   settle<Kind>(o, n, Ask::NORMAL, c);
+  if (kept && search_beyond<Kind>(o, n, look.known, c)) settle<Kind>(o, n, Ask::NORMAL, c);
   int found = 0;
   for (int i = 0; i < n; ++i) {
     if (!(c.take[i] > 0)) continue;
