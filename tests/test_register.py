@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from oracles import covariance as oracle_of
 from oracles.residuals import residuals, summed
 from scipy.spatial.transform import Rotation
 
@@ -14,6 +15,7 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.records import AlignStatus, Fit, Surface
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import boxes, example_pose, plate_scan, view
+from avsreplay.register.covariance import without_dominant_patches
 from avsreplay.register.horn import best_motion, horn_matrix
 from avsreplay.register.quality import evidence, grade, unobservable_directions
 from avsreplay.register.sampling import sample, thin
@@ -216,6 +218,31 @@ def test_sums_over_patches_are_those_of_the_residuals(surface: Surface, scan: np
             order = np.argsort(np.unique(plain.patch, return_index=True)[1])  # by the first point of each patch
             np.testing.assert_allclose(found.normals, whole.normals[order], rtol=1e-8, atol=1e-9)
             np.testing.assert_allclose(found.gradients, whole.gradients[order], rtol=1e-8, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("noise_m", "squeeze", "systematic"), [(0.01, 0.0, True), (0.002, 0.02, True), (0.01, 0.0, False)]
+)
+def test_the_grade_follows_from_the_sums_over_patches(
+    surface: Surface, scan: np.ndarray, noise_m: float, squeeze: float, systematic: bool
+) -> None:
+    """One call of the kernel gives what numpy makes of the sums, the covariance and the test of halves."""
+    points = scan * [1.0 + squeeze, 1.0, 1.0] + _rng().normal(0.0, noise_m, scan.shape)
+    index, visibility, params = SurfaceIndex.build(surface, 0.5), Visibility(surface), RegisterParams()
+    limits = params.limits(surface.extent)
+    T_ca = Registrar(surface).register(points, example_pose()).T_ac.inverse()
+    found = grade(index, visibility, points, Fit(T_ca, 1, True), limits, params, systematic=systematic)
+    sums = evidence(index, visibility, points, T_ca, limits.gate_m)
+    assert (found.points, found.inliers, found.rms_m) == (sums.points, sums.inliers, sums.rms_m)
+    sums = without_dominant_patches(sums)
+    np.testing.assert_allclose(found.info, sums.normals.sum(axis=0) / sums.noise_m**2, rtol=1e-12)
+    errors = oracle_of.systematic_errors(sums, surface.extent, 0.05 * surface.extent)
+    bare = oracle_of.sandwich_covariance(sums.normals, sums.gradients)
+    P, dof = oracle_of.registration_covariance(sums, errors) if systematic else bare
+    assert not found.message  # no size is fitted, whose effect on the pose would be added
+    np.testing.assert_allclose(found.covariance, P, rtol=1e-7, atol=1e-12 * np.abs(P).max())
+    assert found.dof == pytest.approx(dof, rel=1e-6)
+    assert found.split_nis == pytest.approx(oracle_of.split_nis(sums, errors, T_ca.R[:, :2].T), rel=1e-6)
 
 
 def test_covariance_shrinks_with_points_and_grows_with_noise(surface: Surface, registrar: Registrar) -> None:

@@ -112,6 +112,29 @@ class Index:
         threads: int = 1,
         matches: Matches | None = None,
     ) -> tuple[Any, ...]: ...
+    def grade(
+        self,
+        points: NDArray[Any],
+        T_ca: NDArray[np.float64],
+        gate_m: float,
+        patch_m: float,
+        least_patches: int,
+        camera: bool,
+        tested: int,
+        least_facing: float,
+        extent_m: float,
+        noise_m: float,
+        noise_floor_m: float,
+        least_inliers: float,
+        least_ratio: float,
+        least_information: float,
+        systematic: bool,
+        turn_rad: float,
+        move_m: float,
+        across: NDArray[np.float64],
+        threads: int = 1,
+        matches: Matches | None = None,
+    ) -> tuple[Any, ...]: ...
     def looks(self, points: NDArray[Any], T_ca: NDArray[np.float64], stride: int) -> tuple[int, int]: ...
     @property
     def primitives(self) -> int: ...

@@ -6,7 +6,7 @@ appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,20 +15,11 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
-from avsreplay.register.covariance import (
-    Evidence,
-    patch_size,
-    pseudo_inverse,
-    registration_covariance,
-    sandwich_covariance,
-    split_nis,
-    systematic_errors,
-    without_dominant_patches,
-)
+from avsreplay.register.covariance import Evidence, pseudo_inverse, without_dominant_patches
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.size import LEAST_ERROR, SizeError, normal_jacobian, size_error
 from avsreplay.register.surface_index import Closest, SurfaceIndex
-from avsreplay.register.visibility import Visibility
+from avsreplay.register.visibility import LEAST_FACING, TESTED_POINTS, Visibility
 
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
 LEAST_PATCHES = 24
@@ -38,9 +29,43 @@ FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface dist
 AS_MANY, AS_NEAR = 0.99, 1.02  # inliers and rms of a pose that fits as well
 SUGGESTED, SUGGESTED_SIGMAS = 0.4, 2.5  # an error of size by the sums of patches: share of the least one, and sigmas
 MANY_INLIERS = 0.9  # with a smaller share the sums of the inliers alone do not show the size
-UNCHANGED = 0.06  # chi-square with 6 degrees of freedom is smaller with probability 4e-6
+UNCHANGED = 0.06  # of a statistic that is chi-square with 6 degrees of freedom at the true pose: smaller with p = 4e-6
 ACCURACY = (0.1, 1e-3)  # deg and share of the extent, of a back end that states none of its own
 AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grade:
+    """The quality of a pose by the kernel; from ``bounded`` on it holds only if ``observable``.
+
+    Attributes:
+        points, inliers: of the scan.  used: inliers in the patches that are not left out.
+        rms_m, noise_m, centre: as in ``covariance.Evidence``.  total: (6, 6) sum of J'J over the inliers used.
+        statistic: g' N^+ g / noise^2 of all inliers; 0 at a minimum of the distances.
+        overlap, observable: there are enough inliers; they determine every motion.
+        bounded: the standard deviations are below the extent and 1 rad.
+        beyond: the residuals require a step above the accuracy of the back end and three standard deviations.
+        covariance, dof: (6, 6) and its degrees of freedom.  split_nis: the test of halves, NaN where it was not made.
+        size, size_1s: as of ``covariance.patch_size``.
+    """
+
+    points: int
+    inliers: int
+    used: int
+    rms_m: float
+    noise_m: float
+    centre: Array
+    total: Array
+    statistic: float
+    overlap: bool
+    observable: bool
+    bounded: bool
+    beyond: bool
+    covariance: Array
+    dof: float
+    split_nis: float
+    size: float
+    size_1s: float
 
 
 def evidence(
@@ -116,26 +141,22 @@ def grade(
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
-    found = evidence(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m, fit.matches)
-    overlap = found.inliers >= max(params.min_inliers, params.min_inlier_ratio * found.points)
-    left = remaining_step(found)
-    if overlap and _same(fit.T_ca, guess) and unchanged_without_reason(found):
+    across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
+    found = _grade(index, visibility, points, fit, limits.gate_m, params, across, accuracy, systematic)
+    if found.overlap and _same(fit.T_ca, guess) and found.statistic > UNCHANGED:
         failed = not_measured(len(points), AlignStatus.FAILED)
         return replace(failed, message="returned its guess unchanged; the scan asks for another pose")
-    found = without_dominant_patches(found) if overlap else found
-    total = found.normals.sum(axis=0)
-    info = frozen(total / found.noise_m**2)
-    weakest = unobservable_directions(total, int(found.counts.sum()), found.centre) if overlap else ()
-    across = fit.T_ca.R[:, :2].T if halves else np.empty((0, 3))  # x and y of {A}
-    P, dof, split = None, np.inf, None
-    if overlap and not weakest:
-        P, dof, split = _covariance(found, across, index.extent_m, systematic)
-    unbounded = () if P is None else unbounded_directions(P, index.extent_m)
-    if P is not None and unbounded:
-        info, P, weakest = frozen(pseudo_inverse(P)), None, unbounded
-    settled = P is None or not _beyond(left, P, index.extent_m, accuracy)
+    info, P = found.total / found.noise_m**2, None
+    weakest: tuple[str, ...] = ()
+    if found.observable:
+        P, weakest = found.covariance, () if found.bounded else unbounded_directions(found.covariance, index.extent_m)
+        if weakest:
+            info, P = pseudo_inverse(found.covariance), None
+    elif found.overlap:
+        weakest = unobservable_directions(found.total, found.used, found.centre)
+    settled = P is None or not found.beyond
     size = None
-    if P is not None and settled and systematic and _other_size(found, index.extent_m):
+    if P is not None and settled and systematic and _other_size(found):
         size = size_error(index, points, fit.T_ca, visibility.camera_c(index, points, fit.T_ca))
         P = P if size is None else P + np.outer(size.shift, size.shift)
     return Alignment(
@@ -145,22 +166,20 @@ def grade(
         points=found.points,
         inliers=found.inliers,
         rms_m=found.rms_m,
-        info=info,
-        status=_status(overlap, fit.converged and settled, bool(weakest)),
+        info=frozen(info),
+        status=_status(found.overlap, fit.converged and settled, bool(weakest)),
         covariance=None if P is None else frozen(P),
         free_directions=", ".join(weakest),
-        split_nis=split,
+        split_nis=None if np.isnan(found.split_nis) else found.split_nis,
         message=_message(settled, size),
-        dof=np.inf if P is None else dof,
+        dof=np.inf if P is None else found.dof,
     )
 
 
-def _other_size(found: Evidence, extent_m: float) -> bool:
+def _other_size(found: Grade) -> bool:
     """Whether another size is worth a fit: the sums of patches suggest one, or many points are not on the model."""
-    if found.inliers < MANY_INLIERS * found.points:
-        return True
-    delta, sigma = patch_size(found, extent_m, PATCH_OF_EXTENT * extent_m)
-    return abs(delta) > max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * sigma)
+    suggested = max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * found.size_1s)
+    return found.inliers < MANY_INLIERS * found.points or abs(found.size) > suggested
 
 
 def _message(settled: bool, size: SizeError | None) -> str:
@@ -173,37 +192,25 @@ def _same(T_ca: Pose, guess: Pose | None) -> bool:
     return guess is not None and (T_ca.q.tobytes(), T_ca.t.tobytes()) == (guess.q.tobytes(), guess.t.tobytes())
 
 
-def remaining_step(found: Evidence) -> Array:
-    """Return the least-squares step (6,) of the residuals at a pose; zero at a converged pose."""
-    return np.asarray(pseudo_inverse(found.normals.sum(axis=0)) @ found.gradients.sum(axis=0))
-
-
-def unchanged_without_reason(found: Evidence) -> bool:
-    """Return whether the residuals at a guess, which a back end returned unchanged, require a step.
-
-    At the true pose their statistic g' N^-1 g / noise^2 is chi-square with 6 degrees of freedom; at a minimum of the
-    distances it is zero.
-    """
-    statistic = remaining_step(found) @ found.gradients.sum(axis=0) / found.noise_m**2
-    return bool(statistic > UNCHANGED)
-
-
-def _beyond(step: Array, P: Array, extent_m: float, accuracy: tuple[float, float]) -> bool:
-    """Whether a step is larger than the accuracy of the back end and than three standard deviations of the pose."""
-    large = np.linalg.norm(step[:3]) > np.radians(accuracy[0]) or np.linalg.norm(step[3:]) > accuracy[1] * extent_m
-    return bool(large and step @ pseudo_inverse(P) @ step > 9.0 * len(step))
-
-
-def _covariance(
-    found: Evidence, across: Array, extent_m: float, systematic: bool
-) -> tuple[Array | None, float, float | None]:
-    """Covariance, its degrees of freedom, and the test of halves along ``across`` (k, 3) in {C}."""
-    if not (systematic or len(across)):
-        return *sandwich_covariance(found.normals, found.gradients), None
-    errors = systematic_errors(found, extent_m, PATCH_OF_EXTENT * extent_m)
-    bare = not systematic
-    P, dof = sandwich_covariance(found.normals, found.gradients) if bare else registration_covariance(found, errors)
-    return P, dof, split_nis(found, errors, across)
+def _grade(
+    index: SurfaceIndex,
+    visibility: Visibility,
+    points: NDArray[Any],
+    fit: Fit,
+    gate_m: float,
+    params: RegisterParams,
+    across: Array,
+    accuracy: tuple[float, float],
+    systematic: bool,
+) -> Grade:
+    """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}: directions of the test of halves."""
+    extent = index.extent_m
+    camera = (visibility.may_be_camera(fit.T_ca), TESTED_POINTS, LEAST_FACING, extent)
+    noise = (params.noise_m or 0.0, NOISE_FLOOR_OF_GATE * gate_m)
+    overlap = (float(params.min_inliers), params.min_inlier_ratio, FREE_BELOW)
+    step = (systematic, float(np.radians(accuracy[0])), accuracy[1] * extent)
+    rule = (min(gate_m, index.reach_m), PATCH_OF_EXTENT * extent, LEAST_PATCHES, *camera, *noise, *overlap, *step)
+    return Grade(*index.grade(points, fit.T_ca, *rule, np.ascontiguousarray(across), 1, fit.matches))
 
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:

@@ -14,8 +14,6 @@ Normal
     The face normal by the right-hand rule of the chosen triangle, also where the closest point lies on an edge or a
     vertex. For a point cloud: the eigenvector of the smallest eigenvalue of the scatter of the 10 nearest points; its
     sign is arbitrary.
-Degenerate triangles
-    Triangles without area are left out and counted in ``dropped``.
 """
 
 from __future__ import annotations
@@ -208,9 +206,9 @@ class SurfaceIndex:
             if len(faces) and not len(kept):
                 raise UsageError("no face has an area", where=surface.name, hint="give a mesh with proper triangles")
             index = kernel.Index(vertices, faces, kept, float(reach_m), threads, portable)
+            if path is not None:
+                index_cache.write(path, index.save(), kernel.checksum)
         size = int(index.primitives)
-        if path is not None and not restored:
-            index_cache.write(path, index.save(), kernel.checksum)
         return cls(float(reach_m), surface.extent, size, max(0, len(faces) - size), restored, index)
 
     @property
@@ -253,10 +251,7 @@ class SurfaceIndex:
         threads: int = 1,
         facing: bool = False,
     ) -> NormalEquations:
-        """Point-to-plane information, gradient and residual sums of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4).
-
-        ``facing``: as in :class:`IcpParams`.
-        """
+        """Point-to-plane sums of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4); ``facing``: as in :class:`IcpParams`."""
         gate = self.reach_m if gate_m is None else min(gate_m, self.reach_m)
         return NormalEquations(*self._index.normal_equations(_points(points), _rigid(T_ca), gate, threads, facing))
 
@@ -281,6 +276,11 @@ class SurfaceIndex:
         gate = min(gate_m, self.reach_m)
         rule = (gate, patch_m, least_patches, facing, threads, matches)
         return PatchSums(*self._index.evidence(_points(points), _rigid(T_ca), *rule))
+
+    def grade(self, points: NDArray[Any], T_ca: Pose, *rule: Any) -> tuple[Any, ...]:
+        """Grade the pose of ``points`` (n, 3) in {A}, see ``quality.Grade``; ``rule``: as in ``kernel/grade.hpp``."""
+        found: tuple[Any, ...] = self._index.grade(_points(points), T_ca.matrix, *rule)
+        return found
 
     def looks(self, points: NDArray[Any], T_ca: ArrayLike | Pose, stride: int) -> tuple[int, int]:
         """Count every ``stride``-th point (n, 3) with a closest point, and those on a face towards the camera."""

@@ -53,10 +53,14 @@ class Visibility:
 
     def camera_c(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> Array | None:
         """Return the camera position (3,) in {C} [m] if the test applies to this scan (n, 3) and pose, else None."""
-        if not (self.sided and self._clear(T_ca.t)):
+        if not self.may_be_camera(T_ca):
             return None
         matched, facing = index.looks(points, T_ca, max(1, len(points) // TESTED_POINTS))
         return T_ca.t if facing >= LEAST_FACING * matched else None
+
+    def may_be_camera(self, T_ca: Pose) -> bool:
+        """Return whether the test can apply: the outer sides are known, and the origin of {A} is clear of the model."""
+        return self.sided and self._clear(T_ca.t)
 
     def direction_to_camera(self, points: NDArray[Any]) -> Array | None:
         """Return the unit direction (3,) from a scan (n, 3) in {A} to the origin; None if the camera is not there."""

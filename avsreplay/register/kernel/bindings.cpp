@@ -13,6 +13,7 @@
 #include "coarse.hpp"
 #include "covariance.hpp"
 #include "evidence.hpp"
+#include "grade.hpp"
 #include "loop.hpp"
 #include "save.hpp"
 
@@ -83,6 +84,13 @@ Numpy matrix(const double* rows34) {
   std::memcpy(T, rows34, 12 * sizeof(double));
   T[12] = T[13] = T[14] = 0, T[15] = 1;
   return out;
+}
+
+Numpy array66(const Six& P) {
+  double* out;
+  Numpy made = array<double>({6, 6}, &out);
+  std::memcpy(out, P.v, sizeof P.v);
+  return made;
 }
 
 // Every number that is used as an index, and coordinates whose squares single precision can hold.
@@ -218,6 +226,32 @@ class Index {
     return nb::make_tuple(e.points, e.inliers, e.sum_d2, e.median, centre, counts, normals, gradients, offsets, sums, middles);
   }
 
+  nb::tuple grade(nb::handle points, const Doubles& T_ca, double gate, double side, int least, bool camera, int64_t tested,
+                  double least_facing, double extent, double noise, double noise_floor, double least_inliers,
+                  double least_ratio, double least_information, bool systematic, double turn, double move,
+                  const Doubles& across, int threads, const Matches* matches) const {
+    require(gate > 0 && side > 0 && extent > 0, "gate, patch size and extent must be positive");
+    require(tested > 0, "at least one point must be tested");
+    require(across.ndim() == 2 && across.shape(1) == 3, "directions must be (k, 3)");
+    const Cloud cloud(points);
+    const View v = cloud.view();
+    const Rows T = rows(T_ca);
+    const GradeRule rule{{gate, side, least, camera}, extent, tested, least_facing, noise, noise_floor, least_inliers, least_ratio,
+                         least_information, systematic, turn, move, {across.data(), across.data() + across.size()}};
+    Grade g;
+    {
+      nb::gil_scoped_release release;
+      Team team(threads);
+      g = avs::grade(store_, code(), v, T.v, rule, team, matches);
+    }
+    double* c;
+    auto centre = array<double>({3}, &c);
+    std::memcpy(c, g.centre, sizeof g.centre);
+    return nb::make_tuple(g.points, g.inliers, g.used, g.rms, g.noise, centre, array66(g.total), g.statistic, g.overlap,
+                          g.observable, g.bounded, g.beyond, array66(g.covariance.P), g.covariance.dof, g.split,
+                          g.size[0], g.size[1]);
+  }
+
   nb::tuple looks(nb::handle points, const Doubles& T_ca, int64_t stride) const {
     require(stride > 0, "the stride must be positive");
     const Cloud cloud(points);
@@ -287,13 +321,6 @@ void check_patches(const Patches& normals, const Patches& gradients) {
   require(normals.ndim() == 3 && normals.shape(1) == 6 && normals.shape(2) == 6, "the sums of patches must be (m, 6, 6)");
   require(gradients.ndim() == 2 && gradients.shape(0) == normals.shape(0) && gradients.shape(1) == 6,
           "there must be six sums for each patch");
-}
-
-Numpy array66(const Six& P) {
-  double* out;
-  Numpy made = array<double>({6, 6}, &out);
-  std::memcpy(out, P.v, sizeof P.v);
-  return made;
 }
 
 nb::ndarray<nb::numpy, bool> keep_patches(const Patches& normals, const Counts& counts) {
@@ -438,6 +465,11 @@ NB_MODULE(_kernel, m) {
       .def("evidence", &Index::evidence, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"), nb::arg("patch_m"),
            nb::arg("least_patches"), nb::arg("facing") = false, nb::arg("threads") = 1,
            nb::arg("matches").none() = nb::none())
+      .def("grade", &Index::grade, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"), nb::arg("patch_m"),
+           nb::arg("least_patches"), nb::arg("camera"), nb::arg("tested"), nb::arg("least_facing"), nb::arg("extent_m"),
+           nb::arg("noise_m"), nb::arg("noise_floor_m"), nb::arg("least_inliers"), nb::arg("least_ratio"),
+           nb::arg("least_information"), nb::arg("systematic"), nb::arg("turn_rad"), nb::arg("move_m"), nb::arg("across"),
+           nb::arg("threads") = 1, nb::arg("matches").none() = nb::none())
       .def("looks", &Index::looks, nb::arg("points"), nb::arg("T_ca"), nb::arg("stride"))
       .def_prop_ro("primitives", &Index::primitives)
       .def_prop_ro("nbytes", &Index::bytes)

@@ -1,0 +1,37 @@
+// The quality of a pose in one call: what `evidence` sums up, and what follows from the sums, see register/quality.py.
+#pragma once
+#include "covariance.hpp"
+#include "evidence.hpp"
+
+namespace avs {
+
+struct GradeRule {
+  PatchRule patches;             // its `facing` says whether the camera may be where the faces look
+  double extent;                 // of the model [m]
+  int64_t tested;                // points of the scan, about, that tell whether it is
+  double least_facing;           // share of them on faces towards it, at least
+  double noise, noise_floor;     // standard deviation of e [m]; 0: estimated, and not below the floor
+  double least_inliers, least_ratio;  // with fewer there is no overlap
+  double least_information;      // scaled information below which a motion is not observable
+  bool systematic;               // the covariance includes systematic errors
+  double turn, move;             // accuracy of the back end [rad, m]
+  std::vector<double> across;    // (k, 3) directions of the test of halves
+};
+
+struct Grade {
+  int64_t points = 0, inliers = 0, used = 0;  // used: in the patches that are not left out
+  double rms, noise, centre[3];
+  Six total;                     // of the normals of the patches used
+  double statistic = 0;          // g' N^+ g / noise^2 of all patches
+  bool overlap = false, observable = false;
+  bool measured = false;         // what follows is known: there is overlap, and every motion is observable
+  bool bounded = true, beyond = false;  // standard deviations below the extent; the residuals ask for a step
+  Estimated covariance;
+  double split;                  // NaN: not tested
+  std::array<double, 2> size{};  // of `size_error`
+};
+
+Grade grade(const Store& store, const Code& code, const View& points, const double* T, const GradeRule& rule, Team& team,
+            const Matches* matches);
+
+}  // namespace avs
