@@ -197,8 +197,10 @@ def test_the_tutorial_of_an_own_log_gives_the_options_that_it_uses(tmp_path, cli
     assert f"run own.bag --model target.stl {options} -o results/ --report" in text
     done = cli("run", "own.bag", "--model", "target.stl", *options.split(), "--json", cwd=tmp_path)
     rows = json.loads(done.out)["rows"]
-    assert f"{json.loads(done.out)['verdict']['grade']}: " in text
-    assert json.loads(done.out)["verdict"]["reasons"][0]["text"] in text
+    verdict = json.loads(done.out)["verdict"]
+    assert f"{verdict['grade']}: " in text
+    reasons = [reason["text"] for reason in verdict["reasons"]]
+    assert all(reason in text for reason in reasons if not any(sign.isdigit() for sign in reason)), reasons
     assert sum(row["gamma"] for row in rows) >= 0.9 * len(rows) == 0.9 * 42
     assert max(row["pos_err_m"] for row in rows) < 0.01
     assert max(row["rot_err_deg"] for row in rows) < 0.5

@@ -177,6 +177,16 @@ def test_charts_with_nothing_to_show_are_left_out(make_rows):
     assert {"attitude", "sigma", "nees"} <= set(keys)
 
 
+def test_without_truth_the_charts_of_errors_are_charts_of_the_uncertainty(make_rows):
+    known = {
+        **dict.fromkeys(("pos_err_m", "rot_err_deg", "reg_pos_err_m", "reg_rot_err_deg")),
+        "pos_1s_m": 0.01,
+        "rot_1s_deg": 0.1,
+    }
+    titles = [[c["title"] for c in charts(derived(rows))[:2]] for rows in (make_rows(10), make_rows(10, **known))]
+    assert titles == [["Position error", "Attitude error"], ["Position uncertainty", "Attitude uncertainty"]]
+
+
 def test_bands_are_the_value_and_its_sigma(make_rows):
     columns = derived(make_rows(10))
     np.testing.assert_allclose(columns["sigma1_hi"] - columns["sigma1_lo"], 0.02)
@@ -630,6 +640,8 @@ def test_a_run_of_one_scan_loads(opened, make_rows, n):
     browser = opened(rows=rows, truth=None, poses=(), view=None) if n == 1 else opened(rows=rows, view=None)
     assert browser.get_log("browser") == []
     assert _text(browser, "#now").startswith("scan 0 ")
+    low, high = browser.execute_script("const x = uPlot.sync('time').plots[0].scales.x; return [x.min, x.max];")
+    assert high - low <= 1.0
 
 
 @pytest.mark.slow

@@ -17,6 +17,9 @@ from avsreplay.report.summary import Summary
 from avsreplay.report.view import PathView, View, read_view, thin_cloud, thin_surface, write_view
 
 TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.25, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))
+DISC = State(
+    [0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [-1.0, 0.0], [0.5, 0.6, -0.4], exp([0, 0, 0.1])
+)  # no such body
 
 
 @pytest.fixture
@@ -133,6 +136,7 @@ def test_no_rows_is_one_line(tmp_path):
         ("run.json", "[]", "not a JSON object"),
         ("run.json", '{"facts": {"labels": [{"no": 1}]}}', "not as written"),
         ("run.json", '{"facts": {"truth": {"q_ab": 1}}}', "not as written"),
+        ("run.json", json.dumps({"facts": facts_record(labels=None, truth=DISC, counts={})}), "not as written"),
         ("run.json", '{"facts": []}', None),
         ("run.json", '{"facts": [1]}', "not as written"),
         ("truth.tum", "1 2 3", r"truth\.tum:1: not 'stamp"),

@@ -145,6 +145,8 @@ def charts(columns: Columns, truth: State | None = None, limits: Mapping[str, fl
     for chart in whole:
         chart["series"] = [s for s in chart["series"] if s["column"] in columns]
         chart["bands"] = [b for b in chart["bands"] if f"{b['stem']}_lo" in columns]
+        if chart["key"] in ("position", "attitude") and not any("_err_" in s["column"] for s in chart["series"]):
+            chart["title"] = chart["title"].replace("error", "uncertainty")  # no truth: the predicted 1 sigma alone
         if chart["series"]:
             kept.append(_scaled(chart, columns))
     return kept

@@ -218,6 +218,8 @@ def _state(values: Mapping[str, Any]) -> State:
         raise ValueError("a state of another shape")
     if any(abs(np.linalg.norm(arrays[name]) - 1.0) > _UNIT for name in ("q_ab", "q_bc")):
         raise ValueError("a quaternion that is not of unit length")
+    if np.abs(arrays["sigma"]).max() >= 1.0:
+        raise ValueError("an inertia ratio that is not below 1")
     return State(**arrays)
 
 

@@ -170,6 +170,8 @@ def _nearest_row(t_s: float, rows: Sequence[Row]) -> int | None:
 
 
 def _verdict(episode: Episode) -> TableCell:
+    if episode.detected and not episode.harmful:
+        return TableCell("harmless, flagged")
     if episode.detected:
         return TableCell("detected" if episode.scans else "detected as a gap", "good")
     return TableCell("missed", "bad") if episode.harmful else TableCell("harmless, used")

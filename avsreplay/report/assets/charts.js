@@ -300,6 +300,7 @@ const Charts = (() => {
     };
     if (page.states) all.push(strip(host, shared));
     for (const spec of page.charts) all.push(lineChart(host, spec, shared));
+    if (t.length === 1 && all.length) reset();
 
     function readouts() {
       const k = hovered === null ? chosen : hovered;
@@ -318,7 +319,10 @@ const Charts = (() => {
       if (b > a) all[0].u.setScale("x", { min: a, max: b });
     }
     function zoomTo(a, b) { if (b > a) all[0].u.setScale("x", { min: a, max: b }); }
-    function reset() { all[0].u.setScale("x", { min: t[0], max: t[t.length - 1] }); }
+    function reset() {
+      const half = t.length > 1 ? 0 : 0.5;  // a single scan is drawn in the middle of one second
+      all[0].u.setScale("x", { min: t[0] - half, max: t[t.length - 1] + half });
+    }
     function choose(k) { chosen = k; pins(); readouts(); }
     function resize() {
       const width = Math.max(host.clientWidth - 14, 240);
