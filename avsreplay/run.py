@@ -204,7 +204,11 @@ class Run:
             yield row
 
     def rescore(self, rows: list[Row]) -> list[int]:
-        """Score the plans of a log that has grown with the true poses recorded after them; see ``Scorer.rescore``."""
+        """Score the plans of a log that grew with all its true poses; return the indices of the rows that changed.
+
+        Args:
+            rows: of all scans; those whose score changes are replaced.
+        """
         changed = [] if self._scored is None else self._scored.rescore(rows, self._true_poses())
         self._fold = self._fold.anew(rows)
         return changed
@@ -241,8 +245,7 @@ class Run:
 
     def _named(self, motion: Motion | None) -> dict[str, object]:
         """Objects that a checkpoint refers to by name; the interpolation of the truth is made again."""
-        own = {"surface": self.surface, "registrar": self.registrar, "estimator": self._stages.estimator}
-        return {**own, "motion": motion}
+        return {"surface": self.surface, "registrar": self.registrar, "estimator": self.estimator, "motion": motion}
 
     @property
     def truth(self) -> State | None:
@@ -255,9 +258,8 @@ class Run:
         counts = {"losses": len(losses), "lost_messages": sum(loss.messages or 0 for loss in losses)}
         stamps = {"unset": clock.unset, "jumped": clock.jumps, "equal": clock.equal, "back": clock.back}
         counts |= {f"stamps_{name}": count for name, count in stamps.items()}
-        found = replace(self._fold.result(self.truth), counts=counts)
         text = acceleration_text(self.config.estimator, self.acceleration)
-        return replace(found, acceleration=text)
+        return replace(self._fold.result(self.truth), counts=counts, acceleration=text)
 
     def facts(self) -> dict[str, Any]:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""
@@ -317,14 +319,11 @@ class Run:
 
     def _truth_of(self, scan: Scan) -> Truth:
         """Return the truth at a scan; the pose is that of the reference motion if one was fitted."""
-        truth = self._true(scan)
-        if self._reference is None:
+        truth, fitted = self._true(scan), self._reference
+        if fitted is None:
             return truth
-        try:
-            pose = self._reference.at(scan.t_ns).T_ac
-        except ValueError:  # before the first or after the last healthy pose
-            pose = None
-        return replace(truth, pose=pose, state=None)
+        inside = fitted.epoch_ns <= scan.t_ns <= fitted.end_ns  # from the first to the last healthy pose
+        return replace(truth, pose=fitted.at(scan.t_ns).T_ac if inside else None, state=None)
 
     def _without_model(self) -> LogHeader:
         """Reconstruct the model; start and true state of the log refer to another frame {C} and are dropped."""
