@@ -10,10 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from avsreplay.register.reference import best_motion
 
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
+from avsreplay.register.horn import best_motion
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 REACH_M = 0.3
