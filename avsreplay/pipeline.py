@@ -120,10 +120,9 @@ class Monitors:
         self, gramian: Gramian, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track
     ) -> Gramian:
         """The Gramian with one more scan, along the trajectory of the new fit where there is one."""
-        refitted = estimator.refitted_rows(track)
-        if refitted is not None:
+        if (refitted := estimator.refitted_rows(track)) is not None:
             return observability.from_trajectory(gramian.scale, *refitted)
-        return observability.observe(gramian, prior.Phi, prior.H, None if healthy is None else healthy.R)
+        return observability.observe(gramian, *estimator.gramian_row(track, prior, healthy))
 
     def _violations(
         self, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import tumbling
+from click.testing import CliRunner
 
+from avsreplay.cli.observability import observability_command
+from avsreplay.log import SourceOptions
 from avsreplay.monitor.observability import from_trajectory, gramian, measure, observe, weakest
+from avsreplay.rows import Row
+from avsreplay.run import Job, Run
 
 
 def exact(size: int) -> np.ndarray:
@@ -112,3 +120,56 @@ def test_a_trajectory_in_one_call_equals_the_recursion() -> None:
     for a, b in ((once.root, state.root), (once.white, state.white)):
         assert np.abs(a.T @ a - b.T @ b).max() < 1e-9 * np.abs(b.T @ b).max()
     assert measure(once).rank == measure(state).rank
+
+
+POSES = ("register.backend=poses",)
+
+
+def _pose_log(path: Path, rate: float, seconds: float) -> Path:
+    """Noisy poses of a body, in the format of a trajectory file."""
+    world, rng = tumbling.draw(5, seconds=seconds, hz=3.0, rate=rate, sigma_max=0.85), np.random.default_rng(1)
+    lines = []
+    for t, x in zip(world.times, world.states, strict=True):
+        T = tumbling.alignment(x.T_ac, rng, 0.002, 0.003).T_ac
+        lines.append(" ".join(map(repr, [1.0 + float(t), *T.t.tolist(), *T.q.tolist()])))
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return path
+
+
+def _compared(log: Path, *assignments: str) -> list[tuple[Row, dict]]:
+    """Rows of a run, each with the line of ``observability`` at its instant."""
+    options = [part for one in assignments for part in ("--set", one)]
+    done = CliRunner().invoke(observability_command, [str(log), "--json", "--marks", "200", *options])
+    assert done.exit_code == 0, done.output
+    lines = {line["t_s"]: line["two"] for line in json.loads(done.stdout)["lines"]}
+    posed = assignments[:1] == POSES
+    with Run(Job(source=log, assignments=assignments, options=SourceOptions(poses=posed), prefetch=0)) as run:
+        return [(row, lines[row.t_s]) for row in run.rows()]
+
+
+def test_rows_agree_with_the_motion_fitted_to_the_whole_log(tmp_path) -> None:
+    """Before the inertia is known, the motion fitted so far differs from it, and with it the rank by one or two."""
+    pairs = _compared(_pose_log(tmp_path / "tumbling.tum", 0.3, 50.0), *POSES)
+    ranks = [(row.ogm_rank, line["rank_fitted_motion"]) for row, line in pairs]
+    assert all(abs(a - b) <= 2 for a, b in ranks)
+    assert all(abs(a - b) <= 1 for a, b in ranks[len(ranks) // 3 :])
+    assert all(a == b for a, b in ranks[3 * len(ranks) // 5 :])
+    full = [(row, line) for row, line in pairs[len(pairs) // 2 :] if row.ogm_log10_cond is not None]
+    assert len(full) > 30
+    for row, line in full:
+        assert row.ogm_log10_cond == pytest.approx(line["log10_cond_fitted_motion"], abs=0.1)
+        assert row.ogm_log10_cond_scaled == pytest.approx(line["log10_cond_scaled_fitted_motion"], abs=0.1)
+
+
+def test_rows_of_a_body_at_rest_do_not_claim_more_than_pose_and_velocity(tmp_path) -> None:
+    """Twelve directions: without rotation neither inertia nor centre of mass nor axes have an effect."""
+    pairs = _compared(_pose_log(tmp_path / "rest.tum", 1e-9, 20.0), *POSES)
+    assert {line["rank_fitted_motion"] for _, line in pairs[2:]} == {12}
+    assert {row.ogm_rank for row, _ in pairs[2:]} == {12}
+
+
+def test_rows_of_a_cold_start_do_not_claim_more_than_the_motion_allows(fixtures_folder) -> None:
+    """Between two fits the mean of a mixture is no trajectory; along it the rank was 20 where it is 16."""
+    pairs = _compared(fixtures_folder / "tumble.mcap", "estimator.start=cold")
+    assert all(abs(row.ogm_rank - line["rank_fitted_motion"]) <= 1 for row, line in pairs)
+    assert all(row.ogm_rank == line["rank_fitted_motion"] for row, line in pairs if row.t_s > 3.0)

@@ -11,11 +11,13 @@ import click
 from avsreplay.cli.options import PATH, read_options, source_options
 
 if TYPE_CHECKING:
+    from avsreplay.estimate.initialise import PoseFix
     from avsreplay.estimate.reference import Reference
     from avsreplay.geometry import Array
     from avsreplay.monitor.observability import Gramian
+    from avsreplay.records import Belief, State
     from avsreplay.rows import Row
-    from avsreplay.run import Run
+    from avsreplay.run import ReplayedScan, Run
 
 WIDTH = 100
 HEADS = {"two": "two sigma", "three": "three sigma", "known": "all known"}
@@ -28,8 +30,8 @@ Examples:
 \b
 The log is replayed, one motion is fitted to all healthy poses, and the observability Gramian is summed along that
 motion: with sigma1 and sigma2 as parameters, with three independent sigma, and with all parameters known.
-The columns ogm_rank and ogm_log10_cond of 'run' are another quantity: the Gramian along the estimates available at
-each scan. The keys of the JSON document therefore end in _fitted_motion."""
+The columns ogm_rank and ogm_log10_cond of 'run' are the same Gramian along the motion fitted to the poses up to that
+scan, and agree with these once that fit has converged. The keys of the JSON document end in _fitted_motion."""
 
 
 @click.command("observability", epilog=EPILOG)
@@ -70,10 +72,19 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
     from avsreplay.score import HealthyPoses
 
     poses = HealthyPoses(run.estimator)
-    rows = list(run.rows([lambda scan: poses.add(scan.state, scan.outcome)]))
+    beliefs: dict[int, Belief] = {}
+    scales: list[Array] = []
+
+    def listen(scan: ReplayedScan) -> None:
+        poses.add(scan.state, scan.outcome)
+        beliefs[scan.outcome.belief.t_ns] = scan.outcome.belief
+        scales.append(scan.state.monitors.gramian.scale)
+
+    rows = list(run.rows([listen]))
     reference = poses.reference()
     inside = [row for row in rows if reference.epoch_ns <= row.t_ns <= reference.end_ns]
-    lines, ends = _summed(inside, reference, run)
+    start = _in_axes_of(beliefs[inside[-1].t_ns], reference)
+    lines, ends = _summed(inside, start, {fix.scan_ns: fix for fix in poses.fixes}, scales[0])
     keep = sorted({round(k * (len(lines) - 1) / (marks - 1)) for k in range(marks)})
     from avsreplay.estimate.measurement import BLOCKS_OF
     from avsreplay.monitor.observability import weakest as in_words
@@ -86,21 +97,33 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
     }
 
 
-def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[str, Any]], dict[str, Gramian]]:
-    """A record per scan, and the Gramians at the end."""
-    from avsreplay.estimate.measurement import prior_1s, step_of_sets
+def _in_axes_of(belief: Belief, reference: Reference) -> State:
+    """The reference motion at its epoch, with the principal axes in the order nearest to that of an estimate."""
+    from avsreplay.estimate.chart import nearest_permutation
+    from avsreplay.estimate.dynamics import propagate_state
+
+    end, _ = nearest_permutation(belief, reference.at(belief.t_ns))
+    return propagate_state(end, (reference.epoch_ns - belief.t_ns) * 1e-9)[0]
+
+
+def _summed(
+    rows: list[Row], x: State, fixes: dict[int, PoseFix], one_sigma: Array
+) -> tuple[list[dict[str, Any]], dict[str, Gramian]]:
+    """A record per scan along the motion that begins with ``x`` at the first of them, and the Gramians at the end."""
+    from avsreplay.estimate.measurement import in_camera, prior_1s, step_of_sets
     from avsreplay.monitor.observability import gramian, measure, observe
 
-    x, t_ns = reference.at(reference.epoch_ns), reference.epoch_ns
-    one_sigma = run.config.estimator.resolved(run.surface.extent).start_1s
+    t_ns = rows[0].t_ns
     folds = {name: gramian(scale) for name, scale in prior_1s(one_sigma, x.sigma).items()}
     lines = []
     for row in rows:
         x, steps = step_of_sets(x, (row.t_ns - t_ns) * 1e-9)
         t_ns = row.t_ns
         line: dict[str, Any] = {"t_s": row.t_s, "gamma": row.gamma}
+        fix = fixes.get(row.t_ns)
+        R = None if fix is None else in_camera(fix.C, fix.T_ac.q, x.q_bc)
         for name, (Phi, H) in steps.items():
-            folds[name] = observe(folds[name], Phi, H, _noise(row))
+            folds[name] = observe(folds[name], Phi, H, R)
             found = measure(folds[name])
             line[name] = {
                 "rank_fitted_motion": found.rank,
@@ -110,15 +133,6 @@ def _summed(rows: list[Row], reference: Reference, run: Run) -> tuple[list[dict[
             }
         lines.append(line)
     return lines, folds
-
-
-def _noise(row: Row) -> Array | None:
-    """R (6, 6) [m, half-angle] of a healthy scan, isotropic in position and in attitude."""
-    if not row.gamma or row.r_pos_m is None or row.r_rot_deg is None:
-        return None
-    import numpy as np
-
-    return np.diag(np.repeat([row.r_pos_m, 0.5 * np.radians(row.r_rot_deg)], 3) ** 2)
 
 
 def _print(found: dict[str, Any]) -> None:
@@ -131,7 +145,7 @@ def _print(found: dict[str, Any]) -> None:
         (f"{line['t_s']:.1f}", *(cell for name in HEADS for cell in _cells(line[name]))) for line in found["lines"]
     )
     console = make_console(plain_width=WIDTH)
-    note = "ogm_rank and ogm_log10_cond of 'run' are along the estimates available at each scan, and differ from these"
+    note = "ogm_rank and ogm_log10_cond of 'run' are along the motion fitted to the poses up to that scan"
     print_table(console, Table(title, ("t\n[s]", *heads), rows, align="r", note=note))
     for name, words in found["weakest"].items():
         if words:

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import dynamics
 from avsreplay.estimate.acceleration import FreeFall, accelerated
@@ -25,6 +24,7 @@ from avsreplay.estimate.measurement import (
     chart_update,
     constrained_update,
     gate_of,
+    in_camera,
     innovation_of,
     innovation_vector,
     measured_pose,
@@ -34,6 +34,7 @@ from avsreplay.estimate.measurement import (
 from avsreplay.estimate.mixture import mixture_forecast
 from avsreplay.estimate.noise import NO_INFLATION, Noise, line_of_sight_1s
 from avsreplay.estimate.params import EstimatorParams, Start
+from avsreplay.estimate.reference import rows_along
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Epoch, Prediction, Track
 from avsreplay.geometry import Array, Pose
@@ -159,21 +160,34 @@ class Estimator:
         Returns:
             H Phi (n, 6, 20) from the first pose on, R (n, 6, 6) and the transition (20, 20) from there to the scan.
         """
-        if track.mode != "fit" or track.batch is None or track.since or track.batch.count != pose_count(track.fixes):
+        start, trimmed = track.batch, track.mode == "filter" and len(track.fixes) >= self.params.audit_poses
+        if start is None or track.since or trimmed or start.count != pose_count(track.fixes):
             return None
-        start, points = track.batch, track.batch.points
-        if points is None:
-            return None
-        x = to_state(start.chart)
-        J = np.zeros((len(points), 6, 6))  # from d = [theta; v] in {C}, as in ``measurement.to_camera``
-        J[:, :3, 3:], J[:, 3:, :3] = geometry.matrix(points.q), 0.5 * geometry.matrix(x.q_bc)
-        R = J @ points.C @ np.swapaxes(J, 1, 2)
-        _, Phi = dynamics.propagate_state(x, (track.belief.t_ns - start.epoch_ns) * 1e-9, points.arc)
-        rows = dynamics.pose_rows(x, points.times_s, points.arc)
-        if points.counts is not None:  # each normal point stands for several poses
-            each = np.sqrt(points.counts)[:, None, None]
-            rows, R = each * rows, each**2 * R
-        return rows, R, Phi
+        return rows_along(start.chart, start.epoch_ns, track.fixes, track.belief.t_ns)
+
+    def gramian_row(
+        self, track: Track, prediction: Prediction, innovation: Innovation | None
+    ) -> tuple[Array, Array, Array | None, bool]:
+        """Phi (20, 20) and H (6, 20) of a scan, and R (6, 6) as the registration claims it.
+
+        Between two fits along the trajectory of the last one: the published mean, that of a mixture where the
+        likelihood is not Gaussian, follows no trajectory of the body.
+
+        Args:
+            track: after the scan.
+            prediction: of the scan.
+            innovation: of the scan; None where it was not used.
+
+        Returns:
+            Phi, H, R or None, and whether Phi begins at the first pose and not at the last scan.
+        """
+        start, used, t_ns = track.batch, innovation is not None, prediction.belief.t_ns
+        if track.mode != "fit" or start is None or start.points is None:
+            R = None if innovation is None else self.noise.base(innovation.R, prediction.window)
+            return prediction.Phi, prediction.H, R, False
+        x, Phi = dynamics.propagate_state(to_state(start.chart), (t_ns - start.epoch_ns) * 1e-9, start.points.arc)
+        last = track.fixes[-1]
+        return Phi, measurement_jacobian(x), in_camera(last.C, last.T_ac.q, x.q_bc) if used else None, True
 
     def residual_after(
         self, track: Track, prediction: Prediction, innovation: Innovation

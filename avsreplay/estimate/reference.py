@@ -7,10 +7,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, fit
-from avsreplay.estimate.chart import Chart, to_chart
-from avsreplay.estimate.dynamics import rotation_path, translated
+from avsreplay.estimate.chart import Chart, to_chart, to_state
+from avsreplay.estimate.dynamics import pose_rows, propagate_state, rotation_path, translated
 from avsreplay.estimate.initialise import PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
@@ -77,6 +78,30 @@ def reference_of(poses: Sequence[PoseFix], params: EstimatorParams) -> Reference
     first_ns, last_ns = fixes[0].t_ns, fixes[-1].t_ns
     arc = None if fixes[0].orbit is None else fixes[0].orbit.at(first_ns)
     return Reference(fitted, first_ns, last_ns, _motion(fitted.x, first_ns, last_ns, arc))
+
+
+def rows_along(chart: Chart, epoch_ns: int, fixes: tuple[PoseFix, ...], t_ns: int) -> tuple[Array, Array, Array]:
+    """H Phi of poses along one motion, for the observability Gramian.
+
+    Args:
+        chart: values of the motion at its epoch.
+        epoch_ns: the epoch.
+        fixes: the poses (n), later than the epoch.
+        t_ns: instant to which the transition leads.
+
+    Returns:
+        H Phi (n, 6, 20), R (n, 6, 6) [m, half angle], and the transition (20, 20) from the epoch to ``t_ns``.
+    """
+    x, poses = to_state(chart), poses_of(fixes, epoch_ns)
+    arc = None if fixes[0].orbit is None else fixes[0].orbit.at(epoch_ns)
+    J = np.zeros((len(poses), 6, 6))  # from d = [theta; v] in {C}, as in ``measurement.to_camera``
+    J[:, :3, 3:], J[:, 3:, :3] = geometry.matrix(poses.q), 0.5 * geometry.matrix(x.q_bc)
+    R = J @ poses.C @ np.swapaxes(J, 1, 2)
+    rows = pose_rows(x, poses.times_s, arc)
+    if poses.counts is not None:  # where the oldest poses are joined, one stands for several
+        each = np.sqrt(poses.counts)[:, None, None]
+        rows, R = each * rows, each**2 * R
+    return rows, R, propagate_state(x, (t_ns - epoch_ns) * 1e-9, arc)[1]
 
 
 def healthy_pose(track: Track, t_ns: int, T_ac: Pose, params: EstimatorParams) -> PoseFix:
