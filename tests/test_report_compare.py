@@ -173,7 +173,7 @@ def test_github_annotations_are_escaped():
 
 def test_the_gate_names_the_first_broken_rule():
     check_gate(_outcomes()[:1])
-    with pytest.raises(CheckFailed, match=r"(?s)1 of 2 rules broken, .*t1_s 11 > 10.*later is useless"):
+    with pytest.raises(CheckFailed, match=r"(?s)1 of 2 rules broken, .*t1_s: 11 > 10.*later is useless"):
         check_gate(_outcomes())
 
 
