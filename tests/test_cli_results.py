@@ -108,7 +108,8 @@ def test_a_result_of_a_damaged_log_passes_no_gate_in_silence(fixtures_folder: Pa
 
 
 BAD_JSON = ["", "{", "[]", '"a"', "NaN", "9" * 400, '{"facts": 1e999}', '{"facts": {"labels": [1]}}', '{"config": 3}',
-            '{"limits": {"alpha_max_m": "1", "length_m": 1.0}}']  # fmt: skip
+            '{"limits": {"alpha_max_m": "1", "length_m": 1.0}}', '{"limits": {"rms_max_m": -1e308}}',
+            '{"limits": {"alpha_max_m": 1.0, "length_m": 1e-320}}']  # fmt: skip
 
 
 @pytest.mark.parametrize("command", READERS)

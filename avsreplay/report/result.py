@@ -29,7 +29,7 @@ from avsreplay.rows import Row
 _STATE = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}
 _TABLES = ("log", "model", "clock", "losses", "selection", "config", "versions", "files", "limits")
 _RUN_AGAIN = "the result is not as a run wrote it: run again"
-_MAX_TUM, _LARGEST, _UNIT, _LONGEST_S = 512 << 20, 1e15, 1e-3, 9_000_000_000
+_MAX_TUM, _LEAST, _LARGEST, _UNIT, _LONGEST_S = 512 << 20, 1e-12, 1e15, 1e-3, 9_000_000_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,8 +164,8 @@ def _header(path: Path) -> dict[str, Any]:
         if not isinstance(header.get(key, {}), dict):
             raise UnreadableInput(f"'{key}' is not a JSON object", where=str(path), hint=_RUN_AGAIN)
     drawn = [header.get("limits", {}).get(name) for name in ("rms_max_m", "alpha_max_m", "length_m")]
-    if not all(v is None or (type(v) in (int, float) and math.isfinite(v)) for v in drawn):
-        raise UnreadableInput("'limits' are not numbers", where=str(path), hint=_RUN_AGAIN)
+    if not all(v is None or (type(v) in (int, float) and _LEAST <= v < _LARGEST) for v in drawn):
+        raise UnreadableInput("'limits' are not positive numbers", where=str(path), hint=_RUN_AGAIN)
     return header
 
 
