@@ -10,13 +10,20 @@ import pytest
 from scipy.spatial import cKDTree
 
 from avsreplay import geometry
-from avsreplay.geometry import Array, Pose, matrix
+from avsreplay.geometry import Array, Pose, exp, matrix
 from avsreplay.log import read_surface
 from avsreplay.log.ply import read_ply
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar
-from avsreplay.register.contract import boxes, view
-from avsreplay.register.global_search import GlobalSearch, SearchResult, VisibleCentroids, attitudes, directions
+from avsreplay.register.contract import boxes, example_pose, view
+from avsreplay.register.global_search import (
+    Candidate,
+    GlobalSearch,
+    SearchResult,
+    VisibleCentroids,
+    attitudes,
+    directions,
+)
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.restarts import FIXED_WORK, HEALTHY_PASSES, HEALTHY_SCANS
 from avsreplay.register.sampling import sample, thin_to, without_sparse_points
@@ -255,3 +262,28 @@ def test_dragon_is_tracked_over_24_degree_steps_within_half_a_degree_and_half_a_
     rms = np.sqrt(np.mean(np.square(errors), axis=0))
     assert rms[0] < 0.5
     assert rms[1] < 0.5e-3
+
+
+@pytest.mark.parametrize(("noise", "unique"), [(0.001, True), (0.0066, False)])
+def test_a_difference_that_noise_alone_can_cause_does_not_make_a_pose_unique(
+    registrar: Registrar, noise: float, unique: bool
+) -> None:
+    """Noise favours a wrong pose with more surface nearby: 3 % more points on the model say nothing at large noise."""
+    extent, rng = registrar._target.surface.extent, np.random.default_rng(6)
+    distance = noise * extent * np.abs(rng.standard_normal(1500))
+    off = distance.copy()
+    off[:45] = 0.1 * extent
+    turned = Pose(exp([0.0, 0.0, np.pi]), np.zeros(3))
+    found = registrar._global._verdict([Candidate(turned, off), Candidate(Pose.identity(), distance)])
+    assert np.array_equal(found.best.matrix, np.eye(4))
+    assert found.ambiguous is not unique
+
+
+def test_a_known_pose_takes_part_in_a_search(registrar: Registrar) -> None:
+    """The result from a guess is ranked with the poses of the search."""
+    model, T_ac = boxes(), example_pose()
+    scan = T_ac.apply(view(model, 2000, T_ac.inverse().t))
+    apart = Pose(exp([0.0, 0.0, 1.0]), np.zeros(3)) @ T_ac.inverse()
+    found = registrar._global.search(scan, known=apart)
+    assert any(np.array_equal(each.T_ca.matrix, apart.matrix) for each in found.candidates)
+    assert not found.ambiguous

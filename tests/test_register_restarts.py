@@ -153,3 +153,19 @@ def test_points_beyond_three_standard_deviations_do_not_pull_the_pose():
     assert found.status is AlignStatus.ALIGNED
     assert np.degrees(geometry.angle(error.q)) < 0.06
     assert np.linalg.norm(error.t) < 6e-4 * surface.extent
+
+
+def test_an_alignment_from_a_registered_pose_ends_where_it_begins() -> None:
+    """The second alignment of a noisy scan: passes over few points, or to the planes, would lead away first."""
+    model, rng = boxes(), np.random.default_rng(4)
+    T_ac = example_pose()
+    points = T_ac.apply(view(model, 12000, T_ac.inverse().t))
+    ranges = np.linalg.norm(points, axis=1, keepdims=True)
+    points = points * (1.0 + 0.008 * model.extent * rng.standard_normal(ranges.shape) / ranges)
+    backend, width = Registrar(model)._backend, 0.02 * model.extent
+    first = backend.align_within(points, T_ac.inverse(), width)
+    again = backend.align_within(points, first.T_ca, width, near=True)
+    assert again.converged
+    assert again.iterations == 1
+    assert np.allclose(again.T_ca.matrix, first.T_ca.matrix, atol=1e-5)
+    assert backend.align_within(points, first.T_ca, width).iterations > again.iterations

@@ -40,6 +40,7 @@ TURNED_PASSES, TURNED_RIVALS = 6, 2
 RIVALS, RIVAL_WITHIN = 6, 0.15  # poses that are registered to the end: share of unexplained points over the least
 SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05  # two poses nearer than that are the same
 SIGMAS = 5.0
+FAVOURED = 5.0  # noise, in units of the extent, lowers the cost of a wrong pose with more surface nearby by up to this
 REFINED_POINTS = 500  # of the fine points, with which the last poses are registered
 FINE_PASSES = 15  # from a wrong pose it can take hundreds
 LOOK_UPS = 2  # that cost as much as a search on the model
@@ -115,7 +116,9 @@ class GlobalSearch:
         refined = FINE_PASSES * RIVALS * FAR_WORK // 2 * min(fine, REFINED_POINTS)
         return looked // LOOK_UPS + FINE_STARTS * some + refined + RIVALS * fine
 
-    def search(self, points: NDArray[Any], number: int = 0, before: SearchResult | None = None) -> SearchResult:
+    def search(
+        self, points: NDArray[Any], number: int = 0, before: SearchResult | None = None, known: Pose | None = None
+    ) -> SearchResult:
         """Return the best poses for a scan by one round of the search.
 
         Args:
@@ -123,6 +126,7 @@ class GlobalSearch:
             number: 0 assumes that the whole visible side is in the scan; 1 shifts the starts, for a target that is
                 partly outside the scan or hidden; 2 does not assume the position of the camera.
             before: result of another round for the same points, whose poses take part.
+            known: a pose T_ca that takes part: another one is unique only if it explains the scan better.
         """
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
         few, some, fine = (
@@ -134,6 +138,7 @@ class GlobalSearch:
         facing = facing and self._sided
         selected = self._selected(few, some, starts, facing, FIRST_STRIDES[number])
         found = self._refined(some, fine, selected, facing)
+        found = found if known is None else [*found, self._measured(fine, known)]
         return self._verdict([*found, *(before.candidates if before else ())])
 
     def _rounds(self, few: Array, sight: Array | None) -> list[tuple[Sequence[Array | None], Array, bool]]:
@@ -225,29 +230,27 @@ class GlobalSearch:
         d2 = target.index.closest(T_ca.apply(points), camera_c=camera_c).d2
         return Candidate(T_ca, np.sqrt(np.minimum(d2, target.index.reach_m**2)))
 
-    def _ranked(self, found: Sequence[Candidate]) -> tuple[list[Candidate], float]:
-        """The candidates, best first, and the distance [m] beyond which a point is unexplained."""
+    def _verdict(self, found: Sequence[Candidate]) -> SearchResult:
         noise = min(robust_noise(each.distance) for each in found)
         width = max(self._target.limits.gate_m, min(3.0 * noise, 3.0 * NOISE_OF_EXTENT * self._extent))
-        return sorted(found, key=lambda each: float(each.unexplained(width).mean())), width
-
-    def _verdict(self, found: Sequence[Candidate]) -> SearchResult:
-        (best, *rest), width = self._ranked(found)
+        best, *rest = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         second = next((other for other in rest if not self._same(best.T_ca, other.T_ca)), None)
         inliers = float(np.mean(best.distance < width))
-        ambiguous = second is not None and self._as_good(best, second, width)
+        margin = max(self._params.margin, FAVOURED * noise / self._extent)
+        ambiguous = second is not None and _as_good(best, second, width, margin)
         return SearchResult(best.T_ca, second.T_ca if second else None, width, inliers, ambiguous, tuple(found))
-
-    def _as_good(self, best: Candidate, second: Candidate, width: float) -> bool:
-        """Test whether the excess cost of the second, point by point, is below 5 sigma of its mean or the margin."""
-        excess = second.unexplained(width) - best.unexplained(width)
-        error = SIGMAS * float(excess.std()) / np.sqrt(len(excess))
-        return bool(excess.mean() < max(self._params.margin, error))
 
     def _same(self, first: Pose, other: Pose) -> bool:
         step = first @ other.inverse()  # in {C}
         shift = float(np.linalg.norm(step.apply(self._middle) - self._middle))
         return float(geometry.angle(step.q)) < SAME_RAD and shift < SAME_OF_EXTENT * self._extent
+
+
+def _as_good(best: Candidate, second: Candidate, width: float, margin: float) -> bool:
+    """Test whether the excess cost of the second, point by point, is below 5 sigma of its mean or the margin."""
+    excess = second.unexplained(width) - best.unexplained(width)
+    error = SIGMAS * float(excess.std()) / np.sqrt(len(excess))
+    return bool(excess.mean() < max(margin, error))
 
 
 def _best(poses: Array, costs: Array, most: int) -> Array:

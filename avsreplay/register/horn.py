@@ -67,11 +67,23 @@ class HornBackend:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         return self._run(points, guess, self._rules)
 
-    def align_within(self, points: NDArray[Any], guess: Pose, gate_m: float) -> Fit:
-        """Return T_ca with correspondences nearer than ``gate_m`` [m] from the first pass to the last."""
+    def align_within(self, points: NDArray[Any], guess: Pose, gate_m: float, near: bool = False) -> Fit:
+        """Return T_ca with correspondences nearer than ``gate_m`` [m] from the first pass to the last.
+
+        ``near``: the guess is a registered pose, so that no point-to-plane passes and no passes over few points come
+        first: they would end further from the result than it is.
+        """
         most = min(self._rules[True].n_max, MOST_WITHIN)
         rules = {
-            facing: replace(rule, n_max=most, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
+            facing: replace(
+                rule,
+                n_max=most,
+                n_plane=0 if near else rule.n_plane,
+                few=0 if near else rule.few,
+                gate_m=gate_m,
+                floor_m=gate_m,
+                tighten=0.0,
+            )
             for facing, rule in self._rules.items()
         }
         return self._run(points, guess, rules)

@@ -110,12 +110,12 @@ class Registrar:
             return refused
         if effort <= 1:
             return replace(quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED)
-        return self._acquire(scan, Budget(len(scan), effort))
+        return self._acquire(scan, Budget(len(scan), effort), False)
 
     def _acquire(
-        self, scan: NDArray[Any], budget: Budget, carried: bool = False, rounds: int = MOST_ATTEMPTS
+        self, scan: NDArray[Any], budget: Budget, carried: bool, rounds: int = MOST_ATTEMPTS, known: Pose | None = None
     ) -> Alignment:
-        """The best plausible result of the searches that the budget allows; the first is always made."""
+        """The best plausible result of the searches that the budget allows, the first in any case; ``known``: T_ca."""
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
         budget.spend(SCATTER_WORK * len(scan))
         few = self._restarter.part(target)
@@ -126,7 +126,7 @@ class Registrar:
             if results and not budget.allows(work):
                 break
             budget.spend(work + TEST_WORK)
-            search = self._global.search(part, number, whole if part is target else None)
+            search = self._global.search(part, number, whole if part is target else None, known)
             whole = search if part is target else whole
             found, alone = self._acquired(scan, part, search, budget, carried)
             results.append(found)
@@ -234,7 +234,7 @@ class Registrar:
         budget = Budget(len(scan), effort)
         budget.registered(found)
         if budget.allows(self._global.work(len(scan), 0)):
-            return self._acquire(scan, budget, carried)
+            return self._acquire(scan, budget, carried, known=found.T_ac.inverse())
         far = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a global search"
         return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=far)
 
@@ -268,7 +268,7 @@ class Registrar:
         for step in ("restart", "search", "turn") if hopeful or not overlap else ("search", "restart", "turn"):
             if step == "search":
                 if overlap and budget.allows(self._global.work(len(scan), 0)):
-                    found = self._acquire(scan, budget, carried, rounds=1)
+                    found = self._acquire(scan, budget, carried, 1, final.T_ac.inverse() if final.measured else None)
                     if found.status is AlignStatus.ALIGNED:
                         return found, True
                 continue
@@ -336,7 +336,7 @@ class Registrar:
         name = f"back end '{self.params.backend}'"
         try:
             if width_m is not None and isinstance(self._backend, HornBackend):
-                fit = self._backend.align_within(scan, guess, width_m)
+                fit = self._backend.align_within(scan, guess, width_m, near=True)
             else:
                 fit = self._backend.align(scan, guess)
             if not isinstance(fit, Fit):
