@@ -131,9 +131,9 @@ def test_a_search_that_fails_stops_at_the_budget(registrar: Registrar, monkeypat
     scan = rng.uniform([-2.0, -2.0, 7.0], [2.0, 2.0, 11.0], (800, 3))
     search, spent = GlobalSearch.search, []
 
-    def counted(self: GlobalSearch, points: Array, number: int, before: object) -> SearchResult:
+    def counted(self: GlobalSearch, points: Array, number: int, *others: object) -> SearchResult:
         spent.append(self.work(len(points), number))
-        return search(self, points, number, before)
+        return search(self, points, number, *others)
 
     monkeypatch.setattr(GlobalSearch, "search", counted)
     found = registrar.acquire(scan)

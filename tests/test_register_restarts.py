@@ -11,6 +11,8 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar
 from avsreplay.register.contract import boxes, example_pose, view
+from avsreplay.register.global_search import GlobalSearch
+from avsreplay.register.restarts import Restarter
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
 
 SCENARIO = """
@@ -169,3 +171,26 @@ def test_an_alignment_from_a_registered_pose_ends_where_it_begins() -> None:
     assert again.iterations == 1
     assert np.allclose(again.T_ca.matrix, first.T_ca.matrix, atol=1e-5)
     assert backend.align_within(points, first.T_ca, width).iterations > again.iterations
+
+
+def test_a_scan_with_the_work_of_one_registration_is_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the due scans of a run without an accepted pose: no restart, no search, no steps along the valley."""
+    rng = np.random.default_rng(8)
+    sphere = rng.standard_normal((600, 3))
+    scan = 2.0 * sphere / np.linalg.norm(sphere, axis=1, keepdims=True) + np.array([0.0, 0.0, 8.0])
+    made: list[str] = []
+    for kind, name in ((Restarter, "along_valley"), (Restarter, "graduated"), (GlobalSearch, "search")):
+        original = getattr(kind, name)
+
+        def counted(self: object, *given: object, _name: str = name, _original: object = original) -> object:
+            made.append(_name)
+            return _original(self, *given)
+
+        monkeypatch.setattr(kind, name, counted)
+    registrar = Registrar(boxes())
+    guess = Pose(geometry.exp([0.0, 0.0, 0.0]), np.array([0.0, 0.0, 8.0]))
+    found = registrar.register(scan, guess, effort=1)
+    assert found.status is not AlignStatus.ALIGNED
+    assert not made
+    registrar.register(scan, guess)
+    assert made

@@ -265,7 +265,8 @@ class Registrar:
         if not (reason or self._doubtful(few, guess, final)):
             return final, False
         before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without, it may show something else
-        for step in ("restart", "search", "turn") if hopeful or not overlap else ("search", "restart", "turn"):
+        steps = ("restart", "search", "turn") if hopeful or not overlap else ("search", "restart", "turn")
+        for step in () if budget.brief else steps:
             if step == "search":
                 if overlap and budget.allows(self._global.work(len(scan), 0)):
                     found = self._acquire(scan, budget, carried, 1, final.T_ac.inverse() if final.measured else None)
@@ -281,7 +282,8 @@ class Registrar:
                 return final, False
         if not reason:
             return final, False
-        status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted else AlignStatus.IMPLAUSIBLE
+        ended = budget.exhausted or budget.brief
+        status = AlignStatus.BUDGET_EXHAUSTED if ended else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason), False
 
     def _reason(self, few: NDArray[Any], found: Alignment, budget: Budget) -> str:
@@ -302,7 +304,7 @@ class Registrar:
         width = self._restarter.width(kept)
         found = self._graded(scan, kept.T_ca.inverse(), width, halves, carried)
         budget.registered(found)
-        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO:
+        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO or budget.brief:
             return found
         budget.spend(VALLEY_WORK)
         moved = self._restarter.along_valley(few, found.T_ac.inverse())

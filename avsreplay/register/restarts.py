@@ -63,10 +63,11 @@ class Budget:
 
     Args:
         points: points of the scan.
-        scans: most work in units of an ordinary registration.
+        scans: most work in units of an ordinary registration; 1 leaves nothing for restarts and searches.
     """
 
     def __init__(self, points: int, scans: int = HEALTHY_SCANS) -> None:
+        self.brief = scans <= 1
         self._left = scans * (HEALTHY_PASSES * points + FIXED_WORK)
         self.exhausted = False
 
