@@ -1,6 +1,6 @@
 """What the estimator does when the model does not hold.
 
-``python tests/benchmarks/estimate_surprises.py [--bodies 20] [--cases name,name] [--without]``.
+``python tests/benchmarks/estimate_surprises.py [--bodies 20] [--cases name,name] [--without] [--free]``.
 
 Each case is a random tumbling body of 4 m extent, seen at 2 Hz from a cold start, with poses simulated by a
 registration-noise model: white noise of 2 mm and 0.1 deg per axis, a tenth of its variance correlated over 0.4 rad of
@@ -54,6 +54,7 @@ HEADS = (
     "ms a scan",
     "worst ms",
     "grasp 1 sigma, last 10 s [mm]",
+    "claimed over true error during the event: position, attitude, velocity",
     f"NEES at {NEES_S} s, mean: all, attitude, rate, inertia, arm, position, velocity",
 )
 EXTENT, POS_M, ROT_RAD = 4.0, 0.002, np.radians(0.1)
@@ -114,6 +115,7 @@ class Result:
     error: list[tuple[float, float]] = field(default_factory=list)
     grasp: list[float] = field(default_factory=list)
     nees: list[list[float]] = field(default_factory=list)
+    squares: list[Array] = field(default_factory=list)  # (2, 3) claimed and true, of position, attitude, velocity
     violations: list[str] = field(default_factory=list)
     track: Track | None = None
     seconds: float = 0.0
@@ -183,9 +185,10 @@ def measured(case: Case, times: list[float], states: list[State], seed: int) -> 
     return out
 
 
-def run(case: Case, seed: int, tested: bool = True) -> Result:
+def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Result:
     times, states, dv, dw = world_of(case, seed)
-    estimator = Estimator(EstimatorParams(correlated_share=case.correlated), None, EXTENT)
+    none = {"torque_noise_radps15": 0.0, "force_noise_mps15": 0.0} if free else {}
+    estimator = Estimator(EstimatorParams(correlated_share=case.correlated, **none), None, EXTENT)
     estimator.anomalies.enabled = tested
     detector, watch = FaultDetector(FaultParams(), EXTENT), Consistency(ConsistencyParams())
     test = Convergence(ConvergenceParams(), EXTENT)
@@ -214,6 +217,8 @@ def run(case: Case, seed: int, tested: bool = True) -> Result:
         score(result, t, x, track, verdict.gamma, verdict.reason.value, word.converged)
         if any(abs(t - mark) < 0.5 / case.hz for mark in NEES_S):
             result.nees.append(nees_of(estimator.published(track), x))
+        if case.at_s <= t < case.until_s:
+            result.squares.append(squares_of(estimator.published(track), x))
         result.grasp.append(float(forecast.pos_1s_m.max()))
     result.track = track
     return result
@@ -232,6 +237,16 @@ def score(result: Result, t: float, x: State, track: Track, gamma: int, reason: 
     result.converged.append(converged)
     result.error.append((position, np.degrees(angle)))
     result.ratio.append(max(position / claimed[0], angle / claimed[1]))
+
+
+def squares_of(belief: Belief, truth: State) -> Array:
+    """(2, 3) claimed variance and squared error of the pose's position, its attitude, and the velocity."""
+    H, pose = measurement_jacobian(belief.x), belief.x.T_ac
+    S = H @ belief.P @ H.T
+    claimed = np.trace(S[:3, :3]), 4.0 * np.trace(S[3:, 3:]), np.trace(belief.P[VEL, VEL])
+    angle = geometry.angle(geometry.multiply(geometry.conjugate(truth.T_ac.q), pose.q))
+    apart = np.sum((pose.t - truth.T_ac.t) ** 2), angle**2, np.sum((belief.x.v_a - truth.v_a) ** 2)
+    return np.array([claimed, apart])
 
 
 def nees_of(belief: Belief, truth: State) -> list[float]:
@@ -289,9 +304,19 @@ def line(case: Case, results: list[Result]) -> str:
         f"{1e3 * sum(r.seconds for r in results) / sum(len(r.t) for r in results):.2f}",
         f"{max(r.worst_ms for r in results):.0f}",
         f"{1e3 * np.median([max(r.grasp[-20:]) for r in results]):.0f}",
+        _claims(results),
         ", ".join(f"{v:.2f}" for v in np.mean([r.nees for r in results], axis=(0, 1))),
     ]
     return "| " + " | ".join(cells) + " |"
+
+
+def _claims(results: list[Result]) -> str:
+    """Root of the ratio of the mean claimed variance to the mean squared error."""
+    found = [np.mean(r.squares, axis=0) for r in results if r.squares]
+    if not found:
+        return "-"
+    claimed, true = np.mean(found, axis=0)
+    return ", ".join(f"{v:.2f}" for v in np.sqrt(claimed / true))
 
 
 def _scans_to_report(r: Result, first: int) -> int:
@@ -334,6 +359,7 @@ def main() -> None:
     parser.add_argument("--hz", type=float, default=2.0)
     parser.add_argument("--rate", type=float, default=0.1, help="angular rate [rad/s]")
     parser.add_argument("--without", action="store_true", help="without the test of hypotheses")
+    parser.add_argument("--free", action="store_true", help="the estimator is told that there are no disturbances")
     given = parser.parse_args()
     print("| " + " | ".join(HEADS) + " |")
     print("|" + "---|" * len(HEADS))
@@ -342,7 +368,7 @@ def main() -> None:
         if not wanted or any(w in case.name for w in wanted):
             case = replace(case, hz=given.hz, speed=given.rate if case.speed == 0.1 else case.speed)
             seeds = range(given.first, given.first + given.bodies)
-            print(line(case, [run(case, seed, not given.without) for seed in seeds]), flush=True)
+            print(line(case, [run(case, seed, not given.without, given.free) for seed in seeds]), flush=True)
 
 
 if __name__ == "__main__":
