@@ -13,6 +13,7 @@ from avsreplay.build import target_geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.error_state import boxplus
+from avsreplay.estimate.params import NoiseSource
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
@@ -230,7 +231,8 @@ class Replanning:
 
     def _measured(self, belief: Belief, drawn: Belief, rng: np.random.Generator) -> Iterator[PlannerInput]:
         """What guidance knows after each scan of a drawn target: the filter with poses of its own noise."""
-        estimator = Estimator(self.saved.estimator.params, belief, self.saved.extent_m, self.saved.since_ns)
+        params = replace(self.saved.estimator.params, noise=NoiseSource.R0)  # there is no registration
+        estimator = Estimator(params, belief, self.saved.extent_m, self.saved.since_ns)
         motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)
         track = estimator.initial(belief.t_ns, belief.x.T_ac)
         step_ns = int(np.median(np.diff([row.t_ns for row in self.saved.rows])))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from avsreplay import plan, settings, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
@@ -16,6 +16,9 @@ from avsreplay.report.result import load_result, motion_samples
 from avsreplay.result_dir import read_beliefs
 from avsreplay.rows import Row
 from avsreplay.settings import Settings, setting
+
+if TYPE_CHECKING:
+    from avsreplay.run import Run
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +122,31 @@ def load_saved(path: Path, extent_m: float | None = None) -> Saved:
         extent_m=extent,
         surface=result.surface,
         warnings=result.warnings,
+    )
+
+
+def of_run(run: Run, rows: Sequence[Row], beliefs: Sequence[Belief]) -> Saved:
+    """Return what planning needs of a run that was not saved; without its truth.
+
+    Args:
+        run: the run.
+        rows: its rows.
+        beliefs: its belief at each of them.
+    """
+    config, extent_m = run.config, run.surface.extent
+    return Saved(
+        name=run.job.source.name,
+        rows=rows,
+        beliefs=beliefs,
+        truth=None,
+        estimator=Estimator(config.estimator, None, extent_m, rows[0].t_ns),
+        plan=config.plan,
+        supervisor=config.supervisor.resolved(extent_m),
+        limits=config.limits,
+        robot=config.robot,
+        axis_c=config.fixture_axis_c,
+        extent_m=extent_m,
+        surface=run.surface,
     )
 
 

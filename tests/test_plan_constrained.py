@@ -324,3 +324,18 @@ def test_plans_with_a_clearance_are_near_the_best_known(number, known_s):
     assert plan.found
     assert plan.t_go_s <= known_s + 0.1
     assert plan.violation_m == 0.0
+
+
+@pytest.mark.parametrize(("number", "earliest_s"), [(0, 24.016442393), (3, 21.57)])
+def test_a_bound_on_the_capture_that_a_plan_keeps_neither_hides_it_nor_reveals_a_much_earlier_one(number, earliest_s):
+    """Acceleration bounded per axis of a turned base, which makes drafts hard to refine."""
+    base = (0.1830127, 0.1830127, 0.6830127, 0.6830127)
+    shell = {"base_m": (0.0, 0.0, -1.0), "reach_min_m": 0.5, "reach_max_m": 9.0}
+    limits = Limits(final_deg=15.0, clearance_m=0.25, accel_axes_mps2=(0.075, 0.05, 0.0375), **shell)
+    limits = replace(limits, base_attitude_xyzw=base).resolved(8.0)
+    scene, params = problems(number + 1)[number].scene, PlanParams(a_max_mps2=0.0375, latency_s=0.2)
+    alone, bounded = (constrained(scene, ORIGIN, ORIGIN, params, limits, earliest_s=e) for e in (0.0, earliest_s))
+    assert alone.found
+    assert bounded.found
+    assert bounded.t_go_s >= earliest_s - 1e-9
+    assert alone.t_go_s <= 1.05 * bounded.t_go_s

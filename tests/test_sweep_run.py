@@ -336,3 +336,32 @@ def test_dask_listens_on_the_loopback_only():
         assert client.dashboard_link.startswith("http://127.0.0.1:")
     listening = {c.laddr.ip for c in found if c.status == psutil.CONN_LISTEN}
     assert listening == {"127.0.0.1"}
+
+
+@pytest.mark.slow
+def test_whole_flights_of_a_campaign_end_as_those_of_the_plan_command(tmp_path):
+    """Without errors of the thrust every flight captures, with three times the largest thrust none does."""
+    import pyarrow.parquet as pq
+
+    from avsreplay.cli.plan import plan_command
+    from avsreplay.cli.run import run_command
+
+    log, names = FIXTURES / "tumble.mcap", ("count", "captured", "outside", "aborted", "touched")
+    grid = '[[grid]]\nkey = "run.robot.thrust_noise"\nvalues = [0.0, 3.0]\n'
+    sure = '[[success]]\nname = "sure"\nmetric = "flights.captured_share"\nmin = 0.9\n'
+    text = f'logs = ["{log.as_posix()}"]\nscans = false\nflights = 3\n{grid}{sure}'
+    (tmp_path / "flights.toml").write_text(text)
+    done = sweep(tmp_path / "flights.toml", tmp_path / "out", "--workers", "0")
+    assert done.exit_code == 0, done.output
+    table = pq.read_table(tmp_path / "out" / "results.parquet").to_pydict()
+    assert table["flights.count"] == [3.0, 3.0]
+    assert table["flights.captured"] == [3.0, 0.0]
+    cells = json.loads((tmp_path / "out" / "summary.json").read_text())["cells"]
+    assert [cell["rates"]["flights captured"]["successes"] for cell in cells] == [3, 0]
+    assert [cell["rates"]["flights captured"]["count"] for cell in cells] == [3, 3]
+    assert [cell["rates"]["sure"]["successes"] for cell in cells] == [1, 0]
+    saved, options = str(tmp_path / "saved"), ["--samples", "1", "--every", "99", "--flights", "3", "--json"]
+    CliRunner().invoke(run_command, [str(log), "-o", saved], catch_exceptions=False)
+    planned = CliRunner().invoke(plan_command, [saved, *options], catch_exceptions=False)
+    flown = json.loads(planned.stdout)["flights"]
+    assert [flown[name] for name in names] == [table[f"flights.{name}"][0] for name in names]

@@ -4,8 +4,6 @@ Each iteration linearises the constraints about a reference path and solves a se
 time. Most constraints are alternatives (inside the cone, or outside its range); the reference decides which one holds
 at an instant. Several initial paths with different arrival times and sides lead to different local minima; the earliest
 capture is kept. A plan is accepted only after the true constraints hold at sixteen instants of every interval.
-
-The least time without constraints is a certified lower bound of the time with constraints.
 """
 
 from __future__ import annotations
@@ -50,7 +48,10 @@ HOPELESS = 1.2  # an iteration this much later than the best path ends its initi
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
 IMPROVED = 2  # drafts whose entry is moved
 MOVES = 6  # largest number of moves of the entry in one direction
+TRUST = 0.25  # largest relative change of the end time between two iterations
+CAREFUL = 0.03  # the same from a draft whose first refinement ended later or without a path
 TURN_RAD = 0.5  # the target may turn by this much between two iterations
+_Warm = tuple[RobotPath, float] | None  # an earlier path and the time since its begin [s]
 
 
 def constrained(
@@ -91,16 +92,14 @@ def constrained(
     free = rendezvous(scene.goal, r0, v0, strongest, t_ns, earliest_s)
     if not free.found or not limits.any or free.t_go_s <= params.latency_s:
         return free
-    free = _necessary(scene, free, np.asarray(r0, float), params, limits)
+    r0, v0 = np.asarray(r0, float), np.asarray(v0, float)
+    free = _necessary(scene, free, r0, params, limits)
     if not free.found:
         return free
     span_s = 1.5 * free.t_go_s + (0.0 if limits.clearance_m is None else ABORT_S)
     sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
-    case = Case(
-        sampled, limits, params, np.asarray(r0, float), np.asarray(v0, float), 1e-5 * extent_m, earliest_s=earliest_s
-    )
-    unlimited = _free_plan(case, free)
-    return unlimited or _graded(case, free, _best_path(case, free, warm), t_ns)
+    case = Case(sampled, limits, params, r0, v0, 1e-5 * extent_m, earliest_s=earliest_s)
+    return _free_plan(case, free) or _graded(case, free, _best_path(case, free, warm), t_ns)
 
 
 def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:
@@ -200,7 +199,7 @@ def _worst(case: Case, path: RobotPath) -> tuple[float, str]:
     return float(least.min()), CONSTRAINTS[int(least.argmin())] if np.isfinite(least).any() else ""
 
 
-def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> StepPath | None:
+def _best_path(case: Case, free: Plan, warm: _Warm) -> StepPath | None:
     """Return the earliest capture found.
 
     A warm start that converges to about the same end time is taken. Otherwise every initial path is iterated on a
@@ -223,12 +222,16 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
     drafts = _different(drafts)
     drafts[:IMPROVED] = [_moved(coarse, draft) for draft in drafts[:IMPROVED]]
     for draft in sorted(drafts, key=lambda d: d.t_go_s):
-        if best is not None and (draft.t_go_s > best.t_go_s):
-            break
-        refined = _converged(case, warm_reference(case, draft, 0.0))
-        if refined is not None and (best is None or refined.t_go_s < best.t_go_s):
-            best = refined
+        for trust in (TRUST, CAREFUL):
+            if best is None or best.t_go_s > (draft.t_go_s if trust == TRUST else LATER * draft.t_go_s):
+                best = _earlier(best, _converged(case, warm_reference(case, draft, 0.0), trust=trust))
+    for reference in initial_references(case, free) if drafts and best is None else ():
+        best = best or _converged(case, reference)
     return best if best is None else _moved(case, best)
+
+
+def _earlier(one: StepPath | None, other: StepPath | None) -> StepPath | None:
+    return min((path for path in (one, other) if path is not None), key=lambda path: path.t_go_s, default=None)
 
 
 def _entries(case: Case, path: RobotPath) -> tuple[float, float]:
@@ -292,7 +295,7 @@ def _moved(case: Case, path: StepPath) -> StepPath:
 
 
 def _converged(
-    case: Case, reference: ReferencePath, latest_s: float = math.inf, warm: tuple[RobotPath, float] | None = None
+    case: Case, reference: ReferencePath, latest_s: float = math.inf, warm: _Warm = None, trust: float = TRUST
 ) -> StepPath | None:
     """Iterate from a reference until the end time no longer changes; return the earliest feasible path seen.
 
@@ -303,7 +306,7 @@ def _converged(
     n, tolerance = case.limits.nodes, ROUGH_TOLERANCE if case.coarse or warm is not None else RELATIVE_TOLERANCE
     reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
     off, gain = np.zeros((2 * n, len(CONSTRAINTS))), np.array(0.6)  # doubled where an excess remains: it reacts weakly
-    change, slack, settled = _trust(case, reference), math.inf, 0
+    change, slack, settled = _trust(case, reference, trust), math.inf, 0
     rows = () if warm is None else aborted(case, *warm).rows
     for iteration in range(ITERATIONS):
         found = solve(convex_subproblem(case, reference, off, change, rows))
@@ -316,10 +319,8 @@ def _converged(
         if found.slack <= case.buffer_m:
             path = path.ending_at(case.scene.goal)
             allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
-            if _feasible(case, path, max(over.max(), abort.short), allowed) and (
-                best is None or path.t_go_s < best.t_go_s
-            ):
-                best = path
+            if _feasible(case, path, max(over.max(), abort.short), allowed):
+                best = _earlier(best, path)
         settled += abs(t - reference.t) <= max(TIME_TOLERANCE_S, tolerance * t)
         if settled and best is not None and (settled > 1 or path is best):
             return best
@@ -332,14 +333,14 @@ def _converged(
             gain = np.where(over > 0.0, np.minimum(2.0 * gain, 4.8), 0.6)
             off += gain * over + np.where(over > 0.0, case.buffer_m, 0.0)
         slack, reference = found.slack, ReferencePath(t, path.at(case.wait_s + t * interval_fractions(n))[0])
-        change = max(0.5 * change, 1e-3) if iteration >= 6 else _trust(case, reference)
+        change = max(0.5 * change, 1e-3) if iteration >= 6 else _trust(case, reference, trust)
     return best
 
 
-def _trust(case: Case, reference: ReferencePath) -> float:
+def _trust(case: Case, reference: ReferencePath, most: float) -> float:
     """Return the largest relative change of the end time: the target may turn by TURN_RAD at most."""
     turn = turn_rate(case, case.wait_s + reference.t) * reference.t
-    return float(min(0.25, TURN_RAD / max(turn, 1e-9)))
+    return float(min(most, TURN_RAD / max(turn, 1e-9)))
 
 
 def _feasible(case: Case, path: StepPath, over: float, allowed: float) -> bool:

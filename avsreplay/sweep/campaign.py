@@ -99,6 +99,9 @@ class Campaign(Settings):
     logs: tuple[str, ...] = setting((), "Recorded logs in place of a scenario, each one a value of the axis 'log'.")
     config: str = setting("", "File with settings of the replay, as for 'avsreplay run --config'.")
     scans: bool = setting(True, "Keep one line per scan (scans.parquet), from which the ROC curves are made.")
+    flights: int = setting(
+        0, "Whole flights after each run to targets drawn from its belief, as with 'avsreplay plan --flights'.", low=0
+    )
     set: Any = setting(dict, "Settings of every run.")
     grid: tuple[Axis, ...] = setting((), "What is varied.")
     case: tuple[CampaignCase, ...] = setting((), "Alternatives.")

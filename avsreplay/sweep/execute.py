@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +20,14 @@ import numpy as np
 from avsreplay import settings, toml_document
 from avsreplay.errors import AvsError, MissingBackend, UnreadableInput
 from avsreplay.log import SourceOptions
+from avsreplay.plan.arm import with_arm
 from avsreplay.record import RecordOptions, record_scenario
-from avsreplay.records import Label, Scan
+from avsreplay.records import Belief, Label, Scan
+from avsreplay.replan import Replanning
 from avsreplay.report.summary import Summary
 from avsreplay.rows import Row
-from avsreplay.run import Job, ReplayedScan, Run
+from avsreplay.run import Job, Listener, ReplayedScan, Run
+from avsreplay.saved_result import of_run
 from avsreplay.simulate import scenario_of
 from avsreplay.sweep.expansion import Task
 from avsreplay.sweep.statistics import episode_lines
@@ -84,15 +87,34 @@ def _replayed(task: Task, log: Path) -> RunResult:
         def keep(scan: ReplayedScan) -> None:
             lines.append(_line(scan.row, scan.outcome.scan, run.source.header.labels, length_m))
 
+        known: list[tuple[Row, Belief]] = []
+        listeners: list[Listener] = [keep] if task.scans else []
+        if task.flights:
+            listeners.append(lambda scan: known.append((scan.row, scan.outcome.belief)))
         last = None
-        for row in run.rows([keep] if task.scans else []):
+        for row in run.rows(listeners):
             last = row
         summary, losses = run.summary(), run.source.losses
-        found = flat_metrics(summary, last), tuple(lines), episode_lines(summary.faults.episodes), len(lines)
+        metrics = flat_metrics(summary, last) | (_flown(task, run, known) if task.flights else {})
+        found = metrics, tuple(lines), episode_lines(summary.faults.episodes), len(lines)
         if losses:
             what = f"{len(losses)} damaged places were left out, the first: {losses[0].what}"
             return RunResult(task.id, "lossy", what, *found)
         return RunResult(task.id, "ok", None, *found)
+
+
+def _flown(task: Task, run: Run, known: list[tuple[Row, Belief]]) -> dict[str, Any]:
+    """How whole flights from the first converged scan on end, by name; none where the estimate did not converge."""
+    if not any(row.converged for row, _ in known):
+        return {"flights.count": 0}
+    saved = of_run(run, [row for row, _ in known], [belief for _, belief in known])
+    robot, arm = with_arm(saved.robot)
+    planning = Replanning(replace(saved, robot=robot), saved.plan, saved.limits, saved.supervisor, arm)
+    seed = 0 if task.log else toml_document.parse(task.scenario, "scenario").table["seed"]
+    flights = planning.flights(saved.index_at(None), task.flights, seed)
+    counts = settings.dump(flights)
+    shares = {f"{name}_share": flights.share(name)[0] for name in counts if name != "count"}
+    return {f"flights.{name}": value for name, value in {**counts, **shares}.items()}
 
 
 def _line(row: Row, scan: Scan, labels: tuple[Label, ...], length_m: float) -> tuple[Any, ...]:

@@ -27,7 +27,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.simulate import load_scenario, scenario_of
 from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
 
-FORMAT = 3  # of a run's result: one of an older format is made again
+FORMAT = 4  # of a run's result: one of an older format is made again
 _NAMED = ("scenario", "log", "case")  # axes that select a file or a case, not a key
 
 
@@ -43,6 +43,7 @@ class Task:
         model: Model file, or "".
         assignments: Settings ``a.b=value`` of the replay.
         scans: Whether one row per scan is kept.
+        flights: Number of whole flights after the run.
     """
 
     id: str
@@ -52,6 +53,7 @@ class Task:
     model: str
     assignments: tuple[str, ...]
     scans: bool
+    flights: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,9 +110,9 @@ class Expansion:
         assignments = (*self._run, *run)
         named = _models_of(scenario, home)
         inputs = [self._inputs.get(path, "") for path in (log, model or named[0], *named[1:])]
-        content = [FORMAT, avsreplay.__version__, scenario, inputs, assignments, campaign.scans]
+        content = [FORMAT, avsreplay.__version__, scenario, inputs, assignments, campaign.scans, campaign.flights]
         digest = hashlib.sha256(json.dumps(content).encode()).hexdigest()[:24]
-        return Task(digest, scenario, str(home), log, model, assignments, campaign.scans)
+        return Task(digest, scenario, str(home), log, model, assignments, campaign.scans, campaign.flights)
 
     def _scenario(self, name: str, every: Mapping[str, Any], repeat: int) -> str:
         table = dict(self._bases[name])

@@ -31,6 +31,7 @@ CRITERIA = (
     SuccessCriterion("no false alarm", "faults.false_alarms", max=0),
 )
 SCORES = {"rms_m": "rms_m", "alpha_m": "alpha_m", "outlier_ratio": "inlier_ratio", "nis": "nis"}  # score: its column
+FLIGHT_ENDS = ("captured", "outside", "aborted", "touched")
 STATES = 20
 WORST = 5  # runs that are listed
 _ERRORS = {"pose_healthy.position_m.max": "healthy scan", "worst_coast.pos_err_m": "coasting"}
@@ -46,7 +47,7 @@ class Cell:
         runs: Number of finished runs.
         status: Number of runs by status.
         metrics: Quantiles of HEADLINES.
-        rates: Share of the finished runs that meet each criterion.
+        rates: Share of the finished runs that meet each criterion, and of all their whole flights that end in each way.
         nees: NEES at the last scan of each run.
         kinds: Fault detection by kind of fault; "none" for the scans outside every window.
     """
@@ -148,6 +149,7 @@ class _CellFold:
         self._numbers: dict[str, list[float]] = {name: [] for name in (*HEADLINES, "end.nees")}
         self._met: Counter[str] = Counter()
         self._kinds = statistics.FaultKinds()
+        self._flights: Counter[str] = Counter()
 
     def add(self, result: RunResult, criteria: Sequence[SuccessCriterion]) -> None:
         self.status[result.status] += 1
@@ -157,15 +159,18 @@ class _CellFold:
             values += [float(value)] if value is not None and math.isfinite(value) else []
         self._met.update(c.name for c in criteria if _meets(c, metrics))
         self._kinds.add(result.episodes, metrics)
+        self._flights.update({name: metrics.get(f"flights.{name}") or 0 for name in ("count", *FLIGHT_ENDS)})
 
     def result(self, values: Mapping[str, Any], criteria: Sequence[SuccessCriterion]) -> Cell:
-        runs = self.status.total()
+        runs, count = self.status.total(), self._flights["count"]
+        rates = {c.name: statistics.rate(self._met[c.name], runs) for c in criteria}
+        flown = {f"flights {name}": statistics.rate(self._flights[name], count) for name in FLIGHT_ENDS}
         return Cell(
             values=values,
             runs=runs,
             status=dict(sorted(self.status.items())),
             metrics={name: statistics.quantiles(self._numbers[name]) for name in HEADLINES},
-            rates={c.name: statistics.rate(self._met[c.name], runs) for c in criteria},
+            rates=rates | (flown if count else {}),
             nees=statistics.consistency(self._numbers["end.nees"], STATES),
             kinds=self._kinds.result(),
         )
