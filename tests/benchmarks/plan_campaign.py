@@ -116,8 +116,11 @@ def geometry_of(x):
     return TargetGeometry(-centre / arm, hull, closest)
 
 
-def campaign(seed, one=None, limits=LIMITS, noise=0.02):
-    """One campaign: (outcome, miss, rules seen, could it have captured where it first held, touched the body)."""
+def campaign(seed, one=None, limits=LIMITS, noise=0.02, robot=None):
+    """One campaign: (outcome, miss, rules seen, could it have captured where it first held, touched the body).
+
+    With ``robot`` (RobotParams) its bounds, start, delay, size and error of the thrust are those of the approach.
+    """
     rng = np.random.default_rng(seed)
     state, motion = bodies(rng)
     blind = windows(rng, one)
@@ -125,8 +128,11 @@ def campaign(seed, one=None, limits=LIMITS, noise=0.02):
     estimator = Estimator(params, near_start(state(0.0), rng), EXTENT_M)
     convergence, watch = Convergence(ConvergenceParams(), EXTENT_M), ConvergenceTrack()
     target, touched = geometry_of(state(0.0)), False
-    robot, errors = PlanParams(latency_s=0.2), np.random.default_rng([seed, 1])
-    guidance = Guidance(robot, Supervisor(SupervisorParams().resolved(EXTENT_M)), limits, EXTENT_M)
+    flown, errors, gripper, radius = PlanParams(latency_s=0.2), np.random.default_rng([seed, 1]), None, 0.0
+    if robot is not None:
+        flown, limits, noise = robot.applied(flown), robot.limited(limits), robot.thrust_noise
+        gripper, radius = robot.gripper, robot.radius_m
+    guidance = Guidance(flown, Supervisor(SupervisorParams().resolved(EXTENT_M)), limits, EXTENT_M, gripper)
     track, memory = estimator.initial(0, state(0.0).T_ac), guidance.initial(0)
     rules, committed, held_good = [], None, None
     for t in np.arange(1, int(SPAN_S * RATE_HZ)) / RATE_HZ:
@@ -139,12 +145,12 @@ def campaign(seed, one=None, limits=LIMITS, noise=0.02):
         forecast = estimator.forecast(belief, convergence.params.times_s)
         watch = convergence.judge(watch, belief, forecast, True)
         known = planner_input(estimator, belief, target, gamma, watch.converged, partial(estimator.forecast, belief))
-        wrong = with_thrust_error(memory.segment, t_ns, 1.0 / RATE_HZ, noise * robot.a_max_mps2, errors)
+        wrong = with_thrust_error(memory.segment, t_ns, 1.0 / RATE_HZ, noise * flown.a_max_mps2, errors)
         memory = replace(memory, segment=wrong)
         before, memory = memory, guidance.step(memory, known)
         for at_s in np.linspace(t, t + 1.0 / RATE_HZ, 5):
             r = memory.segment.at(round(at_s * 1e9))[0]
-            touched |= bool(np.linalg.norm(r - state(at_s).r_a) < BALL * np.linalg.norm(x.c_b))
+            touched |= bool(np.linalg.norm(r - state(at_s).r_a) < BALL * np.linalg.norm(x.c_b) + radius)
         rule = memory.decision.rule
         if not rules or rules[-1] != rule:
             rules.append(rule)
@@ -157,6 +163,9 @@ def campaign(seed, one=None, limits=LIMITS, noise=0.02):
         if rule == "arrived_sure":
             committed = propagate(belief, memory.segment.end_ns, 0.0, 0.0)[0].x.T_ac.q
         if memory.captured_ns is not None:
+            if memory.segment.turn is not None:  # the gripper has the attitude of its own turn
+                turn = memory.segment.turn
+                committed = turn.at(np.array([(memory.segment.end_ns - turn.t_ns) * 1e-9]))[0]
             found = closed_miss(memory, 0, motion, committed)
             return ("captured" if found.inside(TOLERANCE) else "outside"), found, rules, held_good, touched
     return memory.decision.action.value, None, rules, held_good, touched
