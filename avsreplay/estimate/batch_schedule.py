@@ -42,14 +42,14 @@ from avsreplay.settings import given
 FEWEST_TO_FIT = 3
 MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does not grow with the log
 FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
-FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.15  # poses for a test of drift, and between two tests
+FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a test of drift, and between two tests
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
 _DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
 _RECENT = 0.1  # largest age of a given start over the fit's memory; until then disturbances change it little
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
 _LEAST_TORQUE = 1e-6  # a fit looks back as far as this torque noise allows, even without disturbances [rad/s^1.5]
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
-LEVEL_GROWTH = 0.3  # share by which the poses grow between two estimates of the noise levels
+LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
 _LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
 _instant = attrgetter("t_ns")
 
