@@ -56,6 +56,20 @@ def _parameter(page):
     return pytest.param(page, id=_name(page), marks=() if _name(page) in QUICK else pytest.mark.slow)
 
 
+@pytest.mark.slow
+def test_the_table_of_blackouts_is_that_of_its_command():
+    sys.path.insert(0, str(ROOT / "tests" / "benchmarks"))
+    import plan_blackout
+
+    assert plan_blackout.STARTS_S[-1] == 14.0
+    (line,) = plan_blackout.table(plan_blackout.STARTS_S[-1:])
+    page = plan_blackout.PAGE.read_text(encoding="utf-8")
+    assert line in page.splitlines()
+    lines = page.split(plan_blackout.HEAD + "\n")[1].split("\n\n")[0].splitlines()
+    assert plan_blackout.written(lines, page) == page
+    assert plan_blackout.written(["| other |"], page) != page
+
+
 def _own_bag(folder):
     subprocess.run([sys.executable, ROOT / "docs" / "examples" / "own_bag.py", folder], check=True)
 

@@ -1,54 +1,36 @@
-"""Approaches of the whole chain with vision lost before the capture; prints the table of docs/planning.md.
+"""Approaches of the whole chain with vision lost before the capture; writes the table of docs/planning.md.
 
-python tests/benchmarks/plan_blackout.py
+python tests/benchmarks/plan_blackout.py [--check]
+
+The built-in scenario is recorded for 60 s with one occlusion of 12 s in place of its faults, and replayed with its own
+settings. ``--check`` compares the table with the page and writes nothing.
 """
 
 from __future__ import annotations
 
+import argparse
+import sys
 import tempfile
 from pathlib import Path
 
-from avsreplay import replay
+import tomli_w
+
+from avsreplay import replay, toml_document
 from avsreplay.record import record
+from avsreplay.simulate import load_scenario
 
-SCENARIO = """\
-name = "blackout-before-capture"
-seed = 1
-duration_s = 55.0
-rate_hz = 4.0
-
-[target]
-shape = "satellite"
-
-[motion]
-attitude_xyzw = [0.1, 0.7, -0.1, 0.7]
-rate_radps = [0.060, 0.064, -0.048]
-position_m = [0.15, -0.10, 5.0]
-velocity_mps = [-0.002, 0.001, 0.001]
-
-[scanner]
-fov_deg = [48.0, 48.0]
-rays = [90, 90]
-noise_m = 0.008
-engine = "exact"
-
-[[fault]]
-kind = "occlusion"
-start_s = {start_s}
-duration_s = 12.0
-
-[run.limits]
-final_deg = 15.0
-clearance_m = 0.1
-"""
-STARTS_S = (14.0, 24.0)
+PAGE = Path(__file__).parents[2] / "docs" / "planning.md"
+LENGTH_S, DURATION_S = 12.0, 60.0
+STARTS_S = (10.0, 14.0)
 HEAD = "| occlusion from | actions | closed at | miss | relative speed | angle |\n|---|---|---|---|---|---|"
 
 
 def approach(start_s, folder):
     """Rows of the run with vision lost from ``start_s`` on."""
+    table = dict(toml_document.parse(load_scenario(None).text, "built-in scenario").table)
+    fault = {"kind": "occlusion", "start_s": start_s, "duration_s": LENGTH_S}
     scenario, log = folder / f"{start_s}.toml", folder / f"{start_s}.mcap"
-    scenario.write_text(SCENARIO.format(start_s=start_s), encoding="utf-8")
+    scenario.write_text(tomli_w.dumps(table | {"duration_s": DURATION_S, "fault": [fault]}), encoding="utf-8")
     record(scenario, log)
     return list(replay(log))
 
@@ -62,17 +44,36 @@ def line(start_s, rows):
         return f"| {start_s:g} s | {actions} | no capture | | | |"
     closed = rows[rows.index(end) - 1].capture_time_s
     errors = (
-        f"{1e3 * end.capture_miss_m:.1f} mm | {1e3 * end.capture_miss_mps:.2f} mm/s | {end.capture_miss_deg:.2f} deg"
+        f"{1e3 * end.capture_miss_m:.1f} mm | {1e3 * end.capture_miss_mps:.1f} mm/s | {end.capture_miss_deg:.2f} deg"
     )
     return f"| {start_s:g} s | {actions} | {closed:.1f} s | {errors} |"
 
 
-def table():
+def table(starts_s=STARTS_S):
     """The lines of the table."""
     with tempfile.TemporaryDirectory() as folder:
-        return [line(start_s, approach(start_s, Path(folder))) for start_s in STARTS_S]
+        return [line(start_s, approach(start_s, Path(folder))) for start_s in starts_s]
+
+
+def written(lines, page):
+    """The page with the lines under the head of the table, in place of those that are there."""
+    before, after = page.split(HEAD + "\n")
+    rest = after.split("\n")
+    count = next(k for k, text in enumerate(rest) if not text.startswith("|"))
+    return "\n".join([before + HEAD, *lines, *rest[count:]])
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="compare with the page only")
+    args, page = parser.parse_args(), PAGE.read_text(encoding="utf-8")
+    lines = table()
+    print("\n".join([HEAD, *lines]))
+    if args.check:
+        return 0 if written(lines, page) == page else 1
+    PAGE.write_text(written(lines, page), encoding="utf-8")
+    return 0
 
 
 if __name__ == "__main__":
-    print(HEAD)
-    print("\n".join(table()))
+    sys.exit(main())
