@@ -99,7 +99,7 @@ class Monitors:
         failed = self._violations(estimator, prior, innovation if gamma else None, track)
         consistent = window.consistent and not (track.window.many_outliers or track.doubtful or failed)
         forecast = estimator.track_forecast(track, self.convergence.params.times_s)
-        convergence = self.convergence.judge(state.convergence, track.belief, forecast, consistent is True)
+        judged = self.convergence.judge(state.convergence, estimator.published(track), forecast, consistent is True)
         report = MonitorReport(
             ogm_rank=rank.rank,
             ogm_log10_cond=rank.log10_cond,
@@ -108,13 +108,13 @@ class Monitors:
             violations=state.violations + len(failed),
             nis_mean=window.nis_mean,
             autocorrelation=window.autocorrelation,
-            converged=convergence.converged,
-            covariance_converged=convergence.covariance_converged,
-            predictive_converged=convergence.predictive_converged,
-            unconverged=convergence.unknown,
+            converged=judged.converged,
+            covariance_converged=judged.covariance_converged,
+            predictive_converged=judged.predictive_converged,
+            unconverged=judged.unknown,
             forecast=forecast,
         )
-        return MonitorState(gramian, consistency, convergence, state.violations + len(failed)), report
+        return MonitorState(gramian, consistency, judged, state.violations + len(failed)), report
 
     def _gramian(
         self, gramian: Gramian, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track
@@ -128,8 +128,8 @@ class Monitors:
         self, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track
     ) -> tuple[str, ...]:
         """The consistency checks that the estimate fails after a healthy scan."""
-        found = None if healthy is None else estimator.residual_after(track, prior, healthy)
-        return () if found is None else violations(track.belief, estimator.pose_covariance(track.belief), *found)
+        found = healthy and estimator.residual_after(track, prior, healthy)
+        return violations(track.belief, estimator.pose_covariance(track.belief), *found) if found else ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -260,8 +260,8 @@ def _track(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineSt
     if pose is None:
         measurement = _acquire(stages, state, scan, scan.points, origin)
         pose = measurement.alignment.T_ac
-    start_ns = scan.t_ns if state.track is None else state.start_ns
-    return replace(state, origin=origin, start_ns=start_ns), stages.estimator.initial(scan.t_ns, pose), measurement
+    state = replace(state, origin=origin, start_ns=scan.t_ns if state.track is None else state.start_ns)
+    return state, stages.estimator.initial(scan.t_ns, pose, measurement is not None), measurement
 
 
 def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> Measurement:

@@ -28,8 +28,7 @@ BLOCKS: Mapping[str, slice] = MappingProxyType(
         "varrho": slice(14, 17),  # [m], {B}
         "mu": slice(17, 20),  # dmu_v, half angle, {B}
     }
-)
-"""The 20 error states by name, in the order of every covariance."""
+)  # the 20 error states by name, in the order of every covariance
 
 
 class ScanStatus(Enum):
@@ -124,8 +123,7 @@ class State:
     @property
     def fixture_velocity(self) -> Array:
         """Return the (3,) velocity of the origin of {C} in {A} [m/s] (section 8)."""
-        speed_b = geometry.rotate(geometry.skew(self.w_b), self.c_b)
-        return self.v_a + geometry.rotate(geometry.matrix(self.q_ab), speed_b)
+        return self.v_a + geometry.rotate(geometry.matrix(self.q_ab), np.cross(self.w_b, self.c_b))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,7 +211,7 @@ class Alignment:
         T_ac: measured pose of {C} in {A} (ICP iterates its inverse).
         info: (6, 6) information of d = [theta; v] in {C} [rad, m], T_ac_true = T_ac @ Exp(d); possibly singular.
         covariance: (6, 6) of d, systematic errors included; None if degenerate.  dof: of this estimate, inf if known.
-        message: why the back end failed or the pose is not accepted.  free_directions: not determined, in words.
+        message: why it failed or is not accepted.  free_directions: not determined, in words; free: columns d (6, k).
         split_nis: normalised squared difference of the poses from two halves of the scan, the larger of two splits.
     """
 
@@ -230,6 +228,7 @@ class Alignment:
     message: str = ""
     split_nis: float | None = None
     dof: float = float("inf")
+    free: Array | None = None
 
     @property
     def measured(self) -> bool:
@@ -265,7 +264,7 @@ class Innovation:
 
     Attributes:
         alpha: (6,).  S: (6, 6) = H P H' + R.  R: (6, 6) noise used.  nis: alpha' S^-1 alpha.  distance_m: |d rho|.
-        angle_rad: rotation.  weight: Cauchy weight.  share: correlated part of R.  rms_m: of the registration [m].
+        angle_rad: rotation.  weight: Cauchy weight.  share: correlated part of R.  rms_m, free: of the alignment.
         dof: degrees of freedom of R as an estimate, inf if known.  chi2: the NIS, T^2 of Hotelling, as chi-square.
     """
 
@@ -280,6 +279,7 @@ class Innovation:
     share: float = 0.0
     rms_m: float = float("nan")
     dof: float = float("inf")
+    free: Array | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,8 +16,9 @@ from avsreplay.records import AlignStatus, Fit, Surface
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import boxes, example_pose, plate_scan, view
 from avsreplay.register.covariance import without_dominant_patches
+from avsreplay.register.degenerate import Directions
 from avsreplay.register.horn import best_motion, horn_matrix
-from avsreplay.register.quality import evidence, grade, unobservable_directions
+from avsreplay.register.quality import evidence, grade
 from avsreplay.register.sampling import sample, thin
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Camera, Visibility, is_outward
@@ -304,7 +305,7 @@ def test_points_of_one_instant_have_it_in_every_direction(registrar: Registrar, 
 
 
 def _free(J: np.ndarray, centre: np.ndarray) -> tuple[str, ...]:
-    return unobservable_directions(J.T @ J, len(J), centre)
+    return Directions.of(J.T @ J, len(J), centre).words
 
 
 def _plane(normal: np.ndarray, about: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

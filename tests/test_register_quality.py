@@ -19,7 +19,7 @@ from avsreplay.register.covariance import (
     systematic_errors,
     without_dominant_patches,
 )
-from avsreplay.register.quality import unbounded_directions
+from avsreplay.register.degenerate import unbounded_directions
 
 
 def test_covariance_of_an_ideal_plane_fit_is_the_textbook_one() -> None:

@@ -18,7 +18,7 @@ from avsreplay.estimate.acceleration import FreeFall, accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
-from avsreplay.estimate.error_state import RHO
+from avsreplay.estimate.error_state import DMU, RHO, VARRHO
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
     chart_update,
@@ -36,8 +36,8 @@ from avsreplay.estimate.noise import NO_INFLATION, Noise, line_of_sight_1s
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.reference import rows_along
 from avsreplay.estimate.relative_orbit import RelativeOrbit
-from avsreplay.estimate.track import Epoch, Prediction, Track
-from avsreplay.geometry import Array, Pose
+from avsreplay.estimate.track import Epoch, Prediction, Track, common_motions
+from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory, Verdict
 
 
@@ -69,20 +69,23 @@ class Estimator:
         self.anomalies = AnomalyTest(self.params, extent_m, self.batch, self._replayed)
         self._prior = None if self.start is None else given_prior(self.start)
         self._robust = params.robust and params.start is not Start.PAPER
-        self._by_gain = self.params.by_gain
+        self._by_gain, self._length_m = self.params.by_gain, 0.25 * extent_m
 
-    def initial(self, t_ns: int, T_ac: Pose) -> Track:
+    def initial(self, t_ns: int, T_ac: Pose, acquired: bool = False) -> Track:
         """The track before the first scan: the given start, else a body at rest at a pose.
 
         Args:
             t_ns: instant of the first scan [ns].
             T_ac: pose of {C} in {A}, used where no start is given.
+            acquired: the pose was found by registration, which may leave directions undetermined.
         """
         if self.start is not None:
             return Track(self.start, "near", prior=self._prior, prior_ns=self.start.t_ns, started_ns=t_ns)
         T_ac = T_ac if self.fall is None else self.fall.pose_into(T_ac, t_ns)
         mode = "filter" if self.params.start is Start.PAPER else "start"
-        return Track(guessed_belief(t_ns, T_ac, self.params), mode, started_ns=t_ns)
+        track = Track(guessed_belief(t_ns, T_ac, self.params), mode, started_ns=t_ns)
+        any_motion = frozen(np.diag(np.repeat([1.0 / self._length_m, 1.0], 3)))
+        return replace(track, undetermined=any_motion) if acquired else track
 
     def predict(self, track: Track, t_ns: int) -> Prediction:
         """The predicted mean and covariance at an instant (eq:KF_propagate).
@@ -110,7 +113,7 @@ class Estimator:
         alpha, share = innovation_vector(x, T_ac), self.noise.correlated_share(alignment)
         dof = self.noise.dof(alignment)
         found = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, share, dof)
-        return replace(found, rms_m=alignment.rms_m)
+        return replace(found, rms_m=alignment.rms_m, free=alignment.free)
 
     def step(
         self, track: Track, prediction: Prediction, innovation: Innovation | None, verdict: Verdict, converged: bool
@@ -133,6 +136,10 @@ class Estimator:
         after, verdict = self.anomalies.step(
             track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged)
         )
+        left = (
+            common_motions(track.undetermined, innovation.free, self._length_m) if verdict.gamma else track.undetermined
+        )
+        after = replace(after, undetermined=left)
         tested = verdict.gamma == 1 and self._robust and after.mode in ("fit", "filter")
         return self.batch.between_fits(after) if tested else after, verdict
 
@@ -148,8 +155,14 @@ class Estimator:
             found = dynamics.grasp_forecast(track.belief, times_s, *noise)
         else:
             found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise)
-        turn = np.minimum(found.rot_1s_rad, 2.0 * ANY_HALF_RAD)  # no attitude is less certain than an arbitrary one
-        return replace(found, pos_1s_m=np.hypot(found.pos_1s_m, float(np.linalg.norm(b))), rot_1s_rad=turn)
+        turns, moves = (float(np.linalg.norm(half)) for half in np.split(self._unknown(track), 2))
+        turn = np.minimum(np.hypot(found.rot_1s_rad, turns), 2.0 * ANY_HALF_RAD)  # that of an arbitrary attitude
+        position = np.hypot(np.hypot(found.pos_1s_m, float(np.linalg.norm(b))), moves)
+        return replace(found, pos_1s_m=position, rot_1s_rad=turn)
+
+    def _unknown(self, track: Track) -> Array:
+        """Columns d (6, k): 1 sigma along the motions that no healthy scan determines, half the extent."""
+        return 2.0 * self._length_m * track.undetermined
 
     def refitted_rows(self, track: Track) -> tuple[Array, Array, Array] | None:
         """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no new fit.
@@ -242,19 +255,21 @@ class Estimator:
         return self.batch.check_against_batch(self._filtered(track, prediction, innovation))
 
     def published(self, track: Track) -> Belief:
-        """The belief in {A} with the error of the position along the line of sight that all poses may have in common.
+        """The belief in {A} with errors that later poses do not reduce and the filter therefore does not carry.
 
-        No later pose reduces that error, so it is no part of the belief that the filter carries.
+        These are the error of the position along the line of sight that all poses may have in common, and the motions
+        of the model that no healthy scan determines, such as the rotation of a body of revolution about its axis.
 
         Args:
             track: after a scan.
         """
-        belief, b = self.in_camera(track.belief), self._common_1s(track)
-        if not b.any():
+        belief, b, d = self.in_camera(track.belief), self._common_1s(track), self._unknown(track)
+        if not (b.any() or d.size):
             return belief
-        P = belief.P.copy()
+        P, R_bc, E = belief.P.copy(), geometry.matrix(belief.x.q_bc), np.zeros((20, d.shape[1]))
         P[RHO, RHO] += np.outer(b, b)
-        return replace(belief, P=P)
+        E[VARRHO], E[DMU] = R_bc @ d[3:], 0.5 * R_bc @ d[:3]
+        return replace(belief, P=P + E @ E.T)
 
     def _common_1s(self, track: Track) -> Array:
         """(3,) 1 sigma of that error in {A} [m]."""

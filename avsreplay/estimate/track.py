@@ -28,6 +28,8 @@ _FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale;
 _READY, _READY_AFTER_MANOEUVRE = 8, 3  # least number of poses of an estimate whose prediction can be tested
 _RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 _NO_NOISE = frozen(np.zeros((6, 6)))
+_NO_MOTION = frozen(np.zeros((6, 0)))
+_ALIKE = 0.966  # cosine of 15 deg, between motions that count as the same
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -78,6 +80,7 @@ class Track:
         drift: a constant torque or force on the target, None where none is found.  untested: healthy poses since the
             last test for one.
         levels: noise levels estimated so far.  unlevelled: healthy poses since the last estimate of them.
+        undetermined: (6, k) motions d of the model that neither the start nor any healthy scan so far determines.
     """
 
     belief: Belief
@@ -105,6 +108,23 @@ class Track:
     untested: int = 0
     levels: NoiseLevels = NO_LEVELS
     unlevelled: int = 0
+    undetermined: Array = field(default_factory=lambda: _NO_MOTION)
+
+
+def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
+    """Return the motions that two sets contain, as columns d = [theta; v] in {C} (6, k).
+
+    Args:
+        first: (6, n) independent motions.
+        other: (6, m) likewise; None for no motion.
+        length_m: a rotation by 1 rad is as large as a displacement by this length.
+    """
+    if other is None or not first.size:
+        return _NO_MOTION
+    scale = np.repeat([length_m, 1.0], 3)[:, None]
+    (a, _), (b, _) = (np.linalg.qr(scale * each) for each in (first, other))
+    left, cosines, _ = np.linalg.svd(a.T @ b)
+    return frozen(a @ left[:, : len(cosines)][:, cosines > _ALIKE] / scale)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

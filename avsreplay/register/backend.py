@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from avsreplay.register.surface_index import SurfaceIndex
     from avsreplay.register.visibility import Visibility
 
+MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
 GROUP = "avsreplay.backends"
 POSES = "poses"
 
@@ -166,6 +167,27 @@ def _state(name: str) -> Availability:
         return _availability(name, _entry(name).load())
     except ImportError as error:
         return Availability(name, False, "", f"cannot be imported: {error}", "reinstall the package that provides it")
+
+
+def aligned(name: str, backend: Backend, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | str:
+    """Run a back end. An exception, or a result of a wrong type, is returned as the text of a failure.
+
+    Args:
+        name: of the back end.
+        backend: built for the target.
+        scan: (n, 3) points in {A} [m].
+        guess: T_ca to begin with.
+        width_m: rejection distance from the first pass on [m], for a back end with ``align_within``; None for its own.
+    """
+    within = None if width_m is None else getattr(backend, "align_within", None)
+    try:
+        fit = backend.align(scan, guess) if within is None else within(scan, guess, width_m, near=True)
+        if not isinstance(fit, Fit):
+            return f"back end '{name}' returned {type(fit).__name__}, not Fit"
+        finite = bool(np.isfinite(fit.T_ca.matrix).all())
+    except Exception as error:  # an error of a library is a status of this scan, not the end of a replay
+        return f"back end '{name}' failed: {type(error).__name__}: {error}".splitlines()[0][:MESSAGE_LENGTH]
+    return fit if finite else f"back end '{name}' returned a pose that is not finite"
 
 
 def _availability(name: str, factory: Any) -> Availability:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -69,18 +70,18 @@ class SearchResult:
     """Result of a global search.
 
     Attributes:
-        best, second: the two best poses T_ca that differ by more than 10 deg or 0.05 of the extent; second may be None.
+        best: the best pose T_ca.
+        rivals: other poses, more than 10 deg or 0.05 of the extent from the best one, that explain the scan as well,
+            within the statistical error of these points.
         width_m: distance beyond which a point is not on the model; it follows the noise.
         inlier_ratio: share of the points of the scan on the model at the best pose.
-        ambiguous: the second pose explains the scan as well, within the statistical error of these points.
         candidates: all poses that were registered to the end, for a further round.
     """
 
     best: Pose
-    second: Pose | None
+    rivals: tuple[Pose, ...]
     width_m: float
     inlier_ratio: float
-    ambiguous: bool
     candidates: tuple[Candidate, ...]
 
 
@@ -221,7 +222,7 @@ class GlobalSearch:
         poses = np.stack([pose.matrix for pose in self._selected(few, points, starts, False)])
         rule = (FALL, 0.01 * self._extent, COARSE_OF_EXTENT * self._extent, False, 1)
         poses, costs = self._field.refine(points, poses, 0, self._extent, *rule)
-        apart = [not self._same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
+        apart = [not self.same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
         return np.ascontiguousarray(poses[apart & (costs < SYMMETRIC)][:SYMMETRIES])
 
     def _measured(self, points: Array, T_ca: Pose) -> Candidate:
@@ -234,13 +235,13 @@ class GlobalSearch:
         noise = min(robust_noise(each.distance) for each in found)
         width = max(self._target.limits.gate_m, min(3.0 * noise, 3.0 * NOISE_OF_EXTENT * self._extent))
         best, *rest = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
-        second = next((other for other in rest if not self._same(best.T_ca, other.T_ca)), None)
-        inliers = float(np.mean(best.distance < width))
         margin = max(self._params.margin, FAVOURED * noise / self._extent)
-        ambiguous = second is not None and _as_good(best, second, width, margin)
-        return SearchResult(best.T_ca, second.T_ca if second else None, width, inliers, ambiguous, tuple(found))
+        others = (other for other in rest if not self.same(best.T_ca, other.T_ca))
+        rivals = tuple(other.T_ca for other in takewhile(lambda other: _as_good(best, other, width, margin), others))
+        return SearchResult(best.T_ca, rivals, width, float(np.mean(best.distance < width)), tuple(found))
 
-    def _same(self, first: Pose, other: Pose) -> bool:
+    def same(self, first: Pose, other: Pose) -> bool:
+        """Return whether two poses T_ca differ by less than 10 deg and 0.05 of the extent."""
         step = first @ other.inverse()  # in {C}
         shift = float(np.linalg.norm(step.apply(self._middle) - self._middle))
         return float(geometry.angle(step.q)) < SAME_RAD and shift < SAME_OF_EXTENT * self._extent

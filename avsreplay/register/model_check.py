@@ -45,7 +45,7 @@ class ModelCheck:
             surface: its model, vertices in {C} [m].
         """
         self._registrar, self._surface = registrar, surface
-        self._seen, self._aligned = 0, 0
+        self._aligned, self._matched, self._ambiguous = 0, False, ""
         self._deltas: list[float] = []
         self._weights: list[float] = []
         self._points: list[tuple[Array, Array]] = []  # of each scan that was measured, and the camera, in {C}
@@ -63,6 +63,9 @@ class ModelCheck:
             return
         if found.status is AlignStatus.NOT_CONVERGED and found.inlier_ratio >= LEAST_OF_UNFINISHED:
             self._unfinished = True  # the iteration ended on the model: its limits are the cause, not the shape
+        if found.status is AlignStatus.AMBIGUOUS:
+            self._ambiguous = self._ambiguous or found.free_directions
+        self._matched = self._matched or found.measured
         if found.status is not AlignStatus.ALIGNED:
             self._unmatched = points if self._unmatched is None else self._unmatched
             return
@@ -87,8 +90,11 @@ class ModelCheck:
 
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there are none."""
+        if not self._matched:
+            return () if self._unmatched is None else (self._diagnosis(self._unmatched),)
         if not self._aligned:
-            return () if self._unmatched is None or self._unfinished else (self._diagnosis(self._unmatched),)
+            several = f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init"
+            return (several,) if self._ambiguous else ()
         return (*self._inverted(), *self._size())
 
     def _inverted(self) -> tuple[str, ...]:

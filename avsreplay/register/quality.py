@@ -12,10 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit
-from avsreplay.register.covariance import Evidence, pseudo_inverse, without_dominant_patches
+from avsreplay.register.covariance import (
+    Evidence,
+    pseudo_inverse,
+    registration_covariance,
+    sandwich_covariance,
+    systematic_errors,
+    without_dominant_patches,
+)
+from avsreplay.register.degenerate import FREE_BELOW, Directions, unbounded_directions
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.size import LEAST_ERROR, SizeError, normal_jacobian, size_error
 from avsreplay.register.surface_index import Closest, SurfaceIndex
@@ -25,13 +32,11 @@ PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may
 LEAST_PATCHES = 24
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
 NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
-FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
 AS_MANY, AS_NEAR = 0.99, 1.02  # inliers and rms of a pose that fits as well
 SUGGESTED, SUGGESTED_SIGMAS = 0.4, 2.5  # an error of size by the sums of patches: share of the least one, and sigmas
 MANY_INLIERS = 0.9  # with a smaller share the sums of the inliers alone do not show the size
 UNCHANGED = 0.06  # of a statistic that is chi-square with 6 degrees of freedom at the true pose: smaller with p = 4e-6
 ACCURACY = (0.1, 1e-3)  # deg and share of the extent, of a back end that states none of its own
-AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,12 +153,15 @@ def grade(
         return replace(failed, message="returned its guess unchanged; the scan asks for another pose")
     info, P = found.total / found.noise_m**2, None
     weakest: tuple[str, ...] = ()
+    view: Directions | None = None
     if found.observable:
         P, weakest = found.covariance, () if found.bounded else unbounded_directions(found.covariance, index.extent_m)
         if weakest:
             info, P = pseudo_inverse(found.covariance), None
     elif found.overlap:
-        weakest = unobservable_directions(found.total, found.used, found.centre)
+        sums = evidence(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m, fit.matches)
+        view, info = _degenerate(without_dominant_patches(sums), index.extent_m, systematic)
+        weakest = view.words
     settled = P is None or not found.beyond
     size = None
     if P is not None and settled and systematic and _other_size(found):
@@ -173,6 +181,7 @@ def grade(
         split_nis=None if np.isnan(found.split_nis) else found.split_nis,
         message=_message(settled, size),
         dof=np.inf if P is None else found.dof,
+        free=None if view is None else view.motions,
     )
 
 
@@ -213,6 +222,17 @@ def _grade(
     return Grade(*index.grade(points, fit.T_ca, *rule, np.ascontiguousarray(across), 1, fit.matches))
 
 
+def _degenerate(found: Evidence, extent_m: float, systematic: bool) -> tuple[Directions, Array]:
+    """The directions of a degenerate view, and the information (6, 6) of the observable ones."""
+    view = Directions.of(found.normals.sum(axis=0), int(found.counts.sum()), found.centre)
+    held = view.held(found)
+    if systematic:
+        P, _ = registration_covariance(held, systematic_errors(held, extent_m, PATCH_OF_EXTENT * extent_m))
+    else:
+        P, _ = sandwich_covariance(held.normals, held.gradients)
+    return view, view.observable_information(P)
+
+
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:
     """Return an alignment without a measurement: the guess is kept, no inliers, no information."""
     pose = T_ac if T_ac is not None else Pose.identity()
@@ -227,29 +247,12 @@ def _status(overlap: bool, converged: bool, free: bool) -> AlignStatus:
     return AlignStatus.DEGENERATE if free else AlignStatus.ALIGNED
 
 
-def scaled_information(total: Array, count: int, centre: Array) -> tuple[Array, float]:
-    """Return the mean of J'J (6, 6) with rotations about ``centre`` in units of the rms radius L, and L [m].
-
-    ``total`` is the sum of J'J over ``count`` points, with rotations about the origin. Each diagonal entry is the mean
-    squared change of surface distance per squared unit of point motion, between 0 and about 1, whatever the size of the
-    target.
-    """
-    shift = np.eye(6)
-    shift[3:, :3] = geometry.skew(centre)  # (p - centre) x n = p x n - centre x n
-    mean = shift.T @ total @ shift / count
-    radius = float(np.sqrt(max(np.trace(mean[:3, :3]), 0.0)))
-    scale = np.repeat([1.0 / max(radius, np.finfo(float).tiny), 1.0], 3)
-    return scale[:, None] * mean * scale, radius
-
-
-def unobservable_directions(total: Array, count: int, centre: Array) -> tuple[str, ...]:
-    """Name every motion whose scaled information is below ``FREE_BELOW``; empty if all six are observable."""
-    info, _ = scaled_information(total, count, centre)
-    values, vectors = np.linalg.eigh(info)
-    free = vectors[:, values < FREE_BELOW].T
-    if not len(free):
-        return ()
-    return tuple(_words(row) for row in _sparse_basis(free))
+def directions(
+    index: SurfaceIndex, visibility: Visibility, points: NDArray[Any], T_ca: Pose, gate_m: float
+) -> Directions:
+    """Return the directions that a view determines at a pose, and the others; arguments as in ``evidence``."""
+    found = without_dominant_patches(evidence(index, visibility, points, T_ca, gate_m))
+    return Directions.of(found.normals.sum(axis=0), int(found.counts.sum()), found.centre)
 
 
 def with_free_directions_of(
@@ -257,8 +260,8 @@ def with_free_directions_of(
 ) -> Pose:
     """Return the pose of a degenerate view with its unobservable directions as in the guess.
 
-    Passes over a curved surface drift along them. To first order in the difference, so that the result is kept only if
-    the surface still fits.
+    Passes over a curved surface drift along them. The result is kept only if the surface still fits: a surface of
+    another shape than a plane, a sphere or a body of revolution allows small motions only.
 
     Args:
         guess: predicted T_ca.
@@ -268,68 +271,8 @@ def with_free_directions_of(
         T_ca: registered pose.
         gate_m: distance of an inlier [m].
     """
+    kept = directions(index, visibility, points, T_ca, gate_m).nearest(T_ca, guess)
     found = evidence(index, visibility, points, T_ca, gate_m)
-    sums = without_dominant_patches(found)
-    info, radius = scaled_information(sums.normals.sum(axis=0), int(sums.counts.sum()), sums.centre)
-    values, vectors = np.linalg.eigh(info)
-    free = vectors[:, values < FREE_BELOW]
-    step = guess @ T_ca.inverse()
-    motion = np.concatenate([radius * geometry.log(step.q), step.apply(sums.centre) - sums.centre])
-    along = free @ (free.T @ motion)
-    q = geometry.exp(along[:3] / radius)
-    kept = Pose(q, sums.centre + along[3:] - geometry.matrix(q) @ sums.centre) @ T_ca
     moved = evidence(index, visibility, points, kept, gate_m)
     fits = moved.inliers >= AS_MANY * found.inliers and moved.rms_m <= AS_NEAR * found.rms_m
     return kept if fits else T_ca
-
-
-def unbounded_directions(P: Array, extent_m: float) -> tuple[str, ...]:
-    """Name every motion whose standard deviation by P (6, 6) is at least the extent (rotations: 1 rad)."""
-    scale = np.repeat([1.0, 1.0 / extent_m], 3)
-    scaled = P * np.outer(scale, scale)
-    if np.trace(scaled) < 1.0:  # the largest eigenvalue is not larger
-        return ()
-    values, vectors = np.linalg.eigh(scaled)
-    return tuple(_words(row) for row in _sparse_basis(vectors[:, values >= 1.0].T))
-
-
-def turn_words(step: Pose) -> str:
-    """Describe a rigid motion in {C}: "turned 180 deg about x"."""
-    degrees = float(np.degrees(geometry.angle(step.q)))
-    if degrees < 1.0:
-        return f"moved along {_axis(step.t)}"
-    return f"turned {degrees:.0f} deg about {_axis(geometry.log(step.q))}"
-
-
-def _sparse_basis(rows: Array) -> Array:
-    """Basis of the same space by elimination with full pivoting: one motion per row, as few axes as possible."""
-    basis = rows.copy()
-    used: list[int] = []
-    for k in range(len(basis)):
-        left = np.abs(basis[k:])
-        left[:, used] = 0.0
-        row, column = divmod(int(np.argmax(left)), basis.shape[1])
-        basis[[k, k + row]] = basis[[k + row, k]]
-        basis[k] /= basis[k, column]
-        others = [i for i in range(len(basis)) if i != k]
-        basis[others] -= np.outer(basis[others, column], basis[k])
-        used.append(column)
-    basis = basis[np.argsort(used)]
-    unit: Array = basis / np.linalg.norm(basis, axis=1, keepdims=True)
-    return unit
-
-
-def _words(motion: Array) -> str:
-    turn, slide = motion[:3], motion[3:]
-    if np.linalg.norm(slide) >= np.linalg.norm(turn):
-        return f"slides along {_axis(slide)}"
-    return f"turns about {_axis(turn)}"
-
-
-def _axis(vector: Array) -> str:
-    unit = vector / np.linalg.norm(vector)
-    k = int(np.argmax(np.abs(unit)))
-    if abs(unit[k]) > AXIS_WITHIN:
-        return "xyz"[k]
-    unit = unit * np.sign(unit[k])
-    return "(" + ", ".join(f"{value + 0.0:.2f}" for value in unit) + ")"

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, AlignStatus, Fit, Surface
+from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache, quality
-from avsreplay.register.backend import Target, create_backend, load_backend
+from avsreplay.register.backend import Target, aligned, create_backend, load_backend
+from avsreplay.register.degenerate import turn_words
 from avsreplay.register.global_search import GlobalSearch, SearchResult
-from avsreplay.register.horn import HornBackend
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import HEALTHY_SCANS, SCATTER_WORK, TEST_WORK, VALLEY_WORK, Budget, Restart, Restarter
@@ -31,7 +31,6 @@ TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 LEAST_TO_TURN = 0.2  # with fewer inliers turned starts have no prospect
 SURE_RATIO = 0.9  # a search with fewer inliers is followed by another
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
-MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
 
 
 class Registrar:
@@ -103,7 +102,8 @@ class Registrar:
 
         Returns:
             The pose T_ac with its quality. The status is NO_OVERLAP if no pose explains enough of the scan, and
-            AMBIGUOUS if a second, different pose explains it as well: ``free_directions`` names the rotation to it.
+            AMBIGUOUS if a second, different pose explains it as well: ``free_directions`` names the rotation to it. A
+            motion of a DEGENERATE view along its unobservable directions is not a different pose.
         """
         scan = self._scan(points)
         if refused := self._test.refused(scan, len(points)):
@@ -148,7 +148,7 @@ class Registrar:
         """Whether no other round can find a better pose: what is not on the model is little, or another object's."""
         if search.width_m > self.limits.gate_m:
             return False
-        return search.inlier_ratio >= SURE_RATIO or (alone and not search.ambiguous)
+        return search.inlier_ratio >= SURE_RATIO or (alone and not search.rivals)
 
     def _acquired(
         self, scan: NDArray[Any], part: Array, search: SearchResult, budget: Budget, carried: bool
@@ -169,10 +169,19 @@ class Registrar:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False
         if at.reason:
             return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=at.reason), False
-        if search.ambiguous and search.second is not None:
-            words = quality.turn_words(search.best @ search.second.inverse())
+        rivals = [T_ca for T_ca in search.rivals if not self._differs_freely(scan, found, T_ca)]
+        if rivals:
+            words = turn_words(search.best @ rivals[0].inverse())
             found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
         return found, alone
+
+    def _differs_freely(self, scan: NDArray[Any], found: Alignment, T_ca: Pose) -> bool:
+        """Whether a pose differs from that of a degenerate view only along its unobservable directions."""
+        if found.status is not AlignStatus.DEGENERATE:
+            return False
+        at = found.T_ac.inverse()
+        free = quality.directions(self._index, self._visibility, scan, at, self.limits.gate_m)
+        return self._global.same(T_ca, free.nearest(at, T_ca))
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see ``quality.instants``.
@@ -319,7 +328,7 @@ class Registrar:
     ) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
         start = guess.inverse()
-        fit = self._align(scan, start, width_m)
+        fit = aligned(self.params.backend, self._backend, scan, start, width_m)
         if isinstance(fit, str):
             return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
@@ -333,17 +342,8 @@ class Registrar:
             found = replace(found, T_ac=guess, message=f"back end '{self.params.backend}' {found.message}")
         return found
 
-    def _align(self, scan: NDArray[Any], guess: Pose, width_m: float | None) -> Fit | str:
-        """Run the back end. An exception, or a result of a wrong type, is returned as the text of a failure."""
-        name = f"back end '{self.params.backend}'"
-        try:
-            if width_m is not None and isinstance(self._backend, HornBackend):
-                fit = self._backend.align_within(scan, guess, width_m, near=True)
-            else:
-                fit = self._backend.align(scan, guess)
-            if not isinstance(fit, Fit):
-                return f"{name} returned {type(fit).__name__}, not Fit"
-            finite = bool(np.isfinite(fit.T_ca.matrix).all())
-        except Exception as error:  # an error of a library is a status of this scan, not the end of a replay
-            return f"{name} failed: {type(error).__name__}: {error}".splitlines()[0][:MESSAGE_LENGTH]
-        return fit if finite else f"{name} returned a pose that is not finite"
+
+def _indexed(surface: Surface, reach_m: float, params: RegisterParams) -> SurfaceIndex:
+    large = max(len(surface.vertices), len(surface.faces)) >= index_cache.LEAST_PRIMITIVES
+    cache_dir = index_cache.user_folder() if params.index_cache and large else None
+    return SurfaceIndex.build(surface, reach_m, threads=params.threads, cache_dir=cache_dir)

@@ -19,8 +19,8 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment
 from avsreplay.register.backend import Target
+from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest, robust_noise
-from avsreplay.register.quality import scaled_information
 from avsreplay.register.size import LEAST_RESIDUALS
 from avsreplay.register.surface_index import IcpParams
 

@@ -1,0 +1,170 @@
+"""Directions of a pose that a view does not determine, such as the rotation of a cylinder about its axis.
+
+A motion of the target in {C} is written x = [L theta; u]: rotation about the centroid of the points, in units of their
+rms radius L, and displacement of the centroid. The mean information of a point on x then lies between 0 and about 1 for
+each direction, whatever the size of the target. Directions below ``FREE_BELOW`` are unobservable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.register.covariance import Evidence
+
+FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface distance by less than 0.032 is unobservable
+AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Directions:
+    """Observable and unobservable directions of one view.
+
+    Attributes:
+        free: (6, k) unobservable directions of x, orthonormal.  observable: (6, 6 - k) the others.
+        to_x: (6, 6) x = to_x d for d = [theta; v] about the origin of {C}.
+        centre: (3,) centroid of the points in {C} [m].  radius_m: L.
+    """
+
+    free: Array
+    observable: Array
+    to_x: Array
+    centre: Array
+    radius_m: float
+
+    @classmethod
+    def of(cls, total: Array, count: int, centre: Array) -> Directions:
+        """Return the directions by the sum of J'J (6, 6) over ``count`` points with the centroid (3,) [m]."""
+        info, radius = scaled_information(total, count, centre)
+        values, vectors = np.linalg.eigh(info)
+        to_x = np.eye(6)
+        to_x[3:, :3] = -geometry.skew(centre)  # the inverse of d = shift x in scaled_information
+        to_x[:3] *= radius
+        free = values < FREE_BELOW
+        return cls(vectors[:, free], vectors[:, ~free], to_x, centre, radius)
+
+    @property
+    def motions(self) -> Array:
+        """The unobservable directions as columns d = [theta; v] (6, k), for |x| = 1 m."""
+        return np.asarray(np.linalg.solve(self.to_x, self.free))
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The unobservable directions, one name each."""
+        return tuple(_words(row) for row in _sparse_basis(self.free.T)) if self.free.size else ()
+
+    def held(self, found: Evidence) -> Evidence:
+        """Return the sums with information on the unobservable directions, so that they determine a pose.
+
+        It is the mean information of the observable ones, spread evenly over the patches. Both kinds of directions are
+        orthogonal in the information, so that the covariance of the observable ones does not change.
+        """
+        F = self.to_x.T @ self.free
+        level = found.normals.sum(axis=0)
+        mean = np.trace(self.observable.T @ self._of_x(level) @ self.observable) / self.observable.shape[1]
+        return replace(found, normals=found.normals + mean / len(found.normals) * (F @ F.T))
+
+    def _of_x(self, N: Array) -> Array:
+        """An information matrix of d (6, 6) for x."""
+        B = np.linalg.inv(self.to_x)
+        return np.asarray(B.T @ N @ B)
+
+    def observable_information(self, P: Array) -> Array:
+        """Return the information (6, 6) of d by a covariance P (6, 6) of d, zero along the unobservable directions."""
+        U = self.to_x.T @ self.observable  # columns: gradients of the observable components of x
+        V = np.linalg.inv(self.observable.T @ self.to_x @ P @ self.to_x.T @ self.observable)
+        info = U @ V @ U.T
+        return np.asarray(0.5 * (info + info.T))
+
+    def nearest(self, T_ca: Pose, other: Pose) -> Pose:
+        """Return the pose nearest ``other`` that ``T_ca`` is carried to by a motion along the unobservable directions.
+
+        The motion is a screw motion, so that a body of revolution is carried onto itself by any angle.
+        """
+        step = other @ T_ca.inverse()
+        theta = geometry.log(step.q)
+        x = np.concatenate(
+            [self.radius_m * theta, np.linalg.solve(_screw(theta), step.apply(self.centre) - self.centre)]
+        )
+        along = self.free @ (self.free.T @ x)
+        theta = along[:3] / self.radius_m
+        q, c = geometry.exp(theta), self.centre
+        return Pose(q, c + _screw(theta) @ along[3:] - geometry.matrix(q) @ c) @ T_ca
+
+
+def _screw(theta: Array) -> Array:
+    """V (3, 3) with exp([theta; u]) = (exp(theta), V u), the left Jacobian of SO(3)."""
+    W, angle = geometry.skew(theta), float(np.linalg.norm(theta))
+    if angle < 1e-4:
+        return np.asarray(np.eye(3) + 0.5 * W + W @ W / 6.0)
+    return np.asarray(np.eye(3) + (1.0 - np.cos(angle)) / angle**2 * W + (angle - np.sin(angle)) / angle**3 * W @ W)
+
+
+def scaled_information(total: Array, count: int, centre: Array) -> tuple[Array, float]:
+    """Return the mean of J'J (6, 6) with rotations about ``centre`` in units of the rms radius L, and L [m].
+
+    ``total`` is the sum of J'J over ``count`` points, with rotations about the origin. Each diagonal entry is the mean
+    squared change of surface distance per squared unit of point motion, between 0 and about 1, whatever the size of the
+    target.
+    """
+    shift = np.eye(6)
+    shift[3:, :3] = geometry.skew(centre)  # (p - centre) x n = p x n - centre x n
+    mean = shift.T @ total @ shift / count
+    radius = float(np.sqrt(max(np.trace(mean[:3, :3]), 0.0)))
+    scale = np.repeat([1.0 / max(radius, np.finfo(float).tiny), 1.0], 3)
+    return scale[:, None] * mean * scale, radius
+
+
+def unbounded_directions(P: Array, extent_m: float) -> tuple[str, ...]:
+    """Name every motion whose standard deviation by P (6, 6) is at least the extent (rotations: 1 rad)."""
+    scale = np.repeat([1.0, 1.0 / extent_m], 3)
+    scaled = P * np.outer(scale, scale)
+    if np.trace(scaled) < 1.0:  # the largest eigenvalue is not larger
+        return ()
+    values, vectors = np.linalg.eigh(scaled)
+    return tuple(_words(row) for row in _sparse_basis(vectors[:, values >= 1.0].T))
+
+
+def turn_words(step: Pose) -> str:
+    """Describe a rigid motion in {C}: "turned 180 deg about x"."""
+    degrees = float(np.degrees(geometry.angle(step.q)))
+    if degrees < 1.0:
+        return f"moved along {_axis(step.t)}"
+    return f"turned {degrees:.0f} deg about {_axis(geometry.log(step.q))}"
+
+
+def _sparse_basis(rows: Array) -> Array:
+    """Basis of the same space by elimination with full pivoting: one motion per row, as few axes as possible."""
+    basis = rows.copy()
+    used: list[int] = []
+    for k in range(len(basis)):
+        left = np.abs(basis[k:])
+        left[:, used] = 0.0
+        row, column = divmod(int(np.argmax(left)), basis.shape[1])
+        basis[[k, k + row]] = basis[[k + row, k]]
+        basis[k] /= basis[k, column]
+        others = [i for i in range(len(basis)) if i != k]
+        basis[others] -= np.outer(basis[others, column], basis[k])
+        used.append(column)
+    basis = basis[np.argsort(used)]
+    unit: Array = basis / np.linalg.norm(basis, axis=1, keepdims=True)
+    return unit
+
+
+def _words(motion: Array) -> str:
+    turn, slide = motion[:3], motion[3:]
+    if np.linalg.norm(slide) >= np.linalg.norm(turn):
+        return f"slides along {_axis(slide)}"
+    return f"turns about {_axis(turn)}"
+
+
+def _axis(vector: Array) -> str:
+    unit = vector / np.linalg.norm(vector)
+    k = int(np.argmax(np.abs(unit)))
+    if abs(unit[k]) > AXIS_WITHIN:
+        return "xyz"[k]
+    unit = unit * np.sign(unit[k])
+    return "(" + ", ".join(f"{value + 0.0:.2f}" for value in unit) + ")"
