@@ -31,7 +31,7 @@ EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
 MOST_WEIGHT = 4.0  # of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
-LEAST_OF_UNFINISHED = 0.9  # least share of the points on the model at a pose that has not converged
+LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged
 
 
 class ModelCheck:
@@ -50,7 +50,6 @@ class ModelCheck:
         self._weights: list[float] = []
         self._points: list[tuple[Array, Array]] = []  # of each scan that was measured, and the camera, in {C}
         self._unmatched: NDArray[Any] | None = None
-        self._unfinished = False
 
     def add(self, points: NDArray[Any], found: Alignment | None) -> None:
         """Use one scan.
@@ -61,11 +60,10 @@ class ModelCheck:
         """
         if found is None or not len(points):
             return
-        if found.status is AlignStatus.NOT_CONVERGED and found.inlier_ratio >= LEAST_OF_UNFINISHED:
-            self._unfinished = True  # the iteration ended on the model: its limits are the cause, not the shape
+        if found.measured and found.inlier_ratio >= LEAST_ON_MODEL:
+            self._matched = True  # the scan is on the model, whatever keeps the pose from being accepted
         if found.status is AlignStatus.AMBIGUOUS:
             self._ambiguous = self._ambiguous or found.free_directions
-        self._matched = self._matched or found.measured
         if found.status is not AlignStatus.ALIGNED:
             self._unmatched = points if self._unmatched is None else self._unmatched
             return
