@@ -18,7 +18,7 @@ from avsreplay.estimate.acceleration import FreeFall, accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
-from avsreplay.estimate.error_state import DMU, RHO, VARRHO
+from avsreplay.estimate.error_state import RHO
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
     chart_update,
@@ -36,8 +36,8 @@ from avsreplay.estimate.noise import NO_INFLATION, Noise, line_of_sight_1s
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.reference import rows_along
 from avsreplay.estimate.relative_orbit import RelativeOrbit
-from avsreplay.estimate.track import Epoch, Prediction, Track, common_motions
-from avsreplay.geometry import Array, Pose, frozen
+from avsreplay.estimate.track import Epoch, Prediction, Track, common_motions, motion_covariance
+from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory, Verdict
 
 
@@ -84,7 +84,7 @@ class Estimator:
         T_ac = T_ac if self.fall is None else self.fall.pose_into(T_ac, t_ns)
         mode = "filter" if self.params.start is Start.PAPER else "start"
         track = Track(guessed_belief(t_ns, T_ac, self.params), mode, started_ns=t_ns)
-        any_motion = frozen(np.diag(np.repeat([1.0 / self._length_m, 1.0], 3)))
+        any_motion = common_motions(np.eye(6), np.eye(6), self._length_m)
         return replace(track, undetermined=any_motion) if acquired else track
 
     def predict(self, track: Track, t_ns: int) -> Prediction:
@@ -155,14 +155,10 @@ class Estimator:
             found = dynamics.grasp_forecast(track.belief, times_s, *noise)
         else:
             found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise)
-        turns, moves = (float(np.linalg.norm(half)) for half in np.split(self._unknown(track), 2))
+        turns, moves = (float(np.linalg.norm(half)) for half in np.split(track.undetermined, 2))
         turn = np.minimum(np.hypot(found.rot_1s_rad, turns), 2.0 * ANY_HALF_RAD)  # that of an arbitrary attitude
         position = np.hypot(np.hypot(found.pos_1s_m, float(np.linalg.norm(b))), moves)
         return replace(found, pos_1s_m=position, rot_1s_rad=turn)
-
-    def _unknown(self, track: Track) -> Array:
-        """Columns d (6, k): 1 sigma along the motions that no healthy scan determines, half the extent."""
-        return 2.0 * self._length_m * track.undetermined
 
     def refitted_rows(self, track: Track) -> tuple[Array, Array, Array] | None:
         """H Phi of all poses along the trajectory of a new fit; None where the last scan gave no new fit.
@@ -263,13 +259,10 @@ class Estimator:
         Args:
             track: after a scan.
         """
-        belief, b, d = self.in_camera(track.belief), self._common_1s(track), self._unknown(track)
-        if not (b.any() or d.size):
-            return belief
-        P, R_bc, E = belief.P.copy(), geometry.matrix(belief.x.q_bc), np.zeros((20, d.shape[1]))
+        belief, b = self.in_camera(track.belief), self._common_1s(track)
+        P = belief.P + motion_covariance(track.undetermined, belief.x.q_bc)
         P[RHO, RHO] += np.outer(b, b)
-        E[VARRHO], E[DMU] = R_bc @ d[3:], 0.5 * R_bc @ d[:3]
-        return replace(belief, P=P + E @ E.T)
+        return replace(belief, P=P)
 
     def _common_1s(self, track: Track) -> Array:
         """(3,) 1 sigma of that error in {A} [m]."""

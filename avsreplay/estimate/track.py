@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.dynamics import propagate_state, rotation_path
+from avsreplay.estimate.error_state import DMU, VARRHO
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.measurement import measurement_jacobian, to_camera, to_fixture
 from avsreplay.estimate.noise import NoiseWindow, cholesky_root
@@ -80,7 +81,8 @@ class Track:
         drift: a constant torque or force on the target, None where none is found.  untested: healthy poses since the
             last test for one.
         levels: noise levels estimated so far.  unlevelled: healthy poses since the last estimate of them.
-        undetermined: (6, k) motions d of the model that neither the start nor any healthy scan so far determines.
+        undetermined: (6, k) motions d of the model that neither the start nor any healthy scan so far determines, each
+            as large as half the extent: 1 sigma.
     """
 
     belief: Belief
@@ -112,19 +114,31 @@ class Track:
 
 
 def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
-    """Return the motions that two sets contain, as columns d = [theta; v] in {C} (6, k).
+    """Return the motions of the model that two sets contain, as columns d = [theta; v] in {C} (6, k).
 
     Args:
         first: (6, n) independent motions.
         other: (6, m) likewise; None for no motion.
-        length_m: a rotation by 1 rad is as large as a displacement by this length.
+        length_m: a rotation by 1 rad is as large as a displacement by this length; each column is twice as large.
     """
     if other is None or not first.size:
         return _NO_MOTION
     scale = np.repeat([length_m, 1.0], 3)[:, None]
     (a, _), (b, _) = (np.linalg.qr(scale * each) for each in (first, other))
     left, cosines, _ = np.linalg.svd(a.T @ b)
-    return frozen(a @ left[:, : len(cosines)][:, cosines > _ALIKE] / scale)
+    return frozen(2.0 * length_m * (a @ left[:, : len(cosines)][:, cosines > _ALIKE]) / scale)
+
+
+def undetermined(track: Track, innovation: Innovation, gamma: int, length_m: float) -> Array:
+    """Return ``Track.undetermined`` after a scan; ``track`` before it, ``length_m`` as in ``common_motions``."""
+    return common_motions(track.undetermined, innovation.free, length_m) if gamma else track.undetermined
+
+
+def motion_covariance(d: Array, q_bc: Array) -> Array:
+    """Return the covariance (20, 20) of the state for independent motions d (6, k) of {C}, each with 1 sigma."""
+    R_bc, E = geometry.matrix(q_bc), np.zeros((20, d.shape[1]))
+    E[VARRHO], E[DMU] = R_bc @ d[3:], 0.5 * R_bc @ d[:3]
+    return np.asarray(E @ E.T)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

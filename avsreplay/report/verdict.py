@@ -222,8 +222,7 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     if searches and rows[0].gamma == 1:
         text = f"the pose was searched again {times(len(searches))}, first at {searches[0].t_s:.1f} s"
         yield Concern(Grade.CHECK, text)
-    used = [row.free_directions for row in rows if row.gamma == 1]
-    if used and all(used):
+    if (used := [row.free_directions for row in rows if row.gamma == 1]) and all(used):
         yield Concern(Grade.CHECK, f"no scan determines all directions of the pose (last scan: the model {used[-1]})")
     t1 = summary.convergence
     if rows and t1.t1_s is None:
