@@ -36,7 +36,7 @@ from avsreplay.estimate.noise import NO_INFLATION, Noise, line_of_sight_1s
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.reference import rows_along
 from avsreplay.estimate.relative_orbit import RelativeOrbit
-from avsreplay.estimate.track import Epoch, Prediction, Track, common_motions, motion_covariance
+from avsreplay.estimate.track import Epoch, Prediction, Track, common_motions, motion_covariance, undetermined
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory, Verdict
 
@@ -136,10 +136,7 @@ class Estimator:
         after, verdict = self.anomalies.step(
             track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged)
         )
-        left = (
-            common_motions(track.undetermined, innovation.free, self._length_m) if verdict.gamma else track.undetermined
-        )
-        after = replace(after, undetermined=left)
+        after = replace(after, undetermined=undetermined(track, innovation, verdict.gamma, self._length_m))
         tested = verdict.gamma == 1 and self._robust and after.mode in ("fit", "filter")
         return self.batch.between_fits(after) if tested else after, verdict
 
