@@ -94,7 +94,7 @@ class AnomalyTest:
         best = ranked[0].hypothesis
         changed = best is Hypothesis.MANOEUVRE and _odds_over_free(ranked) >= _OVER_FREE
         changed = changed and (bool(track.doubtful) or _linear(window, ranked))
-        if best is Hypothesis.DISTURBED and _odds_over_free(ranked) >= _OVER_FREE:
+        if (large or track.doubtful) and best is Hypothesis.DISTURBED and _odds_over_free(ranked) >= _OVER_FREE:
             track, doubtful = self._disturbed(track, ranked[0]), self._disturbed(doubtful, ranked[0])
         if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
             return self._accepted(track, epoch, update), verdict

@@ -40,7 +40,7 @@ ACCURACY = (0.1, 1e-3)  # deg and share of the extent, of a back end that states
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Grade:
+class PoseQuality:
     """The quality of a pose by the kernel; from ``bounded`` on it holds only if ``observable``.
 
     Attributes:
@@ -185,7 +185,7 @@ def grade(
     )
 
 
-def _other_size(found: Grade) -> bool:
+def _other_size(found: PoseQuality) -> bool:
     """Whether another size is worth a fit: the sums of patches suggest one, or many points are not on the model."""
     suggested = max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * found.size_1s)
     return found.inliers < MANY_INLIERS * found.points or abs(found.size) > suggested
@@ -211,7 +211,7 @@ def _grade(
     across: Array,
     accuracy: tuple[float, float],
     systematic: bool,
-) -> Grade:
+) -> PoseQuality:
     """Grade the pose of a back end in the kernel; ``across`` (k, 3) in {C}: directions of the test of halves."""
     extent = index.extent_m
     camera = (visibility.may_be_camera(fit.T_ca), TESTED_POINTS, LEAST_FACING, extent)
@@ -219,7 +219,7 @@ def _grade(
     overlap = (float(params.min_inliers), params.min_inlier_ratio, FREE_BELOW)
     step = (systematic, float(np.radians(accuracy[0])), accuracy[1] * extent)
     rule = (min(gate_m, index.reach_m), PATCH_OF_EXTENT * extent, LEAST_PATCHES, *camera, *noise, *overlap, *step)
-    return Grade(*index.grade(points, fit.T_ca, *rule, np.ascontiguousarray(across), 1, fit.matches))
+    return PoseQuality(*index.grade(points, fit.T_ca, *rule, np.ascontiguousarray(across), 1, fit.matches))
 
 
 def _degenerate(found: Evidence, extent_m: float, systematic: bool) -> tuple[Directions, Array]:
