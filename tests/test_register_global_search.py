@@ -276,7 +276,7 @@ def test_a_difference_that_noise_alone_can_cause_does_not_make_a_pose_unique(
     turned = Pose(exp([0.0, 0.0, np.pi]), np.zeros(3))
     found = registrar._global._verdict([Candidate(turned, off), Candidate(Pose.identity(), distance)])
     assert np.array_equal(found.best.matrix, np.eye(4))
-    assert found.ambiguous is not unique
+    assert bool(found.rivals) is not unique
 
 
 def test_a_known_pose_takes_part_in_a_search(registrar: Registrar) -> None:
@@ -286,4 +286,4 @@ def test_a_known_pose_takes_part_in_a_search(registrar: Registrar) -> None:
     apart = Pose(exp([0.0, 0.0, 1.0]), np.zeros(3)) @ T_ac.inverse()
     found = registrar._global.search(scan, known=apart)
     assert any(np.array_equal(each.T_ca.matrix, apart.matrix) for each in found.candidates)
-    assert not found.ambiguous
+    assert not found.rivals
