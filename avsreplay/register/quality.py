@@ -251,8 +251,12 @@ def directions(
     index: SurfaceIndex, visibility: Visibility, points: NDArray[Any], T_ca: Pose, gate_m: float
 ) -> Directions:
     """Return the directions that a view determines at a pose, and the others; arguments as in ``evidence``."""
-    found = without_dominant_patches(evidence(index, visibility, points, T_ca, gate_m))
-    return Directions.of(found.normals.sum(axis=0), int(found.counts.sum()), found.centre)
+    return _directions(evidence(index, visibility, points, T_ca, gate_m))
+
+
+def _directions(found: Evidence) -> Directions:
+    used = without_dominant_patches(found)
+    return Directions.of(used.normals.sum(axis=0), int(used.counts.sum()), used.centre)
 
 
 def with_free_directions_of(
@@ -271,8 +275,8 @@ def with_free_directions_of(
         T_ca: registered pose.
         gate_m: distance of an inlier [m].
     """
-    kept = directions(index, visibility, points, T_ca, gate_m).nearest(T_ca, guess)
     found = evidence(index, visibility, points, T_ca, gate_m)
+    kept = _directions(found).nearest(T_ca, guess)
     moved = evidence(index, visibility, points, kept, gate_m)
     fits = moved.inliers >= AS_MANY * found.inliers and moved.rms_m <= AS_NEAR * found.rms_m
     return kept if fits else T_ca
