@@ -23,7 +23,7 @@ from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import without_scattered_points
-from avsreplay.register.size import LEAST_ERROR, SIGMAS
+from avsreplay.register.size import LEAST_ERROR, SIGMAS, fitted_size, noise_bias
 from avsreplay.register.visibility import is_outward
 
 POINTS = 1500  # points used of each scan
@@ -48,7 +48,7 @@ class ModelCheck:
         self._aligned, self._matched, self._ambiguous = 0, False, ""
         self._deltas: list[float] = []
         self._weights: list[float] = []
-        self._points: list[tuple[Array, Array]] = []  # of each scan that was measured, and the camera, in {C}
+        self._points: list[tuple[Array, Array | None]] = []  # of each scan that was measured, and the camera, in {C}
         self._unmatched: NDArray[Any] | None = None
 
     def add(self, points: NDArray[Any], found: Alignment | None) -> None:
@@ -82,7 +82,7 @@ class ModelCheck:
         n = len(delta)
         spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
         tried = np.linspace(0, n - 1, BIAS_SCANS).astype(np.intp)
-        bias = [self._registrar.size_bias(*self._points[k]) for k in tried]
+        bias = [noise_bias(self._registrar.index, *self._points[k]) for k in tried]
         mean_bias = float(weight[tried] @ np.array(bias) / weight[tried].sum())
         return 1.0 + mean - mean_bias, float(np.hypot(spread, 0.5 * mean_bias))
 
@@ -117,11 +117,12 @@ class ModelCheck:
         finite = np.asarray(points[np.isfinite(points).all(axis=1)], dtype=np.float64)
         T_ca = alignment.T_ac.inverse()
         p = T_ca.apply(finite[:: max(1, len(finite) // POINTS)])
-        measured = self._registrar.fitted_size(p, T_ca.t)
+        camera_c = T_ca.t if self._registrar.sided else None
+        measured = fitted_size(self._registrar.index, p, camera_c)
         if measured is not None and measured.sigma > 0.0:
             self._deltas.append(measured.delta)
             self._weights.append(1.0 / measured.sigma**2)
-            self._points.append((p, T_ca.t))
+            self._points.append((p, camera_c))
 
     def _diagnosis(self, points: NDArray[Any]) -> str:
         """Try the mirrored model on a scan that was not registered, and compare the sizes."""

@@ -247,7 +247,7 @@ def _status(overlap: bool, converged: bool, free: bool) -> AlignStatus:
     return AlignStatus.DEGENERATE if free else AlignStatus.ALIGNED
 
 
-def directions(
+def view_directions(
     index: SurfaceIndex, visibility: Visibility, points: NDArray[Any], T_ca: Pose, gate_m: float
 ) -> Directions:
     """Return the directions that a view determines at a pose, and the others; arguments as in ``evidence``."""

@@ -21,7 +21,6 @@ from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import HEALTHY_SCANS, SCATTER_WORK, TEST_WORK, VALLEY_WORK, Budget, Restart, Restarter
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
-from avsreplay.register.size import SizeError, fitted_size, noise_bias
 from avsreplay.register.surface_index import SurfaceIndex
 from avsreplay.register.visibility import Visibility
 
@@ -180,7 +179,7 @@ class Registrar:
         if found.status is not AlignStatus.DEGENERATE:
             return False
         at = found.T_ac.inverse()
-        free = quality.directions(self._index, self._visibility, scan, at, self.limits.gate_m)
+        free = quality.view_directions(self._index, self._visibility, scan, at, self.limits.gate_m)
         return self._global.same(T_ca, free.nearest(at, T_ca))
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
@@ -205,18 +204,15 @@ class Registrar:
         d2 = self._index.closest(T_ac.inverse().apply(points), most_m=most_m).d2
         return np.asarray(np.sqrt(np.minimum(d2, most_m**2)))
 
-    def fitted_size(self, p: Array, camera_c: Array) -> SizeError | None:
-        """Return the size of the target by points of a registered scan, see ``size.fitted_size``.
+    @property
+    def index(self) -> SurfaceIndex:
+        """Return the index of the model."""
+        return self._index
 
-        Args:
-            p: (n, 3) points in {C} [m], at the registered pose.
-            camera_c: (3,) camera position in {C} [m].
-        """
-        return fitted_size(self._index, p, camera_c if self._visibility.sided else None)
-
-    def size_bias(self, p: Array, camera_c: Array) -> float:
-        """Return the size, less 1, that the noise of a scan causes, see ``size.noise_bias``; arguments as above."""
-        return noise_bias(self._index, p, camera_c if self._visibility.sided else None)
+    @property
+    def sided(self) -> bool:
+        """Return whether the side of a face that the camera sees is known."""
+        return self._visibility.sided
 
     @cached_property
     def _global(self) -> GlobalSearch:
