@@ -26,12 +26,14 @@ class Directions:
     Attributes:
         free: (6, k) unobservable directions of x, orthonormal.  observable: (6, 6 - k) the others.
         to_x: (6, 6) x = to_x d for d = [theta; v] about the origin of {C}.
+        level: mean information of the scan on an observable direction of x.
         centre: (3,) centroid of the points in {C} [m].  radius_m: L.
     """
 
     free: Array
     observable: Array
     to_x: Array
+    level: float
     centre: Array
     radius_m: float
 
@@ -44,7 +46,8 @@ class Directions:
         to_x[3:, :3] = -geometry.skew(centre)  # the inverse of d = shift x in scaled_information
         to_x[:3] *= radius
         free = values < FREE_BELOW
-        return cls(vectors[:, free], vectors[:, ~free], to_x, centre, radius)
+        level = count * float(values[~free].mean())
+        return cls(vectors[:, free], vectors[:, ~free], to_x, level, centre, radius)
 
     @property
     def motions(self) -> Array:
@@ -63,14 +66,7 @@ class Directions:
         orthogonal in the information, so that the covariance of the observable ones does not change.
         """
         F = self.to_x.T @ self.free
-        level = found.normals.sum(axis=0)
-        mean = np.trace(self.observable.T @ self._of_x(level) @ self.observable) / self.observable.shape[1]
-        return replace(found, normals=found.normals + mean / len(found.normals) * (F @ F.T))
-
-    def _of_x(self, N: Array) -> Array:
-        """An information matrix of d (6, 6) for x."""
-        B = np.linalg.inv(self.to_x)
-        return np.asarray(B.T @ N @ B)
+        return replace(found, normals=found.normals + self.level / len(found.normals) * (F @ F.T))
 
     def observable_information(self, P: Array) -> Array:
         """Return the information (6, 6) of d by a covariance P (6, 6) of d, zero along the unobservable directions."""

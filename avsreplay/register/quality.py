@@ -142,7 +142,8 @@ def grade(
     Too few inliers give NO_OVERLAP, whatever the convergence flag of the back end is. ``halves``: compare the poses
     from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
     ``systematic``: the covariance includes errors that vary slowly over the target. ``guess``: T_ca from which the back
-    end began; a pose that equals this guess, although the residuals require a step, is FAILED.
+    end began; a pose that equals this guess, although the residuals require a step, is FAILED, and the pose of a
+    degenerate view has its unobservable directions as in the guess, if the surface then fits as well.
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
@@ -151,7 +152,7 @@ def grade(
     if found.overlap and _same(fit.T_ca, guess) and found.statistic > UNCHANGED:
         failed = not_measured(len(points), AlignStatus.FAILED)
         return replace(failed, message="returned its guess unchanged; the scan asks for another pose")
-    info, P = found.total / found.noise_m**2, None
+    info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca
     weakest: tuple[str, ...] = ()
     view: Directions | None = None
     if found.observable:
@@ -159,16 +160,22 @@ def grade(
         if weakest:
             info, P = pseudo_inverse(found.covariance), None
     elif found.overlap:
-        sums = evidence(index, visibility, points, fit.T_ca, limits.gate_m, params.noise_m, fit.matches)
-        view, info = _degenerate(without_dominant_patches(sums), index.extent_m, systematic)
-        weakest = view.words
+        sums = evidence(index, visibility, points, T_ca, limits.gate_m, params.noise_m, fit.matches)
+        used = without_dominant_patches(sums)
+        view = _directions(used)
+        info, weakest = _observable_information(view, used, index.extent_m, systematic), view.words
+        if guess is not None and fit.converged:
+            kept = view.nearest(T_ca, guess)  # passes over a curved surface drift along the unobservable directions
+            moved = evidence(index, visibility, points, kept, limits.gate_m)
+            fits = moved.inliers >= AS_MANY * sums.inliers and moved.rms_m <= AS_NEAR * sums.rms_m
+            T_ca = kept if fits else T_ca
     settled = P is None or not found.beyond
     size = None
     if P is not None and settled and systematic and _other_size(found):
         size = size_error(index, points, fit.T_ca, visibility.camera_c(index, points, fit.T_ca))
         P = P if size is None else P + np.outer(size.shift, size.shift)
     return Alignment(
-        T_ac=fit.T_ca.inverse(),
+        T_ac=T_ca.inverse(),
         iterations=fit.iterations,
         converged=fit.converged and settled,
         points=found.points,
@@ -222,15 +229,14 @@ def _grade(
     return PoseQuality(*index.grade(points, fit.T_ca, *rule, np.ascontiguousarray(across), 1, fit.matches))
 
 
-def _degenerate(found: Evidence, extent_m: float, systematic: bool) -> tuple[Directions, Array]:
-    """The directions of a degenerate view, and the information (6, 6) of the observable ones."""
-    view = Directions.of(found.normals.sum(axis=0), int(found.counts.sum()), found.centre)
+def _observable_information(view: Directions, found: Evidence, extent_m: float, systematic: bool) -> Array:
+    """The information (6, 6) of a degenerate view, by the same covariance estimate as for any other view."""
     held = view.held(found)
     if systematic:
         P, _ = registration_covariance(held, systematic_errors(held, extent_m, PATCH_OF_EXTENT * extent_m))
     else:
         P, _ = sandwich_covariance(held.normals, held.gradients)
-    return view, view.observable_information(P)
+    return view.observable_information(P)
 
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:
@@ -251,32 +257,8 @@ def view_directions(
     index: SurfaceIndex, visibility: Visibility, points: NDArray[Any], T_ca: Pose, gate_m: float
 ) -> Directions:
     """Return the directions that a view determines at a pose, and the others; arguments as in ``evidence``."""
-    return _directions(evidence(index, visibility, points, T_ca, gate_m))
+    return _directions(without_dominant_patches(evidence(index, visibility, points, T_ca, gate_m)))
 
 
-def _directions(found: Evidence) -> Directions:
-    used = without_dominant_patches(found)
+def _directions(used: Evidence) -> Directions:
     return Directions.of(used.normals.sum(axis=0), int(used.counts.sum()), used.centre)
-
-
-def with_free_directions_of(
-    guess: Pose, index: SurfaceIndex, visibility: Visibility, points: NDArray[Any], T_ca: Pose, gate_m: float
-) -> Pose:
-    """Return the pose of a degenerate view with its unobservable directions as in the guess.
-
-    Passes over a curved surface drift along them. The result is kept only if the surface still fits: a surface of
-    another shape than a plane, a sphere or a body of revolution allows small motions only.
-
-    Args:
-        guess: predicted T_ca.
-        index: of the model.
-        visibility: of its faces.
-        points: (n, 3) in {A} [m].
-        T_ca: registered pose.
-        gate_m: distance of an inlier [m].
-    """
-    found = evidence(index, visibility, points, T_ca, gate_m)
-    kept = _directions(found).nearest(T_ca, guess)
-    moved = evidence(index, visibility, points, kept, gate_m)
-    fits = moved.inliers >= AS_MANY * found.inliers and moved.rms_m <= AS_NEAR * found.rms_m
-    return kept if fits else T_ca

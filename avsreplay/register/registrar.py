@@ -168,19 +168,19 @@ class Registrar:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False
         if at.reason:
             return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=at.reason), False
-        rivals = [T_ca for T_ca in search.rivals if not self._differs_freely(scan, found, T_ca)]
+        rivals = self._rivals(scan, found, search)
         if rivals:
             words = turn_words(search.best @ rivals[0].inverse())
             found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
         return found, alone
 
-    def _differs_freely(self, scan: NDArray[Any], found: Alignment, T_ca: Pose) -> bool:
-        """Whether a pose differs from that of a degenerate view only along its unobservable directions."""
-        if found.status is not AlignStatus.DEGENERATE:
-            return False
+    def _rivals(self, scan: NDArray[Any], found: Alignment, search: SearchResult) -> list[Pose]:
+        """The rivals that differ from a degenerate view not only along its unobservable directions; else all."""
+        if found.status is not AlignStatus.DEGENERATE or not search.rivals:
+            return list(search.rivals)
         at = found.T_ac.inverse()
         free = quality.view_directions(self._index, self._visibility, scan, at, self.limits.gate_m)
-        return self._global.same(T_ca, free.nearest(at, T_ca))
+        return [T_ca for T_ca in search.rivals if not self._global.same(T_ca, free.nearest(at, T_ca))]
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see ``quality.instants``.
@@ -331,9 +331,6 @@ class Registrar:
         found = quality.grade(
             self._index, self._visibility, scan, fit, limits, self.params, halves, self._accuracy, not carried, start
         )
-        if found.status is AlignStatus.DEGENERATE:
-            at = (self._index, self._visibility, scan, fit.T_ca, limits.gate_m)
-            found = replace(found, T_ac=quality.with_free_directions_of(start, *at).inverse())
         if found.status is AlignStatus.FAILED:
             found = replace(found, T_ac=guess, message=f"back end '{self.params.backend}' {found.message}")
         return found
