@@ -78,11 +78,10 @@ def size_error(index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, camera_c: 
     Returns:
         The error without the bias of the noise; None if it is not significant.
     """
-    p = T_ca.apply(points[:: max(1, len(points) // POINTS)])
-    found = fitted_size(index, p, camera_c)
-    if found is None or not found.significant:
+    rows = _fitted(index, T_ca.apply(points[:: max(1, len(points) // POINTS)]), camera_c)
+    if rows is None or not (found := _size_of(index, rows)).significant:
         return None
-    bias = noise_bias(index, p, camera_c)
+    bias = _bias_of(index, rows, camera_c)
     both = SizeError(found.delta - bias, float(np.hypot(found.sigma, 0.5 * bias)), found.shift)
     return both if both.significant else None
 
@@ -128,8 +127,10 @@ def fitted_size(index: SurfaceIndex, p: Array, camera_c: Array | None) -> SizeEr
         The fit, with the bias of the noise; None with fewer than 50 residuals, or if a pose explains any size.
     """
     rows = _fitted(index, p, camera_c)
-    if rows is None:
-        return None
+    return None if rows is None else _size_of(index, rows)
+
+
+def _size_of(index: SurfaceIndex, rows: _Rows) -> SizeError:
     sigma = max(_clustered(rows, side * index.extent_m) for side in PATCHES_OF_EXTENT)
     back = rows.moved.inverse()
     shift = np.concatenate([geometry.log(back.q), back.t])
@@ -149,8 +150,10 @@ def noise_bias(index: SurfaceIndex, p: Array, camera_c: Array | None) -> float:
         counts with the largest error; 0 if there is no fit without it.
     """
     rows = _fitted(index, p, camera_c)
-    if rows is None:
-        return 0.0
+    return 0.0 if rows is None else _bias_of(index, rows, camera_c)
+
+
+def _bias_of(index: SurfaceIndex, rows: _Rows, camera_c: Array | None) -> float:
     rays = rows.normal if camera_c is None else rows.foot - np.asarray(camera_c)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     along = np.einsum("ij,ij->i", rays, rows.normal) * rows.weight
