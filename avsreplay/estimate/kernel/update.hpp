@@ -29,7 +29,7 @@ struct Pose {
   double H[SEEN][DIM], alpha[SEEN], S[SEEN][SEEN], R[SEEN][SEEN];
 };
 
-// x and P once a pose has been seen, its noise widened by `colour` (attitude, position), through the chart: ekf.py.
+// x and P once a pose has been seen, its noise widened by `colour` (attitude, position), through the chart: measurement.py.
 void correct(State& x, double P[DIM][DIM], const Pose& seen, const double colour[2]);
 
 // y and P once rows e + H y of unit variance have been seen, P of the motion having grown by Q before.
