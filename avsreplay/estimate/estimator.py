@@ -83,9 +83,9 @@ class Estimator:
             return Track(self.start, "near", prior=self._prior, prior_ns=self.start.t_ns, started_ns=t_ns)
         T_ac = T_ac if self.fall is None else self.fall.pose_into(T_ac, t_ns)
         mode = "filter" if self.params.start is Start.PAPER else "start"
-        track = Track(guessed_belief(t_ns, T_ac, self.params), mode, started_ns=t_ns)
-        any_motion = common_motions(np.eye(6), np.eye(6), self._length_m)
-        return replace(track, undetermined=any_motion) if acquired else track
+        belief, any_motion = guessed_belief(t_ns, T_ac, self.params), np.eye(6)
+        unknown = common_motions(any_motion, any_motion if acquired else None, self._length_m)
+        return Track(belief, mode, started_ns=t_ns, undetermined=unknown)
 
     def predict(self, track: Track, t_ns: int) -> Prediction:
         """The predicted mean and covariance at an instant (eq:KF_propagate).
