@@ -6,7 +6,6 @@ configuration is saved with every result.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -19,7 +18,7 @@ from avsreplay.monitor.convergence import ConsistencyParams, ConvergenceParams
 from avsreplay.monitor.faults import FaultParams
 from avsreplay.plan import Limits, PlanParams, RobotParams, SupervisorParams
 from avsreplay.register import RegisterParams
-from avsreplay.settings import Settings, setting
+from avsreplay.settings import Settings, is_unit, setting
 from avsreplay.toml_document import Document, build, load, override, toml_value
 
 
@@ -83,7 +82,7 @@ class RunConfig(Settings):
         """Raise ValueError for an invalid initial pose, an axis that is not a unit vector, or an impossible robot."""
         if self.init not in ("log", "truth", "auto"):
             parse_pose(self.init)
-        if abs(math.hypot(*self.fixture_axis_c) - 1.0) > 1e-6:
+        if not is_unit(self.fixture_axis_c, 1e-6):
             raise ValueError(f"fixture_axis_c is {self.fixture_axis_c}, must be of unit length")
         check_robot(self.robot, self.plan, self.limits)
 

@@ -12,7 +12,7 @@ import enum
 import math
 import types
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -110,6 +110,17 @@ class SettingError(ValueError):
         """
         super().__init__(message)
         self.name = name
+
+
+def is_unit(values: Sequence[float], tolerance: float = 1e-3) -> bool:
+    """Return whether a vector or a quaternion has the length 1 within ``tolerance``."""
+    return math.isclose(math.hypot(*values), 1.0, abs_tol=tolerance)
+
+
+def are_orthonormal(first: Sequence[float], other: Sequence[float], tolerance: float = 1e-6) -> bool:
+    """Return whether two vectors have the length 1 and are perpendicular, each within ``tolerance``."""
+    cosine = sum(a * b for a, b in zip(first, other, strict=True))
+    return is_unit(first, tolerance) and is_unit(other, tolerance) and abs(cosine) <= tolerance
 
 
 def setting(default: Any = dataclasses.MISSING, doc: str = "", **declared: Any) -> Any:

@@ -9,7 +9,7 @@ from enum import Enum
 import numpy as np
 
 from avsreplay.geometry import Array
-from avsreplay.settings import Settings, given, setting
+from avsreplay.settings import Settings, are_orthonormal, given, setting
 
 __all__ = ["Adaptation", "Constraint", "EstimatorParams", "NoiseSource", "Start"]
 
@@ -172,9 +172,7 @@ class EstimatorParams(Settings):
 
     def check(self) -> None:
         """Raise ValueError where the axes of the orbit are not orthonormal, or it has an acceleration beside it."""
-        axes = self.orbit_radial_a, self.orbit_normal_a
-        units = [math.isclose(math.hypot(*axis), 1.0, abs_tol=1e-6) for axis in axes]
-        if not all(units) or abs(sum(a * b for a, b in zip(*axes, strict=True))) > 1e-6:
+        if not are_orthonormal(self.orbit_radial_a, self.orbit_normal_a):
             raise ValueError("orbit_radial_a and orbit_normal_a must be unit vectors at right angles to each other")
         if self.orbit_rate_radps > 0.0 and (any(self.acceleration_mps2) or self.fit_acceleration):
             raise ValueError("orbit_rate_radps cannot be combined with acceleration_mps2 or fit_acceleration")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from pathlib import PurePath
 
@@ -11,7 +10,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.plan.rendezvous import PlanParams
-from avsreplay.settings import Settings, setting
+from avsreplay.settings import Settings, is_unit, setting
 
 
 @dataclass(frozen=True, slots=True)
@@ -197,7 +196,7 @@ class RobotParams(Settings):
         if self.mass_kg is not None and not given:
             raise ValueError("mass_kg and thrust_max_n (or another capability) must be given together")
         for name in ("base_attitude_xyzw", "start_attitude_xyzw"):
-            if abs(math.hypot(*getattr(self, name)) - 1.0) > 1e-3:
+            if not is_unit(getattr(self, name)):
                 raise ValueError(f"{name} is {list(getattr(self, name))}, must be of unit length")
         least, most = self.reach_min_m, self.reach_max_m
         if least is not None and most is not None and least >= most:

@@ -22,7 +22,7 @@ from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import State
-from avsreplay.settings import Settings, setting
+from avsreplay.settings import Settings, are_orthonormal, is_unit, setting
 from avsreplay.simulate.inertia import Body
 
 ORDER = 22
@@ -73,11 +73,9 @@ class MotionParams(Settings):
 
     def check(self) -> None:
         """Raise ValueError where the attitude is not a unit quaternion."""
-        if not math.isclose(math.hypot(*self.attitude_xyzw), 1.0, abs_tol=1e-3):
+        if not is_unit(self.attitude_xyzw):
             raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
-        radial, normal = self.radial_a, self.orbit_normal_a
-        units = [math.isclose(math.hypot(*axis), 1.0, abs_tol=1e-6) for axis in (radial, normal)]
-        if not all(units) or abs(sum(a * b for a, b in zip(radial, normal, strict=True))) > 1e-6:
+        if not are_orthonormal(self.radial_a, self.orbit_normal_a):
             raise ValueError("radial_a and orbit_normal_a must be unit vectors at right angles to each other")
 
 

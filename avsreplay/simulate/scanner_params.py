@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from enum import Enum
 
-from avsreplay.settings import Settings, setting
+from avsreplay.settings import Settings, is_unit, setting
 from avsreplay.simulate.rays import Engine, FieldOfView, Pattern
 
 
@@ -112,7 +112,7 @@ class ScannerParams(Settings):
         """Raise ValueError where the ranges, or pattern and duration, do not go together."""
         if self.range_min_m >= self.range_max_m:
             raise ValueError(f"range_min_m = {self.range_min_m} must be below range_max_m = {self.range_max_m}")
-        if self.sun_a is not None and not math.isclose(math.hypot(*self.sun_a), 1.0, abs_tol=1e-6):
+        if self.sun_a is not None and not is_unit(self.sun_a, 1e-6):
             raise ValueError(f"sun_a = {list(self.sun_a)} is not a unit vector")
         if (self.pattern is not Pattern.FLASH) != (self.scan_s > 0.0):
             raise ValueError(f"scan_s = {self.scan_s}: 0 for a flash, positive for any other pattern")

@@ -20,7 +20,7 @@ from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Label, Surface
-from avsreplay.settings import Settings, setting
+from avsreplay.settings import Settings, is_unit, setting
 from avsreplay.simulate.optics import REFLECTANCE, FaceOptics, Material, face_optics
 from avsreplay.simulate.rays import Engine, RayCaster
 from avsreplay.simulate.target import adapter, box
@@ -92,7 +92,7 @@ class SceneObject(Presence):
     def check(self) -> None:
         """Raise ValueError where the attitude is not a unit quaternion, or the name is empty."""
         Presence.check(self)
-        if not math.isclose(math.hypot(*self.attitude_xyzw), 1.0, abs_tol=1e-3):
+        if not is_unit(self.attitude_xyzw):
             raise ValueError(f"attitude_xyzw = {list(self.attitude_xyzw)} is not a unit quaternion")
 
     def poses(self, times_s: Array) -> tuple[Array, Array]:
@@ -124,7 +124,7 @@ class Plume(Presence):
     def check(self) -> None:
         """Raise ValueError where the direction is not a unit vector, or the name is empty."""
         Presence.check(self)
-        if not math.isclose(math.hypot(*self.direction), 1.0, abs_tol=1e-3):
+        if not is_unit(self.direction):
             raise ValueError(f"direction = {list(self.direction)} is not a unit vector")
 
     def particles(self, rays: Array, ends_m: Array, rng: np.random.Generator) -> Array:
@@ -177,7 +177,7 @@ class Limb(Presence):
     def check(self) -> None:
         """Raise ValueError where the centre is not a unit vector, or the name is empty."""
         Presence.check(self)
-        if not math.isclose(math.hypot(*self.centre_a), 1.0, abs_tol=1e-3):
+        if not is_unit(self.centre_a):
             raise ValueError(f"centre_a = {list(self.centre_a)} is not a unit vector")
 
     def behind(self, rays: Array, times_s: Array, R_wa: Array) -> NDArray[np.bool_]:
@@ -212,7 +212,7 @@ class Appendage(Settings):
 
     def check(self) -> None:
         """Raise ValueError where the axis is not a unit vector."""
-        if not math.isclose(math.hypot(*self.axis_c), 1.0, abs_tol=1e-3):
+        if not is_unit(self.axis_c):
             raise ValueError(f"axis_c = {list(self.axis_c)} is not a unit vector")
 
     def placed(self, target: tuple[Array, Array], times_s: Array) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Surface
-from avsreplay.settings import Settings, setting
+from avsreplay.settings import Settings, is_unit, setting
 from avsreplay.simulate.inertia import Body, body_of, with_axes
 
 
@@ -56,7 +56,7 @@ class TargetParams(Settings):
             raise ValueError(
                 f"moments_m2 = {list(self.moments_m2)} are not those of a body: each below the others' sum"
             )
-        if self.axes_xyzw is not None and not math.isclose(math.hypot(*self.axes_xyzw), 1.0, abs_tol=1e-3):
+        if self.axes_xyzw is not None and not is_unit(self.axes_xyzw):
             raise ValueError(f"axes_xyzw = {list(self.axes_xyzw)} is not a unit quaternion")
         if (self.moments_m2 is None) != (self.axes_xyzw is None):
             raise ValueError("moments_m2 and axes_xyzw go together: give both or neither")
