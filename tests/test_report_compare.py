@@ -13,9 +13,12 @@ from click.testing import CliRunner
 from rich.console import Console
 
 from avsreplay.cli.compare import compare_command
+from avsreplay.config import RunConfig
 from avsreplay.errors import AvsError, CheckFailed, UnreadableInput, UsageError
+from avsreplay.log import SourceOptions
+from avsreplay.log.options import ClockChoice, Unit
 from avsreplay.records import Label
-from avsreplay.report.compare import METRICS, first_divergence, metrics
+from avsreplay.report.compare import METRICS, changed_settings, first_divergence, metrics
 from avsreplay.report.gate import GateRule, RuleOutcome, check_gate, github_lines, judge, junit, load_rules
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import build_comparison
@@ -175,6 +178,20 @@ def test_the_gate_names_the_first_broken_rule():
     check_gate(_outcomes()[:1])
     with pytest.raises(CheckFailed, match=r"(?s)1 of 2 rules broken, .*t1_s: 11 > 10.*later is useless"):
         check_gate(_outcomes())
+
+
+def test_every_reading_option_that_is_given_is_stated():
+    assert changed_settings(SourceOptions(), RunConfig()) == []
+    examples = {bool: True, int: 7, float: 7.5, tuple: (1.0, 2.0), type(None): "x", Unit: Unit.MM}
+    special = {"crop_box": (0.0, 0.0, 0.0, 1.0, 2.0, 3.0), "clock": ClockChoice.LOG, "grasp": (1.0, 2.0, 3.0)}
+    for field in dataclasses.fields(SourceOptions):
+        value = special.get(field.name, examples.get(type(field.default)))
+        if field.name in ("start_s", "end_s", "duration_s", "rate_hz", "n_scans", "pose_sigma", "crop_range"):
+            value = {"n_scans": 3, "pose_sigma": (1.0, 2.0), "crop_range": (1.0, 2.0)}.get(field.name, 2.5)
+        (line,) = changed_settings(SourceOptions(**{field.name: value}), RunConfig())
+        assert line.startswith(f"{field.name} = "), line
+        assert " (default " in line
+        assert "(default null" not in line
 
 
 # ---- the command

@@ -1,6 +1,7 @@
 """``avsreplay run`` as a user has it: tables, JSON, result directory, precedence of settings."""
 
 import json
+import re
 import sys
 
 import numpy as np
@@ -238,8 +239,8 @@ def test_a_golden_failure_begins_with_the_settings_that_differ(cli, fixtures_fol
     assert cli("run", log, "--n-scans", 4, "--update-golden", golden).code == 0
     done = cli("run", log, "--n-scans", 4, "--golden", golden, "--set", "register.n_max=1")
     assert done.code == 1
-    heading = "settings that differ from their defaults: register.n_max = 1 (default 200)"
-    assert done.out.index(heading) < done.out.index("Golden: first")
+    heading = "settings that differ from their defaults: n_scans = 4 (default all); register.n_max = 1 (default 200)"
+    assert " ".join(done.out.split()).index(heading) < " ".join(done.out.split()).index("Golden: first")
 
 
 @pytest.mark.slow
@@ -250,3 +251,30 @@ def test_a_required_verdict_decides_the_exit_code(cli, fixtures_folder):
     assert done.code == 1
     assert "the verdict is CHECK" in done.err
     assert cli("run", log, "--n-scans", 5, "--require", "check").code == 0
+
+
+def test_reading_options_are_stated_in_head_json_page_and_comparison(cli, fixtures_folder, tmp_path):
+    given = ["--model-scale", "1.0001", "--crop-range", "0.5,90", "--n-scans", "2"]
+    stated = {
+        "model_scale = 1.0001 (default 1.0)",
+        "crop_range = [0.5, 90.0] (default off)",
+        "n_scans = 2 (default all)",
+    }
+    log, bare, out = fixtures_folder / "tumble.mcap", tmp_path / "bare", tmp_path / "cropped"
+    assert "all at their defaults" in cli("run", log, "-o", bare).out
+    done = cli("run", log, *given, "-o", out, "--report")
+    assert done.code == 0, done.err
+    record = json.loads((out / "run.json").read_text())
+    assert set(record["changed_settings"]) == stated
+    assert all(line.split(" (")[0] in done.out for line in stated)
+    assert "all at their defaults" not in done.out
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert all(line in page for line in stated)
+    compared = cli("compare", bare, out, "--json").out
+    model, *settings = json.loads(compared)["results"][1]["conclusion"]["settings"]
+    assert re.fullmatch(r"model = satellite.ply (\w{8}) \(baseline satellite.ply (?!\1)\w{8}\)", model)
+    assert set(settings) == {
+        "model_scale = 1.0001 (baseline 1.0)",
+        "crop_range = [0.5, 90.0] (baseline not set)",
+        "n_scans = 2 (baseline not set)",
+    }

@@ -287,7 +287,7 @@ def _record(run: Run, summary: Summary) -> dict[str, Any]:
     header = run.source.header
     labels = header.labels if header.labels or header.seed is not None else None
     facts = facts_record(labels=labels, truth=run.truth, counts=dict(summary.counts))
-    changed = changed_settings(dump(run.config), dump(type(run.config)()))
+    changed = changed_settings(run.job.options, run.config)
     limits = dump(run.config.faults.resolved(run.surface.extent))
     return {**run.facts(), "limits": limits, "changed_settings": changed, "facts": facts, "versions": versions()}
 

@@ -14,6 +14,7 @@ from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Statistics
 from avsreplay.report.table import Table, number
 from avsreplay.rows import Row, columns
+from avsreplay.settings import dump, entries
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,15 +161,50 @@ def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return out
 
 
-def changed_settings(config: Mapping[str, Any], base: Mapping[str, Any], word: str = "default") -> list[str]:
-    """Settings of ``config`` that differ from those of ``base``, each as ``key = value (default ...)``."""
-    ours, theirs = flat(config), flat(base)
-    keys = [key for key in dict.fromkeys((*ours, *theirs)) if ours.get(key) != theirs.get(key)]
-    return [f"{key} = {_value(ours.get(key))} ({word} {_value(theirs.get(key))})" for key in keys]
+def changed_settings(*tables: Any) -> list[str]:
+    """Return the settings that differ from their defaults, each as ``key = value (default ...)``.
+
+    Args:
+        tables: dataclasses of settings, such as the configuration of a run and the options for reading its log.
+    """
+    found = []
+    for table in tables:
+        defaults = flat(dump(type(table)()))
+        words = {e.key: e.declared.automatic or "off" for e in entries(type(table))}
+        for key, value in flat(dump(table)).items():
+            if value != defaults.get(key):
+                unset = words.get(key, "off")
+                found.append(f"{key} = {_value(value, unset)} (default {_value(defaults.get(key), unset)})")
+    return found
 
 
-def _value(value: Any) -> str:
-    return "auto" if value is None else json.dumps(value)
+def different_inputs(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[str]:
+    """Log, model, reading options and settings that differ, each as ``key = value (baseline ...)``.
+
+    Args:
+        base: ``run.json`` of the baseline; what one of the two does not state is not compared.
+        other: of the run that is compared with it.
+    """
+    found = []
+    for part in ("log", "model"):
+        ours, theirs = (header.get(part) or {} for header in (other, base))
+        if ours.get("sha256") != theirs.get("sha256"):
+            names = [str(given.get("name", "unknown")) for given in (ours, theirs)]
+            if names[0] == names[1]:  # then the first digits of their SHA-256 tell them apart
+                names = [f"{names[0]} {str(given.get('sha256'))[:8]}" for given in (ours, theirs)]
+            found.append(f"{part} = {names[0]} (baseline {names[1]})")
+    for part in ("selection", "config"):
+        ours, theirs = (header.get(part) for header in (other, base))
+        if ours and theirs:
+            ours, theirs = flat(ours), flat(theirs)
+            keys = [key for key in dict.fromkeys((*ours, *theirs)) if ours.get(key) != theirs.get(key)]
+            keys = [key for key in keys if key != "model"]  # compared above, by its content
+            found += [f"{key} = {_value(ours.get(key))} (baseline {_value(theirs.get(key))})" for key in keys]
+    return found
+
+
+def _value(value: Any, unset: str = "not set") -> str:
+    return unset if value is None else json.dumps(value)
 
 
 def metrics_table(name: str, figures: Sequence[tuple[str, float | None]]) -> Table:

@@ -20,7 +20,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.report.compare import METRICS, changed_settings, first_divergence, metrics
+from avsreplay.report.compare import METRICS, different_inputs, first_divergence, metrics
 from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
@@ -124,7 +124,7 @@ class Conclusion:
         word: "better", "worse", "mixed", "no evidence" or "same" (all rows agree).
         sentence: the conclusion in one line.
         changes: of every metric that one of them has.
-        settings: settings that differ, as ``key = value (baseline ...)``.
+        settings: log, model, reading options and settings that differ, as ``key = value (baseline ...)``.
         pairs: number of paired runs.
     """
 
@@ -148,21 +148,10 @@ def conclude(name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Con
     """
     figures = [(metrics(base.summary), metrics(other.summary)) for base, other in pairs]
     changes = tuple(change for m in METRICS if (change := _change(m.name, figures, pairs)) is not None)
-    settings = dict.fromkeys(text for base, other in pairs for text in _settings(base, other))
+    settings = dict.fromkeys(text for base, other in pairs for text in different_inputs(base.header, other.header))
     same = all(first_divergence(base.rows, other.rows, first=1).ok for base, other in pairs)
     word, sentence = _overall(changes, same=same, rows=sum(len(other.rows) for _, other in pairs))
     return Conclusion(name, word, f"{name}: {sentence}", changes, tuple(settings), len(pairs))
-
-
-def _settings(base: ComparedRun, other: ComparedRun) -> list[str]:
-    """Settings that differ; the log and the model too, since they are inputs."""
-    found = []
-    for part in ("log", "model"):
-        ours, theirs = (run.header.get(part) or {} for run in (other, base))
-        if ours.get("sha256") != theirs.get("sha256"):
-            found.append(f"{part} = {ours.get('name', 'unknown')} (baseline {theirs.get('name', 'unknown')})")
-    config, reference = (run.header.get("config") for run in (other, base))
-    return found + (changed_settings(config, reference, "baseline") if config and reference else [])
 
 
 def _change(
