@@ -11,8 +11,8 @@ from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
 from avsreplay.estimate.params import Start
 from avsreplay.geometry import Array, Pose
+from avsreplay.monitor import FaultDetector
 from avsreplay.monitor.convergence import Consistency, Convergence
-from avsreplay.monitor.faults import FaultDetector
 from avsreplay.pipeline import Monitors, PipelineState, Stages
 from avsreplay.plan import Guidance, Supervisor, TargetGeometry, hull_vertices
 from avsreplay.plan.arm import with_arm

@@ -14,8 +14,8 @@ from typing import Any
 
 from avsreplay.estimate import EstimatorParams
 from avsreplay.geometry import Pose
+from avsreplay.monitor import FaultParams
 from avsreplay.monitor.convergence import ConsistencyParams, ConvergenceParams
-from avsreplay.monitor.faults import FaultParams
 from avsreplay.plan import Limits, PlanParams, RobotParams, SupervisorParams
 from avsreplay.register import RegisterParams
 from avsreplay.settings import Settings, is_unit, setting

@@ -15,16 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
+from avsreplay import geometry, monitor
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
 from avsreplay.estimate.chart import body_parameters
 from avsreplay.estimate.track import deskew, with_scan_duration
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor import observability
+from avsreplay.monitor import FaultDetector, Gramian
 from avsreplay.monitor.convergence import Consistency, ConsistencyTrack, Convergence, ConvergenceTrack, violations
-from avsreplay.monitor.faults import FaultDetector
-from avsreplay.monitor.observability import Gramian
 from avsreplay.outcome import MonitorReport, Outcome
 from avsreplay.plan import Guidance, GuidanceState, PlannerInput, Scene, TargetGeometry
 from avsreplay.plan.guidance import Segment
@@ -71,7 +69,7 @@ class Monitors:
         Args:
             prior_1s: (20,) prior standard deviations of the error states.
         """
-        return MonitorState(observability.gramian(prior_1s), self.consistency.initial(), self.convergence.initial())
+        return MonitorState(monitor.gramian(prior_1s), self.consistency.initial(), self.convergence.initial())
 
     def observe(
         self,
@@ -93,7 +91,7 @@ class Monitors:
             track: estimate after the scan.
         """
         gramian = self._gramian(state.gramian, estimator, prior, innovation if gamma else None, track)
-        rank = observability.measure(gramian)
+        rank = monitor.measure(gramian)
         consistency = self.consistency.observe(state.consistency, innovation, gamma)
         window = self.consistency.judge(consistency)
         failed = self._violations(estimator, prior, innovation if gamma else None, track)
@@ -121,8 +119,8 @@ class Monitors:
     ) -> Gramian:
         """The Gramian with one more scan, along the trajectory of the new fit where there is one."""
         if (refitted := estimator.refitted_rows(track)) is not None:
-            return observability.from_trajectory(gramian.scale, *refitted)
-        return observability.observe(gramian, *estimator.gramian_row(track, prior, healthy))
+            return monitor.from_trajectory(gramian.scale, *refitted)
+        return monitor.observe(gramian, *estimator.gramian_row(track, prior, healthy))
 
     def _violations(
         self, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track

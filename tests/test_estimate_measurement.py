@@ -40,7 +40,7 @@ from avsreplay.estimate.measurement import (
     step_of_sets,
 )
 from avsreplay.geometry import Pose
-from avsreplay.monitor.observability import gramian, measure, observe, weakest
+from avsreplay.monitor import gramian, measure, observe, weakest
 from avsreplay.records import Alignment, AlignStatus, Belief, Innovation, State
 
 

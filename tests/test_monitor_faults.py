@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import Pose
-from avsreplay.monitor.faults import FaultDetector, FaultParams, Policy, pose_limit, weighted_norm
+from avsreplay.monitor import FaultDetector, FaultParams, Policy, pose_limit, weighted_norm
 from avsreplay.records import Alignment, AlignStatus, Belief, Innovation, Reason, ScanStatus, State
 
 PRIOR = Belief(0, State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, np.zeros(2), np.zeros(3), [0, 0, 0, 1.0]), np.eye(20))

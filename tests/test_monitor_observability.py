@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from avsreplay.cli.observability import observability_command
 from avsreplay.log import SourceOptions
-from avsreplay.monitor.observability import from_trajectory, gramian, measure, observe, weakest
+from avsreplay.monitor import from_trajectory, gramian, measure, observe, weakest
 from avsreplay.rows import Row
 from avsreplay.run import Job, Run
 

@@ -17,9 +17,8 @@ from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.reconstruct import at_grasp, deviations, reconstruct, true_frame
 from avsreplay.reconstruct.fusion import continues, contradicting
-from avsreplay.reconstruct.motion import free_motion
 from avsreplay.reconstruct.registration import between
-from avsreplay.reconstruct.tracking import ReconstructionParams
+from avsreplay.reconstruct.tracking import ReconstructionParams, free_motion
 from avsreplay.reconstruct.views import SAMPLE, Twist, extent_of, full_cloud, surveyed, thinned_view
 from avsreplay.records import Scan, Surface
 from avsreplay.simulate import builtin_surface, scenario_of, simulate

@@ -13,8 +13,8 @@ from avsreplay.errors import CheckFailed, MissingBackend, UsageError
 from avsreplay.geometry import Pose, exp, log
 from avsreplay.records import Fit
 from avsreplay.register import backend
+from avsreplay.register.backend import HornBackend
 from avsreplay.register.contract import LAWS, Bench, check, repeats
-from avsreplay.register.horn import HornBackend
 
 BUILT_IN = ("horn", "kiss", "open3d", "reference", "small_gicp")
 SCALES = {"satellite": 1.0, "statue": 0.03}
@@ -121,7 +121,7 @@ def test_an_unknown_name_lists_the_registered_names() -> None:
 
 
 def test_a_missing_library_gives_an_install_hint(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("avsreplay.register.kiss.KissBackend.requires", (("no_such_module", "kiss-icp"),))
+    monkeypatch.setattr("avsreplay.register.peers.KissBackend.requires", (("no_such_module", "kiss-icp"),))
     with pytest.raises(MissingBackend, match="pip install kiss-icp"):
         backend.load_backend("kiss")
     assert [state.installed for state in backend.available() if state.name == "kiss"] == [False]

@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.track import common_motions
 from avsreplay.geometry import Array, Pose
+from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.monitor.convergence import block_1s
-from avsreplay.monitor.faults import FaultDetector, FaultParams
 from avsreplay.records import AlignStatus, ScanStatus, Surface
 from avsreplay.register import Registrar
 from avsreplay.register.contract import view

@@ -23,8 +23,8 @@ from avsreplay.report.gate import GateRule, RuleOutcome, check_gate, github_line
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import build_comparison
 from avsreplay.report.result import load_result, write_manifest
-from avsreplay.report.scan_table import print_sparks, spark
 from avsreplay.report.summary import Summary
+from avsreplay.report.table import print_sparks, spark
 
 
 def _summary(rows):

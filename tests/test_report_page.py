@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from avsreplay.cli.export import report_command
+from avsreplay.cli.record import report_command
 from avsreplay.errors import AvsError
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface

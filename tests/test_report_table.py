@@ -11,10 +11,9 @@ import sys
 import pytest
 
 from avsreplay.records import Label
-from avsreplay.report.scan_table import choose_rows, head, state_cell
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import print_tables
-from avsreplay.report.table import decimals, make_console
+from avsreplay.report.table import choose_rows, decimals, head, make_console, state_cell
 from avsreplay.rows import columns
 
 

@@ -18,9 +18,8 @@ from avsreplay.simulate import builtin_surface, scenario_of, simulate
 from avsreplay.simulate.inertia import principal
 from avsreplay.simulate.motion import Motion, MotionParams
 from avsreplay.simulate.optics import Material, beam, crosstalk, face_optics, merged
-from avsreplay.simulate.rays import Pattern
+from avsreplay.simulate.rays import Pattern, Preset, ScannerParams
 from avsreplay.simulate.scanner import Scanner
-from avsreplay.simulate.scanner_params import Preset, ScannerParams
 
 BODY = principal(np.diag([1.0, 1.1, 1.2]), np.zeros(3))
 CLEAN = ScannerParams(rays=(33, 33), fov_deg=(40.0, 40.0), noise_m=0.0, outlier_ratio=0.0)

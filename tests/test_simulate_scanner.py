@@ -13,9 +13,8 @@ from avsreplay.errors import MissingBackend
 from avsreplay.records import Surface
 from avsreplay.simulate import Shape, builtin_surface, rays
 from avsreplay.simulate.motion import Motion, MotionParams
-from avsreplay.simulate.rays import Engine, FieldOfView, Pattern, RayCaster
+from avsreplay.simulate.rays import Engine, FieldOfView, Pattern, RayCaster, ScannerParams
 from avsreplay.simulate.scanner import Scanner
-from avsreplay.simulate.scanner_params import ScannerParams
 from avsreplay.simulate.target import TargetParams, body
 
 needs_embree = pytest.mark.skipif(not rays.importlib.util.find_spec("embreex"), reason="embreex is not installed")

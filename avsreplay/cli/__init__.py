@@ -45,7 +45,14 @@ SUMMARIES = {
 }
 
 # The modules of the commands that share one; completion is in this one.
-HOMES = {"doctor": "info", "bench": "backends", "odometry": "model", "report": "export", "completion": ""}
+HOMES = {
+    "doctor": "info",
+    "bench": "backends",
+    "odometry": "model",
+    "export": "record",
+    "report": "record",
+    "completion": "",
+}
 
 EPILOG = """\b
 Examples:

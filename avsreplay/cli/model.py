@@ -208,7 +208,7 @@ def odometry_command(
     from avsreplay.geometry import bounding_diagonal
     from avsreplay.log import open_source
     from avsreplay.register.backend import load_backend
-    from avsreplay.register.kiss import KissOdometry
+    from avsreplay.register.peers import KissOdometry
     from avsreplay.report.export import write_tum
 
     check_output(output, overwrite=overwrite)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from avsreplay.estimate.initialise import PoseFix
     from avsreplay.estimate.reference import Reference
     from avsreplay.geometry import Array
-    from avsreplay.monitor.observability import Gramian
+    from avsreplay.monitor import Gramian
     from avsreplay.records import Belief, State
     from avsreplay.rows import Row
     from avsreplay.run import ReplayedScan, Run
@@ -87,7 +87,7 @@ def _document(run: Run, marks: int, weakest: int) -> dict[str, Any]:
     lines, ends = _summed(inside, start, {fix.scan_ns: fix for fix in poses.fixes}, scales[0])
     keep = sorted({round(k * (len(lines) - 1) / (marks - 1)) for k in range(marks)})
     from avsreplay.estimate.measurement import BLOCKS_OF
-    from avsreplay.monitor.observability import weakest as in_words
+    from avsreplay.monitor import weakest as in_words
 
     return {
         "log": Path(run.job.source).name,
@@ -111,7 +111,7 @@ def _summed(
 ) -> tuple[list[dict[str, Any]], dict[str, Gramian]]:
     """A record per scan along the motion that begins with ``x`` at the first of them, and the Gramians at the end."""
     from avsreplay.estimate.measurement import in_camera, prior_1s, step_of_sets
-    from avsreplay.monitor.observability import gramian, measure, observe
+    from avsreplay.monitor import gramian, measure, observe
 
     t_ns = rows[0].t_ns
     folds = {name: gramian(scale) for name, scale in prior_1s(one_sigma, x.sigma).items()}

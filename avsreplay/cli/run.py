@@ -112,7 +112,7 @@ def _whole(job: Job, target: ResultDirectory | None, wanted: Wanted) -> None:
         done = _replayed(run, advice, target, wanted)
         _print(wanted, done)
         if wanted.page and wanted.output:
-            from avsreplay.cli.export import write_page
+            from avsreplay.cli.record import write_page
 
             click.echo(write_page(wanted.output, wanted.output / "report.html"), err=True)
         click.echo(f"verdict {done.verdict.line}", err=True)

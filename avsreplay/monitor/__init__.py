@@ -1,1 +1,263 @@
-"""Monitors of the estimate: fault detection, observability, consistency, convergence."""
+"""Monitors of a replay: fault detection and the observability Gramian; consistency and convergence in ``convergence``.
+
+Fault rule (section 6 of the equations): gamma for each scan, and why it is 0. The pose test is
+|alpha|_W = sqrt(|d rho|^2 + (L theta)^2) against a limit. While the filter tracks, the limit is ``alpha_max_m``; where
+the prediction is uncertain (at the start, after a blackout) it grows to ``sigmas`` times the predicted 1 sigma of the
+same norm, sqrt(tr S_rho + (2 L)^2 tr S_half), so that the first healthy scan is accepted.
+
+Observability (eq after [eq:S_recursive]): W_o = sum of (H Phi)' (H Phi). Its triangular root is stored,
+[root; H Phi] re-triangularised: the condition number of W_o is the square of the root's, so values up to 10^30 are
+resolved; from the sum itself, up to 10^16. Scaled by the prior standard deviations it has no units. The rank is
+relative to the measurement noise: it counts the directions about which the poses, weighted by R^-1, give more
+information than the prior.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Array, frozen
+from avsreplay.records import BLOCKS, Alignment, AlignStatus, Belief, Innovation, Reason, ScanStatus, Verdict
+from avsreplay.settings import Settings, setting
+
+_WORDS: Mapping[str, str] = {
+    "attitude": "attitude of the principal axes",
+    "rate": "angular rate",
+    "position": "centre of mass",
+    "velocity": "velocity of the centre of mass",
+    "sigma": "inertia ratios",
+    "varrho": "fixture position in the body",
+    "mu": "misalignment of the fixture",
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gramian:
+    """The Gramian so far.
+
+    Attributes:
+        root: (n, n) with W_o = root' root.  white: (n, n) the same root with rows weighted by R^-1/2.
+        Phi_k0: (n, n) transition from the first scan to the last.  scale: (n,) prior 1 sigma.
+    """
+
+    root: Array
+    white: Array
+    Phi_k0: Array
+    scale: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Observability:
+    """The Gramian in numbers.
+
+    Attributes:
+        rank: directions that the poses determine better than the prior.  size: number of states.
+        log10_cond, log10_cond_scaled: log10 of the condition number of W_o, None below full rank.
+    """
+
+    rank: int
+    size: int
+    log10_cond: float | None
+    log10_cond_scaled: float | None
+
+
+def gramian(prior_1s: Array) -> Gramian:
+    """Return the Gramian before the first scan.
+
+    Args:
+        prior_1s: (n,) prior standard deviations in the states' units.
+
+    Raises:
+        ValueError: one of them is not positive and finite.
+    """
+    scale = frozen(prior_1s, -1)
+    if not np.all(np.isfinite(scale)) or np.any(scale <= 0.0):
+        raise ValueError("prior standard deviations must be positive and finite")
+    zero = np.zeros((scale.size, scale.size))
+    return Gramian(zero, zero, np.eye(scale.size), scale)
+
+
+def observe(state: Gramian, Phi: Array, H: Array, R: Array | None, from_first: bool = False) -> Gramian:
+    """Return the Gramian after one more scan: Phi_k0 = Phi Phi_k-1,0, and H Phi_k0 is added for a healthy scan.
+
+    Args:
+        state: the Gramian so far.
+        Phi: (n, n) transition from the last scan.
+        H: (m, n) measurement Jacobian.
+        R: (m, m) measurement noise, None for a faulty scan.
+        from_first: ``Phi`` begins at the first scan instead of the last one.
+    """
+    Phi_k0 = Phi if from_first else Phi @ state.Phi_k0
+    if R is None:
+        return Gramian(state.root, state.white, Phi_k0, state.scale)
+    return _added(state, (H @ Phi_k0)[None], R[None], Phi_k0)
+
+
+def from_trajectory(scale: Array, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
+    """Return the Gramian of many healthy scans along one trajectory.
+
+    Args:
+        scale: (n,) prior standard deviations.
+        rows: (k, m, n) H Phi from the first scan.
+        R: (k, m, m) measurement noise.
+        Phi_k0: (n, n) transition from the first scan to the last.
+    """
+    return _added(gramian(scale), rows, R, Phi_k0)
+
+
+def _added(state: Gramian, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
+    white = np.linalg.solve(np.linalg.cholesky(R), rows)
+    roots = [
+        np.asarray(np.linalg.qr(np.vstack([old, new.reshape(-1, state.scale.size)]), mode="r"))
+        for old, new in ((state.root, rows), (state.white, white))
+    ]
+    return Gramian(roots[0], roots[1], Phi_k0, state.scale)
+
+
+def measure(state: Gramian) -> Observability:
+    """Return the rank and the condition numbers."""
+    told = np.linalg.svd(state.white * state.scale, compute_uv=False)
+    rank, n = int(np.sum(told > 1.0)), state.scale.size
+    if rank < n:
+        return Observability(rank, n, None, None)
+    raw = np.linalg.svd(state.root, compute_uv=False)
+    scaled = np.linalg.svd(state.root * state.scale, compute_uv=False)
+    return Observability(rank, n, _log10_cond(raw), _log10_cond(scaled))
+
+
+def _log10_cond(singular: NDArray[Any]) -> float | None:
+    return 2.0 * math.log10(singular[0] / singular[-1]) if singular[-1] > 0.0 else None
+
+
+def weakest(state: Gramian, count: int = 3, blocks: Mapping[str, slice] = BLOCKS) -> tuple[str, ...]:
+    """Return the least observed directions of the scaled Gramian in words, weakest first.
+
+    Args:
+        state: the Gramian.
+        count: number of directions.
+        blocks: names of the states.
+    """
+    _, _, rows = np.linalg.svd(state.root * state.scale)
+    return tuple(_in_words(row, blocks) for row in rows[::-1][:count])
+
+
+def _in_words(direction: Array, blocks: Mapping[str, slice]) -> str:
+    """The blocks that hold most of a unit direction, with their shares."""
+    shares = {name: float(np.sum(direction[where] ** 2)) for name, where in blocks.items()}
+    named = sorted(shares.items(), key=lambda item: (-item[1], item[0]))
+    return " with ".join(f"{_WORDS.get(name, name)} ({share:.0%})" for name, share in named if share >= 0.1)
+
+
+class Policy(Enum):
+    """How the fit test and the pose test are combined."""
+
+    ANY = "any"  # either one is a fault
+    ALL = "all"  # as printed: a fault only where both fail
+
+
+@dataclass(frozen=True, slots=True)
+class FaultParams(Settings):
+    """Limits of fault detection."""
+
+    policy: Policy = setting(
+        Policy.ANY,
+        "How the fit test and the pose test are joined: either one alone is a fault (any), or a fault needs both to"
+        " fail, as printed in the paper (all).",
+    )
+    rms_max_m: float | None = setting(
+        None, "Rms residual of the fit from which a scan is faulty.", unit="m", above=0.0, of_extent=0.01
+    )
+    alpha_max_m: float | None = setting(
+        None, "Pose innovation, in the weighted norm, from which a scan is faulty.", unit="m", above=0.0, of_extent=0.02
+    )
+    length_m: float | None = setting(
+        None,
+        "Characteristic length that converts an angle to a length in the weighted norm.",
+        unit="m",
+        above=0.0,
+        of_extent=0.25,
+    )
+    sigmas: float = setting(
+        4.0, "The limit on the pose innovation is never below this multiple of its predicted 1 sigma.", above=0.0
+    )
+    min_inliers: int = setting(50, "Inliers that a healthy scan needs.", low=0)
+    split_nis_max: float = setting(
+        60.0,
+        "Normalised squared difference of the poses from two halves of the scan above which a scan is faulty.",
+        above=0.0,
+    )
+    min_inlier_ratio: float = setting(0.3, "Ratio of inliers to points that a healthy scan needs.", low=0.0, high=1.0)
+
+
+def weighted_norm(seen: Innovation, length_m: float) -> float:
+    """|alpha|_W [m]: the printed W = diag(I, L I) on metres and the full rotation angle."""
+    return math.hypot(seen.distance_m, length_m * seen.angle_rad)
+
+
+def pose_limit(seen: Innovation, alpha_max_m: float, length_m: float, sigmas: float) -> float:
+    """The limit on |alpha|_W [m]: ``alpha_max_m``, or ``sigmas`` predicted 1 sigma where that is more."""
+    variances = np.diagonal(seen.S)
+    predicted = math.sqrt(float(variances[:3].sum()) + (2.0 * length_m) ** 2 * float(variances[3:].sum()))
+    return max(alpha_max_m, sigmas * predicted)
+
+
+class FaultDetector:
+    """Judges one scan at a time, without state.
+
+    Args:
+        params: limits; those left out are taken from ``extent_m``, the target's bounding diagonal [m].
+    """
+
+    def __init__(self, params: FaultParams, extent_m: float) -> None:
+        self.params = params.resolved(extent_m)
+        p = self.params
+        self._rms, self._alpha, self._length = (float(v or 0.0) for v in (p.rms_max_m, p.alpha_max_m, p.length_m))
+
+    def judge(
+        self, scan_status: ScanStatus, alignment: Alignment | None, innovation: Innovation | None, prior: Belief
+    ) -> Verdict:
+        """Gamma and the first reason that holds, in ``Reason``'s order."""
+        reason = self._unusable(scan_status, alignment, innovation, prior)
+        if reason is None and alignment is not None and innovation is not None:
+            reason = self._doubtful(alignment, innovation)
+        if reason is None and scan_status is ScanStatus.CLOCK:
+            reason = Reason.CLOCK
+        return Verdict(1, Reason.OK) if reason is None else Verdict(0, reason)
+
+    def _unusable(
+        self, status: ScanStatus, alignment: Alignment | None, seen: Innovation | None, prior: Belief
+    ) -> Reason | None:
+        """Return why the scan has no pose that can be tested, whatever the policy; None if it has one."""
+        if status in (ScanStatus.EMPTY, ScanStatus.DAMAGED) or (
+            alignment and alignment.status is AlignStatus.NO_POINTS
+        ):
+            return Reason.NO_SCAN
+        lost = alignment is None or not alignment.measured or alignment.status is AlignStatus.AMBIGUOUS
+        if lost or seen is None or not np.isfinite(seen.nis):
+            return Reason.NOT_ALIGNED
+        return None if np.all(np.isfinite(prior.P)) else Reason.NOT_ALIGNED
+
+    def _doubtful(self, alignment: Alignment, seen: Innovation) -> Reason | None:
+        p = self.params
+        poor_fit = not alignment.rms_m < self._rms
+        jump = weighted_norm(seen, self._length) >= pose_limit(seen, self._alpha, self._length, p.sigmas)
+        if alignment.status is AlignStatus.MEASURED:  # nothing was fitted: the pose test alone decides
+            return Reason.POSE_JUMP if jump else None
+        if p.policy is Policy.ALL:
+            return Reason.FIT_ERROR if poor_fit and jump else None
+        if not alignment.converged or alignment.status is AlignStatus.NOT_CONVERGED:
+            return Reason.NOT_CONVERGED
+        if alignment.inliers < p.min_inliers or alignment.inlier_ratio < p.min_inlier_ratio:
+            return Reason.FEW_INLIERS
+        if poor_fit:
+            return Reason.FIT_ERROR
+        if (alignment.split_nis or 0.0) > p.split_nis_max:
+            return Reason.HALVES_DIFFER
+        return Reason.POSE_JUMP if jump else None

@@ -39,8 +39,15 @@ from avsreplay.reconstruct.model import (
     reconstruction_ply,
     surface_of,
 )
-from avsreplay.reconstruct.motion import FreeMotion, free_motion, twists
-from avsreplay.reconstruct.tracking import ReconstructionParams, Tracked, track, without
+from avsreplay.reconstruct.tracking import (
+    FreeMotion,
+    ReconstructionParams,
+    Tracked,
+    free_motion,
+    track,
+    twists,
+    without,
+)
 from avsreplay.reconstruct.views import ScanView, Survey, selected, surveyed, thinned_view
 from avsreplay.records import Scan
 

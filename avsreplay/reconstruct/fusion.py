@@ -11,9 +11,8 @@ from scipy.spatial import cKDTree
 
 from avsreplay.estimate.chart import to_chart, to_state
 from avsreplay.geometry import Array, Pose
-from avsreplay.reconstruct.motion import FreeMotion
 from avsreplay.reconstruct.registration import SAME_SIDE, between, moved, registered
-from avsreplay.reconstruct.tracking import KEEP_RATIO, ReconstructionParams, Tracked, patchwork
+from avsreplay.reconstruct.tracking import KEEP_RATIO, FreeMotion, ReconstructionParams, Tracked, patchwork
 from avsreplay.reconstruct.views import (
     NEIGHBOURS,
     ScanView,

@@ -17,7 +17,7 @@ from avsreplay import geometry
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.reconstruct.fusion import Sight
-from avsreplay.reconstruct.motion import FreeMotion
+from avsreplay.reconstruct.tracking import FreeMotion
 from avsreplay.reconstruct.views import averaged
 from avsreplay.records import BLOCKS, Surface
 

@@ -1,4 +1,4 @@
-"""The protocol of a registration back end, and the entry-point group in which back ends are registered.
+"""The protocol of a registration back end, the entry points of all back ends, and the default one, ``horn``.
 
 A back end is a class ``Backend(target)`` under the entry-point group ``avsreplay.backends``. It returns a pose, an
 iteration count and its own convergence flag, nothing more: ``quality.grade`` measures the quality of every pose.
@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,15 +21,21 @@ from numpy.typing import NDArray
 from avsreplay.errors import MissingBackend, UsageError
 from avsreplay.geometry import MeasuredPose, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
+from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 if TYPE_CHECKING:
     from avsreplay.register.params import RegistrationLimits
-    from avsreplay.register.surface_index import SurfaceIndex
     from avsreplay.register.visibility import Visibility
 
 MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
 GROUP = "avsreplay.backends"
 POSES = "poses"
+
+PLANE_PASSES = 3
+TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
+LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
+MOST_WITHIN = 60  # passes of an alignment that begins near its result
+FEW_POINTS = 600  # of a scan that has many more, for the first passes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +71,71 @@ class Backend(Protocol):
             T_ca, the number of iterations and whether the iteration converged. If no point has a correspondence, the
             guess and False. An exception, or a pose that is not finite, becomes the status FAILED.
         """
+
+
+class HornBackend:
+    """Exact closest points on the model, one fused pass, identical results for any number of threads.
+
+    Rejection and stopping are those of :class:`~avsreplay.register.surface_index.IcpParams`: the gate starts at
+    ``reach_m``, follows three times the rms of the last pass and never goes below 0.004 of the extent, or ``gate_m`` if
+    that is less: points further away, at the edges of hidden surface, bias the pose. Where the
+    position of the camera is known, only faces that face it are matched.
+    """
+
+    name: ClassVar[str] = "horn"
+    accuracy: ClassVar[tuple[float, float]] = (0.001, 1e-05)
+    same_bytes: ClassVar[bool] = True  # on every x86-64 processor
+    about: ClassVar[str] = (
+        "point-to-plane start, then Newton steps to the fixed point of Horn's quaternion ICP on the mesh itself, C++"
+    )
+    requires: ClassVar[tuple[tuple[str, str], ...]] = (("avsreplay.register._kernel", "avsreplay"),)
+    get: ClassVar[str] = "a C++17 compiler, then pip install ."
+
+    def __init__(self, target: Target) -> None:
+        limits = target.limits
+        self._index, self._visibility = target.index, target.visibility
+        rule = IcpParams(
+            n_max=limits.n_max,
+            n_plane=min(PLANE_PASSES, limits.n_max),
+            few=FEW_POINTS,
+            gate_m=limits.reach_m,
+            floor_m=min(limits.gate_m, LEAST_GATE_OF_EXTENT * target.index.extent_m),
+            tighten=TIGHTEN,
+            eps_rad=limits.eps_rad,
+            eps_m=limits.eps_m,
+            threads=limits.threads,
+        )
+        self._rules = {facing: replace(rule, facing=facing) for facing in (False, True)}
+
+    def align(self, points: NDArray[Any], guess: Pose) -> Fit:
+        """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
+        return self._run(points, guess, self._rules)
+
+    def align_within(self, points: NDArray[Any], guess: Pose, gate_m: float, near: bool = False) -> Fit:
+        """Return T_ca with correspondences nearer than ``gate_m`` [m] from the first pass to the last.
+
+        ``near``: the guess is a registered pose, so that no point-to-plane passes and no passes over few points come
+        first: they would end further from the result than it is.
+        """
+        most = min(self._rules[True].n_max, MOST_WITHIN)
+        rules = {
+            facing: replace(
+                rule,
+                n_max=most,
+                n_plane=0 if near else rule.n_plane,
+                few=0 if near else rule.few,
+                gate_m=gate_m,
+                floor_m=gate_m,
+                tighten=0.0,
+            )
+            for facing, rule in self._rules.items()
+        }
+        return self._run(points, guess, rules)
+
+    def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams]) -> Fit:
+        facing = self._visibility.camera_c(self._index, points, guess) is not None
+        found = self._index.icp(points, guess, rules[facing])
+        return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches)
 
 
 def measured_alignment(found: MeasuredPose) -> Alignment:

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
-from avsreplay.register.backend import Target
-from avsreplay.register.horn import HornBackend
+from avsreplay.register.backend import HornBackend, Target
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
 from avsreplay.register.sampling import sample, thin_to, without_sparse_points

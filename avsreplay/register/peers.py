@@ -1,25 +1,107 @@
-"""Back ends of other libraries, against points sampled from the model: ``small_gicp`` and ``open3d``.
+"""Back ends for comparison with ``horn``: the ICP of the paper, and libraries that use sampled points of the model.
+
+``reference`` is the ICP of the paper (eq:ICP), corrected: every pass matches each point with its closest point on the
+model, then applies Horn's closed-form motion. ``KissOdometry`` tracks scans where there is no model.
 
 Properties of small_gicp 1.0: clouds far apart are returned as converged with no inlier; one and two threads differ in
 the last digits; an unknown method name returns the identity.
+
+Properties of kiss-icp 1.2 and 1.3: correspondences reach over one voxel; ``kernel`` is used as a squared length; with
+more than one thread results are not repeatable to the bit; a guess whose rotation is not orthonormal by 2e-9, and
+points that are all of one instant where it deskews, abort the interpreter; it returns only a pose, and returns the
+guess if nothing matched; scans are deskewed to the end of the sweep.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Fit
 from avsreplay.register.backend import Target
 from avsreplay.register.sampling import sample
 
+TIGHTEN = 3.0  # the gate of the reference in units of the rms of the last pass
+MIN_INLIERS = 6
+SETTLED_GATE = 0.01  # the gate has settled once a pass changes it by less than this share
 SURFACE_POINTS = 100_000
 NEIGHBOURS = 20
 SETTLED = 10.0  # its steps do not become smaller than this many eps: the covariances are not smooth in the pose
 LEAST_POINTS = 20  # fewer points have no neighbourhood of NEIGHBOURS
+POINTS_PER_VOXEL = 20
+SETTLED_OF_GATE = 0.01
+FINE_CALLS = 6  # with the finest map, each of at most n_max iterations
+STEP_OF_EPS = 10.0  # gives 1e-4, the default of the library: its last steps move from one map point to the next
+FAR_M = 1e9  # no part of the map is deleted because of its distance
+THINNED = 1.5  # voxel of the points used in the coarse stages over the voxel of the map, the rule of the library
+THRESHOLD_VOXELS = 2.0  # first threshold of the library over its voxel
+MIN_MOTION_VOXELS = 0.1
+VOXELS = 100.0  # the library's rule: range over voxel
+RECENTRE_VOXELS = 50.0
+
+
+class ReferenceBackend:
+    """Horn's quaternion ICP, point to surface, from the first pass to the fixed point.
+
+    Rejection: a point is used while its distance to the model is below the gate. The gate starts at ``reach_m``; after
+    each pass it is min(gate, max(gate_m, 3 rms)): wide while the guess is off, narrow at the end, never growing.
+    Stopping: a pass that rotates by less than ``eps_rad`` and moves the centroid of the inliers by less than ``eps_m``
+    after the gate has settled.
+    """
+
+    name: ClassVar[str] = "reference"
+    accuracy: ClassVar[tuple[float, float]] = (0.01, 0.0001)
+    same_bytes: ClassVar[bool] = True  # on every x86-64 processor
+    about: ClassVar[str] = "Horn's quaternion ICP against the mesh itself, in numpy: slow, for comparison"
+
+    def __init__(self, target: Target) -> None:
+        self._limits, self._visibility, self._index = target.limits, target.visibility, target.index
+
+    def align(self, points: NDArray[Any], guess: Pose) -> Fit:
+        """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
+        scan = np.ascontiguousarray(points, dtype=np.float64)
+        T_ca, gate = guess, self._limits.reach_m
+        facing = self._visibility.camera_c(self._index, scan, guess) is not None
+        for passes in range(1, self._limits.n_max + 1):
+            moved = T_ca.apply(scan)
+            found = self._index.closest(moved, camera_c=T_ca.t if facing else None)
+            inlier = found.d2 < gate**2
+            if inlier.sum() < MIN_INLIERS:
+                return Fit(T_ca, passes, False)
+            step = best_motion(moved[inlier], found.foot[inlier])
+            T_ca = step @ T_ca
+            tighter = min(gate, max(self._limits.gate_m, TIGHTEN * float(np.sqrt(found.d2[inlier].mean()))))
+            if self._small(step, moved[inlier].mean(axis=0)) and gate - tighter <= SETTLED_GATE * gate:
+                return Fit(T_ca, passes, True)
+            gate = tighter
+        return Fit(T_ca, self._limits.n_max, False)
+
+    def _small(self, step: Pose, centroid: Array) -> bool:
+        moved = float(np.linalg.norm(step.apply(centroid) - centroid))
+        return float(geometry.angle(step.q)) < self._limits.eps_rad and moved < self._limits.eps_m
+
+
+def horn_matrix(N: Array) -> Array:
+    """Horn's M (4, 4) of N = mean(c d') - c_bar d_bar' (3, 3) (eq:M), for SCALAR-FIRST quaternions."""
+    M = np.empty((4, 4))
+    M[0, 0] = np.trace(N)
+    M[0, 1:] = M[1:, 0] = (N[1, 2] - N[2, 1], N[2, 0] - N[0, 2], N[0, 1] - N[1, 0])
+    M[1:, 1:] = N + N.T - M[0, 0] * np.eye(3)
+    return M
+
+
+def best_motion(moving: Array, fixed: Array) -> Pose:
+    """Least-squares rigid motion T with ``fixed ~ T.apply(moving)``; both (n, 3) [m], n >= 1."""
+    c_bar, d_bar = moving.mean(axis=0), fixed.mean(axis=0)
+    N = (moving - c_bar).T @ (fixed - d_bar) / len(moving)
+    w, x, y, z = np.linalg.eigh(horn_matrix(N))[1][:, -1]  # the eigenvector of M is [w x y z]; Pose is scalar last
+    turn = Pose(np.array([x, y, z, w]), np.zeros(3))
+    return Pose(turn.q, d_bar - turn.R @ c_bar)
 
 
 class SmallGicpBackend:
@@ -107,3 +189,160 @@ class Open3dBackend:
             found = self._library.registration_icp(scan, self._cloud, reach, T_ca.matrix, method, rule)
             T_ca, matched = Pose.from_matrix(found.transformation), len(found.correspondence_set)
         return Fit(T_ca, 2, matched > 0)
+
+
+class KissBackend:
+    """Three maps, coarse to fine, with voxels of ``reach_m``, of ``gate_m`` and of their geometric mean in between.
+
+    The coarse maps are used with points thinned by the library's rule, the middle one with the library's adaptive
+    threshold, which follows the error of the guess. Deskewing is the pipeline's, by the predicted
+    motion. The library does not return its iteration count, so ``Fit.iterations`` counts its calls. ``converged``
+    means that one more call, started from the last result, moved the outermost points of the model by less than 0.01
+    ``gate_m``.
+    """
+
+    name: ClassVar[str] = "kiss"
+    accuracy: ClassVar[tuple[float, float]] = (0.3, 0.003)
+    about: ClassVar[str] = "kiss-icp against a voxel map of the model, one thread"
+    requires: ClassVar[tuple[tuple[str, str], ...]] = (("kiss_icp", "kiss-icp"),)
+    get: ClassVar[str] = "pip install kiss-icp"
+
+    def __init__(self, target: Target) -> None:
+        from kiss_icp.mapping import VoxelHashMap
+        from kiss_icp.registration import Registration
+
+        self._limits, self._radius_m = target.limits, 0.5 * target.surface.extent
+        points = np.ascontiguousarray(sample(target.surface, SURFACE_POINTS)[0])
+        reach, gate = target.limits.reach_m, target.limits.gate_m
+        self._maps: list[tuple[float, Any]] = []
+        for voxel in (reach, math.sqrt(reach * gate), gate):
+            voxel_map: Any = VoxelHashMap(voxel, FAR_M, POINTS_PER_VOXEL)
+            voxel_map.add_points(points)
+            self._maps.append((voxel, voxel_map))
+        self._registration = Registration(target.limits.n_max, STEP_OF_EPS * target.limits.eps_rad, 1)
+
+    def align(self, points: NDArray[Any], guess: Pose) -> Fit:
+        """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
+        scan = np.ascontiguousarray(points, dtype=np.float64)
+        (reach, coarse), (voxel, middle), (gate, fine) = self._maps
+        T_ca = self._run(_thinned_at(scan, guess, reach), coarse, guess, reach)
+        sigma = self.threshold(guess, T_ca)
+        T_ca = self._run(_thinned_at(scan, T_ca, voxel), middle, T_ca, 3.0 * sigma)
+        T_ca = self._run(scan, fine, T_ca, gate)
+        for calls in range(1, FINE_CALLS):
+            before, T_ca = T_ca, self._run(scan, fine, T_ca, gate)
+            if self._settled(before, T_ca):
+                return Fit(T_ca, len(self._maps) + calls, True)
+        return Fit(T_ca, len(self._maps) + FINE_CALLS - 1, False)
+
+    def threshold(self, guess: Pose, found: Pose) -> float:
+        """Return the library's adaptive threshold [m] after the first stage, which measured the error of the guess.
+
+        Args:
+            guess: initial T_ca.
+            found: T_ca after the first stage.
+        """
+        from kiss_icp.config.parser import KISSConfig
+        from kiss_icp.threshold import AdaptiveThreshold
+
+        gate = self._limits.gate_m
+        config = KISSConfig()
+        config.adaptive_threshold.initial_threshold = THRESHOLD_VOXELS * gate
+        config.adaptive_threshold.min_motion_th = MIN_MOTION_VOXELS * gate
+        config.data.max_range = self._radius_m
+        rule: Any = AdaptiveThreshold(config)
+        rule.update_model_deviation((guess.inverse() @ found).matrix)
+        return float(rule.get_threshold())
+
+    def _run(self, scan: Array, voxel_map: Any, T_ca: Pose, reach_m: float) -> Pose:
+        # Pose re-orthonormalises: the matrix of a unit quaternion is a rotation to 1e-16.
+        kernel = (reach_m / 3.0) ** 2
+        return Pose.from_matrix(self._registration.align_points_to_map(scan, voxel_map, T_ca.matrix, reach_m, kernel))
+
+    def _settled(self, before: Pose, after: Pose) -> bool:
+        step = after @ before.inverse()  # in {C}, where a rotation of the target does not appear as a translation
+        turn, move = float(geometry.angle(step.q)), float(np.linalg.norm(step.t))
+        small = SETTLED_OF_GATE * self._limits.gate_m
+        return move < small and turn * self._radius_m < small
+
+
+class KissOdometry:
+    """The odometry of KISS-ICP relative to the target instead of the surroundings; it needs no model.
+
+    Adaptive threshold, constant velocity, deskewing and the thinning by voxels are the library's. Lengths are given to
+    it in voxels, so that its defaults (voxel 1, threshold 2, least motion 0.1, range 100) hold for a target of any
+    size: the voxel is a hundredth of the extent. The first motion is that of the centroid, where the library would
+    begin at rest. {C} is parallel to {A} of the first scan, its origin at the centroid of that scan. What does not move
+    with the target must be cropped before.
+    """
+
+    def __init__(self, extent_m: float, deskew: bool = True) -> None:
+        """Begin with an empty map.
+
+        Args:
+            extent_m: largest size of the target [m].
+            deskew: use the instants of the points where they are given.
+        """
+        self._voxel_m, self._deskew = extent_m / VOXELS, deskew
+        self._odometry: Any = None
+        self._centre, self._first, self._count = np.zeros(3), np.zeros(3), 0
+
+    def add(self, points: NDArray[Any], times_s: NDArray[Any] | None = None) -> tuple[Pose, float]:
+        """Register the next scan.
+
+        Args:
+            points: (n, 3) finite, n >= 1, in {A} [m].
+            times_s: (n,) instants of the points [s], or None.
+
+        Returns:
+            T_ac and its instant [s]: that of the last point if the scan was deskewed, otherwise 0.
+        """
+        scan = np.ascontiguousarray(points, dtype=np.float64)
+        middle = scan.mean(axis=0)
+        self._recentre(middle)
+        if self._count == 1:
+            self._odometry.last_delta[:3, 3] = (self._first - middle) / self._voxel_m
+        self._count += 1
+        timed = times_s is not None and self._deskew and float(np.ptp(times_s)) > 0.0
+        instants = np.asarray(times_s, dtype=np.float64) if timed else np.empty(0)
+        self._odometry.register_frame((scan - self._centre) / self._voxel_m, instants)
+        pose = Pose.from_matrix(self._odometry.last_pose)
+        T_ca = Pose(pose.q, self._voxel_m * pose.t - pose.R @ self._centre)
+        return T_ca.inverse(), float(instants.max()) if timed else 0.0
+
+    def _recentre(self, middle: Array) -> None:
+        """Keep the origin of what the library sees near the target, where its range has its usual meaning."""
+        if self._odometry is None:
+            from kiss_icp.config.parser import load_config
+            from kiss_icp.kiss_icp import KissICP
+
+            config: Any = load_config(None)
+            config.data.max_range, config.mapping.voxel_size = VOXELS, 1.0
+            config.data.deskew, config.registration.max_num_threads = self._deskew, 1
+            self._odometry, self._centre = KissICP(config), middle
+            self._first = middle
+        shift = np.eye(4)
+        shift[:3, 3] = (middle - self._centre) / self._voxel_m
+        if float(np.linalg.norm(shift[:3, 3])) > RECENTRE_VOXELS:
+            back = np.linalg.inv(shift)
+            self._odometry.last_pose = self._odometry.last_pose @ shift
+            self._odometry.last_delta = back @ self._odometry.last_delta @ shift
+            self._centre = middle
+
+
+def _thinned_at(scan: Array, T_ca: Pose, voxel_m: float) -> Array:
+    """The points thinned by voxels of {C}, where moving the camera together with the guess changes nothing."""
+    return T_ca.inverse().apply(thinned(T_ca.apply(scan), voxel_m))
+
+
+def thinned(points: Array, voxel_m: float) -> Array:
+    """Return one point of each voxel by the library's rule, the same for any order of the points.
+
+    Args:
+        points: (n, 3) [m].
+        voxel_m: voxel of the map; that of the points is 1.5 times larger.
+    """
+    from kiss_icp.voxelization import voxel_down_sample
+
+    ordered = np.ascontiguousarray(points[np.lexsort(points.T)])
+    return np.asarray(voxel_down_sample(ordered, THINNED * voxel_m))

@@ -9,10 +9,19 @@ from rich.console import Console
 
 from avsreplay.records import BLOCKS
 from avsreplay.report.episodes import Episode
-from avsreplay.report.scan_table import print_sparks, scan_table
 from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Capture, Parameter, Statistics, length_text, times
-from avsreplay.report.table import Table, TableCell, decimals, facts_table, number, print_line, print_table
+from avsreplay.report.table import (
+    Table,
+    TableCell,
+    decimals,
+    facts_table,
+    number,
+    print_line,
+    print_sparks,
+    print_table,
+    scan_table,
+)
 from avsreplay.report.verdict import INSIDE_LEAST, Grade, RunVerdict
 from avsreplay.rows import Row
 

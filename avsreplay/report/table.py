@@ -1,7 +1,7 @@
-"""One table type for terminal, HTML page and Markdown. Cells are text and never interpreted as markup.
+"""One table type for terminal, HTML page and Markdown, and the table of the scans, cut to the width of the console.
 
-This module and ``scan_table`` are the only ones that import rich. States have a sign as well as a colour (Okabe and
-Ito's colours), so that a table can be read without colour.
+Cells are text and never interpreted as markup. States have a sign as well as a colour (Okabe and Ito's colours), so
+that a table can be read without colour.
 """
 
 from __future__ import annotations
@@ -10,12 +10,14 @@ import math
 import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import IO, Literal
+from typing import IO, Any, Literal
 
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
+
+from avsreplay.rows import Column, Row, columns
 
 PLAIN_WIDTH = 80
 _SIGNS = {"good": ("●", "o"), "bad": ("✗", "x"), "warn": ("~", "~"), "faint": ("", "")}
@@ -169,3 +171,175 @@ def decimals(values: Iterable[float], least: int, *, figures: int = 3) -> int:
         return least
     wanted = figures - 1 - math.floor(math.log10(sizes[len(sizes) // 2]))
     return min(max(least, wanted), 8)
+
+
+FEW = 24
+_HEADS = {  # a line end stands where the heading may break
+    "seq": "scan",
+    "t_s": "time",
+    "reason": "state",
+    "fault": "injected fault",
+    "nis": "NIS",
+    "inlier_ratio": "inlier\nratio",
+    "converged": "con-\nverged",
+    "capture_time_s": "planned\ncapture",
+    "ogm_log10_cond": "Gramian\nlog10 cond.",
+    "ogm_rank": "Gramian\nrank",
+    "pos_err_m": "position\nerror",
+    "rot_err_deg": "attitude\nerror",
+}
+_ORDER = (  # which columns are kept first where the width is short
+    *("seq", "t_s", "reason", "fault", "pos_err_m", "rot_err_deg", "rms_m", "nis", "capture_time_s", "iterations"),
+    *("inlier_ratio", "action", "converged", "sigma1", "sigma2", "ogm_rank", "ogm_log10_cond", "status"),
+)
+_TEXT_COLUMNS = ("reason", "fault", "action", "status")
+
+
+def choose_rows(rows: Sequence[Row], *, every: int | None = None, show_all: bool = False) -> tuple[list[Row], str]:
+    """Return the rows to show and a description of the choice.
+
+    With neither flag: every k-th row so that about 24 are left, the last one, and those at which gamma changes.
+    """
+    if show_all or (every is None and len(rows) <= FEW):
+        return list(rows), f"all {len(rows)} scans" if len(rows) != 1 else "1 scan"
+    if every is not None:
+        return list(rows[:: max(every, 1)]), f"every {_ordinal(max(every, 1))} of {len(rows)} scans"
+    step = -(-len(rows) // FEW)
+    turns = {k for k in range(1, len(rows)) if rows[k].gamma != rows[k - 1].gamma}
+    turns = turns if len(turns) <= FEW else set()
+    kept = sorted(set(range(0, len(rows), step)) | {len(rows) - 1} | turns)
+    words = f"every {_ordinal(step)} of {len(rows)} scans" + (" and where gamma changes" if turns else "")
+    return [rows[k] for k in kept], words
+
+
+def _ordinal(n: int) -> str:
+    ending = "th" if n % 100 in (11, 12, 13) else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
+    return f"{n}{ending}"
+
+
+def scan_table(console: Console, rows: Sequence[Row], *, every: int | None = None, show_all: bool = False) -> Table:
+    """The table of the chosen rows; columns that do not fit the console are left out and named in the note."""
+    chosen, words = choose_rows(rows, every=every, show_all=show_all)
+    plain = ascii_only(console)
+    shown = {c.name: c for c in _shown(chosen)}
+    cells = {name: _cells(c, chosen) for name, c in shown.items()}
+    heads = {name: _head(c, chosen) for name, c in shown.items()}
+    widths = {
+        name: max([*(len(c.signed(ascii_only=plain)) for c in cells[name]), *map(len, heads[name].split("\n"))]) + 1
+        for name in cells
+    }
+    fitting = _fit(widths, console.width)
+    left_out = [name for name in cells if name not in fitting]
+    return Table(
+        f"Scans: {words}",
+        tuple(heads[name] for name in fitting),
+        tuple(tuple(cells[name][k] for name in fitting) for k in range(len(chosen))),
+        align="".join("l" if name in _TEXT_COLUMNS else "r" for name in fitting),
+        note=f"not shown at this width: {', '.join(left_out)}" if left_out else "",
+    )
+
+
+def head(column: Column, shown: str = "") -> str:
+    """A heading of whole words with the unit on the last line; ``shown`` is the unit of the printed numbers."""
+    unit = column.unit or ("s" if column.name == "capture_time_s" else "")
+    name = column.name.removesuffix("_" + unit.replace("/", "p")) if unit else column.name
+    name = _HEADS.get(column.name, name.replace("_", " "))
+    return f"{name}\n[{shown or unit}]" if unit else name
+
+
+def _head(column: Column, rows: Sequence[Row]) -> str:
+    said = head(column, _unit(column, rows))
+    fitted = column.name in ("pos_err_m", "rot_err_deg") and rows[0].reference == "fit"
+    return said.replace("error", "from fit") if fitted else said
+
+
+def _shown(rows: Sequence[Row]) -> list[Column]:
+    """Columns of the default table that have a value in these rows; gamma and reason share one."""
+    wanted = [c for c in columns() if c.table and c.name != "gamma"]
+    return [c for c in wanted if any(getattr(row, c.name) is not None for row in rows)]
+
+
+def _unit(column: Column, rows: Sequence[Row]) -> str:
+    """Lengths are printed in millimetres where most are below 1 m."""
+    if column.unit != "m" or not column.fmt.endswith("f"):
+        return column.unit
+    sizes = sorted(abs(v) for row in rows if (v := getattr(row, column.name)) is not None)
+    return "mm" if sizes and sizes[len(sizes) // 2] < 1.0 else "m"
+
+
+def _cells(column: Column, rows: Sequence[Row]) -> list[TableCell]:
+    """The cells of one column."""
+    values: list[Any] = [getattr(row, column.name) for row in rows]
+    if column.name == "reason":
+        return [state_cell(row.gamma, row.reason) for row in rows]
+    fmt = column.fmt
+    if _unit(column, rows) == "mm":
+        values = [None if v is None else 1000.0 * v for v in values]
+        fmt = f".{decimals((v for v in values if v is not None), 1, figures=2)}f"
+    elif column.unit == "m" and fmt.endswith("f"):
+        fmt = f".{decimals((v for v in values if v is not None), int(fmt[1:-1]), figures=2)}f"
+    return [_cell(value, fmt) for value in values]
+
+
+def _cell(value: Any, fmt: str) -> TableCell:
+    if value is None:
+        return TableCell("-", "faint")
+    if isinstance(value, bool):
+        return TableCell("yes" if value else "no")
+    return TableCell(format(value, fmt))
+
+
+def state_cell(gamma: int, reason: str) -> TableCell:
+    """Healthy, coasting because there was no scan, or flagged with the reason."""
+    if gamma == 1:
+        return TableCell("ok", "good")
+    return TableCell(reason, "warn" if reason == "no_scan" else "bad")
+
+
+def _fit(widths: dict[str, int], width: int) -> list[str]:
+    """Column names in row order: as many as fit, chosen in the order of preference."""
+    kept: list[str] = []
+    used = 0
+    for name in dict.fromkeys(n for n in (*_ORDER, *widths) if n in widths):
+        if used + widths[name] <= width:
+            kept.append(name)
+            used += widths[name]
+    return [name for name in widths if name in kept]
+
+
+LEAST_WIDTH = 100
+_BLOCKS = "▁▂▃▄▅▆▇█"
+_LABEL = 32
+
+
+def spark(values: Sequence[float | None], width: int) -> str:
+    """At most ``width`` blocks from 0 to the largest value, each the largest of its part; a blank for none."""
+    parts = [[v for v in values[a:b] if v is not None] for a, b in _parts(len(values), width)]
+    top = max((max(part) for part in parts if part), default=0.0)
+    return "".join(_block(max(part), top) if part else " " for part in parts)
+
+
+def _parts(count: int, width: int) -> list[tuple[int, int]]:
+    cells = min(count, width)
+    return [(count * k // cells, count * (k + 1) // cells) for k in range(cells)]
+
+
+def _block(value: float, top: float) -> str:
+    return _BLOCKS[min(int(value / top * len(_BLOCKS)), len(_BLOCKS) - 1)] if top > 0 else _BLOCKS[0]
+
+
+def print_sparks(console: Console, rows: Sequence[Row]) -> None:
+    """Print pose errors and flagged scans over time; only on a wide terminal with Unicode."""
+    if not console.is_terminal or console.width < LEAST_WIDTH or ascii_only(console):
+        return
+    width = console.width - _LABEL
+    for name, unit, column in (("position error", "mm", "pos_err_m"), ("attitude error", "deg", "rot_err_deg")):
+        found = [getattr(row, column) for row in rows]
+        values = [1000.0 * v if v is not None and unit == "mm" else v for v in found]
+        known = [v for v in values if v is not None]
+        if known:
+            label = f"{name} to {max(known):.3g} {unit}"
+            console.print(Text(f"{label:{_LABEL}}").append(spark(values, width), style="#0072B2"))
+    flags = "".join("✗" if any(row.gamma == 0 for row in rows[a:b]) else "·" for a, b in _parts(len(rows), width))
+    console.print(Text(f"{'flagged':{_LABEL}}").append(flags, style="#D55E00"))
+    console.print()

@@ -29,8 +29,7 @@ from avsreplay.simulate.optics import (
     part_of,
     separated,
 )
-from avsreplay.simulate.rays import Engine, Pattern, RayCaster, ray_grid
-from avsreplay.simulate.scanner_params import ScannerParams
+from avsreplay.simulate.rays import Engine, Pattern, RayCaster, ScannerParams, ray_grid
 from avsreplay.simulate.scene import Appendage, Limb, MovingCamera, Plume, SceneBody, appendage_faces
 
 

@@ -19,7 +19,7 @@ from avsreplay.settings import Settings, setting
 from avsreplay.simulate.faults import LONGEST_S, InjectedFault
 from avsreplay.simulate.motion import MotionParams
 from avsreplay.simulate.optics import Material
-from avsreplay.simulate.scanner_params import Preset, ScannerParams
+from avsreplay.simulate.rays import Preset, ScannerParams
 from avsreplay.simulate.scene import Appendage, CameraParams, Limb, Plume, SceneObject
 from avsreplay.simulate.target import TargetParams
 

@@ -17,7 +17,7 @@ from true_scans import true_scans
 
 from avsreplay import toml_document
 from avsreplay.estimate import Estimator, EstimatorParams
-from avsreplay.monitor.faults import FaultDetector, FaultParams
+from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.records import ScanStatus
 from avsreplay.register import Registrar
 from avsreplay.simulate import builtin_surface, scenario_of, simulate

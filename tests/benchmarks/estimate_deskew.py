@@ -16,7 +16,7 @@ from avsreplay import geometry, toml_document
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.chart import nees
 from avsreplay.estimate.track import deskew, with_scan_duration
-from avsreplay.monitor.faults import FaultDetector, FaultParams
+from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.records import AlignStatus
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.simulate import builtin_surface, scenario_of, simulate

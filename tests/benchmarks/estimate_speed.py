@@ -26,8 +26,8 @@ from avsreplay.estimate.chart import to_chart
 from avsreplay.estimate.dynamics import rotation_history
 from avsreplay.estimate.initialise import weak_prior
 from avsreplay.estimate.params import Constraint, Start
+from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.monitor.convergence import Consistency, ConsistencyParams, Convergence, ConvergenceParams
-from avsreplay.monitor.faults import FaultDetector, FaultParams
 from avsreplay.pipeline import Monitors
 from avsreplay.records import Alignment, Belief, ScanStatus
 

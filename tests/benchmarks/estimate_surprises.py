@@ -26,6 +26,7 @@ from avsreplay.estimate.chart import ARM, ETA, INERTIA, RATE, to_chart, to_error
 from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.geometry import Array, Pose
+from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.monitor.convergence import (
     Consistency,
     ConsistencyParams,
@@ -33,7 +34,6 @@ from avsreplay.monitor.convergence import (
     ConvergenceParams,
     violations,
 )
-from avsreplay.monitor.faults import FaultDetector, FaultParams
 from avsreplay.records import Alignment, AlignStatus, Belief, ScanStatus, State
 
 NEES_S = (40.0, 60.0, 80.0)

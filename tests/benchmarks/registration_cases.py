@@ -13,7 +13,7 @@ import numpy as np
 
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
-from avsreplay.register.horn import best_motion
+from avsreplay.register.peers import best_motion
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 REACH_M = 0.3

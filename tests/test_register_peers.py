@@ -12,7 +12,7 @@ from avsreplay.geometry import Array, Pose, exp
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import boxes, example_pose, view
-from avsreplay.register.kiss import KissBackend, KissOdometry, thinned
+from avsreplay.register.peers import KissBackend, KissOdometry, thinned
 
 TURN = np.array([0.008, 0.02, -0.012])  # rad a scan
 
