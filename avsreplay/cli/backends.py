@@ -37,7 +37,7 @@ differ: libraries that stop by their own rules may take another number of iterat
 
 @click.command("backends", epilog=EPILOG)
 @click.option(
-    "--check", "name", metavar="NAME", help="Test whether this back end keeps the contract; exit code 1 if it does not."
+    "--check", "name", metavar="NAME", help="Run the contract tests on this back end; exit code 1 if one fails."
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def backends_command(name: str | None, as_json: bool) -> None:
@@ -153,7 +153,7 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def bench_command(log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool) -> None:
-    """Time registration back ends side by side on the scans of LOG, in turn.
+    """Measure the time and the error of registration back ends, one after the other on each scan of LOG.
 
     The initial guess is the pose of the previous scan: the true pose if the log has it, otherwise the pose that the
     same back end found. Times can be compared within one run, but not between two runs.

@@ -65,12 +65,12 @@ def _list_metrics(ctx: click.Context, _param: click.Parameter, wanted: bool) -> 
     "-o",
     "--output",
     type=PATH,
-    help="Write an HTML page with the charts of the runs over each other.",
+    help="Write an HTML page with the charts of the runs on common axes.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace an existing page.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @click.option("--markdown", "as_markdown", is_flag=True, help="Print Markdown, for the summary of a CI job.")
-@click.option("--all", "show_all", is_flag=True, help="Print the equal metrics too.")
+@click.option("--all", "show_all", is_flag=True, help="Also print the metrics that are equal.")
 @click.option(
     "--metrics",
     is_flag=True,

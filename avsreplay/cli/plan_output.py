@@ -153,7 +153,7 @@ def _status(made: Plan) -> str:
     words = {
         "optimal": f"optimal{gap}",
         "feasible": f"found; at most {made.gap_s:.2f} s later than the earliest possible capture",
-        "none_found": f"none found{' that the arm can fly' if made.delayed_by == 'arm' else ''}; a capture may exist",
+        "none_found": f"none found{' for this arm' if made.delayed_by == 'arm' else ''}; a capture may exist",
         "infeasible_within_horizon": "proven impossible within the horizon",
     }
     return words.get(made.status.value, made.status.value)

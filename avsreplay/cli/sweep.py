@@ -73,7 +73,7 @@ def sweep_command(
     page: bool,
     as_json: bool,
 ) -> None:
-    """Make the runs of a CAMPAIGN (a TOML file): a grid, cases or random draws over scenarios, logs and settings.
+    """Run a CAMPAIGN (a TOML file): a grid, cases or random draws over scenarios, logs and settings.
 
     Each finished run is saved at once: the same command continues after an interruption. Results are one row per
     run (results.parquet), one row per scan (scans.parquet), summary.json and report.html; they do not depend on the

@@ -87,7 +87,7 @@ class JointPath:
             for name, share in (("range", self.range_share), ("rate", self.rate_share), ("torque", self.torque_share))
             if math.isfinite(share)
         )
-        verdict = "can fly" if self.possible else "cannot fly" if self.complete else "loses the path in"
+        verdict = "can follow" if self.possible else "cannot follow" if self.complete else "loses the path in"
         text = f"{verdict} the last metres ({self.length_m:.2f} m in joints): {used} of the limits"
         return [("arm", f"{text}; condition {self.condition:.0f}")]
 

@@ -174,8 +174,8 @@ class RobotParams(Settings):
     )
     urdf: str | None = setting(
         None,
-        "URDF of a manipulator that carries the end-effector, relative to the file that states it: its joints can fly"
-        " the last metres of every plan, and its reach is the workspace where reach_max_m is not given.",
+        "URDF of a manipulator that carries the end-effector, relative to the file that states it: its joints can"
+        " follow the last metres of every plan, and its reach is the workspace where reach_max_m is not given.",
     )
     urdf_frame: str | None = setting(None, "Frame of the gripper in the URDF.", unset="its last frame")
     delay_s: float | None = setting(
