@@ -17,11 +17,11 @@ from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import boxes, example_pose, plate_scan, view
 from avsreplay.register.covariance import without_dominant_patches
 from avsreplay.register.degenerate import Directions
+from avsreplay.register.params import Camera
 from avsreplay.register.peers import best_motion, horn_matrix
-from avsreplay.register.quality import evidence, grade
+from avsreplay.register.quality import Visibility, evidence, grade, is_outward
 from avsreplay.register.sampling import sample, thin
 from avsreplay.register.surface_index import SurfaceIndex
-from avsreplay.register.visibility import Camera, Visibility, is_outward
 
 RNG_SEED = 11
 

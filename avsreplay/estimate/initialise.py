@@ -19,13 +19,7 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit
-from avsreplay.estimate.batch_covariance import (
-    LATEST,
-    BatchCovariance,
-    covariance_of,
-    final_mixture,
-    sandwich,
-)
+from avsreplay.estimate.batch_covariance import LATEST, BatchCovariance, covariance_of, final_mixture, sandwich
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.error_state import DIM, boxplus, hamilton

@@ -1,15 +1,16 @@
-"""The index of a log: its topics, the places of its cloud and pose messages, and the base class of the log readers."""
+"""The index of a log: its topics, chunks, the places of its messages, and the base class of the log readers."""
 
 from __future__ import annotations
 
+import zlib
 from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from avsreplay.log.bytes_io import BadMessage, ByteFile
+from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate
 from avsreplay.log.cdr import Cursor
-from avsreplay.log.mcap_format import ChunkStore
+from avsreplay.log.mcap_format import ChunkHead
 from avsreplay.log.options import Loss, TopicInfo
 
 MAX_NS = (2**31 - 2) * 1_000_000_000  # a ROS 2 time has 31 bits of seconds; a later one is cut to this
@@ -21,6 +22,8 @@ POSE_NAMES = (
     "geometry_msgs/msg/TransformStamped",
 )
 """Types that hold one stamped pose."""
+_COMPRESSIONS = ("", "zstd", "lz4", "bz2")
+_KEPT = 2  # decompressed chunks held in memory
 _INDEXED = (*CLOUD_TYPES, *POSE_NAMES)
 Sink = Callable[[str, str, int, bytes | memoryview], None]
 """Receives (type, encoding, log time [ns], payload) of each message of a topic, in file order."""
@@ -124,6 +127,48 @@ def _stamp(payload: memoryview, encoding: str) -> int:
         return cursor.stamp()
     except BadMessage:
         return 0
+
+
+class ChunkStore:
+    """The readable chunks of a file by number, in file order; the last two decompressed ones are kept in memory.
+
+    Args:
+        file: the file.
+        limit: largest chunk that is read, compressed or not [bytes].
+    """
+
+    def __init__(self, file: ByteFile, limit: int) -> None:
+        self._file, self._limit = file, limit
+        self._offset, self._packed, self._compression, self._size = (array("q") for _ in range(4))
+        self._cache: dict[int, bytes] = {}
+
+    def __len__(self) -> int:
+        return len(self._offset)
+
+    def check(self, at: int, head: ChunkHead) -> bytes:
+        """Return the decompressed chunk at offset ``at``. Raises BadMessage if it is damaged or over the limit."""
+        if max(head.size, head.data_size) > self._limit:
+            raise BadMessage(f"a chunk of {head.size} bytes is over the limit of {self._limit}")
+        data = inflate(self._file.read(at + head.data_at, head.data_size), head.compression, head.size)
+        if head.crc and zlib.crc32(data) != head.crc:
+            raise BadMessage("the checksum of a chunk is wrong")
+        return data
+
+    def add(self, at: int, head: ChunkHead) -> int:
+        """Add a checked chunk and return its number."""
+        values = (at + head.data_at, head.data_size, _COMPRESSIONS.index(head.compression), head.size)
+        for column, value in zip((self._offset, self._packed, self._compression, self._size), values, strict=True):
+            column.append(value)
+        return len(self._offset) - 1
+
+    def __getitem__(self, number: int) -> bytes:
+        """Return the decompressed chunk. Raises BadMessage if the file has changed since it was indexed."""
+        if number not in self._cache:
+            if len(self._cache) >= _KEPT:
+                self._cache.pop(next(iter(self._cache)))
+            packed = self._file.read(self._offset[number], self._packed[number])
+            self._cache[number] = inflate(packed, _COMPRESSIONS[self._compression[number]], self._size[number])
+        return self._cache[number]
 
 
 class Recording:

@@ -17,8 +17,8 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.log import mcap_format as mcap
 from avsreplay.log.bytes_io import BadMessage, ByteFile, shown
 from avsreplay.log.header import MODEL_ENDINGS
-from avsreplay.log.index import MAX_NS, Recording, Sink
-from avsreplay.log.mcap_format import Channel, ChunkStore, Fields, RecordSink, SummarySection, read_summary
+from avsreplay.log.index import MAX_NS, ChunkStore, Recording, Sink
+from avsreplay.log.mcap_format import Channel, Fields, RecordSink, SummarySection, read_summary
 from avsreplay.log.mcap_salvage import ChannelTable, begins_record, first_chunk, hides_chunk, next_record
 from avsreplay.log.options import Loss
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate
+from avsreplay.log.bytes_io import BadMessage, ByteFile
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
@@ -153,52 +152,6 @@ class RecordSink(Protocol):
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """Receive a metadata record."""
-
-
-_COMPRESSIONS = ("", "zstd", "lz4", "bz2")
-_KEPT = 2  # decompressed chunks held in memory
-
-
-class ChunkStore:
-    """The readable chunks of a file by number, in file order; the last two decompressed ones are kept in memory.
-
-    Args:
-        file: the file.
-        limit: largest chunk that is read, compressed or not [bytes].
-    """
-
-    def __init__(self, file: ByteFile, limit: int) -> None:
-        self._file, self._limit = file, limit
-        self._offset, self._packed, self._compression, self._size = (array("q") for _ in range(4))
-        self._cache: dict[int, bytes] = {}
-
-    def __len__(self) -> int:
-        return len(self._offset)
-
-    def check(self, at: int, head: ChunkHead) -> bytes:
-        """Return the decompressed chunk at offset ``at``. Raises BadMessage if it is damaged or over the limit."""
-        if max(head.size, head.data_size) > self._limit:
-            raise BadMessage(f"a chunk of {head.size} bytes is over the limit of {self._limit}")
-        data = inflate(self._file.read(at + head.data_at, head.data_size), head.compression, head.size)
-        if head.crc and zlib.crc32(data) != head.crc:
-            raise BadMessage("the checksum of a chunk is wrong")
-        return data
-
-    def add(self, at: int, head: ChunkHead) -> int:
-        """Add a checked chunk and return its number."""
-        values = (at + head.data_at, head.data_size, _COMPRESSIONS.index(head.compression), head.size)
-        for column, value in zip((self._offset, self._packed, self._compression, self._size), values, strict=True):
-            column.append(value)
-        return len(self._offset) - 1
-
-    def __getitem__(self, number: int) -> bytes:
-        """Return the decompressed chunk. Raises BadMessage if the file has changed since it was indexed."""
-        if number not in self._cache:
-            if len(self._cache) >= _KEPT:
-                self._cache.pop(next(iter(self._cache)))
-            packed = self._file.read(self._offset[number], self._packed[number])
-            self._cache[number] = inflate(packed, _COMPRESSIONS[self._compression[number]], self._size[number])
-        return self._cache[number]
 
 
 TAIL = 37  # footer record (29 bytes) and closing magic

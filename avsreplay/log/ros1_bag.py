@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from avsreplay.log.bytes_io import BadMessage, ByteFile
-from avsreplay.log.index import Recording, Sink, canonical_type
-from avsreplay.log.mcap_format import ChunkHead, ChunkStore, Fields
+from avsreplay.log.index import ChunkStore, Recording, Sink, canonical_type
+from avsreplay.log.mcap_format import ChunkHead, Fields
 from avsreplay.log.options import Loss
 
 ROS1_MAGIC = b"#ROSBAG V2.0\n"

@@ -9,15 +9,7 @@ from avsreplay.plan.limits import CONSTRAINTS, Scene, TargetGeometry, hull_verti
 from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits, RobotParams
-from avsreplay.plan.supervisor import (
-    RULES,
-    Action,
-    Decision,
-    Facts,
-    Supervisor,
-    SupervisorMemory,
-    SupervisorParams,
-)
+from avsreplay.plan.supervisor import RULES, Action, Decision, Facts, Supervisor, SupervisorMemory, SupervisorParams
 from avsreplay.plan.uncertainty import Disturbance, Future, Spread, draws, spread
 
 __all__ = [

@@ -25,7 +25,7 @@ from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 if TYPE_CHECKING:
     from avsreplay.register.params import RegistrationLimits
-    from avsreplay.register.visibility import Visibility
+    from avsreplay.register.quality import Visibility
 
 MESSAGE_LENGTH = 200  # an error message is cut to this number of characters
 GROUP = "avsreplay.backends"

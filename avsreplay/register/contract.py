@@ -16,11 +16,10 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.backend import load_backend
-from avsreplay.register.params import RegisterParams
+from avsreplay.register.params import Camera, RegisterParams
 from avsreplay.register.quality import ACCURACY
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import sample
-from avsreplay.register.visibility import Camera
 
 POINTS = 3000
 SAME_RAD, SAME_OF_EXTENT = np.radians(0.01), 5e-5  # equal except for rounding and the stopping rule

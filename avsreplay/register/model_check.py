@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
+from avsreplay.register.quality import is_outward
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import without_scattered_points
 from avsreplay.register.size import LEAST_ERROR, SIGMAS, fitted_size, noise_bias
-from avsreplay.register.visibility import is_outward
 
 POINTS = 1500  # points used of each scan
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8

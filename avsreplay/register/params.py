@@ -3,9 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from enum import Enum
 
-from avsreplay.register.visibility import Camera
 from avsreplay.settings import Settings, given, setting
+
+
+class Camera(Enum):
+    """Where the scans were taken from."""
+
+    AUTO = "auto"  # origin of {A}, if the mesh has outward faces and the origin is well outside the model
+    ORIGIN = "origin"  # origin of {A}
+    NONE = "none"  # unknown: both sides of a face are matched
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,10 +29,9 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register.quality import not_measured
+from avsreplay.register.quality import Visibility, not_measured
 from avsreplay.register.sampling import sample
 from avsreplay.register.surface_index import SurfaceIndex
-from avsreplay.register.visibility import Visibility
 
 SURFACE_POINTS = 1500
 LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance|

@@ -19,10 +19,10 @@ from avsreplay.register.degenerate import turn_words
 from avsreplay.register.global_search import GlobalSearch, SearchResult
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
+from avsreplay.register.quality import Visibility
 from avsreplay.register.restarts import HEALTHY_SCANS, SCATTER_WORK, TEST_WORK, VALLEY_WORK, Budget, Restart, Restarter
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
-from avsreplay.register.visibility import Visibility
 
 LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in units of the gate) a fit is close
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search

@@ -19,18 +19,7 @@ from markupsafe import Markup
 
 from avsreplay.geometry import Array
 from avsreplay.records import State, Surface
-from avsreplay.report.charts import (
-    Chart,
-    Columns,
-    charts,
-    derived,
-    embed,
-    flight_charts,
-    most_telling,
-    pack,
-    spans,
-    values,
-)
+from avsreplay.report import charts
 from avsreplay.report.conclusion import ComparedRun, Conclusion, changes_table, settings_table
 from avsreplay.report.export import StampedPose
 from avsreplay.report.gate import RuleOutcome, gate_table
@@ -105,7 +94,7 @@ def build_html(
     listed, first = _listed(parts), _listed(lead)
     style = Markup(_asset("uPlot.min.css") if data else "") + render("page.css")
     script = Markup("\n".join(map(_asset, _SCRIPTS))) if data else ""
-    embedded = Markup(embed(data)) if data else ""
+    embedded = Markup(charts.embed(data)) if data else ""
     return str(
         render(
             "page.html", title=title, lines=lines, lead=first, parts=listed, style=style, script=script, data=embedded
@@ -150,14 +139,14 @@ def build_page(
         The page as text.
     """
     verdict = verdict_of(rows, summary, header)
-    kept = most_telling(rows, MOST_ROWS, (moment.row for moment in verdict.moments))
+    kept = charts.most_telling(rows, MOST_ROWS, (moment.row for moment in verdict.moments))
     place, all_rows, rows = {k: n for n, k in enumerate(kept)}, rows, [rows[k] for k in kept]
-    columns = derived(rows)
+    columns = charts.derived(rows)
     t1 = summary.convergence.t1_s
     data = {
-        "runs": [{"name": title, "t": pack(values(rows, "t_s"), "f8"), "columns": _packed(columns)}],
-        "charts": charts(columns, truth, (header or {}).get("limits")),
-        "spans": spans(rows, summary.faults.episodes),
+        "runs": [{"name": title, "t": charts.pack(charts.values(rows, "t_s"), "f8"), "columns": _packed(columns)}],
+        "charts": charts.charts(columns, truth, (header or {}).get("limits")),
+        "spans": charts.spans(rows, summary.faults.episodes),
         "marks": [] if t1 is None else [{"t": t1, "label": "t_1"}],
         "states": [[row.gamma, row.reason, row.fault or ""] for row in rows],
         "scans": [row.seq for row in rows],
@@ -176,8 +165,8 @@ def build_page(
     return build_html(title, lines, parts, data, lead)
 
 
-def _packed(columns: Columns) -> dict[str, Any]:
-    return {name: pack(column, "f4") for name, column in columns.items()}
+def _packed(columns: charts.Columns) -> dict[str, Any]:
+    return {name: charts.pack(column, "f4") for name, column in columns.items()}
 
 
 def build_comparison(
@@ -193,14 +182,14 @@ def build_comparison(
     Returns:
         The page as text.
     """
-    columns = [derived(run.rows) for run in runs]
+    columns = [charts.derived(run.rows) for run in runs]
     data = {
         "runs": [
-            {"name": run.name, "t": pack(values(run.rows, "t_s"), "f8"), "columns": _packed(own)}
+            {"name": run.name, "t": charts.pack(charts.values(run.rows, "t_s"), "f8"), "columns": _packed(own)}
             for run, own in zip(runs, columns, strict=True)
         ],
         "charts": _overlaid(runs, columns),
-        "spans": spans(runs[0].rows),
+        "spans": charts.spans(runs[0].rows),
         "marks": [],
         "states": None,
         "scene": None,
@@ -221,11 +210,11 @@ def _gate_sentence(outcomes: Sequence[RuleOutcome]) -> str:
     return f" {broken} of {len(outcomes)} rules broken." if broken else f" All {len(outcomes)} rules hold."
 
 
-def _overlaid(runs: Sequence[ComparedRun], columns: Sequence[Columns]) -> list[Chart]:
+def _overlaid(runs: Sequence[ComparedRun], columns: Sequence[charts.Columns]) -> list[charts.Chart]:
     """One chart for each line of the single-run charts, with a line per run."""
-    everything: Columns = {name: column for own in reversed(columns) for name, column in own.items()}
+    everything: charts.Columns = {name: column for own in reversed(columns) for name, column in own.items()}
     out = []
-    for chart in charts(everything):
+    for chart in charts.charts(everything):
         for line in chart["series"]:
             series = [
                 {**line, "run": k, "label": run.name, "colour": k, "dash": k % 2 == 1}
@@ -273,8 +262,8 @@ def build_flight_page(title: str, lines: Sequence[str], flight: Flight, facts: I
     """
     columns = {name: np.asarray(values, dtype=np.float64) for name, values in flight.figures.items()}
     data = {
-        "runs": [{"name": title, "t": pack(flight.t_s, "f8"), "columns": _packed(columns)}],
-        "charts": flight_charts(columns),
+        "runs": [{"name": title, "t": charts.pack(flight.t_s, "f8"), "columns": _packed(columns)}],
+        "charts": charts.flight_charts(columns),
         "spans": [],
         "marks": [],
         "states": None,
@@ -293,12 +282,12 @@ def _scene(flight: Flight) -> dict[str, Any]:
     cones = [cone_lines(flight.axis_c, *cone, flight.mouth_m) for cone in flight.cones]
     nearest = min((length for _, length in flight.cones), default=0.5)
     return scene([], {}, view) | {
-        "estimate": pack(still, "f4"),
-        "truth": pack(np.full_like(still, np.nan), "f4"),
-        "paths": [{"t_s": 0.0, "points": pack(flight.position_c, "f4"), "miss_m": None}],
+        "estimate": charts.pack(still, "f4"),
+        "truth": charts.pack(np.full_like(still, np.nan), "f4"),
+        "paths": [{"t_s": 0.0, "points": charts.pack(flight.position_c, "f4"), "miss_m": None}],
         "flight": {
             "axis": flight.axis_c.tolist(),
-            "cones": pack(np.concatenate([np.zeros((0, 3)), *cones]), "f4"),
+            "cones": charts.pack(np.concatenate([np.zeros((0, 3)), *cones]), "f4"),
             "near_m": nearest,
         },
     }
