@@ -297,6 +297,21 @@ def test_a_rate_that_is_not_finite_or_too_large_is_refused(bad: float) -> None:
         rotation_history(x, np.array([0.0, 1.0, bad]))
 
 
+@pytest.mark.parametrize("ratio", [1.0001, -1e4, np.nan, np.inf])
+def test_an_inertia_ratio_that_no_body_has_is_refused(ratio: float) -> None:
+    """Beyond -1 to 1 the principal moments break the triangle inequality, and the rate grows without bound."""
+    x, _ = some_state(1)
+    sigma = np.array([0.1, ratio])
+    impossible = replace(x, sigma=sigma)
+    for call in (
+        lambda: dynamics.flow(x.w_b, sigma, 0.1),
+        lambda: rotation_path(impossible).at(np.array([0.1])),
+        lambda: rotation_history(impossible, np.array([0.1])),
+    ):
+        with pytest.raises(ValueError, match="an inertia ratio must be between -1 and 1"):
+            call()
+
+
 def test_a_forecast_of_a_rate_that_is_too_large_is_infinite() -> None:
     x = replace(some_state(1)[0], w_b=np.array([1e6, 0.0, 1.0]))
     seen = dynamics.grasp_forecast(Belief(0, x, np.eye(20)), np.array([1.0, 30.0]), 1e-4, 1e-4)

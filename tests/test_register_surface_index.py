@@ -224,8 +224,8 @@ def test_an_invalid_surface_is_refused(what: str) -> None:
         SurfaceIndex.build(BAD[what], 0.5)
 
 
-@pytest.mark.parametrize("reach", [0.0, -1.0, np.nan, np.inf])
-def test_a_reach_must_be_positive(reach: float) -> None:
+@pytest.mark.parametrize("reach", [0.0, -1.0, np.nan, np.inf, 1e9])
+def test_a_reach_must_be_positive_and_not_exceed_the_model_by_far(reach: float) -> None:
     with pytest.raises(UsageError, match="reach"):
         SurfaceIndex.build(shape(), reach)
 

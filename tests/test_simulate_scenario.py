@@ -240,6 +240,14 @@ def test_offsets_that_are_given_are_used_as_they_are():
     assert_allclose(np.degrees(geometry.log(turn)), [0, 2.0, 0], atol=1e-9)
 
 
+def test_an_offset_to_an_impossible_inertia_is_one_line():
+    truth = simulate(scenario(), SURFACE).header.truth
+    given = StartParams(sigma_offset=(1.5, 0.0))
+    with pytest.raises(UsageError, match="inertia ratios are") as error:
+        belief(given, truth, 0, np.random.Generator(np.random.PCG64(0)))
+    assert error.value.where == "start.sigma_offset"
+
+
 def test_without_a_start_table_there_is_no_first_belief():
     assert simulate(scenario(), SURFACE).header.start is None
     assert simulate(scenario("[start]\n"), SURFACE).header.start is not None

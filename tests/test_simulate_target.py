@@ -94,6 +94,18 @@ def test_an_open_mesh_is_a_thin_shell():
     assert_allclose(found.inertia_c[0, 0], (4 * (1 / 4 + 1 / 12) + 1 / 6) / 5, rtol=1e-12)
 
 
+def test_a_body_without_thickness_is_refused():
+    corners = np.array([[-1.0, -0.5, 0.0], [1.0, -0.5, 0.0], [1.0, 0.5, 0.0], [-1.0, 0.5, 0.0]])
+    plate = Surface(corners, np.array([[0, 1, 2], [0, 2, 3]], np.int32), "plate.obj", "")
+    with pytest.raises(UsageError, match="no thickness") as error:
+        body(TargetParams(), plate)
+    assert "moments_m2" in error.value.hint
+    given = TargetParams(moments_m2=(0.1, 0.3, 0.39), axes_xyzw=(0.0, 0.0, 0.0, 1.0))
+    assert np.abs(body(given, plate).sigma).max() < 1.0
+    thin = box((-1.0, -0.5, -1e-3), (1.0, 0.5, 1e-3))
+    assert 0.99 < np.abs(body(TargetParams(), surface_of(thin)).sigma).max() < 1.0
+
+
 def test_mass_properties_agree_with_trimesh_for_every_shape():
     for shape in Shape:
         surface = builtin_surface(shape)

@@ -82,7 +82,7 @@ def flow(w: Array, sigma: Array, h: float, torque: float = 0.0) -> Flow:
     """Rotation over h seconds (either sign) from rate ``w`` (3,); ``torque``: root density of eps_tau [rad/s^1.5].
 
     Raises:
-        ValueError: a rate or time that is not finite, or a step of more than a million radians.
+        ValueError: an inertia ratio beyond -1 to 1, a rate or time that is not finite, or more than a million radians.
     """
     return flows(w, sigma, np.array((h,)), torque)[0]
 

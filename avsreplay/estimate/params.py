@@ -157,7 +157,9 @@ class EstimatorParams(Settings):
     start_vel_1s_mps: float | None = setting(
         None, "1 sigma of the unknown velocity along each axis.", unit="m/s", above=0.0, of_extent=0.05
     )
-    start_sigma_1s: float = setting(0.5, "With start paper: 1 sigma of each unknown inertia ratio.", above=0.0)
+    start_sigma_1s: float = setting(
+        0.5, "With start paper: 1 sigma of each unknown inertia ratio.", above=0.0, high=1.0
+    )
     start_log_inertia_1s: float = setting(
         1.0,
         "With start cold: 1 sigma of each of the five components of the logarithm of the mass moments.",

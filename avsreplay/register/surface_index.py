@@ -31,7 +31,7 @@ from avsreplay.records import Surface
 from avsreplay.register import index_cache
 from avsreplay.settings import Settings, setting
 
-LARGEST_M = 1e9  # largest coordinate [m]
+LARGEST_M, LARGEST_REACH = 1e9, 1e5  # largest coordinate [m], and largest reach in units of the model's extent
 MOST_PRIMITIVES = 50_000_000
 
 
@@ -320,11 +320,11 @@ def _rigid(T_ca: ArrayLike | Pose) -> Array:
 def _checked(surface: Surface, reach_m: float) -> tuple[Array, NDArray[np.int32]]:
     vertices = np.ascontiguousarray(surface.vertices, dtype=np.float64)
     faces = np.ascontiguousarray(surface.faces, dtype=np.int32).reshape(-1, 3)
-    if not (np.isfinite(reach_m) and reach_m > 0.0):
-        raise UsageError(f"reach must be positive, got {reach_m}", where=surface.name, hint="give a distance in metres")
     if not len(vertices) or not np.isfinite(vertices).all():
         what = "has a coordinate that is not finite" if len(vertices) else "has no point"
         raise UsageError(f"the model {what}", where=surface.name, hint="repair the model")
+    if not (most := LARGEST_REACH * (surface.extent or 1.0)) >= reach_m > 0.0:
+        raise UsageError(f"reach is {reach_m:g} m, must be above 0 and at most {most:g} m", where="register.reach_m")
     _check_size(surface, vertices, faces)
     if len(faces) and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise UsageError("a face refers to a missing vertex", where=surface.name, hint="repair the model")

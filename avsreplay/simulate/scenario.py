@@ -37,8 +37,10 @@ class StartParams(Settings):
 
     rate_std_radps: float = setting(0.005, "1 sigma of the angular rate in {B}.", unit="rad/s", above=0.0)
     rate_offset_radps: Triple | None = setting(None, "Error of the angular rate.", unit="rad/s", unset=DRAWN)
-    sigma_std: float = setting(0.05, "1 sigma of sigma_1 and sigma_2.", above=0.0)
-    sigma_offset: tuple[float, float] | None = setting(None, "Error of sigma_1 and sigma_2.", unset=DRAWN)
+    sigma_std: float = setting(0.05, "1 sigma of sigma_1 and sigma_2.", above=0.0, high=1.0)
+    sigma_offset: tuple[float, float] | None = setting(
+        None, "Error of sigma_1 and sigma_2; the believed ratios must be between -1 and 1.", unset=DRAWN
+    )
     varrho_std_m: float = setting(0.05, "1 sigma of the fixture's position in {B}.", unit="m", above=0.0)
     varrho_offset_m: Triple | None = setting(None, "Error of the fixture's position.", unit="m", unset=DRAWN)
     mu_std_deg: float = setting(1.0, "1 sigma of mu, as a rotation about the axes of {B}.", unit="deg", above=0.0)
@@ -172,6 +174,9 @@ def belief(start: StartParams, truth: State, t_ns: int, rng: np.random.Generator
     """The initial belief: the true state plus offsets, given or drawn, and the covariance of the 20 error states."""
     rate = _offset(start.rate_offset_radps, start.rate_std_radps, 3, rng)
     sigma = _offset(start.sigma_offset, start.sigma_std, 2, rng)
+    if start.sigma_offset is not None and np.abs(truth.sigma + sigma).max() >= 1.0:
+        what = f"with it the believed inertia ratios are {[round(float(s), 4) for s in truth.sigma + sigma]}"
+        raise UsageError(what, where="start.sigma_offset", hint="they must be between -1 and 1, as those of any body")
     varrho = _offset(start.varrho_offset_m, start.varrho_std_m, 3, rng)
     mu = np.radians(_offset(start.mu_offset_deg, start.mu_std_deg, 3, rng))
     position = _offset(start.position_offset_m, start.position_std_m, 3, rng)

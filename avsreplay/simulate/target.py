@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import UsageError
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, is_unit, setting
@@ -32,6 +33,7 @@ class Shape(Enum):
 
 
 FROM_MESH = "from the mesh, of uniform density"
+LEAST_THICKNESS = 1e-9  # how far an inertia ratio is from -1 and 1, which no body reaches
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +86,18 @@ def body(params: TargetParams, surface: Surface) -> Body:
     """Mass properties of the target: those of the scenario where given, else those of the mesh.
 
     Raises:
-        UsageError: They are needed from a mesh that has none (see ``body_of``).
+        UsageError: They are needed from a mesh that has none (see ``body_of``), or the body has no thickness.
     """
+    found = _stated_or_computed(params, surface)
+    if np.abs(found.sigma).max() > 1.0 - LEAST_THICKNESS:
+        moments = ", ".join(f"{m:.4g}" for m in found.moments)
+        what = f"the body has no thickness: of its principal moments {moments} m2 one is the sum of the others"
+        hint = "give the model a thickness, or moments_m2 and axes_xyzw under [target]"
+        raise UsageError(what, where=surface.name, hint=hint)
+    return found
+
+
+def _stated_or_computed(params: TargetParams, surface: Surface) -> Body:
     given = params.moments_m2 is not None and params.axes_xyzw is not None
     if given and params.mass_centre_m is not None:
         return with_axes(params.moments_m2 or (), params.axes_xyzw or (), params.mass_centre_m)

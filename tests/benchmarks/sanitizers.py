@@ -157,9 +157,12 @@ def from_motion(rng: np.random.Generator) -> str:
     """Extreme states and covariances for the motion kernel."""
     from avsreplay.estimate import _motion
 
-    sigma, push = tuple(numbers(rng, 3)), tuple(numbers(rng, 3))
+    sigma, push = numbers(rng, 3), tuple(numbers(rng, 3))
     times = np.sort(np.abs(numbers(rng, 5)) % 10.0)  # a million radians, the limit, take minutes
     state = [numbers(rng, k) for k in (4, 3, 3, 3, 2, 3, 4)]
+    if rng.random() < 0.9:  # others are refused
+        sigma, state[4] = np.clip(sigma, -1.0, 1.0), np.clip(state[4], -1.0, 1.0)
+    sigma = tuple(sigma)
     P = numbers(rng, 20, 20)
     done = _tried(lambda: _motion.follow(state[0], state[1], sigma, push, times))
     done |= _tried(lambda: _motion.Path(state[0], state[1], sigma).at(times))

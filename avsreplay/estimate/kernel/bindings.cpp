@@ -3,7 +3,9 @@
 #include <nanobind/ndarray.h>
 #include <nanobind/stl/array.h>
 
+#include <cmath>
 #include <cstring>
+#include <stdexcept>
 
 #include "fit.hpp"
 
@@ -36,7 +38,14 @@ Turn turn(const Vector<4>& q, const Vector<3>& w) {
   return at;
 }
 
+// Principal moments satisfy the triangle inequality only with ratios from -1 to 1. Beyond them the rate grows without bound.
+void check_ratios(const double* sigma, int count) {
+  for (int k = 0; k < count; ++k)
+    if (!(std::fabs(sigma[k]) <= 1 + 1e-9)) throw std::invalid_argument("an inertia ratio must be between -1 and 1");
+}
+
 Body body(const Three& sigma, const Three& push) {
+  check_ratios(sigma.data(), 3);
   return {{sigma[0], sigma[1], sigma[2]}, {push[0], push[1], push[2]}, 1e-12};
 }
 
@@ -107,6 +116,7 @@ State state_from(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, 
   State x;
   put<4>(q_ab, x.q_ab), put<3>(w, x.w_b), put<3>(r, x.r_a), put<3>(v, x.v_a);
   put<2>(sigma, x.sigma), put<3>(c, x.c_b), put<4>(q_bc, x.q_bc);
+  check_ratios(x.sigma, 2);
   return x;
 }
 
