@@ -79,6 +79,7 @@ class Monitors:
         innovation: Innovation | None,
         gamma: int,
         track: Track,
+        belief: Belief,
     ) -> tuple[MonitorState, MonitorReport]:
         """Process one scan.
 
@@ -89,6 +90,7 @@ class Monitors:
             innovation: of the measurement; None where nothing was measured.
             gamma: 1 if the fault detector accepts the measurement, else 0.
             track: estimate after the scan.
+            belief: what is published of it.
         """
         gramian = self._gramian(state.gramian, estimator, prior, innovation if gamma else None, track)
         rank = monitor.measure(gramian)
@@ -97,7 +99,7 @@ class Monitors:
         failed = self._violations(estimator, prior, innovation if gamma else None, track)
         consistent = window.consistent and not (track.window.many_outliers or track.doubtful or failed)
         forecast = estimator.track_forecast(track, self.convergence.params.times_s)
-        judged = self.convergence.judge(state.convergence, estimator.published(track), forecast, consistent is True)
+        judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True)
         report = MonitorReport(
             ogm_rank=rank.rank,
             ogm_log10_cond=rank.log10_cond,
@@ -196,10 +198,10 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         measurement = _acquire(stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired")
         prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
     track, verdict = stages.estimator.step(track, prior, innovation, verdict, state.monitors.convergence.converged)
-    gamma = verdict.gamma
-    monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, innovation, gamma, track)
+    gamma, belief = verdict.gamma, stages.estimator.published(track)
+    seen = innovation, gamma, track, belief
+    monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
     forecast = partial(stages.estimator.track_forecast, track)
-    belief = stages.estimator.published(track)
     known = planner_input(stages.estimator, belief, stages.target, gamma, report.converged, forecast)
     guidance = stages.guidance.step(state.guidance or stages.guidance.initial(scan.t_ns), known)
     outcome = Outcome(
@@ -224,10 +226,9 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
         supervisor_rule=guidance.decision.rule,
         plan=guidance.plan,
     )
-    last_pose = measurement.alignment.T_ac if gamma else state.last_pose
-    failed = state.failed + (measurement.alignment.points > 0) if last_pose is None else 0
-    state = replace(state, monitors=monitors, guidance=guidance, track=track, last_pose=last_pose, failed=failed)
-    return state, outcome
+    pose = measurement.alignment.T_ac if gamma else state.last_pose
+    failed = state.failed + (measurement.alignment.points > 0) if pose is None else 0
+    return replace(state, monitors=monitors, guidance=guidance, track=track, last_pose=pose, failed=failed), outcome
 
 
 def fold(stages: Stages, state: PipelineState, scans: Iterable[Scan]) -> Iterator[tuple[PipelineState, Outcome]]:

@@ -101,9 +101,12 @@ def test_patches_are_left_out_until_none_determines_a_motion_alone() -> None:
 
 def test_a_motion_known_no_better_than_the_targets_size_is_loose() -> None:
     P = np.diag([1e-8, 1e-8, 4.0, 1e-8, 1e12, 1e-8])
-    assert unbounded_directions(P, 3.0) == ("turns about z", "slides along y")
-    assert unbounded_directions(P, 3e6) == ("turns about z",)
-    assert unbounded_directions(np.eye(6) * 1e-6, 3.0) == ()
+    words, motions = unbounded_directions(P, 3.0)
+    assert words == ("turns about z", "slides along y")
+    assert np.abs(motions[[2, 4]]).max(axis=1) == pytest.approx([1.0, 3.0])
+    assert np.count_nonzero(np.abs(motions) > 1e-9) == 2
+    assert unbounded_directions(P, 3e6)[0] == ("turns about z",)
+    assert unbounded_directions(np.eye(6) * 1e-6, 3.0)[0] == ()
 
 
 def _ellipsoid(rng: np.random.Generator, count: int = 6000) -> tuple[np.ndarray, np.ndarray]:

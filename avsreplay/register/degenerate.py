@@ -114,14 +114,23 @@ def scaled_information(total: Array, count: int, centre: Array) -> tuple[Array, 
     return scale[:, None] * mean * scale, radius
 
 
-def unbounded_directions(P: Array, extent_m: float) -> tuple[str, ...]:
-    """Name every motion whose standard deviation by P (6, 6) is at least the extent (rotations: 1 rad)."""
-    scale = np.repeat([1.0, 1.0 / extent_m], 3)
-    scaled = P * np.outer(scale, scale)
+def unbounded_directions(P: Array, extent_m: float) -> tuple[tuple[str, ...], Array]:
+    """Return every motion whose standard deviation by P (6, 6) is at least the extent (rotations: 1 rad).
+
+    Args:
+        P: covariance of d = [theta; v] in {C} [rad, m].
+        extent_m: the target's bounding diagonal [m].
+
+    Returns:
+        Their names, and the motions as columns d (6, k), of length 1 in units of 1 rad and of the extent.
+    """
+    scale = np.repeat([1.0, extent_m], 3)
+    scaled = P / np.outer(scale, scale)
     if np.trace(scaled) < 1.0:  # the largest eigenvalue is not larger
-        return ()
+        return (), np.zeros((6, 0))
     values, vectors = np.linalg.eigh(scaled)
-    return tuple(_words(row) for row in _sparse_basis(vectors[:, values >= 1.0].T))
+    free = vectors[:, values >= 1.0]
+    return tuple(_words(row) for row in _sparse_basis(free.T)), scale[:, None] * free
 
 
 def turn_words(step: Pose) -> str:

@@ -225,16 +225,19 @@ def grade(
         return replace(failed, message="returned its guess unchanged; the scan asks for another pose")
     info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca
     weakest: tuple[str, ...] = ()
-    view: Directions | None = None
+    free: Array | None = None
     if found.observable:
-        P, weakest = found.covariance, () if found.bounded else unbounded_directions(found.covariance, index.extent_m)
+        P = found.covariance
+        if not found.bounded:
+            weakest, free = unbounded_directions(P, index.extent_m)
         if weakest:
             info, P = pseudo_inverse(found.covariance), None
     elif found.overlap:
         sums = evidence(index, visibility, points, T_ca, limits.gate_m, params.noise_m, fit.matches)
         used = without_dominant_patches(sums)
         view = _directions(used)
-        info, weakest = _observable_information(view, used, index.extent_m, systematic), view.words
+        info = _observable_information(view, used, index.extent_m, systematic)
+        weakest, free = view.words, view.motions
         if guess is not None and fit.converged:
             kept = view.nearest(T_ca, guess)  # passes over a curved surface drift along the unobservable directions
             moved = evidence(index, visibility, points, kept, limits.gate_m)
@@ -259,7 +262,7 @@ def grade(
         split_nis=None if np.isnan(found.split_nis) else found.split_nis,
         message=_message(settled, size),
         dof=np.inf if P is None else found.dof,
-        free=None if view is None else view.motions,
+        free=free if weakest else None,
     )
 
 

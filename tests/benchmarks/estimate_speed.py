@@ -130,7 +130,9 @@ def run_ms(world: tumbling.World) -> np.ndarray:
         verdict = detector.judge(ScanStatus.OK, alignment, innovation, prediction.belief)
         track, verdict = estimator.step(track, prediction, innovation, verdict, state.convergence.converged)
         middle = time.process_time()
-        state, _ = monitors.observe(state, estimator, prediction, innovation, verdict.gamma, track)
+        state, _ = monitors.observe(
+            state, estimator, prediction, innovation, verdict.gamma, track, estimator.published(track)
+        )
         spent.append((1e3 * (middle - begun), 1e3 * (time.process_time() - middle)))
     return np.array(spent)
 
