@@ -83,17 +83,20 @@ def preflight(source: Source, surface: Surface | None, registrar: Registrar | No
     if source.options.poses:
         return [*_poses(source, surface), *_transforms(info, source), *_truth(info), *_clock(info)]
     clouds = _sampled_clouds(source)
-    found = [
-        *_sizes(clouds, surface, registrar, source.options),
-        *_transforms(info, source),
-        *_truth(info),
-        *_clock(info),
-    ]
+    found = [*_sizes(clouds, surface, registrar, source.options), *_faces(surface)]
+    found += [*_transforms(info, source), *_truth(info), *_clock(info)]
     share = None if registrar is None else _share_on_model(source, registrar)
     if share is not None:
         text = f"{100 * share:.0f} % of the points of the first scan are on the model at the first pose"
         found.insert(1, Advice("ok" if share >= 0.5 else "check", "points on the model", text))
     return found
+
+
+def _faces(surface: Surface | None) -> list[Advice]:
+    if surface is None or not surface.reversed:
+        return []
+    text = f"{surface.reversed} of {len(surface.faces)} faces pointed inwards and are used reversed"
+    return [Advice("ok", "faces", text)]
 
 
 def _sampled_clouds(source: Source) -> list[NDArray[Any]]:

@@ -76,8 +76,8 @@ class Surface:
     """A target model in {C}: a triangle mesh, or a point cloud if ``faces`` is empty.
 
     Attributes:
-        vertices: (n, 3) [m].  faces: (m, 3) vertex indices, int32, possibly (0, 3).
-        name: file name as given.  sha256: hash of the file.  data: the file (for the attachment in a log).
+        vertices: (n, 3) [m].  faces: (m, 3) vertex indices, int32; outwards where they form a closed part.
+        name, sha256, data: of the file.  reversed: faces that were reversed on reading.
     """
 
     vertices: Array
@@ -85,6 +85,7 @@ class Surface:
     name: str
     sha256: str
     data: bytes = b""
+    reversed: int = 0
 
     @property
     def extent(self) -> float:
@@ -117,8 +118,8 @@ class State:
     @property
     def T_ac(self) -> Pose:
         """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho."""
-        position = self.r_a + geometry.rotate(geometry.matrix(self.q_ab), self.c_b)
-        return Pose(geometry.multiply(self.q_ab, self.q_bc), position)
+        R_ab = geometry.matrix(self.q_ab)
+        return Pose(geometry.multiply(self.q_ab, self.q_bc), self.r_a + geometry.rotate(R_ab, self.c_b))
 
     @property
     def fixture_velocity(self) -> Array:
@@ -233,8 +234,7 @@ class Alignment:
     @property
     def measured(self) -> bool:
         """Return whether ``T_ac`` is a measurement and not only the initial guess."""
-        s = AlignStatus
-        return self.status in (s.ALIGNED, s.MEASURED, s.NOT_CONVERGED, s.DEGENERATE, s.AMBIGUOUS)
+        return self.status not in (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED)
 
     @property
     def inlier_ratio(self) -> float:

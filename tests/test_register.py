@@ -19,7 +19,7 @@ from avsreplay.register.covariance import without_dominant_patches
 from avsreplay.register.degenerate import Directions
 from avsreplay.register.params import Camera
 from avsreplay.register.peers import best_motion, horn_matrix
-from avsreplay.register.quality import Visibility, evidence, grade, is_outward
+from avsreplay.register.quality import Visibility, evidence, grade
 from avsreplay.register.sampling import sample, thin
 from avsreplay.register.surface_index import SurfaceIndex
 
@@ -388,17 +388,11 @@ def test_a_cylinder_seen_from_the_side_keeps_its_place_along_the_axis(guess_deg:
 # --- what the camera can see
 
 
-def test_outward_is_told_from_inward_open_and_cloud(surface: Surface) -> None:
-    assert is_outward(surface)
-    assert not is_outward(replace(surface, faces=surface.faces[:, ::-1]))
-    assert not is_outward(replace(surface, faces=surface.faces[::2]))
-    assert not is_outward(replace(surface, faces=np.empty((0, 3), dtype=np.int32)))
-    soup = replace(
-        surface,
-        vertices=surface.vertices[surface.faces].reshape(-1, 3),
-        faces=np.arange(surface.faces.size, dtype=np.int32).reshape(-1, 3),
-    )
-    assert is_outward(soup)
+def test_only_meshes_with_closed_parts_are_sided(surface: Surface) -> None:
+    assert Visibility(surface).sided
+    assert not Visibility(replace(surface, faces=surface.faces[:, ::-1])).sided
+    assert not Visibility(replace(surface, faces=surface.faces[::2])).sided
+    assert not Visibility(replace(surface, faces=np.empty((0, 3), dtype=np.int32))).sided
 
 
 def test_the_camera_is_the_origin_where_it_can_be(surface: Surface, scan: np.ndarray) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avsreplay import geometry
+from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar, allowed_scans
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
-from avsreplay.register.quality import Visibility, is_outward
+from avsreplay.register.quality import Visibility
 from avsreplay.register.restarts import FIXED_WORK, HEALTHY_PASSES, HEALTHY_SCANS, Budget
 from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
@@ -154,10 +154,12 @@ def test_a_mesh_whose_sheets_touch_at_edges_is_closed() -> None:
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int32)
     opposite = apex * [1.0, -1.0, -1.0]  # a half turn about the common edge
     both = Surface(np.vstack([apex, opposite]), np.vstack([faces, faces + 4]).astype(np.int32), "two", "")
-    assert is_outward(both)
-    assert not is_outward(Surface(apex, faces[:3], "open", ""))
+    assert Visibility(both).sided
+    assert not Visibility(Surface(apex, faces[:3], "open", "")).sided
     inwards = np.vstack([faces, faces[:, ::-1] + 4]).astype(np.int32)
-    assert not is_outward(Surface(both.vertices, inwards, "one of them inside out", ""))
+    found, reversed_ = mesh.outward(both.vertices, inwards)
+    assert reversed_ == 4
+    np.testing.assert_array_equal(found[4:, ::-1], inwards[4:])
 
 
 def test_a_complete_visible_side_is_told_from_one_with_gaps(surface: Surface) -> None:

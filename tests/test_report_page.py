@@ -353,6 +353,7 @@ def browser():
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     chrome = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
+    chrome.set_script_timeout(300)  # the default of 30 s is too short on a busy machine
     yield chrome
     chrome.quit()
 

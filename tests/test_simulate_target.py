@@ -9,9 +9,10 @@ from numpy.testing import assert_allclose
 
 from avsreplay import geometry
 from avsreplay.errors import UsageError
+from avsreplay.mesh import is_closed
 from avsreplay.records import Surface
 from avsreplay.simulate import Shape, builtin_surface
-from avsreplay.simulate.inertia import body_of, is_closed, principal
+from avsreplay.simulate.inertia import body_of, principal
 from avsreplay.simulate.target import TargetParams, body, box, extrusion, frustum, join, shell
 
 RNG = np.random.Generator(np.random.PCG64(5))
@@ -88,8 +89,8 @@ def test_an_open_mesh_is_a_thin_shell():
     solid = box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
     lidless = Surface(solid.vertices, solid.faces[2:], "open", "")
     found = body_of(lidless)
-    assert not is_closed(lidless.faces, lidless.vertices)
-    assert is_closed(solid.faces, solid.vertices)
+    assert not is_closed(lidless.vertices, lidless.faces)
+    assert is_closed(solid.vertices, solid.faces)
     assert_allclose(found.centre_c, [0.1, 0, 0], atol=1e-14)  # five unit squares, the one at x = -1/2 missing
     assert_allclose(found.inertia_c[0, 0], (4 * (1 / 4 + 1 / 12) + 1 / 6) / 5, rtol=1e-12)
 
@@ -175,5 +176,5 @@ def test_solids_are_closed_whatever_their_rings():
         box((0, 0, 0), (1, 2, 3)),
     ]
     for solid in [*parts, join(parts)]:
-        assert is_closed(solid.faces, solid.vertices)
+        assert is_closed(solid.vertices, solid.faces)
         assert trimesh.Trimesh(solid.vertices, solid.faces, process=False).volume > 0

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import mesh
 from avsreplay.errors import UnreadableInput
 from avsreplay.files import BadFile
 from avsreplay.geometry import Array, frozen
@@ -197,7 +198,7 @@ def scaled(surface: Surface, scale: float) -> Surface:
     """Return the model with its coordinates multiplied by ``scale``; its bytes and SHA-256 are those of the result."""
     if scale == 1.0:
         return surface
-    bare = Surface(frozen(scale * surface.vertices, -1, 3), surface.faces, surface.name, "")
+    bare = replace(surface, vertices=frozen(scale * surface.vertices, -1, 3), sha256="", data=b"")
     data = surface_bytes(bare)
     return replace(bare, data=data, sha256=hashlib.sha256(data).hexdigest())
 
@@ -234,11 +235,11 @@ def _parsed(data: bytes, name: str, where: str, cloud_ok: bool) -> Surface:
         ) from None
     _check(vertices, faces, where, cloud_ok)
     vertices = frozen(vertices, -1, 3)
-    faces = _with_area(vertices, faces)
+    faces, reversed_ = mesh.outward(vertices, mesh.with_area(vertices, faces))
     if not cloud_ok and not len(faces):
         raise UnreadableInput("every triangle has zero area", where=where, hint="check the units of the model")
     faces.flags.writeable = False
-    return Surface(vertices, faces, name, hashlib.sha256(data).hexdigest(), data)
+    return Surface(vertices, faces, name, hashlib.sha256(data).hexdigest(), data, reversed_)
 
 
 def _ply(data: bytes) -> tuple[Array, NDArray[np.int64]]:
@@ -266,8 +267,8 @@ def _trimesh(data: bytes, suffix: str) -> tuple[Array, NDArray[Any]]:
     # process=False keeps the vertices unchanged; force="mesh" joins the parts of a scene.
     logging.getLogger("trimesh").addHandler(_SILENT)  # trimesh logs tracebacks before it tries another way
     with np.errstate(all="ignore"):
-        mesh: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
-    vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces)
+        loaded: Any = trimesh.load(io.BytesIO(data), file_type=suffix, process=False, force="mesh", **options)
+    vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), np.asarray(loaded.faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or (len(faces) and faces.shape[1] != 3):
         raise BadFile("no triangles in three dimensions")
     return _merged(vertices, faces)
@@ -277,10 +278,8 @@ def _merged(vertices: Array, faces: NDArray[Any]) -> tuple[Array, NDArray[Any]]:
     """Merge equal vertices, which occur in STL files and in OBJ files with normals."""
     if not np.isfinite(vertices).all():
         return vertices, faces
-    _, first, inverse = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
-    place = np.empty(len(first), dtype=np.int64)
-    place[np.argsort(first)] = np.arange(len(first))
-    return vertices[np.sort(first)], place[inverse.reshape(-1)][faces]
+    first, number = mesh.merged(vertices)
+    return vertices[first], number[faces]
 
 
 def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> None:
@@ -301,16 +300,6 @@ def _check(vertices: Array, faces: NDArray[Any], where: str, cloud_ok: bool) -> 
     if np.ptp(vertices, axis=0).max() < LEAST_EXTENT_M:
         what = f"the model spans {np.ptp(vertices, axis=0).max():.3g} m; the least is {LEAST_EXTENT_M:g} m"
         raise UnreadableInput(what, where=where, hint="check the units of the model")
-
-
-def _with_area(vertices: Array, faces: NDArray[Any]) -> NDArray[np.int32]:
-    """Return the triangles whose area is not zero; the others have no normal."""
-    corners = vertices[faces.reshape(-1, 3)]
-    with np.errstate(over="ignore", invalid="ignore"):
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        flat = ~(np.linalg.norm(normals, axis=1) > 0.0)
-    kept: NDArray[np.int32] = np.ascontiguousarray(faces.reshape(-1, 3)[~flat], np.int32)
-    return kept
 
 
 _OCTAHEDRON = np.array(

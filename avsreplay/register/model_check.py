@@ -1,4 +1,4 @@
-"""Errors of the model that a run reveals: its size, inverted faces, a mirrored or a wrong shape.
+"""Errors of the model that a run reveals: its size, a mirrored or a wrong shape.
 
 Size: along a run, the factor between target and model is estimated from the residuals of registered scans. With
 T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register.quality import is_outward
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import without_scattered_points
 from avsreplay.register.size import LEAST_ERROR, SIGMAS, fitted_size, noise_bias
@@ -93,12 +92,7 @@ class ModelCheck:
         if not self._aligned:
             several = f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init"
             return (several,) if self._ambiguous else ()
-        return (*self._inverted(), *self._size())
-
-    def _inverted(self) -> tuple[str, ...]:
-        if is_outward(replace(self._surface, faces=self._surface.faces[:, ::-1])):
-            return ("the faces of the model point inwards: the side that the camera sees is not used",)
-        return ()
+        return self._size()
 
     def _size(self) -> tuple[str, ...]:
         found = self.scale()

@@ -11,7 +11,7 @@ from avsreplay.settings import Settings, given, setting
 class Camera(Enum):
     """Where the scans were taken from."""
 
-    AUTO = "auto"  # origin of {A}, if the mesh has outward faces and the origin is well outside the model
+    AUTO = "auto"  # origin of {A}, if the mesh has a closed part and the origin is well outside the model
     ORIGIN = "origin"  # origin of {A}
     NONE = "none"  # unknown: both sides of a face are matched
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay import mesh
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register.covariance import (
@@ -50,13 +51,13 @@ class Visibility:
     thickness of the panel, the measured front is next to the back of the model, and plain ICP converges there: on the
     built-in target, started 3 deg and 5 cm off, in every third view.
 
-    AUTO applies it if the mesh is closed with outward faces (19 of 20 edges used as often in one
-    direction as in the other, positive volume) and the origin of
+    AUTO applies it if the mesh has a closed part, encloses a positive volume, and the origin of
     {A} is at least a quarter of the extent outside the bounding box of the model. If fewer than 40 % of the closest
     faces of the scan face the origin, the camera was elsewhere and both sides are matched.
 
     Attributes:
         sided: the faces of this surface have a known outer side.
+        surface: the surface; where it is sided, with the other side of each face that belongs to an open part.
     """
 
     def __init__(self, surface: Surface, camera: Camera = Camera.AUTO) -> None:
@@ -64,7 +65,13 @@ class Visibility:
         clear = CLEARANCE_OF_EXTENT * surface.extent if camera is Camera.AUTO else -np.inf
         self._box = (low, high, clear)
         self._extent, self._known = surface.extent, camera is not Camera.NONE
-        self.sided = camera is Camera.ORIGIN or (camera is Camera.AUTO and is_outward(surface))
+        opened = mesh.open_faces(surface.vertices, surface.faces)
+        outward = bool((~opened).any()) and mesh.signed_volume(surface.vertices, surface.faces) > 0.0
+        self.sided = camera is Camera.ORIGIN or (camera is Camera.AUTO and outward)
+        self.surface = surface
+        if self.sided and opened.any():
+            both = np.concatenate([surface.faces, surface.faces[opened][:, ::-1]])
+            self.surface = replace(surface, faces=np.ascontiguousarray(both))
 
     def camera_c(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose) -> Array | None:
         """Return the camera position (3,) in {C} [m] if the test applies to this scan (n, 3) and pose, else None."""
@@ -90,24 +97,6 @@ class Visibility:
         low, high, clear = self._box
         outside = np.maximum(np.maximum(low - camera_c, camera_c - high), 0.0)
         return float(np.linalg.norm(outside)) >= clear
-
-
-def is_outward(surface: Surface) -> bool:
-    """Test whether the mesh is closed with outward faces. Vertices at the same position are merged first."""
-    if len(surface.faces) == 0:
-        return False
-    _, merged = np.unique(surface.vertices, axis=0, return_inverse=True)
-    faces = merged.reshape(-1)[surface.faces].astype(np.int64)
-    start, end = faces[:, (0, 1, 2)].ravel(), faces[:, (1, 2, 0)].ravel()
-    there, back = start * (merged.max() + 1) + end, end * (merged.max() + 1) + start
-    ordered = np.sort(there)
-    uses, opposite = (
-        np.searchsorted(ordered, edge, side="right") - np.searchsorted(ordered, edge, side="left")
-        for edge in (there, back)
-    )
-    paired = uses == opposite  # more than one where surfaces touch at an edge
-    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
-    return float(paired.mean()) >= PAIRED_EDGES and float(np.einsum("ij,ij->", a, np.cross(b, c))) > 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -54,9 +54,10 @@ class Registrar:
         self.params = params or RegisterParams()
         self.limits = self.params.limits(surface.extent)
         factory = load_backend(self.params.backend)  # before the index, so that a wrong name is reported at once
+        self._visibility = Visibility(surface, self.params.camera)
+        surface = self._visibility.surface
         cache_dir = index_cache.folder_for(surface) if self.params.index_cache else None
         self._index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
-        self._visibility = Visibility(surface, self.params.camera)
         self._target = Target(surface, self._index, self.limits, self._visibility)
         self._accuracy: tuple[float, float] = getattr(factory, "accuracy", quality.ACCURACY)
         self._backend = create_backend(self.params.backend, factory, self._target)

@@ -11,11 +11,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from avsreplay import geometry
 from avsreplay.errors import UsageError
 from avsreplay.geometry import Array, frozen
+from avsreplay.mesh import is_closed
 from avsreplay.records import Surface
 
 
@@ -58,21 +59,10 @@ def body_of(surface: Surface) -> Body:
         raise UsageError("a cloud has no mass", where=surface.name, hint=hint)
     mass, first, second = _moments(surface)
     if not mass > 0.0:
-        raise UsageError("the model encloses no volume", where=surface.name, hint="turn its faces outward")
+        raise UsageError("the model encloses no volume", where=surface.name, hint="name a mesh that is not flat")
     centre = first / mass
     central = second / mass - np.outer(centre, centre)
     return principal(np.eye(3) * np.trace(central) - central, centre)
-
-
-def is_closed(faces: NDArray[np.int32], vertices: Array) -> bool:
-    """Whether every edge occurs exactly once in each direction; equal vertices are merged, since STL repeats them."""
-    _, corner = np.unique(vertices, axis=0, return_inverse=True)
-    loops = corner.reshape(-1)[faces].astype(np.int64)
-    edges = np.concatenate([loops[:, [0, 1]], loops[:, [1, 2]], loops[:, [2, 0]]])
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    span = len(vertices)
-    forward = np.sort(edges[:, 0] * span + edges[:, 1])
-    return bool(np.array_equal(forward, np.sort(edges[:, 1] * span + edges[:, 0])))
 
 
 def principal(inertia_c: ArrayLike, centre_c: ArrayLike) -> Body:
@@ -98,7 +88,7 @@ def with_axes(moments: ArrayLike, q_bc: ArrayLike, centre_c: ArrayLike) -> Body:
 def _moments(surface: Surface) -> tuple[float, Array, Array]:
     """Mass, first and second moments about {C}'s origin for unit density."""
     a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
-    if is_closed(surface.faces, surface.vertices):
+    if is_closed(surface.vertices, surface.faces):
         weight, over, under = np.sum(a * np.cross(b, c), axis=1) / 6.0, 4.0, 20.0  # tetrahedra from the origin
     else:
         weight, over, under = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1), 3.0, 12.0

@@ -1,0 +1,253 @@
+"""The sides of a triangle mesh: consistent winding, outward faces, and faces of open parts that both sides show.
+
+Registration with a known position of the camera, signed distances and mass properties need the outer side of each face
+(right-hand rule). CAD exports often reverse single faces or mirrored parts. Parts are the sets of faces that are
+connected by edges of exactly two faces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from avsreplay.geometry import Array
+
+PAIRED_EDGES = 0.95  # least share of the edges of a closed part that two opposite half-edges form
+LEAST_VOLUME = 1e-9  # of a part that has an inside, times six, in units of its area to the power of 3/2
+TESTED_VERTICES = 20  # of a part, to decide whether it is a cavity
+
+Faces = NDArray[np.int32]
+
+
+def with_area(vertices: Array, faces: NDArray[np.int64]) -> Faces:
+    """Return the triangles whose area is not zero; the others have no normal.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices.
+    """
+    corners = vertices[faces.reshape(-1, 3)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat = ~(np.linalg.norm(normals, axis=1) > 0.0)
+    kept: Faces = np.ascontiguousarray(faces.reshape(-1, 3)[~flat], np.int32)
+    return kept
+
+
+def merged(vertices: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Identify equal vertices.
+
+    Args:
+        vertices: (n, 3) [m], finite.
+
+    Returns:
+        The first (k,) of each set of equal vertices in the order of the list, and the number (n,) of each vertex's set.
+    """
+    values = vertices + 0.0  # -0.0 equals 0.0
+    order = np.lexsort(values.T)
+    begins = np.concatenate([[True], (np.diff(values[order], axis=0) != 0.0).any(axis=1)])
+    first = np.minimum.reduceat(order, np.flatnonzero(begins))
+    place = np.empty(len(first), dtype=np.int64)
+    place[np.argsort(first)] = np.arange(len(first))
+    number = np.empty(len(values), dtype=np.int64)
+    number[order] = place[np.cumsum(begins) - 1]
+    return np.sort(first), number
+
+
+def is_closed(vertices: Array, faces: Faces) -> bool:
+    """Return whether each edge is used as often in one direction as in the other; equal vertices count as one.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices.
+    """
+    return bool(_edges(_corners(vertices, faces)).paired().all())
+
+
+def outward(vertices: Array, faces: Faces) -> tuple[Faces, int]:
+    """Wind the faces consistently and outwards.
+
+    Within a part that is not consistent, the fewer faces are reversed. Then closed parts are reversed whose volume is
+    negative, unless they are a cavity inside another closed part. Open parts have no outer side.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices.
+
+    Returns:
+        The faces (m, 3) in the same order, and the number of faces that were reversed.
+    """
+    if not len(faces):
+        return faces, 0
+    first, number = _distinct(_corners(vertices, faces))
+    changed = _reversed(vertices, faces[first])[number]
+    if not changed.any():
+        return faces, 0
+    result: Faces = np.ascontiguousarray(np.where(changed[:, None], faces[:, ::-1], faces))
+    return result, int(changed.sum())
+
+
+def _reversed(vertices: Array, faces: Faces) -> NDArray[np.bool_]:
+    """Which of distinct faces (m,) must be reversed."""
+    parts = _parts(_edges(_corners(vertices, faces)))
+    wound = np.where(parts.reversed[:, None], faces[:, ::-1], faces)
+    volume, area = _volumes(vertices, wound, parts.of)
+    closed = parts.closed & (np.abs(volume) > LEAST_VOLUME * area**1.5)
+    inside_out = np.full(len(volume), bool(volume[closed].sum() < 0.0)) & closed
+    wound = np.where(inside_out[parts.of, None], wound[:, ::-1], wound)
+    volume = np.where(inside_out, -volume, volume)
+    solid, negative = closed & (volume > 0.0), closed & (volume < 0.0)
+    cavities = [
+        part
+        for part in np.flatnonzero(negative)
+        if _is_inside(vertices, wound[parts.of == part], wound[solid[parts.of]])
+    ]
+    inside_out = inside_out ^ negative
+    inside_out[cavities] ^= True
+    changed: NDArray[np.bool_] = parts.reversed ^ inside_out[parts.of]
+    return changed
+
+
+def signed_volume(vertices: Array, faces: Faces) -> float:
+    """Return the volume [m^3] that the faces enclose, negative if they point inwards.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices.
+    """
+    return float(_volumes(vertices, faces, np.zeros(len(faces), np.int64))[0].sum()) / 6.0
+
+
+def open_faces(vertices: Array, faces: Faces) -> NDArray[np.bool_]:
+    """Return which faces (m,) belong to parts that are not closed, so that both of their sides can be seen.
+
+    Args:
+        vertices: (n, 3) [m].
+        faces: (m, 3) vertex indices.
+    """
+    if not len(faces):
+        return np.zeros(0, bool)
+    first, number = _distinct(corners := _corners(vertices, faces))
+    edges = _edges(corners[first])
+    paired = edges.paired()
+    if paired.all():
+        return np.zeros(len(faces), bool)
+    parts = _parts(edges)
+    opened: NDArray[np.bool_] = (~parts.closed & (_share(paired, parts.of) < PAIRED_EDGES))[parts.of][number]
+    return opened
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edges:
+    """Number (3 m,) of the edge of each half-edge, its direction (3 m,) as 1 or -1, and the pairs with two faces.
+
+    A pair is two half-edges (k, 2) that are alone at their edge.
+    """
+
+    number: NDArray[np.int64]
+    sign: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+
+    def paired(self) -> NDArray[np.bool_]:
+        """Which half-edges (3 m,) have as many opposite ones."""
+        balanced: NDArray[np.bool_] = np.bincount(self.number, self.sign)[self.number] == 0.0
+        return balanced
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Parts:
+    """Part (m,) of each face; whether (m,) it must be reversed for a consistent winding; which parts are closed."""
+
+    of: NDArray[np.int64]
+    reversed: NDArray[np.bool_]
+    closed: NDArray[np.bool_]
+
+
+def _corners(vertices: Array, faces: Faces) -> NDArray[np.int64]:
+    """The faces (m, 3) with equal vertices as one."""
+    return merged(vertices)[1][faces]
+
+
+def _distinct(corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Faces without repetitions of the same winding: indices (k,), and which of them (m,) each face equals."""
+    begin = np.argmin(corners, axis=1)[:, None]
+    return merged(np.take_along_axis(corners, (begin + np.arange(3)) % 3, axis=1).astype(np.float64))
+
+
+def _edges(corners: NDArray[np.int64]) -> _Edges:
+    start, end = corners.ravel(), corners[:, (1, 2, 0)].ravel()
+    key = np.minimum(start, end) * (corners.max() + 1) + np.maximum(start, end)
+    order = np.argsort(key, kind="stable")
+    begins = np.diff(key[order], prepend=-1) != 0
+    number = np.empty(len(key), dtype=np.int64)
+    number[order] = np.cumsum(begins) - 1
+    first = np.flatnonzero(begins)
+    twice = first[np.diff(first, append=len(key)) == 2]
+    return _Edges(number, np.where(start < end, 1, -1), np.stack([order[twice], order[twice + 1]], axis=1))
+
+
+def _parts(edges: _Edges) -> _Parts:
+    """The parts of a mesh.
+
+    Where faces must be reversed, each face is two nodes of a graph, as it is and reversed. Nodes are connected if the
+    faces share an edge and are wound consistently. A part that can be wound consistently is two components of it.
+    """
+    m = len(edges.number) // 3
+    a, b = edges.pairs.T // 3
+    same = edges.sign[edges.pairs[:, 0]] == edges.sign[edges.pairs[:, 1]]
+    if not same.any():
+        of, reversed_ = _components(m, a, b), np.zeros(m, bool)
+    else:
+        nodes = _components(2 * m, np.append(a, a + m), np.append(b + same * m, b + ~same * m)).reshape(2, m)
+        _, of = np.unique(nodes.min(axis=0), return_inverse=True)
+        turned = nodes[1] < nodes[0]
+        most = np.bincount(of, turned) > 0.5 * np.bincount(of)
+        reversed_ = (turned ^ most[of]) & (nodes[0] != nodes[1])
+    sign = np.where(np.repeat(reversed_, 3), -edges.sign, edges.sign)
+    _, group = np.unique(edges.number * (of.max() + 1) + np.repeat(of, 3), return_inverse=True)
+    paired = np.bincount(group, sign)[group] == 0.0
+    return _Parts(of, reversed_, _share(paired, of) >= PAIRED_EDGES)
+
+
+def _components(nodes: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
+    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(nodes, nodes))
+    labels: NDArray[np.int64] = connected_components(graph, directed=False)[1].astype(np.int64)
+    return labels
+
+
+def _share(paired: NDArray[np.bool_], of: NDArray[np.int64]) -> Array:
+    """Share of paired half-edges of each part."""
+    share: Array = np.bincount(of, paired.reshape(-1, 3).mean(axis=1)) / np.bincount(of)
+    return share
+
+
+def _volumes(vertices: Array, faces: Faces, of: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Six times the signed volume and the area of each part; tetrahedra from the centroid of its faces."""
+    corners = vertices[faces]
+    middles = corners.mean(axis=1)
+    centres = np.stack([np.bincount(of, middles[:, k]) for k in range(3)], axis=1) / np.bincount(of)[:, None]
+    a, b, c = (corners[:, k] - centres[of] for k in range(3))
+    areas = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    return np.bincount(of, np.einsum("ij,ij->i", a, np.cross(b, c))), np.bincount(of, areas)
+
+
+def _is_inside(vertices: Array, part: Faces, others: Faces) -> bool:
+    """Whether a part is inside other closed parts: their solid angle is 4 pi at each of some of its vertices."""
+    if not len(others):
+        return False
+    points = vertices[np.unique(part)]
+    corners = vertices[others]
+    return all(_solid_angle(corners - p) > 2.0 * np.pi for p in points[:: -(-len(points) // TESTED_VERTICES)])
+
+
+def _solid_angle(corners: Array) -> float:
+    """Solid angle [sr] at the origin of outward triangles (m, 3, 3) (Van Oosterom and Strackee 1983)."""
+    a, b, c = (corners[:, k] for k in range(3))
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    dots = [np.einsum("ij,ij->i", u, v) for u, v in ((a, b), (b, c), (c, a))]
+    below = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
+    return float(2.0 * np.arctan2(np.einsum("ij,ij->i", a, np.cross(b, c)), below).sum())
