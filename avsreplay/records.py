@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -18,17 +17,15 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, MeasuredPose, Pose, frozen
 
-BLOCKS: Mapping[str, slice] = MappingProxyType(
-    {
-        "attitude": slice(0, 3),  # dq_v, half angle, {B}
-        "rate": slice(3, 6),  # w_b [rad/s]
-        "position": slice(6, 9),  # rho_o [m], {A}
-        "velocity": slice(9, 12),  # [m/s], {A}
-        "sigma": slice(12, 14),
-        "varrho": slice(14, 17),  # [m], {B}
-        "mu": slice(17, 20),  # dmu_v, half angle, {B}
-    }
-)  # the 20 error states by name, in the order of every covariance
+BLOCKS: Mapping[str, slice] = {
+    "attitude": slice(0, 3),  # dq_v, half angle, {B}
+    "rate": slice(3, 6),  # w_b [rad/s]
+    "position": slice(6, 9),  # rho_o [m], {A}
+    "velocity": slice(9, 12),  # [m/s], {A}
+    "sigma": slice(12, 14),
+    "varrho": slice(14, 17),  # [m], {B}
+    "mu": slice(17, 20),  # dmu_v, half angle, {B}
+}  # the 20 error states by name, in the order of every covariance
 
 
 class ScanStatus(Enum):
@@ -118,8 +115,8 @@ class State:
     @property
     def T_ac(self) -> Pose:
         """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho."""
-        R_ab = geometry.matrix(self.q_ab)
-        return Pose(geometry.multiply(self.q_ab, self.q_bc), self.r_a + geometry.rotate(R_ab, self.c_b))
+        position = self.r_a + geometry.rotate(geometry.matrix(self.q_ab), self.c_b)
+        return Pose(geometry.multiply(self.q_ab, self.q_bc), position)
 
     @property
     def fixture_velocity(self) -> Array:
@@ -234,7 +231,8 @@ class Alignment:
     @property
     def measured(self) -> bool:
         """Return whether ``T_ac`` is a measurement and not only the initial guess."""
-        return self.status not in (AlignStatus.NO_POINTS, AlignStatus.NO_OVERLAP, AlignStatus.FAILED)
+        s = AlignStatus
+        return self.status in (s.ALIGNED, s.MEASURED, s.NOT_CONVERGED, s.DEGENERATE, s.AMBIGUOUS)
 
     @property
     def inlier_ratio(self) -> float:
