@@ -231,9 +231,9 @@ def _volumes(vertices: Array, faces: Faces, of: NDArray[np.int64]) -> tuple[Arra
     middles = corners.mean(axis=1)
     centres = np.stack([np.bincount(of, middles[:, k]) for k in range(3)], axis=1) / np.bincount(of)[:, None]
     a, b, c = (corners[:, k] - centres[of] for k in range(3))
-    volumes: Array = np.bincount(of, np.einsum("ij,ij->i", a, np.cross(b, c)))
-    areas: Array = np.bincount(of, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    return volumes, areas
+    volumes = np.bincount(of, np.einsum("ij,ij->i", a, np.cross(b, c)))
+    areas = np.bincount(of, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    return volumes.astype(np.float64), areas.astype(np.float64)
 
 
 def _is_inside(vertices: Array, part: Faces, others: Faces) -> bool:
