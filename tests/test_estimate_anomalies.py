@@ -14,6 +14,7 @@ from avsreplay.estimate import anomalies, hypotheses, noise, scan_window
 from avsreplay.estimate.dynamics import propagate, propagate_state
 from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.track import Epoch, Prediction, Track, ready
+from avsreplay.geometry import Pose
 from avsreplay.records import Belief, Innovation
 
 CLEAN = surprises.Case("clean", seconds=60.0)
@@ -113,6 +114,28 @@ def test_three_poses_that_agree_replace_the_first_ones() -> None:
     result = surprises.run(case, 0)
     after = result.t.index(2.0)
     assert result.reason[after : after + 3] == ["doubtful", "doubtful", "ok"]
+    assert max(error for error, _ in result.error[after + 2 :]) < 0.02
+
+
+@pytest.mark.parametrize("seed", [0, 2, 4])
+def test_bad_scans_before_the_end_of_an_early_bias_do_not_make_it_a_manoeuvre(
+    monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    """15 cm off for 10 s, 2 cm more in the last second: changes of the velocity that cancel would explain the step."""
+    simulated = surprises.measured
+
+    def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
+        shifts = {9.0: np.array([0.0, 0.02, 0.0]), 9.5: np.array([0.0, 0.0, 0.02])}
+        poses = simulated(case, times, states, seed)
+        moved = (Pose(a.T_ac.q, a.T_ac.t + shifts.get(t, 0.0)) for t, a in zip(times, poses, strict=True))
+        return [replace(a, T_ac=T) for a, T in zip(poses, moved, strict=True)]
+
+    monkeypatch.setattr(surprises, "measured", measured)
+    result = surprises.run(surprises.Case("early", at_s=0.0, until_s=10.0, bias=0.15, seconds=20.0), seed)
+    assert result.track is not None
+    assert result.track.manoeuvres == ()
+    after = result.t.index(10.0)
+    assert all(result.gamma[after + 2 :])  # three poses that agree are enough
     assert max(error for error, _ in result.error[after + 2 :]) < 0.02
 
 
@@ -330,3 +353,30 @@ def test_changes_in_every_interval_and_a_single_change_are_told_apart(density: f
             assert disturbed.log_evidence > change.log_evidence + 3.0
             assert disturbed.size[kind] == pytest.approx(density, rel=0.8)
             assert not disturbed.size[3 - kind : 6 - kind].any()
+
+
+@pytest.mark.parametrize("cancels", [False, True])
+def test_changes_that_cancel_are_no_manoeuvre(cancels: bool) -> None:
+    """Half a second at 0.3 m/s: a step of the pose by 15 cm if the target stops again, an impact if it does not."""
+    rng, n, step = np.random.Generator(np.random.PCG64(8)), 14, np.array([0.0, 0.1, -0.3])
+    start = Belief(0, tumbling.draw(2, seconds=7.0).states[0], np.eye(20) * 1e-10)
+    R, free, epochs = np.eye(6) * 1e-6, start.x, []
+    for k in range(n):
+        free = propagate_state(free, 0.5)[0]
+        since = max(0.0, 0.5 * (k - 8))  # the change is at 4.5 s
+        moved = step * (min(since, 0.5) if cancels else since) + 0.01 * since  # and a small error of the velocity
+        T = Pose(free.T_ac.q, free.T_ac.t + moved)
+        alpha = innovation_vector(free, T) + 1e-3 * rng.normal(size=6)
+        prediction = Prediction(
+            Belief(round((k + 1) * 5e8), free, start.P), np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty()
+        )
+        epochs.append(Epoch(Track(start, "filter"), prediction, Innovation(alpha, R, R, 0.0, 0.0, 0.0, 0.0), False))
+    priors = scan_window.ChangePriors(0.05, 0.2, 0.2, 0.05)
+    ranked = hypotheses.explain(epochs, 9, priors, 0.0, 0.0)
+    change = next(e for e in ranked if e.hypothesis is scan_window.Hypothesis.MANOEUVRE)
+    others = max(e.log_evidence for e in ranked if e is not change)
+    if cancels:
+        assert change.log_evidence < others - 3.0
+    else:
+        assert change.log_evidence > others + 3.0
+        assert change.size[3:] == pytest.approx(step, abs=0.05)

@@ -188,7 +188,7 @@ class AnomalyTest:
             anew = self._initialised_anew(track)
         if anew is not None:
             return replace(anew, reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
-        return with_history(track, track), Verdict(0, Reason.POSE_JUMP)
+        return replace(with_history(track, track), doubtful=track.doubtful[1 - _FEWEST :]), Verdict(0, Reason.POSE_JUMP)
 
     def _previous_agrees(self, track: Track) -> bool:
         """Return whether the estimate before the last new start predicted the doubtful poses to within its errors."""
@@ -271,7 +271,7 @@ class AnomalyTest:
 
     def _initialised_anew(self, track: Track) -> Track | None:
         """A new track from the doubtful poses alone, all or the last of them, that agree through free motion."""
-        for first in range(max(1, len(track.doubtful) - _FEWEST)):
+        for first in range(len(track.doubtful) + 1 - _FEWEST):
             anew = self._from_poses(track, track.doubtful[first:])
             if anew is not None:
                 return anew

@@ -39,6 +39,7 @@ _INSTANTS, _FEWER, _LONG = 8, 4, 9  # instants tried for a manoeuvre between two
 _LONGEST_SPREAD = 6  # latest scans over whose intervals a manoeuvre that is not instantaneous may extend
 _FINE, _REFINEMENTS, _NO_WEIGHT = 16, 5, 1e-4  # instants of a refined grid, refinements, share of evidence neglected
 _TAIL = 0.05  # probability that a manoeuvre is earlier, or later, than the interval in which it is allowed for
+_NOT_BY_CHANCE = 16.3  # 99.9 % point of chi-square with 3 degrees of freedom
 _CHANGES = (slice(0, 3), slice(3, 6), slice(0, 6))  # rate, velocity, both
 _SPREAD = (0.7, 0.1, 0.1, 0.1)  # prior share of manoeuvres at one instant, and over one, two and three intervals
 _OFFSETS = (slice(6, 7), slice(0, 3), slice(0, 6))  # range, position, pose
@@ -102,9 +103,11 @@ def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors:
             total.append(-math.inf)
             continue
         values = free + _joint(columns, white, scale, np.array(chosen))
-        total.append(log_mean(values.tolist()))
         c = chosen[int(np.argmax(values))]
-        found.append(_changes(instants[c], columns[c], white, free, scale))
+        likely = _thrust_like(instants[c], columns[c], white, scale)
+        total.append(log_mean(values.tolist()) if likely else -math.inf)
+        if likely:
+            found.append(_changes(instants[c], columns[c], white, free, scale))
     fine, value = _located(window, start, white, free, scale, instants, single)
     total[0] = max(total[0], value - math.log(float(window.times_s[-1])))
     odds = float(np.logaddexp.reduce(np.log(_SPREAD) + total)) + PRIOR_ODDS
@@ -226,6 +229,25 @@ def _changes(instants: Array, columns: Array, white: Array, free: float, scale: 
         joined @ P @ joined.T,
         tuple(instants.tolist()),
     )
+
+
+def _thrust_like(instants: Array, columns: Array, white: Array, scale: Array) -> bool:
+    """Return whether changes at ``instants`` (m,) may be those of a thrust or an impact.
+
+    The velocity during either lies between those before and after, give or take their difference. Changes that cancel
+    displace the target further than that: they imitate a step of the pose, which is an error of the sensor.
+    """
+    m = len(instants)
+    _, u, P = log_evidence(white, 0.0, np.hstack(list(columns)), np.tile(scale, m))
+    v, acts = u.reshape(m, 6)[:, 3:], instants[-1] - instants
+    change, moved = v.sum(axis=0), acts @ v
+    size = float(np.linalg.norm(change))
+    early = float(np.clip(moved @ change / max(size * size, 1e-300), 0.0, acts[0]))
+    beyond = moved - early * change
+    distance = float(np.linalg.norm(beyond))
+    along = (acts - early)[:, None] * np.concatenate([np.zeros(3), beyond / max(distance, 1e-300)])
+    variance = float(along.reshape(-1) @ P @ along.reshape(-1))
+    return distance <= float(acts[0]) * size + math.sqrt(_NOT_BY_CHANCE * max(variance, 0.0))
 
 
 def _sensor_bias(window: Window, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
