@@ -131,7 +131,7 @@ STEP_NS = 200_000_000
 START_NS = 1_700_000_000_123_456_789
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_rows() -> Callable[..., list[Row]]:
     """``make_rows(n, seed=0, blackout=range(...), **columns)``: a seeded run whose blackout has no scan to use."""
 

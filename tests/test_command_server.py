@@ -10,7 +10,7 @@ from command_server import CommandServer
 pytestmark = pytest.mark.skipif(not hasattr(os, "fork"), reason="this system cannot fork")
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def server():
     made = CommandServer()
     yield made

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,16 +24,22 @@ DISC = State(
 )  # no such body
 
 
-@pytest.fixture
-def folder(tmp_path, make_rows):
-    rows = make_rows(40)
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, make_rows):
+    """A result directory, written once and copied for each test, and its summary."""
+    path, rows = tmp_path_factory.mktemp("written"), make_rows(40)
     labels = [Label("full_occlusion", rows[20].t_ns, rows[25].t_ns, True, 0.5)]
-    write_rows(tmp_path / "rows.jsonl", rows)
+    write_rows(path / "rows.jsonl", rows)
     facts = facts_record(labels=labels, truth=TRUTH, counts={"lost": 3})
-    (tmp_path / "run.json").write_text(json.dumps({"facts": facts, "seed": 7}))
-    write_tum(tmp_path / "truth.tum", [(r.t_ns, Pose(exp([0, 0, 0.3]), [1, 2, 3])) for r in rows])
-    write_view(tmp_path / "view.npz", _view())
-    return tmp_path, Summary.fold(rows, labels=labels, truth=TRUTH, counts={"lost": 3})
+    (path / "run.json").write_text(json.dumps({"facts": facts, "seed": 7}))
+    write_tum(path / "truth.tum", [(r.t_ns, Pose(exp([0, 0, 0.3]), [1, 2, 3])) for r in rows])
+    write_view(path / "view.npz", _view())
+    return path, Summary.fold(rows, labels=labels, truth=TRUTH, counts={"lost": 3})
+
+
+@pytest.fixture
+def folder(written, tmp_path):
+    return Path(shutil.copytree(written[0], tmp_path, dirs_exist_ok=True)), written[1]
 
 
 def _view():

@@ -171,7 +171,11 @@ def _with_preset(document: toml_document.Document) -> toml_document.Document:
 
 
 def belief(start: StartParams, truth: State, t_ns: int, rng: np.random.Generator) -> Belief:
-    """The initial belief: the true state plus offsets, given or drawn, and the covariance of the 20 error states."""
+    """The initial belief: the true state plus offsets, given or drawn, and the covariance of the 20 error states.
+
+    Raises:
+        UsageError: the given offset leads to inertia ratios that no body has.
+    """
     rate = _offset(start.rate_offset_radps, start.rate_std_radps, 3, rng)
     sigma = _offset(start.sigma_offset, start.sigma_std, 2, rng)
     if start.sigma_offset is not None and np.abs(truth.sigma + sigma).max() >= 1.0:
