@@ -15,20 +15,23 @@ import numpy as np
 
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan, PlanStatus
-from avsreplay.plan.cone_programme import solve
+from avsreplay.plan.cone_programme import PointRows, solve
 from avsreplay.plan.convexification import (
     ABORT_S,
     BETWEEN,
     COARSE_NODES,
-    ReferencePath,
     aborted,
     convex_subproblem,
-    dense_margins,
     excess,
+    feasible,
+    margins_at,
+    worst_margin,
+)
+from avsreplay.plan.initial_paths import (
+    ReferencePath,
     initial_references,
     interval_fractions,
-    margins_at,
-    turn_rate,
+    largest_change,
     warm_reference,
 )
 from avsreplay.plan.limits import CONSTRAINTS, Case, SampledScene, Scene, largest_acceleration
@@ -42,7 +45,7 @@ RELATIVE_TOLERANCE = 2e-4  # the same as a fraction of the end time
 ROUGH_TOLERANCE = 2e-3  # the same while initial paths are compared, and where an earlier plan is renewed
 SAME_PATH = 5e-3  # drafts whose end times differ by less, relative to them, have the same minimum
 LATER, LATER_S = 1.02, 0.1  # a renewed plan that is later than the earlier one by more starts the full search
-ALTERNATING = 4  # from this iteration on the aborts of the iteration before are required too: the worst may alternate
+KEPT = 1  # earlier iterations whose aborts are required too: the worst moment may alternate
 NEAR_REFERENCE = 0.02  # relative change of the end time from which on the excess tightens the constraints
 HOPELESS = 1.2  # an iteration this much later than the best path ends its initial path
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
@@ -50,8 +53,7 @@ IMPROVED = 2  # drafts whose entry is moved
 MOVES = 6  # largest number of moves of the entry in one direction
 TRUST = 0.25  # largest relative change of the end time between two iterations
 CAREFUL = 0.03  # the same from a draft whose first refinement ended later or without a path
-TURN_RAD = 0.5  # the target may turn by this much between two iterations
-_Warm = tuple[RobotPath, float] | None  # an earlier path and the time since its begin [s]
+STUCK = 4  # from this iteration on an initial path without a plan ends where the slack does not shrink
 
 
 def constrained(
@@ -159,7 +161,7 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
             return None
     if margins_at(case, path, times[::BETWEEN]).values.min() < 0.0:  # few instants show most violations
         return None
-    worst, name = _worst(case, path)
+    worst, name = worst_margin(case, path)
     abort = aborted(case, path)
     if worst < 0.0 or abort.short > 0.0:
         return None
@@ -170,7 +172,7 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
     if found is None:
         return no_plan(t_ns, PlanStatus.NOT_FOUND, free.a_max, free.lower_bound_s)
     position, velocity = found.terminal_errors(case.scene.goal)
-    worst, name = _worst(case, found)
+    worst, name = worst_margin(case, found)
     return Plan(
         t_ns=t_ns,
         status=PlanStatus.OPTIMAL if found.t_go_s - free.lower_bound_s <= SAME_TIME_S else PlanStatus.FEASIBLE,
@@ -190,25 +192,15 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
     )
 
 
-def _worst(case: Case, path: RobotPath) -> tuple[float, str]:
-    """Return the smallest margin along a path and the constraint that has it, "" without geometric constraints."""
-    if not case.limits.geometric:
-        return math.inf, ""
-    values = dense_margins(case, path)[1].between
-    least = values.min(axis=0)
-    return float(least.min()), CONSTRAINTS[int(least.argmin())] if np.isfinite(least).any() else ""
+def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> StepPath | None:
+    """Return the earliest capture found: that of a warm start where it converges to about the same end time.
 
-
-def _best_path(case: Case, free: Plan, warm: _Warm) -> StepPath | None:
-    """Return the earliest capture found.
-
-    A warm start that converges to about the same end time is taken. Otherwise every initial path is iterated on a
-    coarse grid with a coarse check, and the results are refined in the order of their arrival times.
+    Otherwise initial paths are iterated on a coarse grid and the results are refined in the order of their arrival.
     """
     best: StepPath | None = None
     if warm is not None:
         again = _shortened(case, *warm)
-        best = _converged(again, warm_reference(again, *warm), warm=warm)
+        best = _refined(again, *warm, rough=True)
         if best is not None and best.t_go_s <= LATER * max(_expected(case, *warm), case.earliest_s) + LATER_S:
             return best
     coarse = replace(case, limits=replace(case.limits, nodes=min(COARSE_NODES, case.limits.nodes)), coarse=True)
@@ -221,17 +213,17 @@ def _best_path(case: Case, free: Plan, warm: _Warm) -> StepPath | None:
             break
     drafts = _different(drafts)
     drafts[:IMPROVED] = [_moved(coarse, draft) for draft in drafts[:IMPROVED]]
-    for draft in sorted(drafts, key=lambda d: d.t_go_s):
+    for draft in sorted(drafts, key=_duration):
         for trust in (TRUST, CAREFUL):
             if best is None or best.t_go_s > (draft.t_go_s if trust == TRUST else LATER * draft.t_go_s):
-                best = _earlier(best, _converged(case, warm_reference(case, draft, 0.0), trust=trust))
+                best = min(filter(None, (best, _refined(case, draft, trust=trust))), key=_duration, default=None)
     for reference in initial_references(case, free) if drafts and best is None else ():
         best = best or _converged(case, reference)
     return best if best is None else _moved(case, best)
 
 
-def _earlier(one: StepPath | None, other: StepPath | None) -> StepPath | None:
-    return min((path for path in (one, other) if path is not None), key=lambda path: path.t_go_s, default=None)
+def _duration(path: RobotPath) -> float:
+    return path.t_go_s
 
 
 def _entries(case: Case, path: RobotPath) -> tuple[float, float]:
@@ -264,7 +256,7 @@ def _expected(case: Case, path: RobotPath, since_s: float) -> float:
 def _different(drafts: list[StepPath]) -> list[StepPath]:
     """Return the drafts in the order of their end times without those that are the same local minimum."""
     out: list[StepPath] = []
-    for draft in sorted(drafts, key=lambda draft: draft.t_go_s):
+    for draft in sorted(drafts, key=_duration):
         if not out or draft.t_go_s - out[-1].t_go_s > SAME_PATH * draft.t_go_s:
             out.append(draft)
     return out
@@ -285,7 +277,7 @@ def _moved(case: Case, path: StepPath) -> StepPath:
             entry = list(start)
             entry[which] += count * direction
             moved = replace(case, entry=(entry[0], entry[1]))
-            trial = _converged(moved, warm_reference(case, best, 0.0), best.t_go_s)
+            trial = _refined(moved, best, latest_s=best.t_go_s)
             if trial is None or trial.t_go_s > best.t_go_s - TIME_TOLERANCE_S:
                 break
             best = trial
@@ -294,20 +286,37 @@ def _moved(case: Case, path: StepPath) -> StepPath:
     return best
 
 
+def _refined(
+    case: Case,
+    path: RobotPath,
+    since_s: float = 0.0,
+    latest_s: float = math.inf,
+    trust: float = TRUST,
+    rough: bool = False,
+) -> StepPath | None:
+    """Iterate from the rest of an earlier path, whose aborts the first iteration requires."""
+    rows = aborted(case, path, since_s).rows
+    return _converged(case, warm_reference(case, path, since_s), latest_s, trust, rough, rows)
+
+
 def _converged(
-    case: Case, reference: ReferencePath, latest_s: float = math.inf, warm: _Warm = None, trust: float = TRUST
+    case: Case,
+    reference: ReferencePath,
+    latest_s: float = math.inf,
+    trust: float = TRUST,
+    rough: bool = False,
+    rows: tuple[PointRows, ...] = (),
 ) -> StepPath | None:
     """Iterate from a reference until the end time no longer changes; return the earliest feasible path seen.
 
     The iterations end without a result where the end time remains later than ``latest_s``. The first iteration requires
-    the aborts of ``warm``, an earlier path and the time since its begin.
+    ``rows``, the aborts of an earlier path.
     """
     best: StepPath | None = None
-    n, tolerance = case.limits.nodes, ROUGH_TOLERANCE if case.coarse or warm is not None else RELATIVE_TOLERANCE
+    n, tolerance = case.limits.nodes, ROUGH_TOLERANCE if case.coarse or rough else RELATIVE_TOLERANCE
     reference = replace(reference, t=max(reference.t, case.earliest_s - case.wait_s))
     off, gain = np.zeros((2 * n, len(CONSTRAINTS))), np.array(0.6)  # doubled where an excess remains: it reacts weakly
-    change, slack, settled = _trust(case, reference, trust), math.inf, 0
-    rows = () if warm is None else aborted(case, *warm).rows
+    change, slack, settled = largest_change(case, reference, trust), math.inf, 0
     for iteration in range(ITERATIONS):
         found = solve(convex_subproblem(case, reference, off, change, rows))
         if found is None:
@@ -315,36 +324,25 @@ def _converged(
         t = n * found.h
         path = StepPath(case.r0, case.v0, found.u, case.wait_s, case.wait_s + t)
         over, abort = excess(case, path), aborted(case, path)
-        rows = (*abort.rows, *(rows[:1] if iteration >= ALTERNATING else ()))
+        rows = (*abort.rows, *rows[:KEPT])
         if found.slack <= case.buffer_m:
             path = path.ending_at(case.scene.goal)
             allowed = (case.limits.mouth_m or 0.0) if case.coarse else 0.0
-            if _feasible(case, path, max(over.max(), abort.short), allowed):
-                best = _earlier(best, path)
+            if feasible(case, path, max(over.max(), abort.short), allowed):
+                best = path if best is None else min(best, path, key=_duration)
         settled += abs(t - reference.t) <= max(TIME_TOLERANCE_S, tolerance * t)
         if settled and best is not None and (settled > 1 or path is best):
             return best
         stuck = best is None and found.slack > 0.9 * slack
         late = path.t_go_s > (latest_s if iteration >= 3 else HOPELESS * latest_s)
-        hopeless = iteration >= 1 and (late or (stuck and iteration >= 6))
+        hopeless = iteration >= 1 and (late or (stuck and iteration >= STUCK))
         if hopeless or t > case.params.horizon_s - case.wait_s:
             return best
-        if abs(t - reference.t) <= NEAR_REFERENCE * t:
+        if found.slack > case.buffer_m and over.max() == 0.0:
+            off *= 0.5
+        elif abs(t - reference.t) <= NEAR_REFERENCE * t:
             gain = np.where(over > 0.0, np.minimum(2.0 * gain, 4.8), 0.6)
             off += gain * over + np.where(over > 0.0, case.buffer_m, 0.0)
         slack, reference = found.slack, ReferencePath(t, path.at(case.wait_s + t * interval_fractions(n))[0])
-        change = max(0.5 * change, 1e-3) if iteration >= 6 else _trust(case, reference, trust)
+        change = max(0.5 * change, 1e-3) if iteration >= 6 else largest_change(case, reference, trust)
     return best
-
-
-def _trust(case: Case, reference: ReferencePath, most: float) -> float:
-    """Return the largest relative change of the end time: the target may turn by TURN_RAD at most."""
-    turn = turn_rate(case, case.wait_s + reference.t) * reference.t
-    return float(min(most, TURN_RAD / max(turn, 1e-9)))
-
-
-def _feasible(case: Case, path: StepPath, over: float, allowed: float) -> bool:
-    position, velocity = path.terminal_errors(case.scene.goal)
-    short = path.t_go_s <= case.params.horizon_s
-    exact = position <= 1e-8 and velocity <= 1e-8 and path.u_max() <= case.a_max and case.within_axes(path.u)
-    return bool(short and exact and over <= allowed)
