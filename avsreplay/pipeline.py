@@ -193,6 +193,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     state, track, acquired = _track(stages, state, scan)
     predicted = stages.estimator.predict(track, scan.t_ns)
     measurement = acquired or _register(stages, state, scan, predicted)
+    track, predicted = stages.estimator.determined(track, predicted, measurement.alignment)
     prior, innovation, verdict = _judge(stages, scan, predicted, measurement)
     if acquired is None and not verdict.gamma and _prediction_lost(stages, scan, predicted):
         measurement = _acquire(stages, state, scan, _deskewed(stages, state, scan, predicted), "acquired")
@@ -274,7 +275,8 @@ def _register(stages: Stages, state: PipelineState, scan: Scan, predicted: Predi
     elif stages.guess is Guess.LAST:
         guess, origin = state.last_pose, "last"
     effort, carried = allowed_scans(state.failed), points is not scan.points
-    found = stages.registrar.register(points, guess, scan.seq, carried, effort)
+    unknown = None if state.track is None else state.track.undetermined
+    found = stages.registrar.register(points, guess, scan.seq, carried, effort, unknown)
     return _measurement(stages, scan, points, found, origin)
 
 

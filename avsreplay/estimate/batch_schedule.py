@@ -28,7 +28,13 @@ from avsreplay.estimate.initialise import (
     joined,
     pose_count,
 )
-from avsreplay.estimate.measurement import chart_update, in_fixture, measured_pose, measurement_jacobian
+from avsreplay.estimate.measurement import (
+    chart_update,
+    constrained_update,
+    in_fixture,
+    measured_pose,
+    measurement_jacobian,
+)
 from avsreplay.estimate.mixture import carried, moments, worn
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
@@ -104,6 +110,28 @@ class BatchSchedule:
     def _growth(self, last: BatchResult) -> float:
         """The share by which the poses grow until the next fit; a Gaussian likelihood is propagated well in between."""
         return CHECK_GROWTH if last.gaussian else self.params.refit_growth
+
+    def filtered(self, track: Track, prediction: Prediction, innovation: Innovation) -> Track:
+        """The filter's posterior after a healthy pose, its noise window and its memory of poses."""
+        prior = prediction.belief
+        dt_ns = prior.t_ns - track.belief.t_ns
+        mean = 0.0 if track.batch is None else track.batch.share
+        inflation = self.noise.inflation(track.inflation, mean, prior.x.w_b, dt_ns, innovation.share)
+        if self.params.by_gain and track.batch is None:
+            belief, hits = constrained_update(prior, prediction.H, innovation, self.params.sigma_margin, inflation)
+        else:
+            belief, hits = chart_update(prior, prediction.H, innovation, inflation), 0
+        return replace(
+            track,
+            belief=belief,
+            mode="filter",
+            window=self.noise.updated(prediction.window, prior.x, prediction.H, innovation, belief, inflation),
+            sigma_hits=track.sigma_hits + hits,
+            r_floors=track.r_floors + self.noise.floors(innovation.R),
+            R=innovation.R,
+            fixes=self.remembered(track, prediction, innovation),
+            since=track.since + 1,
+        )
 
     def remembered(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
         """The newest poses, for ``check_against_batch``."""

@@ -21,8 +21,6 @@ from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
 from avsreplay.estimate.error_state import RHO
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
-    chart_update,
-    constrained_update,
     gate_of,
     in_camera,
     innovation_of,
@@ -32,11 +30,20 @@ from avsreplay.estimate.measurement import (
     residual,
 )
 from avsreplay.estimate.mixture import mixture_forecast
-from avsreplay.estimate.noise import NO_INFLATION, Noise, line_of_sight_1s
+from avsreplay.estimate.noise import NO_INFLATION, Noise
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.reference import rows_along
 from avsreplay.estimate.relative_orbit import RelativeOrbit
-from avsreplay.estimate.track import Epoch, Prediction, Track, common_motions, motion_covariance, undetermined
+from avsreplay.estimate.track import (
+    Epoch,
+    Prediction,
+    Track,
+    common_1s,
+    common_motions,
+    motion_covariance,
+    turned,
+    undetermined,
+)
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, Belief, Forecast, Innovation, Trajectory, Verdict
 
@@ -100,6 +107,19 @@ class Estimator:
         belief, Phi = self.batch.propagated(track, track.belief, t_ns)
         return Prediction(belief, Phi, measurement_jacobian(belief.x), track.window)
 
+    def determined(self, track: Track, prediction: Prediction, alignment: Alignment) -> tuple[Track, Prediction]:
+        """The track before a scan and its prediction, turned if its pose first determines a rotation of the model.
+
+        Args:
+            track: after the last scan.
+            prediction: of this scan.
+            alignment: of this scan.
+        """
+        t_ns = prediction.belief.t_ns
+        T_ac = alignment.T_ac if self.fall is None else self.fall.pose_into(alignment.T_ac, t_ns)
+        after = turned(track, prediction.belief.x.T_ac, T_ac, alignment)
+        return (track, prediction) if after is track else (after, self.predict(after, t_ns))
+
     def innovate(self, prediction: Prediction, alignment: Alignment) -> Innovation:
         """The innovation of a registered pose: alpha, S, R, NIS and the Cauchy weight of the pose in the update.
 
@@ -147,7 +167,7 @@ class Estimator:
             track: after the scan.
             times_s: (n,) >= 0, ascending [s after the scan].
         """
-        noise, b = self.batch.noise_levels(track), self._common_1s(track)
+        noise, b = self.batch.noise_levels(track), common_1s(track, self.in_camera(track.belief).x.T_ac.t)
         if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
             found = dynamics.grasp_forecast(track.belief, times_s, *noise)
         else:
@@ -245,7 +265,7 @@ class Estimator:
             return replace(track, belief=prediction.belief)
         if track.mode in ("start", "fit") or (track.mode == "near" and not self._by_gain):
             return self.batch.initialised(track, prediction, innovation, converged)
-        return self.batch.check_against_batch(self._filtered(track, prediction, innovation))
+        return self.batch.check_against_batch(self.batch.filtered(track, prediction, innovation))
 
     def published(self, track: Track) -> Belief:
         """The belief in {A} with errors that later poses do not reduce and the filter therefore does not carry.
@@ -256,17 +276,11 @@ class Estimator:
         Args:
             track: after a scan.
         """
-        belief, b = self.in_camera(track.belief), self._common_1s(track)
+        belief = self.in_camera(track.belief)
+        b = common_1s(track, belief.x.T_ac.t)
         P = belief.P + motion_covariance(track.undetermined, belief.x.q_bc)
         P[RHO, RHO] += np.outer(b, b)
         return replace(belief, P=P)
-
-    def _common_1s(self, track: Track) -> Array:
-        """(3,) 1 sigma of that error in {A} [m]."""
-        if track.batch is None or track.batch.share == 0.0 or track.batch.position_m2 is None:
-            return np.zeros(3)
-        share = track.levels.common[1] * track.batch.share
-        return line_of_sight_1s(self.in_camera(track.belief).x.T_ac.t, track.batch.position_m2, share)
 
     def in_camera(self, belief: Belief) -> Belief:
         """The belief of a track or a prediction in {A}; it differs only where an acceleration is known.
@@ -326,25 +340,3 @@ class Estimator:
         """
         H = measurement_jacobian(belief.x)
         return np.asarray(H @ belief.P @ H.T)
-
-    def _filtered(self, track: Track, prediction: Prediction, innovation: Innovation) -> Track:
-        """The filter's posterior, its noise window and its memory of poses."""
-        prior = prediction.belief
-        dt_ns = prior.t_ns - track.belief.t_ns
-        mean = 0.0 if track.batch is None else track.batch.share
-        inflation = self.noise.inflation(track.inflation, mean, prior.x.w_b, dt_ns, innovation.share)
-        if self._by_gain and track.batch is None:
-            belief, hits = constrained_update(prior, prediction.H, innovation, self.params.sigma_margin, inflation)
-        else:
-            belief, hits = chart_update(prior, prediction.H, innovation, inflation), 0
-        return replace(
-            track,
-            belief=belief,
-            mode="filter",
-            window=self.noise.updated(prediction.window, prior.x, prediction.H, innovation, belief, inflation),
-            sigma_hits=track.sigma_hits + hits,
-            r_floors=track.r_floors + self.noise.floors(innovation.R),
-            R=innovation.R,
-            fixes=self.batch.remembered(track, prediction, innovation),
-            since=track.since + 1,
-        )

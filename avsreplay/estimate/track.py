@@ -20,16 +20,17 @@ from avsreplay.estimate.dynamics import propagate_state, rotation_path
 from avsreplay.estimate.error_state import DMU, VARRHO
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.measurement import measurement_jacobian, to_camera, to_fixture
-from avsreplay.estimate.noise import NoiseWindow, cholesky_root
+from avsreplay.estimate.noise import NoiseWindow, cholesky_root, line_of_sight_1s
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
-from avsreplay.geometry import Array, frozen
-from avsreplay.records import Belief, Drift, Innovation, Manoeuvre, State
+from avsreplay.geometry import Array, Pose, frozen
+from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre, State
 
 _FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
 _READY, _READY_AFTER_MANOEUVRE = 8, 3  # least number of poses of an estimate whose prediction can be tested
 _RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 _NO_NOISE = frozen(np.zeros((6, 6)))
 _NO_MOTION = frozen(np.zeros((6, 0)))
+_TURN_WITHIN_RAD = 0.2  # of the other rotations, where a first determined one turns the whole track
 _ALIKE = 0.966  # cosine of 15 deg, between motions that count as the same
 
 
@@ -132,6 +133,48 @@ def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
 def undetermined(track: Track, innovation: Innovation, gamma: int, length_m: float) -> Array:
     """Return ``Track.undetermined`` after a scan; ``track`` before it, ``length_m`` as in ``common_motions``."""
     return common_motions(track.undetermined, innovation.free, length_m) if gamma else track.undetermined
+
+
+def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Track:
+    """Return the track after a pose first determines a rotation of the model: all of it is turned to this pose.
+
+    No scan before has determined this rotation, so that the earlier poses are as correct after any such turn of the
+    model. The next fit begins anew, because the turn is not small.
+
+    Args:
+        track: before the scan.
+        T_ac: predicted pose.
+        measured: pose of the scan, in the frame of the track.
+        alignment: of the scan.
+
+    Returns:
+        The track itself if the view has unobservable directions, or if not one rotation alone is undetermined or
+        explains the difference.
+    """
+    d, determines = track.undetermined, alignment.status is AlignStatus.ALIGNED and alignment.free is None
+    size = float(np.linalg.norm(d[:3])) if d.shape[1] == 1 and determines else 0.0
+    if size < 1e-9:
+        return track
+    axis, moment = np.split(d[:, 0] / size, 2)
+    step = T_ac.inverse() @ measured
+    q, centre = geometry.exp(float(geometry.log(step.q) @ axis) * axis), np.cross(axis, moment)
+    G = Pose(q, centre - geometry.matrix(q) @ centre)
+    if float(geometry.angle((G.inverse() @ step).q)) > _TURN_WITHIN_RAD:
+        return track
+    x, adjoint = track.belief.x, np.kron(np.eye(2), G.R.T)  # d' = adjoint d of T_ac G
+    adjoint[3:, :3] = -G.R.T @ geometry.skew(G.t)
+    x = replace(x, q_bc=geometry.multiply(x.q_bc, G.q), c_b=x.c_b + geometry.matrix(x.q_bc) @ G.t)
+    fixes = tuple(replace(fix, T_ac=fix.T_ac @ G, C=adjoint @ fix.C @ adjoint.T) for fix in track.fixes)
+    belief = replace(track.belief, x=x)
+    return replace(track, belief=belief, fixes=fixes, mode="start", batch=None, recent=(), doubtful=(), bias=None)
+
+
+def common_1s(track: Track, r_a: Array) -> Array:
+    """Return the 1 sigma (3,) in {A} [m] of the error along the line of sight to ``r_a`` (3,) that all poses have."""
+    if track.batch is None or track.batch.share == 0.0 or track.batch.position_m2 is None:
+        return np.zeros(3)
+    share = track.levels.common[1] * track.batch.share
+    return line_of_sight_1s(r_a, track.batch.position_m2, share)
 
 
 def motion_covariance(d: Array, q_bc: Array) -> Array:

@@ -133,6 +133,26 @@ def unbounded_directions(P: Array, extent_m: float) -> tuple[tuple[str, ...], Ar
     return tuple(_words(row) for row in _sparse_basis(free.T)), scale[:, None] * free
 
 
+def motions_outside(motions: Array, free: Array | None, length_m: float) -> Array:
+    """Return those of the motions d (6, k) that are not in the span of others (6, n).
+
+    Args:
+        motions: as columns d = [theta; v].
+        free: the others; None for none.
+        length_m: a rotation by 1 rad counts as much as a displacement by this length.
+    """
+    if free is None or not motions.size:
+        return motions
+    scale = np.repeat([length_m, 1.0], 3)[:, None]
+    basis, d = np.linalg.qr(scale * free)[0], scale * motions / np.linalg.norm(scale * motions, axis=0)
+    return motions[:, np.linalg.norm(basis.T @ d, axis=0) < AXIS_WITHIN]
+
+
+def motion_words(d: Array) -> tuple[str, ...]:
+    """Name the motions d = [theta; v] (6, k), one name each."""
+    return tuple(_words(column) for column in d.T)
+
+
 def turn_words(step: Pose) -> str:
     """Describe a rigid motion in {C}: "turned 180 deg about x"."""
     degrees = float(np.degrees(geometry.angle(step.q)))

@@ -101,9 +101,9 @@ class GlobalSearch:
         self._refine = HornBackend(replace(target, limits=brief))
 
     @property
-    def near_symmetric(self) -> bool:
-        """Whether a motion carries most of the surface onto itself."""
-        return len(self._symmetries) > 0
+    def symmetries(self) -> Array:
+        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, without the identity."""
+        return self._symmetries
 
     def work(self, points: int, number: int) -> int:
         """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
@@ -231,13 +231,25 @@ class GlobalSearch:
         return Candidate(T_ca, np.sqrt(np.minimum(d2, target.index.reach_m**2)))
 
     def _verdict(self, found: Sequence[Candidate]) -> SearchResult:
-        noise = min(robust_noise(each.distance) for each in found)
+        noise = self.noise_of(found)
         width = max(self._target.limits.gate_m, min(3.0 * noise, 3.0 * NOISE_OF_EXTENT * self._extent))
         best, *rest = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
-        margin = max(self._params.margin, FAVOURED * noise / self._extent)
+        margin = self.margin(noise)
         others = (other for other in rest if not self.same(best.T_ca, other.T_ca))
-        rivals = tuple(other.T_ca for other in takewhile(lambda other: _as_good(best, other, width, margin), others))
+        rivals = tuple(other.T_ca for other in takewhile(lambda other: as_good(best, other, width, margin), others))
         return SearchResult(best.T_ca, rivals, width, float(np.mean(best.distance < width)), tuple(found))
+
+    def noise_of(self, found: Sequence[Candidate]) -> float:
+        """Return the least robust noise [m] of the poses."""
+        return min(robust_noise(each.distance) for each in found)
+
+    def margin(self, noise_m: float) -> float:
+        """Return the share of the scan by which a unique pose explains more than any other one."""
+        return max(self._params.margin, FAVOURED * noise_m / self._extent)
+
+    def refined(self, points: Array, T_ca: Pose, width_m: float) -> Pose:
+        """Return the pose T_ca registered to the model with ``points`` (n, 3) in {A} nearer than ``width_m`` [m]."""
+        return self._refine.align_within(points, T_ca, width_m).T_ca
 
     def same(self, first: Pose, other: Pose) -> bool:
         """Return whether two poses T_ca differ by less than 10 deg and 0.05 of the extent."""
@@ -246,8 +258,8 @@ class GlobalSearch:
         return float(geometry.angle(step.q)) < SAME_RAD and shift < SAME_OF_EXTENT * self._extent
 
 
-def _as_good(best: Candidate, second: Candidate, width: float, margin: float) -> bool:
-    """Test whether the excess cost of the second, point by point, is below 5 sigma of its mean or the margin."""
+def as_good(best: Candidate, second: Candidate, width: float, margin: float) -> bool:
+    """Return whether the excess cost of the second, point by point, is below 5 sigma of its mean or the margin."""
     excess = second.unexplained(width) - best.unexplained(width)
     error = SIGMAS * float(excess.std()) / np.sqrt(len(excess))
     return bool(excess.mean() < max(margin, error))

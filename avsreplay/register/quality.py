@@ -23,7 +23,7 @@ from avsreplay.register.covariance import (
     systematic_errors,
     without_dominant_patches,
 )
-from avsreplay.register.degenerate import FREE_BELOW, Directions, unbounded_directions
+from avsreplay.register.degenerate import FREE_BELOW, Directions, motion_words, unbounded_directions
 from avsreplay.register.params import Camera, RegisterParams, RegistrationLimits
 from avsreplay.register.size import LEAST_ERROR, SizeError, normal_jacobian, size_error
 from avsreplay.register.surface_index import Closest, SurfaceIndex
@@ -300,6 +300,16 @@ def _observable_information(view: Directions, found: Evidence, extent_m: float, 
     else:
         P, _ = sandwich_covariance(held.normals, held.gradients)
     return view.observable_information(P)
+
+
+def undetermined(found: Alignment, motions: Array) -> Alignment:
+    """Return an alignment whose information is independent of motions d (6, k) of the model: DEGENERATE."""
+    N, D = found.info, motions / np.linalg.norm(motions, axis=0)
+    info = N - N @ D @ np.linalg.pinv(D.T @ N @ D, hermitian=True) @ D.T @ N
+    motions = motions if found.free is None else np.hstack([found.free, motions])
+    words, info = ", ".join(motion_words(motions)), frozen(0.5 * (info + info.T))
+    free = replace(found, status=AlignStatus.DEGENERATE, info=info, covariance=None, dof=np.inf)
+    return replace(free, free_directions=words, free=motions, split_nis=None)
 
 
 def not_measured(points: int, status: AlignStatus, T_ac: Pose | None = None) -> Alignment:

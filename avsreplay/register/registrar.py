@@ -13,22 +13,22 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
-from avsreplay.register import index_cache, quality
+from avsreplay.register import index_cache, quality, restarts
 from avsreplay.register.backend import Target, aligned, create_backend, load_backend
-from avsreplay.register.degenerate import turn_words
+from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import GlobalSearch, SearchResult
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
-from avsreplay.register.quality import Visibility
-from avsreplay.register.restarts import HEALTHY_SCANS, SCATTER_WORK, TEST_WORK, VALLEY_WORK, Budget, Restart, Restarter
+from avsreplay.register.restarts import Budget, Restart, Restarter
+from avsreplay.register.rivals import LEAST_RAYS, NearSymmetry
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 
-LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in units of the gate) a fit is close
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
 TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 LEAST_TO_TURN = 0.2  # with fewer inliers turned starts have no prospect
 SURE_RATIO = 0.9  # a search with fewer inliers is followed by another
+NO_MOTION: Array = np.zeros((6, 0))
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
 
 
@@ -54,7 +54,7 @@ class Registrar:
         self.params = params or RegisterParams()
         self.limits = self.params.limits(surface.extent)
         factory = load_backend(self.params.backend)  # before the index, so that a wrong name is reported at once
-        self._visibility = Visibility(surface, self.params.camera)
+        self._visibility = quality.Visibility(surface, self.params.camera)
         surface = self._visibility.surface
         cache_dir = index_cache.folder_for(surface) if self.params.index_cache else None
         self._index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
@@ -65,7 +65,13 @@ class Registrar:
         self._restarter = Restarter(self._target, self._test)
 
     def register(
-        self, points: NDArray[Any], guess: Pose, seq: int = 0, carried: bool = False, effort: int = HEALTHY_SCANS
+        self,
+        points: NDArray[Any],
+        guess: Pose,
+        seq: int = 0,
+        carried: bool = False,
+        effort: int = restarts.HEALTHY_SCANS,
+        unknown: Array | None = None,
     ) -> Alignment:
         """Register a scan from a guess (eq:ICP).
 
@@ -77,6 +83,8 @@ class Registrar:
                 the scan like a systematic error, but the estimator models it (``Alignment.instants``): the covariance
                 then leaves it out, so that it is not counted twice.
             effort: most work, in ordinary registrations; with 1 an implausible pose is neither restarted nor searched.
+            unknown: (6, k) motions d of the model about which the guess knows nothing; None for no motion. The scan
+                determines them only if no pose turned by a near-symmetry of the model explains it as well.
 
         Returns:
             The pose T_ac with its quality. A failure is reported as its status, never as an exception. Where nothing
@@ -89,11 +97,14 @@ class Registrar:
         first = self._graded(scan, guess, halves=halves, carried=carried)
         if first.status is AlignStatus.FAILED:
             return first
-        healthy = self._healthy(first)
+        healthy = self._restarter.healthy(first)
         found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried, effort)
-        return self._searched(scan, found, carried, effort) if self._far(guess, found) and not searched else found
+        if self._far(guess, found) and not searched:
+            return self._searched(scan, found, carried, effort)
+        free = NO_MOTION if unknown is None else unknown
+        return found if searched or effort <= 1 else self._settled(scan, found, halves, carried, free)
 
-    def acquire(self, points: NDArray[Any], effort: int = HEALTHY_SCANS) -> Alignment:
+    def acquire(self, points: NDArray[Any], effort: int = restarts.HEALTHY_SCANS) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
 
         Args:
@@ -117,7 +128,7 @@ class Registrar:
     ) -> Alignment:
         """The best plausible result of the searches that the budget allows, the first in any case; ``known``: T_ca."""
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
-        budget.spend(SCATTER_WORK * len(scan))
+        budget.spend(restarts.SCATTER_WORK * len(scan))
         few = self._restarter.part(target)
         whole: SearchResult | None = None
         results: list[Alignment] = []
@@ -125,14 +136,15 @@ class Registrar:
             work = self._global.work(len(part), number)
             if results and not budget.allows(work):
                 break
-            budget.spend(work + TEST_WORK)
+            budget.spend(work + restarts.TEST_WORK)
             search = self._global.search(part, number, whole if part is target else None, known)
             whole = search if part is target else whole
             found, alone = self._acquired(scan, part, search, budget, carried)
             results.append(found)
             if found.status is AlignStatus.FAILED:
                 return found
-            if found.measured and self._sure(search, alone):
+            little = search.inlier_ratio >= SURE_RATIO or (alone and not search.rivals)  # left to explain
+            if found.measured and little and search.width_m <= self.limits.gate_m:
                 break
         measured = [(each, self._restarter.measure(few, each.T_ac.inverse())) for each in results if each.measured]
         if measured:
@@ -143,12 +155,6 @@ class Registrar:
             return first
         message = "no pose of the model explains the scan, and no work is left for a longer search"
         return replace(first, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=message)
-
-    def _sure(self, search: SearchResult, alone: bool) -> bool:
-        """Whether no other round can find a better pose: what is not on the model is little, or another object's."""
-        if search.width_m > self.limits.gate_m:
-            return False
-        return search.inlier_ratio >= SURE_RATIO or (alone and not search.rivals)
 
     def _acquired(
         self, scan: NDArray[Any], part: Array, search: SearchResult, budget: Budget, carried: bool
@@ -169,19 +175,25 @@ class Registrar:
             return replace(found, status=AlignStatus.NO_OVERLAP, covariance=None), False
         if at.reason:
             return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=at.reason), False
-        rivals = self._rivals(scan, found, search)
+        best, rivals = found.T_ac.inverse(), list(search.rivals)
+        if self._symmetry.marked:
+            best, rivals = self._symmetry.decided(part, best, rivals, at.covered)
+            budget.spend(self._symmetry.work(len(part)))
+            if not self._global.same(best, found.T_ac.inverse()):
+                found = self._regraded(scan, few, self._restarter.measure(few, best), budget, carried=carried)
+        rivals = self._rivals(scan, found, rivals)
         if rivals:
-            words = turn_words(search.best @ rivals[0].inverse())
+            words = turn_words(found.T_ac.inverse() @ rivals[0].inverse())
             found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
         return found, alone
 
-    def _rivals(self, scan: NDArray[Any], found: Alignment, search: SearchResult) -> list[Pose]:
+    def _rivals(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> list[Pose]:
         """The rivals that differ from a degenerate view not only along its unobservable directions; else all."""
-        if found.status is not AlignStatus.DEGENERATE or not search.rivals:
-            return list(search.rivals)
+        if found.status is not AlignStatus.DEGENERATE or not rivals:
+            return rivals
         at = found.T_ac.inverse()
         free = quality.view_directions(self._index, self._visibility, scan, at, self.limits.gate_m)
-        return [T_ca for T_ca in search.rivals if not self._global.same(T_ca, free.nearest(at, T_ca))]
+        return [T_ca for T_ca in rivals if not self._global.same(T_ca, free.nearest(at, T_ca))]
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see ``quality.instants``.
@@ -219,21 +231,36 @@ class Registrar:
     def _global(self) -> GlobalSearch:
         return GlobalSearch(self._target, self.params.acquire)
 
+    @cached_property
+    def _symmetry(self) -> NearSymmetry:
+        return NearSymmetry(self._target, self._test, self._global)
+
     def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
         finite = np.isfinite(points)
         scan = points if finite.all() else points[finite.all(axis=1)]
         return thin(scan, self.params.subsample_m) if self.params.subsample_m > 0.0 else scan
 
-    def _healthy(self, found: Alignment) -> bool:
-        """A close fit of nearly all points needs no further test."""
-        return found.inlier_ratio >= LEAST_RATIO and found.rms_m <= POOR_OF_GATE * self.limits.gate_m
+    def _settled(self, scan: NDArray[Any], found: Alignment, halves: bool, carried: bool, unknown: Array) -> Alignment:
+        """The pose turned by a near-symmetry of the model, if the points off the model decide for it.
+
+        DEGENERATE in the motions that the guess leaves unknown, if other poses explain the scan as well.
+        """
+        unknown = motions_outside(unknown, found.free, self._target.surface.extent)
+        unsure, accepted = unknown.size > 0, found.status in (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
+        if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.near:
+            return found
+        T_ca, part = found.T_ac.inverse(), self._restarter.part(scan)
+        best, rivals = self._symmetry.decided(scan, T_ca, [] if unsure else None, self._test.check(part, T_ca).covered)
+        turned = found if best is T_ca else self._graded(scan, best.inverse(), None, halves, carried)
+        found = turned if unsure or turned.status is AlignStatus.ALIGNED else found
+        return quality.undetermined(found, unknown) if unsure and rivals else found
 
     def _far(self, guess: Pose, found: Alignment) -> bool:
         """A measured pose so far from the guess that another local minimum may be better."""
         angle = float(geometry.angle((guess.inverse() @ found.T_ac).q))
         if not found.measured or found.status is AlignStatus.DEGENERATE or angle < TURNED_RAD:
             return False
-        return angle > FAR_RAD or self._global.near_symmetric
+        return angle > FAR_RAD or len(self._global.symmetries) > 0
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, effort: int) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
@@ -243,20 +270,6 @@ class Registrar:
             return self._acquire(scan, budget, carried, known=found.T_ac.inverse())
         far = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a global search"
         return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=far)
-
-    def _doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment) -> bool:
-        """A failure, a poor fit of a part of the scan, or a poor fit of all away from the guess: a local minimum?
-
-        A misfit of nearly all points of which neighbours share less than half is noise, and no reason for doubt.
-        """
-        if found.status is AlignStatus.FAILED or not found.inliers:
-            return True
-        T_ca, poor = found.T_ac.inverse(), POOR_OF_GATE * self.limits.gate_m
-        if found.rms_m <= poor or found.inlier_ratio < LEAST_RATIO:
-            return found.rms_m > poor
-        moved = T_ca.apply(points) - guess.inverse().apply(points)
-        far = float(np.linalg.norm(moved, axis=1).mean()) > self.limits.gate_m
-        return far and self._restarter.structure(points, T_ca) > max(poor, np.sqrt(0.5) * found.rms_m)
 
     def _recovered(
         self, scan: NDArray[Any], guess: Pose, first: Alignment, halves: bool, carried: bool, effort: int
@@ -268,7 +281,7 @@ class Registrar:
         hopeful = first.measured and kept.noise_m <= NOISE_OF_EXTENT * self._target.surface.extent
         final = self._regraded(scan, few, kept, budget, halves, carried) if hopeful else first
         reason = self._reason(few, final, budget)
-        if not (reason or self._doubtful(few, guess, final)):
+        if not (reason or self._restarter.doubtful(few, guess, final)):
             return final, False
         before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without, it may show something else
         steps = ("restart", "search", "turn") if hopeful or not overlap else ("search", "restart", "turn")
@@ -294,7 +307,7 @@ class Registrar:
 
     def _reason(self, few: NDArray[Any], found: Alignment, budget: Budget) -> str:
         """Why a pose is not plausible; "" if it is, or nothing was measured."""
-        budget.spend(TEST_WORK)
+        budget.spend(restarts.TEST_WORK)
         return self._test.check(few, found.T_ac.inverse()).reason if found.measured else ""
 
     def _regraded(
@@ -310,9 +323,9 @@ class Registrar:
         width = self._restarter.width(kept)
         found = self._graded(scan, kept.T_ca.inverse(), width, halves, carried)
         budget.registered(found)
-        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= LEAST_RATIO or budget.brief:
+        if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= restarts.LEAST_RATIO or budget.brief:
             return found
-        budget.spend(VALLEY_WORK)
+        budget.spend(restarts.VALLEY_WORK)
         moved = self._restarter.along_valley(few, found.T_ac.inverse())
         if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
             return found
@@ -335,9 +348,3 @@ class Registrar:
         if found.status is AlignStatus.FAILED:
             found = replace(found, T_ac=guess, message=f"back end '{self.params.backend}' {found.message}")
         return found
-
-
-def _indexed(surface: Surface, reach_m: float, params: RegisterParams) -> SurfaceIndex:
-    large = max(len(surface.vertices), len(surface.faces)) >= index_cache.LEAST_PRIMITIVES
-    cache_dir = index_cache.user_folder() if params.index_cache and large else None
-    return SurfaceIndex.build(surface, reach_m, threads=params.threads, cache_dir=cache_dir)

@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment
+from avsreplay.records import Alignment, AlignStatus
 from avsreplay.register.backend import Target
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest, robust_noise
 from avsreplay.register.size import LEAST_RESIDUALS
 from avsreplay.register.surface_index import IcpParams
 
+LEAST_RATIO, POOR_OF_GATE = 0.9, 0.3  # with more inliers and a smaller rms (in units of the gate) a fit is close
 POINTS = 1000  # points of the scan used by restarts
 START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
@@ -167,6 +168,31 @@ class Restarter:
         sums, counts = (np.bincount(half, w, 2 * (int(patch.max()) + 1)).reshape(-1, 2) for w in (e, None))
         shared = float(sums.prod(axis=1).sum()) / max(float(counts.prod(axis=1).sum()), 1.0)
         return float(np.sqrt(max(shared, 0.0)))
+
+    def healthy(self, found: Alignment) -> bool:
+        """Return whether an alignment is a close fit of nearly all points, which needs no further test."""
+        return found.inlier_ratio >= LEAST_RATIO and found.rms_m <= POOR_OF_GATE * self._target.limits.gate_m
+
+    def doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment) -> bool:
+        """Return whether an alignment may be a local minimum.
+
+        After a failure, a poor fit of a part of the scan, or a poor fit of all away from the guess. A misfit of nearly
+        all points of which neighbours share less than half is noise, and no reason for doubt.
+
+        Args:
+            points: (n, 3) in {A} [m], part of the scan.
+            guess: T_ac from which it was registered.
+            found: its result.
+        """
+        if found.status is AlignStatus.FAILED or not found.inliers:
+            return True
+        T_ca, gate = found.T_ac.inverse(), self._target.limits.gate_m
+        poor = POOR_OF_GATE * gate
+        if found.rms_m <= poor or found.inlier_ratio < LEAST_RATIO:
+            return found.rms_m > poor
+        moved = T_ca.apply(points) - guess.inverse().apply(points)
+        far = float(np.linalg.norm(moved, axis=1).mean()) > gate
+        return far and self.structure(points, T_ca) > max(poor, np.sqrt(0.5) * found.rms_m)
 
     def along_valley(self, points: NDArray[Any], T_ca: Pose) -> Pose:
         """Return the best pose along the two directions in which the scan determines it least, or the pose itself.

@@ -1,0 +1,272 @@
+"""Decision between poses that differ by a near-symmetry of the model, by the rays that contradict each of them.
+
+A nearly symmetric body differs from its turned copies only by its marks: the parts that no near-symmetry carries onto
+the surface. Three kinds of rays decide between two poses: points on the model at one pose and well off it at the other;
+rays that pass through a mark of one pose, because the point measured in that direction lies behind it; and directions
+in which a mark should be visible and nothing was measured, if the visible side of the model is complete in the scan.
+
+With a share e of rays that contradict the true pose (other objects, errors of the model), a ray that contradicts one
+pose only has the log likelihood ratio log((1 - e) / e). Poses whose sum is below ``LEAST_LIKELIHOOD`` stay rivals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.register.backend import Target
+from avsreplay.register.degenerate import scaled_information
+from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
+from avsreplay.register.plausibility import PlausibilityTest
+from avsreplay.register.sampling import sample
+from avsreplay.register.size import normal_jacobian
+
+SAMPLES, MOST_MARKS = 20_000, 500  # on the surface
+MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
+TURNS, GENERIC_TURNS = 72, (5, 11, 23, 31, 43, 59)  # about an axis of revolution; those by which it is recognised
+REVOLVED, FITS = 0.02, 2  # of the extent: distance within which turned surface is on the model; fits of the axis
+TRIED = 16  # motions of a kind by which the marks are found
+NEAR = 0.004  # of the extent: a point nearer than this, or than three standard deviations of the noise, is on the model
+OFF = 2.0  # a point farther from the model than this many widths is off it
+LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
+CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
+LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
+LEAST_RAYS = 8  # fewer points off the model decide nothing
+MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
+STEPS = 24  # of the march from a mark to the camera
+NEIGHBOUR, EMPTY, SPACED = 8, 2.5, 500  # for the density of rays; no ray within so many spacings: nothing was measured
+MOST_POINTS, SCREENED, FINALISTS = (
+    6000,
+    150,
+    2,
+)  # of the scan; of each kind for all motions; poses of each kind of motion
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contradicted(Candidate):
+    """A pose with what contradicts it.
+
+    Attributes:
+        passed: rays that passed through a mark that should be visible.
+        empty: rays expected on marks in directions in which nothing was measured.
+    """
+
+    passed: float
+    empty: float
+
+
+class NearSymmetry:
+    """The motions that carry most of a model onto itself, and its marks."""
+
+    def __init__(self, target: Target, test: PlausibilityTest, search: GlobalSearch) -> None:
+        """Find the axis of revolution, if there is one, and sample the marks."""
+        self._target, self._test, self._search, self._gate = target, test, search, target.limits.gate_m
+        surface = target.surface
+        points, normals = sample(surface, SAMPLES)
+        self._kinds = self._all_motions(points, normals) if len(surface.faces) else []
+        moved = np.zeros(len(points), dtype=bool)
+        for motions in self._kinds:
+            for T in motions[:: max(1, len(motions) // TRIED)]:
+                if moved.mean() >= MOST_MARKED:
+                    break
+                moved |= self._distances(points, T[None])[0] > OFF * self._gate
+        marks = np.flatnonzero(moved)
+        stride, self._share = max(1, -(-len(marks) // MOST_MARKS)), len(marks) / max(1, len(points))
+        a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+        area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+        self._marks, self._normals = points[marks[::stride]], normals[marks[::stride]]
+        self._area = stride * area / max(1, len(points))
+        self._low, self._high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+
+    @property
+    def near(self) -> bool:
+        """Whether turned copies of the model differ from it by a mark at most."""
+        return len(self._kinds) > 0 and self._share < MOST_MARKED
+
+    @property
+    def marked(self) -> bool:
+        """Whether the turned copies of the model can be told apart by a mark, and only by it."""
+        return self.near and self._share > 0.0
+
+    def work(self, points: int) -> int:
+        """Return the usual cost of a decision in point searches."""
+        n = min(points, MOST_POINTS)
+        motions = sum(len(motions) for motions in self._kinds)
+        finalists = FINALISTS * len(self._kinds)
+        return 2 * SCREENED * motions + finalists * (FINE_PASSES * 2 * SCREENED + n + STEPS * len(self._marks) // 2)
+
+    def decided(
+        self, scan: NDArray[np.floating], T_ca: Pose, others: list[Pose] | None, complete: bool
+    ) -> tuple[Pose, list[Pose]]:
+        """Return the pose for which the rays decide, and the others that explain the scan as well.
+
+        Args:
+            scan: (n, 3) in {A} [m].
+            T_ca: registered pose.
+            others: other poses that explain the scan; None asks only for a pose that explains more of it.
+            complete: the visible side of the model is complete in the scan, so that empty directions count.
+        """
+        points = np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64)
+        rays = _Rays(points)
+        turned = self._turned(rays, T_ca, others is None)
+        if others is None and not turned:
+            return T_ca, []
+        found = [self._measured(rays, pose) for pose in (T_ca, *(others or ()), *turned)]
+        noise, best = self._search.noise_of(found), found[0]
+        width = max(NEAR * self._target.surface.extent, 3.0 * noise)
+        for each in found[1:]:
+            best = each if decides(each, best, width, complete) else best
+        margin = self._search.margin(noise)
+        rivals = [
+            each.T_ca
+            for each in found
+            if not self._search.same(best.T_ca, each.T_ca)
+            and as_good(best, each, max(self._gate, width), margin)
+            and not decides(best, each, width, complete)
+        ]
+        return best.T_ca, rivals
+
+    def _all_motions(self, points: Array, normals: Array) -> list[Array]:
+        """The near-symmetries (k, 4, 4) without the identity: turns about an axis of revolution, and the others."""
+        found = self._search.symmetries
+        axis = self._axis(points, normals) if len(found) else None
+        if axis is None:
+            return [found[k::FINALISTS] for k in range(min(FINALISTS, len(found)))]
+        direction, centre = axis
+        turns = revolved(direction, centre, TURNS)
+        flips = [T for T in found if direction @ T[:3, :3] @ direction < -0.9]
+        return [turns[1:], *(turns @ flip for flip in flips[:1])]
+
+    def _axis(self, points: Array, normals: Array) -> tuple[Array, Array] | None:
+        """Direction and a point of the axis about which most of the surface is a surface of revolution, or None."""
+        on = np.ones(len(points), dtype=bool)
+        for _ in range(FITS):
+            centre = points[on].mean(axis=0)
+            J = normal_jacobian(points[on], normals[on])
+            info, radius = scaled_information(J.T @ J, int(on.sum()), centre)
+            x = np.linalg.eigh(info)[1][:, 0]
+            theta = x[:3] / radius
+            size = float(np.linalg.norm(theta))
+            if size * radius < 0.5:
+                return None
+            direction, centre = theta / size, centre + np.cross(theta, x[3:]) / size**2
+            turns = revolved(direction, centre, TURNS)[list(GENERIC_TURNS)]
+            on = np.all(self._distances(points, turns) < REVOLVED * self._target.surface.extent, axis=0)
+            if on.mean() < 0.5:
+                return None
+        return direction, centre
+
+    def _distances(self, points: Array, motions: Array) -> Array:
+        """Distances (k, n) [m] of points (n, 3) in {C} moved by (k, 4, 4), at most the reach."""
+        moved = points @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
+        d2 = self._target.index.closest(moved.reshape(-1, 3)).d2
+        return np.sqrt(np.minimum(d2, self._target.index.reach_m**2)).reshape(len(motions), -1)
+
+    def _turned(self, rays: _Rays, T_ca: Pose, better: bool) -> list[Pose]:
+        """The best poses that the near-symmetries give, registered with the points off the model in their number.
+
+        Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays pass through a mark. ``better``: only
+        poses that explain more points, by ``LEAST_RAYS`` at least.
+        """
+        distance = self._test.measure(rays.points, T_ca)
+        kinds = [np.flatnonzero(mask) for mask in (distance > self._gate, distance <= self._gate)]
+        few = [k[:: max(1, -(-len(k) // SCREENED))] for k in kinds]
+        weights = np.concatenate([np.full(len(f), len(k) / max(1, len(f))) for k, f in zip(kinds, few, strict=True)])
+        part = np.ascontiguousarray(rays.points[np.concatenate(few)])
+        width = OFF * self._gate
+        kept: list[Pose] = []
+        for motions in self._kinds:
+            cost = np.minimum(self._distances(T_ca.apply(part), motions) / width, 1.0) ** 2 @ weights
+            here = float(np.minimum(self._distances(T_ca.apply(part), np.eye(4)[None]) / width, 1.0)[0] ** 2 @ weights)
+            most, order = len(kept) + FINALISTS, np.argsort(cost, kind="stable")
+            for k in order[cost[order] < here - LEAST_RAYS] if better else order:
+                start = Pose.from_matrix(motions[k]) @ T_ca
+                if any(self._search.same(start, other) for other in (T_ca, *kept)):
+                    continue
+                if self._passed(rays, start)[0] < LEAST_RAYS:
+                    kept.append(start)
+                if len(kept) == most:
+                    break
+        return [self._search.refined(part, start, width) for start in kept]
+
+    def _measured(self, rays: _Rays, T_ca: Pose) -> Contradicted:
+        return Contradicted(T_ca, self._test.measure(rays.points, T_ca), *self._passed(rays, T_ca))
+
+    def _passed(self, rays: _Rays, T_ca: Pose) -> tuple[float, float]:
+        """Rays that passed through marks that should be visible at a pose, and those expected where nothing is."""
+        seen = self._visible(T_ca)
+        if not len(seen) or rays.tree is None:
+            return 0.0, 0.0
+        marks = T_ca.inverse().apply(self._marks[seen])
+        far = np.linalg.norm(marks, axis=1)
+        cosine = -np.einsum("ij,ij->i", self._normals[seen] @ T_ca.R, marks) / far
+        expected = self._area * cosine / (far * rays.spacing) ** 2
+        angle, nearest = (np.asarray(each) for each in rays.tree.query(marks / far[:, None]))
+        empty = angle > EMPTY * rays.spacing
+        passed = ~empty & (rays.ranges[nearest] > far + OFF * self._gate)
+        return float(expected[passed].sum()), float(expected[empty].sum())
+
+    def _visible(self, T_ca: Pose) -> NDArray[np.intp]:
+        """The marks that face the camera and that no other part of the model hides; none if the camera is unknown."""
+        if not self._target.visibility.may_be_camera(T_ca):
+            return np.empty(0, dtype=np.intp)
+        towards = T_ca.t - self._marks
+        towards /= np.linalg.norm(towards, axis=1)[:, None]
+        seen = np.flatnonzero(np.einsum("ij,ij->i", towards, self._normals) > LEAST_COSINE)
+        at, hidden = np.full(len(seen), OFF * self._gate), np.zeros(len(seen), dtype=bool)
+        for _ in range(STEPS):
+            p = self._marks[seen] + at[:, None] * towards[seen]
+            inside = ((p > self._low) & (p < self._high)).all(axis=1) & ~hidden
+            if not inside.any():
+                break
+            distance = self._distances(p[inside], np.eye(4)[None])[0]
+            hidden[inside] |= distance < 0.25 * self._gate
+            at[inside] += np.maximum(distance, 0.5 * self._gate)
+        return seen[~hidden]
+
+
+class _Rays:
+    """The points (n, 3) of a scan in {A} [m] by their directions: ranges [m], tree (None: too few), spacing [rad]."""
+
+    def __init__(self, points: Array) -> None:
+        from scipy.spatial import cKDTree
+
+        self.points, self.ranges = points, np.linalg.norm(points, axis=1)
+        self.tree, self.spacing = None, np.inf
+        if len(points) <= NEIGHBOUR:
+            return
+        directions = points / self.ranges[:, None]
+        self.tree = cKDTree(directions)
+        apart = np.asarray(self.tree.query(directions[:: max(1, len(points) // SPACED)], k=NEIGHBOUR + 1)[0])[:, -1]
+        self.spacing = float(np.median(apart)) * np.sqrt(np.pi / NEIGHBOUR)
+
+
+def decides(better: Contradicted, other: Contradicted, width_m: float, complete: bool) -> bool:
+    """Return whether the rays decide for one pose against another.
+
+    Args:
+        better: the pose that is to be decided for.
+        other: the other pose, measured on the same points.
+        width_m: distance within which a point is on the model [m].
+        complete: as of ``NearSymmetry.decided``.
+    """
+    a, b, off = better.distance, other.distance, OFF * width_m
+    share = max(CONTRADICTING, float(np.mean((a > width_m) & (b > width_m))))
+    if share >= 0.5:
+        return False
+    rays_for = np.count_nonzero((a < width_m) & (b > off)) + other.passed + (other.empty if complete else 0.0)
+    against = np.count_nonzero((b < width_m) & (a > off)) + better.passed + (better.empty if complete else 0.0)
+    enough = (rays_for - against) * np.log((1.0 - share) / share) >= LEAST_LIKELIHOOD
+    return bool(enough and against <= MOST_AGAINST * rays_for)
+
+
+def revolved(axis: Array, centre: Array, count: int) -> Array:
+    """Return (count, 4, 4) rotations about an axis (3,) through ``centre`` (3,) in {C}; the first is the identity."""
+    R = geometry.matrix(geometry.exp(2.0 * np.pi / count * np.arange(count)[:, None] * axis))
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3], T[:, :3, 3] = R, centre - R @ centre
+    return T
