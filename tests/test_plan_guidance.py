@@ -21,7 +21,7 @@ from avsreplay.plan import (
     closed_loop,
     rendezvous,
 )
-from avsreplay.plan.flights import pushed, with_thrust_error
+from avsreplay.plan.evaluation import pushed, with_thrust_error
 from avsreplay.plan.limits import margin
 from avsreplay.records import Forecast
 

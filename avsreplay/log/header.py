@@ -177,13 +177,12 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
     return _parsed(data, path.name, shown(path), cloud_ok)
 
 
-def parse_surface(data: bytes, name: str, cloud_ok: bool = True) -> Surface:
-    """Parse the bytes of a model file.
+def parse_surface(data: bytes, name: str) -> Surface:
+    """Parse the bytes of a model file; one without faces is a point-cloud model.
 
     Args:
         data: the bytes of the file.
         name: its name; the extension selects the format.
-        cloud_ok: accept a file without faces as a point-cloud model.
 
     Returns:
         The model.
@@ -191,7 +190,7 @@ def parse_surface(data: bytes, name: str, cloud_ok: bool = True) -> Surface:
     Raises:
         UnreadableInput: as for ``read_surface``.
     """
-    return _parsed(data, PurePath(name).name, shown(name), cloud_ok)
+    return _parsed(data, PurePath(name).name, shown(name), cloud_ok=True)
 
 
 def scaled(surface: Surface, scale: float) -> Surface:

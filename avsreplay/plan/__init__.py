@@ -2,8 +2,17 @@
 
 from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn
 from avsreplay.plan.constrained import constrained
-from avsreplay.plan.evaluation import Execution, Miss, Motion, Tolerance, execute, interpolated, miss
-from avsreplay.plan.flights import Flights, closed_loop
+from avsreplay.plan.evaluation import (
+    Execution,
+    Flights,
+    Miss,
+    Motion,
+    Tolerance,
+    closed_loop,
+    execute,
+    interpolated,
+    miss,
+)
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import CONSTRAINTS, Scene, TargetGeometry, hull_vertices, in_fixture_axes, margins
 from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of

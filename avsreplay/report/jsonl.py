@@ -22,6 +22,7 @@ from avsreplay.rows import Row
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
 _MAX_LINE, _MAX_FILE, _MAX_NAME, _MAX_TEXT = 1 << 20, 2 << 30, 100, 10_000
+_MAX_JSON = 64 << 20
 _LARGEST = 1e100  # sums of squares of larger values are not finite
 
 
@@ -179,9 +180,9 @@ def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
     return value
 
 
-def read_json(path: Path, *, limit: int = 64 << 20, hint: str) -> Any:
+def read_json(path: Path, *, hint: str) -> Any:
     """Return the value of a JSON file; see ``parse_json``. Raises UnreadableInput."""
-    return parse_json(read_limited(path, limit, hint), where=str(path), hint=hint)
+    return parse_json(read_limited(path, _MAX_JSON, hint), where=str(path), hint=hint)
 
 
 def _reject_constant(name: str) -> None:

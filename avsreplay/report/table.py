@@ -154,9 +154,9 @@ def escaped(text: str) -> str:
     return " ".join(text.split())
 
 
-def facts_table(title: str, facts: Iterable[tuple[str, str]], heads: tuple[str, str] = ("what", "value")) -> Table:
+def facts_table(title: str, facts: Iterable[tuple[str, str]]) -> Table:
     """A table of names and values."""
-    return Table(title, heads, tuple(facts), align="l")
+    return Table(title, ("what", "value"), tuple(facts), align="l")
 
 
 def number(value: float | None, spec: str = ".5g", none: str = "-") -> str:

@@ -39,8 +39,7 @@ from avsreplay.plan import (
     Tolerance,
     miss,
 )
-from avsreplay.plan.evaluation import closed_miss
-from avsreplay.plan.flights import with_thrust_error
+from avsreplay.plan.evaluation import closed_miss, with_thrust_error
 from avsreplay.records import Alignment, AlignStatus, Belief, State
 
 EXTENT_M, RATE_HZ, SPAN_S = 8.0, 5.0, 120.0
