@@ -13,8 +13,8 @@ from typing import Protocol
 from avsreplay.log.bytes_io import BadMessage, ByteFile
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
-ATTACHMENT, ATTACHMENT_INDEX, STATISTICS, METADATA, METADATA_INDEX, SUMMARY_OFFSET, DATA_END = 9, 10, 11, 12, 13, 14, 15
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX = 1, 2, 3, 4, 5, 6, 7
+ATTACHMENT, STATISTICS, METADATA, DATA_END = 9, 11, 12, 15
 CHUNK_PREFIX = 9 + 8 + 8 + 8 + 4 + 4 + 4 + 8  # opcode and length, then the longest head of a chunk
 _HEAD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQII")

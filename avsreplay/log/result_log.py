@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, transform
-from avsreplay.log.mcap_writer import McapWriter
 from avsreplay.records import Surface
 
 CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
@@ -96,6 +95,7 @@ class ResultLog:
         Raises:
             UnreadableInput: the file cannot be written.
         """
+        from mcap.writer import CompressionType, Writer
         from rosbags.typesys import Stores, get_typestore
 
         self._definitions: Any = get_typestore(Stores.ROS2_HUMBLE)
@@ -104,9 +104,10 @@ class ResultLog:
         except OSError as error:
             what = error.strerror or "cannot be written"
             raise UnreadableInput(what, where=str(path), hint="check the folder and its rights") from None
-        self._writer = McapWriter(self._stream, "ros2", LIBRARY, CHUNK_BYTES)
+        self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
+        self._writer.start(profile="ros2", library=LIBRARY)
         if metadata:
-            self._writer.add_metadata("avsreplay", metadata)
+            self._writer.add_metadata("avsreplay", dict(metadata))
         self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -116,7 +117,7 @@ class ResultLog:
         if self._stream.closed:
             return
         try:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
         finally:
             self._stream.close()
 
