@@ -8,6 +8,7 @@ allows, the fit replaces the filter's estimate.
 
 from __future__ import annotations
 
+import math
 from bisect import bisect_left
 from dataclasses import replace
 from operator import attrgetter
@@ -188,14 +189,26 @@ class BatchSchedule:
         epoch_ns = track.fixes[0].t_ns
         start = last.chart if last.epoch_ns == epoch_ns else self.chart_at(track.belief, epoch_ns)
         factors = np.array([track.window.factors[3], track.window.factors[0]])
-        found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels)
+        known = track.drift
+        if known is not None and last.epoch_ns != epoch_ns:
+            return track
+        found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels, known)
         if found is None:
             return track
-        if track.drift is not None:
-            return replace(track, drift=replace(found, detected_ns=track.drift.detected_ns))
-        track = replace(track, drift=found)
-        result = batch_estimate(track.fixes, self.params, self._rules, self._levels(track), start=start)
-        return self._adopted(track, result, to_filter=True)
+        drift, chart = found
+        if drift.t_ns == epoch_ns:  # it may have acted before the first of these poses
+            since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
+            spread = math.hypot(drift.t_1s_s, since_ns * 1e-9 / math.sqrt(3.0))
+            drift = replace(drift, t_ns=epoch_ns - since_ns, t_1s_s=spread)
+        if known is not None:
+            drift = replace(drift, detected_ns=known.detected_ns)
+            precise = float(np.trace(drift.P)) < float(np.trace(known.P))
+            return replace(track, drift=drift, batch=replace(last, chart=chart)) if precise else track
+        track = replace(track, drift=drift)
+        oldest = bisect_left(track.fixes, track.belief.t_ns - self._memory_ns(track), key=_instant)
+        latest = track.fixes[min(oldest, len(track.fixes) - FEWEST) :]  # those that free motion joins
+        result = batch_estimate(latest, self.params, self._rules, self._levels(track))
+        return self._adopted(track, replace(result, chart=chart, epoch_ns=epoch_ns), to_filter=True)
 
     def noise_levels(self, track: Track) -> tuple[float, float]:
         """Root densities of torque [rad/s^1.5] and force [m/s^1.5], given or estimated.
@@ -225,7 +238,7 @@ class BatchSchedule:
         """The track with new noise levels, where the poses have grown enough since they were last estimated."""
         count, last = pose_count(track.fixes), track.batch
         due = max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
-        ready = bool(self.checked_poses) and last is not None and count >= FEWEST
+        ready = bool(self.checked_poses) and last is not None and count >= FEWEST and track.drift is None
         if not ready or last is None or track.unlevelled < due or track.since == 0:
             return replace(track, unlevelled=track.unlevelled + 1)
         epoch_ns = track.fixes[0].t_ns
@@ -263,7 +276,8 @@ class BatchSchedule:
     def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
         """The poses within the fit's memory, including this one; of many poses the older half is joined in pairs."""
         oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns(track), key=_instant)
-        fixes = track.fixes[oldest:]
+        refines = track.drift is not None and track.mode == "filter"  # the test that does needs all
+        fixes = track.fixes[0 if refines else oldest :]
         if len(fixes) >= MOST_FIXES:
             half, factors = MOST_FIXES // 2, np.array([track.window.factors[3], track.window.factors[0]])
             fixes = joined(fixes[:half], self.chart_at(prediction.belief, fixes[0].t_ns), factors) + fixes[half:]

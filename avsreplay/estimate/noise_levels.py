@@ -185,8 +185,8 @@ def disturbed_likelihood(
     k: int,
     columns: Array | None = None,
     size: Array | None = None,
-) -> float:
-    """Log likelihood of the poses with a random disturbance of unknown density, and other unknowns beside it.
+) -> tuple[float, float]:
+    """Log likelihood of the poses without and with a random disturbance of unknown density, and other unknowns.
 
     Args:
         points: normal points, at most ``MOST_POINTS``.
@@ -203,7 +203,7 @@ def disturbed_likelihood(
         info = np.block([[data.info, np.zeros((20, m))], [np.zeros((m, 20)), np.eye(m)]])
         data = _Residuals(data.e, J, info, np.concatenate([data.off, size]))
     none, odds = _marginal(_variances(levels), 4 + k, parts, data)
-    return none + float(np.logaddexp(math.log(_FREE), math.log(1.0 - _FREE) + _log_mean(odds)))
+    return none, none + float(np.logaddexp(math.log(_FREE), math.log(1.0 - _FREE) + _log_mean(odds)))
 
 
 def _log_mean(values: Array) -> float:
