@@ -12,8 +12,9 @@ import math
 import typing
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
+from functools import cache
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any
 
 from avsreplay.errors import UnreadableInput
@@ -26,10 +27,11 @@ _MAX_JSON = 64 << 20
 _LARGEST = 1e100  # sums of squares of larger values are not finite
 
 
-def field_types() -> dict[str, tuple[type, bool]]:
+@cache
+def field_types() -> Mapping[str, tuple[type, bool]]:
     """Column name -> (str, int, float or bool; whether it may be null)."""
     hints = typing.get_type_hints(Row)
-    return {name: _split(hints[name]) for name in _NAMES}
+    return MappingProxyType({name: _split(hints[name]) for name in _NAMES})
 
 
 def _split(hint: Any) -> tuple[type, bool]:
