@@ -28,9 +28,10 @@ def frozen(values: ArrayLike, *shape: int) -> Array:
         ValueError: the values have another shape.
     """
     array = np.array(values, dtype=np.float64, order="C")
-    sizes = zip(shape, array.shape, strict=False)
-    if shape and array.shape != shape and (len(shape) != array.ndim or any(s not in (-1, n) for s, n in sizes)):
-        raise ValueError(f"expected shape {shape}, got {array.shape}")
+    if shape and array.shape != shape:
+        sizes = zip(shape, array.shape, strict=False)
+        if len(shape) != array.ndim or any(s not in (-1, n) for s, n in sizes):
+            raise ValueError(f"expected shape {shape}, got {array.shape}")
     array.setflags(write=False)
     return array
 
@@ -67,8 +68,8 @@ def normalise(q: ArrayLike) -> Array:
         (..., 4) unit quaternions of the same rotation.
     """
     unit: Array = np.asarray(q, dtype=np.float64)
-    if unit.ndim == 1 and unit.any():
-        return _normalised(*unit.tolist())
+    if unit.ndim == 1 and any(parts := unit.tolist()):
+        return _normalised(*parts)
     unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
     wxyz = np.roll(unit, 1, axis=-1)
     lead = np.take_along_axis(wxyz, np.argmax(wxyz != 0.0, axis=-1)[..., None], axis=-1)
@@ -77,8 +78,7 @@ def normalise(q: ArrayLike) -> Array:
 
 def _normalised(x: float, y: float, z: float, w: float) -> Array:
     n = math.sqrt(x * x + y * y + z * z + w * w)
-    lead = w or x or y or z
-    n = -n if lead < 0.0 else n
+    n = -n if (w or x or y or z) < 0.0 else n
     return np.array((x / n, y / n, z / n, w / n))
 
 
@@ -133,15 +133,22 @@ def matrix(q_ab: ArrayLike) -> Array:
         (..., 3, 3) rotation matrices.
     """
     q: Array = np.asarray(q_ab, dtype=np.float64)
+    if q.ndim == 1:
+        return np.array(_rows(*q.tolist()))
     R = np.empty((*q.shape[:-1], 3, 3))
-    x, y, z, w = q.tolist() if q.ndim == 1 else (q[..., 0], q[..., 1], q[..., 2], q[..., 3])
-    square, w2 = x * x + y * y + z * z, 2.0 * w
-    R[..., 0, 0], R[..., 1, 1] = 1.0 + 2.0 * (x * x - square), 1.0 + 2.0 * (y * y - square)
-    R[..., 2, 2] = 1.0 + 2.0 * (z * z - square)
-    R[..., 0, 1], R[..., 1, 0] = 2.0 * (x * y) - w2 * z, w2 * z + 2.0 * (x * y)
-    R[..., 0, 2], R[..., 2, 0] = w2 * y + 2.0 * (x * z), 2.0 * (x * z) - w2 * y
-    R[..., 1, 2], R[..., 2, 1] = 2.0 * (y * z) - w2 * x, w2 * x + 2.0 * (y * z)
+    for k, row in enumerate(_rows(*np.moveaxis(q, -1, 0))):
+        R[..., k, 0], R[..., k, 1], R[..., k, 2] = row
     return R
+
+
+def _rows(x: Any, y: Any, z: Any, w: Any) -> tuple[tuple[Any, Any, Any], ...]:
+    square, w2 = x * x + y * y + z * z, 2.0 * w
+    xy, xz, yz = 2.0 * (x * y), 2.0 * (x * z), 2.0 * (y * z)
+    return (
+        (1.0 + 2.0 * (x * x - square), xy - w2 * z, w2 * y + xz),
+        (w2 * z + xy, 1.0 + 2.0 * (y * y - square), yz - w2 * x),
+        (xz - w2 * y, w2 * x + yz, 1.0 + 2.0 * (z * z - square)),
+    )
 
 
 def rotate(R_ab: ArrayLike, v_b: ArrayLike) -> Array:
@@ -155,8 +162,7 @@ def rotate(R_ab: ArrayLike, v_b: ArrayLike) -> Array:
         (..., 3) vectors in a.
     """
     R, v = np.asarray(R_ab, dtype=np.float64), np.asarray(v_b, dtype=np.float64)
-    out: Array = R[..., :, 0] * v[..., :1] + R[..., :, 1] * v[..., 1:2] + R[..., :, 2] * v[..., 2:]
-    return out
+    return np.asarray(R[..., :, 0] * v[..., :1] + R[..., :, 1] * v[..., 1:2] + R[..., :, 2] * v[..., 2:])
 
 
 def quaternion(R_ab: ArrayLike) -> Array:
@@ -192,10 +198,9 @@ def _quaternion(
     xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float, zz: float
 ) -> Array:
     squares = (1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz)
-    best = squares.index(max(squares))
     a, b, c, d, e, f = xy + yx, xz + zx, yz + zy, zy - yz, xz - zx, yx - xy
-    row = ((squares[0], a, b, d), (a, squares[1], c, e), (b, c, squares[2], f), (d, e, f, squares[3]))[best]
-    return normalise(row)
+    rows = ((squares[0], a, b, d), (a, squares[1], c, e), (b, c, squares[2], f), (d, e, f, squares[3]))
+    return normalise(rows[squares.index(max(squares))])
 
 
 def exp(rotvec: ArrayLike) -> Array:
@@ -226,8 +231,7 @@ def log(q: ArrayLike) -> Array:
     norm = np.linalg.norm(v, axis=-1, keepdims=True)
     small = norm < 1e-8
     scale = np.where(small, 2.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm))
-    rotvec: Array = scale * v
-    return rotvec
+    return np.asarray(scale * v)
 
 
 def angle(q: ArrayLike) -> Array:
@@ -240,8 +244,7 @@ def angle(q: ArrayLike) -> Array:
         (...) angles in [0, pi] [rad].
     """
     a: Array = np.asarray(q, dtype=np.float64)
-    theta: Array = 2.0 * np.arctan2(np.linalg.norm(a[..., :3], axis=-1), np.abs(a[..., 3]))
-    return theta
+    return np.asarray(2.0 * np.arctan2(np.linalg.norm(a[..., :3], axis=-1), np.abs(a[..., 3])))
 
 
 def slerp(q0: ArrayLike, q1: ArrayLike, fraction: float) -> Array:

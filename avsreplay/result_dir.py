@@ -118,6 +118,7 @@ class ViewWriter:
 
     def __init__(self, surface: Surface, registrar: Registrar) -> None:
         self._surface, self._registrar, self._paths = surface, registrar, NewPaths()
+        self._reach_m = VIEW_REACH * surface.extent
         self._clouds: list[CloudView] = []
         self._plans: list[PathView] = []
 
@@ -137,7 +138,7 @@ class ViewWriter:
 
     def _residual(self, points: NDArray[np.float32], T_ac: Pose) -> NDArray[np.float32]:
         """Distance (n,) [m] of points (n, 3) in {A} to the model at the estimated pose."""
-        return self._registrar.distance(points, T_ac, VIEW_REACH * self._surface.extent).astype(np.float32)
+        return self._registrar.distance(points, T_ac, self._reach_m).astype(np.float32)
 
     def view(self) -> View:
         """Return everything kept so far."""

@@ -9,6 +9,7 @@ covariance would be too small.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -230,7 +231,7 @@ def nis_scale(track: Track) -> float:
     """
     if len(track.nis) < _FEWEST_NIS:
         return 1.0
-    return max(1.0, float(np.median(track.nis)) / _MEDIAN_CHI2)
+    return max(1.0, median(track.nis) / _MEDIAN_CHI2)
 
 
 def with_nis(after: Track, before: Track, nis: float) -> Track:

@@ -245,6 +245,7 @@ def robust_noise(distance: Array) -> float:
     ordered = np.sort(distance)
     noise = float(np.min(np.interp(LEVELS * (len(ordered) - 1), np.arange(len(ordered)), ordered) / NORMAL_QUANTILES))
     for _ in range(REFINEMENTS):
-        near = distance[distance < 3.0 * noise]
-        noise = min(noise, float(np.median(near)) / NORMAL_QUANTILES[2]) if len(near) else noise
+        if near := int(np.searchsorted(ordered, 3.0 * noise)):
+            middle = 0.5 * float(ordered[(near - 1) // 2] + ordered[near // 2])
+            noise = min(noise, middle / NORMAL_QUANTILES[2])
     return noise
