@@ -18,7 +18,8 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import Plan
 from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan import Limits, PlannerInput, PlanParams, Scene, SupervisorParams
-from avsreplay.plan.arm import Arm, JointPath
+from avsreplay.plan.arm import Arm
+from avsreplay.plan.joint_path import JointPath
 from avsreplay.plan.robot import slowed
 from avsreplay.records import Alignment, AlignStatus, Belief, State
 from avsreplay.report.page import Flight

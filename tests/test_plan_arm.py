@@ -11,6 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.geometry import Pose
 from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan import (
     Guidance,
@@ -25,7 +26,8 @@ from avsreplay.plan import (
     constrained,
     path_of,
 )
-from avsreplay.plan.arm import Arm, JointPath, with_arm
+from avsreplay.plan.arm import Arm, with_arm
+from avsreplay.plan.joint_path import JointPath
 from avsreplay.plan.robot import slowed
 from avsreplay.records import Forecast
 
@@ -104,7 +106,7 @@ def test_the_use_of_the_limits_is_that_of_the_joints(arm: Arm, tmp_path: Path) -
     again = slow.last_metres(path, scene, LIMITS)
     assert again.rate_share == pytest.approx(2.0, rel=1e-6)
     assert not again.possible
-    assert "cannot fly" in again.described()[0][1]
+    assert "cannot follow" in again.described()[0][1]
     weak = Arm(_urdf(tmp_path / "weak.urdf", effort=0.25 * found.torque_share * 50.0), "gripper")
     assert weak.last_metres(path, scene, LIMITS).torque_share == pytest.approx(4.0, rel=1e-6)
 
@@ -115,9 +117,9 @@ def test_a_capture_out_of_reach_is_said_so(arm: Arm) -> None:
     assert found.described() == [("arm", "cannot reach the pose of the capture")]
 
 
-def _turning(phase: float, rate: float) -> Scene:
+def _turning(phase: float, rate: float, away_m: float = 1.9) -> Scene:
     """A grasp point 0.3 m from a centre in front of the arm; the fixture turns about z."""
-    centre, q0 = np.array([1.9, 0.0, 0.9]), Rotation.from_rotvec([0.0, 0.0, phase])
+    centre, q0 = np.array([away_m, 0.0, 0.9]), Rotation.from_rotvec([0.0, 0.0, phase])
 
     def turn(t: np.ndarray) -> Rotation:
         return Rotation.from_rotvec(np.outer(t, [0.0, 0.0, rate])) * q0
@@ -183,6 +185,25 @@ def test_no_capture_that_the_arm_can_fly_is_none_found(arm: Arm) -> None:
     assert made.delayed_by == "arm"
     assert not np.isfinite(made.t_go_s)
     assert joints is None or not joints.possible
+
+
+def test_no_reachable_pose_is_called_out_of_reach(arm: Arm) -> None:
+    rng = np.random.default_rng(3)
+    for q in rng.uniform(-2.9, 2.9, (200, 6)):
+        position, turn = _forward(q)
+        assert arm.missing_m(Pose(turn.as_quat(), position)) <= 1e-9
+    position, turn = _forward(np.zeros(6))  # the straight arm: the wrist is as far from the shoulder as it can be
+    assert arm.missing_m(Pose(turn.as_quat(), position)) == pytest.approx(0.0, abs=1e-9)
+    assert arm.missing_m(Pose(turn.as_quat(), position + np.array([0.0, 0.0, 0.2]))) == pytest.approx(0.2)
+    aside = turn * Rotation.from_rotvec([0.5 * np.pi, 0.0, 0.0])  # the same place with the gripper across
+    assert arm.missing_m(Pose(aside.as_quat(), position)) > 0.3
+
+
+def test_a_fixture_that_never_comes_into_reach_is_proven_impossible(arm: Arm) -> None:
+    free, made, joints = _fitted(arm, _turning(phase=1.6, rate=0.002, away_m=2.7), horizon_s=60.0)
+    assert free.found  # the end-effector alone reaches it
+    assert made.status is PlanStatus.INFEASIBLE
+    assert joints is None
 
 
 def test_guidance_flies_a_capture_that_the_arm_reaches(arm: Arm) -> None:

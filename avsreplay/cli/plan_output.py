@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from avsreplay.outcome import Plan
     from avsreplay.plan import Execution, Flights, Miss, Spread
-    from avsreplay.plan.arm import JointPath
+    from avsreplay.plan.joint_path import JointPath
     from avsreplay.replan import Replanning
     from avsreplay.report.table import Table
 

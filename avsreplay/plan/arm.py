@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,76 +20,26 @@ from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import Plan, PlanStatus
+from avsreplay.plan.joint_path import JointPath, share_of
 from avsreplay.plan.limits import Scene
-from avsreplay.plan.path import RobotPath
+from avsreplay.plan.path import MOTION_FACTOR, RobotPath
 from avsreplay.plan.rendezvous import no_plan
 from avsreplay.plan.robot import Limits, RobotParams
 
 INSTANTS = 81  # of the last metres
 STARTS = 32  # joint configurations from which the inverse kinematics of the capture begins
 ITERATIONS = 200
+STALLED = 10  # iterations without a smaller error that end the inverse kinematics
 POSE_ERROR = 1e-8  # in metres and radians
 DAMPING = 1e-3
 CAPTURES = 16  # plans that are tried until the joints can fly one
+GRID_S = 0.25  # spacing of the instants at which the reach is bounded
+EXACT_M = 1e-9  # an offset is on an axis
 STEP_S = 1.0  # spacing of the capture instants
+APPROACH = 9  # poses on the axis of the corridor at which a capture instant is tried
 QUICK = 8  # joint configurations from which the inverse kinematics of a capture instant begins
 SLOWEST = 0.1  # smallest share of the largest acceleration
 JUMP_RAD = 0.5  # a larger change of a joint between two instants is another branch
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class JointPath:
-    """The joints during the last metres of a plan.
-
-    Attributes:
-        times: (n,) instants [s after the instant of planning]; fewer than INSTANTS where the path is not complete.
-        joints: (n, k) joint positions [rad or m].
-        length_m: Length of the end-effector's path that the joints follow [m].
-        complete: Whether this is all of the last metres.
-        condition: Largest condition number of the Jacobian.
-        range_share, rate_share, torque_share: Largest use of the limits of joint range, rate and torque, 1 at the
-            limit; NaN where the URDF has none.
-    """
-
-    times: Array
-    joints: Array
-    length_m: float
-    complete: bool
-    condition: float
-    range_share: float
-    rate_share: float
-    torque_share: float
-
-    @property
-    def possible(self) -> bool:
-        """Whether the arm can fly the last metres within all limits."""
-        shares = (self.range_share, self.rate_share, self.torque_share)
-        return self.complete and not any(share > 1.0 + 1e-9 for share in shares)
-
-    @property
-    def slower(self) -> float:
-        """Share of the acceleration with which rates and torques may fit; 1 where another limit is exceeded."""
-        inside = self.complete and not self.range_share > 1.0 + 1e-9
-        rate, torque = (x if math.isfinite(x) else 0.0 for x in (self.rate_share, self.torque_share))
-        return min(1.0, 0.9 / max(torque, rate * rate, 0.9)) if inside else 1.0
-
-    def record(self) -> dict[str, object]:
-        """Return the path and its figures for a JSON document."""
-        names = ("length_m", "complete", "possible", "condition", "range_share", "rate_share", "torque_share")
-        return {**{n: getattr(self, n) for n in names}, "t_s": self.times.tolist(), "joints": self.joints.tolist()}
-
-    def described(self) -> list[tuple[str, str]]:
-        """Return what is known about the arm as a name and a text."""
-        if not len(self.times):
-            return [("arm", "cannot reach the pose of the capture")]
-        used = ", ".join(
-            f"{name} {100.0 * share:.0f} %"
-            for name, share in (("range", self.range_share), ("rate", self.rate_share), ("torque", self.torque_share))
-            if math.isfinite(share)
-        )
-        verdict = "can follow" if self.possible else "cannot follow" if self.complete else "loses the path in"
-        text = f"{verdict} the last metres ({self.length_m:.2f} m in joints): {used} of the limits"
-        return [("arm", f"{text}; condition {self.condition:.0f}")]
 
 
 class Arm:
@@ -129,6 +79,7 @@ class Arm:
             raise UsageError(f"there is no frame '{frame}'", where=str(urdf), hint=f"frames: {names}")
         model.gravity = self._pin.Motion.Zero()
         self._data, self._frame = model.createData(), model.getFrameId(frame)
+        self._reach = self._wrist()
 
     @property
     def reach_m(self) -> float:
@@ -144,6 +95,54 @@ class Arm:
             joint = int(model.parents[joint])
         return total
 
+    def _wrist(self) -> tuple[Array, Array, float]:
+        """Return shoulder (3,), wrist (3,) and the largest distance between them [m], the same for all joint positions.
+
+        The shoulder is given in the frame of the base, the wrist in that of the gripper. They are the origins of the
+        first and the last joint, or of the ones next to them where the offset lies on the axis of rotation.
+        """
+        pin, model, data = self._pin, self._model, self._data
+        tip, chain = model.frames[self._frame].placement.inverse(), [int(model.frames[self._frame].parentJoint)]
+        while model.parents[chain[0]] > 0:
+            chain.insert(0, int(model.parents[chain[0]]))
+        pin.computeJointJacobians(model, data, pin.neutral(model))
+        axes = [pin.getJointJacobian(model, data, j, pin.LOCAL)[:, model.joints[j].idx_v] for j in chain]
+        if len(chain) < 4 or any(np.linalg.norm(axis[3:]) < 0.5 for axis in axes):  # a prismatic joint
+            return np.zeros(3), np.zeros(3), self.reach_m
+        place = model.jointPlacements
+        shoulder, wrist, inner = place[chain[0]].translation.copy(), tip.translation.copy(), chain[1:]
+        if float(np.linalg.norm(np.cross(axes[0][3:], place[chain[1]].translation))) < EXACT_M:
+            shoulder += place[chain[0]].rotation @ place[chain[1]].translation
+            inner = inner[1:]
+        offset = place[chain[-1]].rotation.T @ place[chain[-1]].translation
+        if float(np.linalg.norm(np.cross(axes[-1][3:], offset))) < EXACT_M:
+            wrist -= tip.rotation @ offset
+            inner = inner[:-1]
+        return shoulder, wrist, float(sum(np.linalg.norm(place[j].translation) for j in inner))
+
+    def missing_m(self, target: Pose) -> float:
+        """Return by how much a pose is certainly out of reach [m]; at most 0 where it may be in reach.
+
+        Args:
+            target: Pose of the gripper in the frame of the base.
+        """
+        shoulder, wrist, length = self._reach
+        return float(np.linalg.norm(target.t + geometry.matrix(target.q) @ wrist - shoulder)) - length
+
+    def never_reaches(self, scene: Scene, limits: Limits, horizon_s: float) -> bool:
+        """Return whether the pose of the fixture is certainly out of reach at all times.
+
+        Between two instants the distance changes by at most half the spacing times its largest rate, times 1.5.
+
+        Args:
+            scene: The target after the instant of planning, with its attitude.
+            limits: Resolved limits: the pose of the base.
+            horizon_s: Latest capture [s after the instant of planning].
+        """
+        times = np.arange(0.0, horizon_s + GRID_S, GRID_S)
+        missing = np.array([self.missing_m(pose) for pose in self._poses(scene, limits, times, scene.goal(times)[0])])
+        return bool(missing.min() > 0.5 * MOTION_FACTOR * np.abs(np.diff(missing)).max())
+
     def inverse(self, target: Pose, start: Array) -> Array | None:
         """Return joints (k,) that bring the gripper to a pose, by damped Gauss-Newton steps; None where it fails.
 
@@ -153,12 +152,16 @@ class Arm:
         """
         pin, model, data = self._pin, self._model, self._data
         goal = pin.SE3(geometry.matrix(target.q), np.asarray(target.t))
-        q = np.array(start, dtype=np.float64)
+        q, least, since = np.array(start, dtype=np.float64), math.inf, 0
         for _ in range(ITERATIONS):
             pin.framesForwardKinematics(model, data, q)
             error = pin.log6(data.oMf[self._frame].actInv(goal)).vector
-            if float(np.abs(error).max()) <= POSE_ERROR:
+            size = float(np.abs(error).max())
+            if size <= POSE_ERROR:
                 return q
+            least, since = (size, 0) if size < 0.95 * least else (least, since + 1)
+            if since > STALLED:
+                return None
             J = pin.computeFrameJacobian(model, data, q, self._frame, pin.ReferenceFrame.LOCAL)
             damping = DAMPING * min(float(error @ error), 1.0) + 1e-12
             step = J.T @ np.linalg.solve(J @ J.T + damping * np.eye(6), error)
@@ -224,9 +227,12 @@ class Arm:
             hint_s: Capture of an earlier plan that the joints delayed; it is tried first, a little earlier.
 
         Returns:
-            The plan and its joints. Without one the first plan with the status ``none_found`` and the joints of the
-            first plan; a plan that was not found, without joints.
+            The plan and its joints. Without one a plan with the status ``none_found`` and the joints of the first plan,
+            or ``infeasible_within_horizon`` without joints where the fixture is certainly out of the arm's reach.
         """
+        if self.never_reaches(scene, limits, horizon_s):
+            made = make(first_s, 1.0)
+            return no_plan(made.t_ns, PlanStatus.INFEASIBLE, made.a_max, horizon_s), None
         if hint_s - 0.5 * STEP_S > first_s:
             made = make(hint_s - 0.5 * STEP_S, 1.0)
             joints = self.last_metres(path(made), scene, limits) if made.found else None
@@ -249,17 +255,28 @@ class Arm:
             earliest_s, share = after_s, 1.0
         assert first is not None
         made, joints = first
-        none = no_plan(made.t_ns, PlanStatus.NOT_FOUND, made.a_max, made.lower_bound_s)
-        return (replace(none, delayed_by="arm") if made.found else made), joints
+        none = replace(no_plan(made.t_ns, PlanStatus.NOT_FOUND, made.a_max, made.lower_bound_s), delayed_by="arm")
+        return (none if made.found else made), joints
 
     def _next_capture(self, scene: Scene, limits: Limits, after_s: float, horizon_s: float) -> float | None:
-        """Return the first instant later than ``after_s`` by STEP_S or more at which the arm reaches the fixture."""
+        """Return the first instant later than ``after_s`` by STEP_S or more at which the arm reaches the fixture.
+
+        It reaches the pose of the capture and, with the same branch of the joints, the corridor ahead of it.
+        """
         times = np.arange(after_s + STEP_S, horizon_s, STEP_S)
-        poses, reach = self._poses(scene, limits, times, scene.goal(times)[0]), self.reach_m
-        for t, pose in zip(times, poses, strict=True):
-            near = float(np.linalg.norm(pose.t)) <= reach
-            if near and any(self.inverse(pose, start) is not None for start in self._starts()[:QUICK]):
-                return float(t)
+        goal = scene.goal(times)[0]
+        near = [self.missing_m(pose) <= 0.0 for pose in self._poses(scene, limits, times, goal)]
+        axis = np.array([1.0, 0.0, 0.0]) if scene.axis_c is None else scene.axis_c
+        for k in np.flatnonzero(near):
+            instants = np.full(APPROACH, times[k])
+            ahead = np.linspace(limits.final_range_m or 0.0, 0.0, APPROACH)[:, None]
+            assert scene.attitude is not None
+            r = goal[k] + ahead * (geometry.matrix(scene.attitude(instants[:1])[0]) @ axis)
+            line = self._poses(scene, limits, instants, r)
+            for start in self._starts()[:QUICK]:
+                end = self.inverse(line[-1], start)
+                if end is not None and len(self._traced(line, end)) == APPROACH:
+                    return float(times[k])
         return None
 
     def _poses(self, scene: Scene, limits: Limits, times: Array, r: Array) -> list[Pose]:
@@ -306,21 +323,15 @@ class Arm:
             length_m=float(np.linalg.norm(np.diff(r, axis=0), axis=1).sum()),
             complete=complete,
             condition=float(np.linalg.cond(np.array(J)).max()),
-            range_share=_share(q - middle, half),
-            rate_share=_share(rate, model.velocityLimit),
-            torque_share=_share(torque, model.effortLimit),
+            range_share=share_of(q - middle, half),
+            rate_share=share_of(rate, model.velocityLimit),
+            torque_share=share_of(torque, model.effortLimit),
         )
 
 
 def _later(made: Plan, lower_bound_s: float) -> Plan:
     """Return a plan that the joints delay; the bound is certified without them [s]."""
     return replace(made, status=PlanStatus.FEASIBLE, lower_bound_s=lower_bound_s, delayed_by="arm")
-
-
-def _share(values: Array, limits: Array) -> float:
-    """Return the largest ratio to the limits; NaN where there is none."""
-    on = np.isfinite(limits) & (limits > 0.0)
-    return float((np.abs(values[:, on]) / limits[on]).max()) if on.any() else math.nan
 
 
 def with_arm(robot: RobotParams) -> tuple[RobotParams, Arm | None]:

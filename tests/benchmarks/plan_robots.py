@@ -116,7 +116,12 @@ def checked(problem, robot: RobotParams, arm) -> dict:
         first_s = rendezvous(scene.goal, r0, v0, params).lower_bound_s  # of a robot without a workspace
         goal = scene.goal(np.linspace(first_s, params.horizon_s, 2401))[0]
         away = np.linalg.norm(goal - limits.base_m, axis=1)
-        out["reachable"] = bool(np.any((away <= limits.reach_max_m) & (away >= (limits.reach_min_m or 0.0))))
+        near = (away <= limits.reach_max_m) & (away >= (limits.reach_min_m or 0.0))
+        if arm is not None:  # the last three links lie along the gripper's axis up to the wrist
+            turn_c = Rotation.from_quat(scene.attitude(np.linspace(first_s, params.horizon_s, 2401)))
+            wrist = goal - limits.base_m - turn_c.apply([0.0, 0.0, sum(LENGTHS[4:])])
+            near &= np.linalg.norm(wrist - [0.0, 0.0, LENGTHS[0]], axis=1) <= sum(LENGTHS[1:4])
+        out["reachable"] = bool(np.any(near))
     if not plan.found:
         return out
     path, t = path_of(plan, r0, v0), np.linspace(0.0, plan.t_go_s, INSTANTS)
