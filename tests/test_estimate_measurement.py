@@ -267,10 +267,17 @@ def test_the_order_of_axes_does_not_matter(naming) -> None:
 def test_values_that_are_not_numbers_terminate() -> None:
     x, rng = some_state(1), np.random.Generator(np.random.PCG64(0))
     P, H, S = spread_of(x, rng), measurement_jacobian(x), np.eye(6)
-    bad = replace(x, w_b=np.array([np.nan, 0.0, 0.0]), sigma=np.array([np.nan, 1.0]))
+    bad = replace(x, w_b=np.array([np.nan, 0.0, 0.0]))
     for state, covariance, alpha in ((bad, P, np.ones(6)), (x, P * np.nan, np.ones(6)), (x, P, np.ones(6) * np.inf)):
         got = chart_update(Belief(0, state, covariance), H, Innovation(alpha, S, S, 0.0, 0.0, 0.0, 0.0), WHITE)
         assert not np.all(np.isfinite(got.P))
+    with pytest.raises(ValueError, match="an inertia ratio must be between -1 and 1"):
+        chart_update(
+            Belief(0, replace(x, sigma=np.array([np.nan, 1.0])), P),
+            H,
+            Innovation(np.ones(6), S, S, 0.0, 0.0, 0.0, 0.0),
+            WHITE,
+        )
     with pytest.raises(TypeError):
         _motion.correct(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, P, H[:5], np.ones(6), S, S, (1.0, 1.0))
 
