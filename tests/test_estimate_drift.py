@@ -10,12 +10,15 @@ import pytest
 import tumbling
 
 from avsreplay import geometry
-from avsreplay.estimate.chart import to_chart
-from avsreplay.estimate.drift import _NONE, _equivalents, _without, find_drift
-from avsreplay.estimate.dynamics import propagate_state
-from avsreplay.estimate.initialise import PoseFix, poses_of
+from avsreplay.estimate.batch import FitParams
+from avsreplay.estimate.chart import INERTIA, to_chart, to_errors
+from avsreplay.estimate.drift import _NONE, _without, find_drift
+from avsreplay.estimate.dynamics import drift_equivalents, propagate_state
+from avsreplay.estimate.initialise import PoseFix, batch_estimate, poses_of
+from avsreplay.estimate.noise_levels import NO_LEVELS
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import Pose
+from avsreplay.records import State
 
 PARAMS = EstimatorParams(correlated_share=0.1).resolved(4.0)
 
@@ -64,11 +67,32 @@ def test_the_equivalent_error_is_that_of_the_integrated_motion() -> None:
         x, _ = propagate_state(x, end / parts)
         x = type(x)(x.q_ab, x.w_b + push * end / parts, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc)
     free, Phi = propagate_state(x0, end)
-    B = _equivalents(x0, np.array([end]))[0]
+    B = drift_equivalents(x0, np.array([end]))[0]
     moved = Phi[:6, :6] @ B[:6, :3] @ push
     turn = geometry.multiply(geometry.conjugate(free.q_ab), x.q_ab)[:3]
     assert turn == pytest.approx(moved[:3], rel=0.02, abs=1e-5)
     assert x.w_b - free.w_b == pytest.approx(moved[3:], rel=0.02, abs=1e-6)
+
+
+def inertia_of(fixes: tuple[PoseFix, ...], truth: State, params: EstimatorParams) -> tuple[float, float]:
+    """NEES per degree of freedom of the inertia at the last pose by a fit to all poses, and the trace of its P."""
+    found = batch_estimate(fixes, params, FitParams(rescale=False), NO_LEVELS).belief
+    here = to_chart(found.x)
+    T, off = to_errors(here), to_chart(truth).minus(here)[INERTIA]
+    P = np.linalg.solve(T, np.linalg.solve(T, found.P).T)[INERTIA, INERTIA]
+    return float(off @ np.linalg.solve(P, off)) / len(off), float(np.trace(P))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_covariance_allows_for_a_torque_that_a_wrong_inertia_explains(seed: int) -> None:
+    told_none = replace(PARAMS, torque_noise_radps15=0.0)
+    for case in (surprises.Case("torque", torque=1e-4, seconds=40.0), surprises.Case("free", seconds=40.0)):
+        fixes, truth = fixes_of(case, seed), surprises.world_of(case, seed)[1][-1]
+        (nees, trace), (nees_told, trace_told) = (inertia_of(fixes, truth, p) for p in (PARAMS, told_none))
+        if case.torque:
+            assert nees < 0.5 * nees_told
+        else:
+            assert trace < 1.5 * trace_told
 
 
 def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPatch) -> None:

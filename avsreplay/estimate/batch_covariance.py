@@ -14,6 +14,7 @@ errors are propagated back to the epoch, where the transition is the identity, a
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -21,7 +22,7 @@ import numpy as np
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, torque_density, translation
+from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, drift_equivalents, torque_density, translation
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite, least_eigenvalue
 from avsreplay.estimate.mixture import Component
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
@@ -38,6 +39,8 @@ _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
 LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
 _DISTURBED = 12  # error states that a disturbance reaches: attitude to velocity; they depend on steps of these alone
 SPHERE = 3.0  # tr I / I of a sphere
+_TORQUES = (3e-4, 1e-4, 3e-5, 1e-5)  # 1 sigma of the acceleration by a constant torque, equally likely [rad/s2]
+_TORQUE = 0.1  # prior probability of a constant torque
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -173,6 +176,37 @@ def sandwich(problem: Problem, points: Poses, levels: NoiseLevels) -> tuple[Arra
     return np.asarray(M), np.maximum(inflation, 1.0)
 
 
+def unseen_torque(problem: Problem, after_s: float) -> Array:
+    """How much a constant torque that the poses do not show adds to the covariance of a fit of free motion.
+
+    A wrong inertia can explain a constant torque for most of a turn. By the law of total covariance the possible
+    torques enlarge the covariance by that of the motion, given the torque, in proportion to their probability. It is at
+    most the prior one: a torque that the poses show is found by the test for it.
+
+    Args:
+        problem: linearised at the minimum of its cost.
+        after_s: instant after the epoch at which the covariance is used [s].
+
+    Returns:
+        (20, 20) in chart steps at the epoch.
+    """
+    e, H = problem.core.rows()
+    T, times = to_errors(problem.chart), np.append(problem.poses.times_s, after_s)
+    B = drift_equivalents(to_state(problem.chart), times)[:, :_DISTURBED, :3]
+    J, C = (H @ T).reshape(-1, DIM), (H[:, :, :_DISTURBED] @ B[:-1]).reshape(-1, 3)
+    P, cross, total = problem.covariance, J.T @ C, np.zeros((3, 3))
+    moved = -P @ cross
+    moved[:_DISTURBED] += np.linalg.solve(T[:_DISTURBED, :_DISTURBED], B[-1])
+    precision, found = C.T @ C - cross.T @ P @ cross, -C.T @ e.reshape(-1)
+    for one_sigma in _TORQUES:
+        scaled = one_sigma**2 * precision + np.eye(3)
+        own = one_sigma**2 * np.linalg.inv(scaled)
+        torque = own @ found
+        log_odds = 0.5 * float(found @ torque - np.linalg.slogdet(scaled)[1])
+        total += _TORQUE / len(_TORQUES) * math.exp(min(log_odds, 0.0)) * (own + np.outer(torque, torque))
+    return np.asarray(moved @ total @ moved.T)
+
+
 def final_mixture(
     found: BatchCovariance,
     problem: Problem,
@@ -181,6 +215,7 @@ def final_mixture(
     t_ns: int,
     after_s: float,
     spread: Array | None = None,
+    unseen: Array | None = None,
 ) -> tuple[Component, ...]:
     """The fit with process noise as a Gaussian mixture at the last pose; the first component has the published mean.
 
@@ -192,11 +227,13 @@ def final_mixture(
         t_ns: the instant of the last scan [ns].
         after_s: that instant after the epoch [s].
         spread: (20, 20) M in chart steps: M P M' is the covariance with the correlation of the poses' errors.
+        unseen: (20, 20) in chart steps at the epoch, added to the covariance of each component (``unseen_torque``).
     """
     fitted, n = found.fitted, len(found.directions)
     bases: list[tuple[float, Chart, Pin | None]] = [(1.0 - 2.0 * _WEIGHT * n, fitted.chart, None)]
     bases += [(_WEIGHT, p.chart, p.pin) for d in found.directions for p in d.points]
-    out, lost = [], 0.0
+    out, lost, rows = [], 0.0, [d.row for d in found.directions]
+    unseen = np.zeros((DIM, DIM)) if unseen is None else _fixed(unseen, rows)
     recent = Problem(latest, problem.prior, fitted.effective)
     for weight, chart, pin in bases:
         y, P = process_noise_pass(chart, pin, problem, noise)
@@ -213,8 +250,10 @@ def final_mixture(
         if least_eigenvalue(P) < ROUNDING or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
             share = _accepted_share(base, move, recent)
         there = base.moved(share * move)
-        P = P if pin is not None else _fixed(P, [d.row for d in found.directions])
-        P = step @ P @ step.T + (1.0 - share) ** 2 * np.outer(move, move)
+        P = P if pin is not None else _fixed(P, rows)
+        if pin is None:
+            unseen = step @ unseen @ step.T  # that of free motion: about the other trajectories it does not hold
+        P = step @ P @ step.T + unseen + (1.0 - share) ** 2 * np.outer(move, move)
         if pin is not None and not least_eigenvalue(P) >= -ROUNDING:
             lost += weight  # about an unstable spin, rounding at the epoch has grown beyond the covariance
             continue
@@ -227,7 +266,8 @@ def _fixed(P: Array, rows: list[Array]) -> Array:
     """P given the coordinates along ``rows``: their variance is that between the components of the mixture."""
     for row in rows:
         column = P @ row
-        P = P - (1.0 - _PIN_1S**2) * np.outer(column, column) / float(row @ column)
+        if float(row @ column) > 0.0:
+            P = P - (1.0 - _PIN_1S**2) * np.outer(column, column) / float(row @ column)
     return P
 
 

@@ -18,18 +18,17 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import flow, rotation_history
+from avsreplay.estimate.dynamics import drift_equivalents, flow
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, disturbed_likelihood
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import Array
-from avsreplay.records import Drift, State
+from avsreplay.records import Drift
 
 _ONSETS, _FINER = 12, 9  # number of onsets tried, the first at the epoch, and around the most likely one
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
-_STEP_RAD = 0.1  # step of the integral B
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
 _CONSTANT = 6.0  # log odds over random disturbances from which it is reported
 _ROUNDS, _LEAST_GAIN = 10, 0.5  # of linearisation; decrease of the cost (half chi-square) from which another follows
@@ -225,35 +224,16 @@ def _onsets(times_s: Array, near_s: float | None = None) -> Array:
     return np.unique(np.concatenate([found, np.clip(finer, 0.0, found[-1])]))
 
 
-def _equivalents(x: State, times_s: Array) -> Array:
-    """B (n, 12, 6) at ``times_s`` (n,): errors of attitude to velocity at the epoch that equal a unit drift since."""
-    last = float(times_s.max())
-    count = max(100, math.ceil(float(np.linalg.norm(x.w_b)) * last / _STEP_RAD))
-    grid = np.linspace(0.0, last, count + 1)
-    S = rotation_history(x, grid).S[:, :, :6]
-    rate = np.linalg.inv(S)[:, :, 3:]
-    total = np.zeros((count + 1, 6, 3))
-    np.cumsum(0.5 * (rate[1:] + rate[:-1]) * (last / count), axis=0, out=total[1:])
-    B = np.zeros((len(times_s), 12, 6))
-    place = np.clip(times_s / (last / count), 0.0, count)
-    low = np.minimum(place.astype(int), count - 1)
-    part = (place - low)[:, None, None]
-    B[:, :6, :3] = (1.0 - part) * total[low] + part * total[low + 1]
-    B[:, 6:9, 3:] = -0.5 * (times_s**2)[:, None, None] * np.eye(3)
-    B[:, 9:12, 3:] = times_s[:, None, None] * np.eye(3)
-    return B
-
-
 def _columns(G: Array, times_s: Array, chart: Chart, onset_s: float) -> Array:
     """White columns (n, 6, 6) of the residuals by the drift since the onset."""
-    B = _equivalents(to_state(chart), np.append(times_s, onset_s))
+    B = drift_equivalents(to_state(chart), np.append(times_s, onset_s))
     return np.asarray((G @ (B[:-1] - B[-1])) * (times_s > onset_s)[:, None, None])
 
 
 def _compared(frame: _Frame, onsets: Array, widths: Array) -> list[_Found]:
     """The most likely drift from each onset on, with the claimed noise, then with that of the residuals without it."""
     n, times = len(frame.points), frame.points.times_s
-    B = _equivalents(to_state(frame.chart), np.concatenate([times, onsets]))
+    B = drift_equivalents(to_state(frame.chart), np.concatenate([times, onsets]))
     here, late = (frame.G @ B[:n]).reshape(-1, 6), np.repeat(times, 6) > onsets[:, None]
     columns = (here - frame.G.reshape(-1, 12) @ B[n:]) * late[:, :, None]
     inflation = 1.0

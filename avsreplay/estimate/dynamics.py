@@ -7,6 +7,7 @@ independent sigma; ``transition`` applies the chain rule for sigma3(sigma1, sigm
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -26,6 +27,7 @@ SUBSTEP_RAD = 0.2  # largest rotation of one Taylor series (SUBSTEP in motion.hp
 MOST_RAD = 2e4  # largest rotation of a single step [rad]; it takes a few seconds of processor time
 _I3, _I20 = np.eye(3), np.eye(DIM)
 _NO_TORQUE = (0.0, 0.0, 0.0)
+_DRIFT_STEP_RAD = 0.1  # step of the integral in drift_equivalents
 
 
 def _diagonal(rows: slice, columns: slice) -> slice:
@@ -205,6 +207,33 @@ def rotation_history(x: State, times_s: Array) -> RotationHistory:
     times = np.asarray(times_s, dtype=np.float64)
     q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), _NO_TORQUE, times)
     return RotationHistory(q, w, np.concatenate([S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)], axis=2))
+
+
+def drift_equivalents(x: State, times_s: Array) -> Array:
+    """Errors of attitude to velocity at the epoch that equal a constant unit acceleration since.
+
+    Args:
+        x: state at the epoch.
+        times_s: (n,) >= 0, since the epoch [s].
+
+    Returns:
+        B (n, 12, 6): the integral of Phi(s, 0)^-1 G ds, of the angular acceleration in {B} and the acceleration in {A}.
+    """
+    last = float(times_s.max())
+    count = max(100, math.ceil(float(np.linalg.norm(x.w_b)) * last / _DRIFT_STEP_RAD))
+    grid = np.linspace(0.0, last, count + 1)
+    S = rotation_history(x, grid).S[:, :, :6]
+    rate = np.linalg.inv(S)[:, :, 3:]
+    total = np.zeros((count + 1, 6, 3))
+    np.cumsum(0.5 * (rate[1:] + rate[:-1]) * (last / count), axis=0, out=total[1:])
+    B = np.zeros((len(times_s), 12, 6))
+    place = np.clip(times_s / (last / count), 0.0, count)
+    low = np.minimum(place.astype(int), count - 1)
+    part = (place - low)[:, None, None]
+    B[:, :6, :3] = (1.0 - part) * total[low] + part * total[low + 1]
+    B[:, 6:9, 3:] = -0.5 * (times_s**2)[:, None, None] * np.eye(3)
+    B[:, 9:12, 3:] = times_s[:, None, None] * np.eye(3)
+    return B
 
 
 def rotation_path(x: State) -> _motion.Path:

@@ -19,7 +19,14 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit
-from avsreplay.estimate.batch_covariance import LATEST, BatchCovariance, covariance_of, final_mixture, sandwich
+from avsreplay.estimate.batch_covariance import (
+    LATEST,
+    BatchCovariance,
+    covariance_of,
+    final_mixture,
+    sandwich,
+    unseen_torque,
+)
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.error_state import DIM, boxplus, hamilton
@@ -252,7 +259,8 @@ def batch_estimate(
     spread, inflation = sandwich(problem, points, levels)
     now_ns = fixes[-1].scan_ns
     after_s = (now_ns - fixes[0].t_ns) * 1e-9
-    components = final_mixture(found, problem, poses.latest(LATEST, after_s), noise, now_ns, after_s, spread)
+    unseen = unseen_torque(problem, after_s) if params.torque_noise_radps15 is None else None
+    components = final_mixture(found, problem, poses.latest(LATEST, after_s), noise, now_ns, after_s, spread, unseen)
     gaussian = _determined(found, weak)
     return BatchResult(
         epoch_ns=fixes[0].t_ns,
