@@ -18,7 +18,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import drift_equivalents, flow
+from avsreplay.estimate.dynamics import drift_equivalents, flow, rotation_history
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, disturbed_likelihood
