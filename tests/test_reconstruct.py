@@ -15,12 +15,13 @@ from avsreplay import geometry, toml_document
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
-from avsreplay.reconstruct import at_grasp, deviations, reconstruct, true_frame
+from avsreplay.reconstruct import at_grasp, deviations, reconstruct, surface_of, true_frame
 from avsreplay.reconstruct.fusion import continues, contradicting
 from avsreplay.reconstruct.registration import between
 from avsreplay.reconstruct.tracking import ReconstructionParams, free_motion
 from avsreplay.reconstruct.views import SAMPLE, Twist, extent_of, full_cloud, surveyed, thinned_view
-from avsreplay.records import Scan, Surface
+from avsreplay.records import AlignStatus, Scan, Surface
+from avsreplay.register import Registrar
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
 
 CORNERS = np.random.default_rng(11).normal(size=(14, 3)) * [0.5, 0.35, 0.25]
@@ -435,6 +436,25 @@ def test_a_survey_keeps_few_scans_of_a_long_log():
     assert survey.offered == 200
     assert len(survey.chosen) == 50
     assert survey.chosen == tuple(range(0, 200, 4))
+
+
+@pytest.mark.slow
+def test_a_displaced_guess_does_not_end_at_a_false_minimum_between_the_points_of_a_model(fixtures_folder):
+    """A scan that shows one flat side mainly: from guesses 4 cm beside it, every pose that is accepted is right."""
+    with open_source(fixtures_folder / "tumble.mcap") as source:
+        scans = list(source.scans())
+    made = at_grasp(reconstruct(lambda: scans))
+    registrar, rng, at = Registrar(surface_of(made)), np.random.default_rng(5), dict(made.poses)
+    shifts = []
+    for scan in scans[:7]:
+        own = at[scan.t_ns]
+        for _ in range(6):
+            guess = own @ Pose(geometry.exp(0.01 * rng.normal(size=3)), 0.04 * rng.normal(size=3))
+            found = registrar.register(scan.points, guess)
+            if found.status is AlignStatus.ALIGNED:
+                shifts.append(float(np.linalg.norm(found.T_ac.t - own.t)))
+    assert len(shifts) > 35
+    assert max(shifts) < 0.01
 
 
 def test_scans_of_a_plate_in_front_of_the_target_are_not_used():

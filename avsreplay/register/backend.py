@@ -32,6 +32,7 @@ GROUP = "avsreplay.backends"
 POSES = "poses"
 
 PLANE_PASSES = 3
+CLOUD_PLANE_PASSES = 30  # of a second alignment to a model of points
 TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
@@ -80,6 +81,10 @@ class HornBackend:
     ``reach_m``, follows three times the rms of the last pass and never goes below 0.004 of the extent, or ``gate_m`` if
     that is less: points further away, at the edges of hidden surface, bias the pose. Where the
     position of the camera is known, only faces that face it are matched.
+
+    A model of points is aligned twice, and the pose with the smaller sum of min(d^2, gate_m^2) is taken. Along a flat
+    side Horn's iteration ends at false minima between the points, which more point-to-plane passes avoid; where the
+    model has holes, these passes can lead away from the guess.
     """
 
     name: ClassVar[str] = "horn"
@@ -94,6 +99,7 @@ class HornBackend:
     def __init__(self, target: Target) -> None:
         limits = target.limits
         self._index, self._visibility = target.index, target.visibility
+        self._cloud, self._gate = not len(target.surface.faces), limits.gate_m
         rule = IcpParams(
             n_max=limits.n_max,
             n_plane=min(PLANE_PASSES, limits.n_max),
@@ -109,7 +115,18 @@ class HornBackend:
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
-        return self._run(points, guess, self._rules)
+        found = self._run(points, guess, self._rules)
+        if not self._cloud:
+            return found
+        passes = min(CLOUD_PLANE_PASSES, self._rules[False].n_max)
+        other = self._run(
+            points, guess, {facing: replace(rule, n_plane=passes) for facing, rule in self._rules.items()}
+        )
+        return min(found, other, key=lambda fit: self._cost(points, fit.T_ca))
+
+    def _cost(self, points: NDArray[Any], T_ca: Pose) -> float:
+        sums = self._index.normal_equations(points, T_ca, self._gate)
+        return sums.sum_d2 + (sums.points - sums.inliers) * self._gate**2
 
     def align_within(self, points: NDArray[Any], guess: Pose, gate_m: float, near: bool = False) -> Fit:
         """Return T_ca with correspondences nearer than ``gate_m`` [m] from the first pass to the last.
