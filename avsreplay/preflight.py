@@ -17,9 +17,9 @@ from avsreplay.geometry import Array
 from avsreplay.log import LogInfo, Source, SourceOptions
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.options import ASSUMED_HZ, NO_TIMES, Unit
-from avsreplay.records import Surface
+from avsreplay.records import Scan, ScanStatus, Surface
 from avsreplay.register import Registrar
-from avsreplay.report.table import Table, TableCell
+from avsreplay.register.size import diameter
 
 SCANS = 5
 _POSES = 200  # measured poses examined
@@ -27,6 +27,8 @@ _LEAST, _MOST = 0.25, 1.3  # diameter of a scan over that of the model outside w
 _WHOLE = 1.1  # no scan of the target alone is larger than this
 _FEW = 0.02  # share of background below which it does not explain too large a scan
 _LEFT_OVER = 2.0  # below it some background explains too large a scan better than feet (3.28) do
+_FEET = 0.36  # below it a model in feet explains the sizes as well as a view from a narrow side
+_LARGEST_TARGET_M = 500.0
 _ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
 _UNITS = {
     0.001: "millimetres",
@@ -82,9 +84,8 @@ def preflight(source: Source, surface: Surface | None, registrar: Registrar | No
     info = source.info()
     if source.options.poses:
         return [*_poses(source, surface), *_transforms(info, source), *_truth(info), *_clock(info)]
-    clouds = _sampled_clouds(source)
-    found = [*_sizes(clouds, surface, registrar, source.options), *_faces(surface)]
-    found += [*_transforms(info, source), *_truth(info), *_clock(info)]
+    contents = _contents(_sampled(source), surface, registrar, source.options)
+    found = [*contents, *_faces(surface), *_transforms(info, source), *_truth(info), *_clock(info)]
     share = None if registrar is None else _share_on_model(source, registrar)
     if share is not None:
         text = f"{100 * share:.0f} % of the points of the first scan are on the model at the first pose"
@@ -99,11 +100,23 @@ def _faces(surface: Surface | None) -> list[Advice]:
     return [Advice("ok", "faces", text)]
 
 
-def _sampled_clouds(source: Source) -> list[NDArray[Any]]:
-    """Finite points of a few scans, spread evenly over the log; scans with fewer than ten points are left out."""
+def _sampled(source: Source) -> list[Scan]:
+    """A few scans, spread evenly over the log."""
     wanted = np.unique(np.linspace(0, len(source) - 1, SCANS).astype(int)).tolist() if len(source) else []
-    clouds = [source.scan_at(seq).points for seq in wanted]
-    return [cloud[np.isfinite(cloud).all(axis=1)] for cloud in clouds if len(cloud) >= 10]
+    return [source.scan_at(seq) for seq in wanted]
+
+
+def _contents(
+    scans: Sequence[Scan], surface: Surface | None, registrar: Registrar | None, options: SourceOptions
+) -> list[Advice]:
+    """Scans that cannot be decoded, with the reason, and the size of those with at least ten points."""
+    broken, clouds = [scan for scan in scans if scan.status is ScanStatus.DAMAGED], [scan.points for scan in scans]
+    finite = [cloud[np.isfinite(cloud).all(axis=1)] for cloud in clouds if len(cloud) >= 10]
+    found = [] if broken and len(broken) == len(scans) else _sizes(finite, surface, registrar, options)
+    if broken:
+        text = f"{len(broken)} of {len(scans)} examined scans cannot be decoded, the first: {broken[0].note}"
+        found.insert(0, Advice("check" if found else "fail", "scans", text))
+    return found
 
 
 def _poses(source: Source, surface: Surface | None) -> list[Advice]:
@@ -139,28 +152,6 @@ def _share_on_model(source: Source, registrar: Registrar) -> float | None:
     return None if pose is None else registrar.register(scan.points, pose).inlier_ratio
 
 
-def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
-    """Return the approximate largest distance between two points, found by two sweeps.
-
-    Args:
-        points: (n, 3) coordinates [m].
-        trimmed: leave out the 2 % of the points that are farthest from the median.
-
-    Returns:
-        The distance [m]; 0 without points.
-    """
-    points = np.asarray(points, dtype=np.float64)
-    if not len(points):
-        return 0.0
-    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    if trimmed:
-        points = points[away <= np.quantile(away, 0.98)]
-        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
-    first = points[np.argmax(away)]
-    second = points[np.argmax(np.linalg.norm(points - first, axis=1))]
-    return float(np.linalg.norm(points - second, axis=1).max())
-
-
 def _sizes(
     clouds: Sequence[NDArray[Any]], surface: Surface | None, registrar: Registrar | None, options: SourceOptions
 ) -> list[Advice]:
@@ -180,7 +171,7 @@ def _sizes(
     ratio = scan_m / model_m if model_m else np.inf
     said = f"the scans measure {_metres(scan_m)}, the model {_metres(model_m)}"
     if _LEAST <= ratio <= _WHOLE:
-        return [Advice("ok", "size", said)]
+        return [_agreeing(said, scan_m, ratio)]
     if ratio > _MOST and _unit(ratio) is None and (crop := _crop_of_located(clouds, surface, registrar)):
         return [crop]
     targets = [_target(cloud, model_m) for cloud in clouds] if ratio > _MOST else []
@@ -201,6 +192,15 @@ def _sizes(
         return [Advice("fail", "size", f"{said}; no common unit explains the difference")]
     text = f"{said}: the model seems to be in {_UNITS[scale]}"
     return [Advice("fail", "unit", text, _unit_option(scale))]
+
+
+def _agreeing(said: str, scan_m: float, ratio: float) -> Advice:
+    """Sizes that agree, though both may be in millimetres, or the model in feet."""
+    if scan_m > _LARGEST_TARGET_M:
+        text = f"{said}: if both are in millimetres, all lengths are 1000 times too large; convert them to metres"
+        return Advice("check", "unit", text)
+    feet = "; if more than a narrow side is seen, the model is in feet (--model-scale 0.3048)"
+    return Advice("ok", "size", said + feet * (ratio < _FEET))
 
 
 def _unit_option(scale: float) -> str:
@@ -257,8 +257,6 @@ def _crop_of_located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar
     The search looks at the connected parts of the scan with the size of the model, and tests every pose: size alone
     does not tell the target from other objects.
     """
-    from avsreplay.register import Registrar
-
     registrar, found = registrar or Registrar(surface), []
     for k, cloud in enumerate(clouds):
         pose = registrar.acquire(cloud[:: max(len(cloud) // _SEARCHED, 1)])
@@ -334,14 +332,3 @@ def _clock(info: LogInfo) -> list[Advice]:
         return [Advice("ok", "time stamps", text)]
     option = "--clock log" if clock.clock == "header" else ""
     return [Advice("check", "time stamps", f"time stamps of scans: {', '.join(problems)}", option)]
-
-
-def advice_table(found: Sequence[Advice]) -> Table:
-    """Return a table of the findings with the option to add for each.
-
-    Args:
-        found: the findings of ``preflight``.
-    """
-    marks = {"ok": "good", "check": "warn", "fail": "bad"}
-    rows = tuple((TableCell(a.about, marks[a.grade]), a.text, a.option) for a in found)
-    return Table("Checks before a run", ("check", "finding", "option to add"), rows, align="l")

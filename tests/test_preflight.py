@@ -12,9 +12,10 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
 from avsreplay.log.header import parse_surface, scaled, surface_bytes
 from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
-from avsreplay.preflight import diameter, preflight
+from avsreplay.preflight import preflight
 from avsreplay.records import Scan, ScanStatus
 from avsreplay.register.contract import boxes
+from avsreplay.register.size import diameter
 
 
 @dataclasses.dataclass
@@ -115,6 +116,42 @@ def test_a_model_that_is_smaller_than_a_scan_is_doubtful(surface, factor, grade)
     found = _found(preflight(Log(_seen(surface)), scaled(surface, factor)), "size")
     assert found.grade == grade
     assert ("too small" in found.text) == (grade == "check")
+
+
+@dataclasses.dataclass
+class Undecodable(Log):
+    """A source of which some clouds cannot be decoded."""
+
+    bad: tuple = ()
+
+    def scan_at(self, seq):
+        scan = super().scan_at(seq)
+        if seq not in self.bad:
+            return scan
+        note = "no field 'x' among intensity"
+        return dataclasses.replace(scan, points=np.zeros((0, 3)), status=ScanStatus.DAMAGED, note=note)
+
+
+@pytest.mark.parametrize(("bad", "grade"), [((0, 1, 2, 3, 4), "fail"), ((2,), "check")])
+def test_clouds_that_cannot_be_decoded_are_named_with_the_reason(surface, bad, grade):
+    """Not as scans without points: their fields have other names, or the message is damaged."""
+    found = preflight(Undecodable(_seen(surface, n=5), bad=bad), surface)
+    advice = _found(found, "scans")
+    assert advice.grade == grade
+    assert advice.text == f"{len(bad)} of 5 examined scans cannot be decoded, the first: no field 'x' among intensity"
+    assert any(other.about == "size" for other in found) == (grade == "check")
+
+
+def test_sizes_beyond_any_target_are_doubtful_though_they_agree(surface):
+    found = preflight(Log([1000.0 * cloud for cloud in _seen(surface)]), scaled(surface, 1000.0))
+    assert _found(found, "unit").grade == "check"
+    assert "1000 times too large" in _found(found, "unit").text
+
+
+def test_a_model_in_feet_is_named_though_a_narrow_view_explains_the_sizes_too(surface):
+    found = _found(preflight(Log(_seen(surface)), scaled(surface, 3.28084)), "size")
+    assert (found.grade, "--model-scale 0.3048" in found.text) == ("ok", True)
+    assert "feet" not in _found(preflight(Log(_seen(surface)), surface), "size").text
 
 
 def test_no_unit_is_guessed_where_none_fits(surface):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +16,7 @@ from oracles.closest_point import OracleIndex
 
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
+from avsreplay.register import RegisterParams
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 
 kernel = pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
@@ -306,6 +309,32 @@ def test_any_number_of_threads_gives_the_same_bits(target: Surface, threads: int
     rule = IcpParams(n_max=40, threads=threads)
     assert everything(model, scan, rule) == everything(model, scan)
     assert everything(model, scan, replace(rule, facing=True)) == everything(model, scan, FACING)
+
+
+def test_a_number_of_threads_that_no_system_has_is_refused(target: Surface) -> None:
+    with pytest.raises(ValueError, match="threads is 1000000, must be at least 1 and at most 1024"):
+        IcpParams(threads=1_000_000)
+    with pytest.raises(ValueError, match="at most 1024"):
+        RegisterParams(threads=1_000_000)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits the address space of a process")
+def test_threads_that_the_system_refuses_do_not_end_the_process() -> None:
+    """Those that start do the work: here the stacks of 1024 threads do not fit in the address space."""
+    code = (
+        "import resource\n"
+        "import numpy as np\n"
+        "from avsreplay.register.surface_index import SurfaceIndex\n"
+        "from avsreplay.simulate import builtin_surface\n"
+        "surface, points = builtin_surface(), np.random.default_rng(1).normal(size=(2000, 3))\n"
+        "index = SurfaceIndex.build(surface, 1.0)\n"
+        "alone = index.closest(points).d2\n"
+        "size = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (size + (256 << 20), resource.RLIM_INFINITY))\n"
+        "assert index.closest(points, threads=1024).d2.tobytes() == alone.tobytes()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_keeping_neighbours_gives_the_same_bits(target: Surface) -> None:

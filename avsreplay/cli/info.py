@@ -120,16 +120,24 @@ def loss_line(loss: Loss) -> str:
 
 def _print(info: LogInfo, advice: list[Advice]) -> None:
     from avsreplay.log.bytes_io import shown
-    from avsreplay.preflight import advice_table
     from avsreplay.report.table import facts_table, make_console, print_line, print_table
 
     console = make_console(plain_width=WIDTH)
     print_table(console, facts_table("Log", [(name, shown(value)) for name, value in _facts(info)]))
     print_table(console, _topics(info))
     print_table(console, _faults(info))
-    print_table(console, advice_table(advice))
+    print_table(console, _checks(advice))
     for loss in info.losses:
         print_line(console, "lost: " + loss_line(loss))
+
+
+def _checks(found: list[Advice]) -> Table:
+    """The findings of the checks before a run, with the option to add for each."""
+    from avsreplay.report.table import Table, TableCell
+
+    marks = {"ok": "good", "check": "warn", "fail": "bad"}
+    rows = tuple((TableCell(a.about, marks[a.grade]), a.text, a.option) for a in found)
+    return Table("Checks before a run", ("check", "finding", "option to add"), rows, align="l")
 
 
 def _facts(info: LogInfo) -> list[tuple[str, str]]:

@@ -176,9 +176,10 @@ def propagate(
     """
     h = (t_ns - belief.t_ns) * 1e-9
     x = belief.x
-    if abs(h) * max(map(abs, x.w_b.tolist())) > MOST_RAD:
-        what = f"a scan comes {h:.4g} s after the one before, too far to predict its pose"
-        raise UsageError(what, where=f"stamp {t_ns}", hint="leave out what is beyond the gap with --start or --end")
+    if (turn := abs(h) * max(map(abs, x.w_b.tolist()))) > MOST_RAD:
+        what = f"a scan comes {h:.4g} s after the one before, in which the target would turn {turn:.3g} rad"
+        hint = "too far to predict: check the time stamps (--clock log), or leave out the gap with --start or --end"
+        raise UsageError(what, where=f"stamp {t_ns}", hint=hint)
     step = flow(x.w_b, x.sigma, h, torque)
     arc = None if orbit is None else orbit.at(belief.t_ns)
     Phi = transition(step, x.sigma, h, arc)

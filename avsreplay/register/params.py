@@ -98,7 +98,9 @@ class RegisterParams(Settings):
     split_every: int = setting(
         5, "The poses from two halves of the scan are compared on every n-th scan (column split_nis).", low=1
     )
-    threads: int = setting(1, "Largest number of threads of a back end; the result does not depend on it.", low=1)
+    threads: int = setting(
+        1, "Largest number of threads of a back end; the result does not depend on it.", low=1, high=1024
+    )
     index_cache: bool = setting(True, "Keep the index of a large model in the user's cache folder between runs.")
     acquire: AcquireParams = setting(AcquireParams, "The global search.")
 

@@ -248,3 +248,25 @@ def _normal_numbers(count: int) -> Array:
     numbers: Array = quantiles[order]
     numbers.flags.writeable = False
     return numbers
+
+
+def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
+    """Return the approximate largest distance between two points, found by two sweeps.
+
+    Args:
+        points: (n, 3) coordinates [m].
+        trimmed: leave out the 2 % of the points that are farthest from the median.
+
+    Returns:
+        The distance [m]; 0 without points.
+    """
+    points = np.asarray(points, dtype=np.float64)
+    if not len(points):
+        return 0.0
+    away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    if trimmed:
+        points = points[away <= np.quantile(away, 0.98)]
+        away = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    first = points[np.argmax(away)]
+    second = points[np.argmax(np.linalg.norm(points - first, axis=1))]
+    return float(np.linalg.norm(points - second, axis=1).max())

@@ -55,7 +55,7 @@ class IcpParams(Settings):
     eps_m: float | None = setting(
         None, "Stopping rule: displacement of the inliers' centroid.", unit="m", low=0.0, of_extent=1e-6
     )
-    threads: int = setting(1, "Largest number of threads; the result is identical to the bit for any number.", low=1)
+    threads: int = setting(1, "Largest number of threads; no result depends on it.", low=1, high=1024)
     facing: bool = setting(False, "Match only faces that face the camera (origin of {A}); needs outward faces.")
     few: int = setting(0, "Points of the scan with which a much larger scan is aligned first; 0: none.", low=0)
     keep: bool = setting(True, "Keep a correspondence while it provably cannot change; does not change a result.")

@@ -1,9 +1,15 @@
 #include "team.hpp"
 
+#include <system_error>
+
 namespace avs {
 
 Team::Team(int threads) {
-  for (int k = 1; k < threads; ++k) threads_.emplace_back([this] { serve(); });
+  threads_.reserve(threads > 1 ? threads - 1 : 0);
+  try {
+    for (int k = 1; k < threads; ++k) threads_.emplace_back([this] { serve(); });
+  } catch (const std::system_error&) {  // the system has no more: those that started do the work
+  }
 }
 
 Team::~Team() {
