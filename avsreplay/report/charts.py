@@ -6,6 +6,7 @@ import base64
 import json
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -28,8 +29,7 @@ def pack(array: ArrayLike, kind: str) -> dict[str, str]:
 
 def values(rows: Iterable[Row], name: str) -> NDArray[np.float64]:
     """A column as floats (n,), NaN where a row has no value."""
-    found = (getattr(row, name) for row in rows)
-    return np.array([np.nan if v is None else float(v) for v in found], dtype=np.float64)
+    return np.array(list(map(attrgetter(name), rows)), dtype=np.float64)
 
 
 def embed(value: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Iterable, Mapping, Sequence
 
 from rich.console import Console
@@ -175,7 +176,8 @@ def manoeuvre_table(summary: Summary, rows: Sequence[Row] = ()) -> Table:
 
 
 def _nearest_row(t_s: float, rows: Sequence[Row]) -> int | None:
-    return min(range(len(rows)), key=lambda k: abs(rows[k].t_s - t_s), default=None)
+    after = bisect_left(rows, t_s, key=lambda row: row.t_s)
+    return min(range(max(after - 1, 0), min(after + 1, len(rows))), key=lambda k: abs(rows[k].t_s - t_s), default=None)
 
 
 def _verdict(episode: Episode) -> TableCell:
