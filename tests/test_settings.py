@@ -288,3 +288,22 @@ def test_the_papers_settings_are_settings() -> None:
         for name in assignment.partition("=")[0].split("."):
             first, second = getattr(first, name), getattr(second, name)
         assert first != second, assignment
+
+
+@pytest.mark.parametrize(
+    "assignment",
+    [
+        "estimator.torque_noise_radps15=1e15",
+        "estimator.r0_pos_m=1e15",
+        "estimator.start_rate_1s_radps=1e15",
+        "estimator.start_vel_1s_mps=1e15",
+        "estimator.start_log_inertia_1s=1e3",
+        "estimator.start_sigma_1s=2",
+        "convergence.horizon_steps=1000000",
+        "register.threads=1000000",
+    ],
+)
+def test_values_with_which_no_run_can_be_computed_are_refused(assignment):
+    """They had ended in an error of the linear algebra, or had taken minutes."""
+    with pytest.raises(UsageError, match="at most"):
+        load_config(None, {}, (assignment,))

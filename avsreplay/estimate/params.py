@@ -56,6 +56,7 @@ class EstimatorParams(Settings):
         "Root spectral density of the angular acceleration noise eps_tau.",
         unit="rad/s^1.5",
         low=0.0,
+        high=1e6,
         unset="estimated from the residuals of the poses",
     )
     force_noise_mps15: float | None = setting(
@@ -96,7 +97,7 @@ class EstimatorParams(Settings):
     )
     window: int = setting(30, "Healthy scans in the window of the noise adaptation.", low=6)
     r0_pos_m: float | None = setting(
-        None, "R0: 1 sigma of the measured position.", unit="m", above=0.0, of_extent=0.002
+        None, "R0: 1 sigma of the measured position.", unit="m", above=0.0, high=1e6, of_extent=0.002
     )
     r0_rot_deg: float = setting(0.5, "R0: 1 sigma of the measured attitude about each axis.", unit="deg", above=0.0)
     r_floor: float = setting(1e-6, "Smallest eigenvalue of R in units of R0.", above=0.0)
@@ -152,10 +153,10 @@ class EstimatorParams(Settings):
         10.0, "1 sigma of the attitude of the initial pose about each axis.", unit="deg", above=0.0
     )
     start_rate_1s_radps: float = setting(
-        0.5, "1 sigma of the unknown angular rate about each axis.", unit="rad/s", above=0.0
+        0.5, "1 sigma of the unknown angular rate about each axis.", unit="rad/s", above=0.0, high=1e3
     )
     start_vel_1s_mps: float | None = setting(
-        None, "1 sigma of the unknown velocity along each axis.", unit="m/s", above=0.0, of_extent=0.05
+        None, "1 sigma of the unknown velocity along each axis.", unit="m/s", above=0.0, high=1e6, of_extent=0.05
     )
     start_sigma_1s: float = setting(
         0.5, "With start paper: 1 sigma of each unknown inertia ratio.", above=0.0, high=1.0
@@ -164,6 +165,7 @@ class EstimatorParams(Settings):
         1.0,
         "With start cold: 1 sigma of each of the five components of the logarithm of the mass moments.",
         above=0.0,
+        high=10.0,
     )
     start_varrho_1s_m: float | None = setting(
         None, "1 sigma of the unknown fixture position in {B}.", unit="m", above=0.0, of_extent=0.25

@@ -64,7 +64,7 @@ class ConvergenceParams(Settings):
     )
     dwell_s: float = setting(2.0, "Time for which the test must hold without interruption.", unit="s", low=0.0)
     horizon_s: float = setting(30.0, "predictive: How far ahead the grasp point is predicted.", unit="s", low=0.0)
-    horizon_steps: int = setting(6, "predictive: Number of instants over the horizon.", low=1)
+    horizon_steps: int = setting(6, "predictive: Number of instants over the horizon.", low=1, high=1000)
     grasp_pos_m: float | None = setting(
         None, "predictive: Limit on the grasp point's position.", unit="m", low=0.0, of_extent=0.01
     )
