@@ -287,3 +287,14 @@ def test_a_known_pose_takes_part_in_a_search(registrar: Registrar) -> None:
     found = registrar._global.search(scan, known=apart)
     assert any(np.array_equal(each.T_ca.matrix, apart.matrix) for each in found.candidates)
     assert not found.rivals
+
+
+def test_a_point_at_the_sensor_has_no_direction_and_is_left_out() -> None:
+    """Sensors report a missing return as (0, 0, 0); the choice between nearly symmetric poses uses directions."""
+    surface, T_ac = _box((1.0, 0.8, 0.4)), example_pose()
+    points, missing = T_ac.apply(view(surface, 500, T_ac.inverse().t)), np.zeros((5, 3))
+    rays = Registrar(surface)._symmetry
+    expected = rays.decided(points, T_ac.inverse(), [], True)
+    found = rays.decided(np.concatenate([points, missing]), T_ac.inverse(), [], True)
+    np.testing.assert_array_equal(found[0].matrix, expected[0].matrix)
+    np.testing.assert_array_equal(rays.decided(missing, T_ac.inverse(), None, True)[0].matrix, T_ac.inverse().matrix)

@@ -111,6 +111,10 @@ class NearSymmetry:
             complete: the visible side of the model is complete in the scan, so that empty directions count.
         """
         points = np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64)
+        away = np.linalg.norm(points, axis=1)
+        points = points[np.isfinite(away) & (away > 0.0)]  # a point at the sensor has no direction
+        if not len(points):
+            return T_ca, others or []
         rays = _Rays(points)
         turned = self._turned(rays, T_ca, others is None)
         if others is None and not turned:
