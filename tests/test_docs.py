@@ -249,12 +249,12 @@ def test_the_back_end_of_the_tutorial_keeps_the_contract(tmp_path):
 
 def _command_lines(page):
     for block in _blocks(page):
-        if block["language"] in ("sh", "bash", "console"):
+        if block["language"] in ("sh", "bash", "console", "yaml"):
             for line in block["text"].replace("\\\n", " ").splitlines():
-                for part in re.split(r"&&|\|\||;|\|", re.sub(r"\d?>\s*\S+", "", line.removeprefix("$ "))):
-                    words = shlex.split(part, comments=True)
-                    if words[:1] == ["avsreplay"]:
-                        yield words[1:]
+                command = line.strip().removeprefix("- run: ").removeprefix("$ ")
+                for part in re.split(r"&&|\|\||;|\|", re.sub(r"\d?>+\s*\S+", "", command)):
+                    if part.split()[:1] == ["avsreplay"]:
+                        yield shlex.split(part, comments=True)[1:]
 
 
 LINES = [(page, words) for page in PAGES for words in _command_lines(page)]
@@ -270,6 +270,27 @@ def test_every_command_line_parses(page, words):
             return
     else:
         assert words[0] in ("--help", "-h", "--version", "COMMAND")
+
+
+def _mentioned(page):
+    """Commands in a sentence, as words; arguments may be missing or stand for others."""
+    text = re.sub(r"```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    found = re.findall(r"`((?:avsreplay|python (?:tests|docs|fixtures)/)[^`\n]+)`", text)
+    return [line.partition("|")[0].split() for line in found]
+
+
+MENTIONED = sorted({tuple(words) for page in PAGES for words in _mentioned(page)})
+
+
+@pytest.mark.parametrize("words", MENTIONED, ids=" ".join)
+def test_every_option_of_a_command_in_a_sentence_exists(words):
+    options = {word.partition("=")[0] for word in words if word.startswith("--")}
+    if words[0] == "python" and not words[1].endswith("/NAME.py"):
+        source = (ROOT / words[1]).read_text(encoding="utf-8")
+        assert not [option for option in options if f'"{option}"' not in source]
+    elif words[1:] and words[1] in SUMMARIES:
+        command = group.get_command(click.Context(group), words[1])
+        assert options <= {option for param in command.params for option in (*param.opts, "--help")}
 
 
 def _links(page):
