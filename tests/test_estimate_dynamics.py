@@ -174,7 +174,7 @@ def test_forecast_adds_the_disturbance_of_every_step() -> None:
 
 def test_a_gap_of_years_is_refused_in_one_line() -> None:
     x, _ = some_state(1)
-    with pytest.raises(UsageError, match=r"the target would turn .* rad; too far to predict: check the time stamps"):
+    with pytest.raises(UsageError, match=r"the target turns .* rad: too far to predict; check the stamps"):
         dynamics.propagate(Belief(0, x, np.eye(20)), 10**18, 0.0, 0.0)
 
 

@@ -177,9 +177,8 @@ def propagate(
     h = (t_ns - belief.t_ns) * 1e-9
     x = belief.x
     if (turn := abs(h) * max(map(abs, x.w_b.tolist()))) > MOST_RAD:
-        what = f"a scan comes {h:.4g} s after the one before, in which the target would turn {turn:.3g} rad"
-        hint = "too far to predict: check the time stamps (--clock log), or leave out the gap with --start or --end"
-        raise UsageError(what, where=f"stamp {t_ns}", hint=hint)
+        what = f"a scan comes {h:.4g} s after the one before, and the target turns {turn:.3g} rad: too far to predict"
+        raise UsageError(what, where=f"stamp {t_ns}", hint="check the stamps (--clock log), or use --start or --end")
     step = flow(x.w_b, x.sigma, h, torque)
     arc = None if orbit is None else orbit.at(belief.t_ns)
     Phi = transition(step, x.sigma, h, arc)
