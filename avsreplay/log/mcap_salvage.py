@@ -93,7 +93,7 @@ def _is_whole(kind: str, payload: memoryview, doubles: int) -> bool:
     return cursor.pos == len(cursor.data)
 
 
-_WINDOW = 1 << 20
+_FIRST_WINDOW, _WINDOW = 1 << 12, 1 << 20  # the next record is usually near; the search grows to the largest window
 _MARGIN = 64  # a candidate is recognised by at most so many bytes
 _MAX_CANDIDATES = 1_000_000
 _MESSAGE = re.compile(rb"(?=\x05[\s\S]{4}\x00{4}[\s\S]{2})")
@@ -155,14 +155,14 @@ def _search(
     candidates: Callable[[bytes], Iterable[int]],
     accept: Callable[[int], bool],
 ) -> int | None:
-    tried = 0
+    tried, width = 0, _FIRST_WINDOW
     while at < stop:
-        window = file.read_at_most(at, min(_WINDOW, stop - at) + _MARGIN)
+        window = file.read_at_most(at, min(width, stop - at) + _MARGIN)
         for place in candidates(window):
             tried += 1
             if tried > _MAX_CANDIDATES:  # a file made to look like records everywhere
                 return None
             if at + place < stop and accept(at + place):
                 return at + place
-        at += _WINDOW
+        at, width = at + width, min(2 * width, _WINDOW)
     return None

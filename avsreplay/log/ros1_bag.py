@@ -19,7 +19,7 @@ from avsreplay.log.options import Loss
 ROS1_MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 4, 5, 6, 7
 _CHUNK_OP = re.compile(rb"\x04\x00\x00\x00op=\x05")
-_WINDOW, _MARGIN = 1 << 20, 128
+_FIRST_WINDOW, _WINDOW, _MARGIN = 1 << 12, 1 << 20, 128
 _MAX_HEAD, _MOST_FOREIGN = 1 << 16, 10_000
 _MAX_CANDIDATES, _MAX_LOSSES = 20_000, 10_000
 _COMPRESSIONS = {"none": "", "bz2": "bz2", "lz4": "lz4"}
@@ -194,9 +194,9 @@ class Ros1Bag(Recording):
         return resume
 
     def _next_chunk(self, at: int, end: int) -> int | None:
-        start = at
+        start, width = at, _FIRST_WINDOW
         while at < end:
-            window = self._file.read_at_most(at, _WINDOW + _MARGIN)
+            window = self._file.read_at_most(at, width + _MARGIN)
             for match in _CHUNK_OP.finditer(window):
                 self._tried += 1
                 if self._tried > _MAX_CANDIDATES:  # a file made to look like chunks everywhere
@@ -204,7 +204,7 @@ class Ros1Bag(Recording):
                 for place in range(max(at + match.start() - _MARGIN, start), at + match.start()):
                     if self._is_chunk(place, end):
                         return place
-            at += _WINDOW
+            at, width = at + width, min(2 * width, _WINDOW)
         return None
 
     def _is_chunk(self, at: int, end: int) -> bool:
