@@ -9,7 +9,9 @@ from scipy.spatial.transform import Rotation
 
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan import CostatePath, PlanParams, rendezvous
-from avsreplay.plan.reachable_set import gauge, integrals, support
+from avsreplay.plan.path import sample_goal
+from avsreplay.plan.reachable_set import Gauge, gauge, integrals, support
+from avsreplay.plan.rendezvous import _Margin
 
 ORIGIN = np.zeros(3)
 GAUSS = np.polynomial.legendre.leggauss(200)
@@ -201,3 +203,11 @@ def test_a_state_that_is_not_finite_is_named():
         rendezvous(fixed([1.0, 0, 0]), np.array([math.nan, 0, 0]), ORIGIN)
     with pytest.raises(ValueError, match="goal trajectory is not finite"):
         rendezvous(fixed([math.nan, 0, 0]), ORIGIN, ORIGIN)
+
+
+def test_a_goal_without_relative_acceleration_does_not_divide_by_zero() -> None:
+    """With a steep slope and a margin at the limit of rounding, the bound moves by one step of the grid."""
+    goal = sample_goal(lambda t: (np.zeros((len(t), 3)),) * 2, np.ones(3), np.zeros(3), 0.0, 0.0, 10.0, 1.0)
+    found = Gauge(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 1.0, 0.0)
+    reached = _Margin(n0=1.0, n1=1.0, slope=1e8).step(goal, found, 0.0, 1e-12, 1e-6)
+    assert 0.0 < reached <= goal.end

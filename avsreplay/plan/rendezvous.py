@@ -275,8 +275,8 @@ class _Margin:
         """
         sag = 0.125 * goal.step**2
         near = self.bend(goal, t + goal.step, a_max)
-        taylor = 2.0 * margin / (math.sqrt(self.slope * self.slope + 2.0 * near * margin) - self.slope)
-        reach = t + min(taylor, goal.step)
+        rest = math.sqrt(self.slope * self.slope + 2.0 * near * margin) - self.slope
+        reach = t + (min(2.0 * margin / rest, goal.step) if rest > 0.0 else goal.step)
         first = int((t - goal.begin) / goal.step) + 1
         if first >= len(goal.times) or margin <= near * sag:
             return reach

@@ -39,11 +39,8 @@ LEAST_RAYS = 8  # fewer points off the model decide nothing
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 STEPS = 24  # of the march from a mark to the camera
 NEIGHBOUR, EMPTY, SPACED = 8, 2.5, 500  # for the density of rays; no ray within so many spacings: nothing was measured
-MOST_POINTS, SCREENED, FINALISTS = (
-    6000,
-    150,
-    2,
-)  # of the scan; of each kind for all motions; poses of each kind of motion
+MOST_POINTS, SCREENED = 6000, 150  # of the scan; of them, on and off the model, for the comparison of all motions
+FINALISTS = 2  # poses of each kind of motion that are refined
 
 
 @dataclass(frozen=True, slots=True, eq=False)
