@@ -9,10 +9,11 @@ import tumbling
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.error_state import boxplus
+from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector
-from avsreplay.estimate.track import deskew, with_scan_duration
+from avsreplay.estimate.track import Track, deskew, turned, with_scan_duration
 from avsreplay.geometry import Pose
-from avsreplay.records import Belief
+from avsreplay.records import Alignment, AlignStatus, Belief
 
 
 def skewed(rate: float, span: float, at: float):
@@ -120,3 +121,53 @@ def test_points_all_late_by_the_same_time_test_the_pose_then() -> None:
     want = then.H @ then.Phi
     np.testing.assert_allclose(told.H[:3], turn @ want[:3], atol=1e-12)
     np.testing.assert_allclose(told.H[3:], want[3:], atol=1e-12)
+
+
+# --- the first scan that determines a rotation of a nearly symmetric model
+
+
+def symmetric_track(seed: int) -> tuple[Track, Pose, np.ndarray]:
+    """A track that does not know the rotation about an axis in {C}, a turn G about it, and the error of its pose."""
+    rng = np.random.default_rng(seed)
+    now = tumbling.draw(seed, seconds=1.0).states[0]
+    axis, centre, error = rng.normal(size=3), rng.normal(size=3), 1e-6 * rng.normal(size=6)
+    axis /= np.linalg.norm(axis)
+    q = geometry.exp(rng.uniform(-3.0, 3.0) * axis)
+    G = Pose(q, centre - geometry.matrix(q) @ centre)
+    d = 2.0 * np.concatenate([axis, np.cross(centre, axis)])[:, None]
+    fix = PoseFix(0, now.T_ac, np.outer(error, error))
+    return Track(Belief(0, now, np.eye(20) * 1e-6), "filter", fixes=(fix,), undetermined=d), G, error
+
+
+def aligned(T_ac: Pose, status: AlignStatus = AlignStatus.ALIGNED) -> Alignment:
+    return Alignment(T_ac, 5, True, 100, 100, 1e-3, np.eye(6), status, np.eye(6) * 1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_determined_rotation_turns_the_whole_track(seed: int) -> None:
+    track, G, error = symmetric_track(seed)
+    x = track.belief.x
+    measured = x.T_ac @ G
+    after = turned(track, x.T_ac, measured, aligned(measured))
+    np.testing.assert_allclose(after.belief.x.T_ac.t, measured.t, atol=1e-12)
+    assert geometry.angle(geometry.multiply(geometry.conjugate(after.belief.x.T_ac.q), measured.q)) < 1e-7
+    for name in ("q_ab", "w_b", "r_a", "v_a", "sigma"):  # the body moves as before; only the model on it is turned
+        np.testing.assert_array_equal(getattr(after.belief.x, name), getattr(x, name))
+    fix = after.fixes[0]
+    truth = x.T_ac @ Pose(geometry.exp(error[:3]), error[3:]) @ G
+    left = fix.T_ac.inverse() @ truth
+    seen = np.concatenate([geometry.log(left.q), left.t])
+    np.testing.assert_allclose(fix.C, np.outer(seen, seen), atol=1e-16)
+
+
+def test_other_differences_do_not_turn_the_track() -> None:
+    track, G, _ = symmetric_track(1)
+    x = track.belief.x
+    measured = x.T_ac @ G
+    assert turned(track, x.T_ac, measured, aligned(measured, AlignStatus.DEGENERATE)) is track
+    two = Track(track.belief, "filter", undetermined=np.hstack([track.undetermined, np.eye(6)[:, 3:4]]))
+    assert turned(two, x.T_ac, measured, aligned(measured)) is two
+    assert turned(Track(track.belief, "filter"), x.T_ac, measured, aligned(measured)).undetermined.size == 0
+    across = np.cross(track.undetermined[:3, 0], [0.3, -0.5, 0.8])
+    other = Pose(geometry.exp(0.5 * across / np.linalg.norm(across)), np.zeros(3))
+    assert turned(track, x.T_ac, measured @ other, aligned(measured)) is track
