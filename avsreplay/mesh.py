@@ -18,6 +18,7 @@ from avsreplay.geometry import Array
 
 PAIRED_EDGES = 0.95  # least share of the edges of a closed part that two opposite half-edges form
 LEAST_VOLUME = 1e-9  # of a part that has an inside, times six, in units of its area to the power of 3/2
+LEAST_PART = 1e-3  # of the area of the mesh: smaller open parts are remains of meshing
 TESTED_VERTICES = 20  # of a part, to decide whether it is a cavity
 
 Faces = NDArray[np.int32]
@@ -125,6 +126,8 @@ def signed_volume(vertices: Array, faces: Faces) -> float:
 def open_faces(vertices: Array, faces: Faces) -> NDArray[np.bool_]:
     """Return which faces (m,) belong to parts that are not closed, so that both of their sides can be seen.
 
+    Parts with less than a thousandth of the area are left out.
+
     Args:
         vertices: (n, 3) [m].
         faces: (m, 3) vertex indices.
@@ -137,7 +140,9 @@ def open_faces(vertices: Array, faces: Faces) -> NDArray[np.bool_]:
     if paired.all():
         return np.zeros(len(faces), bool)
     parts = _parts(edges)
-    opened: NDArray[np.bool_] = (~parts.closed & (_share(paired, parts.of) < PAIRED_EDGES))[parts.of][number]
+    area = _volumes(vertices, faces[first], parts.of)[1]
+    large = area > LEAST_PART * area.sum()
+    opened: NDArray[np.bool_] = (~parts.closed & large & (_share(paired, parts.of) < PAIRED_EDGES))[parts.of][number]
     return opened
 
 

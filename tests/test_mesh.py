@@ -106,6 +106,7 @@ def test_open_parts_are_told_from_closed_ones() -> None:
     sheet.apply_translation((3, 0, 0))
     vertices, faces = joined([box, sheet])
     np.testing.assert_array_equal(mesh.open_faces(vertices, faces), np.arange(14) >= 12)
+    assert not mesh.open_faces(np.where(np.arange(len(vertices))[:, None] < 8, vertices, 0.01 * vertices), faces).any()
     both = np.concatenate([faces, faces[12:, ::-1]])  # the other side of the sheet, as faces of their own
     assert not mesh.open_faces(vertices, both).any()
     assert mesh.outward(vertices, both)[1] == 0

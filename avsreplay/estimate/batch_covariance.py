@@ -192,7 +192,10 @@ def unseen_torque(problem: Problem, after_s: float) -> Array:
     """
     e, H = problem.core.rows()
     T, times = to_errors(problem.chart), np.append(problem.poses.times_s, after_s)
-    B = drift_equivalents(to_state(problem.chart), times)[:, :_DISTURBED, :3]
+    try:
+        B = drift_equivalents(to_state(problem.chart), times)[:, :_DISTURBED, :3]
+    except np.linalg.LinAlgError:  # an unstable spin over so long a time that its motion cannot be inverted
+        return np.zeros((DIM, DIM))
     J, C = (H @ T).reshape(-1, DIM), (H[:, :, :_DISTURBED] @ B[:-1]).reshape(-1, 3)
     P, cross, total = problem.covariance, J.T @ C, np.zeros((3, 3))
     moved = -P @ cross
@@ -204,7 +207,8 @@ def unseen_torque(problem: Problem, after_s: float) -> Array:
         torque = own @ found
         log_odds = 0.5 * float(found @ torque - np.linalg.slogdet(scaled)[1])
         total += _TORQUE / len(_TORQUES) * math.exp(min(log_odds, 0.0)) * (own + np.outer(torque, torque))
-    return np.asarray(moved @ total @ moved.T)
+    added = np.asarray(moved @ total @ moved.T)
+    return added if np.isfinite(added).all() else np.zeros((DIM, DIM))
 
 
 def final_mixture(

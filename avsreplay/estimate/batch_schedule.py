@@ -192,7 +192,10 @@ class BatchSchedule:
         known = track.drift
         if known is not None and last.epoch_ns != epoch_ns:
             return track
-        found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels, known)
+        try:
+            found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels, known)
+        except np.linalg.LinAlgError:  # an unstable spin over so long a time that its motion cannot be inverted
+            found = None
         if found is None:
             return track
         drift, chart = found
