@@ -92,9 +92,7 @@ class Scene:
                 raise ValueError("keepout_m needs the mass centre, and the scene has none")
             most = float(np.linalg.norm(self.centre_c)) + (limits.keepout_release_m or 0.0)
             if limits.keepout_m >= most:
-                raise ValueError(
-                    f"keepout_m is {limits.keepout_m}, must be below {most:.3f}, where it contains the grasp point"
-                )
+                raise ValueError(f"keepout_m is {limits.keepout_m}, must be below {most:.3f} to leave the grasp point")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
