@@ -39,7 +39,7 @@ def with_area(vertices: Array, faces: NDArray[np.int64]) -> Faces:
     return kept
 
 
-def merged(vertices: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def distinct_rows(vertices: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Identify equal vertices.
 
     Args:
@@ -174,13 +174,13 @@ class _Parts:
 
 def _corners(vertices: Array, faces: Faces) -> NDArray[np.int64]:
     """The faces (m, 3) with equal vertices as one."""
-    return merged(vertices)[1][faces]
+    return distinct_rows(vertices)[1][faces]
 
 
 def _distinct(corners: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Faces without repetitions of the same winding: indices (k,), and which of them (m,) each face equals."""
     begin = np.argmin(corners, axis=1)[:, None]
-    return merged(np.take_along_axis(corners, (begin + np.arange(3)) % 3, axis=1).astype(np.float64))
+    return distinct_rows(np.take_along_axis(corners, (begin + np.arange(3)) % 3, axis=1).astype(np.float64))
 
 
 def _edges(corners: NDArray[np.int64]) -> _Edges:

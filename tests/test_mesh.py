@@ -137,7 +137,7 @@ def test_no_faces() -> None:
 def test_merged_vertices_are_those_of_a_dictionary(seed: int) -> None:
     rng = np.random.default_rng(seed)
     vertices = rng.integers(-2, 3, size=(40, 3)) * np.array([1.0, -0.5, 0.0])
-    first, number = mesh.merged(vertices)
+    first, number = mesh.distinct_rows(vertices)
     seen: dict[tuple[float, ...], int] = {}
     expected = [seen.setdefault(tuple(v), len(seen)) for v in vertices.tolist()]
     np.testing.assert_array_equal(number, expected)

@@ -277,7 +277,7 @@ def _merged(vertices: Array, faces: NDArray[Any]) -> tuple[Array, NDArray[Any]]:
     """Merge equal vertices, which occur in STL files and in OBJ files with normals."""
     if not np.isfinite(vertices).all():
         return vertices, faces
-    first, number = mesh.merged(vertices)
+    first, number = mesh.distinct_rows(vertices)
     return vertices[first], number[faces]
 
 

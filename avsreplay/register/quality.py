@@ -302,7 +302,7 @@ def _observable_information(view: Directions, found: Evidence, extent_m: float, 
     return view.observable_information(P)
 
 
-def undetermined(found: Alignment, motions: Array) -> Alignment:
+def left_undetermined(found: Alignment, motions: Array) -> Alignment:
     """Return an alignment whose information is independent of motions d (6, k) of the model: DEGENERATE."""
     N, D = found.info, motions / np.linalg.norm(motions, axis=0)
     info = N - N @ D @ np.linalg.pinv(D.T @ N @ D, hermitian=True) @ D.T @ N

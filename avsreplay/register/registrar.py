@@ -253,7 +253,7 @@ class Registrar:
         best, rivals = self._symmetry.decided(scan, T_ca, [] if unsure else None, self._test.check(part, T_ca).covered)
         turned = found if best is T_ca else self._graded(scan, best.inverse(), None, halves, carried)
         found = turned if unsure or turned.status is AlignStatus.ALIGNED else found
-        return quality.undetermined(found, unknown) if unsure and rivals else found
+        return quality.left_undetermined(found, unknown) if unsure and rivals else found
 
     def _far(self, guess: Pose, found: Alignment) -> bool:
         """A measured pose so far from the guess that another local minimum may be better."""
