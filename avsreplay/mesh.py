@@ -39,16 +39,18 @@ def with_area(vertices: Array, faces: NDArray[np.int64]) -> Faces:
     return kept
 
 
-def distinct_rows(vertices: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Identify equal vertices.
+def distinct_rows(rows: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Identify equal rows, such as the repeated vertices of an STL file.
 
     Args:
-        vertices: (n, 3) [m], finite.
+        rows: (n, 3), finite.
 
     Returns:
-        The first (k,) of each set of equal vertices in the order of the list, and the number (n,) of each vertex's set.
+        The first (k,) of each set of equal rows in the order of the list, and the number (n,) of each row's set.
     """
-    values = vertices + 0.0  # -0.0 equals 0.0
+    if not len(rows):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    values = rows + 0.0  # -0.0 equals 0.0
     order = np.lexsort(values.T)
     begins = np.concatenate([[True], (np.diff(values[order], axis=0) != 0.0).any(axis=1)])
     first = np.minimum.reduceat(order, np.flatnonzero(begins))

@@ -130,6 +130,7 @@ def test_no_faces() -> None:
     none = np.zeros((0, 3), np.int32)
     assert mesh.outward(np.eye(3), none)[1] == 0
     assert not len(mesh.open_faces(np.eye(3), none))
+    assert [len(found) for found in mesh.distinct_rows(np.zeros((0, 3)))] == [0, 0]
 
 
 @given(SEEDS)

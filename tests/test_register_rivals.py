@@ -10,7 +10,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import Registrar
-from avsreplay.register.quality import undetermined
+from avsreplay.register.quality import left_undetermined
 
 
 def stage(edge_m: float, sides: int, nozzle: bool, tilt: float) -> trimesh.Trimesh:
@@ -101,7 +101,7 @@ def test_the_information_left_without_motions_is_that_of_free_motions():
     rng = np.random.default_rng(5)
     A, d = rng.normal(size=(9, 6)), rng.normal(size=(6, 1))
     found = Alignment(Pose.identity(), 1, True, 99, 99, 0.0, A.T @ A, AlignStatus.ALIGNED)
-    left = undetermined(found, d)
+    left = left_undetermined(found, d)
     assert left.status is AlignStatus.DEGENERATE
     assert left.covariance is None
     along = A @ d / np.linalg.norm(A @ d)
