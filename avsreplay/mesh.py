@@ -19,7 +19,7 @@ from avsreplay.geometry import Array
 PAIRED_EDGES = 0.95  # least share of the edges of a closed part that two opposite half-edges form
 LEAST_VOLUME = 1e-9  # of a part that has an inside, times six, in units of its area to the power of 3/2
 LEAST_PART = 1e-3  # of the area of the mesh: smaller open parts are remains of meshing
-TESTED_VERTICES = 20  # of a part, to decide whether it is a cavity
+_DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0  # (26, 3)
 
 Faces = NDArray[np.int32]
 
@@ -244,12 +244,18 @@ def _volumes(vertices: Array, faces: Faces, of: NDArray[np.int64]) -> tuple[Arra
 
 
 def _is_inside(vertices: Array, part: Faces, others: Faces) -> bool:
-    """Whether a part is inside other closed parts: their solid angle is 4 pi at each of some of its vertices."""
+    """Whether a part is inside other closed parts: at its outermost vertices and on its largest faces.
+
+    The solid angle of closed parts is 4 pi inside them. All vertices of a rod may be inside the parts that it joins.
+    """
     if not len(others):
         return False
-    points = vertices[np.unique(part)]
-    corners = vertices[others]
-    return all(_solid_angle(corners - p) > 2.0 * np.pi for p in points[:: -(-len(points) // TESTED_VERTICES)])
+    points, corners = vertices[np.unique(part)], vertices[others]
+    outermost = np.unique(np.argmax(points @ _DIRECTIONS.T, axis=0))
+    a, b, c = (vertices[part[:, k]] for k in range(3))
+    largest = np.argsort(-np.linalg.norm(np.cross(b - a, c - a), axis=1), kind="stable")[: len(_DIRECTIONS)]
+    tested = np.concatenate([((a + b + c) / 3.0)[largest], points[outermost]])
+    return all(_solid_angle(corners - p) > 2.0 * np.pi for p in tested)
 
 
 def _solid_angle(corners: Array) -> float:

@@ -88,6 +88,18 @@ def test_a_single_reversed_part_of_several_is_found() -> None:
     np.testing.assert_allclose(normals(vertices, found), normals(vertices, right), atol=1e-12)
 
 
+def test_a_reversed_rod_between_two_bodies_is_no_cavity() -> None:
+    """All vertices of the rod are inside the bodies that it joins."""
+    boxes_, rod = [trimesh.creation.box((1, 1, 1)) for _ in range(2)], trimesh.creation.cylinder(0.03, 2.6, sections=12)
+    for box, side in zip(boxes_, (-1.5, 1.5), strict=True):
+        box.apply_translation((0, 0, side))
+    vertices, right = joined([*boxes_, rod])
+    rod.invert()
+    found, count = mesh.outward(*joined([*boxes_, rod]))
+    assert count == len(rod.faces)
+    np.testing.assert_allclose(normals(vertices, found), normals(vertices, right), atol=1e-12)
+
+
 @pytest.mark.parametrize("inverted", [False, True])
 def test_a_cavity_keeps_its_faces_towards_the_hollow(inverted: bool) -> None:
     outer, inner = trimesh.creation.box((2, 2, 2)), trimesh.creation.box((1.8, 1.8, 1.8))
