@@ -81,7 +81,8 @@ def find_drift(
     spacing = float(np.diff(np.append(_onsets(poses.times_s), poses.times_s[-1])).max())
     spread = math.hypot(math.sqrt(float(weight @ (onsets - mean) ** 2 / weight.sum())), spacing / math.sqrt(12.0))
     onset_ns = fixes[0].t_ns + round(best.onset_s * 1e9)
-    P = best.P + np.outer(left, left)
+    misfit = max(1.0, frame.cost / (3.0 * len(frame.points.times_s)))  # reduced chi-square: 1 if the drift explains all
+    P = misfit * best.P + np.outer(left, left)
     return Drift(onset_ns, spread, size[3:], size[:3], P, fixes[-1].scan_ns), frame.chart
 
 
