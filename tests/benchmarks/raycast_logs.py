@@ -27,6 +27,8 @@ import resource
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -146,17 +148,10 @@ def make(folder: Path, case: str, seed: int, asked: argparse.Namespace) -> None:
     times = np.arange(round(asked.seconds * asked.hz)) / asked.hz
     turns, places, centre = motion(rng, times, case, asked.rate)
     np.save(folder / "centre.npy", centre)
-    half = np.tan(np.radians(17.0)) * (np.arange(80) - 39.5) / 40.0
-    rays = np.stack([*np.meshgrid(half, half), np.ones((80, 80))], -1).reshape(-1, 3)
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    with Writer(folder / "log", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        clouds = bag.add_connection("/lidar/points", "sensor_msgs/msg/PointCloud2", typestore=STORE)
-        poses = bag.add_connection("/truth/pose", "geometry_msgs/msg/PoseStamped", typestore=STORE)
+    rays = ray_grid(17.0, 80)
+    with recorded(folder / "log") as write:
         for t_s, turn, place in zip(times, turns, places, strict=True):
-            hits, rows, _ = caster.intersects_location(
-                np.tile(-place @ turn, (len(rays), 1)), rays @ turn, multiple_hits=False
-            )
-            ranges = np.linalg.norm(hits @ turn.T + place, axis=1)
+            ranges, rows, _ = cast(caster, rays, turn, place)
             points_rays = rays[rows]
             begin, end = EVENTS.get(case, (0.0, 0.0))
             inside = begin <= t_s < end
@@ -170,9 +165,39 @@ def make(folder: Path, case: str, seed: int, asked: argparse.Namespace) -> None:
                 points = np.concatenate(
                     [points, np.column_stack([rng.uniform(-4, 4, (n, 2)), 10 + 0.003 * rng.normal(size=n)])]
                 )
+            write(t_s, points, turn, place)
+
+
+def ray_grid(half_deg: float, count: int) -> np.ndarray:
+    """Unit directions (count^2, 3) of a square field of view with this half angle."""
+    half = np.tan(np.radians(half_deg)) * (np.arange(count) + 0.5 - 0.5 * count) / (0.5 * count)
+    rays = np.stack([*np.meshgrid(half, half), np.ones((count, count))], -1).reshape(-1, 3)
+    return rays / np.linalg.norm(rays, axis=1)[:, None]
+
+
+def cast(
+    caster: RayMeshIntersector, rays: np.ndarray, turn: np.ndarray, place: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Ranges (k,) [m] of the rays that hit the body in a pose, their numbers and the faces that they hit."""
+    hits, rows, faces = caster.intersects_location(
+        np.tile(-place @ turn, (len(rays), 1)), rays @ turn, multiple_hits=False
+    )
+    return np.linalg.norm(hits @ turn.T + place, axis=1), rows, faces
+
+
+@contextmanager
+def recorded(path: Path) -> Iterator[Callable[[float, np.ndarray, np.ndarray, np.ndarray], None]]:
+    """A ROS 2 bag; the function writes a scan and its true pose: time [s], points, rotation and position of the body."""
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        clouds = bag.add_connection("/lidar/points", "sensor_msgs/msg/PointCloud2", typestore=STORE)
+        poses = bag.add_connection("/truth/pose", "geometry_msgs/msg/PoseStamped", typestore=STORE)
+
+        def write(t_s: float, points: np.ndarray, turn: np.ndarray, place: np.ndarray) -> None:
             ns = START_NS + round(t_s * 1e9)
             bag.write(clouds, ns, STORE.serialize_cdr(cloud(ns, points), "sensor_msgs/msg/PointCloud2"))
             bag.write(poses, ns, STORE.serialize_cdr(stamped(ns, turn, place), "geometry_msgs/msg/PoseStamped"))
+
+        yield write
 
 
 def header(ns: int) -> object:

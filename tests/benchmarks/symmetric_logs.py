@@ -28,8 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from raycast_logs import START_NS, STORE, cloud, motion, stamped
-from rosbags.rosbag2 import StoragePlugin, Writer
+from raycast_logs import cast, motion, ray_grid, recorded
 from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
@@ -102,23 +101,13 @@ def make(folder: Path, name: str, mark: str, seed: int, asked: argparse.Namespac
     turns, places, _ = motion(rng, times, "clean", asked.rate)
     if asked.away and count:
         turns = hidden_first(turns, places, mesh, count)
-    half = np.tan(np.radians(14.0)) * (np.arange(asked.rays) + 0.5 - 0.5 * asked.rays) / (0.5 * asked.rays)
-    rays = np.stack([*np.meshgrid(half, half), np.ones((asked.rays, asked.rays))], -1).reshape(-1, 3)
-    rays /= np.linalg.norm(rays, axis=1)[:, None]
-    seen = []
-    with Writer(folder / "log", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
-        clouds = bag.add_connection("/lidar/points", "sensor_msgs/msg/PointCloud2", typestore=STORE)
-        poses = bag.add_connection("/truth/pose", "geometry_msgs/msg/PoseStamped", typestore=STORE)
+    rays, seen = ray_grid(14.0, asked.rays), []
+    with recorded(folder / "log") as write:
         for t_s, turn, place in zip(times, turns, places, strict=True):
-            hits, rows, faces = caster.intersects_location(
-                np.tile(-place @ turn, (len(rays), 1)), rays @ turn, multiple_hits=False
-            )
-            ranges = np.linalg.norm(hits @ turn.T + place, axis=1) + NOISE_M * rng.normal(size=len(hits))
-            seen.append((len(hits), int(np.count_nonzero(faces >= len(mesh.faces) - count))))
-            ns = START_NS + round(t_s * 1e9)
-            points = ranges[:, None] * rays[rows]
-            bag.write(clouds, ns, STORE.serialize_cdr(cloud(ns, points), "sensor_msgs/msg/PointCloud2"))
-            bag.write(poses, ns, STORE.serialize_cdr(stamped(ns, turn, place), "geometry_msgs/msg/PoseStamped"))
+            ranges, rows, faces = cast(caster, rays, turn, place)
+            ranges += NOISE_M * rng.normal(size=len(ranges))
+            seen.append((len(ranges), int(np.count_nonzero(faces >= len(mesh.faces) - count))))
+            write(t_s, ranges[:, None] * rays[rows], turn, place)
     np.save(folder / "seen.npy", np.array(seen))
     np.savez(folder / "truth.npz", turns=turns, places=places)
 
