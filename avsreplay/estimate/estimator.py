@@ -76,7 +76,7 @@ class Estimator:
         self.anomalies = AnomalyTest(self.params, extent_m, self.batch, self._replayed)
         self._prior = None if self.start is None else given_prior(self.start)
         self._robust = params.robust and params.start is not Start.PAPER
-        self._by_gain, self._length_m = self.params.by_gain, 0.25 * extent_m
+        self._length_m = 0.25 * extent_m
 
     def initial(self, t_ns: int, T_ac: Pose, acquired: bool = False) -> Track:
         """The track before the first scan: the given start, else a body at rest at a pose.
@@ -263,7 +263,7 @@ class Estimator:
         """
         if innovation is None or gamma == 0:
             return replace(track, belief=prediction.belief)
-        if track.mode in ("start", "fit") or (track.mode == "near" and not self._by_gain):
+        if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
             return self.batch.initialised(track, prediction, innovation, converged)
         return self.batch.check_against_batch(self.batch.filtered(track, prediction, innovation))
 

@@ -112,16 +112,15 @@ class HornBackend:
             threads=limits.threads,
         )
         self._rules = {facing: replace(rule, facing=facing) for facing in (False, True)}
+        passes = min(CLOUD_PLANE_PASSES, limits.n_max)
+        self._more_plane = {facing: replace(rule, n_plane=passes) for facing, rule in self._rules.items()}
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:
         """Return T_ca, see :class:`avsreplay.register.backend.Backend`."""
         found = self._run(points, guess, self._rules)
         if not self._cloud:
             return found
-        passes = min(CLOUD_PLANE_PASSES, self._rules[False].n_max)
-        other = self._run(
-            points, guess, {facing: replace(rule, n_plane=passes) for facing, rule in self._rules.items()}
-        )
+        other = self._run(points, guess, self._more_plane)
         return min(found, other, key=lambda fit: self._cost(points, fit.T_ca))
 
     def _cost(self, points: NDArray[Any], T_ca: Pose) -> float:

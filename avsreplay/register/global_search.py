@@ -85,7 +85,11 @@ class SearchResult:
 
 
 class GlobalSearch:
-    """Searches the pose of one target. Built once; a search does not change it."""
+    """Searches the pose of one target. Built once; a search does not change it.
+
+    Attributes:
+        symmetries: (k, 4, 4) motions in {C} that carry most of the surface onto itself, without the identity.
+    """
 
     def __init__(self, target: Target, params: AcquireParams) -> None:
         self._target, self._params = target, params
@@ -96,14 +100,9 @@ class GlobalSearch:
         self._field = kernel_module().Field(points, np.ascontiguousarray(planes), CELLS)
         self._centroids = VisibleCentroids(points, normals if self._sided else np.zeros_like(normals), self._extent)
         self._middle = points.mean(axis=0)
-        self._symmetries = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
+        self.symmetries = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
         brief = replace(target.limits, n_max=min(FINE_PASSES, target.limits.n_max))
         self._refine = HornBackend(replace(target, limits=brief))
-
-    @property
-    def symmetries(self) -> Array:
-        """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, without the identity."""
-        return self._symmetries
 
     def work(self, points: int, number: int) -> int:
         """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
@@ -112,7 +111,7 @@ class GlobalSearch:
         starts, stride = p.starts * (1, SHIFTS, 7)[number] // THINNED[number], FIRST_STRIDES[number]
         looked = few * (starts * (1 + FIRST_PASSES) // stride + p.starts // KEPT_AFTER_FIRST * (1 + COARSE_PASSES))
         looked += some * int(APART * MIDDLE_STARTS) * (1 + MIDDLE_PASSES)
-        looked += some * len(self._symmetries) * (1 + TURNED_PASSES)
+        looked += some * len(self.symmetries) * (1 + TURNED_PASSES)
         refined = FINE_PASSES * RIVALS * FAR_WORK // 2 * min(fine, REFINED_POINTS)
         return looked // LOOK_UPS + FINE_STARTS * some + refined + RIVALS * fine
 
@@ -207,10 +206,10 @@ class GlobalSearch:
         best = [each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most]
         found = [self._measured(fine, self._refine.align_within(part, T_ca, width).T_ca) for T_ca in best]
         first = min(found, key=lambda each: float(each.unexplained(width).mean())).T_ca
-        if not len(self._symmetries):
+        if not len(self.symmetries):
             return found
         rule = (FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
-        turned, costs = self._field.refine(some, self._symmetries @ first.matrix, TURNED_PASSES, 4.0 * width, *rule)
+        turned, costs = self._field.refine(some, self.symmetries @ first.matrix, TURNED_PASSES, 4.0 * width, *rule)
         rivals = [Pose.from_matrix(T) for T in _best(turned, costs, TURNED_RIVALS)]
         return [*found, *(self._measured(fine, self._refine.align_within(part, T_ca, width).T_ca) for T_ca in rivals)]
 

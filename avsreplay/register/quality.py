@@ -30,7 +30,6 @@ from avsreplay.register.surface_index import Closest, SurfaceIndex
 
 CLEARANCE_OF_EXTENT = 0.25
 LEAST_FACING = 0.4
-PAIRED_EDGES = 0.95
 FAR_OF_EXTENT = 0.6  # if the median of a scan is this far from the origin, the camera was at the origin
 TESTED_POINTS = 200
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
@@ -65,10 +64,12 @@ class Visibility:
         clear = CLEARANCE_OF_EXTENT * surface.extent if camera is Camera.AUTO else -np.inf
         self._box = (low, high, clear)
         self._extent, self._known = surface.extent, camera is not Camera.NONE
+        self.sided, self.surface = False, surface
+        if camera is Camera.NONE:
+            return
         opened = mesh.open_faces(surface.vertices, surface.faces)
-        outward = bool((~opened).any()) and mesh.signed_volume(surface.vertices, surface.faces) > 0.0
-        self.sided = camera is Camera.ORIGIN or (camera is Camera.AUTO and outward)
-        self.surface = surface
+        outward = not opened.all() and mesh.signed_volume(surface.vertices, surface.faces) > 0.0
+        self.sided = camera is Camera.ORIGIN or outward
         if self.sided and opened.any():
             both = np.concatenate([surface.faces, surface.faces[opened][:, ::-1]])
             self.surface = replace(surface, faces=np.ascontiguousarray(both))
