@@ -162,11 +162,11 @@ def test_a_looked_up_distance_is_that_to_the_sampled_surface(registrar: Registra
 
 def test_a_body_with_a_near_symmetry_is_known_to_have_it() -> None:
     search = Registrar(_box((2.0, 1.0, 0.6)))._global
-    turns = [float(np.degrees(geometry.angle(Pose.from_matrix(T).q))) for T in search._symmetries]
+    turns = [float(np.degrees(geometry.angle(Pose.from_matrix(T).q))) for T in search.symmetries]
     assert turns
     assert all(angle > 175.0 for angle in turns)
     tree = cKDTree(sample(_box((2.0, 1.0, 0.6)), 20_000)[0])
-    moved = [Pose.from_matrix(T).apply(sample(_box((2.0, 1.0, 0.6)), 1000)[0]) for T in search._symmetries]
+    moved = [Pose.from_matrix(T).apply(sample(_box((2.0, 1.0, 0.6)), 1000)[0]) for T in search.symmetries]
     assert all((tree.query(points)[0] < 0.1).mean() > 0.9 for points in moved)
 
 

@@ -187,7 +187,7 @@ def cast(
 
 @contextmanager
 def recorded(path: Path) -> Iterator[Callable[[float, np.ndarray, np.ndarray, np.ndarray], None]]:
-    """A ROS 2 bag; the function writes a scan and its true pose: time [s], points, rotation and position of the body."""
+    """A ROS 2 bag; the function writes a scan and its true pose: time [s], points, rotation and position."""
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         clouds = bag.add_connection("/lidar/points", "sensor_msgs/msg/PointCloud2", typestore=STORE)
         poses = bag.add_connection("/truth/pose", "geometry_msgs/msg/PoseStamped", typestore=STORE)
