@@ -122,6 +122,28 @@ def test_flags_override_the_run(result):
     assert limited["plan"]["capture_time_s"] > free["plan"]["capture_time_s"]
 
 
+@pytest.mark.parametrize(
+    ("limit", "setting", "flag"),
+    [
+        (("--set", "limits.reach_max_m=2"), "limits.reach_max_m", "--set"),
+        (("--horizon", 6), "plan.horizon_s", "--horizon"),
+    ],
+)
+def test_without_a_plan_the_limit_that_prevents_it_is_named_and_the_stated_change_gives_one(
+    result, limit, setting, flag
+):
+    args = (result, "--samples", 2, "--every", 99, "--at", 6, *limit)
+    document = json.loads(run(*args, "--json").stdout)
+    assert document["plan"]["t_go_s"] is None
+    change = document["changes"][0]
+    assert change["option"].startswith(flag)
+    words = " ".join(run(*args).stdout.split())
+    assert f"what prevents it {setting}; a capture is found with {change['option']} (at " in words
+    found = json.loads(run(*args, "--json", *change["option"].split()).stdout)
+    assert found["plan"]["capture_time_s"] == change["capture_time_s"]
+    assert found["changes"] == []
+
+
 def test_settings_of_supervisor_and_robot_can_be_changed(result):
     args = (result, "--json", "--samples", 4, "--every", 99, "--at", 6)
     robot = ("--set", "robot.mass_kg=100", "--set", "robot.thrust_max_n=3", "--set", "robot.thrust_noise=0.5")

@@ -11,7 +11,7 @@ from avsreplay.cli.config import robot_option, setting_option
 from avsreplay.cli.options import Numbers
 
 if TYPE_CHECKING:
-    from avsreplay.cli.plan_output import Answer
+    from avsreplay.cli.plan_output import Answer, Change
     from avsreplay.outcome import Plan
     from avsreplay.plan import Limits, PlanParams
     from avsreplay.plan.arm import Arm
@@ -19,10 +19,30 @@ if TYPE_CHECKING:
     from avsreplay.saved_result import Saved
 
 PLAN, LIMITS = "avsreplay.plan:PlanParams", "avsreplay.plan:Limits"
+# settings changed one at a time where no plan is found, with the factors of their values, and later instants [s]
+CHANGES = (
+    ("limits.clearance_sigmas", (2.0 / 3.0, 1.0 / 3.0, 0.0)),
+    ("limits.clearance_m", (0.5, 0.25)),
+    ("limits.final_range_m", (1.5, 2.0, 3.0)),
+    ("limits.final_deg", (1.5,)),
+    ("limits.cone_deg", (1.5,)),
+    ("limits.cone_range_m", (0.5,)),
+    ("limits.keepout_m", (0.75,)),
+    ("limits.keepout_release_m", (1.5,)),
+    ("robot.reach_max_m", (1.5, 2.0, 3.0)),
+    ("limits.reach_max_m", (1.5, 2.0, 3.0)),
+    ("limits.speed_max_mps", (2.0,)),
+    ("limits.contact_accel_mps2", (2.0,)),
+    ("robot.accel_max_mps2", (2.0, 4.0)),
+    ("plan.a_max_mps2", (2.0, 4.0)),
+    ("plan.horizon_s", (2.0, 4.0)),
+)
+LATER_S = (1.0, 3.0, 10.0)
+MOST_CHANGES = 3  # settings that are named
 EPILOG = """\b
 Examples:
   avsreplay plan results/                          from t_1 on, with the run's settings
-  avsreplay plan results/ --at 40 --a-max 0.02
+  avsreplay plan results/ --at 8 --a-max 0.02
   avsreplay plan results/ --cone-deg 30 --final-deg 8 --speed-max 0.4
   avsreplay plan results/ --final-deg 15 --clearance 0.1 --set supervisor.sigmas=2 --set robot.thrust_noise=0.02
   avsreplay plan results/ --robot robot.toml
@@ -128,6 +148,7 @@ def plan_command(
     planning = _planning(replace(saved, robot=robot), flags, arm)
     index = saved.index_at(at_s)
     made = _usable(lambda: planning.plan_at(index))
+    changes = [] if made.found else _changes(planning, saved, flags, index)
     spread = _usable(lambda: planning.spread_at(index, made, samples, seed)) if made.found else None
     flown = _usable(lambda: planning.flights(index, flights, seed)) if made.found and flights else None
     joints = _usable(lambda: planning.joints(index, made))
@@ -137,7 +158,7 @@ def plan_command(
     if export:
         _export(planning, made, export)
     at_s = saved.rows[index].t_s
-    answer = Answer(planning, at_s, made, spread, flown, joints, hindsight, execution)
+    answer = Answer(planning, at_s, made, spread, flown, joints, hindsight, execution, changes)
     if animate:
         click.echo(_animate(answer, index, animate), err=True)
     if as_json:
@@ -157,17 +178,61 @@ def _usable(action: Any) -> Any:
 
 
 def _planning(saved: Saved, flags: dict[str, Any], arm: Arm | None) -> Replanning:
+    from avsreplay.replan import Replanning
+
+    params, limits = _usable(lambda: _given(saved, flags))
+    made: Replanning = _usable(lambda: Replanning(saved, params, limits, saved.supervisor, arm))
+    return made
+
+
+def _given(saved: Saved, flags: dict[str, Any]) -> tuple[PlanParams, Limits]:
+    """Return the settings of the result with the options of the command, which take precedence."""
     from dataclasses import fields, replace
 
     from avsreplay.plan import PlanParams
-    from avsreplay.replan import Replanning
 
     given = {name: value for name, value in flags.items() if value is not None}
     of_plan = {f.name for f in fields(PlanParams)}
-    params: PlanParams = _usable(lambda: replace(saved.plan, **{k: v for k, v in given.items() if k in of_plan}))
-    limits: Limits = _usable(lambda: replace(saved.limits, **{k: v for k, v in given.items() if k not in of_plan}))
-    made: Replanning = _usable(lambda: Replanning(saved, params, limits, saved.supervisor, arm))
-    return made
+    params = replace(saved.plan, **{k: v for k, v in given.items() if k in of_plan})
+    return params, replace(saved.limits, **{k: v for k, v in given.items() if k not in of_plan})
+
+
+def _changes(planning: Replanning, saved: Saved, flags: dict[str, Any], index: int) -> list[Change]:
+    """Return single changes with which a plan is found: of settings, then of the instant."""
+    from dataclasses import replace
+
+    from avsreplay.cli.plan_output import Change
+    from avsreplay.errors import UsageError
+    from avsreplay.saved_result import with_settings
+
+    options = {p.name: p.opts[0] for p in click.get_current_context().command.params}
+    params, limits = _given(saved, flags)
+    tables = {"plan": params, "limits": limits.resolved(saved.extent_m), "robot": planning.robot}
+    out: list[Change] = []
+    for key, factors in CHANGES:
+        table, name = key.split(".")
+        before = getattr(tables[table], name)
+        for factor in factors if before is not None and len(out) < MOST_CHANGES else ():
+            value = f"{factor * before:.2g}"
+            given: dict[str, Any] = {name: float(value)} if table == "robot" else {}
+            robot = replace(planning.robot, **given)
+            changed = replace(with_settings(saved, () if table == "robot" else (f"{key}={value}",)), robot=robot)
+            others = {k: v for k, v in flags.items() if k != name}
+            try:
+                made = _planning(changed, others, planning.arm).plan_at(index)
+            except (ValueError, UsageError):  # the changed value contradicts another one
+                continue
+            if made.found:
+                option = f"{options[name]} {value}" if name in options else f"--set {key}={value}"
+                out.append(Change(key, option, saved.rows[index].t_s, made))
+                break
+    for later_s in LATER_S:
+        at_s = saved.rows[index].t_s + later_s
+        for later in [k for k, row in enumerate(saved.rows) if row.t_s >= at_s and row.converged][:1]:
+            made = planning.plan_at(later)
+            if made.found:
+                return [*out, Change("--at", f"--at {saved.rows[later].t_s:.2f}", saved.rows[later].t_s, made)]
+    return out
 
 
 def _export(planning: Replanning, made: Plan, path: Path) -> None:

@@ -14,6 +14,28 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """One change of the problem with which a plan is found.
+
+    Attributes:
+        setting: the key that is changed, or ``--at``.
+        option: the option that makes the change.
+        at_s: instant of planning with it [s after the first scan].
+        plan: the plan with it.
+    """
+
+    setting: str
+    option: str
+    at_s: float
+    plan: Plan
+
+    @property
+    def capture_s(self) -> float:
+        """Instant of the capture [s after the first scan]."""
+        return self.at_s + self.plan.t_go_s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Answer:
     """Everything that planning from a saved result found.
 
@@ -26,6 +48,7 @@ class Answer:
         joints: of an arm during the last metres; None without an arm.
         hindsight: plans at regular intervals with their errors.
         execution: the simulated approach; None without ground truth.
+        changes: single changes with which a plan is found, where there is none.
     """
 
     planning: Replanning
@@ -36,6 +59,7 @@ class Answer:
     joints: JointPath | None
     hindsight: list[tuple[float, Plan, Miss | None]]
     execution: Execution | None
+    changes: list[Change]
 
 
 def document(answer: Answer) -> str:
@@ -50,6 +74,7 @@ def document(answer: Answer) -> str:
     document = {
         "made_at_s": answer.at_s,
         "plan": _plan_record(answer.made, answer.at_s),
+        "changes": [{"option": c.option, "capture_time_s": c.capture_s} for c in answer.changes],
         "limits": settings.dump(planning.limits),
         "params": settings.dump(planning.params),
         "robot": settings.dump(planning.robot),
@@ -110,6 +135,7 @@ def print_answer(answer: Answer) -> None:
     for found in (answer.joints, answer.spread, answer.flown):
         facts += found.described() if found else []
     if not answer.made.found:
+        facts.append(("what prevents it", prevented(answer.changes)))
         facts.append(("spread over belief", "not computed, because there is no plan"))
     print_table(console, facts_table(f"Plan made at {answer.at_s:.2f} s", facts))
     print_table(console, _hindsight_table(answer.hindsight))
@@ -117,6 +143,16 @@ def print_answer(answer: Answer) -> None:
         print_table(console, _execution_table(answer.execution))
         for line in _outcome_lines(answer.execution, answer.planning):
             print_line(console, line)
+
+
+def prevented(changes: list[Change]) -> str:
+    """Return in one sentence which settings prevent a plan and with which changes one is found."""
+    if not changes:
+        return "more than one limit: no single change of a limit or of --at gives a plan"
+    names = [c.setting for c in changes if c.setting != "--at"] or ["the estimate at this instant"]
+    together = f"{' and '.join(names)} together" if len(names) > 1 else names[0]
+    found = " or ".join(f"{c.option} (at {c.capture_s:.2f} s)" for c in changes)
+    return f"{together}; a capture is found with {found}"
 
 
 def plan_facts(planning: Replanning, at_s: float, made: Plan) -> list[tuple[str, str]]:

@@ -84,7 +84,7 @@ class Spread:
         ]
         if self.contact >= 0.0:
             low, high = self.contact_95
-            text = f"{self.contact:.3f} (95 % {low:.3f} to {high:.3f}) outside the corridor"
+            text = f"{self.contact:.3f} (95 % {low:.3f} to {high:.3f}) outside the corridor, without replanning"
             out.append(("contact probability", text))
         return out
 
