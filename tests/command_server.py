@@ -19,7 +19,19 @@ import traceback
 from pathlib import Path
 
 START_ONLY = ("PYTHON", "LD_", "LC_", "LANG", "OPENBLAS", "OMP_", "NPY_", "GLIBC_", "AVSREPLAY_ARITHMETIC")
-KEPT = ("avsreplay", "scipy", "rich", "rosbags", "trimesh", "clarabel", "jinja2", "tomli_w", "mcap", "embreex")
+KEPT = (
+    "avsreplay",
+    "scipy",
+    "rich",
+    "rosbags",
+    "trimesh",
+    "clarabel",
+    "jinja2",
+    "tomli_w",
+    "mcap",
+    "msgspec",
+    "embreex",
+)
 
 
 def fixed(environment):

@@ -7,6 +7,7 @@ import dataclasses
 import json
 import math
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.supervisor import Action
 from avsreplay.records import AlignStatus, Reason, ScanStatus
+from avsreplay.report import jsonl
 from avsreplay.report.export import (
     columns_page,
     descriptions,
@@ -119,6 +121,49 @@ def test_bad_rows_are_one_line_with_the_place(tmp_path, text, match):
     path.write_text(text)
     with pytest.raises(UnreadableInput, match=match):
         read_rows(path)
+
+
+TOKENS = (
+    *("null", "true", "-1", "3.0", "1e101", "1e999", "NaN", "9" * 400, "-0.0", "1e-400", "01"),
+    *('"x"', "[]", "{}", "", '"\\ud800"', '"\\u0007"', '"=1"', '"\u2028"', "\u2028"),
+    *('0, "nonsense": 1', '0}\n{"seq": 9'),
+)
+
+
+@given(st.lists(st.tuples(st.integers(0, 4), st.integers(0, 200), st.sampled_from(TOKENS)), max_size=3))
+def test_blocks_are_read_as_cell_by_cell(changes):
+    """Rows checked at once are those that the reader of single cells gives, and so are the errors."""
+    lines = (ROOT / "fixtures" / "tumble.rows.jsonl").read_text(encoding="utf-8").splitlines()[:5]
+    for number, place, token in changes:
+        cells = lines[number].split(", ")
+        name, colon, _ = cells[place % len(cells)].partition(": ")
+        cells[place % len(cells)] = f"{name}{colon}{token}"
+        lines[number] = ", ".join(cells) if place < 190 else ", ".join(cells[:-1])
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        path = Path(folder) / "a.jsonl"
+        path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        at_once = _rows_or_error(path)
+        patch.setattr(jsonl, "_decoder", lambda: None)  # as where msgspec is not installed
+        assert at_once == _rows_or_error(path)
+
+
+def _rows_or_error(path: Path) -> list[Row] | str:
+    try:
+        return read_rows(path)
+    except UnreadableInput as error:
+        return str(error)
+
+
+def test_blocks_are_decoded_at_once_and_lines_counted_across_them(tmp_path, monkeypatch):
+    text = (ROOT / "fixtures" / "tumble.rows.jsonl").read_bytes()
+    assert jsonl._checked_at_once(text, 35) == read_rows(ROOT / "fixtures" / "tumble.rows.jsonl")
+    monkeypatch.setattr(jsonl, "_BLOCK", 5000)  # about one row
+    assert read_rows(ROOT / "fixtures" / "tumble.rows.jsonl") == jsonl._checked_at_once(text, 35)
+    lines = text.splitlines()
+    lines[20] = lines[20].replace(b'"seq": 20', b'"seq": 19')
+    (tmp_path / "a.jsonl").write_bytes(b"\n\n" + b"\n".join(lines))
+    with pytest.raises(UnreadableInput, match=r"a\.jsonl:23: scan 19 after scan 19"):
+        read_rows(tmp_path / "a.jsonl")
 
 
 def test_bytes_that_are_not_utf8_are_one_line(tmp_path):

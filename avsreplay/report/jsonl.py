@@ -10,12 +10,14 @@ import dataclasses
 import json
 import math
 import typing
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from functools import cache
+from itertools import pairwise
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any
+from typing import Annotated, Any
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.files import output_text, read_limited
@@ -23,6 +25,7 @@ from avsreplay.rows import Row
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
 _MAX_LINE, _MAX_FILE, _MAX_NAME, _MAX_TEXT = 1 << 20, 2 << 30, 100, 10_000
+_BLOCK = 4 << 20
 _MAX_JSON = 64 << 20
 _LARGEST = 1e100  # sums of squares of larger values are not finite
 
@@ -94,17 +97,33 @@ def read_records(path: str | Path) -> Iterator[tuple[str, dict[str, Any]]]:
     Raises:
         UnreadableInput: the file is missing or larger than 2 GiB, or a line is not such an object.
     """
-    path = Path(path)
+    for first, _, block in _blocks(Path(path)):
+        yield from _records(block, path, first)
+
+
+def _blocks(path: Path) -> Iterator[tuple[int, int, bytes]]:
+    """Yield the number of the first line, the count of line ends, and whole lines, some MiB at a time.
+
+    A line that is too long is cut.
+    """
     try:
         if path.stat().st_size > _MAX_FILE or not path.is_file():
             raise UnreadableInput("not a rows.jsonl file", where=str(path), hint="name a rows.jsonl file")
+        number = 1
         with path.open("rb") as stream:
-            for number, line in enumerate(iter(lambda: stream.readline(_MAX_LINE + 1), b""), 1):
-                if line.strip():
-                    yield f"{path}:{number}", _parse(line, f"{path}:{number}")
+            while block := stream.read(_BLOCK) + stream.readline(_MAX_LINE + 1):
+                ends = block.count(b"\n")
+                yield number, ends, block
+                number += ends
     except OSError as error:
         what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
         raise UnreadableInput(what, where=str(path), hint="check the path") from None
+
+
+def _records(block: bytes, path: str | Path, first: int) -> Iterator[tuple[str, dict[str, Any]]]:
+    for number, line in enumerate(block.split(b"\n"), first):
+        if line.strip():
+            yield f"{path}:{number}", _parse(line, f"{path}:{number}")
 
 
 def _parse(line: bytes, where: str) -> dict[str, Any]:
@@ -157,15 +176,71 @@ def _checked(value: Any, name: str, kind: type, nullable: bool, where: str) -> A
 
 
 def read_rows(path: str | Path) -> list[Row]:
-    """Return all rows of a file. Raises UnreadableInput, also if the scans are not in ascending order."""
+    """Return all rows of a file. Raises UnreadableInput, also if the scans are not in ascending order.
+
+    Whole blocks of lines are decoded and checked at once. A block in which anything differs from what a run writes is
+    read cell by cell, which accepts it or names line and column.
+    """
     rows: list[Row] = []
-    for where, record in read_records(path):
+    for first, ends, block in _blocks(Path(path)):
+        found = _checked_at_once(block, ends + (not block.endswith(b"\n")))
+        if found is None or any(a.seq >= b.seq for a, b in pairwise([*rows[-1:], *found])):
+            _add_cell_by_cell(rows, block, path, first)
+        else:
+            rows += found
+    return rows
+
+
+def _add_cell_by_cell(rows: list[Row], block: bytes, path: str | Path, first: int) -> None:
+    for where, record in _records(block, path, first):
         row = parse_row(record, where)
         if rows and row.seq <= rows[-1].seq:
             what = f"scan {row.seq} after scan {rows[-1].seq}"
             raise UnreadableInput(what, where=where, hint="the file is not as a run wrote it: run again")
         rows.append(row)
-    return rows
+
+
+def _checked_at_once(block: bytes, lines: int) -> list[Row] | None:
+    """The rows of some lines, None where a line is not one object with the columns, types and ranges of a row."""
+    decode = _decoder()
+    found = decode(block) if decode else None
+    if found is None or len(found) != lines:
+        return None
+    texts = {text for name, (kind, _) in field_types().items() if kind is str for text in map(attrgetter(name), found)}
+    return found if all(text is None or text.isprintable() for text in texts) else None
+
+
+@cache
+def _decoder() -> Callable[[bytes], list[Row] | None] | None:
+    """Decodes JSON lines into rows and checks names, types and ranges, without a call for each cell.
+
+    The function returns None where a line does not pass. None in its place where msgspec is not installed.
+    """
+    try:
+        import msgspec
+    except ImportError:
+        return None
+    meta = msgspec.Meta
+    kinds: dict[type, Any] = {
+        int: Annotated[int, meta(ge=-(2**63), le=2**63 - 1)],
+        float: Annotated[float, meta(ge=-_LARGEST, le=_LARGEST)],
+        str: Annotated[str, meta(max_length=_MAX_TEXT)],
+        bool: bool,
+    }
+    fields = [
+        (name, kinds[kind] | None, None) if nullable else (name, kinds[kind])
+        for name, (kind, nullable) in field_types().items()
+    ]
+    checked = msgspec.defstruct("CheckedRow", fields, kw_only=True, forbid_unknown_fields=True, gc=False)
+    lines = msgspec.json.Decoder(checked)
+
+    def decode(block: bytes) -> list[Row] | None:
+        try:
+            return msgspec.convert(lines.decode_lines(block), list[Row], from_attributes=True)
+        except (msgspec.MsgspecError, UnicodeError, RecursionError):
+            return None
+
+    return decode
 
 
 def parse_json(text: str | bytes, *, where: str, hint: str) -> Any:
