@@ -19,6 +19,7 @@ from avsreplay.estimate.batch_covariance import (
     covariance_of,
     final_mixture,
     process_noise_pass,
+    unseen_torque,
 )
 from avsreplay.estimate.chart import Chart, nees, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import advance, flow, process_noise, rotation_history, transition
@@ -303,6 +304,21 @@ def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
     assert np.mean(plain) > 3.0
     assert np.mean(mended) < 1.6
     assert max(mended) < 3.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_unseen_torque_is_sought_in_what_the_motion_leaves_of_the_residuals(seed: int) -> None:
+    """A fit ends some tenths of a sigma away from the minimum; this difference is no evidence for a torque."""
+    poses, fitted, prior = grown(seen(tumbling.draw(seed, seconds=30.0), seed, 0.001, 0.05), 41, 61)
+    values, vectors = np.linalg.eigh(fitted.P_chart / np.outer(prior.one_sigma, prior.one_sigma))
+    weakest = 0.3 * np.sqrt(values[-1]) * vectors[:, -1] * prior.one_sigma
+    at_minimum, beside = (
+        unseen_torque(Problem(poses, prior, fitted.effective, fitted.chart.moved(step)), 30.0)
+        for step in (np.zeros(20), weakest)
+    )
+    scale = np.sqrt(np.diag(fitted.P_chart))
+    sizes = [np.sqrt(np.trace(added / np.outer(scale, scale))) for added in (at_minimum, beside)]
+    assert sizes[1] == pytest.approx(sizes[0], rel=0.5)
 
 
 def test_a_long_arc_settles() -> None:

@@ -198,9 +198,10 @@ def unseen_torque(problem: Problem, after_s: float) -> Array:
         return np.zeros((DIM, DIM))
     J, C = (H @ T).reshape(-1, DIM), (H[:, :, :_DISTURBED] @ B[:-1]).reshape(-1, 3)
     P, cross, total = problem.covariance, J.T @ C, np.zeros((3, 3))
+    newton = P @ problem.core.normal()[1]  # to the minimum of the linearised cost, which a fit reaches approximately
     moved = -P @ cross
     moved[:_DISTURBED] += np.linalg.solve(T[:_DISTURBED, :_DISTURBED], B[-1])
-    precision, found = C.T @ C - cross.T @ P @ cross, -C.T @ e.reshape(-1)
+    precision, found = C.T @ C - cross.T @ P @ cross, -C.T @ e.reshape(-1) - cross.T @ newton
     for one_sigma in _TORQUES:
         scaled = one_sigma**2 * precision + np.eye(3)
         own = one_sigma**2 * np.linalg.inv(scaled)
