@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
 from avsreplay.register import index_cache
+from avsreplay.register.global_search import GlobalSearch
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.registrar import Registrar
+from avsreplay.register.rivals import NearSymmetry
 from avsreplay.register.surface_index import SurfaceIndex
 
 kernel = pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
@@ -139,4 +142,38 @@ def test_a_registrar_keeps_the_index_of_a_large_model_unless_told_not_to(
     Registrar(small)
     assert not list(tmp_path.iterdir())
     Registrar(large)
-    assert len(list((tmp_path / "avsreplay").iterdir())) == 1
+    assert len(list((tmp_path / "avsreplay").iterdir())) == 2  # the index, and what a search needs
+
+
+def _searched(registrar: Registrar) -> list[bytes]:
+    search, symmetry = registrar._global, registrar._symmetry
+    arrays = [search.symmetries, *symmetry._kinds, symmetry._marks, symmetry._normals]
+    return [a.tobytes() for a in arrays] + [repr((symmetry._share, symmetry._area)).encode()]
+
+
+def test_what_a_search_needs_is_kept_with_the_index_and_made_again_if_damaged(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A nearly symmetric body: its near-symmetries and marks are the same from the file, built, or after damage."""
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(index_cache, "LEAST_PRIMITIVES", 10)
+    shape = trimesh.util.concatenate(
+        [
+            trimesh.creation.cylinder(0.5, 2.5, sections=24),
+            trimesh.creation.box((0.2, 0.2, 0.2)).apply_translation((0.55, 0, 0)),
+        ]
+    )
+    surface = Surface(np.array(shape.vertices), np.array(shape.faces, dtype=np.int32), "stage", "")
+    built = _searched(Registrar(surface, RegisterParams(index_cache=False)))
+    assert len(built) > 5
+    assert _searched(Registrar(surface)) == built
+    with monkeypatch.context() as patched:
+        patched.setattr(GlobalSearch, "_near_symmetries", None)
+        patched.setattr(NearSymmetry, "_found", None)
+        assert _searched(Registrar(surface)) == built
+    for path in (tmp_path / "avsreplay").iterdir():
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 1
+        path.write_bytes(bytes(data))
+    assert _searched(Registrar(surface)) == built

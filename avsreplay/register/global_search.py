@@ -27,6 +27,7 @@ from avsreplay.register.sampling import sample, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 
 MODEL_POINTS = 3000
+CLOUD_POINTS = 20  # times as many points of a cloud, evenly over its order, are thinned to so many
 COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # of the scan: first and second selection, final ranking
 COARSE_PASSES, MIDDLE_PASSES = 8, 12  # point-to-plane iterations for each attitude in the two selections
 MIDDLE_STARTS, FINE_STARTS = 50, 10  # attitudes kept for the second selection, and poses registered on the model
@@ -91,16 +92,21 @@ class GlobalSearch:
         symmetries: (k, 4, 4) motions in {C} that carry most of the surface onto itself, without the identity.
     """
 
-    def __init__(self, target: Target, params: AcquireParams) -> None:
+    def __init__(self, target: Target, params: AcquireParams, kept: dict[str, Array]) -> None:
+        """Sample the model and find its near-symmetries, or take both from ``kept``; what is missing is added to it."""
         self._target, self._params = target, params
         self._extent = target.surface.extent
-        points, normals = _sampled(target.surface)
         self._sided = target.visibility.sided
+        if "sampled" not in kept:
+            kept["sampled"] = np.stack(_sampled(target.surface))
+        points, normals = kept["sampled"]
         planes = normals if self._sided else target.index.closest(points).normal
         self._field = kernel_module().Field(points, np.ascontiguousarray(planes), CELLS)
         self._centroids = VisibleCentroids(points, normals if self._sided else np.zeros_like(normals), self._extent)
         self._middle = points.mean(axis=0)
-        self.symmetries = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
+        if "symmetries" not in kept:
+            kept["symmetries"] = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
+        self.symmetries = kept["symmetries"]
         brief = replace(target.limits, n_max=min(FINE_PASSES, target.limits.n_max))
         self._refine = HornBackend(replace(target, limits=brief))
 
@@ -273,10 +279,30 @@ class VisibleCentroids:
     """Centroid of the part of a model that a distant camera sees, tabulated for ``count`` directions."""
 
     def __init__(self, points: Array, normals: Array, extent_m: float, count: int = 80) -> None:
-        """Build it from points sampled on the surface, (n, 3) in {C} [m]; zero normals: visible from all sides."""
-        self._directions = directions(count)
-        cell = CELL_OF_EXTENT * extent_m
-        self._centroids = np.stack([_visible_centroid(points, normals, u, cell) for u in self._directions])
+        """Build it from points sampled on the surface, (n, 3) in {C} [m]; zero normals: visible from all sides.
+
+        The centroid is that of the points that face the camera and are the nearest of their pixel, within a cell.
+        """
+        self._directions, cell = directions(count), CELL_OF_EXTENT * extent_m
+        cosine = normals @ self._directions.T if normals.any() else np.ones((len(points), count))
+        depth = points @ self._directions.T
+        u = np.cross(self._directions, np.eye(3)[np.argmin(np.abs(self._directions), axis=1)])
+        u /= np.linalg.norm(u, axis=1)[:, None]
+        x, y = (np.floor(points @ axes.T / cell).astype(np.int64) for axes in (u, np.cross(self._directions, u)))
+        x, y = x - x.min(axis=0), y - y.min(axis=0)
+        wide, high = int(x.max()) + 1, int(y.max()) + 1
+        pixel = (x + wide * y) + wide * high * np.arange(count)
+        nearest = np.full(count * wide * high, -np.inf)
+        facing = cosine > LEAST_COSINE
+        np.maximum.at(nearest, pixel[facing], depth[facing])
+        weight = np.where(facing & (depth > nearest[pixel] - cell), cosine, 0.0)
+        total = weight.sum(axis=0)
+        seen = total > 0.0
+        self._centroids = np.where(
+            seen[:, None],
+            np.einsum("nk,nj->kj", weight, points) / np.where(seen, total, 1.0)[:, None],
+            points.mean(axis=0),
+        )
 
     def of(self, direction_c: Array) -> Array:
         """Return the centroid (..., 3) in {C} [m] for directions (..., 3) to the camera in {C}."""
@@ -300,24 +326,6 @@ def directions(count: int) -> Array:
     return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
 
-def _visible_centroid(points: Array, normals: Array, towards: Array, cell_m: float) -> Array:
-    """Centroid over the image of the points that face the camera and are the nearest of their pixel, within a cell."""
-    sided = normals.any()
-    cosine = normals @ towards if sided else np.ones(len(points))
-    facing = cosine > LEAST_COSINE
-    p, weight, depth = points[facing], cosine[facing], points[facing] @ towards
-    across = np.linalg.svd(towards[None])[2][1:]
-    image = np.floor(p @ across.T / cell_m).astype(np.int64)
-    image -= image.min(axis=0, initial=0)
-    pixel = image[:, 0] * (image[:, 1].max(initial=0) + 1) + image[:, 1]
-    nearest = np.full(pixel.max(initial=-1) + 1, -np.inf)
-    np.maximum.at(nearest, pixel, depth)
-    weight = weight * (depth > nearest[pixel] - cell_m)
-    if not weight.sum() > 0.0:
-        return np.asarray(points.mean(axis=0))
-    return np.asarray((p * weight[:, None]).sum(axis=0) / weight.sum())
-
-
 def _axes(points: Array) -> list[Array]:
     """Both directions of each principal axis of a scan: one of them is near the direction to the camera."""
     axes = np.linalg.eigh(np.cov(points.T))[1].T if len(points) > 3 else np.eye(3)
@@ -328,5 +336,5 @@ def _sampled(surface: Surface) -> tuple[Array, Array]:
     points, normals = sample(surface, MODEL_POINTS)
     if len(surface.faces):
         return points, normals
-    thinned = thin_to(points, MODEL_POINTS)
+    thinned = thin_to(points[:: max(1, len(points) // (CLOUD_POINTS * MODEL_POINTS))], MODEL_POINTS)
     return thinned, np.zeros_like(thinned)

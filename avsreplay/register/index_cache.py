@@ -1,4 +1,4 @@
-"""Surface indices kept on disk, so that a large model is indexed once.
+"""Surface indices, and what a search needs of a model, kept on disk, so that a large model is prepared once.
 
 A file is ``<key>.avsindex``: 8 bytes of magic, a checksum of the payload (8 bytes), zeros up to 64, the payload. The
 key is the SHA-256 of the layout version, the byte order, the reach and the vertices and faces of the surface, so a
@@ -9,6 +9,7 @@ be written to is no error: the index is then built in every run, with the same r
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import sys
 import tempfile
@@ -46,12 +47,12 @@ def folder_for(surface: Surface) -> Path | None:
     return user_folder() if large else None
 
 
-def cache_path(folder: Path, layout: int, vertices: Array, faces: NDArray[np.int32], reach_m: float) -> Path:
+def cache_path(folder: Path, layout: int | str, vertices: Array, faces: NDArray[np.int32], reach_m: float) -> Path:
     """Return the file name of the index of a surface.
 
     Args:
         folder: cache folder.
-        layout: version of the layout of the index.
+        layout: version of the layout of the index, or of what else is kept of the surface.
         vertices: (n, 3) in {C} [m].
         faces: (m, 3) vertex indices.
         reach_m: largest distance of a query [m].
@@ -81,6 +82,23 @@ def read(path: Path, checksum: Checksum) -> NDArray[np.uint8] | None:
     payload = data[HEADER:]
     whole = len(data) > HEADER and data[:HEADER].tobytes() == header(payload, checksum)
     return payload if whole else None
+
+
+def read_arrays(path: Path | None, checksum: Checksum) -> dict[str, Array]:
+    """Return the arrays that ``write_arrays`` wrote by their names; none without a complete, unchanged file."""
+    payload = None if path is None else read(path, checksum)
+    if payload is None:
+        return {}
+    with np.load(io.BytesIO(payload.tobytes()), allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}
+
+
+def write_arrays(path: Path | None, arrays: dict[str, Array], checksum: Checksum) -> None:
+    """Write arrays to a file where there is a path; the same arrays give the same bytes."""
+    if path is not None:
+        out = io.BytesIO()
+        np.savez(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        write(path, out.getvalue(), checksum)
 
 
 def write(path: Path, payload: bytes, checksum: Checksum) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cached_property
 from itertools import islice
 from typing import Any
 
@@ -16,11 +15,11 @@ from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache, quality, restarts
 from avsreplay.register.backend import Target, aligned, create_backend, load_backend
 from avsreplay.register.degenerate import motions_outside, turn_words
-from avsreplay.register.global_search import GlobalSearch, SearchResult
+from avsreplay.register.global_search import SearchResult
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import Budget, Restart, Restarter
-from avsreplay.register.rivals import LEAST_RAYS, NearSymmetry
+from avsreplay.register.rivals import LEAST_RAYS, prepared
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 
@@ -63,6 +62,7 @@ class Registrar:
         self._backend = create_backend(self.params.backend, factory, self._target)
         self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
         self._restarter = Restarter(self._target, self._test)
+        self._global, self._symmetry = prepared(self._target, self._test, self.params.acquire, cache_dir)
 
     def register(
         self,
@@ -226,14 +226,6 @@ class Registrar:
     def sided(self) -> bool:
         """Return whether the side of a face that the camera sees is known."""
         return self._visibility.sided
-
-    @cached_property
-    def _global(self) -> GlobalSearch:
-        return GlobalSearch(self._target, self.params.acquire)
-
-    @cached_property
-    def _symmetry(self) -> NearSymmetry:
-        return NearSymmetry(self._target, self._test, self._global)
 
     def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
         finite = np.isfinite(points)

@@ -12,24 +12,32 @@ pose only has the log likelihood ratio log((1 - e) / e). Poses whose sum is belo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
+from avsreplay.records import Surface
+from avsreplay.register import index_cache
 from avsreplay.register.backend import Target
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
+from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import PlausibilityTest
 from avsreplay.register.sampling import sample
 from avsreplay.register.size import normal_jacobian
+from avsreplay.register.surface_index import kernel_module
 
-SAMPLES, MOST_MARKS = 20_000, 500  # on the surface
+VERSION = 1  # of what is kept of a model
+SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # on the surface: to find marks, around those found, and kept
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
 TURNS, GENERIC_TURNS = 72, (5, 11, 23, 31, 43, 59)  # about an axis of revolution; those by which it is recognised
 REVOLVED, FITS = 0.02, 2  # of the extent: distance within which turned surface is on the model; fits of the axis
 TRIED = 16  # motions of a kind by which the marks are found
+AXIS_STRIDE = 3  # every n-th of these points determines the axis
+AROUND = 2.0  # more points are sampled within so many spacings of a point on a mark
 NEAR = 0.004  # of the extent: a point nearer than this, or than three standard deviations of the noise, is on the model
 OFF = 2.0  # a point farther from the model than this many widths is off it
 LEAST_COSINE = 0.25  # a mark is expected in the scan if the cosine of its incidence is larger
@@ -59,25 +67,53 @@ class Contradicted(Candidate):
 class NearSymmetry:
     """The motions that carry most of a model onto itself, and its marks."""
 
-    def __init__(self, target: Target, test: PlausibilityTest, search: GlobalSearch) -> None:
-        """Find the axis of revolution, if there is one, and sample the marks."""
+    def __init__(self, target: Target, test: PlausibilityTest, search: GlobalSearch, kept: dict[str, Array]) -> None:
+        """Find the axis of revolution, if there is one, and sample the marks; or take both from ``kept``."""
         self._target, self._test, self._search, self._gate = target, test, search, target.limits.gate_m
         surface = target.surface
-        points, normals = sample(surface, SAMPLES)
-        self._kinds = self._all_motions(points, normals) if len(surface.faces) else []
-        moved = np.zeros(len(points), dtype=bool)
+        if "kinds" not in kept:
+            kinds = self._all_motions(*sample(surface, SAMPLES)) if len(surface.faces) else []
+            kept["kinds"] = np.concatenate(kinds) if kinds else np.zeros((0, 4, 4))
+            kept["ends"] = np.cumsum([len(motions) for motions in kinds], dtype=np.int64)
+        self._kinds = np.split(kept["kinds"], kept["ends"])[:-1]
+        if "marks" not in kept:
+            kept["marks"], kept["marked"] = self._found()
+        self._marks, self._normals = kept["marks"]
+        self._share, self._area = (float(x) for x in kept["marked"])
+        self._low, self._high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+
+    def _found(self) -> tuple[Array, Array]:
+        """Points on the marks and their normals (2, n, 3); the share of the surface that they have, and a point's area.
+
+        Few points tell which parts are marks, and how large they are together; more are then sampled around these.
+        """
+        surface, none = self._target.surface, np.zeros((2, 0, 3))
+        if not len(self._kinds):
+            return none, np.zeros(2)
+        points, _ = sample(surface, SAMPLES)
+        moved = self._carried_off(points, MOST_MARKED)
+        share, area = float(moved.mean()), surface_area(surface)
+        if not moved.any() or share >= MOST_MARKED:
+            return none, np.array([share, 0.0])
+        from scipy.spatial import cKDTree
+
+        dense, normals = sample(surface, DENSE)
+        apart = np.asarray(cKDTree(points[moved]).query(dense)[0])
+        around = np.flatnonzero(apart < AROUND * np.sqrt(area / SAMPLES))
+        marks = around[self._carried_off(dense[around], 1.0)]
+        stride = max(1, -(-len(marks) // MOST_MARKS))
+        found = np.stack([dense[marks[::stride]], normals[marks[::stride]]])
+        return found, np.array([len(marks) / DENSE, stride * area / DENSE])
+
+    def _carried_off(self, points: Array, most: float) -> NDArray[np.bool_]:
+        """Which points some near-symmetry does not carry onto the surface; ends when this share of them is exceeded."""
+        moved, width = np.zeros(len(points), dtype=bool), OFF * self._gate
         for motions in self._kinds:
             for T in motions[:: max(1, len(motions) // TRIED)]:
-                if moved.mean() >= MOST_MARKED:
-                    break
-                moved |= self._distances(points, T[None])[0] > OFF * self._gate
-        marks = np.flatnonzero(moved)
-        stride, self._share = max(1, -(-len(marks) // MOST_MARKS)), len(marks) / max(1, len(points))
-        a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
-        area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-        self._marks, self._normals = points[marks[::stride]], normals[marks[::stride]]
-        self._area = stride * area / max(1, len(points))
-        self._low, self._high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
+                if moved.mean() >= most:
+                    return moved
+                moved[~moved] = self._distances(points[~moved], T[None], width)[0] >= width
+        return moved
 
     @property
     def near(self) -> bool:
@@ -134,7 +170,7 @@ class NearSymmetry:
     def _all_motions(self, points: Array, normals: Array) -> list[Array]:
         """The near-symmetries (k, 4, 4) without the identity: turns about an axis of revolution, and the others."""
         found = self._search.symmetries
-        axis = self._axis(points, normals) if len(found) else None
+        axis = self._axis(points[::AXIS_STRIDE], normals[::AXIS_STRIDE]) if len(found) else None
         if axis is None:
             return [found[k::FINALISTS] for k in range(min(FINALISTS, len(found)))]
         direction, centre = axis
@@ -156,16 +192,18 @@ class NearSymmetry:
                 return None
             direction, centre = theta / size, centre + np.cross(theta, x[3:]) / size**2
             turns = revolved(direction, centre, TURNS)[list(GENERIC_TURNS)]
-            on = np.all(self._distances(points, turns) < REVOLVED * self._target.surface.extent, axis=0)
+            width = REVOLVED * self._target.surface.extent
+            on = np.all(self._distances(points, turns, width) < width, axis=0)
             if on.mean() < 0.5:
                 return None
         return direction, centre
 
-    def _distances(self, points: Array, motions: Array) -> Array:
-        """Distances (k, n) [m] of points (n, 3) in {C} moved by (k, 4, 4), at most the reach."""
+    def _distances(self, points: Array, motions: Array, most_m: float = np.inf) -> Array:
+        """Distances (k, n) [m] of points (n, 3) in {C} moved by (k, 4, 4), at most ``most_m`` and the reach."""
         moved = points @ motions[:, :3, :3].transpose(0, 2, 1) + motions[:, None, :3, 3]
-        d2 = self._target.index.closest(moved.reshape(-1, 3)).d2
-        return np.sqrt(np.minimum(d2, self._target.index.reach_m**2)).reshape(len(motions), -1)
+        most_m = min(most_m, self._target.index.reach_m)
+        d2 = self._target.index.closest(moved.reshape(-1, 3), most_m=most_m).d2
+        return np.sqrt(np.minimum(d2, most_m**2)).reshape(len(motions), -1)
 
     def _turned(self, rays: _Rays, T_ca: Pose, better: bool) -> list[Pose]:
         """The best poses that the near-symmetries give, registered with the points off the model in their number.
@@ -181,8 +219,8 @@ class NearSymmetry:
         width = OFF * self._gate
         kept: list[Pose] = []
         for motions in self._kinds:
-            cost = np.minimum(self._distances(T_ca.apply(part), motions) / width, 1.0) ** 2 @ weights
-            here = float(np.minimum(self._distances(T_ca.apply(part), np.eye(4)[None]) / width, 1.0)[0] ** 2 @ weights)
+            cost = (self._distances(T_ca.apply(part), motions, width) / width) ** 2 @ weights
+            here = float((self._distances(T_ca.apply(part), np.eye(4)[None], width) / width)[0] ** 2 @ weights)
             most, order = len(kept) + FINALISTS, np.argsort(cost, kind="stable")
             for k in order[cost[order] < here - LEAST_RAYS] if better else order:
                 start = Pose.from_matrix(motions[k]) @ T_ca
@@ -263,6 +301,36 @@ def decides(better: Contradicted, other: Contradicted, width_m: float, complete:
     against = np.count_nonzero((b < width_m) & (a > off)) + better.passed + (better.empty if complete else 0.0)
     enough = (rays_for - against) * np.log((1.0 - share) / share) >= LEAST_LIKELIHOOD
     return bool(enough and against <= MOST_AGAINST * rays_for)
+
+
+def prepared(
+    target: Target, test: PlausibilityTest, params: AcquireParams, folder: Path | None
+) -> tuple[GlobalSearch, NearSymmetry]:
+    """Return the search of a target and its near-symmetries, which are kept in a folder where one is given.
+
+    Args:
+        target: what is searched.
+        test: tests of poses of this target.
+        params: of the search.
+        folder: cache folder; the file is named by all that its content depends on.
+    """
+    kernel, surface, limits, path = kernel_module(), target.surface, target.limits, None
+    if folder is not None:
+        layout = f"{kernel.LAYOUT} {VERSION} {target.visibility.sided} {params.starts} {limits.gate_m.hex()}"
+        path = index_cache.cache_path(folder, layout, surface.vertices, surface.faces, limits.reach_m)
+    kept = index_cache.read_arrays(path, kernel.checksum)
+    known = len(kept)
+    search = GlobalSearch(target, params, kept)
+    symmetry = NearSymmetry(target, test, search, kept)
+    if len(kept) > known:
+        index_cache.write_arrays(path, kept, kernel.checksum)
+    return search, symmetry
+
+
+def surface_area(surface: Surface) -> float:
+    """Return the area of a mesh [m^2]."""
+    a, b, c = (surface.vertices[surface.faces[:, k]] for k in range(3))
+    return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
 
 
 def revolved(axis: Array, centre: Array, count: int) -> Array:
