@@ -97,7 +97,7 @@ def write_arrays(path: Path | None, arrays: dict[str, Array], checksum: Checksum
     """Write arrays to a file where there is a path; the same arrays give the same bytes."""
     if path is not None:
         out = io.BytesIO()
-        np.savez(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+        np.savez(out, allow_pickle=False, **arrays)
         write(path, out.getvalue(), checksum)
 
 
