@@ -3,6 +3,8 @@ from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
 
+_Rows = tuple[NDArray[np.int64], Array, Array, Array, Array, Array, NDArray[np.int64]]
+
 def solve(
     n: int,
     start: tuple[float, float, float],
@@ -12,3 +14,21 @@ def solve(
     d: Array,
     cones: NDArray[np.int32],
 ) -> tuple[float, float, Array, int] | None: ...
+def rows(
+    y: Array,
+    dy: Array,
+    r: Array,
+    rho: Array,
+    R: Array,
+    first: Array,
+    second: Array,
+    off: Array,
+    foot: Array,
+    distance: Array,
+    clearance: Array,
+    inside: NDArray[np.bool_],
+    frame: Array,
+    limits: tuple[float, ...],
+    /,
+) -> tuple[_Rows, _Rows]: ...
+def motion(c: Array, x: Array, times: Array, order: int, /) -> tuple[Array, Array]: ...

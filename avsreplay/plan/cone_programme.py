@@ -59,7 +59,8 @@ class Subproblem:
         earliest: Lower bound of h.
         axes: (3, 3) rows e with |e.u| <= 1; None without bounds per axis.
         planes: Rows that must be at least 0.
-        cones: Rows in groups of ``size``; in each group the first row bounds the norm of the others.
+        cones: Sizes of groups of rows, one for all groups or one for each, and the rows; in each group the first row
+            bounds the norm of the others.
     """
 
     n: int
@@ -77,7 +78,7 @@ class Subproblem:
     axes: Array | None = None
     earliest: float = 0.0
     planes: tuple[PointRows, ...] = ()
-    cones: tuple[tuple[int, PointRows], ...] = ()
+    cones: tuple[tuple[int | Index, PointRows], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,12 +101,12 @@ class _Rows:
     d: list[Array] = field(default_factory=list)
     sizes: list[Index] = field(default_factory=list)
 
-    def put(self, size: int, stage: Index, C: Array, d: Array) -> None:
-        """Add rows of cones of one size; positions in C are those less the start."""
+    def put(self, size: int | Index, stage: Index, C: Array, d: Array) -> None:
+        """Add rows of cones of one size, or of the sizes of all; positions in C are those less the start."""
         self.stage.append(stage)
         self.C.append(C)
         self.d.append(d + C[:, :3] @ self.origin)
-        self.sizes.append(np.full(len(stage) // size, size))
+        self.sizes.append(np.full(len(stage) // size, size) if isinstance(size, int) else size)
 
     def solved(self, start: Array, weight: float) -> tuple[float, float, Array, int] | None:
         """Return h, slack, w (n, 3) and the number of iterations; None where no solution was found."""
@@ -188,7 +189,7 @@ def _end(rows: _Rows, p: Subproblem, scale: float) -> None:
     rows.put(4, last, C, d)
 
 
-def _point_rows(rows: _Rows, p: Subproblem, points: PointRows, scale: float, size: int) -> None:
+def _point_rows(rows: _Rows, p: Subproblem, points: PointRows, scale: float, size: int | Index) -> None:
     C, s = np.empty((len(points.interval), 11)), points.fraction[:, None]
     lead = 0.0 if points.lead is None else points.lead[:, None] / p.h
     C[:, :_Q] = points.vector

@@ -333,6 +333,8 @@ def _converged(
         settled += abs(t - reference.t) <= max(TIME_TOLERANCE_S, tolerance * t)
         if settled and best is not None and (settled > 1 or path is best):
             return best
+        if case.entry is not None and t > latest_s and found.slack <= case.buffer_m:
+            return best
         stuck = best is None and found.slack > 0.9 * slack
         late = path.t_go_s > (latest_s if iteration >= 3 else HOPELESS * latest_s)
         hopeless = iteration >= 1 and (late or (stuck and iteration >= STUCK))

@@ -7,14 +7,15 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
+from avsreplay.plan import _cone
 from avsreplay.plan.cone_programme import Index, PointRows, Subproblem
 from avsreplay.plan.initial_paths import ReferencePath, interval_fractions
-from avsreplay.plan.limits import CONSTRAINTS, THRUST_SHARE, Case, Margins, in_fixture_axes, margins
+from avsreplay.plan.limits import CONSTRAINTS, THRUST_SHARE, Case, Margins, Scene, in_fixture_axes, margins
 from avsreplay.plan.path import RobotPath, StepPath
+from avsreplay.plan.robot import Limits
 
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
 RESERVE = 3.0  # margin at the checked instants in units of the buffer, for the instants between them
@@ -22,7 +23,6 @@ FAR = 2e4  # a constraint with a larger margin at the reference, in units of the
 COARSE_NODES = 16  # thrust intervals while initial paths are compared
 ABORT_S = 30.0  # duration of an abort
 ABORTS = 16  # instants at which an abort is tried
-_WITH_RADIUS = np.concatenate([np.zeros((1, 3)), np.eye(3)])  # rows of a ball: its radius, then the coordinates
 TOWARD_AXIS = 2.0  # weight of the fixture's axis in the direction away from the grasp point
 LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight
 
@@ -154,136 +154,55 @@ def convex_subproblem(
     )
     if not case.limits.geometric:
         return problem
-    rows = _RowMaker(case, reference)
-    return rows.added(problem, off + rows.sag[:, None] - allowed(case.start, interval_fractions(n)))
+    planes, cones, sizes = _geometric(case, reference, off)
+    return replace(problem, planes=(*aborts, planes), cones=((sizes, cones),))
 
 
-class _RowMaker:
-    """Rows of the geometric constraints at the middle and the end of every interval."""
+def _geometric(case: Case, reference: ReferencePath, off: Array) -> tuple[PointRows, PointRows, Index]:
+    """Return the rows of the geometric constraints at the middle and the end of every interval, tightened by ``off``.
 
-    def __init__(self, case: Case, reference: ReferencePath) -> None:
-        n = case.limits.nodes
-        s = interval_fractions(n)
-        times = case.wait_s + reference.t * s
-        self.limits, self.scene = case.limits, case.scene
-        self.far_m = FAR * case.buffer_m
-        self.rho, self.R = case.sampled.at(times)
-        drho, dR = case.sampled.at(times, 1)
-        self.y = in_fixture_axes(self.R, reference.r - self.rho)
-        dy = in_fixture_axes(dR, reference.r - self.rho) - in_fixture_axes(self.R, drho)
-        self.dy = dy * (reference.t * s)[:, None]  # change with the relative change of the end time
-        bend = np.linalg.norm(np.diff(np.concatenate([case.begin_c[None], self.y]), 2, axis=0), axis=1) / 8.0
-        self.sag = np.concatenate([bend, bend[-1:]])  # distance of the path in {C} from its chord between two points
-        self.interval = np.arange(2 * n) // 2
-        self.fraction = np.where(np.arange(2 * n) % 2 == 0, 0.5, 1.0)
-        self.r = reference.r
-        self.found = margins(case.scene, case.limits, self.y, reference.r, case.sampled.sigma(times))
-        self.inside = self.found.inside
-        if case.entry is not None:
-            self.inside[:, 0] = s >= case.entry[0] - 1e-9
-            self.inside[:, 1] = self.inside[:, 3] = s >= case.entry[1] - 1e-9
-        self.near = np.ones(2 * n, dtype=bool)
-        self.near[-1] = False  # the grasp point itself is the end condition
+    They are planes, and cones with the sizes of their groups. ``off`` grows by the distance of the path in {C} from its
+    chord between two points, less the violation that is accepted at the begin.
+    """
+    n, limits, scene = case.limits.nodes, case.limits, case.scene
+    s = interval_fractions(n)
+    times = case.wait_s + reference.t * s
+    rho, R = case.sampled.at(times)
+    drho, dR = case.sampled.at(times, 1)
+    y = in_fixture_axes(R, reference.r - rho)
+    dy = in_fixture_axes(dR, reference.r - rho) - in_fixture_axes(R, drho)
+    dy *= (reference.t * s)[:, None]  # change with the relative change of the end time
+    bend = np.linalg.norm(np.diff(np.concatenate([case.begin_c[None], y]), 2, axis=0), axis=1) / 8.0
+    off = off + np.concatenate([bend, bend[-1:]])[:, None] - allowed(case.start, s)
+    found = margins(scene, limits, y, reference.r, case.sampled.sigma(times))
+    inside = found.inside
+    if case.entry is not None:
+        inside[:, 0] = s >= case.entry[0] - 1e-9
+        inside[:, 1] = inside[:, 3] = s >= case.entry[1] - 1e-9
+    arrays = (y, dy, reference.r, rho, R, found.first, found.second, off, found.foot, found.distance, found.clearance)
+    values = (*_constraint_values(limits, scene.centre_c is not None), FAR * case.buffer_m, TOWARD_AXIS)
+    planes, cones = _cone.rows(*arrays, inside, _frame(scene, limits), values)
+    return PointRows(*planes[:-1]), PointRows(*cones[:-1]), cones[-1]
 
-    def rows(self, k: Index, vectors: Array, constant: Array | float) -> PointRows:
-        """Return g rows vector.y for each point k, the first with constant and slack; vectors (m or 1, g, 3) in {C}."""
-        vectors = np.broadcast_to(vectors, (len(k), *vectors.shape[1:]))
-        in_a = vectors @ self.R[k].transpose(0, 2, 1)
-        offset = -(in_a @ self.rho[k][:, :, None])[:, :, 0]
-        rate = (vectors @ self.dy[k][:, :, None])[:, :, 0]
-        return self.grouped(k, in_a, offset, rate, constant)
 
-    def grouped(self, k: Index, in_a: Array, offset: Array, rate: Array, constant: Array | float) -> PointRows:
-        """Return rows (m, g) ordered point by point; the first of each point has the constant and the slack."""
-        g = in_a.shape[1]
-        offset[:, 0] += constant
-        slack = np.tile(np.eye(1, g)[0], len(k))
-        interval, fraction = np.repeat(self.interval[k], g), np.repeat(self.fraction[k], g)
-        return PointRows(interval, fraction, in_a.reshape(-1, 3), offset.ravel(), rate.ravel(), slack)
+def _constraint_values(limits: Limits, centred: bool) -> tuple[float, ...]:
+    """Return the limits in the order of the extension; NaN where a constraint is not set."""
+    tangents = (math.nan if a is None else math.tan(math.radians(a)) for a in (limits.cone_deg, limits.final_deg))
+    lengths = (limits.cone_range_m, limits.final_range_m, limits.mouth_m)
+    keepout = limits.keepout_m if centred else None
+    others = (keepout, limits.keepout_release_m, limits.clearance_m, limits.reach_max_m, limits.reach_min_m)
+    return (*tangents, *(x or 0.0 for x in lengths), *(math.nan if x is None else x for x in others))
 
-    def added(self, problem: Subproblem, off: Array) -> Subproblem:
-        """Return the subproblem with the rows of all constraints."""
-        planes = list(problem.planes)
-        cones: list[tuple[int, PointRows]] = []
-        limits, y, inside = self.limits, self.y, self.inside
-        chosen = np.where(inside, self.found.first, self.found.second)
-        on = (chosen < self.far_m) & self.near[:, None]
-        for i, degrees, length in (
-            (0, limits.cone_deg, limits.cone_range_m),
-            (1, limits.final_deg, limits.final_range_m),
-        ):
-            if degrees is not None:
-                k = np.flatnonzero(on[:, i] & inside[:, i])
-                cones.append(self.cone(k, degrees, off[k, i]))
-                k = np.flatnonzero(on[:, i] & ~inside[:, i])
-                planes.append(self.rows(k, self.outward(k, length or 0.0)[:, None], -(length or 0.0) - off[k, i]))
-        if limits.keepout_m is not None and self.scene.centre_c is not None:
-            k = np.flatnonzero(on[:, 2] & inside[:, 2])
-            cones.append(self.ball(k, (limits.keepout_release_m or 0.0) - off[k, 2]))
-            k = np.flatnonzero(on[:, 2] & ~inside[:, 2])
-            out = y[k] - self.scene.centre_c
-            normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
-            planes.append(self.rows(k, normal[:, None], -normal @ self.scene.centre_c - limits.keepout_m - off[k, 2]))
-        if limits.clearance_m is not None:
-            self._body(planes, cones, on[:, 3], off[:, 3])
-        self._workspace(planes, cones, np.flatnonzero(self.near), off[:, 4])
-        return replace(
-            problem,
-            planes=tuple(p for p in planes if len(p.interval)),
-            cones=tuple(c for c in cones if len(c[1].interval)),
-        )
 
-    def outward(self, k: Index, length: float) -> Array:
-        """Return unit vectors (m, 3) in {C} along which the points k have to be at least ``length`` away.
-
-        They point to the reference, and towards the entry of the cone where the reference is too near.
-        """
-        distance = np.maximum(np.linalg.norm(self.y[k], axis=1, keepdims=True), 1e-9)
-        missing = np.sqrt(np.maximum(1.0 - distance / max(length, 1e-9), 0.0))
-        out = self.y[k] / distance + TOWARD_AXIS * missing * np.asarray(self.scene.axis_c)
-        return np.asarray(out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9))
-
-    def _body(
-        self, planes: list[PointRows], cones: list[tuple[int, PointRows]], on: NDArray[np.bool_], off: Array
-    ) -> None:
-        """Add the clearance to the surface, or the corridor with its range where the reference is inside it."""
-        found, limits = self.found, self.limits
-        k = np.flatnonzero(on & self.inside[:, 3])
-        cones.append(self.cone(k, limits.final_deg or 0.0, off[k]))
-        cones.append(self.ball(k, (limits.final_range_m or 0.0) - off[k]))
-        k = np.flatnonzero(on & ~self.inside[:, 3])
-        foot = found.foot[k]
-        gap = found.distance[k]
-        normal = (self.y[k] - foot) / np.where(np.abs(gap) > 1e-9, gap, 1e-9)[:, None]
-        planes.append(self.rows(k, normal[:, None], -np.sum(normal * foot, axis=1) - found.clearance[k] - off[k]))
-
-    def _workspace(self, planes: list[PointRows], cones: list[tuple[int, PointRows]], k: Index, off: Array) -> None:
-        """Add the shell around the robot's base, which is fixed in {A}."""
-        limits, base, m = self.limits, np.array(self.limits.base_m), len(k)
-
-        def rows(vectors: Array, constant: Array) -> PointRows:
-            return self.grouped(k, vectors, -(vectors @ base), np.zeros(vectors.shape[:2]), constant)
-
-        if limits.reach_max_m is not None:
-            cones.append((4, rows(np.tile(_WITH_RADIUS, (m, 1, 1)), limits.reach_max_m - off[k])))
-        if limits.reach_min_m is not None:
-            out = self.r[k] - base
-            normal = out / np.maximum(np.linalg.norm(out, axis=1, keepdims=True), 1e-9)
-            planes.append(rows(normal[:, None], -limits.reach_min_m - off[k]))
-
-    def cone(self, k: Index, degrees: float, off: Array) -> tuple[int, PointRows]:
-        """Return |across| <= tan(degrees) along + mouth - off at the points k."""
-        vectors = _cone_rows(tuple(np.asarray(self.scene.axis_c).tolist()), degrees)
-        return 3, self.rows(k, vectors, (self.limits.mouth_m or 0.0) - off)
-
-    def ball(self, k: Index, radius: Array) -> tuple[int, PointRows]:
-        """Return |y| <= radius at the points k."""
-        return 4, self.rows(k, _WITH_RADIUS[None], radius)
+def _frame(scene: Scene, limits: Limits) -> Array:
+    """Return the fixture's axis and two directions across it, the centre of mass in {C}, and the base in {A} (5, 3)."""
+    axis = (1.0, 0.0, 0.0) if scene.axis_c is None else tuple(np.asarray(scene.axis_c).tolist())
+    centre = np.zeros(3) if scene.centre_c is None else scene.centre_c
+    return np.concatenate([_axes(axis), [centre, limits.base_m]])
 
 
 @lru_cache(maxsize=16)
-def _cone_rows(axis: tuple[float, float, float], degrees: float) -> Array:
-    """Return the rows (1, 3, 3) of a cone about an axis in {C}: its radius, and the coordinates across the axis."""
-    e = np.array(axis)
-    side = geometry.across(e)
-    return np.stack([math.tan(math.radians(degrees)) * e, side, np.cross(e, side)])[None]
+def _axes(axis: tuple[float, float, float]) -> Array:
+    """Return an axis in {C} and two directions across it (3, 3)."""
+    side = geometry.across(np.array(axis))
+    return np.stack([np.array(axis), side, np.cross(axis, side)])

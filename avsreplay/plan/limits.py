@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
+from avsreplay.plan import _cone
 from avsreplay.plan.rendezvous import PlanParams
 from avsreplay.plan.robot import Limits
 from avsreplay.records import Trajectory
@@ -246,17 +247,16 @@ class SampledScene:
     def __init__(self, scene: Scene, horizon_s: float, step_s: float, span_s: float) -> None:
         self.scene, self._horizon_s, self._step_s, self._span_s = scene, horizon_s, step_s, span_s
         self._end_s = 0.0
-        self._spline: Callable[..., Array] | None = None
+        self._pieces: tuple[Array, Array] | None = None
         self._sigma: tuple[Array, Array, Array] | None = None
 
     def at(self, times: Array, order: int = 0) -> tuple[Array, Array]:
-        """Return rho (n, 3) and R_ac (n, 3, 3), or their derivatives of an order, at times (n,) [s]."""
+        """Return rho (n, 3) and R_ac (n, 3, 3), or their first derivatives (order 1), at times (n,) [s]."""
         last = float(times.max())
-        if self._spline is None or last > self._end_s:
+        if self._pieces is None or last > self._end_s:
             self._end_s = min(max(1.5 * last, self._span_s), max(self._horizon_s, last))
-            self._spline = self._joined(self._end_s)
-        values = self._spline(times, order)
-        return values[:, :3], values[:, 3:].reshape(-1, 3, 3)
+            self._pieces = self._joined(self._end_s)
+        return _cone.motion(*self._pieces, times, order)
 
     def coordinates(self, times: Array, r: Array) -> Array:
         """Return the coordinates in {C} (n, 3) of positions r (n, 3) in {A}."""
@@ -273,15 +273,16 @@ class SampledScene:
         grid, position, attitude = self._sigma
         return np.interp(times, grid, position), np.interp(times, grid, attitude)
 
-    def _joined(self, end_s: float) -> Callable[..., Array]:
+    def _joined(self, end_s: float) -> tuple[Array, Array]:
+        """Return the coefficients (4, n, 12) of the cubic pieces and their limits (n + 1,)."""
         from scipy.interpolate import CubicSpline
 
         times = np.linspace(0.0, end_s, max(math.ceil(end_s / self._step_s), 4) + 1)
         turn = np.tile(np.eye(3).ravel(), (len(times), 1))
         if self.scene.attitude is not None:
             turn = geometry.matrix(self.scene.attitude(times)).reshape(-1, 9)
-        spline: Callable[..., Array] = CubicSpline(times, np.concatenate([self.scene.goal(times)[0], turn], axis=1))
-        return spline
+        spline = CubicSpline(times, np.concatenate([self.scene.goal(times)[0], turn], axis=1))
+        return np.ascontiguousarray(spline.c), times
 
 
 @dataclass(frozen=True, slots=True, eq=False)

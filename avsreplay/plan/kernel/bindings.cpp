@@ -5,6 +5,7 @@
 
 #include <cstring>
 
+#include "constraints.hpp"
 #include "interior_point.hpp"
 
 namespace nb = nanobind;
@@ -46,9 +47,63 @@ nb::object solve(int n, const std::array<double, 3>& start, const std::array<dou
   return nb::make_tuple(found.h, found.slack, nb::ndarray<nb::numpy, double>(w, 2, shape, owner), found.iterations);
 }
 
+template <typename T>
+nb::object array(std::vector<T>& values, size_t width = 0) {
+  T* data = new T[values.size()];
+  std::copy(values.begin(), values.end(), data);
+  nb::capsule owner(data, [](void* p) noexcept { delete[] static_cast<T*>(p); });
+  const size_t shape[2] = {width ? values.size() / width : values.size(), width};
+  return nb::cast(nb::ndarray<nb::numpy, T>(data, width ? 2 : 1, shape, owner));
+}
+
+nb::object fields(PointRows& rows) {
+  return nb::make_tuple(array(rows.interval), array(rows.fraction), array(rows.vector, 3), array(rows.offset),
+                        array(rows.rate), array(rows.slack), array(rows.sizes));
+}
+
+// Rows of the geometric constraints: planes and cones, each as the fields of PointRows with the sizes of the groups.
+nb::object rows(const In<double, -1, 3>& y, const In<double, -1, 3>& dy, const In<double, -1, 3>& r,
+                const In<double, -1, 3>& rho, const In<double, -1, 3, 3>& R, const In<double, -1, ALTERNATIVES>& first,
+                const In<double, -1, ALTERNATIVES>& second, const In<double, -1, ALTERNATIVES>& off,
+                const In<double, -1, 3>& foot, const In<double, -1>& distance, const In<double, -1>& clearance,
+                const In<bool, -1, ALTERNATIVES>& inside, const In<double, 5, 3>& frame,
+                const std::array<double, 12>& limits) {
+  const size_t m = y.shape(0);
+  for (size_t other : {dy.shape(0), r.shape(0), rho.shape(0), R.shape(0), first.shape(0), second.shape(0), off.shape(0),
+                       foot.shape(0), distance.shape(0), clearance.shape(0), inside.shape(0)})
+    if (other != m) throw nb::value_error("points of different numbers");
+  const auto vectors = [](const double* p) { return reinterpret_cast<const Vector3*>(p); };
+  const auto pairs = [](const double* p) { return reinterpret_cast<const Pairs*>(p); };
+  const ReferencePoints at{m, vectors(y.data()), vectors(dy.data()), vectors(r.data()), vectors(rho.data()),
+                           reinterpret_cast<const Matrix3*>(R.data()), pairs(first.data()), pairs(second.data()),
+                           pairs(off.data()), vectors(foot.data()), distance.data(), clearance.data(),
+                           reinterpret_cast<const uint8_t*>(inside.data())};
+  const Vector3* f = vectors(frame.data());
+  const auto& l = limits;
+  const ConstraintLimits of{{l[0], l[1]}, {l[2], l[3]}, l[4], l[5], l[6], l[7], l[8], l[9], l[10], l[11]};
+  PointRows planes, cones;
+  constraint_rows(at, {f[0], f[1], f[2], f[3], f[4]}, of, planes, cones);
+  return nb::make_tuple(fields(planes), fields(cones));
+}
+
+// Positions (m, 3) and rotations (m, 3, 3) from cubic pieces of 12 values, or their derivatives.
+nb::object motion(const In<double, 4, -1, 12>& c, const In<double, -1>& x, const In<double, -1>& times, int order) {
+  const size_t n = c.shape(1), m = times.shape(0);
+  if (n < 1 || x.shape(0) != n + 1 || order < 0 || order > 1) throw nb::value_error("pieces and limits differ");
+  double *rho = new double[3 * m], *R = new double[9 * m];
+  piecewise(c.data(), x.data(), n, 12, times.data(), m, order, 3, rho, R);
+  const auto free = [](void* p) noexcept { delete[] static_cast<double*>(p); };
+  nb::capsule own_rho(rho, free), own_R(R, free);
+  const size_t shape[3] = {m, 3, 3};
+  return nb::make_tuple(nb::ndarray<nb::numpy, double>(rho, 2, shape, own_rho),
+                        nb::ndarray<nb::numpy, double>(R, 3, shape, own_R));
+}
+
 }  // namespace
 
 NB_MODULE(_cone, m) {
   m.def("solve", &solve, nb::arg("n"), nb::arg("start"), nb::arg("cost"), nb::arg("stage"), nb::arg("C"), nb::arg("d"),
         nb::arg("cones"));
+  m.def("rows", &rows);
+  m.def("motion", &motion);
 }
