@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
-from avsreplay.plan import _cone
+from avsreplay.plan import Limits, PlanParams, _cone, margins
 from avsreplay.plan.cone_programme import PointRows, Subproblem, solve
+from avsreplay.plan.convexification import convex_subproblem
+from avsreplay.plan.initial_paths import ReferencePath, interval_fractions
+from avsreplay.plan.limits import Case, SampledScene
+
+sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))
+from plan_scenes import problems
 
 
 def _rows(rng, n, count, vectors, offset, slack=True):
@@ -130,3 +141,95 @@ def test_rows_that_do_not_fit_are_refused():
     for stage, cones in (([0, 1], [2]), ([0, 0], [1]), ([0, 2], [1, 1]), ([0, 0], [5]), ([0, 0], [1, 0, 1])):
         with pytest.raises(ValueError, match=r"cone|stage"):
             call(stage, cones)
+
+
+def _reference(limits, entry=None):
+    """A case of a tumbling box and a reference path near it."""
+    problem = problems(1, 5)[0]
+    params = PlanParams(a_max_mps2=problem.a_max)
+    resolved = limits.resolved(8.0)
+    case = Case(SampledScene(problem.scene, 120.0, 0.2, 60.0), resolved, params, problem.r0, np.zeros(3), 1e-4)
+    s = interval_fractions(resolved.nodes)
+    goal = problem.scene.goal(40.0 * s)[0]
+    path = goal * s[:, None] + 0.3 * np.sin(7.0 * s)[:, None] + (1.0 - s)[:, None]
+    return replace(case, entry=entry), ReferencePath(40.0, path)
+
+
+def _values(p, rows, h=1.0):
+    """Rows at the positions of the reference, ``vector.r + offset + rate (h - 1)``, without slack."""
+    r = p[np.asarray(2 * rows.interval + (rows.fraction == 1.0), dtype=int)]
+    return np.sum(rows.vector * r, axis=1) + rows.offset + rows.rate * (h - 1.0)
+
+
+@pytest.mark.parametrize("entry", [None, (0.5, 0.8)])
+def test_rows_of_the_constraints_have_the_margins_at_the_reference(entry):
+    """A plane has the margin of the second alternative there; in a cone the first row less the norm of the others."""
+    base = (0.0, 2.0, 0.0)
+    workspace = Limits(reach_max_m=30.0, reach_min_m=0.01, base_m=base)
+    limits = replace(workspace, cone_deg=35.0, final_deg=15.0, clearance_m=0.2, keepout_m=0.4)
+    case, reference = _reference(limits, entry)
+    n = case.limits.nodes
+    made = convex_subproblem(case, reference, np.zeros((2 * n, 5)), 0.2)
+    times = reference.t * interval_fractions(n)
+    y = case.sampled.coordinates(times, reference.r)
+    found = margins(case.scene, case.limits, y, reference.r)
+    away, from_base = np.linalg.norm(y, axis=1), np.linalg.norm(reference.r - base, axis=1)
+    tight = np.linalg.norm(np.diff(np.vstack([case.begin_c, y]), 2, axis=0), axis=1) / 8.0
+    tight = np.append(tight, tight[-1])
+    (planes,), ((sizes, cones),) = made.planes, made.cones
+    value = _values(reference.r, cones)
+    begins = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    assert set(sizes) == {3, 4}
+    for begin, size in zip(begins, sizes, strict=True):
+        k = 2 * cones.interval[begin] + (cones.fraction[begin] == 1.0)
+        margin = value[begin] - np.linalg.norm(value[begin + 1 : begin + size])
+        rest = margin + tight[k]
+        balls = (case.limits.keepout_release_m - away[k], case.limits.final_range_m - away[k], 30.0 - from_base[k])
+        expected = balls if size == 4 else (found.first[k, 0], found.first[k, 1])
+        assert np.abs(np.array(expected) - rest).min() < 1e-9
+    value = _values(reference.r, planes)
+    k = np.asarray(2 * planes.interval + (planes.fraction == 1.0), dtype=int)
+    expected = [from_base[k] - 0.01, found.second[k, 2], found.second[k, 3]]
+    for length in (
+        case.limits.cone_range_m,
+        case.limits.final_range_m,
+    ):  # where too near, towards the entry of the cone
+        missing = np.sqrt(np.maximum(1.0 - away[k] / length, 0.0))[:, None]
+        out = y[k] / away[k, None] + 2.0 * missing * case.scene.axis_c
+        expected.append(np.sum(out * y[k], axis=1) / np.linalg.norm(out, axis=1) - length)
+    assert np.abs(np.array(expected) - value - tight[k]).min(axis=0).max() < 1e-9
+    assert len(planes.interval) > n
+
+
+def test_rows_change_with_the_end_time_as_the_target_moves():
+    """The rate of a row is its derivative by the relative end time, the robot fixed in {A}."""
+    case, reference = _reference(Limits(cone_deg=35.0, cone_range_m=9.0), (0.0, 0.0))
+    n, step = case.limits.nodes, 1e-5
+    off = np.zeros((2 * n, 5))
+    at, later = (
+        convex_subproblem(case, ReferencePath(t, reference.r), off, 0.2).cones[0][1]
+        for t in (reference.t, reference.t * (1.0 + step))
+    )
+    bend = [
+        np.linalg.norm(np.diff(np.vstack([case.begin_c, y]), 2, axis=0), axis=1) / 8.0
+        for t in (reference.t, reference.t * (1.0 + step))
+        for y in [case.sampled.coordinates(t * interval_fractions(n), reference.r)]
+    ]
+    change = (_values(reference.r, later) - _values(reference.r, at)) / step
+    tightened = np.append(bend[1] - bend[0], (bend[1] - bend[0])[-1])[:-1] / step
+    change[::3] += tightened
+    assert np.abs(at.rate).max() > 0.1
+    np.testing.assert_allclose(at.rate, change, atol=2e-3 * np.abs(at.rate).max())
+
+
+def test_motion_between_samples_is_the_cubic_spline():
+    rng = np.random.default_rng(3)
+    x, times = np.linspace(0.0, 7.0, 29), np.concatenate([rng.uniform(0.0, 7.0, 200), [0.0, 7.0, 0.25, 7.1]])
+    spline = CubicSpline(x, rng.normal(size=(29, 12)))
+    for order in (0, 1):
+        rho, turn = _cone.motion(np.ascontiguousarray(spline.c), x, times, order)
+        expected = spline(times, order)
+        np.testing.assert_allclose(rho, expected[:, :3], atol=1e-12)
+        np.testing.assert_allclose(turn.reshape(-1, 9), expected[:, 3:], atol=1e-12)
+    with pytest.raises(ValueError, match="pieces"):
+        _cone.motion(np.ascontiguousarray(spline.c), x[:-1], times, 0)

@@ -274,8 +274,7 @@ class SampledScene:
         return np.interp(times, grid, position), np.interp(times, grid, attitude)
 
     def _joined(self, end_s: float) -> tuple[Array, Array]:
-        """Return the coefficients (4, n, 12) of the cubic pieces and their limits (n + 1,)."""
-        from scipy.interpolate import CubicSpline
+        from scipy.interpolate import CubicSpline  # coefficients (4, n, 12), highest power first
 
         times = np.linspace(0.0, end_s, max(math.ceil(end_s / self._step_s), 4) + 1)
         turn = np.tile(np.eye(3).ravel(), (len(times), 1))
