@@ -306,7 +306,7 @@ class Manoeuvre:
 
 
 class Drift(Manoeuvre):
-    """A constant acceleration from ``t_ns`` on: ``rate`` by a torque [rad/s2], ``velocity`` by a force [m/s2]."""
+    """A constant acceleration since ``t_ns``: ``rate`` in {C} [rad/s2] by a torque, ``velocity`` [m/s2] by a force."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -4,7 +4,12 @@ from numpy.typing import NDArray
 from avsreplay.geometry import Array
 
 def follow(
-    q: Array, w: Array, sigma: tuple[float, float, float], push: tuple[float, float, float], times: NDArray[np.float64]
+    q: Array,
+    w: Array,
+    sigma: tuple[float, float, float],
+    push: tuple[float, float, float],
+    times: NDArray[np.float64],
+    drive: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[Array, Array, Array, Array]: ...
 def correct(
     q_ab: Array,
@@ -81,5 +86,11 @@ class Problem:
     def weights(self) -> Array: ...
 
 class Path:
-    def __init__(self, q: Array, w: Array, sigma: tuple[float, float, float]) -> None: ...
+    def __init__(
+        self,
+        q: Array,
+        w: Array,
+        sigma: tuple[float, float, float],
+        drive: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None: ...
     def at(self, times: NDArray[np.float64]) -> tuple[Array, Array]: ...

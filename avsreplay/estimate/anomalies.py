@@ -18,6 +18,7 @@ from avsreplay.estimate.batch import FitParams, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import LATEST, SPHERE, BatchCovariance, final_mixture
 from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
+from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import VEL, W
 from avsreplay.estimate.hypotheses import explain
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
@@ -232,26 +233,18 @@ class AnomalyTest:
             P[W, W] += self._priors.rate_radps**2 * np.eye(3)
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
             at = replace(at, P=P)
+        after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
+        anew = replace(track, since=0, recent=(), doubtful=(), pending=False)
+        if isinstance(at, DrivenBelief):  # the filter continues, with rate and velocity free
+            return self._used(replace(anew, belief=at, mode="filter", fixes=()), after)
         chart = to_chart(at.x)
         prior = Prior(
             chart, _definite(np.asarray(np.linalg.solve(to_errors(chart), cholesky_root(at.P)), dtype=np.float64))
         )
-        after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
-        return replace(
-            track,
-            belief=result.belief,
-            mode="filter" if track.mode == "filter" else "fit",
-            fixes=fixes,
-            batch=result,
-            since=0,
-            prior=prior,
-            prior_ns=t_ns,
-            recent=(),
-            doubtful=(),
-            pending=False,
-        )
+        mode = "filter" if track.mode == "filter" else "fit"
+        return replace(anew, belief=result.belief, mode=mode, fixes=fixes, batch=result, prior=prior, prior_ns=t_ns)
 
     def _fitted(self, track: Track, fixes: tuple[PoseFix, ...], prior: Prior, t_ns: int) -> BatchResult:
         """Fit of the poses after a manoeuvre with the prior at its instant."""

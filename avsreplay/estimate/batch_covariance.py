@@ -22,7 +22,8 @@ import numpy as np
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, drift_equivalents, torque_density, translation
+from avsreplay.estimate.driven import drift_equivalents
+from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, torque_density, translation
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite, least_eigenvalue
 from avsreplay.estimate.mixture import Component
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance

@@ -18,8 +18,10 @@ import numpy as np
 from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_chart
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
-from avsreplay.estimate.drift import find_drift
-from avsreplay.estimate.dynamics import propagate, propagate_state
+from avsreplay.estimate.drift import DriftFound, find_drift
+from avsreplay.estimate.driven import DrivenBelief, propagated
+from avsreplay.estimate.driven_fit import driven_belief, levels_of
+from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import (
     BatchResult,
     PoseFix,
@@ -39,11 +41,11 @@ from avsreplay.estimate.measurement import (
 from avsreplay.estimate.mixture import carried, moments, worn
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
-from avsreplay.estimate.params import EstimatorParams, Start
+from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Prediction, Track
 from avsreplay.geometry import Array
-from avsreplay.records import Belief, Innovation
+from avsreplay.records import Belief, Drift, Innovation
 from avsreplay.settings import given
 
 FEWEST_TO_FIT = 3
@@ -122,9 +124,13 @@ class BatchSchedule:
             belief, hits = constrained_update(prior, prediction.H, innovation, self.params.sigma_margin, inflation)
         else:
             belief, hits = chart_update(prior, prediction.H, innovation, inflation), 0
+        drift = track.drift
+        if drift is not None and isinstance(belief, DrivenBelief):
+            drift = replace(drift, rate=belief.u[:3], velocity=belief.u[3:], P=belief.P_u)
         return replace(
             track,
             belief=belief,
+            drift=drift,
             mode="filter",
             window=self.noise.updated(prediction.window, prior.x, prediction.H, innovation, belief, inflation),
             sigma_hits=track.sigma_hits + hits,
@@ -177,50 +183,60 @@ class BatchSchedule:
     def check_for_drift(self, track: Track) -> Track:
         """The track with the constant torque or force that its poses show, tested each time they have grown enough.
 
-        At its first detection the estimate is replaced by that of a fit with process noise of the same size, and the
-        filter continues with this noise. Later tests refine the reported values.
+        From its first detection on it is part of the motion that the filter predicts, and the filter improves its
+        value. Later fits to all poses replace the estimate of the filter.
         """
-        count, last = pose_count(track.fixes), track.batch
-        due = max(FEWEST_TO_TEST, DRIFT_GROWTH * count)
+        count, last, known = pose_count(track.fixes), track.batch, track.drift
+        due = max(FEWEST_TO_TEST, (DRIFT_GROWTH if known is None else CHECK_GROWTH) * count)
         ready = bool(self.checked_poses) and last is not None and count >= FEWEST_WITH_DRIFT
         if not ready or last is None or track.untested < due or track.since == 0:  # never in the same scan as a fit
             return replace(track, untested=track.untested + 1)
-        track = replace(track, untested=0)
-        epoch_ns = track.fixes[0].t_ns
+        track, epoch_ns, begun = replace(track, untested=0), track.fixes[0].t_ns, None
         start = last.chart if last.epoch_ns == epoch_ns else self.chart_at(track.belief, epoch_ns)
         factors = np.array([track.window.factors[3], track.window.factors[0]])
-        known = track.drift
-        if known is not None and last.epoch_ns != epoch_ns:
-            return track
-        try:
-            found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels, known)
-        except np.linalg.LinAlgError:  # an unstable spin over so long a time that its motion cannot be inverted
-            found = None
-        if found is None:
-            return track
-        drift, chart = found
-        if drift.t_ns == epoch_ns:  # it may have acted before the first of these poses
-            since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
-            spread = math.hypot(drift.t_1s_s, since_ns * 1e-9 / math.sqrt(3.0))
-            drift = replace(drift, t_ns=epoch_ns - since_ns, t_1s_s=spread)
         if known is not None:
-            drift = replace(drift, detected_ns=known.detected_ns)
-            precise = float(np.trace(drift.P)) < float(np.trace(known.P))
-            return replace(track, drift=drift, batch=replace(last, chart=chart)) if precise else track
-        track = replace(track, drift=drift)
-        oldest = bisect_left(track.fixes, track.belief.t_ns - self._memory_ns(track), key=_instant)
-        latest = track.fixes[min(oldest, len(track.fixes) - FEWEST) :]  # those that free motion joins
-        result = batch_estimate(latest, self.params, self._rules, self._levels(track))
-        return self._adopted(track, replace(result, chart=chart, epoch_ns=epoch_ns), to_filter=True)
+            if last.epoch_ns != epoch_ns or not isinstance(track.belief, DrivenBelief):
+                return track
+            begun = max(0.0, (known.t_ns - epoch_ns) * 1e-9), track.belief.u
+        try:
+            found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels, begun)
+            return track if found is None else self._driven(track, last, found)
+        except np.linalg.LinAlgError:  # an unstable spin over so long a time that its motion cannot be inverted
+            return track
+
+    def _driven(self, track: Track, last: BatchResult, found: DriftFound) -> Track:
+        """The track with the estimate of a fit with a constant torque or force."""
+        epoch_ns, fitted, known = track.fixes[0].t_ns, found.fitted, track.drift
+        claimed = self.params.adapt is Adaptation.OFF
+        levels = levels_of(fitted, track.levels, found.widths, claimed, self._given_levels)
+        now_ns = track.belief.t_ns
+        belief, inflation = driven_belief(fitted, found.onset_1s_s, found.widths, levels, epoch_ns, now_ns, self.orbit)
+        if not np.isfinite(belief.P).all():
+            return track
+        onset_ns, spread = epoch_ns + round(fitted.onset_s * 1e9), found.onset_1s_s
+        if onset_ns == epoch_ns:  # it may have acted before the first of these poses
+            since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
+            onset_ns, spread = onset_ns - since_ns, math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0))
+        detected_ns = now_ns if known is None else known.detected_ns
+        drift = Drift(onset_ns, spread, belief.u[3:], belief.u[:3], belief.P_u, detected_ns)
+        plain = levels.factors(last.share)
+        result = replace(
+            last, epoch_ns=epoch_ns, chart=fitted.chart, count=pose_count(track.fixes), belief=belief, factors=plain
+        )
+        result = replace(result, inflation=inflation, components=(), points=None)
+        count = pose_count(track.fixes)
+        track = replace(track, drift=drift, levels=replace(levels, count=count))
+        return self._adopted(track, result, to_filter=True)
 
     def noise_levels(self, track: Track) -> tuple[float, float]:
         """Root densities of torque [rad/s^1.5] and force [m/s^1.5], given or estimated.
 
-        Those of a drift apply if larger. White noise of root density q changes the rate by q
-        sqrt(T) within T, a constant acceleration a by a T; the two are equal over ``_DRIFT_S``. The torque acts on the
-        rate through B(sigma), which is 3 for a sphere.
+        Those of a drift apply if larger, where it is not part of the motion of the belief. White noise of root density
+        q changes the rate by q sqrt(T) within T, a constant acceleration a by a T; the two are equal over ``_DRIFT_S``.
+        The torque acts on the rate through B(sigma), which is 3 for a sphere.
         """
-        found, drift = [track.levels.torque, track.levels.force], track.drift
+        driven = isinstance(track.belief, DrivenBelief)
+        found, drift = [track.levels.torque, track.levels.force], None if driven else track.drift
         if track.levels.count == 0:  # not yet estimated
             found[0] = _LEAST_TORQUE
         sizes = (0.0, 0.0) if drift is None else (float(np.linalg.norm(v)) for v in (drift.rate, drift.velocity))
@@ -300,7 +316,7 @@ class BatchSchedule:
 
     def propagated(self, track: Track, belief: Belief, t_ns: int) -> tuple[Belief, Array]:
         """A belief at another instant with the disturbances of a track, and the transition matrix (20, 20)."""
-        return propagate(belief, t_ns, *self.noise_levels(track), self.orbit)
+        return propagated(belief, t_ns, *self.noise_levels(track), self.orbit)
 
     def chart_at(self, belief: Belief, t_ns: int) -> Chart:
         """The belief's mean propagated to another instant, as a starting point of a fit."""

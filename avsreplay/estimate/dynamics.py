@@ -7,7 +7,6 @@ independent sigma; ``transition`` applies the chain rule for sigma3(sigma1, sigm
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -26,8 +25,7 @@ Triple = tuple[float, float, float]
 SUBSTEP_RAD = 0.2  # largest rotation of one Taylor series (SUBSTEP in motion.hpp)
 MOST_RAD = 2e4  # largest rotation of a single step [rad]; it takes a few seconds of processor time
 _I3, _I20 = np.eye(3), np.eye(DIM)
-_NO_TORQUE = (0.0, 0.0, 0.0)
-_DRIFT_STEP_RAD = 0.1  # step of the integral in drift_equivalents
+NO_DRIVE = (0.0, 0.0, 0.0)  # no angular acceleration
 
 
 def _diagonal(rows: slice, columns: slice) -> slice:
@@ -80,22 +78,24 @@ class Flow:
     Q: Array
 
 
-def flow(w: Array, sigma: Array, h: float, torque: float = 0.0) -> Flow:
+def flow(w: Array, sigma: Array, h: float, torque: float = 0.0, drive: Triple = NO_DRIVE) -> Flow:
     """Rotation over h seconds (either sign) from rate ``w`` (3,); ``torque``: root density of eps_tau [rad/s^1.5].
+
+    ``drive`` is the angular acceleration in {B} by a constant torque [rad/s2].
 
     Raises:
         ValueError: an inertia ratio beyond -1 to 1, a rate or time that is not finite, or more than a million radians.
     """
-    return flows(w, sigma, np.array((h,)), torque)[0]
+    return flows(w, sigma, np.array((h,)), torque, drive)[0]
 
 
-def flows(w: Array, sigma: Array, times_s: Array, torque: float = 0.0) -> list[Flow]:
+def flows(w: Array, sigma: Array, times_s: Array, torque: float = 0.0, drive: Triple = NO_DRIVE) -> list[Flow]:
     """``flow`` to each of ``times_s`` (n,) [s], each reached from the one before.
 
     Raises:
         ValueError: as ``flow``.
     """
-    found = _motion.follow(IDENTITY_QUAT, w, ratios(sigma), torque_density(sigma, torque), times_s)
+    found = _motion.follow(IDENTITY_QUAT, w, ratios(sigma), torque_density(sigma, torque), times_s, drive)
     return [Flow(w, q, S, Q) for q, w, S, Q in zip(*found, strict=True)]
 
 
@@ -174,11 +174,7 @@ def propagate(
     Raises:
         UsageError: the step turns the target by more than ``MOST_RAD``.
     """
-    h = (t_ns - belief.t_ns) * 1e-9
-    x = belief.x
-    if (turn := abs(h) * max(map(abs, x.w_b.tolist()))) > MOST_RAD:
-        what = f"a scan comes {h:.4g} s after the one before, and the target turns {turn:.3g} rad: too far to predict"
-        raise UsageError(what, where=f"stamp {t_ns}", hint="check the stamps (--clock log), or use --start or --end")
+    h, x = seconds_to(belief, t_ns), belief.x
     step = flow(x.w_b, x.sigma, h, torque)
     arc = None if orbit is None else orbit.at(belief.t_ns)
     Phi = transition(step, x.sigma, h, arc)
@@ -186,6 +182,19 @@ def propagate(
     if h > 0.0:
         P += process_noise(step, h, force)
     return Belief(t_ns, advance(x, step, h, arc), 0.5 * (P + P.T)), Phi
+
+
+def seconds_to(belief: Belief, t_ns: int) -> float:
+    """Time from a belief to another instant [s].
+
+    Raises:
+        UsageError: the target turns by more than ``MOST_RAD`` in between.
+    """
+    h = (t_ns - belief.t_ns) * 1e-9
+    if (turn := abs(h) * max(map(abs, belief.x.w_b.tolist()))) > MOST_RAD:
+        what = f"a scan comes {h:.4g} s after the one before, and the target turns {turn:.3g} rad: too far to predict"
+        raise UsageError(what, where=f"stamp {t_ns}", hint="check the stamps (--clock log), or use --start or --end")
+    return h
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -205,53 +214,29 @@ class RotationHistory:
 def rotation_history(x: State, times_s: Array) -> RotationHistory:
     """Rotation from ``x`` at 0 to each of ``times_s`` (n,) [s], of either sign; each is reached from the one before."""
     times = np.asarray(times_s, dtype=np.float64)
-    q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), _NO_TORQUE, times)
+    q, w, S, _ = _motion.follow(x.q_ab, x.w_b, ratios(x.sigma), NO_DRIVE, times)
     return RotationHistory(q, w, np.concatenate([S[:, :, :6], S[:, :, 6:] @ sigma_join(x.sigma)], axis=2))
 
 
-def drift_equivalents(x: State, times_s: Array) -> Array:
-    """Errors of attitude to velocity at the epoch that equal a constant unit acceleration since.
-
-    Args:
-        x: state at the epoch.
-        times_s: (n,) >= 0, since the epoch [s].
-
-    Returns:
-        B (n, 12, 6): the integral of Phi(s, 0)^-1 G ds, of the angular acceleration in {B} and the acceleration in {A}.
-    """
-    last = float(times_s.max())
-    count = max(100, math.ceil(float(np.linalg.norm(x.w_b)) * last / _DRIFT_STEP_RAD))
-    grid = np.linspace(0.0, last, count + 1)
-    S = rotation_history(x, grid).S[:, :, :6]
-    rate = np.linalg.inv(S)[:, :, 3:]
-    total = np.zeros((count + 1, 6, 3))
-    np.cumsum(0.5 * (rate[1:] + rate[:-1]) * (last / count), axis=0, out=total[1:])
-    B = np.zeros((len(times_s), 12, 6))
-    place = np.clip(times_s / (last / count), 0.0, count)
-    low = np.minimum(place.astype(int), count - 1)
-    part = (place - low)[:, None, None]
-    B[:, :6, :3] = (1.0 - part) * total[low] + part * total[low + 1]
-    B[:, 6:9, 3:] = -0.5 * (times_s**2)[:, None, None] * np.eye(3)
-    B[:, 9:12, 3:] = times_s[:, None, None] * np.eye(3)
-    return B
-
-
-def rotation_path(x: State) -> _motion.Path:
+def rotation_path(x: State, drive: Triple = NO_DRIVE) -> _motion.Path:
     """Rotation from ``x`` at arbitrary instants; intermediate states are kept, so repeated queries are cheap.
+
+    ``drive`` is the angular acceleration in {B} by a constant torque [rad/s2].
 
     Returns:
         An object whose ``at(times_s)`` (n,) [s] gives attitude q_ab (n, 4) and rate in {B} (n, 3) [rad/s]. It raises
         ValueError for a time that is not finite or more than a million radians away.
     """
-    return _motion.Path(x.q_ab, x.w_b, ratios(x.sigma))
+    return _motion.Path(x.q_ab, x.w_b, ratios(x.sigma), drive)
 
 
-def grasp_trajectory(x: State, arc: OrbitArc | None = None) -> Trajectory:
+def grasp_trajectory(x: State, arc: OrbitArc | None = None, drive: Triple = NO_DRIVE) -> Trajectory:
     """Positions and velocities of the undisturbed grasp point.
 
     Args:
         x: the state now.
         arc: the orbit from now on; None for free motion.
+        drive: angular acceleration in {B} by a constant torque [rad/s2].
 
     Returns:
         Function of times (n,) >= 0 [s after now]: positions (n, 3) [m] and velocities (n, 3) [m/s] in {A}.
@@ -259,7 +244,7 @@ def grasp_trajectory(x: State, arc: OrbitArc | None = None) -> Trajectory:
     Raises:
         ValueError: by the returned function, for a time that is negative or not finite.
     """
-    path, arm = rotation_path(x), geometry.skew(x.c_b)  # w x c = w' [c x]
+    path, arm = rotation_path(x, drive), geometry.skew(x.c_b)  # w x c = w' [c x]
 
     def at(times: Array) -> tuple[Array, Array]:
         times = np.asarray(times, dtype=np.float64)
@@ -275,9 +260,9 @@ def grasp_trajectory(x: State, arc: OrbitArc | None = None) -> Trajectory:
     return at
 
 
-def fixture_attitude(x: State) -> Callable[[Array], Array]:
-    """Times (n,) >= 0 [s after now] -> attitudes q_ac (n, 4) of the fixture, undisturbed."""
-    path = rotation_path(x)
+def fixture_attitude(x: State, drive: Triple = NO_DRIVE) -> Callable[[Array], Array]:
+    """Times (n,) >= 0 [s after now] -> attitudes q_ac (n, 4) of the fixture; ``drive`` as in ``grasp_trajectory``."""
+    path = rotation_path(x, drive)
     return lambda times: geometry.multiply(path.at(np.asarray(times, dtype=np.float64))[0], x.q_bc)
 
 

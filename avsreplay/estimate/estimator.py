@@ -18,6 +18,7 @@ from avsreplay.estimate.acceleration import FreeFall, accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
+from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast
 from avsreplay.estimate.error_state import RHO
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
@@ -169,7 +170,7 @@ class Estimator:
         """
         noise, b = self.batch.noise_levels(track), common_1s(track, self.in_camera(track.belief).x.T_ac.t)
         if track.mode != "fit" or track.batch is None or len(track.batch.components) < 2:
-            found = dynamics.grasp_forecast(track.belief, times_s, *noise)
+            found = driven_forecast(track.belief, times_s, *noise)
         else:
             found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise)
         turns, moves = (float(np.linalg.norm(half)) for half in np.split(track.undetermined, 2))
@@ -305,8 +306,9 @@ class Estimator:
             in {A}. It raises ValueError for a time that is negative or not finite.
         """
         orbit = self.batch.orbit
-        free = dynamics.grasp_trajectory(belief.x, None if orbit is None else orbit.at(belief.t_ns))
-        return free if self.fall is None else accelerated(free, self.fall.acceleration)
+        path = dynamics.grasp_trajectory(belief.x, None if orbit is None else orbit.at(belief.t_ns), drive_in(belief))
+        path = accelerated(path, belief.u[3:]) if isinstance(belief, DrivenBelief) else path
+        return path if self.fall is None else accelerated(path, self.fall.acceleration)
 
     def attitude(self, belief: Belief) -> Callable[[Array], Array]:
         """The predicted attitudes of the fixture without disturbances.
@@ -317,7 +319,7 @@ class Estimator:
         Returns:
             Function of times (n,) [s after the belief's instant]: attitudes q_ac (n, 4).
         """
-        return dynamics.fixture_attitude(belief.x)
+        return dynamics.fixture_attitude(belief.x, drive_in(belief))
 
     def forecast(self, belief: Belief, times_s: Array) -> Forecast:
         """Predicted 1 sigma of the grasp point.
@@ -327,7 +329,7 @@ class Estimator:
             times_s: (n,) >= 0, ascending [s after the belief's instant].
         """
         torque, force = (given or 0.0 for given in self.params.disturbances)
-        return dynamics.grasp_forecast(belief, times_s, torque, force)
+        return driven_forecast(belief, times_s, torque, force)
 
     def pose_covariance(self, belief: Belief) -> Array:
         """The covariance of the pose of {C}, H P H' (H of eq:innovation).

@@ -22,6 +22,7 @@ from types import MappingProxyType
 import numpy as np
 
 from avsreplay.estimate import _motion
+from avsreplay.estimate.driven import DrivenBelief, corrected
 from avsreplay.estimate.dynamics import advance, flow, sigma_join, transition
 from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, Quad, boxplus, conjugate_quad, hamilton, rotation
 from avsreplay.geometry import Array, Pose
@@ -286,7 +287,10 @@ def chart_update(prior: Belief, H: Array, innovation: Innovation, inflation: Arr
     *mean, P = _motion.correct(
         x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, prior.P, H, alpha, S, R, factors.tolist()
     )
-    return Belief(prior.t_ns, State(*mean), P)
+    then = Belief(prior.t_ns, State(*mean), P)
+    if not isinstance(prior, DrivenBelief):
+        return then
+    return corrected(prior, then, H, S + inflated(R, factors) - R, alpha)
 
 
 def joseph(P: Array, H: Array, K: Array, R: Array) -> Array:

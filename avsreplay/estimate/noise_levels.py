@@ -109,7 +109,12 @@ def mean_share(points: Poses) -> float:
 
 
 def estimate_levels(
-    points: Poses, problem: Problem, levels: NoiseLevels, claimed: bool, fixed: tuple[float | None, float | None]
+    points: Poses,
+    problem: Problem,
+    levels: NoiseLevels,
+    claimed: bool,
+    fixed: tuple[float | None, float | None],
+    others: tuple[Array, Array] | None = None,
 ) -> NoiseLevels:
     """Improve variance components by a bounded number of steps, from those of an estimate with fewer poses.
 
@@ -119,13 +124,14 @@ def estimate_levels(
         levels: the last estimate.
         claimed: the noise of the poses is as claimed; only the disturbances are estimated.
         fixed: root densities of torque and force that are given; None to estimate them.
+        others: columns and size of other unknowns, as in ``disturbed_likelihood``.
     """
     n, theta = len(points), _variances(levels)
     open_ = np.array([*([not claimed] * 4), *(f is None for f in fixed)])
     open_[2:4] &= points.shares is not None and bool(np.any(points.shares))
     for k, given in enumerate(fixed):
         theta[4 + k] = theta[4 + k] if given is None else given**2
-    data, parts = _linearised(points, problem)
+    data, parts = _linearised(points, problem, others)
     for _ in range(min(_MOST_STEPS, max(1, _WORK // n**3))):
         theta = _improved(theta, open_, parts, data, points)
     likely = theta.copy()
@@ -183,8 +189,7 @@ def disturbed_likelihood(
     problem: Problem,
     levels: NoiseLevels,
     k: int,
-    columns: Array | None = None,
-    size: Array | None = None,
+    others: tuple[Array, Array] | None = None,
 ) -> tuple[float, float]:
     """Log likelihood of the poses without and with a random disturbance of unknown density, and other unknowns.
 
@@ -193,15 +198,10 @@ def disturbed_likelihood(
         problem: their cost, linearised at the fit.
         levels: variance components; those of the errors of the poses and of the other disturbance are used.
         k: 0 for a random torque, 1 for a random force.
-        columns: (n, 6, m) effect on the whitened residuals of each other unknown at its prior 1 sigma.
-        size: (m,) of these unknowns in the motion about which the residuals are, in 1 sigma.
+        others: (n, 6, m) effect on the whitened residuals of each other unknown at its prior 1 sigma, and (m,) size of
+            these unknowns in the motion about which the residuals are, in 1 sigma; None for no others.
     """
-    data, parts = _linearised(points, problem)
-    if columns is not None and size is not None:
-        m = columns.shape[2]
-        J = np.hstack([data.J, np.ascontiguousarray(columns.transpose(1, 0, 2)).reshape(-1, m)])
-        info = np.block([[data.info, np.zeros((20, m))], [np.zeros((m, 20)), np.eye(m)]])
-        data = _Residuals(data.e, J, info, np.concatenate([data.off, size]))
+    data, parts = _linearised(points, problem, others)
     none, odds = _marginal(_variances(levels), 4 + k, parts, data)
     return none, none + float(np.logaddexp(math.log(_FREE), math.log(1.0 - _FREE) + _log_mean(odds)))
 
@@ -227,12 +227,19 @@ class _Residuals:
     off: Array
 
 
-def _linearised(points: Poses, problem: Problem) -> tuple[_Residuals, Sequence[Array]]:
+def _linearised(
+    points: Poses, problem: Problem, others: tuple[Array, Array] | None = None
+) -> tuple[_Residuals, Sequence[Array]]:
     """Residuals about the chart of ``problem``, and the covariances of the six components."""
     e, H = problem.core.rows()
     J = np.ascontiguousarray((H @ to_errors(problem.chart)).transpose(1, 0, 2)).reshape(6 * len(points), -1)
     info: Array = np.asarray(np.linalg.inv(problem.prior.P), dtype=np.float64)
     off = problem.chart.minus(problem.prior.mean)
+    if others is not None:
+        m = others[0].shape[2]
+        J = np.hstack([J, np.ascontiguousarray(others[0].transpose(1, 0, 2)).reshape(-1, m)])
+        info = np.block([[info, np.zeros((20, m))], [np.zeros((m, 20)), np.eye(m)]])
+        off = np.concatenate([off, others[1]])
     return _Residuals(np.ascontiguousarray(e.T).reshape(-1), J, info, off), _components(points, problem, H)
 
 

@@ -15,7 +15,8 @@ from enum import Enum
 
 import numpy as np
 
-from avsreplay.estimate.dynamics import advance, flows, process_noise, transition
+from avsreplay.estimate.driven import DrivenBelief, driven_steps
+from avsreplay.estimate.dynamics import process_noise
 from avsreplay.estimate.error_state import rotation
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import cholesky_root, correlated_noise
@@ -97,14 +98,15 @@ def window_of(
     epochs: Sequence[Epoch], start: Belief, torque: float, force: float, arc: OrbitArc | None = None
 ) -> Window:
     """The scans about the trajectory from ``start``, with disturbances of these root densities."""
-    n, x = len(epochs), start.x
+    n = len(epochs)
     times = np.array([(e.prediction.belief.t_ns - start.t_ns) * 1e-9 for e in epochs])
     y, rows, back, poses, R_ba = np.empty((n, 6)), np.empty((n, 6, 20)), np.empty((n, 20, 20)), [], []
-    for k, (epoch, step, t) in enumerate(zip(epochs, flows(x.w_b, x.sigma, times, torque), times, strict=True)):
-        then, Phi = advance(x, step, t, arc), transition(step, x.sigma, t, arc)
+    states, transitions, by_u, steps = driven_steps(start, times, torque, arc)
+    for k, (epoch, step, then, Phi, t) in enumerate(zip(epochs, steps, states, transitions, times, strict=True)):
         poses.append(measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha))
         y[k] = innovation_vector(then, poses[-1])
-        rows[k] = measurement_jacobian(then) @ Phi
+        H = measurement_jacobian(then)
+        rows[k], by_u[k, :6] = H @ Phi, H @ by_u[k]
         inverse = np.linalg.inv(Phi)
         back[k] = start.P + inverse @ process_noise(step, t, force) @ inverse.T  # what the noise at the start would be
         R_ba.append(rotation(then.q_ab).T)
@@ -114,6 +116,10 @@ def window_of(
     innovations = [e.innovation for e in epochs]
     R = tuple(i.R for i in innovations)
     flat = C.reshape(6 * n, 6 * n) + correlated_noise(R, [i.share for i in innovations])
+    if isinstance(start, DrivenBelief):
+        seen = by_u[:, :6].reshape(6 * n, 6)
+        across = rows.reshape(6 * n, 20) @ start.cross @ seen.T
+        flat += across + across.T + seen @ start.P_u @ seen.T
     flat = 0.5 * (flat + flat.T)
     whiten = np.asarray(np.linalg.inv(cholesky_root(flat)), dtype=np.float64)
     return Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, tuple(R_ba))

@@ -44,19 +44,20 @@ void check_ratios(const double* sigma, int count) {
     if (!(std::fabs(sigma[k]) <= 1 + 1e-9)) throw std::invalid_argument("an inertia ratio must be between -1 and 1");
 }
 
-Body body(const Three& sigma, const Three& push) {
+Body body(const Three& sigma, const Three& push, const Three& drive) {
   check_ratios(sigma.data(), 3);
-  return {{sigma[0], sigma[1], sigma[2]}, {push[0], push[1], push[2]}, 1e-12};
+  return {{sigma[0], sigma[1], sigma[2]}, {push[0], push[1], push[2]}, 1e-12, {drive[0], drive[1], drive[2]}};
 }
 
 // One flow through all times in turn, each from the one before.
-nb::tuple follow(const Vector<4>& q0, const Vector<3>& w0, const Three& sigma, const Three& push, const Times& times) {
+nb::tuple follow(const Vector<4>& q0, const Vector<3>& w0, const Three& sigma, const Three& push, const Times& times,
+                 const Three& drive) {
   const size_t n = times.shape(0);
   double *q, *w, *S, *Q;
   Numpy qs = array({n, 4}, &q), ws = array({n, 3}, &w), Ss = array({n, 6, 9}, &S), Qs = array({n, 6, 6}, &Q);
   {
     nb::gil_scoped_release release;
-    const Body b = body(sigma, push);
+    const Body b = body(sigma, push, drive);
     Flow flow = begin(turn(q0, w0));
     double t = 0;
     for (size_t k = 0; k < n; ++k) {
@@ -337,7 +338,8 @@ nb::tuple carry_of(const Flat& from, const Matrix<DIM, DIM>& P0, double h, const
 }  // namespace
 
 NB_MODULE(_motion, m) {
-  m.def("follow", &follow, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("push"), nb::arg("times"));
+  m.def("follow", &follow, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("push"), nb::arg("times"),
+        nb::arg("drive") = Three{0, 0, 0});
   m.def("correct", &correct_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
         nb::arg("colour"));
@@ -371,8 +373,8 @@ NB_MODULE(_motion, m) {
       .def_prop_ro("d", [](const Problem& self) { return copied(self.d, {self.poses.size(), SEEN}); }, nb::rv_policy::move)
       .def_prop_ro("weights", [](const Problem& self) { return copied(self.weights, {self.poses.size()}); }, nb::rv_policy::move);
   nb::class_<Path>(m, "Path")
-      .def("__init__", [](Path* self, const Vector<4>& q, const Vector<3>& w, const Three& sigma) {
-        new (self) Path(turn(q, w), body(sigma, {0, 0, 0}));
-      }, nb::arg("q"), nb::arg("w"), nb::arg("sigma"))
+      .def("__init__", [](Path* self, const Vector<4>& q, const Vector<3>& w, const Three& sigma, const Three& drive) {
+        new (self) Path(turn(q, w), body(sigma, {0, 0, 0}, drive));
+      }, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("drive") = Three{0, 0, 0})
       .def("at", &at, nb::arg("times"));
 }

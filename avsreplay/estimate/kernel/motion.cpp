@@ -1,7 +1,8 @@
 // One Taylor series gives all of it. With time scaled to the step, u = w h, the rate obeys u' = phi(u, sigma), a quadratic
 // equation whose coefficients follow from Cauchy products; attitude, derivatives and noise obey linear equations with u
 // as coefficient. The solutions are elliptic functions without a pole nearer than |w| h = pi / 2, so the order at which
-// the tail is small enough is known beforehand.
+// the tail is small enough is known beforehand. A constant torque adds its acceleration a to u', times h^2; by the
+// majorant y' = y^2 + a the pole is then not nearer than (|w| + root |a|) h = 1.
 #include "motion.hpp"
 
 #include <algorithm>
@@ -17,6 +18,9 @@ constexpr double MOST = 1e6;  // rad in one advance: some seconds of work
 constexpr int MOST_ORDER = 16;  // enough for a piece of SUBSTEP
 
 double size(const double* w) { return std::sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2]); }
+
+// Rate [rad/s] that bounds the growth of the series.
+double pace(const double* w, const Body& body) { return size(w) + std::sqrt(size(body.drive)); }
 
 // Terms until the tail is below `tail`; one at least.
 int terms(double turn, double tail) {
@@ -114,7 +118,7 @@ void linear(Series<N>& y, int k, const Body& body, const double* p, const double
 // The whole series of a step of h seconds; returns its orders.
 template <int N>
 Orders expand(Series<N>& y, const double* w, const Body& body, double h) {
-  const Orders orders = orders_for<N>(size(w) * std::fabs(h), body.tail);
+  const Orders orders = orders_for<N>(pace(w, body) * std::fabs(h), body.tail);
   double push[3];
   for (int r = 0; r < 3; ++r) {
     y.u[0][r] = w[r] * h;
@@ -130,6 +134,7 @@ Orders expand(Series<N>& y, const double* w, const Body& body, double h) {
     double p[3];
     products(y, k, p);
     for (int r = 0; r < 3; ++r) y.u[k + 1][r] = body.sigma[r] * p[r] / (k + 1);
+    for (int r = 0; k == 0 && r < 3; ++r) y.u[1][r] += body.drive[r] * (h * h);
     attitude(y, k);
     if constexpr (N > 0)
       if (k < orders.derivative) linear(y, k, body, p, push);
@@ -230,7 +235,7 @@ void piece(Flow& flow, const Body& body, double h) {
 template <class Rate, class One>
 void cut(double h, Rate rate, One one) {
   while (h != 0) {
-    const double turn = size(rate()) * std::fabs(h);
+    const double turn = rate() * std::fabs(h);
     if (!(turn <= MOST)) throw std::invalid_argument("a step must be finite and turn less than a million radians");
     const double pieces = std::ceil(turn / SUBSTEP - 1e-9);
     const double length = pieces <= 1 ? h : h / pieces;
@@ -248,7 +253,7 @@ Flow begin(const Turn& at) {
 }
 
 void advance(Turn& at, const Body& body, double h) {
-  cut(h, [&] { return at.w; }, [&](double length) {
+  cut(h, [&] { return pace(at.w, body); }, [&](double length) {
     Series<0> y;
     double q[4];
     finish(y, expand(y, at.w, body, length).state, length, at, q);
@@ -257,7 +262,7 @@ void advance(Turn& at, const Body& body, double h) {
 
 void advance(Flow& flow, const Body& body, double h) {
   const bool noisy = body.push[0] != 0 || body.push[1] != 0 || body.push[2] != 0;
-  cut(h, [&] { return flow.at.w; }, [&](double length) {
+  cut(h, [&] { return pace(flow.at.w, body); }, [&](double length) {
     if (noisy)
       piece<12>(flow, body, length);
     else

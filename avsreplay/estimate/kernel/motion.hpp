@@ -1,15 +1,18 @@
-// Torque-free rotation in the inertia ratios (eq:dot_omega, Eq:F): attitude, rate, their derivatives and their noise.
+// Rotation in the inertia ratios (eq:dot_omega, Eq:F), free or under a constant torque: attitude, rate, their derivatives
+// and their noise.
 #pragma once
 #include <vector>
 
 namespace avs {
 
-// A body: sigma1..3, the variance its rate gets from the disturbance torque [rad2/s3], by axis of {B}, and the largest
-// relative error of derivatives and noise in a piece of the flow; the state itself is always exact to 1e-12.
+// A body: sigma1..3, the variance its rate gets from the disturbance torque [rad2/s3], by axis of {B}, the largest
+// relative error of derivatives and noise in a piece of the flow (the state itself is always exact to 1e-12), and the
+// angular acceleration in {B} by a constant torque [rad/s2].
 struct Body {
   double sigma[3];
   double push[3];
   double tail = 1e-12;
+  double drive[3] = {0, 0, 0};
 };
 
 // Attitude [x y z w] of {B} and rate in {B} [rad/s].

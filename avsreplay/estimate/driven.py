@@ -1,0 +1,217 @@
+"""A constant torque and a constant force as a part of the motion: its prediction, correction and forecast.
+
+The torque gives a constant angular acceleration of the body, in {C} because the fixture is known and the principal axes
+are not, and the force one of the centre of mass in {A}. The six are unknowns beside the 20 states: constants, of which
+the covariance with the states is carried along, so that the prediction contains their uncertainty and each pose
+corrects them (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 4).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from avsreplay import geometry
+from avsreplay.estimate import _motion
+from avsreplay.estimate.chart import to_chart, to_errors
+from avsreplay.estimate.dynamics import (
+    MOST_RAD,
+    NO_DRIVE,
+    Flow,
+    Triple,
+    advance,
+    flow,
+    flows,
+    grasp_forecast,
+    grasp_jacobian,
+    process_noise,
+    propagate,
+    ratios,
+    rotation_history,
+    seconds_to,
+    transition,
+)
+from avsreplay.estimate.error_state import DIM, DMU, RHO, VEL
+from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
+from avsreplay.geometry import IDENTITY_QUAT, Array
+from avsreplay.records import Belief, Forecast, State
+
+_STEP_RAD = 0.1  # step of the integral in drift_equivalents
+_SIMPSON_RAD = 0.4  # largest rotation of two steps of Simpson's rule in drift_response
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivenBelief(Belief):
+    """A belief about a body on which a constant torque or force acts.
+
+    Attributes:
+        u: (6,) acceleration: rad/s2 in {C}, m/s2 in {A}.  P_u: (6, 6) its covariance.
+        cross: (20, 6) covariance of the error states with that of u.
+    """
+
+    u: Array
+    P_u: Array
+    cross: Array
+
+
+def drive_of(x: State, u: Array) -> Triple:
+    """The angular acceleration in {B} [rad/s2] of u (6,)."""
+    x_b, y_b, z_b = (geometry.matrix(x.q_bc) @ u[:3]).tolist()
+    return x_b, y_b, z_b
+
+
+def drive_in(belief: Belief) -> Triple:
+    """The angular acceleration in {B} [rad/s2] that a belief contains, zero without a torque."""
+    return drive_of(belief.x, belief.u) if isinstance(belief, DrivenBelief) else NO_DRIVE
+
+
+def propagated(
+    belief: Belief, t_ns: int, torque: float, force: float, orbit: RelativeOrbit | None = None
+) -> tuple[Belief, Array]:
+    """``dynamics.propagate`` of a belief that may contain a constant acceleration.
+
+    Raises:
+        UsageError: the step turns the target by more than ``MOST_RAD``.
+    """
+    if not isinstance(belief, DrivenBelief):
+        return propagate(belief, t_ns, torque, force, orbit)
+    h, x, u = seconds_to(belief, t_ns), belief.x, belief.u
+    arc = None if orbit is None else orbit.at(belief.t_ns)
+    step = flow(x.w_b, x.sigma, h, torque, drive_of(x, u))
+    Phi, by_u = (M[0] for M in _derivatives(x, u, np.array([h]), [transition(step, x.sigma, h, arc)]))
+    P = _covariance(belief, Phi, by_u)
+    if h > 0.0:
+        P += process_noise(step, h, force)
+    cross = Phi @ belief.cross + by_u @ belief.P_u
+    there = _pushed(advance(x, step, h, arc), u, h)
+    return replace(belief, t_ns=t_ns, x=there, P=0.5 * (P + P.T), cross=cross), Phi
+
+
+def driven_steps(
+    belief: Belief, times_s: Array, torque: float, arc: OrbitArc | None
+) -> tuple[list[State], Array, Array, list[Flow]]:
+    """The motion of a belief to ``times_s`` (n,) [s], with the disturbance torque of this root density.
+
+    Returns:
+        The states, Phi (n, 20, 20), the derivative (n, 20, 6) by a constant acceleration, 0 where the belief has none,
+        and the rotations.
+    """
+    x, u = belief.x, belief.u if isinstance(belief, DrivenBelief) else None
+    steps = flows(x.w_b, x.sigma, times_s, torque, drive_in(belief))
+    states = [advance(x, step, t, arc) for step, t in zip(steps, times_s.tolist(), strict=True)]
+    Phi = [transition(step, x.sigma, t, arc) for step, t in zip(steps, times_s.tolist(), strict=True)]
+    if u is None:
+        return states, np.array(Phi), np.zeros((len(times_s), DIM, 6)), steps
+    moved = [_pushed(then, u, t) for then, t in zip(states, times_s.tolist(), strict=True)]
+    return moved, *_derivatives(x, u, times_s, Phi), steps
+
+
+def _pushed(x: State, u: Array, h: float) -> State:
+    """A state of which the centre of mass has in addition been accelerated for h seconds."""
+    return replace(x, r_a=x.r_a + 0.5 * h * h * u[3:], v_a=x.v_a + h * u[3:])
+
+
+def _covariance(belief: DrivenBelief, Phi: Array, by_u: Array) -> Array:
+    """Covariance (20, 20) of the states without process noise."""
+    across = Phi @ belief.cross @ by_u.T
+    return np.asarray(Phi @ belief.P @ Phi.T + across + across.T + by_u @ belief.P_u @ by_u.T)
+
+
+def _derivatives(x: State, u: Array, times_s: Array, Phi: list[Array]) -> tuple[Array, Array]:
+    """Phi (n, 20, 20), completed by the effect of mu, and the derivative (n, 20, 6) of the states by u.
+
+    u is given in {C} and acts in {B}: R(mu) u, with R(dmu mu) = (1 + 2 [dmu x]) R(mu).
+
+    Args:
+        x: state now.
+        u: (6,) acceleration.
+        times_s: (n,) [s after now], each reached from the one before.
+        Phi: (20, 20) along the motion with u, of each instant, without that effect.
+    """
+    n, drive = len(times_s), drive_of(x, u)
+    lengths = np.diff(times_s, prepend=0.0)
+    turn = float(np.abs(lengths).max()) * float(np.linalg.norm(x.w_b))
+    m = 2 * max(1, math.ceil(turn / _SIMPSON_RAD))
+    grid = ((times_s - lengths)[:, None] + lengths[:, None] * (np.arange(1, m + 1) / m)).reshape(-1)
+    S = _motion.follow(IDENTITY_QUAT, x.w_b, ratios(x.sigma), NO_DRIVE, grid, drive)[2][:, :, :6]
+    slope = np.concatenate([np.eye(6)[None, :, 3:], np.linalg.inv(S)[:, :, 3:]])
+    weight = np.where(np.arange(m + 1) % 2 == 1, 4.0, 2.0) / (3.0 * m)  # Simpson's rule
+    weight[[0, -1]] *= 0.5
+    pieces = slope[m * np.arange(n)[:, None] + np.arange(m + 1)]  # (n, m + 1, 6, 3)
+    total = np.cumsum(lengths[:, None, None] * (pieces * weight[:, None, None]).sum(axis=1), axis=0)
+    turned = S[m - 1 :: m] @ total
+    full, by_u = np.array(Phi), np.zeros((n, DIM, 6))
+    full[:, :6, DMU] += -2.0 * turned @ geometry.skew(np.array(drive))
+    by_u[:, :6, :3] = turned @ geometry.matrix(x.q_bc)
+    by_u[:, RHO, 3:] = 0.5 * (times_s**2)[:, None, None] * np.eye(3)
+    by_u[:, VEL, 3:] = times_s[:, None, None] * np.eye(3)
+    return full, by_u
+
+
+def corrected(prior: DrivenBelief, then: Belief, H: Array, S: Array, alpha: Array) -> DrivenBelief:
+    """A posterior of the states, with that of the constant acceleration.
+
+    Args:
+        prior: before the pose.
+        then: posterior mean and covariance of the states.
+        H: (6, 20) measurement Jacobian.
+        S: (6, 6) covariance of the innovation that the gain was computed with.
+        alpha: (6,) innovation.
+    """
+    seen = H @ prior.cross
+    K = np.linalg.solve(S, np.hstack([H @ prior.P, seen])).T
+    cross = prior.cross - K[:DIM] @ seen
+    P_u = prior.P_u - K[DIM:] @ seen
+    moved = to_errors(to_chart(then.x)) @ np.linalg.solve(to_errors(to_chart(prior.x)), cross)
+    u = prior.u + K[DIM:] @ alpha
+    return DrivenBelief(then.t_ns, then.x, then.P, u, 0.5 * (P_u + P_u.T), np.asarray(moved))
+
+
+def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float) -> Forecast:
+    """``dynamics.grasp_forecast`` of a belief that may contain a constant acceleration.
+
+    Raises:
+        ValueError: times that do not ascend from 0.
+    """
+    found = grasp_forecast(belief, times_s, torque, force)  # of free motion
+    most = max(map(abs, belief.x.w_b.tolist())) * float(times_s.max(initial=0.0))
+    if not isinstance(belief, DrivenBelief) or most > MOST_RAD or not len(times_s):
+        return found
+    states, Phi, by_u, steps = driven_steps(belief, times_s, torque, None)
+    rotations = geometry.matrix(np.array([x.q_ab for x in states]))
+    J = grasp_jacobian(rotations, np.array([x.w_b for x in states]), belief.x.c_b)
+    variances = np.empty((len(times_s), 9))
+    for k, t in enumerate(times_s.tolist()):
+        P = _covariance(belief, Phi[k], by_u[k]) + process_noise(steps[k], t, force)
+        variances[k] = np.diagonal(J[k] @ P @ J[k].T)
+    sums = np.sqrt(np.maximum(variances.reshape(-1, 3, 3).sum(axis=2), 0.0))
+    return Forecast(times_s, sums[:, 0], sums[:, 1], 2.0 * sums[:, 2])
+
+
+def drift_equivalents(x: State, times_s: Array) -> Array:
+    """Errors of attitude to velocity at the epoch that equal a constant unit acceleration since.
+
+    Args:
+        x: state at the epoch.
+        times_s: (n,) >= 0, since the epoch [s].
+
+    Returns:
+        B (n, 12, 6): the integral of Phi(s, 0)^-1 G ds, of the angular acceleration in {B} and the acceleration in {A}.
+    """
+    last = float(times_s.max())
+    count = max(100, math.ceil(float(np.linalg.norm(x.w_b)) * last / _STEP_RAD))
+    grid = np.linspace(0.0, last, count + 1)
+    S = rotation_history(x, grid).S[:, :, :6]
+    rate = np.linalg.inv(S)[:, :, 3:]
+    total = np.zeros((count + 1, 6, 3))
+    np.cumsum(0.5 * (rate[1:] + rate[:-1]) * (last / count), axis=0, out=total[1:])
+    B = np.zeros((len(times_s), 12, 6))
+    place = np.clip(times_s / (last / count), 0.0, count)
+    low = np.minimum(place.astype(int), count - 1)
+    part = (place - low)[:, None, None]
+    B[:, :6, :3] = (1.0 - part) * total[low] + part * total[low + 1]
+    B[:, 6:9, 3:] = -0.5 * (times_s**2)[:, None, None] * np.eye(3)
+    B[:, 9:12, 3:] = times_s[:, None, None] * np.eye(3)
+    return B
