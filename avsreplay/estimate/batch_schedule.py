@@ -19,7 +19,7 @@ from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_chart
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
 from avsreplay.estimate.drift import DriftFound, find_drift
-from avsreplay.estimate.driven import DrivenBelief, propagated
+from avsreplay.estimate.driven import DrivenBelief, driven_moments, propagated
 from avsreplay.estimate.driven_fit import driven_belief, levels_of
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import (
@@ -206,25 +206,26 @@ class BatchSchedule:
 
     def _driven(self, track: Track, last: BatchResult, found: DriftFound) -> Track:
         """The track with the estimate of a fit with a constant torque or force."""
-        epoch_ns, fitted, known = track.fixes[0].t_ns, found.fitted, track.drift
+        epoch_ns, now_ns, known = track.fixes[0].t_ns, track.belief.t_ns, track.drift
+        best, widths, count = found.hypotheses[0], found.widths, pose_count(track.fixes)
         claimed = self.params.adapt is Adaptation.OFF
-        levels = levels_of(fitted, track.levels, found.widths, claimed, self._given_levels)
-        now_ns = track.belief.t_ns
-        belief, inflation = driven_belief(fitted, found.onset_1s_s, found.widths, levels, epoch_ns, now_ns, self.orbit)
+        levels = levels_of(best.fitted, track.levels, widths, claimed, self._given_levels)
+        parts = [
+            (h.weight, driven_belief(h.fitted, h.onset_1s_s, widths, levels, epoch_ns, now_ns))
+            for h in found.hypotheses
+        ]
+        inflation, belief = parts[0][1][1], driven_moments([(weight, each) for weight, (each, _) in parts])
         if not np.isfinite(belief.P).all():
             return track
-        onset_ns, spread = epoch_ns + round(fitted.onset_s * 1e9), found.onset_1s_s
+        onset_ns, spread = epoch_ns + round(best.fitted.onset_s * 1e9), best.onset_1s_s
         if onset_ns == epoch_ns:  # it may have acted before the first of these poses
             since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
             onset_ns, spread = onset_ns - since_ns, math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0))
         detected_ns = now_ns if known is None else known.detected_ns
         drift = Drift(onset_ns, spread, belief.u[3:], belief.u[:3], belief.P_u, detected_ns)
-        plain = levels.factors(last.share)
-        result = replace(
-            last, epoch_ns=epoch_ns, chart=fitted.chart, count=pose_count(track.fixes), belief=belief, factors=plain
-        )
+        plain, chart = levels.factors(last.share), best.fitted.chart
+        result = replace(last, epoch_ns=epoch_ns, chart=chart, count=count, belief=belief, factors=plain)
         result = replace(result, inflation=inflation, components=(), points=None)
-        count = pose_count(track.fixes)
         track = replace(track, drift=drift, levels=replace(levels, count=count))
         return self._adopted(track, result, to_filter=True)
 

@@ -10,14 +10,21 @@ in ``hypotheses``. The noise of the poses is that of the residuals with the drif
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
 
 from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.chart import Chart
-from avsreplay.estimate.driven_fit import DrivenFit, drift_unknowns, equivalents, fit_driven
+from avsreplay.estimate.driven_fit import (
+    DrivenFit,
+    drift_columns,
+    drift_unknowns,
+    equivalents,
+    fit_driven,
+    without_drift,
+)
 from avsreplay.estimate.initialise import PoseFix, poses_of, weak_prior
 from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, disturbed_likelihood
@@ -34,6 +41,7 @@ _PARTS = (1.0, 0.3, 0.1, 0.03)  # of a step, the first that decreases the cost i
 _WIDTHS = (1.0, 0.1)  # of the prior 1 sigma: a large or a small drift
 _SCALES = (1.0, 0.1, 0.01)  # the same, where a drift is compared with disturbances of any density
 _KINDS = (slice(0, 3), slice(3, 6), slice(0, 6))  # torque, force, both
+_NO_WEIGHT = 1e-3  # probability of an onset hypothesis that is left out
 _PER_KIND = (0.0, 0.0, math.log(1e-2))  # log prior odds of each
 
 
@@ -68,20 +76,33 @@ def find_drift(
         free = min(free, fit_driven(poses, frame.chart, prior, factors, 0.0, _NO_DRIFT), key=lambda f: f.cost)
         if free.cost - frame.cost < _FOUND or not _constant(frame, free, levels, best, widths):
             return None
-    odds = np.array([f.log_odds for f in found])
-    weight = np.exp(odds - odds.max())
-    mean = float(weight @ onsets / weight.sum())
-    spacing = float(np.diff(np.append(_onsets(poses.times_s), poses.times_s[-1])).max())
-    spread = math.hypot(math.sqrt(float(weight @ (onsets - mean) ** 2 / weight.sum())), spacing / math.sqrt(12.0))
-    return DriftFound(frame, spread, widths)
+    within = _Onset(onsets, np.array([f.log_odds for f in found]))
+    later = DrivenHypothesis(frame, 1.0, within.spread_s)
+    if frame.onset_s == 0.0:
+        return DriftFound((later,), widths)
+    always, _, _ = _descended(poses, prior, factors, widths, frame, np.zeros(1))
+    columns = drift_columns(frame.G, frame.points.times_s, frame.chart, best.onset_s)
+    noise = _remaining_noise(frame, columns.reshape(-1, 6), best)
+    odds = (_cost(always, poses) - _cost(frame, poses)) / noise + math.log(within.width_s / float(poses.times_s[-1]))
+    share = 1.0 / (1.0 + math.exp(min(odds, 700.0)))
+    both = DrivenHypothesis(always, share, 0.0), replace(later, weight=1.0 - share)
+    return DriftFound(tuple(h for h in sorted(both, key=lambda h: -h.weight) if h.weight > _NO_WEIGHT), widths)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivenHypothesis:
+    """The fit with a drift since some instant, its posterior probability, and the 1 sigma of the instant [s]."""
+
+    fitted: DrivenFit
+    weight: float
+    onset_1s_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftFound:
-    """A drift: the fit with it, the 1 sigma of its onset [s] and the prior 1 sigma (6,) of its size."""
+    """A drift, the most likely hypothesis on its onset first, and the prior 1 sigma (6,) of its size."""
 
-    fitted: DrivenFit
-    onset_1s_s: float
+    hypotheses: tuple[DrivenHypothesis, ...]
     widths: Array
 
 
@@ -100,16 +121,16 @@ _NO_DRIFT = np.zeros(6)
 
 
 def _descended(
-    poses: Poses, prior: Prior, factors: Array, widths: Array, free: DrivenFit
+    poses: Poses, prior: Prior, factors: Array, widths: Array, free: DrivenFit, only: Array | None = None
 ) -> tuple[DrivenFit, list[_Found], Array]:
     """The best frame of a descent from free motion, and the drifts from each onset (n,) on about it.
 
     Free motion fits the poses of a drifting body so poorly that a full step of the linearised problem often leads away
-    from the minimum. A step is therefore taken only as far as the cost decreases.
+    from the minimum. A step is therefore taken only as far as the cost decreases. ``only``: the onsets that are tried.
     """
     frame, gain = free, math.inf
     for k in range(_ROUNDS + 1):
-        onsets = _onsets(frame.points.times_s, frame.onset_s if k else None)
+        onsets = _onsets(frame.points.times_s, frame.onset_s if k else None) if only is None else only
         found = _compared(frame, onsets, widths)
         best = max(found, key=lambda f: f.log_odds)
         if best.log_odds < _FOUND or gain < _LEAST_GAIN or k == _ROUNDS:
@@ -117,7 +138,8 @@ def _descended(
         step, at, was, onset_s = best.y, frame.chart, frame.u, best.onset_s
         tried = ((at.moved(part * step), was + part * (best.u - was)) for part in _PARTS)
         closer = (fit_driven(poses, start, prior, factors, onset_s, u) for start, u in tried)
-        lower = next((f for f in closer if f.cost < frame.cost), None)
+        limit = frame.cost if only is None or k else math.inf  # a given onset may be a less likely one
+        lower = next((f for f in closer if f.cost < limit), None)
         if lower is None:
             break
         frame, gain = lower, frame.cost - lower.cost
@@ -146,6 +168,35 @@ def _evidence(frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Arra
         for k in kinds
     ]
     return min(float(np.logaddexp.reduce(found)) - math.log(len(_SCALES)) for found in each)
+
+
+def _cost(frame: DrivenFit, poses: Poses) -> float:
+    """Half chi-square of all poses about a fit, normal points being different ones for each."""
+    every = without_drift(poses, frame.chart, frame.onset_s, frame.u)
+    return Problem(every, frame.problem.prior, frame.problem.factors).cost(frame.chart)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Onset:
+    """The posterior of the onset among instants (n,) by the log odds (n,) of a drift since each."""
+
+    instants_s: Array
+    odds: Array
+
+    @property
+    def spread_s(self) -> float:
+        """Standard deviation, with that of an instant between two that are tried."""
+        weight = np.exp(self.odds - self.odds.max())
+        share = weight / weight.sum()
+        spacing = float(np.diff(self.instants_s).max(initial=0.0))
+        variance = float(share @ (self.instants_s - share @ self.instants_s) ** 2)
+        return math.sqrt(variance + spacing**2 / 12.0)
+
+    @property
+    def width_s(self) -> float:
+        """Integral of the likelihood over that of the most likely instant."""
+        weight = np.exp(self.odds - self.odds.max())
+        return float(np.sum(0.5 * (weight[1:] + weight[:-1]) * np.diff(self.instants_s)))
 
 
 def _onsets(times_s: Array, near_s: float | None = None) -> Array:

@@ -9,13 +9,14 @@ corrects them (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Trac
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate import _motion
-from avsreplay.estimate.chart import to_chart, to_errors
+from avsreplay.estimate.chart import to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import (
     MOST_RAD,
     NO_DRIVE,
@@ -167,6 +168,22 @@ def corrected(prior: DrivenBelief, then: Belief, H: Array, S: Array, alpha: Arra
     moved = to_errors(to_chart(then.x)) @ np.linalg.solve(to_errors(to_chart(prior.x)), cross)
     u = prior.u + K[DIM:] @ alpha
     return DrivenBelief(then.t_ns, then.x, then.P, u, 0.5 * (P_u + P_u.T), np.asarray(moved))
+
+
+def driven_moments(parts: Sequence[tuple[float, DrivenBelief]]) -> DrivenBelief:
+    """Mean and covariance of a mixture of beliefs at one instant, given by weight and belief, the heaviest first."""
+    first, here = parts[0][1], to_chart(parts[0][1].x)
+    if len(parts) == 1:
+        return first
+    T, P, mean = to_errors(here), np.zeros((DIM + 6, DIM + 6)), np.zeros(DIM + 6)
+    off = [np.concatenate([T @ to_chart(each.x).minus(here), each.u - first.u]) for _, each in parts]
+    for (weight, _), d in zip(parts, off, strict=True):
+        mean += weight * d
+    for (weight, each), d in zip(parts, off, strict=True):
+        own = np.block([[each.P, each.cross], [each.cross.T, each.P_u]])
+        P += weight * (own + np.outer(d - mean, d - mean))
+    x = to_state(here.moved(np.linalg.solve(T, mean[:DIM])))
+    return DrivenBelief(first.t_ns, x, P[:DIM, :DIM], first.u + mean[DIM:], P[DIM:, DIM:], P[:DIM, DIM:])
 
 
 def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float) -> Forecast:

@@ -7,6 +7,7 @@ of a Kalman filter over the poses, with the disturbances between them, gives the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,15 +18,25 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import sandwich
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.driven import DrivenBelief, drift_equivalents, drive_of, propagated
-from avsreplay.estimate.dynamics import NO_DRIVE, propagate_state, ratios, rotation_history, torque_density
-from avsreplay.estimate.error_state import DIM, RHO, VEL, W, definite
+from avsreplay.estimate.driven import DrivenBelief, drift_equivalents, drive_of, driven_steps
+from avsreplay.estimate.dynamics import (
+    NO_DRIVE,
+    propagate_state,
+    ratios,
+    rotation_history,
+    torque_density,
+    translated,
+)
+from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, VEL, W, definite
+from avsreplay.estimate.measurement import GATE, measurement_jacobian, to_fixture
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels, mean_share
 from avsreplay.estimate.normal_points import normal_points
-from avsreplay.estimate.relative_orbit import RelativeOrbit
+from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.geometry import Array
+from avsreplay.records import Belief, State
 
 _REACHED = 12  # error states that a disturbance reaches: attitude to velocity
+_PASSES, _SMALL = 4, 0.1  # most linearisations; size of a step, in 1 sigma, after which none follows
 _U, _ONSET = slice(DIM, DIM + 6), DIM + 6  # the acceleration and its onset after the 20 initial values
 
 
@@ -35,6 +46,7 @@ class DrivenFit:
 
     Attributes:
         poses, points: with the effect of the acceleration removed, and normal points of them.
+        about: initial values of the motion about which it is removed.
         chart: of the fit.  problem: the cost of the points, linearised there.  cost: half chi-square of the fit.
         onset_s: since the epoch [s].  u: (6,) acceleration: rad/s2 in {C}, m/s2 in {A}; zero for free motion.
         e, J: white residuals (6n,), extrapolated to no acceleration, and their Jacobian (6n, 20) in the chart.
@@ -44,6 +56,7 @@ class DrivenFit:
 
     poses: Poses
     points: Poses
+    about: Chart
     chart: Chart
     problem: Problem
     cost: float
@@ -77,20 +90,25 @@ def fit_driven(poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s
         e = e - drift_columns(G, points.times_s, chart, onset_s) @ u
     info = np.asarray(np.linalg.inv(prior.P), dtype=np.float64)
     off, J = info @ chart.minus(prior.mean), (H @ to_errors(chart)).reshape(e.size, -1)
-    return DrivenFit(poses, points, chart, problem, fitted.half_chi2, onset_s, u, e.reshape(-1), J, G, info, off)
+    return DrivenFit(poses, points, start, chart, problem, fitted.half_chi2, onset_s, u, e.reshape(-1), J, G, info, off)
 
 
-def without_drift(poses: Poses, start: Chart, onset_s: float, u: Array) -> Poses:
-    """The poses as they would be without the acceleration u (6,) since ``onset_s``, about the motion from ``start``."""
-    x, times = to_state(start), poses.times_s
-    since = np.maximum(times - onset_s, 0.0)
-    q_free, late = rotation_history(x, times).q, times > onset_s
-    at, q_driven = propagate_state(x, onset_s)[0], q_free.copy()
+def without_drift(poses: Poses, about: Chart, onset_s: float, u: Array, back: bool = False) -> Poses:
+    """The poses as they would be without the acceleration u (6,) since ``onset_s``, about the motion from ``about``.
+
+    They have the same errors in {C}, relative to free motion, as the poses relative to that with u. ``back``: the
+    inverse.
+    """
+    x, times = to_state(about), poses.times_s
+    since, late = np.maximum(times - onset_s, 0.0), times > onset_s
+    q_free, at = rotation_history(x, times).q, propagate_state(x, onset_s)[0]
+    q_driven, centre = q_free.copy(), translated(x, times, poses.arc)[0]
     q_driven[late] = _motion.follow(at.q_ab, at.w_b, ratios(x.sigma), NO_DRIVE, since[late], drive_of(x, u))[0]
-    drifted, free = geometry.multiply(q_driven, x.q_bc), geometry.multiply(q_free, x.q_bc)
-    turned = geometry.multiply(poses.q, geometry.multiply(geometry.conjugate(drifted), free))
-    arm = (geometry.matrix(q_free) - geometry.matrix(q_driven)) @ x.c_b
-    return replace(poses, q=turned, t=poses.t + arm - 0.5 * since[:, None] ** 2 * u[3:])
+    moved = centre + 0.5 * since[:, None] ** 2 * u[3:]
+    (q_from, r_from), (q_to, r_to) = ((q_free, centre), (q_driven, moved))[:: 1 if back else -1]
+    turn = geometry.multiply(q_to, geometry.conjugate(q_from))
+    away = (geometry.matrix(turn) @ (poses.t - r_from)[:, :, None])[:, :, 0]
+    return replace(poses, q=geometry.multiply(turn, poses.q), t=r_to + away)
 
 
 def equivalents(chart: Chart, times_s: Array) -> Array:
@@ -143,7 +161,6 @@ def driven_belief(
     levels: NoiseLevels,
     epoch_ns: int,
     now_ns: int,
-    orbit: RelativeOrbit | None,
 ) -> tuple[DrivenBelief, Array]:
     """The belief at the last pose, and the inflation (2,) of the noise for correlated errors.
 
@@ -154,71 +171,82 @@ def driven_belief(
         levels: noise levels.
         epoch_ns: instant of the first pose.
         now_ns: instant of the last scan.
-        orbit: the relative orbit that the target is on; None for free motion.
     """
-    points, chart, prior = fitted.points, fitted.chart, fitted.problem.prior
+    points, prior, chart, u, onset_s = fitted.points, fitted.problem.prior, fitted.chart, fitted.u, fitted.onset_s
     plain = levels.factors(mean_share(points))
-    problem = Problem(points, prior, plain, chart, levels.slack)
-    inflation = sandwich(problem, points, levels)[1]
-    problem.reweigh(plain * np.sqrt(inflation))
-    e, H = problem.core.rows()
-    A = np.concatenate([H @ to_errors(chart), _unknowns(fitted, H[:, :, :_REACHED])], axis=2)
-    e = e - A[:, :, _U] @ fitted.u
-    v, P = np.zeros(_ONSET + 1), np.zeros((_ONSET + 1, _ONSET + 1))
-    v[:DIM], P[:DIM, :DIM] = -chart.minus(prior.mean), prior.P
-    P[_U, _U] = np.diag(np.where(fitted.u != 0.0, widths, 0.0) ** 2)
-    P[_ONSET, _ONSET] = onset_1s_s**2
-    one = np.eye(len(v))
-    for rows, off, Q in zip(A, e, _noise_between(points.times_s, chart, levels), strict=True):
-        P[:_REACHED, :_REACHED] += Q
-        AP = rows @ P
-        K = np.linalg.solve(AP @ rows.T + np.eye(6), AP).T
-        left = one - K @ rows
-        v, P = v - K @ (off + rows @ v), left @ P @ left.T + K @ K.T
-    return _at(chart.moved(v[:DIM]), v, P, fitted, epoch_ns, now_ns, orbit), inflation
+    inflation = sandwich(Problem(points, prior, plain, chart, levels.slack), points, levels)[1]
+    seen = without_drift(points, fitted.about, onset_s, u, back=True)
+    root, gate = seen.root / np.repeat(plain * np.sqrt(inflation), 3), GATE * levels.slack
+    for _ in range(_PASSES):  # linearised about the motion of the fit, then about the one found
+        v, P = np.zeros(_ONSET + 1), np.zeros((_ONSET + 1, _ONSET + 1))
+        v[:DIM], v[_U], v[_ONSET] = -chart.minus(prior.mean), -u, fitted.onset_s - onset_s
+        P[:DIM, :DIM], P[_ONSET, _ONSET] = prior.P, onset_1s_s**2
+        P[_U, _U] = np.diag(np.where(fitted.u != 0.0, widths, 0.0) ** 2)
+        v, P = _smoothed(seen, root, gate, levels, (chart, u, onset_s), v, P)
+        if not np.isfinite(v).all() or float(np.abs(v[:DIM]).max()) > LARGEST_MOVE:
+            break
+        chart, u, onset_s = chart.moved(v[:DIM]), u + v[_U], max(0.0, onset_s + float(v[_ONSET]))
+        if _small(v, P):
+            break
+    states, D = _followed(chart, u, onset_s, np.array([(now_ns - epoch_ns) * 1e-9]), points.arc)
+    C = D[0] @ P @ D[0].T
+    belief = DrivenBelief(now_ns, states[0], definite(0.5 * (C + C.T)), u, P[_U, _U], D[0] @ P[:, _U])
+    return belief, inflation
 
 
-def _unknowns(fitted: DrivenFit, G: Array) -> Array:
-    """White columns (n, 6, 7) by the acceleration and by its onset."""
-    times, onset, u = fitted.points.times_s, fitted.onset_s, fitted.u
-    x, back = to_state(fitted.chart), np.zeros((_REACHED, 1))  # of a later onset [1/s], as errors at the epoch
-    S = rotation_history(x, np.array([onset])).S[0, :, :6]
-    back[:6, 0] = -np.linalg.inv(S)[:, 3:] @ np.array(drive_of(x, u))
-    back[RHO, 0], back[VEL, 0] = onset * u[3:], -u[3:]
-    later = (G @ back) * (times > onset)[:, None, None]
-    return np.concatenate([drift_columns(G, times, fitted.chart, onset), later], axis=2)
+def _small(v: Array, P: Array) -> bool:
+    """Return whether a step is so small that the linearisation holds."""
+    open_ = np.diagonal(P) > 0.0
+    return bool(np.all(np.abs(v[open_]) < _SMALL * np.sqrt(np.diagonal(P)[open_])))
 
 
-def _noise_between(times_s: Array, chart: Chart, levels: NoiseLevels) -> Array:
-    """Covariance (n, 12, 12) in chart steps at the epoch of the disturbance before each pose since the one before.
+def _smoothed(
+    seen: Poses, root: Array, gate: float, levels: NoiseLevels, about: tuple[Chart, Array, float], v: Array, P: Array
+) -> tuple[Array, Array]:
+    """Steps v (27,) of initial values, acceleration and onset with covariance P, from those before the poses.
 
-    It acts as one impulse in the middle, as in ``noise_levels``.
+    The disturbance between two poses acts as one impulse in the middle, as in ``noise_levels``.
     """
-    x, lengths = to_state(chart), np.diff(times_s, prepend=times_s[0])
-    middle = times_s - 0.5 * lengths
-    M = np.zeros((len(times_s), _REACHED, 6))
-    density = np.sqrt(torque_density(x.sigma, levels.torque))
-    M[:, :6, :3] = np.linalg.inv(rotation_history(x, middle).S[:, :, :6])[:, :, 3:] * density
-    M[:, RHO, 3:] = -levels.force * middle[:, None, None] * np.eye(3)
-    M[:, VEL, 3:] = levels.force * np.eye(3)
-    into = np.linalg.inv(to_errors(chart)[:_REACHED, :_REACHED])
-    steps = into @ M * np.sqrt(lengths)[:, None, None]
-    return np.asarray(steps @ np.swapaxes(steps, 1, 2))
+    times, n, one = seen.times_s, len(seen), np.eye(len(v))
+    lengths = np.diff(times, prepend=times[0])
+    order = np.argsort(np.concatenate([times - 0.5 * lengths, times]), kind="stable")
+    place = np.argsort(order)
+    states, D = _followed(*about, np.sort(np.concatenate([times - 0.5 * lengths, times])), seen.arc)
+    density = np.sqrt(torque_density(to_state(about[0]).sigma, levels.torque))
+    push = np.zeros((DIM, 6))
+    push[W, :3], push[VEL, 3:] = np.diag(density), levels.force * np.eye(3)
+    for k in range(n):
+        x, J = states[place[n + k]], D[place[n + k]]
+        if lengths[k] > 0.0:
+            M = np.linalg.solve(D[place[k]][:, :DIM], push)
+            P[:DIM, :DIM] += lengths[k] * M @ M.T
+        theta = geometry.log(geometry.multiply(geometry.conjugate(seen.q[k]), x.T_ac.q))
+        d = np.concatenate([theta, geometry.matrix(seen.q[k]).T @ (x.T_ac.t - seen.t[k])])
+        e, rows = root[k] @ d, root[k] @ to_fixture(x.T_ac.q, x.q_bc) @ measurement_jacobian(x) @ J
+        weight = math.sqrt(1.0 / max(1.0, float(e @ e) / gate))
+        e, rows = weight * e, weight * rows
+        seen_by = rows @ P
+        K = np.linalg.solve(seen_by @ rows.T + np.eye(6), seen_by).T
+        left = one - K @ rows
+        v, P = v - K @ (e + rows @ v), left @ P @ left.T + K @ K.T
+    return v, P
 
 
-def _at(
-    chart: Chart, v: Array, P: Array, fitted: DrivenFit, epoch_ns: int, now_ns: int, orbit: RelativeOrbit | None
-) -> DrivenBelief:
-    """The belief at ``now_ns`` by initial values, acceleration and onset, with their covariance P (27, 27)."""
-    x0, u = to_state(chart), v[_U]
-    onset_s = float(np.clip(fitted.onset_s + v[_ONSET], 0.0, (now_ns - epoch_ns) * 1e-9))
-    x, Phi = propagate_state(x0, onset_s, fitted.poses.arc)
-    M = np.zeros((DIM + 6, _ONSET + 1))
-    M[:DIM, :DIM], M[_U, _U] = Phi @ to_errors(chart), np.eye(6)
-    M[W, _ONSET], M[VEL, _ONSET] = -np.array(drive_of(x, u)), -u[3:]
-    C = M @ P @ M.T
-    onset = DrivenBelief(epoch_ns + round(onset_s * 1e9), x, C[:DIM, :DIM], u, C[_U, _U], C[:DIM, _U])
-    there, _ = propagated(onset, now_ns, 0.0, 0.0, orbit)
-    if not isinstance(there, DrivenBelief):
-        raise AssertionError("a driven belief remains one")
-    return replace(there, P=definite(there.P))
+def _followed(
+    chart: Chart, u: Array, onset_s: float, times_s: Array, arc: OrbitArc | None
+) -> tuple[list[State], Array]:
+    """The states at ``times_s`` (n,) [s], ascending, and their derivatives (n, 20, 27) by chart steps, u and onset."""
+    first, T = int(np.searchsorted(times_s, onset_s, side="right")), to_errors(chart)
+    D = np.zeros((len(times_s), DIM, _ONSET + 1))
+    start = Belief(0, to_state(chart), np.eye(DIM))
+    states, Phi, _, _ = driven_steps(start, np.append(times_s[:first], onset_s), 0.0, arc)
+    D[:first, :, :DIM], at, until = Phi[:-1] @ T, states.pop(), Phi[-1] @ T
+    if first < len(times_s):
+        driven = DrivenBelief(0, at, np.eye(DIM), u, np.zeros((6, 6)), np.zeros((DIM, 6)))
+        arc = None if arc is None else arc.shifted(onset_s)
+        later, Phi, by_u, _ = driven_steps(driven, times_s[first:] - onset_s, 0.0, arc)
+        missed = np.zeros(DIM)  # per second by which the onset is later
+        missed[W], missed[VEL] = -np.array(drive_of(at, u)), -u[3:]
+        D[first:, :, :DIM], D[first:, :, _U], D[first:, :, _ONSET] = Phi @ until, by_u, Phi @ missed
+        states += later
+    return states, D
