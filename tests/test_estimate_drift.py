@@ -11,9 +11,11 @@ import tumbling
 
 from avsreplay import geometry
 from avsreplay.estimate.batch import FitParams
-from avsreplay.estimate.chart import INERTIA, to_chart, to_errors
-from avsreplay.estimate.drift import _NONE, _without, find_drift
-from avsreplay.estimate.dynamics import drift_equivalents, propagate_state
+from avsreplay.estimate.chart import INERTIA, nees, to_chart, to_errors
+from avsreplay.estimate.drift import DrivenHypothesis, find_drift
+from avsreplay.estimate.driven import DrivenBelief, drift_equivalents
+from avsreplay.estimate.driven_fit import driven_belief, without_drift
+from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import PoseFix, batch_estimate, poses_of
 from avsreplay.estimate.noise_levels import NO_LEVELS
 from avsreplay.estimate.params import EstimatorParams
@@ -33,10 +35,16 @@ def fixes_of(case: surprises.Case, seed: int, force: float = 0.0, onset_s: float
     return tuple(found)
 
 
-def found_in(fixes: tuple[PoseFix, ...], case: surprises.Case, seed: int):
+def found_in(
+    fixes: tuple[PoseFix, ...], case: surprises.Case, seed: int
+) -> tuple[DrivenHypothesis, DrivenBelief] | None:
+    """The most likely hypothesis of the test, and the belief at the last pose."""
     start = to_chart(surprises.world_of(case, seed)[1][0])
     found = find_drift(fixes, start, PARAMS, np.ones(2), (1e-3, 1e-3))
-    return None if found is None else found[0]
+    if found is None:
+        return None
+    best = found.hypotheses[0]
+    return best, driven_belief(best.fitted, best.onset_1s_s, found.widths, NO_LEVELS, fixes[0].t_ns, fixes[-1].t_ns)[0]
 
 
 @pytest.mark.parametrize("case", [surprises.Case("c"), surprises.Case("s", spin=2), surprises.Case("r", speed=1e-6)])
@@ -48,13 +56,14 @@ def test_free_motion_shows_no_drift(case: surprises.Case, seed: int) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_constant_force_is_found_with_its_onset(seed: int) -> None:
     case = surprises.Case("c", seconds=100.0)
-    drift = found_in(fixes_of(case, seed, force=2e-4, onset_s=50.0), case, seed)
-    assert drift is not None
-    assert abs(drift.t_ns * 1e-9 - 50.0) < 4.0 * drift.t_1s_s
-    off = drift.velocity - np.array([2e-4, 0.0, 0.0])
-    assert np.linalg.norm(off) < 0.25 * 2e-4 + 4.0 * np.sqrt(np.trace(drift.P[3:, 3:]))
-    assert np.linalg.norm(drift.velocity) > 10.0 * np.sqrt(np.trace(drift.P[3:, 3:]))
-    assert not drift.rate.any()
+    found = found_in(fixes_of(case, seed, force=2e-4, onset_s=50.0), case, seed)
+    assert found is not None
+    drift, belief = found
+    assert abs(drift.fitted.onset_s - 50.0) < 4.0 * drift.onset_1s_s
+    off = belief.u[3:] - np.array([2e-4, 0.0, 0.0])
+    assert np.linalg.norm(off) < 4.0 * np.sqrt(np.trace(belief.P_u[3:, 3:]))
+    assert np.linalg.norm(belief.u[3:]) > 10.0 * np.sqrt(np.trace(belief.P_u[3:, 3:]))
+    assert not belief.u[:3].any()
 
 
 def test_the_equivalent_error_is_that_of_the_integrated_motion() -> None:
@@ -110,6 +119,14 @@ def test_a_constant_torque_is_reported_and_tracked(monkeypatch: pytest.MonkeyPat
     assert result.track.manoeuvres == ()
     assert max(result.ratio[80:]) < 4.0
     assert result.violations == []
+    assert all(result.converged[-10:])
+    truth = surprises.world_of(case, 0)[1][-1]
+    belief = result.track.belief
+    assert isinstance(belief, DrivenBelief)
+    direction = surprises._direction(np.random.Generator(np.random.PCG64([0, 5])))
+    off = np.concatenate([geometry.matrix(truth.q_bc).T @ (1e-4 * direction), np.zeros(3)]) - belief.u
+    assert float(off[:3] @ np.linalg.solve(belief.P_u[:3, :3], off[:3])) < 21.1  # 99.99 % point, 3 degrees of freedom
+    assert nees(belief, truth) < 2.0 * 20
 
 
 @pytest.mark.parametrize("seed", [0, 2, 4])
@@ -145,11 +162,17 @@ def test_removing_a_drift_gives_the_poses_of_free_motion() -> None:
     fixes = tuple(PoseFix(round(t * 1e9), x.T_ac, np.eye(6)) for t, x in zip(times, states, strict=True))
     straight = surprises.world_of(free, 5)[1]
     direction = surprises._direction(np.random.Generator(np.random.PCG64([5, 5])))
-    found = replace(_NONE, u=np.concatenate([2e-4 * direction, np.zeros(3)]))
-    left = _without(poses_of(fixes), to_chart(states[0]), found)
+    about, u = (
+        to_chart(states[0]),
+        np.concatenate([geometry.matrix(states[0].q_bc).T @ (2e-4 * direction), np.zeros(3)]),
+    )
+    left = without_drift(poses_of(fixes), about, 0.0, u)
     moved, rest = (
         [geometry.angle(geometry.multiply(geometry.conjugate(a.T_ac.q), q)) for a, q in zip(straight, qs, strict=True)]
         for qs in ([x.T_ac.q for x in states], left.q)
     )
     assert max(moved) > 0.1
     assert max(rest) < 0.02 * max(moved)
+    again = without_drift(left, about, 0.0, u, back=True)
+    assert again.q == pytest.approx(poses_of(fixes).q, abs=1e-12)
+    assert again.t == pytest.approx(poses_of(fixes).t, abs=1e-12)

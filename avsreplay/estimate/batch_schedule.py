@@ -217,7 +217,7 @@ class BatchSchedule:
         inflation, belief = parts[0][1][1], driven_moments([(weight, each) for weight, (each, _) in parts])
         if not np.isfinite(belief.P).all():
             return track
-        onset_ns, spread = epoch_ns + round(best.fitted.onset_s * 1e9), best.onset_1s_s
+        onset_ns, spread = epoch_ns + round(best.fitted.onset_s * 1e9), found.onset_1s_s
         if onset_ns == epoch_ns:  # it may have acted before the first of these poses
             since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
             onset_ns, spread = onset_ns - since_ns, math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0))

@@ -77,21 +77,22 @@ def find_drift(
         if free.cost - frame.cost < _FOUND or not _constant(frame, free, levels, best, widths):
             return None
     within = _Onset(onsets, np.array([f.log_odds for f in found]))
-    later = DrivenHypothesis(frame, 1.0, within.spread_s)
+    later = DrivenHypothesis(frame, 1.0, within.spread_s if frame.onset_s else 0.0)
     if frame.onset_s == 0.0:
-        return DriftFound((later,), widths)
+        return DriftFound((later,), best.width * widths, within.spread_s)
     always, _, _ = _descended(poses, prior, factors, widths, frame, np.zeros(1))
     columns = drift_columns(frame.G, frame.points.times_s, frame.chart, best.onset_s)
     noise = _remaining_noise(frame, columns.reshape(-1, 6), best)
     odds = (_cost(always, poses) - _cost(frame, poses)) / noise + math.log(within.width_s / float(poses.times_s[-1]))
     share = 1.0 / (1.0 + math.exp(min(odds, 700.0)))
     both = DrivenHypothesis(always, share, 0.0), replace(later, weight=1.0 - share)
-    return DriftFound(tuple(h for h in sorted(both, key=lambda h: -h.weight) if h.weight > _NO_WEIGHT), widths)
+    likely = tuple(h for h in sorted(both, key=lambda h: -h.weight) if h.weight > _NO_WEIGHT)
+    return DriftFound(likely, best.width * widths, within.spread_s)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DrivenHypothesis:
-    """The fit with a drift since some instant, its posterior probability, and the 1 sigma of the instant [s]."""
+    """The fit with a drift since some instant, its probability, and the 1 sigma of the instant [s], 0 for the epoch."""
 
     fitted: DrivenFit
     weight: float
@@ -100,21 +101,30 @@ class DrivenHypothesis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriftFound:
-    """A drift, the most likely hypothesis on its onset first, and the prior 1 sigma (6,) of its size."""
+    """A drift.
+
+    Attributes:
+        hypotheses: on its onset, the most likely first.
+        widths: (6,) prior 1 sigma of its size.  onset_1s_s: 1 sigma of the onset over all instants that were tried [s].
+    """
 
     hypotheses: tuple[DrivenHypothesis, ...]
     widths: Array
+    onset_1s_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """Log odds of a drift from ``onset_s`` on, its most likely size u (6,) with covariance P, and the fit's step y."""
+    """Log odds of a drift since ``onset_s``, its most likely size u (6,), the fit's step y, and its most likely prior.
+
+    ``width`` is the 1 sigma of that prior over the given one.
+    """
 
     log_odds: float
     onset_s: float
     u: Array
-    P: Array
     y: Array
+    width: float
 
 
 _NO_DRIFT = np.zeros(6)
@@ -250,9 +260,9 @@ def _explained(linear: DrivenFit, columns: Array, onsets: Array, widths: Array, 
         for k, known in enumerate(best):
             if known is not None and known.log_odds >= odds[k]:
                 continue
-            u, P = np.zeros(6), np.zeros((6, 6))
-            u[kind], P[kind, kind] = scaled * v[k], np.outer(scaled, scaled) * own[k]
-            best[k] = _Found(float(odds[k]), float(onsets[k]), u, P, -solve @ (g + cross[k] @ u))
+            u = np.zeros(6)
+            u[kind] = scaled * v[k]
+            best[k] = _Found(float(odds[k]), float(onsets[k]), u, -solve @ (g + cross[k] @ u), width)
     return [found for found in best if found is not None]
 
 

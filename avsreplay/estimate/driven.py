@@ -182,7 +182,7 @@ def driven_moments(parts: Sequence[tuple[float, DrivenBelief]]) -> DrivenBelief:
     for (weight, each), d in zip(parts, off, strict=True):
         own = np.block([[each.P, each.cross], [each.cross.T, each.P_u]])
         P += weight * (own + np.outer(d - mean, d - mean))
-    x = to_state(here.moved(np.linalg.solve(T, mean[:DIM])))
+    x = to_state(here.moved(np.asarray(np.linalg.solve(T, mean[:DIM]), dtype=np.float64)))
     return DrivenBelief(first.t_ns, x, P[:DIM, :DIM], first.u + mean[DIM:], P[DIM:, DIM:], P[:DIM, DIM:])
 
 
