@@ -12,7 +12,7 @@ scans after it.
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, takewhile
 
@@ -193,11 +193,18 @@ def _members(marks: Sequence[Mark], labels: Sequence[Label]) -> list[list[int]]:
     """Rows of each label: those of its kind to whose stamp its window is the nearest (a fault may shift stamps)."""
     out: list[list[int]] = [[] for _ in labels]
     kinds: dict[str | None, list[int]] = {}
-    for i, label in enumerate(labels):
+    for i, label in sorted(enumerate(labels), key=lambda item: item[1].start_ns):
         kinds.setdefault(label.kind, []).append(i)
+    starts = {kind: [labels[i].start_ns for i in same] for kind, same in kinds.items()}
+    apart = {
+        kind: all(labels[i].end_ns < labels[j].start_ns for i, j in pairwise(same)) for kind, same in kinds.items()
+    }
     for k, mark in enumerate(marks):
         if same := kinds.get(mark.fault):
-            out[min(same, key=lambda i: _distance(labels[i], mark.t_ns))].append(k)
+            place = bisect_right(starts[mark.fault], mark.t_ns)
+            # of windows that do not overlap only the neighbours of the stamp can be the nearest
+            near = same[max(place - 1, 0) : place + 1] if apart[mark.fault] else same
+            out[min(near, key=lambda i: (_distance(labels[i], mark.t_ns), i))].append(k)
     return out
 
 
@@ -216,9 +223,13 @@ def _episode(
     own = [marks[k] for k in rows]
     flagged = [m for m in own if m.gamma == 0]
     missing = not rows and any(a <= label.end_ns and label.start_ns <= b for a, b in holes)
-    after = marks[rows[-1] + 1 if rows else bisect_right(marks, label.end_ns, key=lambda m: m.t_ns) :]
-    recover_scans, recover_s = _first((m for m in after if m.fault is None), gamma=1)
-    lost = recover_scans is None and any(m.fault is None for m in after)
+    behind = rows[-1] + 1 if rows else bisect_right(marks, label.end_ns, key=lambda m: m.t_ns)
+
+    def after() -> Iterator[Mark]:
+        return (marks[k] for k in range(behind, len(marks)))
+
+    recover_scans, recover_s = _first((m for m in after() if m.fault is None), gamma=1)
+    lost = recover_scans is None and any(m.fault is None for m in after())
     if not flagged and not missing and recover_scans == 0:
         recover_scans = recover_s = None  # there was nothing to recover from
     delay_scans, delay_s = _first(own, gamma=0)
@@ -238,7 +249,7 @@ def _episode(
         lost=lost,
         peak_flagged=Peak.of(flagged),
         peak_used=Peak.of(m for m in own if m.gamma == 1),
-        peak_after=Peak.of(m for m in _until_next(after, next_ns) if m.gamma == 1),
+        peak_after=Peak.of(m for m in _until_next(after(), next_ns) if m.gamma == 1),
     )
 
 
@@ -252,7 +263,7 @@ def _first(marks: Iterable[Mark], gamma: int) -> tuple[int, float] | tuple[None,
     return None, None
 
 
-def _until_next(marks: Sequence[Mark], next_ns: int | None) -> Iterable[Mark]:
+def _until_next(marks: Iterable[Mark], next_ns: int | None) -> Iterable[Mark]:
     """The first of ``marks`` up to a label; one that begins at ``next_ns`` may have left no scan."""
     return takewhile(lambda m: m.fault is None and (next_ns is None or m.t_ns < next_ns), marks)
 

@@ -6,12 +6,16 @@ correctly rounded, so the summary does not depend on their order. The speed in s
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from itertools import compress, pairwise, repeat
+from operator import attrgetter, not_
+from typing import Any
 
+import numpy as np
+
+from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, Label, State
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
 from avsreplay.report.summary_parts import (
@@ -31,6 +35,11 @@ NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 deg
 NIS_LIMIT = 27.8563  # 99.99 % point of chi-square with 6 degrees of freedom, above which a pose gets a smaller weight
 BLOCK_BANDS = {2: (0.05064, 7.3778), 3: (0.2158, 9.3484)}  # the same with 2 and 3
 NEES_BAND = (9.5908, 34.1696)  # the same with 20
+_BY_STATE = ("pos_err_m", "rot_err_deg", "reg_pos_err_m", "reg_rot_err_deg", "nis", "rms_m", "iterations")
+_OF_ALL = ("nees", *(f"nees_{name}" for name in BLOCKS))
+_STATES = ("t_ns", "t_s", "gamma", "fault", "status", "reason", "cauchy_weight", "reference", "ogm_rank", "converged")
+_TAKEN = (*_STATES, *_BY_STATE, *_OF_ALL)
+_OF_ROW = attrgetter(*_TAKEN)
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,15 +171,8 @@ class SummaryFold:
         counts: Mapping[str, int] | None = None,
     ) -> None:
         self._labels, self._truth, self._counts = labels, truth, dict(counts or {})
-        self._marks: list[Mark] = []
-        self._values: dict[str, list[float]] = {}
-        self._status: Counter[str] = Counter()
-        self._reasons: Counter[str] = Counter()
+        self._taken: list[tuple[Any, ...]] = []
         self._last: Row | None = None
-        self._reference: str | None = None
-        self._full_rank_s: float | None = None
-        self._t1_s: float | None = None
-        self._withdrawn = self._weighed_down = 0
         self._changes: tuple[VelocityChange, ...] = ()
         self._capture = CaptureFold()
 
@@ -183,46 +185,20 @@ class SummaryFold:
 
     def add(self, row: Row) -> None:
         """Take the next row."""
-        self._marks.append(Mark(row.t_ns, row.gamma, row.fault, row.pos_err_m, row.rot_err_deg))
-        self._status[row.status] += 1
-        if row.gamma == 0:
-            self._reasons[row.reason] += 1
-        elif row.cauchy_weight is not None and row.cauchy_weight < 1.0:
-            self._weighed_down += 1
-        self._add_errors(row)
-        self._add_milestones(row)
-        self._last = row
-
-    def _add_errors(self, row: Row) -> None:
-        state = "healthy" if row.gamma == 1 else "coasting"
-        for name in ("pos_err_m", "rot_err_deg", "reg_pos_err_m", "reg_rot_err_deg", "nis", "rms_m", "iterations"):
-            self._keep(f"{name}/{state}", getattr(row, name))
-        self._keep("nees", row.nees)
-        for name, block in BLOCKS.items():
-            value = getattr(row, f"nees_{name}")
-            self._keep(f"nees_{name}", None if value is None else value / (block.stop - block.start))
-        self._reference = row.reference or self._reference
-
-    def _keep(self, name: str, value: float | None) -> None:
-        if value is not None and math.isfinite(value):
-            self._values.setdefault(name, []).append(float(value))
-
-    def _add_milestones(self, row: Row) -> None:
-        if self._full_rank_s is None and row.ogm_rank == 20:
-            self._full_rank_s = row.t_s
-        if self._t1_s is None and row.converged:
-            self._t1_s = row.t_s
-        if self._last is not None and self._last.converged and not row.converged:
-            self._withdrawn += 1
+        self._taken.append(_OF_ROW(row))
         self._changes = with_manoeuvre(self._changes, row)
         self._capture.add(row)
+        self._last = row
 
     def result(self, truth: State | None = None) -> Summary:
         """The summary of all rows so far; ``truth`` in place of the one given at the start."""
-        stamps = [m.t_ns for m in self._marks]
+        taken = dict(zip(_TAKEN, zip(*self._taken, strict=True) if self._taken else repeat(()), strict=False))
+        marks = list(map(Mark, *(taken[name] for name in ("t_ns", "gamma", "fault", "pos_err_m", "rot_err_deg"))))
+        stamps, times_s, flagged = taken["t_ns"], taken["t_s"], [gamma == 0 for gamma in taken["gamma"]]
         steps = [b - a for a, b in pairwise(stamps) if b > a]
         last = self._last
-        healthy = sum(m.gamma == 1 for m in self._marks)
+        healthy = taken["gamma"].count(1)
+        figures = _figures(taken)
         return Summary(
             scans=len(stamps),
             duration_s=(max(stamps) - min(stamps)) * 1e-9 if stamps else 0.0,
@@ -230,63 +206,82 @@ class SummaryFold:
             healthy=healthy,
             coasting=len(stamps) - healthy,
             gaps=len(gaps(stamps)),
-            status=dict(sorted(self._status.items())),
-            reasons=dict(sorted(self._reasons.items())),
-            pose_all=self._errors("", "healthy", "coasting"),
-            pose_healthy=self._errors("", "healthy"),
-            pose_coasting=self._errors("", "coasting"),
-            registration_healthy=self._errors("reg_", "healthy"),
-            registration_flagged=self._errors("reg_", "coasting"),
-            fit_error_m=Statistics.of(self._values.get("rms_m/healthy", [])),
-            iterations=Statistics.of(self._values.get("iterations/healthy", [])),
-            faults=account(self._marks, self._labels),
-            coasts=tuple(coasts(self._marks)),
+            status=dict(sorted(Counter(taken["status"]).items())),
+            reasons=dict(sorted(Counter(compress(taken["reason"], flagged)).items())),
+            pose_all=_errors(figures, "", "healthy", "coasting"),
+            pose_healthy=_errors(figures, "", "healthy"),
+            pose_coasting=_errors(figures, "", "coasting"),
+            registration_healthy=_errors(figures, "reg_", "healthy"),
+            registration_flagged=_errors(figures, "reg_", "coasting"),
+            fit_error_m=Statistics.of(figures["rms_m/healthy"]),
+            iterations=Statistics.of(figures["iterations/healthy"]),
+            faults=account(marks, self._labels),
+            coasts=tuple(coasts(marks)),
             parameters=parameters(last, truth or self._truth) if last else (),
             sigma_hits=last.sigma_hits if last else None,
             r_floors=last.r_floors if last else None,
-            weighed_down=self._weighed_down,
+            weighed_down=sum(w is not None and w < 1.0 for w in compress(taken["cauchy_weight"], map(not_, flagged))),
             reinitialised=last.reinitialised if last else None,
             manoeuvres=last.manoeuvres if last else None,
             velocity_changes=self._changes,
             drift=Drifting.of(last) if last else None,
             violations=last.violations if last else None,
-            nis=_share(self._values.get("nis/healthy", []), NIS_BAND),
-            nees=_share(self._values.get("nees", []), NEES_BAND),
-            nees_blocks=self._blocks(),
-            reference=self._reference,
-            observability=self._observability(),
-            convergence=ConvergenceSummary(self._t1_s, bool(last and last.converged), self._withdrawn),
+            nis=_share(figures["nis/healthy"], NIS_BAND),
+            nees=_share(figures["nees"], NEES_BAND),
+            nees_blocks=_blocks(figures),
+            reference=next(filter(None, reversed(taken["reference"])), None),
+            observability=_observability(last, next(compress(times_s, map((20).__eq__, taken["ogm_rank"])), None)),
+            convergence=ConvergenceSummary(
+                t1_s=next(compress(times_s, taken["converged"]), None),
+                at_end=bool(last and last.converged),
+                withdrawn=sum(a and not b for a, b in pairwise(taken["converged"])),
+            ),
             capture=self._capture.result(),
             counts=self._counts,
         )
 
-    def _blocks(self) -> dict[str, Share]:
-        """NEES of each block of the state and its band, per degree of freedom."""
-        out: dict[str, Share] = {}
-        for name, block in BLOCKS.items():
-            size = block.stop - block.start
-            low, high = (bound / size for bound in BLOCK_BANDS[size])
-            share = _share(self._values.get(f"nees_{name}", []), (low, high))
-            if share is not None:
-                out[name] = share
-        return out
 
-    def _errors(self, prefix: str, *states: str) -> Errors:
-        position, rotation = (
-            [v for state in states for v in self._values.get(f"{prefix}{name}/{state}", [])]
-            for name in ("pos_err_m", "rot_err_deg")
-        )
-        return Errors(Statistics.of(position), Statistics.of(rotation))
-
-    def _observability(self) -> ObservabilitySummary:
-        row = self._last
-        if row is None:
-            return ObservabilitySummary(None, None, None, None)
-        return ObservabilitySummary(row.ogm_log10_cond, row.ogm_log10_cond_scaled, row.ogm_rank, self._full_rank_s)
+def _figures(taken: Mapping[str, Sequence[Any]]) -> dict[str, Array]:
+    """The finite values of each figure, of those in ``_BY_STATE`` apart for healthy and coasting scans."""
+    healthy, out = np.equal(taken["gamma"], 1), {}
+    for name in (*_BY_STATE, *_OF_ALL):
+        column = np.array(taken[name], dtype=np.float64)
+        known = np.isfinite(column)
+        if name in _BY_STATE:
+            out[f"{name}/healthy"], out[f"{name}/coasting"] = column[known & healthy], column[known & ~healthy]
+        else:
+            out[name] = column[known]
+    return out
 
 
-def _share(values: Sequence[float], band: tuple[float, float]) -> Share | None:
-    if not values:
+def _observability(last: Row | None, full_rank_s: float | None) -> ObservabilitySummary:
+    if last is None:
+        return ObservabilitySummary(None, None, None, None)
+    return ObservabilitySummary(last.ogm_log10_cond, last.ogm_log10_cond_scaled, last.ogm_rank, full_rank_s)
+
+
+def _errors(figures: Mapping[str, Array], prefix: str, *states: str) -> Errors:
+    position, rotation = (
+        np.concatenate([figures[f"{prefix}{name}/{state}"] for state in states])
+        for name in ("pos_err_m", "rot_err_deg")
+    )
+    return Errors(Statistics.of(position), Statistics.of(rotation))
+
+
+def _blocks(figures: Mapping[str, Array]) -> dict[str, Share]:
+    """NEES of each block of the state and its band, per degree of freedom."""
+    out: dict[str, Share] = {}
+    for name, block in BLOCKS.items():
+        size = block.stop - block.start
+        low, high = (bound / size for bound in BLOCK_BANDS[size])
+        share = _share(figures[f"nees_{name}"] / size, (low, high))
+        if share is not None:
+            out[name] = share
+    return out
+
+
+def _share(values: Array, band: tuple[float, float]) -> Share | None:
+    if not len(values):
         return None
-    inside = sum(band[0] <= v <= band[1] for v in values) / len(values)
+    inside = int(np.count_nonzero((band[0] <= values) & (values <= band[1]))) / len(values)
     return Share(len(values), median(values), inside, *band)

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from avsreplay import geometry
 from avsreplay.records import State
@@ -140,20 +141,21 @@ class Statistics:
     max: float
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Statistics | None:
-        """Statistics of ``values``; None without any value."""
-        if not values:
+    def of(cls, values: ArrayLike) -> Statistics | None:
+        """Statistics of ``values`` (n,); None without any value."""
+        array = np.asarray(values, dtype=np.float64)
+        n = len(array)
+        if not n:
             return None
-        n = len(values)
-        mean = math.fsum(values) / n
-        rmse = math.sqrt(math.fsum(v * v for v in values) / n)
-        std = math.sqrt(math.fsum((v - mean) ** 2 for v in values) / n)
-        return cls(n, rmse, mean, median(values), std, min(values), max(values))
+        mean = math.fsum(array.tolist()) / n
+        rmse, std = (math.sqrt(math.fsum((part * part).tolist()) / n) for part in (array, array - mean))
+        return cls(n, rmse, mean, median(array), std, float(array.min()), float(array.max()))
 
 
-def median(values: Sequence[float]) -> float:
-    """The middle value, or the mean of the two middle values; ``values`` must not be empty."""
-    ordered, half = sorted(values), len(values) // 2
+def median(values: ArrayLike) -> float:
+    """The middle value, or the mean of the two middle values; ``values`` (n,) must not be empty."""
+    ordered: list[float] = np.sort(np.asarray(values)).tolist()
+    half = len(ordered) // 2
     return ordered[half] if len(ordered) % 2 else 0.5 * (ordered[half - 1] + ordered[half])
 
 

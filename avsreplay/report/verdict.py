@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from heapq import nlargest
 from itertools import chain, groupby
 from typing import Any
 
@@ -287,12 +288,12 @@ def _robot(header: Mapping[str, Any]) -> str:
 
 def worst_moments(rows: Sequence[Row]) -> list[Moment]:
     """The five worst intervals: without a used scan, or with an error or NIS that stands out; no two overlap."""
-    found = [moment for _, moment in sorted(_moments(rows), key=lambda item: -item[0])]
     kept: list[Moment] = []
-    for moment in found:
-        if all(moment.end_s < other.start_s or other.end_s < moment.start_s for other in kept):
+    for _, moment in sorted(_moments(rows), key=lambda item: -item[0]):
+        apart = (moment.end_s < other.start_s or other.end_s < moment.start_s for other in kept)
+        if len(kept) < MOMENTS and all(apart):
             kept.append(moment)
-    return kept[:MOMENTS]
+    return kept
 
 
 def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
@@ -316,8 +317,7 @@ def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
 
 
 def _largest(rows: Sequence[Row], places: Sequence[int], column: str) -> list[tuple[float, int]]:
-    known = [(value, k) for k in places if (value := getattr(rows[k], column)) is not None]
-    return sorted(known, reverse=True)[:MOMENTS]
+    return nlargest(MOMENTS, ((value, k) for k in places if (value := getattr(rows[k], column)) is not None))
 
 
 def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, Moment]:
