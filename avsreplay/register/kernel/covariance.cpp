@@ -12,8 +12,8 @@ namespace {
 constexpr double DOMINANT = 0.5;            // a patch with more than this share of the information on a motion is left out
 constexpr int64_t LEAST_POINTS = 6;         // no patch is left out where fewer points would remain
 constexpr double ALONE = 1e-9;              // keeps a motion finite that only one patch determines
-constexpr double SMALL = 0.1;               // trace below which the power series of (I - A)^-1/2 is used
-constexpr int TERMS = 8;                    // of the series: an error below 1e-9
+constexpr double SMALL = 0.6;               // trace below which the power series of (I - A)^-1/2 is used
+constexpr double LEAST_TERM = 1e-12;        // the series ends with terms below this
 constexpr int64_t LEAST_HALF = 12;          // patches that each half of a split needs
 constexpr double WORST_CONDITION = 1e8;     // of the scaled information of a half
 constexpr double LEAST_DOF = 12, MOST_DOF = 1e6;  // of an estimated covariance
@@ -41,18 +41,24 @@ Six congruence(const Six& W, const Six& B) {
   return A;
 }
 
-// Largest eigenvalue of W' N_p W, if its trace exceeds DOMINANT; the trace bounds it.
-double share(const double* Np, const Six& W) {
+// Whether an eigenvalue of W' N_p W exceeds DOMINANT. Their sum is the trace. Where that does not decide, DOMINANT I - W' N_p W
+// is factorised: all eigenvalues are below DOMINANT where every pivot is positive.
+bool dominates(const double* Np, const Six& W) {
   const Six B = product(Np, W);
   double trace = 0;
   for (int j = 0; j < 6; ++j)
     for (int k = 0; k < 6; ++k) trace += W.v[k][j] * B.v[k][j];
-  if (!(trace > DOMINANT)) return trace;
-  Six A = congruence(W, B), V;
-  eigen(A.v, V.v, 6, 1e-32);
-  double largest = 0;
-  for (int k = 0; k < 6; ++k) largest = std::max(largest, A.v[k][k]);
-  return largest;
+  if (!(trace > DOMINANT)) return false;
+  Six L = congruence(W, B);
+  for (int i = 0; i < 6; ++i)
+    for (int j = 0; j < 6; ++j) L.v[i][j] = (i == j ? DOMINANT : 0) - L.v[i][j];
+  for (int j = 0; j < 6; ++j) {
+    const double pivot = L.v[j][j];
+    if (!(pivot > 0)) return true;
+    for (int i = j + 1; i < 6; ++i)
+      for (int k = j + 1; k <= i; ++k) L.v[i][k] -= L.v[i][j] * L.v[k][j] / pivot;
+  }
+  return false;
 }
 
 // Root W of the pseudo-inverse of N: N^+ = W W'.
@@ -76,7 +82,8 @@ std::array<double, 6> reduced(const double* Np, const Six& W, std::array<double,
   for (int i = 0; i < 6; ++i) trace += A.v[i][i];
   std::array<double, 6> out = x, term = x;
   if (trace < SMALL) {
-    for (int n = 1; n <= TERMS; ++n) {
+    double largest = trace;  // of the powers of A
+    for (int n = 1; largest > LEAST_TERM; ++n, largest *= trace) {
       std::array<double, 6> next{};
       for (size_t i = 0; i < 6; ++i) {
         for (size_t k = 0; k < 6; ++k) next[i] += A.v[i][k] * term[k];
@@ -258,7 +265,7 @@ void drop_dominant(const double* normals, const int64_t* counts, int64_t m, uint
     int64_t points = 0, dropped = 0;
     for (int64_t k = 0; k < m; ++k) {
       if (!keep[k]) continue;
-      if (share(normals + 36 * k, W) > DOMINANT) {
+      if (dominates(normals + 36 * k, W)) {
         left[(size_t)k] = 0, ++dropped;
         continue;
       }
