@@ -132,7 +132,7 @@ class Registrar:
         few = self._restarter.part(target)
         whole: SearchResult | None = None
         results: list[Alignment] = []
-        for part, number in islice(attempts(target, self._target.surface.extent), rounds):
+        for part, number in islice(attempts(target, self._index.extent_m), rounds):
             work = self._global.work(len(part), number)
             if results and not budget.allows(work):
                 break
@@ -237,7 +237,7 @@ class Registrar:
 
         DEGENERATE in the motions that the guess leaves unknown, if other poses explain the scan as well.
         """
-        unknown = motions_outside(unknown, found.free, self._target.surface.extent)
+        unknown = motions_outside(unknown, found.free, self._index.extent_m)
         unsure, accepted = unknown.size > 0, found.status in (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
         if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.near:
             return found
@@ -270,7 +270,7 @@ class Registrar:
         few, budget = self._restarter.part(scan), Budget(len(scan), effort)
         budget.registered(first)
         kept = self._restarter.measure(few, first.T_ac.inverse())
-        hopeful = first.measured and kept.noise_m <= NOISE_OF_EXTENT * self._target.surface.extent
+        hopeful = first.measured and kept.noise_m <= NOISE_OF_EXTENT * self._index.extent_m
         final = self._regraded(scan, few, kept, budget, halves, carried) if hopeful else first
         reason = self._reason(few, final, budget)
         if not (reason or self._restarter.doubtful(few, guess, final)):

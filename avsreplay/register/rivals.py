@@ -154,7 +154,7 @@ class NearSymmetry:
             return T_ca, []
         found = [self._measured(rays, pose) for pose in (T_ca, *(others or ()), *turned)]
         noise, best = self._search.noise_of(found), found[0]
-        width = max(NEAR * self._target.surface.extent, 3.0 * noise)
+        width = max(NEAR * self._target.index.extent_m, 3.0 * noise)
         for each in found[1:]:
             best = each if decides(each, best, width, complete) else best
         margin = self._search.margin(noise)
@@ -192,7 +192,7 @@ class NearSymmetry:
                 return None
             direction, centre = theta / size, centre + np.cross(theta, x[3:]) / size**2
             turns = revolved(direction, centre, TURNS)[list(GENERIC_TURNS)]
-            width = REVOLVED * self._target.surface.extent
+            width = REVOLVED * self._target.index.extent_m
             on = np.all(self._distances(points, turns, width) < width, axis=0)
             if on.mean() < 0.5:
                 return None
