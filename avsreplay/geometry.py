@@ -36,8 +36,7 @@ def frozen(values: ArrayLike, *shape: int) -> Array:
     return array
 
 
-IDENTITY_QUAT = frozen([0.0, 0.0, 0.0, 1.0])
-_CONJUGATE = frozen([-1.0, -1.0, -1.0, 1.0])
+IDENTITY_QUAT, _CONJUGATE = frozen([0.0, 0.0, 0.0, 1.0]), frozen([-1.0, -1.0, -1.0, 1.0])
 
 
 def skew(v: ArrayLike) -> Array:
@@ -230,12 +229,10 @@ def log(q: ArrayLike) -> Array:
     Returns:
         (..., 3) rotation vectors [rad] with an angle in [0, pi].
     """
-    unit = normalise(q)
-    v, w = unit[..., :3], unit[..., 3:]
+    v, w = np.split(normalise(q), [3], axis=-1)
     norm = np.linalg.norm(v, axis=-1, keepdims=True)
     small = norm < 1e-8
-    scale = np.where(small, 2.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm))
-    return np.asarray(scale * v)
+    return np.asarray(np.where(small, 2.0, 2.0 * np.arctan2(norm, w) / np.where(small, 1.0, norm)) * v)
 
 
 def angle(q: ArrayLike) -> Array:
@@ -274,8 +271,7 @@ def across(axis: Array) -> Array:
 
 def bounding_diagonal(points: ArrayLike) -> float:
     """Return the diagonal [m] of the bounding box of points (n, 3) [m]."""
-    columns = np.ascontiguousarray(np.asarray(points).T)  # along rows of three numpy takes 25 times as long
-    return float(np.linalg.norm(np.ptp(columns, axis=1)))
+    return float(np.linalg.norm(np.ptp(np.ascontiguousarray(np.asarray(points).T), axis=1)))  # numpy is slow along rows
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,11 +287,7 @@ class Pose:
     t: Array
 
     def __post_init__(self) -> None:
-        q = normalise(self.q)  # an array of its own
-        if q.shape != (4,):
-            raise ValueError(f"expected shape (4,), got {q.shape}")
-        q.setflags(write=False)
-        object.__setattr__(self, "q", q)
+        object.__setattr__(self, "q", frozen(normalise(self.q), 4))
         object.__setattr__(self, "t", frozen(self.t, 3))
 
     @classmethod
