@@ -297,7 +297,7 @@ def test_a_damaged_line_costs_its_own_run_only(campaign, reference, tmp_path):
     path.write_bytes(lines[0] + lines[1].replace(b"ok", b"oK", 1) + b"".join(lines[2:]))
     done = sweep(campaign, tmp_path / "out", "--workers", "0")
     assert done.exit_code == 0, done.output
-    assert "1 damaged lines of the journal were moved" in done.output
+    assert "1 damaged line of the journal was moved" in done.output
     assert sorted(path.read_bytes().splitlines(keepends=True)) == sorted(lines)
     assert path.read_bytes().splitlines(keepends=True)[:-1] == [lines[0], *lines[2:]]
     assert results(tmp_path / "out") == reference

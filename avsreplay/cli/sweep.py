@@ -118,11 +118,13 @@ def sweep_command(
 def _report_damage(journal: Journal) -> None:
     """Print which runs are made again because their results were damaged."""
     again = journal.check_scans()
-    if journal.damaged:
-        what = f"{len(journal.damaged)} damaged lines of the journal were moved to {journal.folder / 'journal.damaged'}"
-        click.echo(f"avsreplay: {what}; their runs are made again", err=True)
+    if count := len(journal.damaged):
+        what = "1 damaged line of the journal was" if count == 1 else f"{count} damaged lines of the journal were"
+        where = journal.folder / "journal.damaged"
+        click.echo(f"avsreplay: {what} moved to {where}; what they held is made again", err=True)
     if again:
-        click.echo(f"avsreplay: the scans of {again} runs are damaged or missing; these runs are made again", err=True)
+        runs = "1 run are damaged or missing; it is" if again == 1 else f"{again} runs are damaged or missing; they are"
+        click.echo(f"avsreplay: the scans of {runs} made again", err=True)
 
 
 def _report_failures(summary: SweepSummary, journal: Journal, output: Path) -> None:
