@@ -254,6 +254,21 @@ def test_fit_is_the_optimum_from_any_side() -> None:
     assert Problem(poses, prior, fitted.effective).cost(to_chart(world.states[0])) > fitted.half_chi2
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3, 4])
+def test_a_bent_valley_of_the_cost_is_followed_to_its_minimum_in_few_steps(seed: int) -> None:
+    """Without the second-order part of a step some of these fits take more than 40 steps, or end before the minimum."""
+    fixes, work = seen(tumbling.draw(seed, seconds=30.0), seed, 1e-4, 0.01), 0
+    chart = to_chart(rough_state(fixes))
+    for count in (5, 9, 15, 25, 40, 60):
+        poses = poses_of(fixes[:count])
+        prior = weak_prior(poses, WHITE)
+        fitted = fit(poses, chart, prior, FitParams(rescale=False))
+        chart, work = fitted.chart, max(work, fitted.steps)
+        A, b = Problem(poses, prior, fitted.effective, chart).core.normal()
+        assert b @ np.linalg.solve(A, b) < 0.01
+    assert work <= 20
+
+
 def test_false_poses_are_weighted_down() -> None:
     world = tumbling.draw(4)
     fixes = list(seen(world, 4))

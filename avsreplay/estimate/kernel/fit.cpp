@@ -9,6 +9,8 @@ namespace {
 
 constexpr double GATE = 27.86;  // 99.99 % point of chi-square with 6 degrees of freedom, as in noise.py
 constexpr double DERIVATIVE_TAIL = 1e-7;  // relative error of the Jacobian by one piece of the flow
+constexpr double DIFFERENCE = 0.1;  // part of a step for the second derivative along it
+constexpr double MOST_BENT = 0.14;  // square of the second-order part of a step over that of the first: (0.75 / 2)^2
 constexpr double LARGEST_RADPS = 0.5;  // a step that changes the rate by more than this plus the rate itself is not tried
 
 double dot(const double* a, const double* b, int n) {
@@ -269,6 +271,40 @@ void Problem::normal(Square A, double b[DIM]) const {
   }
 }
 
+// The second-order part of a step of the damped normal equations M (Transtrum and Sethna, arXiv:1201.5885): a =
+// -1/2 M^-1 J' r'', r'' the second derivative of the residuals along the step, by a finite difference. A descent along
+// a bent valley of the cost takes far fewer steps with it. Returns whether the step with it remains a small correction.
+bool Problem::bent(const Square M, const Square A, double step[DIM], std::vector<double>& trial) const {
+  double part[DIM], along[DIM] = {}, g[DIM] = {}, a[DIM] = {}, sizes[2] = {}, e[SEEN];
+  for (int r = 0; r < DIM; ++r) part[r] = DIFFERENCE * step[r];
+  if (!std::isfinite(trial_cost(moved(at, part), trial.data()))) return false;
+  for (int r = 0; r < DIM; ++r)
+    for (int c = 0; c < DIM; ++c) along[r] += T[r][c] * step[c];
+  Rows H;
+  for (size_t k = 0; k < poses.size(); ++k) {
+    whitened(k, e, H);
+    double second[SEEN];
+    for (int i = 0; i < SEEN; ++i) {
+      const size_t row = SEEN * k + i;
+      second[i] = 2 / DIFFERENCE * ((trial[row] - d[row]) / DIFFERENCE - dot(&J[DIM * row], along, DIM));
+    }
+    const double w = std::sqrt(weights[k]);
+    for (int r = 0; r < SEEN; ++r) {
+      double one = 0;
+      for (int i = 0; i <= r; ++i) one += w * poses[k].root[r][i] / factors[i >= 3] * second[i];
+      for (int c = 0; c < DIM; ++c) g[c] += H[r][c] * one;
+    }
+  }
+  for (int i = 0; i < DIM; ++i)
+    for (int r = 0; r < DIM; ++r) a[r] -= 0.5 * T[i][r] * g[i];
+  solve(M, a);
+  for (int r = 0; r < DIM; ++r) {
+    sizes[0] += A[r][r] * step[r] * step[r], sizes[1] += A[r][r] * a[r] * a[r];
+    step[r] += a[r];
+  }
+  return sizes[1] <= MOST_BENT * sizes[0];
+}
+
 bool Problem::descend(int most, double gain_tol, int& steps) {
   double damping = 1e-3;
   Square A, M;
@@ -283,9 +319,10 @@ bool Problem::descend(int most, double gain_tol, int& steps) {
     double expected = dot(step, b, DIM);
     for (int r = 0; r < DIM; ++r) expected -= 0.5 * step[r] * dot(A[r], step, DIM);
     const double turning = std::sqrt(dot(at.w.x, at.w.x, 3)), change = std::sqrt(dot(step + 3, step + 3, 3));
-    const bool tried = change <= LARGEST_RADPS + turning;
-    const Chart there = tried ? moved(at, step) : at;
+    bool tried = change <= LARGEST_RADPS + turning;
     const bool last = std::fabs(expected) < gain_tol && tried;
+    if (tried && !last) tried = bent(M, A, step, trial);
+    const Chart there = tried ? moved(at, step) : at;
     const double gain = tried ? cost - trial_cost(there, last ? trial.data() : nullptr) : 0;
     ++steps;
     if (last) {  // so short a step that the Jacobian is kept

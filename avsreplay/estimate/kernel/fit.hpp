@@ -66,6 +66,7 @@ class Problem {
               double force_density) const;
 
  private:
+  bool bent(const Square M, const Square A, double step[DIM], std::vector<double>& trial) const;
   double residual(const Measured& pose, const State& x, const Turn& turn, double d[SEEN]) const;
   double robust(double chi2, double* weight) const;
   double penalty(const Chart& chart) const;
