@@ -339,3 +339,12 @@ def test_a_bound_on_the_capture_that_a_plan_keeps_neither_hides_it_nor_reveals_a
     assert bounded.found
     assert bounded.t_go_s >= earliest_s - 1e-9
     assert alone.t_go_s <= 1.05 * bounded.t_go_s
+
+
+def test_a_late_capture_of_a_target_that_turns_far_is_found():
+    """The coarse intervals are short enough for the turn of the target until the earliest capture that is allowed."""
+    problem, limits = problems(22, 1)[21], Limits(final_deg=15.0, clearance_m=0.3)
+    params = PlanParams(a_max_mps2=0.05, latency_s=0.5)
+    plan = constrained(problem.scene, problem.r0, ORIGIN, params, limits, earliest_s=73.245)
+    assert plan.found
+    assert plan.t_go_s == pytest.approx(73.245, abs=2e-3)

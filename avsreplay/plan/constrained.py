@@ -19,16 +19,18 @@ from avsreplay.plan.cone_programme import PointRows, solve
 from avsreplay.plan.convexification import (
     ABORT_S,
     BETWEEN,
-    COARSE_NODES,
     aborted,
     convex_subproblem,
+    entries,
     excess,
     feasible,
     margins_at,
     worst_margin,
 )
 from avsreplay.plan.initial_paths import (
+    COARSE_NODES,
     ReferencePath,
+    coarse_nodes,
     initial_references,
     interval_fractions,
     largest_change,
@@ -203,13 +205,15 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
         best = _refined(again, *warm, rough=True)
         if best is not None and best.t_go_s <= LATER * max(_expected(case, *warm), case.earliest_s) + LATER_S:
             return best
-    coarse = replace(case, limits=replace(case.limits, nodes=min(COARSE_NODES, case.limits.nodes)), coarse=True)
+    coarse = replace(case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True)
     drafts: list[StepPath] = []
+    earliest_s = math.inf
     for reference in initial_references(coarse, free):
-        draft = _converged(coarse, reference, 1.1 * min((d.t_go_s for d in drafts), default=math.inf))
+        draft = _converged(coarse, reference, 1.1 * earliest_s)
         if draft is not None:
             drafts.append(draft)
-        if drafts and reference.t > 1.5 * min(d.t_go_s for d in drafts):
+        earliest_s = min((d.t_go_s for d in drafts), default=math.inf)
+        if reference.t > 1.5 * earliest_s or earliest_s <= case.earliest_s + SAME_TIME_S:
             break
     drafts = _different(drafts)
     drafts[:IMPROVED] = [_moved(coarse, draft) for draft in drafts[:IMPROVED]]
@@ -224,18 +228,6 @@ def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> 
 
 def _duration(path: RobotPath) -> float:
     return path.t_go_s
-
-
-def _entries(case: Case, path: RobotPath) -> tuple[float, float]:
-    """Return the fractions of a flight from which it stays inside the cone and the corridor, each from its range on."""
-    s = interval_fractions(case.limits.nodes)
-    times = case.wait_s + (path.t_go_s - case.wait_s) * s
-    inside = margins_at(case, path, times).inside
-    found = []
-    for column in (0, 1):
-        outside = np.flatnonzero(~inside[:-1, column])
-        found.append(float(s[outside[-1] + 1]) if len(outside) else 0.0)
-    return found[0], found[1]
 
 
 def _shortened(case: Case, path: RobotPath, since_s: float) -> Case:
@@ -268,10 +260,11 @@ def _moved(case: Case, path: StepPath) -> StepPath:
     The alternative that is required at an instant follows from the reference, so that the iterations alone cannot move
     the entry by more than they move the path.
     """
-    if case.limits.cone_deg is None and case.limits.final_deg is None:
+    at_bound = path.t_go_s <= case.earliest_s + SAME_TIME_S
+    if at_bound or (case.limits.cone_deg is None and case.limits.final_deg is None):
         return path
     which, step = 0 if case.limits.cone_deg is not None else 1, 0.5 / case.limits.nodes
-    best, start = path, _entries(case, path)
+    best, start = path, entries(case, path)
     for direction in (-step, step):
         for count in range(1, MOVES + 1):
             entry = list(start)

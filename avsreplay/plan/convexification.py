@@ -20,7 +20,6 @@ from avsreplay.plan.robot import Limits
 BETWEEN = 16  # instants of every interval at which the true constraints are checked
 RESERVE = 3.0  # margin at the checked instants in units of the buffer, for the instants between them
 FAR = 2e4  # a constraint with a larger margin at the reference, in units of the buffer, is left out of the programme
-COARSE_NODES = 16  # thrust intervals while initial paths are compared
 ABORT_S = 30.0  # duration of an abort
 ABORTS = 16  # instants at which an abort is tried
 TOWARD_AXIS = 2.0  # weight of the fixture's axis in the direction away from the grasp point
@@ -39,6 +38,18 @@ def margins_at(case: Case, path: RobotPath, times: Array) -> Margins:
     y = case.sampled.coordinates(times, r)
     y[times >= path.t_go_s] = 0.0
     return margins(case.scene, case.limits, y, r, case.sampled.sigma(times))
+
+
+def entries(case: Case, path: RobotPath) -> tuple[float, float]:
+    """Return the fractions of a flight from which it stays inside the cone and the corridor, each from its range on."""
+    s = interval_fractions(case.limits.nodes)
+    times = case.wait_s + (path.t_go_s - case.wait_s) * s
+    inside = margins_at(case, path, times).inside
+    found = []
+    for column in (0, 1):
+        outside = np.flatnonzero(~inside[:-1, column])
+        found.append(float(s[outside[-1] + 1]) if len(outside) else 0.0)
+    return found[0], found[1]
 
 
 def excess(case: Case, path: StepPath) -> Array:

@@ -13,6 +13,8 @@ from avsreplay.outcome import Plan
 from avsreplay.plan.limits import Case
 from avsreplay.plan.path import RobotPath, path_of
 
+COARSE_NODES = 16  # least number of thrust intervals while initial paths are compared
+COARSE_TURN_RAD = 0.25  # largest turn of the target in one of them
 TURN_RAD = 0.5  # the target may turn by this much between two iterations
 
 
@@ -33,6 +35,12 @@ def turn_rate(case: Case, t: float) -> float:
     """Return the angular rate of the target [rad/s]."""
     rate = case.sampled.at(np.array([t]), 1)[1]
     return float(np.linalg.norm(rate)) / math.sqrt(2.0)
+
+
+def coarse_nodes(case: Case, least_s: float) -> int:
+    """Return the number of intervals while initial paths are compared, for flights of at least a time [s]."""
+    t = max(least_s, case.earliest_s)
+    return min(max(COARSE_NODES, math.ceil(turn_rate(case, t) * t / COARSE_TURN_RAD)), case.limits.nodes)
 
 
 def initial_references(case: Case, free: Plan) -> list[ReferencePath]:
