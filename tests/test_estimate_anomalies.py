@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import estimate_surprises as surprises
@@ -10,8 +11,10 @@ import pytest
 import tumbling
 from scipy.stats import multivariate_normal
 
-from avsreplay.estimate import anomalies, hypotheses, noise, scan_window
+from avsreplay import geometry
+from avsreplay.estimate import hypotheses, noise, scan_window
 from avsreplay.estimate.dynamics import propagate, propagate_state
+from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.track import Epoch, Prediction, Track, ready
 from avsreplay.geometry import Pose
@@ -247,7 +250,7 @@ def test_an_explanation_without_degrees_of_freedom_does_not_scale_the_odds() -> 
     """Its residuals say nothing about the noise."""
     found = scan_window.Explanation(scan_window.Hypothesis.MANOEUVRE, 10.0, 0.0, 0, 0)
     free = scan_window.Explanation(scan_window.Hypothesis.FREE_MOTION, 1.0, 300.0, 12, 0)
-    assert anomalies._odds_over_free([found, free]) == pytest.approx(9.0)
+    assert hypotheses.odds_over_free([found, free]) == pytest.approx(9.0)
 
 
 def test_the_evidence_of_changes_at_several_instants_is_that_of_the_gaussian_they_make() -> None:
@@ -380,3 +383,68 @@ def test_changes_that_cancel_are_no_manoeuvre(cancels: bool) -> None:
     else:
         assert change.log_evidence > others + 3.0
         assert change.size[3:] == pytest.approx(step, abs=0.05)
+
+
+def _poses_of(monkeypatch: pytest.MonkeyPatch, pose_at: Callable[[float], Pose]) -> None:
+    """The campaign's simulated measurements, of other poses."""
+    simulated = surprises.measured
+
+    def measured(case: surprises.Case, times: list[float], states: list, seed: int) -> list:
+        errors = [x.T_ac.inverse() @ a.T_ac for x, a in zip(states, simulated(case, times, states, seed), strict=True)]
+        given = simulated(case, times, states, seed)
+        return [replace(a, T_ac=pose_at(t) @ e) for t, a, e in zip(times, given, errors, strict=True)]
+
+    monkeypatch.setattr(surprises, "measured", measured)
+
+
+def _swing(t: float) -> Pose:
+    """A part on a cable of 2 m that swings by 12 degrees in one plane and 4 in the other, and turns about the cable."""
+    a, b = 0.2 * np.cos(2.2 * t), 0.07 * np.cos(2.2 * t + 1.0)
+    place = np.array([2.0 * np.sin(a), 2.0 * (np.cos(a) * np.cos(b) - 1.0), 4.0 + 2.0 * np.sin(b)])
+    turn = geometry.multiply(geometry.exp([b, 0.0, -a]), geometry.exp([0.0, 0.8 * np.cos(0.5 * t), 0.0]))
+    return Pose(turn, place)
+
+
+def test_a_part_on_a_cable_is_followed_although_its_motion_is_not_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Gravity and the cable accelerate it by 2 m/s^2: after eight rejected poses their level is estimated from them."""
+    _poses_of(monkeypatch, _swing)
+    result = surprises.run(surprises.Case("swing", hz=10.0, seconds=15.0), 0)
+    assert result.track is not None
+    first = result.reason.index("ok", 13)
+    assert result.t[first] < 2.5
+    assert all(result.gamma[first:])
+    assert not any(result.converged)  # the forces of the cable are not known in advance
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_poses_that_contradict_one_another_are_no_driven_target(monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+    """After 2 s, poses with independent errors of 5 cm, which no motion explains."""
+    rng = np.random.Generator(np.random.PCG64(seed))
+    _poses_of(monkeypatch, lambda t: Pose.from_matrix(np.eye(4)) if t < 2.0 else Pose(_swing(0).q, rng.normal(size=3)))
+    result = surprises.run(surprises.Case("wrong", hz=10.0, seconds=12.0), seed)
+    assert result.track is not None
+    assert result.track.reinitialised == 0
+    assert not any(result.gamma[25:])
+
+
+@pytest.mark.parametrize(("interval_s", "density"), [(0.1, 0.3), (0.5, 0.01)])
+def test_the_level_of_disturbances_is_found_from_differences_of_poses(interval_s: float, density: float) -> None:
+    """A velocity that is a random walk: the root density is found to within the error of few poses."""
+    rng = np.random.Generator(np.random.PCG64(7))
+    fine = 50
+    step = interval_s / fine
+    found = []
+    for _ in range(40):
+        velocity = np.cumsum(density * np.sqrt(step) * rng.normal(size=(fine * 12, 3)), axis=0)
+        places = np.cumsum(velocity * step, axis=0)[::fine]
+        turned = np.cumsum(velocity[::fine, 0]) * interval_s
+        fixes = [
+            PoseFix(round(k * interval_s * 1e9), Pose(geometry.exp([turn, 0.0, 0.0]), place), np.eye(6))
+            for k, (turn, place) in enumerate(zip(turned, places, strict=True))
+        ]
+        levels = scan_window.driven_levels(fixes, 4.0)
+        if levels is not None:
+            found.append(levels[1])
+        assert scan_window.driven_levels(fixes[:7], 4.0) is None
+    assert len(found) > 20
+    assert 0.8 * density < np.sqrt(np.mean(np.square(found))) < 1.3 * density

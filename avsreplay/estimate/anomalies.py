@@ -19,14 +19,23 @@ from avsreplay.estimate.batch_covariance import LATEST, SPHERE, BatchCovariance,
 from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.driven import DrivenBelief
-from avsreplay.estimate.error_state import VEL, W
-from avsreplay.estimate.hypotheses import explain
+from avsreplay.estimate.error_state import VEL, W, definite_product
+from avsreplay.estimate.hypotheses import explain, odds_over_free
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.mixture import moments
 from avsreplay.estimate.noise import cholesky_root
+from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
-from avsreplay.estimate.scan_window import PRIOR_ODDS, ChangePriors, Explanation, Hypothesis
+from avsreplay.estimate.scan_window import (
+    DRIVEN,
+    ChangePriors,
+    Explanation,
+    Hypothesis,
+    driven_levels,
+    last_change_ns,
+    scans_after,
+)
 from avsreplay.estimate.track import (
     Epoch,
     SensorBias,
@@ -46,7 +55,6 @@ _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decisio
 _OVER_FREE, _OVER_NEXT = 3.0, 2.0  # log odds over free motion, and over the next hypothesis, of an early decision
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 _NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
-_LEAST = 1e-9  # of the eigenvalues of the prior after a manoeuvre
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, in its spread, that tells which poses are biased
 _SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
@@ -69,6 +77,7 @@ class AnomalyTest:
         self.params, self.batch, self._replay = params, batch, replay
         self.enabled = params.robust and params.start is not Start.PAPER
         speed = 0.2 * given(params.start_vel_1s_mps)
+        self._extent_m = extent_m
         self._priors = ChangePriors(0.1 * params.start_rate_1s_radps, speed, 0.05 * extent_m, 0.05)
 
     def step(
@@ -93,9 +102,9 @@ class AnomalyTest:
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
         ranked = explain(window, first, self._priors, *self.batch.noise_levels(track), self.batch.orbit)
         best = ranked[0].hypothesis
-        changed = best is Hypothesis.MANOEUVRE and _odds_over_free(ranked) >= _OVER_FREE
+        changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= _OVER_FREE
         changed = changed and (bool(track.doubtful) or _linear(window, ranked))
-        if (large or track.doubtful) and best is Hypothesis.DISTURBED and _odds_over_free(ranked) >= _OVER_FREE:
+        if (large or track.doubtful) and best is Hypothesis.DISTURBED and odds_over_free(ranked) >= _OVER_FREE:
             track, doubtful = self._disturbed(track, ranked[0]), self._disturbed(doubtful, ranked[0])
         if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
             return self._accepted(track, epoch, update), verdict
@@ -107,7 +116,7 @@ class AnomalyTest:
         The hypotheses are linear about the prediction from the first recent scan. This one must be from an estimate
         that is based on enough poses: before, its errors are too large for the linearisation.
         """
-        after = update(replace(track, doubtful=(), manoeuvres=confirmed(track), pending=False))
+        after = update(replace(track, doubtful=(), rejected=(), manoeuvres=confirmed(track), pending=False))
         after = with_nis(after, track, epoch.innovation.chi2)
         return replace(after, recent=(*track.recent, epoch)[-_RECENT:]) if ready(track) else after
 
@@ -122,12 +131,12 @@ class AnomalyTest:
         doubtful, in_doubt = len(track.doubtful), (track, Verdict(0, Reason.DOUBTFUL))
         best, explained = ranked[0], ranked[0].chi2 < _EXPLAINED * ranked[0].dof
         certain = explained and best.log_evidence - ranked[1].log_evidence >= _OVER_NEXT
-        certain = certain and (_odds_over_free(ranked) >= _OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
+        certain = certain and (odds_over_free(ranked) >= _OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
         if doubtful < _MOST and not certain:
             return in_doubt
         if best.hypothesis is Hypothesis.MANOEUVRE and explained:
             reported = self._reported(track, window, best)
-            if _after(window, best) >= FEWEST_TO_FIT:
+            if scans_after(window, best) >= FEWEST_TO_FIT:
                 return self._manoeuvred(reported, window, best), Verdict(1, Reason.OK)
             if doubtful < 2 * _MOST:
                 return reported, Verdict(0, Reason.DOUBTFUL)
@@ -186,10 +195,23 @@ class AnomalyTest:
         if old is not None and self._previous_agrees(track):
             anew: Track | None = self._used(with_history(old, track), track.doubtful)
         else:
-            anew = self._initialised_anew(track)
+            anew = self._initialised_anew(track) or self._driven(track := self._with_rejected(track))
         if anew is not None:
             return replace(anew, reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
         return replace(with_history(track, track), doubtful=track.doubtful[1 - _FEWEST :]), Verdict(0, Reason.POSE_JUMP)
+
+    def _with_rejected(self, track: Track) -> Track:
+        """The track with the doubtful poses in its list of rejected ones."""
+        last_ns = track.rejected[-1].t_ns if track.rejected else 0
+        fixes = (self.batch.fix(e.prediction, e.innovation) for e in track.doubtful)
+        return replace(track, rejected=(*track.rejected, *(f for f in fixes if f.t_ns > last_ns))[-DRIVEN:])
+
+    def _driven(self, track: Track) -> Track | None:
+        """A new track from the last poses of a target that disturbances move, such as a part on a cable."""
+        found = driven_levels(track.rejected, self._extent_m)
+        if found is None:
+            return None
+        return self._started(track, track.doubtful[-_FEWEST:], NoiseLevels(torque=found[0], force=found[1], count=1))
 
     def _previous_agrees(self, track: Track) -> bool:
         """Return whether the estimate before the last new start predicted the doubtful poses to within its errors."""
@@ -224,7 +246,7 @@ class AnomalyTest:
 
     def _manoeuvred(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
         """Rate and velocity fitted anew from the manoeuvre on; everything else is continuous."""
-        start_ns, t_ns = window[0].track.belief.t_ns, _last_change_ns(window, best)
+        start_ns, t_ns = window[0].track.belief.t_ns, last_change_ns(window, best)
         at = window[best.onset].track.belief  # of all scans before the first change
         for after_s in best.changes_s:
             then_ns = start_ns + round(after_s * 1e9)
@@ -239,7 +261,8 @@ class AnomalyTest:
             return self._used(replace(anew, belief=at, mode="filter", fixes=()), after)
         chart = to_chart(at.x)
         prior = Prior(
-            chart, _definite(np.asarray(np.linalg.solve(to_errors(chart), cholesky_root(at.P)), dtype=np.float64))
+            chart,
+            definite_product(np.asarray(np.linalg.solve(to_errors(chart), cholesky_root(at.P)), dtype=np.float64)),
         )
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
@@ -277,8 +300,13 @@ class AnomalyTest:
         fitted = fit(poses, to_chart(rough_state(fixes)), weak_prior(poses, self.params), FitParams(rescale=False))
         if 2.0 * fitted.half_chi2 > _EXPLAINED * (6 * len(fixes) - 12):
             return None
+        return self._started(track, epochs)
+
+    def _started(self, track: Track, epochs: tuple[Epoch, ...], levels: NoiseLevels = NO_LEVELS) -> Track:
+        """A new track from some poses and noise levels, with the events of ``track``."""
         first = epochs[0].prediction.belief
-        out = self._used(Track(Belief(first.t_ns, first.x, first.P), "start", started_ns=first.t_ns), epochs)
+        begin = Track(Belief(first.t_ns, first.x, first.P), "start", started_ns=first.t_ns, levels=levels)
+        out = self._used(begin, epochs)
         old = replace(track, recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None
         out = replace(with_history(out, track), drift=track.drift, previous=old)
         return replace(out, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
@@ -301,17 +329,6 @@ def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
     return replace(bias, last=epoch) if still < min(GATE, ended + gain) else None
 
 
-def _odds_over_free(ranked: list[Explanation]) -> float:
-    """Log odds of the best hypothesis over free motion, with the noise that its own residuals show if that is larger.
-
-    Errors of the registration that are larger than claimed, or correlated, resemble small changes of the motion.
-    """
-    best = ranked[0]
-    free = next(e.log_evidence for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
-    scale = max(1.0, best.chi2 / best.dof) if best.dof > 0 else 1.0
-    return (best.log_evidence - free - PRIOR_ODDS) / scale + PRIOR_ODDS
-
-
 def _linear(window: tuple[Epoch, ...], ranked: list[Explanation]) -> bool:
     """Return whether the linearisation about the first prediction holds over scans that were all used.
 
@@ -323,21 +340,3 @@ def _linear(window: tuple[Epoch, ...], ranked: list[Explanation]) -> bool:
 
 def _chi2(y: Array, C: Array) -> float:
     return float(y @ np.linalg.solve(C, y))
-
-
-def _definite(root: Array) -> Array:
-    """Root root', with eigenvalues, in units of the variances, raised to ``_LEAST``: its inverse is then definite."""
-    scale = np.linalg.norm(root, axis=1)
-    values, axes = np.linalg.eigh((root / scale[:, None]) @ (root / scale[:, None]).T)
-    half = axes * np.sqrt(np.maximum(values, _LEAST)) * scale[:, None]
-    return np.asarray(half @ half.T)
-
-
-def _after(window: tuple[Epoch, ...], found: Explanation) -> int:
-    """Number of scans of the window after a manoeuvre."""
-    return sum(e.prediction.belief.t_ns > _last_change_ns(window, found) for e in window)
-
-
-def _last_change_ns(window: tuple[Epoch, ...], found: Explanation) -> int:
-    """Instant at which a manoeuvre ends [ns]."""
-    return window[0].track.belief.t_ns + round(found.changes_s[-1] * 1e9)

@@ -17,6 +17,7 @@ DIM = 20
 DQ, W, RHO, VEL, SIGMA, VARRHO, DMU = (BLOCKS[name] for name in BLOCKS)
 
 ROUNDING = 1e-9  # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
+_LEAST = 1e-9  # least eigenvalue of a product of a root with itself, in the same units
 LARGEST_MOVE = 1e3  # largest correction in chart steps, of which none has a larger unit than a metre or a radian
 
 Quad = tuple[float, float, float, float]
@@ -112,4 +113,12 @@ def definite(P: Array) -> Array:
     scale = np.sqrt(np.maximum(np.abs(np.diagonal(P)), np.finfo(float).tiny))
     values, axes = np.linalg.eigh(0.5 * (P + P.T) / np.outer(scale, scale))
     half = np.minimum(scale, LARGEST_MOVE)[:, None] * axes * np.sqrt(np.maximum(values, ROUNDING))
+    return np.asarray(half @ half.T)
+
+
+def definite_product(root: Array) -> Array:
+    """Root root' with its eigenvalues, in units of its variances, raised to ``_LEAST``, so that it has an inverse."""
+    scale = np.linalg.norm(root, axis=1)
+    values, axes = np.linalg.eigh((root / scale[:, None]) @ (root / scale[:, None]).T)
+    half = axes * np.sqrt(np.maximum(values, _LEAST)) * scale[:, None]
     return np.asarray(half @ half.T)

@@ -303,3 +303,14 @@ def _gaussian(y: Array, C: Array) -> tuple[float, float]:
     white = np.linalg.solve(root, y)
     chi2 = float(white @ white)
     return -0.5 * chi2 - float(np.log(np.diagonal(root)).sum()), chi2
+
+
+def odds_over_free(ranked: Sequence[Explanation]) -> float:
+    """Log odds of the best hypothesis over free motion, with the noise that its own residuals show if that is larger.
+
+    Errors of the registration that are larger than claimed, or correlated, resemble small changes of the motion.
+    """
+    best = ranked[0]
+    free = next(e.log_evidence for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
+    scale = max(1.0, best.chi2 / best.dof) if best.dof > 0 else 1.0
+    return (best.log_evidence - free - PRIOR_ODDS) / scale + PRIOR_ODDS

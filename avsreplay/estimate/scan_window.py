@@ -12,21 +12,27 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from itertools import pairwise
 
 import numpy as np
 
+from avsreplay.estimate.batch_covariance import SPHERE
 from avsreplay.estimate.driven import DrivenBelief, driven_steps
 from avsreplay.estimate.dynamics import process_noise
 from avsreplay.estimate.error_state import rotation
+from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import cholesky_root, correlated_noise
 from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.estimate.track import Epoch
-from avsreplay.geometry import Array, Pose, frozen
+from avsreplay.geometry import Array, Pose, conjugate, frozen, log, multiply
 from avsreplay.records import Belief
 
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _SCALES = (1.0, 0.1)  # of the prior standard deviations: a large or a small change
+DRIVEN = 8  # poses from which disturbances are estimated without a model of the motion
+_LONGEST = 3.0  # interval between two of them over the median
+_MOST_TURN, _MOST_MOVE = 0.35, 0.1  # change of the step between poses: angle [rad], and length over the extent
 _ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
 
 
@@ -150,6 +156,50 @@ def mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice]) -> Array
             v = np.linalg.solve(A, b[:, :, None])[:, :, 0]
             found.append(0.5 * (b * v).sum(axis=1) - 0.5 * np.linalg.slogdet(A)[1])
     return np.asarray(np.logaddexp.reduce(found, axis=0) - math.log(len(found)))
+
+
+def driven_levels(fixes: Sequence[PoseFix], extent_m: float) -> tuple[float, float] | None:
+    """Root densities of white disturbances that explain the differences of poses, without a model of the motion.
+
+    The mean rates and velocities v_k between poses are differences of the pose over the interval h_k. White noise of
+    root density q makes E (v_k+1 - v_k)^2 = q^2 (h_k + h_k+1) / 3 for each component. Errors that are independent from
+    pose to pose give consecutive differences of v a correlation of -2/3, white disturbances of 1/4, and smooth motion a
+    correlation near 1: poses that contradict one another are told from a driven target by the sign.
+
+    Args:
+        fixes: registered poses in the order of time, none of them used.
+        extent_m: the target's bounding diagonal [m].
+
+    Returns:
+        Of the torque over the trace of the inertia tensor [rad/s^1.5], and of the force per unit mass [m/s^1.5]; None
+        where the poses are too few, or contradict one another, or the steps between them are too large to be followed.
+    """
+    if len(fixes) < DRIVEN:
+        return None
+    times = np.array([f.t_ns for f in fixes], dtype=np.float64) * 1e-9
+    h = np.diff(times)
+    if h.min() <= 0.0 or h.max() > _LONGEST * np.median(h):
+        return None
+    turns = np.array([log(multiply(conjugate(a.T_ac.q), b.T_ac.q)) for a, b in pairwise(fixes)])
+    moves = np.diff(np.array([f.T_ac.t for f in fixes]), axis=0)
+    found = []
+    for step, most in ((turns, _MOST_TURN), (moves, _MOST_MOVE * extent_m)):
+        change = np.diff(step / h[:, None], axis=0)
+        whole, lagged = float((change**2).sum()), float((change[1:] * change[:-1]).sum())
+        if lagged < 0.0 or np.sqrt((np.diff(step, axis=0) ** 2).sum(axis=1)).max() > most:
+            return None
+        found.append(math.sqrt(whole / float((h[1:] + h[:-1]).sum())))
+    return found[0] / SPHERE, found[1]
+
+
+def scans_after(window: tuple[Epoch, ...], found: Explanation) -> int:
+    """Number of scans of the window after a manoeuvre."""
+    return sum(e.prediction.belief.t_ns > last_change_ns(window, found) for e in window)
+
+
+def last_change_ns(window: tuple[Epoch, ...], found: Explanation) -> int:
+    """Instant at which a manoeuvre ends [ns]."""
+    return window[0].track.belief.t_ns + round(found.changes_s[-1] * 1e9)
 
 
 def log_mean(values: Sequence[float]) -> float:

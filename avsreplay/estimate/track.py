@@ -76,6 +76,7 @@ class Track:
         inflation: (2,) factor on R for errors correlated in time (attitude, position) by the last fit; None before it.
         prior, prior_ns: Gaussian prior of the fit and its instant: the given start, or that after a manoeuvre.
         recent: the last accepted scans.  doubtful: the scans not yet decided on.  nis: of the last healthy scans.
+        rejected: the last poses since the last accepted scan that nothing explained.
         bias: an error of the sensor in effect, None where there is none.
         started_ns: instant of the first scan of this estimate.
         previous: the estimate before the last new start, None where there was none.
@@ -102,6 +103,7 @@ class Track:
     prior_ns: int = 0
     recent: tuple[Epoch, ...] = ()
     doubtful: tuple[Epoch, ...] = ()
+    rejected: tuple[PoseFix, ...] = ()
     nis: tuple[float, ...] = ()
     bias: SensorBias | None = None
     started_ns: int = 0
