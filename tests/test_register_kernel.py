@@ -258,6 +258,38 @@ def test_newton_steps_end_at_the_fixed_point_of_horns_iteration(seed: int) -> No
     assert slow.iterations > 2 * found.iterations
 
 
+def test_a_view_along_a_plate_ends_although_newton_steps_fail_there() -> None:
+    """A direction that a few points next to edges determine: full Newton steps leave the region in which these points
+    have the same faces, and Horn's steps alone need hundreds of passes."""
+    trimesh = pytest.importorskip("trimesh")
+    body = trimesh.util.concatenate(
+        [
+            trimesh.creation.box(size).apply_translation(at)
+            for size, at in (
+                ((0.30, 0.10, 0.02), (0, 0, 0)),
+                ((0.02, 0.10, 0.20), (-0.14, 0, 0.11)),
+                ((0.08, 0.02, 0.08), (-0.09, 0.03, 0.05)),
+            )
+        ]
+        + [trimesh.creation.cylinder(0.02, 0.08, sections=32).apply_translation((0.08, 0.02, 0.05))]
+    )
+    model = SurfaceIndex.build(surface(body.vertices, body.faces), 0.05)
+    T_ac = Pose(np.array([-0.05857033, 0.04744796, 0.72315495, 0.68656036]), np.array([0.03254935, -0.01001189, 1.61113644]))
+    across = np.tan(np.radians(15.0)) * (np.arange(100) - 49.5) / 50.0
+    rays = np.stack([*np.meshgrid(across, across), np.ones((100, 100))], -1).reshape(-1, 3)
+    rays = rays[np.linalg.norm(rays[:, :2], axis=1) < 0.13]
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    eye = np.tile(T_ac.inverse().t, (len(rays), 1))
+    hits, seen, _ = body.ray.intersects_location(eye, rays @ T_ac.R, multiple_hits=False)
+    ranges = np.linalg.norm(hits - eye[0], axis=1)
+    rule = IcpParams(gate_m=0.05, floor_m=0.0015, n_max=200, eps_m=4e-7, facing=True)
+    for seed in (*range(10), 158, 190, 194, 201, 283):
+        r = rng(seed)
+        scan = (ranges + 1e-3 * r.standard_normal(len(ranges)))[:, None] * rays[seen]
+        guess = Pose(exp(1e-3 * r.standard_normal(3)), 3e-4 * r.standard_normal(3)) @ T_ac.inverse()
+        assert model.icp(scan, guess, rule).converged
+
+
 @pytest.mark.parametrize("seen", ["plate", "side of a cylinder"])
 def test_directions_that_cannot_be_observed_are_left_at_the_guess(seen: str) -> None:
     r = rng(25)

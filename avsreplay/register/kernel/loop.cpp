@@ -78,8 +78,9 @@ void apply(const Store& s, const Step& step, double* T) {
 }
 
 // Decides between Newton's and Horn's step after the plane passes. A Newton step stands while the sum of min(d^2, gate^2)
-// over the scan falls; else it is undone and Horn's step, which cannot raise the sum, is made in its place. After a few
-// such failures only Horn's steps are made.
+// over the scan falls; else it is undone, Horn's step, which cannot raise the sum, is made in its place, and the next
+// Newton steps are limited to a quarter of the one that failed (a trust region). Once that is below `eps_m`, only Horn's steps
+// are made.
 class Newton {
  public:
   struct Choice {
@@ -93,22 +94,22 @@ class Newton {
     const double cost = sums.v[1] + outside * gate * gate;
     const bool comparable = used_ && gate == gate_;
     if (comparable && !(cost < cost_)) {
-      ++failures_, used_ = false;
+      used_ = false, longest_ = SHORTER * length_;
       return {horn_, true, false};
     }
+    if (used_) longest_ *= LONGER;
     used_ = false, gate_ = gate, cost_ = cost, horn_ = horn;
     Step step;
-    if (failures_ >= MOST_FAILURES || !newton_step(sums, longest, step)) return {horn, false, true};
-    if (step.turn < eps_rad && step.move < eps_m) return {horn, false, true};
-    used_ = true;
+    if (longest_ <= eps_m || !newton_step(sums, std::min(longest, longest_), step)) return {horn, false, true};
+    if (step.turn < eps_rad && step.move < eps_m && step.length < longest_) return {horn, false, true};
+    used_ = true, length_ = step.length;
     return {step, false, false};
   }
 
  private:
-  static constexpr int MOST_FAILURES = 3;
-  double cost_ = 0, gate_ = 0;
+  static constexpr double SHORTER = 0.25, LONGER = 2.0;
+  double cost_ = 0, gate_ = 0, length_ = 0, longest_ = worst();
   Step horn_{};
-  int failures_ = 0;
   bool used_ = false;
 };
 

@@ -71,6 +71,7 @@ bool to_step(double* d, const double* c, double radius, double longest, Step& s)
   place(s.D, c, to);
   s.turn = angle;
   s.move = norm3(d + 3);
+  s.length = length < longest ? length : longest;
   return std::isfinite(s.turn) && std::isfinite(s.move);
 }
 

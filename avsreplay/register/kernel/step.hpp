@@ -7,6 +7,7 @@ namespace avs {
 struct Step {
   double D[12];       // rows of [R t]: the new pose is D T
   double turn, move;  // angle [rad]; how far the inliers' centroid moves [m]
+  double length;      // how far an inlier is expected to move at most [m]; not set by `horn_step`
 };
 
 // Horn 1987 (equations section 6): M of the cross-covariance, scalar first; its largest eigenvector.
