@@ -274,7 +274,8 @@ def test_a_view_along_a_plate_ends_although_newton_steps_fail_there() -> None:
         + [trimesh.creation.cylinder(0.02, 0.08, sections=32).apply_translation((0.08, 0.02, 0.05))]
     )
     model = SurfaceIndex.build(surface(body.vertices, body.faces), 0.05)
-    T_ac = Pose(np.array([-0.05857033, 0.04744796, 0.72315495, 0.68656036]), np.array([0.03254935, -0.01001189, 1.61113644]))
+    attitude = np.array([-0.05857033, 0.04744796, 0.72315495, 0.68656036])
+    T_ac = Pose(attitude, np.array([0.03254935, -0.01001189, 1.61113644]))
     across = np.tan(np.radians(15.0)) * (np.arange(100) - 49.5) / 50.0
     rays = np.stack([*np.meshgrid(across, across), np.ones((100, 100))], -1).reshape(-1, 3)
     rays = rays[np.linalg.norm(rays[:, :2], axis=1) < 0.13]
