@@ -413,6 +413,7 @@ def test_a_part_on_a_cable_is_followed_although_its_motion_is_not_free(monkeypat
     first = result.reason.index("ok", 13)
     assert result.t[first] < 2.5
     assert all(result.gamma[first:])
+    assert result.violations == []
     assert not any(result.converged)  # the forces of the cable are not known in advance
 
 

@@ -16,8 +16,9 @@ from avsreplay.estimate.measurement import (
     innovation_of,
     innovation_vector,
     measurement_jacobian,
+    to_fixture,
 )
-from avsreplay.estimate.mixture import Component, carried, moments, worn
+from avsreplay.estimate.mixture import Component, carried, moments, not_worse, worn
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
@@ -102,3 +103,31 @@ def test_between_fits_the_pose_is_known_better_than_from_the_last_scan(seed: int
     assert len(errors) >= 15
     estimated, measured = np.square(errors).sum(axis=(0, 2))
     assert estimated < measured
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_fit_is_corrected_by_its_last_pose_where_it_is_less_precise_than_that_pose(seed: int) -> None:
+    """The pose's covariance afterwards is the measured one in the directions in which it was larger, and the mean moves
+    by the share 1 - C/S of the residual there; the other directions remain."""
+    x, _ = body(seed)
+    rng = np.random.default_rng(seed)
+    J = to_fixture(x.T_ac.q, x.q_bc) @ measurement_jacobian(x) @ to_errors(to_chart(x))
+    ratios = np.array([0.25, 0.5, 0.9, 3.0, 30.0, 1e4])
+    axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    root = np.sqrt(np.diag(C))[:, None] * axes
+    S = root @ np.diag(ratios) @ root.T
+    P = np.eye(20) * 1e-12 + np.linalg.pinv(J) @ S @ np.linalg.pinv(J).T
+    fitted = (Component(1.0, 1.0, T_NS, to_chart(x), P),)
+    off = 1e-4 * rng.normal(size=6)
+    pose = Pose(geometry.multiply(x.T_ac.q, geometry.exp(off[:3])), x.T_ac.t + x.T_ac.R @ off[3:])
+    after = not_worse(fitted, T_NS, pose, C, 1.0, (0.0, 0.0))
+    there = moments(after).x
+    J2 = to_fixture(there.T_ac.q, there.q_bc) @ measurement_jacobian(there) @ to_errors(to_chart(there))
+    white = np.linalg.inv(root)
+    assert np.diag(white @ J2 @ after[0].P @ J2.T @ white.T) == pytest.approx(np.minimum(ratios, 1.0), rel=2e-3)
+    between = x.T_ac.inverse() @ there.T_ac
+    moved = white @ np.concatenate([geometry.log(between.q), between.t])
+    asked = np.maximum(1.0 - 1.0 / ratios, 0.0) * (white @ off)
+    assert moved == pytest.approx(asked, abs=2e-3 * np.abs(white @ off).max())
+    precise = (Component(1.0, 1.0, T_NS, to_chart(x), 1e-3 * P * 0.1),)
+    assert not_worse(precise, T_NS, pose, 1.1 * C, 1.0, (0.0, 0.0)) is precise

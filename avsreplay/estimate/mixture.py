@@ -16,10 +16,13 @@ from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.dynamics import grasp_prediction, torque_density, translation
 from avsreplay.estimate.error_state import DIM
+from avsreplay.estimate.measurement import measurement_jacobian, to_fixture
+from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, Forecast
 
+_NO_INFORMATION = 1e-9  # of that of the last pose, in directions in which it is not used again
 _MOVED = 0.5  # sum of the changes of the weights from which the mixture is no longer a quadrature
 
 
@@ -105,6 +108,35 @@ def carried(
     weights = [c.weight * math.exp(value - best) for c, value in found]
     total = sum(weights)
     return tuple(replace(c, weight=w / total) for (c, _), w in zip(found, weights, strict=True))
+
+
+def not_worse(
+    components: tuple[Component, ...], t_ns: int, pose: Pose, C: Array, weight: float, noise: tuple[float, float]
+) -> tuple[Component, ...]:
+    """The result of a fit, corrected by its last pose where it states that pose less precisely than it was measured.
+
+    A fit weights all poses alike and adds the covariance that disturbances cause afterwards. Where these are large, its
+    mean at the last pose is far from that pose. In the directions in which the pose's covariance S exceeds C, the pose
+    is used as a measurement with the information C^-1 - S^-1, which makes the posterior covariance C. As the fit has
+    used the pose before, it is not made smaller than that.
+
+    Args:
+        components: the result of the fit.
+        t_ns: instant of its last pose [ns].
+        pose: that pose T_ac, as measured.
+        C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
+        weight: Cauchy weight of the pose.
+        noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
+    """
+    x = moments(components)
+    J = to_fixture(x.x.T_ac.q, x.x.q_bc) @ measurement_jacobian(x.x)
+    L = cholesky_root(C)
+    whiten = np.linalg.inv(L)
+    values, axes = np.linalg.eigh(whiten @ J @ x.P @ J.T @ whiten.T)
+    if values[-1] <= 1.0:
+        return components
+    half = L @ axes / np.sqrt(np.maximum(1.0 - 1.0 / np.maximum(values, 1.0), _NO_INFORMATION))
+    return carried(components, t_ns, pose, half @ half.T, np.ones(2), weight, noise)
 
 
 def mixture_forecast(
