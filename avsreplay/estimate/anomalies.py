@@ -28,11 +28,11 @@ from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.scan_window import (
-    DRIVEN,
+    FEWEST_DISTURBED,
     ChangePriors,
     Explanation,
     Hypothesis,
-    driven_levels,
+    disturbance_levels,
     last_change_ns,
     scans_after,
 )
@@ -195,7 +195,7 @@ class AnomalyTest:
         if old is not None and self._previous_agrees(track):
             anew: Track | None = self._used(with_history(old, track), track.doubtful)
         else:
-            anew = self._initialised_anew(track) or self._driven(track := self._with_rejected(track))
+            anew = self._initialised_anew(track) or self._disturbed_start(track := self._with_rejected(track))
         if anew is not None:
             return replace(anew, reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
         return replace(with_history(track, track), doubtful=track.doubtful[1 - _FEWEST :]), Verdict(0, Reason.POSE_JUMP)
@@ -204,11 +204,11 @@ class AnomalyTest:
         """The track with the doubtful poses in its list of rejected ones."""
         last_ns = track.rejected[-1].t_ns if track.rejected else 0
         fixes = (self.batch.fix(e.prediction, e.innovation) for e in track.doubtful)
-        return replace(track, rejected=(*track.rejected, *(f for f in fixes if f.t_ns > last_ns))[-DRIVEN:])
+        return replace(track, rejected=(*track.rejected, *(f for f in fixes if f.t_ns > last_ns))[-FEWEST_DISTURBED:])
 
-    def _driven(self, track: Track) -> Track | None:
+    def _disturbed_start(self, track: Track) -> Track | None:
         """A new track from the last poses of a target that disturbances move, such as a part on a cable."""
-        found = driven_levels(track.rejected, self._extent_m)
+        found = disturbance_levels(track.rejected, self._extent_m)
         if found is None:
             return None
         return self._started(track, track.doubtful[-_FEWEST:], NoiseLevels(torque=found[0], force=found[1], count=1))

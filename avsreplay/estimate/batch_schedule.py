@@ -30,6 +30,7 @@ from avsreplay.estimate.initialise import (
     improved_levels,
     joined,
     pose_count,
+    with_last_pose,
 )
 from avsreplay.estimate.measurement import (
     chart_update,
@@ -38,7 +39,7 @@ from avsreplay.estimate.measurement import (
     measured_pose,
     measurement_jacobian,
 )
-from avsreplay.estimate.mixture import carried, moments, not_worse, worn
+from avsreplay.estimate.mixture import carried, moments, worn
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
 from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
@@ -97,7 +98,7 @@ class BatchSchedule:
             start = self.chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
             given = self._given(track)
             result = batch_estimate(track.fixes, self.params, self._rules, self._levels(track), last, start, given)
-            result = self._not_worse(track, result, innovation.weight)
+            result = with_last_pose(result, track.fixes[-1], innovation.weight, self.noise_levels(track))
             rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
             track = replace(track, reinitialised=track.reinitialised + rejected)
             remembers = forgot and track.levels.slack > 1.0  # the filter remembers what later fits cannot use
@@ -293,16 +294,6 @@ class BatchSchedule:
         return replace(
             track, belief=result.belief, mode=mode, window=window, batch=result, since=0, inflation=result.inflation
         )
-
-    def _not_worse(self, track: Track, result: BatchResult, weight: float) -> BatchResult:
-        """The result, in no direction less precise at the last pose than that pose."""
-        fix, s = track.fixes[-1], np.repeat(result.factors * np.sqrt(result.inflation), 3)
-        C = fix.C * np.outer(s, s)
-        mixture = not_worse(result.components, fix.t_ns, fix.T_ac, C, weight, self.noise_levels(track))
-        if mixture is result.components:
-            return result
-        belief, _ = self.propagated(track, moments(mixture), result.belief.t_ns)
-        return replace(result, belief=belief, components=mixture)
 
     def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
         """The poses within the fit's memory, including this one; of many poses the older half is joined in pairs."""

@@ -28,10 +28,10 @@ from avsreplay.estimate.batch_covariance import (
     unseen_torque,
 )
 from avsreplay.estimate.chart import Chart, to_chart
-from avsreplay.estimate.dynamics import propagate_state
+from avsreplay.estimate.dynamics import propagate, propagate_state
 from avsreplay.estimate.error_state import DIM, boxplus, hamilton
 from avsreplay.estimate.measurement import in_camera, measurement_jacobian
-from avsreplay.estimate.mixture import Component, moments
+from avsreplay.estimate.mixture import Component, moments, not_worse
 from avsreplay.estimate.noise import BOUND
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import normal_points
@@ -309,6 +309,23 @@ def improved_levels(
     claimed = params.adapt is Adaptation.OFF
     found = estimate_levels(points, problem, levels, claimed, params.disturbances)
     return replace(found, count=pose_count(fixes))
+
+
+def with_last_pose(result: BatchResult, fix: PoseFix, weight: float, noise: tuple[float, float]) -> BatchResult:
+    """The result of a fit, in no direction less precise at its last pose ``fix`` than that pose (``not_worse``).
+
+    Args:
+        result: the fit's result.
+        fix: the last of its poses.
+        weight: Cauchy weight of that pose.
+        noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
+    """
+    scale = np.repeat(result.factors * np.sqrt(result.inflation), 3)
+    mixture = not_worse(result.components, fix.t_ns, fix.T_ac, fix.C * np.outer(scale, scale), weight, noise)
+    if mixture is result.components:
+        return result
+    belief, _ = propagate(moments(mixture), result.belief.t_ns, *noise, fix.orbit)
+    return replace(result, belief=belief, components=mixture)
 
 
 def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior) -> bool:

@@ -30,7 +30,7 @@ from avsreplay.records import Belief
 
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _SCALES = (1.0, 0.1)  # of the prior standard deviations: a large or a small change
-DRIVEN = 8  # poses from which disturbances are estimated without a model of the motion
+FEWEST_DISTURBED = 8  # poses from which disturbances are estimated without a model of the motion
 _LONGEST = 3.0  # interval between two of them over the median
 _MOST_TURN, _MOST_MOVE = 0.35, 0.1  # change of the step between poses: angle [rad], and length over the extent
 _ZERO, _NO_COVARIANCE = frozen(np.zeros(6)), frozen(np.zeros((6, 6)))
@@ -158,13 +158,13 @@ def mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice]) -> Array
     return np.asarray(np.logaddexp.reduce(found, axis=0) - math.log(len(found)))
 
 
-def driven_levels(fixes: Sequence[PoseFix], extent_m: float) -> tuple[float, float] | None:
+def disturbance_levels(fixes: Sequence[PoseFix], extent_m: float) -> tuple[float, float] | None:
     """Root densities of white disturbances that explain the differences of poses, without a model of the motion.
 
     The mean rates and velocities v_k between poses are differences of the pose over the interval h_k. White noise of
     root density q makes E (v_k+1 - v_k)^2 = q^2 (h_k + h_k+1) / 3 for each component. Errors that are independent from
     pose to pose give consecutive differences of v a correlation of -2/3, white disturbances of 1/4, and smooth motion a
-    correlation near 1: poses that contradict one another are told from a driven target by the sign.
+    correlation near 1: the sign tells a disturbed target from poses that contradict one another.
 
     Args:
         fixes: registered poses in the order of time, none of them used.
@@ -174,7 +174,7 @@ def driven_levels(fixes: Sequence[PoseFix], extent_m: float) -> tuple[float, flo
         Of the torque over the trace of the inertia tensor [rad/s^1.5], and of the force per unit mass [m/s^1.5]; None
         where the poses are too few, or contradict one another, or the steps between them are too large to be followed.
     """
-    if len(fixes) < DRIVEN:
+    if len(fixes) < FEWEST_DISTURBED:
         return None
     times = np.array([f.t_ns for f in fixes], dtype=np.float64) * 1e-9
     h = np.diff(times)
