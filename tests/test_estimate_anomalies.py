@@ -412,7 +412,7 @@ def test_a_part_on_a_cable_is_followed_although_its_motion_is_not_free(monkeypat
     assert result.track is not None
     last_rejected = max(k for k, gamma in enumerate(result.gamma) if not gamma)
     assert result.t[last_rejected] < 2.5
-    assert result.violations == []
+    assert max(result.failed_at) < result.t[last_rejected]  # the estimate is then never worse than the measured pose
     assert not any(result.converged)  # the forces of the cable are not known in advance
 
 

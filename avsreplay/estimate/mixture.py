@@ -23,6 +23,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, Forecast
 
 _NO_INFORMATION = 1e-9  # of that of the last pose, in directions in which it is not used again
+_SMALL_EXCESS = 1.1  # of the corrected covariance over that of the last pose
 _MOVED = 0.5  # sum of the changes of the weights from which the mixture is no longer a quadrature
 
 
@@ -56,15 +57,20 @@ class Component:
 
 def moments(components: tuple[Component, ...]) -> Belief:
     """Mean and second moments about it: the mean of the first component, and what the weights have moved it since."""
+    return _joined(components).belief
+
+
+def _joined(components: tuple[Component, ...]) -> Component:
+    """One Gaussian with the moments of the mixture."""
     first = components[0]
     if len(components) == 1:
-        return first.belief
+        return first
     off = np.array([c.chart.minus(first.chart) for c in components])
     shift = np.array([c.weight - c.quadrature for c in components]) @ off
     P = np.zeros((DIM, DIM))
     for component, y in zip(components, off - shift, strict=True):
         P += component.weight * (np.outer(y, y) + component.P)
-    return replace(first, chart=first.chart.moved(shift), P=P).belief
+    return replace(first, chart=first.chart.moved(shift), P=P, weight=1.0, quadrature=1.0)
 
 
 def worn(components: tuple[Component, ...]) -> bool:
@@ -128,11 +134,22 @@ def not_worse(
         weight: Cauchy weight of the pose.
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
     """
-    x = moments(components)
-    J = to_fixture(x.x.T_ac.q, x.x.q_bc) @ measurement_jacobian(x.x)
+    after = _corrected(components, t_ns, pose, C, weight, noise)
+    if after is components or _corrected(after, t_ns, pose, _SMALL_EXCESS * C, weight, noise) is after:
+        return after
+    # the components lie further apart than C: the pose can only move each of them within its own covariance
+    return _corrected((_joined(components),), t_ns, pose, C, weight, noise)
+
+
+def _corrected(
+    components: tuple[Component, ...], t_ns: int, pose: Pose, C: Array, weight: float, noise: tuple[float, float]
+) -> tuple[Component, ...]:
+    """The components corrected by the pose in the directions in which the covariance of all exceeds C."""
+    belief = moments(components)
+    J = to_fixture(belief.x.T_ac.q, belief.x.q_bc) @ measurement_jacobian(belief.x)
     L = cholesky_root(C)
     whiten = np.linalg.inv(L)
-    values, axes = np.linalg.eigh(whiten @ J @ x.P @ J.T @ whiten.T)
+    values, axes = np.linalg.eigh(whiten @ J @ belief.P @ J.T @ whiten.T)
     if values[-1] <= 1.0:
         return components
     half = L @ axes / np.sqrt(np.maximum(1.0 - 1.0 / np.maximum(values, 1.0), _NO_INFORMATION))

@@ -117,6 +117,7 @@ class Result:
     nees: list[list[float]] = field(default_factory=list)
     squares: list[Array] = field(default_factory=list)  # (2, 3) claimed and true, of position, attitude, velocity
     violations: list[str] = field(default_factory=list)
+    failed_at: list[float] = field(default_factory=list)  # times of these checks [s]
     track: Track | None = None
     seconds: float = 0.0
     worst_ms: float = 0.0
@@ -211,6 +212,7 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
             covariance = estimator.pose_covariance(track.belief)
             failed = violations(track.belief, covariance, *found)
         result.violations += list(failed)
+        result.failed_at += [t] * len(failed)
         honest = honest and not track.doubtful and not failed
         forecast = estimator.track_forecast(track, test.params.times_s)
         word = test.judge(word, track.belief, forecast, honest)
