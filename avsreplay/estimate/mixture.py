@@ -22,7 +22,6 @@ from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, Forecast
 
-_NO_INFORMATION = 1e-9  # of that of the last pose, in directions in which it is not used again
 _SMALL_EXCESS = 1.1  # of the corrected covariance over that of the last pose
 _MOVED = 0.5  # sum of the changes of the weights from which the mixture is no longer a quadrature
 
@@ -100,8 +99,21 @@ def carried(
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
         orbit: the relative orbit that the target is on; None for free motion.
     """
-    root, pair = np.linalg.inv(np.linalg.cholesky(C)), (float(factors[0]), float(factors[1]))
-    found = []
+    return _carried(components, t_ns, pose, np.linalg.inv(np.linalg.cholesky(C)), factors, weight, noise, orbit)
+
+
+def _carried(
+    components: tuple[Component, ...],
+    t_ns: int,
+    pose: Pose,
+    root: Array,
+    factors: Array,
+    weight: float,
+    noise: tuple[float, float],
+    orbit: RelativeOrbit | None = None,
+) -> tuple[Component, ...]:
+    """``carried`` with the information root' root of the pose; ``root`` is lower triangular."""
+    pair, found = (float(factors[0]), float(factors[1])), []
     for c in components:
         density = torque_density(to_state(c.chart).sigma, noise[0])
         h = (t_ns - c.t_ns) * 1e-9
@@ -147,13 +159,13 @@ def _corrected(
     """The components corrected by the pose in the directions in which the covariance of all exceeds C."""
     belief = moments(components)
     J = to_fixture(belief.x.T_ac.q, belief.x.q_bc) @ measurement_jacobian(belief.x)
-    L = cholesky_root(C)
-    whiten = np.linalg.inv(L)
+    whiten = np.linalg.inv(cholesky_root(C))
     values, axes = np.linalg.eigh(whiten @ J @ belief.P @ J.T @ whiten.T)
     if values[-1] <= 1.0:
         return components
-    half = L @ axes / np.sqrt(np.maximum(1.0 - 1.0 / np.maximum(values, 1.0), _NO_INFORMATION))
-    return carried(components, t_ns, pose, half @ half.T, np.ones(2), weight, noise)
+    G = np.sqrt(1.0 - 1.0 / np.maximum(values, 1.0))[:, None] * axes.T @ whiten  # C^-1 - S^-1 = G' G
+    _, upper = np.linalg.qr(G[:, ::-1])
+    return _carried(components, t_ns, pose, upper[::-1, ::-1].copy(), np.ones(2), weight, noise)
 
 
 def mixture_forecast(
