@@ -21,12 +21,10 @@ from avsreplay.register.global_search import (
     GlobalSearch,
     SearchResult,
     VisibleCentroids,
-    attitudes,
-    directions,
 )
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.restarts import FIXED_WORK, HEALTHY_PASSES, HEALTHY_SCANS
-from avsreplay.register.sampling import sample, thin_to, without_sparse_points
+from avsreplay.register.sampling import attitudes, directions, sample, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

@@ -96,10 +96,11 @@ def test_what_is_called_aligned_is_right(registrar: Registrar, surface: Surface,
 
 
 def test_the_budget_counts_work() -> None:
-    budget = Budget(1000)
-    budget.spend(HEALTHY_PASSES * 1000)
-    left = (HEALTHY_SCANS - 1) * HEALTHY_PASSES * 1000 + HEALTHY_SCANS * FIXED_WORK
+    budget = Budget(3000)
+    budget.spend(HEALTHY_PASSES * 3000)
+    left = (HEALTHY_SCANS - 1) * HEALTHY_PASSES * 3000 + HEALTHY_SCANS * FIXED_WORK
     budget.spend(left - 500)
+    assert not budget.allows(300, kept=300)  # as the rest is kept for a later step
     assert budget.allows(500)
     assert not budget.exhausted
     assert not budget.allows(501)

@@ -27,7 +27,7 @@ from avsreplay.reconstruct.views import (
     turn,
 )
 from avsreplay.records import Scan
-from avsreplay.register import global_search
+from avsreplay.register import sampling
 from avsreplay.register.size import normal_jacobian
 
 PAIR_TURN_RAD = np.radians(90.0)  # key scans seen from directions closer than this are compared in the refinement
@@ -335,5 +335,5 @@ def turn_and_coverage(views: Sequence[ScanView], poses: Sequence[Pose]) -> tuple
     """Largest turn between two poses [rad], and the share of all directions in {C} from which a scan was taken."""
     turns = [turn(poses[0], T) for T in poses]
     seen = sight_lines(views, [T.inverse() for T in poses])
-    near = (global_search.directions(1000) @ seen.T).max(axis=1) > np.cos(SPREAD_RAD)
+    near = (sampling.directions(1000) @ seen.T).max(axis=1) > np.cos(SPREAD_RAD)
     return max(turns), float(near.mean())

@@ -20,7 +20,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.registration import Match, Patchwork, best_starts, near_attitudes, registered
 from avsreplay.reconstruct.views import ScanView, Twist, averaged, depth_behind, turn
 from avsreplay.records import BLOCKS, State
-from avsreplay.register import global_search
+from avsreplay.register import sampling
 
 MOTION_POSES = 8  # fewest poses to which free motion is fitted
 MOTION_SHARE = 0.7  # share of the poses that must agree with it
@@ -271,7 +271,7 @@ def _searched(
     """The best acceptable match from turned guesses: first about the prediction, then over all attitudes."""
     turned = [near_attitudes(guess.q)]
     if found.lost % SEARCH_EVERY < 2:
-        turned.append(global_search.attitudes(400))
+        turned.append(sampling.attitudes(400))
     for attitudes in turned:
         for start in best_starts(views[k], model, attitudes, 2.0 * p.reach * extent, extent):
             fine = registered(views[k], model, start, p.reach * extent, extent)

@@ -133,24 +133,17 @@ class HornBackend:
         ``near``: the guess is a registered pose, so that no point-to-plane passes and no passes over few points come
         first: they would end further from the result than it is.
         """
-        most = min(self._rules[True].n_max, MOST_WITHIN)
-        rules = {
-            facing: replace(
-                rule,
-                n_max=most,
-                n_plane=0 if near else rule.n_plane,
-                few=0 if near else rule.few,
-                gate_m=gate_m,
-                floor_m=gate_m,
-                tighten=0.0,
-            )
-            for facing, rule in self._rules.items()
-        }
-        return self._run(points, guess, rules)
+        facing = self._visibility.camera_c(self._index, points, guess) is not None
+        rule = self._rules[facing]
+        plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, MOST_WITHIN)
+        within = replace(rule, n_max=most, n_plane=plane, few=few, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
+        return self._with(points, guess, within)
 
     def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams]) -> Fit:
-        facing = self._visibility.camera_c(self._index, points, guess) is not None
-        found = self._index.icp(points, guess, rules[facing])
+        return self._with(points, guess, rules[self._visibility.camera_c(self._index, points, guess) is not None])
+
+    def _with(self, points: NDArray[Any], guess: Pose, rule: IcpParams) -> Fit:
+        found = self._index.icp(points, guess, rule)
         return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches)
 
 

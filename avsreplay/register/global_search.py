@@ -23,7 +23,7 @@ from avsreplay.records import Surface
 from avsreplay.register.backend import HornBackend, Target
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
-from avsreplay.register.sampling import sample, thin_to, without_sparse_points
+from avsreplay.register.sampling import attitudes, directions, sample, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 
 MODEL_POINTS = 3000
@@ -35,6 +35,8 @@ CELLS = 40  # of the grid along the diagonal of the model
 COARSE_OF_EXTENT, MIDDLE_OF_EXTENT = 0.03, 0.02  # distances beyond which a point counts as unexplained
 START_OF_EXTENT, FALL = 0.3, 0.7  # rejection distance of the first pass, and its factor from pass to pass
 FIRST_PASSES, KEPT_AFTER_FIRST = 2, 3  # most starts are dropped after two passes with part of the points
+SECOND_PASSES, KEPT_AFTER_SECOND = 2, 8  # the same after more passes with all of them
+MIDDLE_FIRST, MIDDLE_STRIDE, KEPT_IN_MIDDLE = 4, 2, 20  # passes with every second point, after which so many are left
 FIRST_STRIDES, THINNED = (2, 3, 3), (1, 2, 2)  # every n-th point, and every n-th attitude, by the round
 SYMMETRIC, SYMMETRIES = 0.3, 6  # largest unexplained share of the surface turned onto itself; most motions tried
 TURNED_PASSES, TURNED_RIVALS = 6, 2
@@ -43,11 +45,12 @@ SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05  # two poses nearer than that 
 SIGMAS = 5.0
 FAVOURED = 5.0  # noise, in units of the extent, lowers the cost of a wrong pose with more surface nearby by up to this
 REFINED_POINTS = 500  # of the fine points, with which the last poses are registered
-FINE_PASSES = 15  # from a wrong pose it can take hundreds
-LOOK_UPS = 2  # that cost as much as a search on the model
+FIRST_FINE, FINE_PASSES = 5, 15  # of all, then of the best; from a wrong pose it can take hundreds
+RIVAL_AFTER, MOST_RIVALS = 0.05, 4  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
+LOOK_UPS = 4  # that cost as much as a search on the model
+ROUND_WORK = 60_000  # what a round costs besides: the last poses to the end, thinning and the interpreter
 APART = 0.6  # usual share of the starts of the second selection that are different poses
 FAR_WORK = 4  # searches that a pass from a wrong pose costs a point
-PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
 CELL_OF_EXTENT = 0.02
 LEAST_COSINE = 0.05
 SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # of the starts across the direction to the camera
@@ -107,19 +110,24 @@ class GlobalSearch:
         if "symmetries" not in kept:
             kept["symmetries"] = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
         self.symmetries = kept["symmetries"]
-        brief = replace(target.limits, n_max=min(FINE_PASSES, target.limits.n_max))
-        self._refine = HornBackend(replace(target, limits=brief))
+        self._brief, self._refine = (
+            HornBackend(replace(target, limits=replace(target.limits, n_max=min(passes, target.limits.n_max))))
+            for passes in (FIRST_FINE, FINE_PASSES)
+        )
 
     def work(self, points: int, number: int) -> int:
         """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
         p = self._params
         few, some, fine = (min(points, most) for most in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS))
         starts, stride = p.starts * (1, SHIFTS, 7)[number] // THINNED[number], FIRST_STRIDES[number]
-        looked = few * (starts * (1 + FIRST_PASSES) // stride + p.starts // KEPT_AFTER_FIRST * (1 + COARSE_PASSES))
-        looked += some * int(APART * MIDDLE_STARTS) * (1 + MIDDLE_PASSES)
+        halved = p.starts // KEPT_AFTER_FIRST * (1 + SECOND_PASSES)
+        halved += p.starts // KEPT_AFTER_SECOND * (1 + COARSE_PASSES - SECOND_PASSES)
+        looked = few * (starts * (1 + FIRST_PASSES) // stride + halved)
+        looked += some * int(APART * MIDDLE_STARTS) * (1 + MIDDLE_FIRST) // MIDDLE_STRIDE
+        looked += some * KEPT_IN_MIDDLE * (1 + MIDDLE_PASSES - MIDDLE_FIRST)
         looked += some * len(self.symmetries) * (1 + TURNED_PASSES)
-        refined = FINE_PASSES * RIVALS * FAR_WORK // 2 * min(fine, REFINED_POINTS)
-        return looked // LOOK_UPS + FINE_STARTS * some + refined + RIVALS * fine
+        registered = RIVALS * (FAR_WORK // 2 * FIRST_FINE * min(fine, REFINED_POINTS) + fine) + FINE_STARTS * some
+        return ROUND_WORK + looked // LOOK_UPS + registered
 
     def search(
         self, points: NDArray[Any], number: int = 0, before: SearchResult | None = None, known: Pose | None = None
@@ -180,26 +188,29 @@ class GlobalSearch:
             np.ascontiguousarray(few[::stride]), starts, FIRST_PASSES, START_OF_EXTENT * L, *coarse
         )
         poses = _best(poses, costs, max(1, p.starts // KEPT_AFTER_FIRST))
-        poses, costs = self._field.refine(few, poses, COARSE_PASSES, narrow * L, *coarse)
+        poses, costs = self._field.refine(few, poses, SECOND_PASSES, narrow * L, *coarse)
+        poses, narrow = _best(poses, costs, max(1, p.starts // KEPT_AFTER_SECOND)), narrow * FALL**SECOND_PASSES
+        poses, costs = self._field.refine(few, poses, COARSE_PASSES - SECOND_PASSES, narrow * L, *coarse)
         apart = self._different(_best(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
         poses = np.stack([pose.matrix for pose in apart])
-        poses, costs = self._field.refine(some, poses, MIDDLE_PASSES, narrow * L, *middle)
+        narrow = START_OF_EXTENT * FALL**FIRST_PASSES
+        poses, costs = self._field.refine(some[::MIDDLE_STRIDE].copy(), poses, MIDDLE_FIRST, narrow * L, *middle)
+        poses, narrow = _best(poses, costs, KEPT_IN_MIDDLE), narrow * FALL**MIDDLE_FIRST
+        poses, costs = self._field.refine(some, poses, MIDDLE_PASSES - MIDDLE_FIRST, narrow * L, *middle)
         return self._different(_best(poses, costs, MIDDLE_STARTS), FINE_STARTS, 0.5)
 
     def _different(self, poses: Array, most: int, scale: float) -> list[Pose]:
         """The first few of (k, 4, 4) that are different poses."""
-        R, middles = (
-            poses[:, :3, :3],
-            poses[:, :3, :3].transpose(0, 2, 1) @ (self._middle - poses[:, :3, 3])[:, :, None],
-        )
-        near = 1.0 + 2.0 * np.cos(scale * SAME_RAD), scale * SAME_OF_EXTENT * self._extent
+        R = poses[:, :3, :3]
+        middles = (R.transpose(0, 2, 1) @ (self._middle - poses[:, :3, 3])[:, :, None])[:, :, 0]
+        turned = np.einsum("aij,bij->ab", R, R) > 1.0 + 2.0 * np.cos(scale * SAME_RAD)
+        near = np.linalg.norm(middles[:, None] - middles, axis=2) < scale * SAME_OF_EXTENT * self._extent
+        left = np.ones(len(poses), dtype=bool)
         kept: list[int] = []
-        for k in range(len(poses)):
-            turned = np.einsum("kij,ij->k", R[kept], R[k]) > near[0]
-            if not (turned & (np.linalg.norm((middles[kept] - middles[k])[:, :, 0], axis=1) < near[1])).any():
-                kept.append(k)
-            if len(kept) == most:
-                break
+        while left.any() and len(kept) < most:
+            kept.append(int(np.argmax(left)))
+            left &= ~(turned & near)[kept[-1]]
+            left[kept[-1]] = False
         return [Pose.from_matrix(poses[k]) for k in kept]
 
     def _refined(self, some: Array, fine: Array, poses: list[Pose], facing: bool) -> list[Candidate]:
@@ -210,14 +221,23 @@ class GlobalSearch:
         ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         most = float(ranked[0].unexplained(width).mean()) + RIVAL_WITHIN
         best = [each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most]
-        found = [self._measured(fine, self._refine.align_within(part, T_ca, width).T_ca) for T_ca in best]
+        found = self._to_the_end(part, fine, best, width)
         first = min(found, key=lambda each: float(each.unexplained(width).mean())).T_ca
         if not len(self.symmetries):
             return found
         rule = (FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
         turned, costs = self._field.refine(some, self.symmetries @ first.matrix, TURNED_PASSES, 4.0 * width, *rule)
         rivals = [Pose.from_matrix(T) for T in _best(turned, costs, TURNED_RIVALS)]
-        return [*found, *(self._measured(fine, self._refine.align_within(part, T_ca, width).T_ca) for T_ca in rivals)]
+        return [*found, *self._to_the_end(part, fine, rivals, width)]
+
+    def _to_the_end(self, part: Array, fine: Array, poses: list[Pose], width_m: float) -> list[Candidate]:
+        """The poses registered to the model by a few passes, and to the end those that may be as good as the best."""
+        found = [self._measured(fine, self._brief.align_within(part, T_ca, width_m).T_ca) for T_ca in poses]
+        costs = np.array([each.unexplained(width_m).mean() for each in found])
+        order = np.argsort(costs, kind="stable")
+        last = [k for k in order[:MOST_RIVALS] if costs[k] < costs[order[0]] + RIVAL_AFTER]
+        ended = [self._refine.align_within(part, found[k].T_ca, width_m, near=True).T_ca for k in last]
+        return [*(self._measured(fine, T_ca) for T_ca in ended), *(found[k] for k in order if k not in last)]
 
     def _near_symmetries(self, points: Array) -> Array:
         """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, without the identity: the best few."""
@@ -308,22 +328,6 @@ class VisibleCentroids:
         """Return the centroid (..., 3) in {C} [m] for directions (..., 3) to the camera in {C}."""
         centroid: Array = self._centroids[np.argmax(direction_c @ self._directions.T, axis=-1)]
         return centroid
-
-
-def attitudes(count: int) -> Array:
-    """Return (count, 4) unit quaternions [x y z w], uniform over all rotations: super-Fibonacci spiral (Alexa 2022)."""
-    s = np.arange(count) + 0.5
-    inner, outer = np.sqrt(s / count), np.sqrt(1.0 - s / count)
-    a, b = 2.0 * np.pi * s / np.sqrt(2.0), 2.0 * np.pi * s / PSI
-    return np.stack([inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)], axis=1)
-
-
-def directions(count: int) -> Array:
-    """Return (count, 3) unit vectors, uniform over the sphere: Fibonacci spiral."""
-    k = np.arange(count) + 0.5
-    z, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
-    ring = np.sqrt(1.0 - z * z)
-    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
 
 def _axes(points: Array) -> list[Array]:

@@ -97,10 +97,12 @@ class Registrar:
         first = self._graded(scan, guess, halves=halves, carried=carried)
         if first.status is AlignStatus.FAILED:
             return first
+        budget = Budget(len(scan), effort)
+        budget.registered(first)
         healthy = self._restarter.healthy(first)
-        found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried, effort)
+        found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried, budget)
         if self._far(guess, found) and not searched:
-            return self._searched(scan, found, carried, effort)
+            return self._searched(scan, found, carried, budget)
         free = NO_MOTION if unknown is None else unknown
         return found if searched or effort <= 1 else self._settled(scan, found, halves, carried, free)
 
@@ -254,41 +256,42 @@ class Registrar:
             return False
         return angle > FAR_RAD or len(self._global.symmetries) > 0
 
-    def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, effort: int) -> Alignment:
+    def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
-        budget = Budget(len(scan), effort)
-        budget.registered(found)
-        if budget.allows(self._global.work(len(scan), 0)):
+        if not budget.brief:
             return self._acquire(scan, budget, carried, known=found.T_ac.inverse())
         far = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a global search"
         return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=far)
 
     def _recovered(
-        self, scan: NDArray[Any], guess: Pose, first: Alignment, halves: bool, carried: bool, effort: int
+        self, scan: NDArray[Any], guess: Pose, first: Alignment, halves: bool, carried: bool, budget: Budget
     ) -> tuple[Alignment, bool]:
         """Register again within a distance that follows the noise; restart if implausible. Whether it was searched."""
-        few, budget = self._restarter.part(scan), Budget(len(scan), effort)
-        budget.registered(first)
-        kept = self._restarter.measure(few, first.T_ac.inverse())
-        hopeful = first.measured and kept.noise_m <= NOISE_OF_EXTENT * self._index.extent_m
-        final = self._regraded(scan, few, kept, budget, halves, carried) if hopeful else first
+        few = self._restarter.part(scan)
+        at = self._restarter.measure(few, first.T_ac.inverse())
+        hopeful = first.measured and at.noise_m <= NOISE_OF_EXTENT * self._index.extent_m
+        final = self._regraded(scan, few, at, budget, halves, carried) if hopeful else first
         reason = self._reason(few, final, budget)
         if not (reason or self._restarter.doubtful(few, guess, final)):
             return final, False
         before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without, it may show something else
-        steps = ("restart", "search", "turn") if hopeful or not overlap else ("search", "restart", "turn")
+        restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose must be searched in any case
+        steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
+        work = self._global.work(len(scan), 0) + restarts.SCATTER_WORK * len(scan) if overlap else 0
         for step in () if budget.brief else steps:
             if step == "search":
-                if overlap and budget.allows(self._global.work(len(scan), 0)):
+                if overlap:
                     found = self._acquire(scan, budget, carried, 1, final.T_ac.inverse() if final.measured else None)
                     if found.status is AlignStatus.ALIGNED:
                         return found, True
                 continue
             if before and np.mean(before.distance < self.limits.gate_m) < LEAST_TO_TURN:
                 break
-            before = self._restarter.best(few, guess.inverse(), final.T_ac.inverse(), budget, before)
-            final = self._regraded(scan, few, before, budget, halves, carried)
-            reason = self._reason(few, final, budget)
+            kept = work if reason and step == "restart" and restart else 0  # a search follows
+            before = self._restarter.best(few, guess.inverse(), final.T_ac.inverse(), budget, before, kept)
+            if before.T_ca.matrix.tobytes() != final.T_ac.inverse().matrix.tobytes():
+                final = self._regraded(scan, few, before, budget, halves, carried)
+                reason = self._reason(few, final, budget)
             if final.measured and not reason:
                 return final, False
         if not reason:

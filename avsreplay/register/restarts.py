@@ -32,14 +32,15 @@ TURN_RAD = np.radians(4.0)
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # neighbouring points: those in a cube of this side; cubes along the extent, at least
 VALLEY_STEPS, VALLEY_POINTS = 8, 400  # each way along the two least certain directions, by half a gate
 BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
-PASS_WORK = 3000  # what a pass of a restart costs besides its points, in point searches
+PASS_WORK = 1000  # what a pass of a restart costs besides its points, in point searches
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # another object: of the points nearer than so many widths this share is on the model
-FAR_WORK, LEAST_NEAR = 4, 0.5  # searches that a pass costs a point while fewer points than this share are on the model
-SCATTER_WORK = 20  # what leaving out scattered points costs a point
-TEST_WORK = 20_000  # what a test of a pose costs
-VALLEY_WORK = 60_000  # what the search along the valley costs
-HEALTHY_PASSES = 12  # passes of an ordinary registration, over all points of the scan
+FAR_WORK, LEAST_NEAR = 3, 0.5  # searches that a pass costs a point while fewer points than this share are on the model
+SCATTER_WORK = 10  # what leaving out scattered points costs a point
+TEST_WORK = 15_000  # what a test of a pose costs
+VALLEY_WORK = 2 * 2 * VALLEY_STEPS * VALLEY_POINTS  # what the search along the valley costs
+HEALTHY_PASSES = 7  # searches a point that an ordinary registration and its quality cost
+LEAST_POINTS = 2000  # of an ordinary scan: one of fewer points may be that of a target that is mostly hidden
 FIXED_WORK = 15_000  # what a registration costs besides its points: quality, covariance
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
@@ -69,7 +70,7 @@ class Budget:
 
     def __init__(self, points: int, scans: int = HEALTHY_SCANS) -> None:
         self.brief = scans <= 1
-        self._left = scans * (HEALTHY_PASSES * points + FIXED_WORK)
+        self._left = scans * (HEALTHY_PASSES * max(points, LEAST_POINTS) + FIXED_WORK)
         self.exhausted = False
 
     def spend(self, searches: int) -> None:
@@ -81,10 +82,10 @@ class Budget:
         share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
         self.spend(found.iterations * found.points * share + FIXED_WORK)
 
-    def allows(self, searches: int) -> bool:
-        """Return whether this much work is left; if not, the budget is exhausted."""
+    def allows(self, searches: int, kept: int = 0) -> bool:
+        """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""
         self.exhausted = self.exhausted or searches > self._left
-        return not self.exhausted
+        return not self.exhausted and searches + kept <= self._left
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -214,14 +215,15 @@ class Restarter:
         centre = T_ca.apply(few[on]).mean(axis=0) if on.any() else self._middle
         info, radius = scaled_information(sums.info, max(1, sums.inliers), centre)
         floor = np.linalg.eigh(info)[1][:, :2].T
-        best, least = T_ca, here.cost(width)
         steps = 0.5 * gate * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
+        tried = [T_ca]
         for step in np.multiply.outer(steps, floor).reshape(-1, 6):
             turn = geometry.exp(step[:3] / radius)
-            moved = Pose(turn, centre + step[3:] - geometry.matrix(turn) @ centre) @ T_ca
-            cost = self.measure(few, moved).cost(width)
-            best, least = (moved, cost) if cost < least else (best, least)
-        return best
+            tried.append(Pose(turn, centre + step[3:] - geometry.matrix(turn) @ centre) @ T_ca)
+        camera_c = target.visibility.camera_c(index, few, T_ca)  # the steps are short
+        moved = np.concatenate([each.apply(few) for each in tried])
+        d2 = index.closest(moved, camera_c=camera_c, most_m=width).d2.reshape(len(tried), -1)
+        return tried[int(np.argmin(np.minimum(d2, width**2).mean(axis=1)))]
 
     def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
         """Return the pose after passes with a falling rejection distance, from ``start_m`` [m] on."""
@@ -234,7 +236,13 @@ class Restarter:
         return self.measure(points, T_ca)
 
     def best(
-        self, points: NDArray[Any], guess: Pose, result: Pose, budget: Budget, before: Restart | None = None
+        self,
+        points: NDArray[Any],
+        guess: Pose,
+        result: Pose,
+        budget: Budget,
+        before: Restart | None = None,
+        kept: int = 0,
     ) -> Restart:
         """Return the best of the first result and the restarts, all T_ca; ends at the first plausible pose.
 
@@ -244,11 +252,12 @@ class Restarter:
             result: its result.
             budget: work that is left.
             before: best of the restarts from guess and result; the starts are then poses turned by ``TURN_RAD``.
+            kept: work that is kept for a later step.
         """
         found = [self.measure(points, result), *([before] if before else [])]
         tested: Restart | None = None  # the last pose that was tested, and is not plausible
         for T_ca, start in self._starts(guess, result, points.mean(axis=0), before is not None):
-            if not budget.allows(self.work(start) * (len(points) + PASS_WORK)):
+            if not budget.allows(self.work(start) * (len(points) + PASS_WORK), kept):
                 break
             found.append(self.graduated(points, T_ca, start, budget))
             best = self._least(found)

@@ -15,6 +15,7 @@ from avsreplay.records import Surface
 EVEN_ROUNDS, EVEN_WITHIN = 10, (0.85, 1.2)
 STRAY_SHARE, STRAY_VOXELS, STRAY_POINTS = 0.15, 150, 10
 R2 = np.array([0.7548776662466927, 0.5698402909980532])  # plastic-number sequence: low discrepancy in the unit square
+PSI = 1.533751168755204288118041  # positive root of psi^4 = psi + 4 (super-Fibonacci spirals)
 NEIGHBOUR = 8
 SCATTERED = 2.0  # distance to neighbour NEIGHBOUR of a scattered point over that in the denser part, at least
 DENSE_QUANTILE = 0.2  # the scan has at least this share of surface points
@@ -45,6 +46,22 @@ def sample(surface: Surface, count: int) -> tuple[Array, Array]:
     u, v = np.where(fold, 1.0 - u, u)[:, None], np.where(fold, 1.0 - v, v)[:, None]
     points = a[face] + u * (b - a)[face] + v * (c - a)[face]
     return points, cross[face] / np.maximum(twice_area[face], np.finfo(float).tiny)[:, None]
+
+
+def attitudes(count: int) -> Array:
+    """Return (count, 4) unit quaternions [x y z w], uniform over all rotations: super-Fibonacci spiral (Alexa 2022)."""
+    s = np.arange(count) + 0.5
+    inner, outer = np.sqrt(s / count), np.sqrt(1.0 - s / count)
+    a, b = 2.0 * np.pi * s / np.sqrt(2.0), 2.0 * np.pi * s / PSI
+    return np.stack([inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)], axis=1)
+
+
+def directions(count: int) -> Array:
+    """Return (count, 3) unit vectors, uniform over the sphere: Fibonacci spiral."""
+    k = np.arange(count) + 0.5
+    z, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + np.sqrt(5.0)) * k
+    ring = np.sqrt(1.0 - z * z)
+    return np.stack([ring * np.cos(turn), ring * np.sin(turn), z], axis=1)
 
 
 def thin(points: Array, voxel_m: float) -> Array:
