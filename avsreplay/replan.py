@@ -12,6 +12,7 @@ from avsreplay import geometry, plan
 from avsreplay.build import target_geometry
 from avsreplay.errors import UsageError
 from avsreplay.estimate import Estimator
+from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.params import NoiseSource
 from avsreplay.geometry import Array, Pose
@@ -169,8 +170,7 @@ class Replanning:
             seed: seed of the draws.
         """
         belief = self.saved.beliefs[index]
-        offsets = plan.draws(belief.P, count, np.random.Generator(np.random.PCG64(seed)))
-        drawn = [replace(belief, x=_bounded(boxplus(belief.x, d))) for d in offsets]
+        drawn = _draws(belief, count, np.random.Generator(np.random.PCG64(seed)))
         path, aimed = self.path(made), self.attitude(belief, made.t_go_s)
 
         def planner(scene: Scene) -> Plan:
@@ -222,8 +222,7 @@ class Replanning:
         """
         belief, rng = self.saved.beliefs[index], np.random.Generator(np.random.PCG64([seed, 2]))
         noise, ended = self.robot.thrust_noise * self.params.a_max_mps2, []
-        for offset in plan.draws(belief.P, count, rng):
-            drawn = replace(belief, x=_bounded(boxplus(belief.x, offset)))
+        for drawn in _draws(belief, count, rng):
             flight = self._guidance(), self._measured(belief, drawn, rng), self._scene(drawn)
             ended.append(plan.closed_loop(*flight, belief.t_ns, self.tolerance, noise, rng, self._body))
         numbers = {name: sum(end == name for end, _ in ended) for name in ("captured", "outside", "abort")}
@@ -263,6 +262,16 @@ class Replanning:
         )
         turned = lambda known, after_s: self.attitude(beliefs[known.t_ns], after_s)  # noqa: E731
         return plan.execute(self._guidance(), inputs, self.saved.truth, turned, self.saved.since_ns)
+
+
+def _draws(belief: Belief, count: int, rng: np.random.Generator) -> list[Belief]:
+    """Draws from a belief; those of one with a constant acceleration have different accelerations."""
+    if not isinstance(belief, DrivenBelief):
+        return [replace(belief, x=_bounded(boxplus(belief.x, d))) for d in plan.draws(belief.P, count, rng)]
+    P, n = np.block([[belief.P, belief.cross], [belief.cross.T, belief.P_u]]), len(belief.P)
+    return [
+        replace(belief, x=_bounded(boxplus(belief.x, d[:n])), u=belief.u + d[n:]) for d in plan.draws(P, count, rng)
+    ]
 
 
 def _bounded(x: State) -> State:

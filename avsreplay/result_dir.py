@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from avsreplay.binary_files import read_npz
 from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.files import check_output, output_folder
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State, Surface
@@ -38,6 +39,16 @@ _MOST_BELIEF_BYTES, _LARGEST = 1 << 30, 1e15
 VIEW_REACH = 0.05  # of the model's extent: residuals in the view are cut off there
 _BLOCKS = (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4))
 MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in _BLOCKS for k in range(size))
+_DRIVEN = ("driven", "u", "P_u", "cross")  # arrays of beliefs.npz about beliefs with a constant acceleration
+_SHAPES: dict[str, tuple[str, tuple[int | None, ...]]] = {
+    "t_ns": ("i", (None,)),
+    "x": ("f", (None, len(MEAN_COLUMNS))),
+    "P": ("f", (None, 20, 20)),
+    "driven": ("i", (None,)),
+    "u": ("f", (None, 6)),
+    "P_u": ("f", (None, 6, 6)),
+    "cross": ("f", (None, 20, 6)),
+}
 
 
 def mean_vector(x: State) -> Array:
@@ -58,15 +69,21 @@ def read_beliefs(path: Path) -> list[Belief]:
     Raises:
         UnreadableInput: the file is missing or not as a run writes it.
     """
-    shapes = {"t_ns": ("i", (None,)), "x": ("f", (None, len(MEAN_COLUMNS))), "P": ("f", (None, 20, 20))}
     hint = "name a directory written by run -o"
-    data = read_npz(path, shapes, limit=_MOST_BELIEF_BYTES, hint=hint)
+    data = read_npz(path, _SHAPES, limit=_MOST_BELIEF_BYTES, hint=hint, optional=_DRIVEN)
     ends = np.cumsum([0, *(size for _, size in _BLOCKS)])
     try:
         beliefs = [
             Belief(int(t), State(*(x[a:b] for a, b in pairwise(ends))), P)
             for t, x, P in zip(data["t_ns"], data["x"], data["P"], strict=True)
         ]
+        for k, u, P_u, cross in zip(*(data.get(name, ()) for name in _DRIVEN), strict=True):
+            if not 0 <= k < len(beliefs):
+                raise UnreadableInput(
+                    f"it has no belief {k}, to which an acceleration belongs", where=str(path), hint=hint
+                )
+            plain = beliefs[k]
+            beliefs[k] = DrivenBelief(plain.t_ns, plain.x, plain.P, u, P_u, cross)
     except ValueError:
         raise UnreadableInput("its arrays differ in length", where=str(path), hint=hint) from None
     for k, belief in enumerate(beliefs):
@@ -79,6 +96,8 @@ def _defect(belief: Belief) -> str:
     """Return what is wrong with a belief, an empty string if nothing is."""
     x, P = belief.x, belief.P
     numbers = np.concatenate([mean_vector(x), P.ravel()])
+    if isinstance(belief, DrivenBelief):
+        numbers = np.concatenate([numbers, belief.u, belief.P_u.ravel(), belief.cross.ravel()])
     if not (np.isfinite(numbers).all() and np.abs(numbers).max() < _LARGEST):
         return "is not finite"
     if any(abs(np.linalg.norm(q) - 1.0) > 1e-6 for q in (x.q_ab, x.q_bc)):
@@ -97,6 +116,7 @@ class Beliefs:
         self.t_ns: list[int] = []
         self.x: list[Array] = []
         self.P: list[Array] = []
+        self.driven: list[tuple[int, Array, Array, Array]] = []
         self.truth: list[tuple[int, Pose]] = []
 
     def __call__(self, scan: ReplayedScan) -> None:
@@ -105,12 +125,21 @@ class Beliefs:
         self.t_ns.append(belief.t_ns)
         self.x.append(mean_vector(belief.x))
         self.P.append(belief.P)
+        if isinstance(belief, DrivenBelief):
+            self.driven.append((len(self.P) - 1, belief.u, belief.P_u, belief.cross))
         if scan.truth.pose is not None:
             self.truth.append((scan.row.t_ns, scan.truth.pose))
 
     def write(self, path: Path) -> None:
-        """Write ``beliefs.npz``: t_ns (n,), x (n, 22), P (n, 20, 20)."""
-        np.savez(path, t_ns=np.array(self.t_ns, np.int64), x=np.array(self.x), P=np.array(self.P))
+        """Write ``beliefs.npz``: t_ns (n,), x (n, 22), P (n, 20, 20), and of those with a constant acceleration more.
+
+        For k scans with one: driven (k,) their numbers, u (k, 6), P_u (k, 6, 6) and cross (k, 20, 6), see
+        :class:`~avsreplay.estimate.driven.DrivenBelief`.
+        """
+        arrays: dict[str, Any] = {"t_ns": np.array(self.t_ns, np.int64), "x": np.array(self.x), "P": np.array(self.P)}
+        for name, values in zip(_DRIVEN, zip(*self.driven, strict=True), strict=False):
+            arrays[name] = np.array(values)
+        np.savez(path, **arrays)
 
 
 class ViewWriter:

@@ -3,11 +3,14 @@
 import json
 import re
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from avsreplay.result_dir import MEAN_COLUMNS, read_beliefs
+from avsreplay.errors import UnreadableInput
+from avsreplay.estimate.driven import DrivenBelief
+from avsreplay.result_dir import MEAN_COLUMNS, Beliefs, read_beliefs
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +53,34 @@ def test_beliefs_read_back_as_written(result):
     np.testing.assert_allclose(last.x.T_ac.t, [row["x_m"], row["y_m"], row["z_m"]], atol=1e-12)
     np.testing.assert_allclose(last.x.sigma, [row["sigma1"], row["sigma2"]], atol=0)
     assert np.linalg.eigvalsh(last.P).min() > 0.0
+
+
+def test_beliefs_with_a_constant_acceleration_read_back_as_written(result, tmp_path):
+    out, _ = result
+    plain, written, rng = read_beliefs(out / "beliefs.npz"), Beliefs(), np.random.default_rng(1)
+    beliefs = [
+        DrivenBelief(b.t_ns, b.x, b.P, rng.normal(size=6), np.eye(6), rng.normal(size=(20, 6))) if k % 3 == 1 else b
+        for k, b in enumerate(plain)
+    ]
+    for belief in beliefs:
+        scan = SimpleNamespace(outcome=SimpleNamespace(belief=belief), truth=SimpleNamespace(pose=None))
+        written(scan)
+    written.write(tmp_path / "beliefs.npz")
+    for found, belief in zip(read_beliefs(tmp_path / "beliefs.npz"), beliefs, strict=True):
+        assert type(found) is type(belief)
+        if isinstance(belief, DrivenBelief):
+            assert all(np.array_equal(getattr(found, name), getattr(belief, name)) for name in ("u", "P_u", "cross"))
+
+
+@pytest.mark.parametrize("numbers", [[1000], [-1]])
+def test_an_acceleration_of_a_belief_that_does_not_exist_is_refused(result, tmp_path, numbers):
+    out, _ = result
+    with np.load(out / "beliefs.npz") as data:
+        arrays = dict(data)
+    drive = {"driven": np.array(numbers), "u": np.zeros((1, 6)), "P_u": np.eye(6)[None], "cross": np.zeros((1, 20, 6))}
+    np.savez(tmp_path / "beliefs.npz", **arrays, **drive)
+    with pytest.raises(UnreadableInput, match="has no belief"):
+        read_beliefs(tmp_path / "beliefs.npz")
 
 
 def test_an_existing_result_is_not_overwritten(result, cli, fixtures_folder):
