@@ -127,12 +127,15 @@ def test_a_target_at_rest_is_refused():
         reconstruct(lambda: scans)
 
 
-def test_a_sphere_is_refused():
+@pytest.mark.parametrize("noise_m", [0.0, 0.003])
+def test_a_sphere_is_refused(noise_m):
+    """Also where noise makes its attitude drift by more than a target at rest is allowed to."""
     rng = np.random.default_rng(2)
     scans = []
     for k in range(6):
         p = rng.normal(size=(3000, 3))
-        p = 0.5 * p / np.linalg.norm(p, axis=1, keepdims=True) + [0.01 * k, 0.0, 4.0]
+        p = (0.5 + noise_m * rng.normal(size=(3000, 1))) * p / np.linalg.norm(p, axis=1, keepdims=True)
+        p += [0.01 * k, 0.0, 4.0]
         scans.append(Scan(seq=k, t_ns=k * 500_000_000, points=p[p[:, 2] < 3.9]))
     with pytest.raises(UnreadableInput, match="does not determine its attitude"):
         reconstruct(lambda: scans)
@@ -170,6 +173,17 @@ def test_points_that_one_scan_only_has_seen_are_kept_where_they_continue_a_surfa
     kept = continues(np.vstack([plane, stray]), normals, 0.05)
     assert kept[:2000].mean() > 0.99
     assert kept[2000:].mean() < 0.05
+
+
+def test_the_standard_error_of_points_that_few_scans_have_seen_is_that_of_their_noise():
+    """Against the faces of the body, at the frame of the first scan: of the right size within a factor of two."""
+    scans, truth = turning(4, 10.0, noise_m=0.004)
+    made = reconstruct(lambda: scans)
+    _, first = made.poses[0]
+    points = (truth[0].inverse() @ first).apply(made.points)
+    height = np.abs((points @ HULL.equations[:, :3].T + HULL.equations[:, 3]).max(axis=1))
+    assert np.median(made.scans) == 1
+    assert 0.33 < np.median(height / made.one_sigma_m) < 1.33  # 0.67 for a normal distribution
 
 
 def test_too_few_scans_are_refused():

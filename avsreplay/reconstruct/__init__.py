@@ -64,7 +64,7 @@ __all__ = [
     "true_frame",
 ]
 
-WEAKEST = 1e-3  # below this ratio of the eigenvalues of a registration, a surface does not determine the pose
+WEAKEST = 1e-3  # below this ratio of the eigenvalues of a registration, a surface leaves three directions open
 AS_WELL = 1.01  # free motion replaces the refined poses if it increases the rms between scans by no more than this
 STILL_RAD = np.radians(5.0)  # a target that turned by less is at rest
 MOST_ROUNDS = 3  # times views that contradict the others are left out and the poses are refined again
@@ -104,7 +104,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
         tracked = without(tracked, wrong)
         _refuse_few(tracked, views)
     turned, coverage = turn_and_coverage([views[k] for k in poses], list(poses.values()))
-    _refuse_still(turned, tracked.weakest)
+    _refuse_undetermined(turned, tracked.weakest)
     motion = free_motion([views[k].t_ns for k in sorted(poses)], [poses[k] for k in sorted(poses)], survey.extent)
     if motion is not None:
         motion = joint_motion(better, sorted(keys), motion, gate, survey.extent)
@@ -117,7 +117,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
     chosen = dict(sorted(poses.items())[:: max(1, -(-len(poses) // MOST_FUSED))])
     twist = twists([view.t_ns for view in views], poses, motion if survey.timed else None)
     points, normals, one_sigma_m, seen, sights = fused(
-        selected(scans, survey), survey, {k: twist[k] for k in chosen}, p.voxel * survey.extent
+        selected(scans, survey), survey, {k: twist[k] for k in chosen}, p.voxel * survey.extent, rms
     )
     found = tuple((views[k].t_ns, T) for k, T in sorted(poses.items()))
     return Reconstruction(
@@ -190,12 +190,14 @@ def _on_motion(views: Sequence[ScanView], poses: dict[int, Pose], motion: FreeMo
     return {k: motion.at(views[k].t_ns) for k, agrees in zip(sorted(poses), motion.agrees, strict=True) if agrees}
 
 
-def _refuse_still(turned: float, weakest: Sequence[float]) -> None:
-    if turned < STILL_RAD:
-        what = f"the scans show a turn of {np.degrees(turned):.1f} deg only"
-        known = float(np.median(weakest)) > WEAKEST
-        why = "the target is at rest" if known else "its surface does not determine its attitude, as that of a sphere"
-        raise UnreadableInput(f"{what}: {why}", hint="a model needs scans of several sides; give one with --model FILE")
+def _refuse_undetermined(turned: float, weakest: Sequence[float]) -> None:
+    """A sphere is refused whatever its poses are: its attitude follows the noise, and drifts by degrees."""
+    what = f"the scans show a turn of {np.degrees(turned):.1f} deg only: the target is at rest"
+    if float(np.median(weakest)) < WEAKEST:
+        what = "the surface of the target does not determine its attitude, as that of a sphere"
+    elif turned >= STILL_RAD:
+        return
+    raise UnreadableInput(what, hint="a model needs scans of several sides; give one with --model FILE")
 
 
 def _notes(used: int, offered: int, contradicting: int, coverage: float) -> tuple[str, ...]:

@@ -288,12 +288,13 @@ class Sight:
 
 
 def fused(
-    scans: Iterable[Scan], survey: Survey, twist: dict[int, Twist], size_m: float
+    scans: Iterable[Scan], survey: Survey, twist: dict[int, Twist], size_m: float, rms_m: float
 ) -> tuple[Array, Array, Array, NDArray[np.int64], list[Sight]]:
     """Surface points, normals, standard errors along the normal, numbers of scans, and sights; one scan at a time.
 
     Points seen through by more than a third as many scans as have seen them are left out, and points that one scan only
-    has seen and that do not continue the surface of their neighbours.
+    has seen and that do not continue the surface of their neighbours. Where voxels hold few points, their scatter is
+    joined with one square of the noise of a point: half the mean square ``rms_m`` of the distances between two scans.
     """
     points, normals, owner, sights = [], [], [], list[Sight]()
     apart = max(1, len(twist) // MOST_SIGHTS)
@@ -312,12 +313,11 @@ def fused(
     count = np.bincount(cell)
     seen = np.bincount(np.unique(np.column_stack([cell, who]), axis=0)[:, 0], minlength=len(count))
     height = np.einsum("ni,ni->n", p - mean[cell], normal[cell])
-    scatter = np.sqrt(np.bincount(cell, height**2) / np.maximum(count - 1, 1))
     wide = 1.5 * size_m  # rays of one scan are farther apart than points of all scans
     through = sum((s.seen_through(mean, 1.5 * wide) > 6.0 * wide).astype(np.float64) for s in sights)
     keep = np.asarray(through) * (len(twist) / len(sights)) <= 0.34 * seen
     keep &= (seen >= 2) | (len(twist) < 12) | continues(mean, normal, size_m)
-    sigma = scatter / np.sqrt(np.maximum(count, 1))
+    sigma = np.sqrt(np.bincount(cell, height**2) + 0.5 * rms_m**2) / count
     return mean[keep], normal[keep], np.maximum(sigma, 1e-3 * size_m)[keep], seen[keep], sights
 
 

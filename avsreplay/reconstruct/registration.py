@@ -35,8 +35,8 @@ class Match:
         T_ac: pose of the model in the camera frame.
         ratio: share of the points that lie on the model.
         rms_m: root mean square of their point-to-plane distances [m].
-        weakest: smallest eigenvalue of the normal equations over the largest, in units of the extent; near 0 where the
-            surface does not determine the pose (a sphere, a plane).
+        weakest: third smallest eigenvalue of the normal equations over the largest, in units of the extent; near 0
+            where the surface leaves three directions of the pose open (a sphere, a plane).
     """
 
     T_ac: Pose
@@ -95,7 +95,7 @@ def _solved(N: Array, g: Array, extent: float) -> tuple[Array, float]:
     values, vectors = np.linalg.eigh(N * np.outer(scale, scale))
     good = values > 1e-4 * values[-1]
     step = vectors[:, good] @ ((vectors[:, good].T @ (g * scale)) / values[good])
-    return np.asarray(step * scale), float(values[0] / values[-1])
+    return np.asarray(step * scale), float(values[2] / values[-1])
 
 
 def moved(T_ca: Pose, step: Array) -> Pose:

@@ -160,7 +160,7 @@ class ReconstructionParams:
 
 @dataclass(slots=True, eq=False)
 class Tracked:
-    """Poses by number of the view, key views, searches made, scans lost in a row, weakest direction of every match."""
+    """Poses by number of the view, key views, searches made, scans lost in a row, ``weakest`` of every match."""
 
     poses: dict[int, Pose]
     keys: list[int]
