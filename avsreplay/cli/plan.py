@@ -11,7 +11,7 @@ from avsreplay.cli.config import robot_option, setting_option
 from avsreplay.cli.options import Numbers
 
 if TYPE_CHECKING:
-    from avsreplay.cli.plan_output import Answer, Change
+    from avsreplay.cli.plan_output import Answer, PossibleChange
     from avsreplay.outcome import Plan
     from avsreplay.plan import Limits, PlanParams
     from avsreplay.plan.arm import Arm
@@ -197,18 +197,18 @@ def _given(saved: Saved, flags: dict[str, Any]) -> tuple[PlanParams, Limits]:
     return params, replace(saved.limits, **{k: v for k, v in given.items() if k not in of_plan})
 
 
-def _changes(planning: Replanning, saved: Saved, flags: dict[str, Any], index: int) -> list[Change]:
+def _changes(planning: Replanning, saved: Saved, flags: dict[str, Any], index: int) -> list[PossibleChange]:
     """Return single changes with which a plan is found: of settings, then of the instant."""
     from dataclasses import replace
 
-    from avsreplay.cli.plan_output import Change
+    from avsreplay.cli.plan_output import PossibleChange
     from avsreplay.errors import UsageError
     from avsreplay.saved_result import with_settings
 
     options = {p.name: p.opts[0] for p in click.get_current_context().command.params}
     params, limits = _given(saved, flags)
     tables = {"plan": params, "limits": limits.resolved(saved.extent_m), "robot": planning.robot}
-    out: list[Change] = []
+    out: list[PossibleChange] = []
     for key, factors in CHANGES:
         table, name = key.split(".")
         before = getattr(tables[table], name)
@@ -224,14 +224,14 @@ def _changes(planning: Replanning, saved: Saved, flags: dict[str, Any], index: i
                 continue
             if made.found:
                 option = f"{options[name]} {value}" if name in options else f"--set {key}={value}"
-                out.append(Change(key, option, saved.rows[index].t_s, made))
+                out.append(PossibleChange(key, option, saved.rows[index].t_s, made))
                 break
     for later_s in LATER_S:
         at_s = saved.rows[index].t_s + later_s
         for later in [k for k, row in enumerate(saved.rows) if row.t_s >= at_s and row.converged][:1]:
             made = planning.plan_at(later)
             if made.found:
-                return [*out, Change("--at", f"--at {saved.rows[later].t_s:.2f}", saved.rows[later].t_s, made)]
+                return [*out, PossibleChange("--at", f"--at {saved.rows[later].t_s:.2f}", saved.rows[later].t_s, made)]
     return out
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Change:
+class PossibleChange:
     """One change of the problem with which a plan is found.
 
     Attributes:
@@ -59,7 +59,7 @@ class Answer:
     joints: JointPath | None
     hindsight: list[tuple[float, Plan, Miss | None]]
     execution: Execution | None
-    changes: list[Change]
+    changes: list[PossibleChange]
 
 
 def document(answer: Answer) -> str:
@@ -145,7 +145,7 @@ def print_answer(answer: Answer) -> None:
             print_line(console, line)
 
 
-def prevented(changes: list[Change]) -> str:
+def prevented(changes: list[PossibleChange]) -> str:
     """Return in one sentence which settings prevent a plan and with which changes one is found."""
     if not changes:
         return "more than one limit: no single change of a limit or of --at gives a plan"

@@ -21,7 +21,7 @@ from avsreplay.plan.convexification import (
     BETWEEN,
     aborted,
     convex_subproblem,
-    entries,
+    entry_fractions,
     excess,
     feasible,
     margins_at,
@@ -264,7 +264,7 @@ def _moved(case: Case, path: StepPath) -> StepPath:
     if at_bound or (case.limits.cone_deg is None and case.limits.final_deg is None):
         return path
     which, step = 0 if case.limits.cone_deg is not None else 1, 0.5 / case.limits.nodes
-    best, start = path, entries(case, path)
+    best, start = path, entry_fractions(case, path)
     for direction in (-step, step):
         for count in range(1, MOVES + 1):
             entry = list(start)

@@ -40,7 +40,7 @@ def margins_at(case: Case, path: RobotPath, times: Array) -> Margins:
     return margins(case.scene, case.limits, y, r, case.sampled.sigma(times))
 
 
-def entries(case: Case, path: RobotPath) -> tuple[float, float]:
+def entry_fractions(case: Case, path: RobotPath) -> tuple[float, float]:
     """Return the fractions of a flight from which it stays inside the cone and the corridor, each from its range on."""
     s = interval_fractions(case.limits.nodes)
     times = case.wait_s + (path.t_go_s - case.wait_s) * s
