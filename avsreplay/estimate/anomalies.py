@@ -195,16 +195,20 @@ class AnomalyTest:
         if old is not None and self._previous_agrees(track):
             anew: Track | None = self._used(with_history(old, track), track.doubtful)
         else:
-            anew = self._initialised_anew(track) or self._disturbed_start(track := self._with_rejected(track))
+            anew = self._initialised_anew(track)
+            if anew is None:
+                track = self._with_rejected(track)
+                anew = self._disturbed_start(track)
         if anew is not None:
             return replace(anew, reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
         return replace(with_history(track, track), doubtful=track.doubtful[1 - _FEWEST :]), Verdict(0, Reason.POSE_JUMP)
 
     def _with_rejected(self, track: Track) -> Track:
         """The track with the doubtful poses in its list of rejected ones."""
-        last_ns = track.rejected[-1].t_ns if track.rejected else 0
-        fixes = (self.batch.fix(e.prediction, e.innovation) for e in track.doubtful)
-        return replace(track, rejected=(*track.rejected, *(f for f in fixes if f.t_ns > last_ns))[-FEWEST_DISTURBED:])
+        last_ns = track.rejected[-1].scan_ns if track.rejected else -1
+        later = (e for e in track.doubtful if e.prediction.belief.t_ns > last_ns)
+        fixes = (self.batch.fix(e.prediction, e.innovation) for e in later)
+        return replace(track, rejected=(*track.rejected, *fixes)[-FEWEST_DISTURBED:])
 
     def _disturbed_start(self, track: Track) -> Track | None:
         """A new track from the last poses of a target that disturbances move, such as a part on a cable."""
