@@ -108,7 +108,8 @@ class BatchSchedule:
             return replace(track, belief=belief)
         fix, factors = track.fixes[-1], last.factors * np.sqrt(last.inflation)
         noise = self.noise_levels(track)
-        mixture = carried(last.components, fix.t_ns, fix.T_ac, fix.C, factors, innovation.weight, noise, self.orbit)
+        root = np.linalg.inv(np.linalg.cholesky(fix.C))
+        mixture = carried(last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit)
         belief, _ = self.propagated(track, moments(mixture), prediction.belief.t_ns)
         return replace(track, belief=belief, batch=replace(last, components=mixture))
 

@@ -23,8 +23,10 @@ from avsreplay.estimate.dynamics import (
     Flow,
     Triple,
     advance,
+    ascending,
     flow,
     flows,
+    forecast_of,
     grasp_forecast,
     grasp_jacobian,
     process_noise,
@@ -192,10 +194,10 @@ def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float)
     Raises:
         ValueError: times that do not ascend from 0.
     """
-    found = grasp_forecast(belief, times_s, torque, force)  # of free motion
+    times_s = ascending(times_s)
     most = max(map(abs, belief.x.w_b.tolist())) * float(times_s.max(initial=0.0))
     if not isinstance(belief, DrivenBelief) or most > MOST_RAD or not len(times_s):
-        return found
+        return grasp_forecast(belief, times_s, torque, force)
     states, Phi, by_u, steps = driven_steps(belief, times_s, torque, None)
     rotations = geometry.matrix(np.array([x.q_ab for x in states]))
     J = grasp_jacobian(rotations, np.array([x.w_b for x in states]), belief.x.c_b)
@@ -203,8 +205,7 @@ def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float)
     for k, t in enumerate(times_s.tolist()):
         P = _covariance(belief, Phi[k], by_u[k]) + process_noise(steps[k], t, force)
         variances[k] = np.diagonal(J[k] @ P @ J[k].T)
-    sums = np.sqrt(np.maximum(variances.reshape(-1, 3, 3).sum(axis=2), 0.0))
-    return Forecast(times_s, sums[:, 0], sums[:, 1], 2.0 * sums[:, 2])
+    return forecast_of(times_s, variances.reshape(-1, 3, 3).sum(axis=2))
 
 
 def drift_equivalents(x: State, times_s: Array) -> Array:

@@ -274,14 +274,25 @@ def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) 
     Raises:
         ValueError: times that do not ascend from 0.
     """
-    times = np.asarray(times_s, dtype=np.float64)
-    if times.ndim != 1 or np.any(times[:1] < 0.0) or np.any(times[1:] < times[:-1]):
-        raise ValueError("times must ascend from 0")
+    times = ascending(times_s)
     predicted = grasp_prediction(belief, times, torque, force)
     if predicted is None:
         return Forecast(times, *np.full((3, len(times)), np.inf))
-    position, velocity, half_angle = np.sqrt(np.maximum(predicted[0], 0.0)).T
-    return Forecast(times, position, velocity, 2.0 * half_angle)
+    return forecast_of(times, predicted[0])
+
+
+def ascending(times_s: Array) -> Array:
+    """Return times (n,) [s] as numbers. Raises ValueError where they do not ascend from 0."""
+    times = np.asarray(times_s, dtype=np.float64)
+    if times.ndim != 1 or np.any(times[:1] < 0.0) or np.any(times[1:] < times[:-1]):
+        raise ValueError("times must ascend from 0")
+    return times
+
+
+def forecast_of(times_s: Array, variances: Array) -> Forecast:
+    """Return the 1 sigma of variances (n, 3) of position [m], velocity [m/s] and half angle; rounding below 0 is 0."""
+    position, velocity, half_angle = np.sqrt(np.maximum(variances, 0.0)).T
+    return Forecast(times_s, position, velocity, 2.0 * half_angle)
 
 
 def grasp_prediction(belief: Belief, times_s: Array, torque: float, force: float) -> tuple[Array, Array] | None:

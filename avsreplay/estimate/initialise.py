@@ -321,7 +321,7 @@ def with_last_pose(result: BatchResult, fix: PoseFix, weight: float, noise: tupl
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
     """
     scale = np.repeat(result.factors * np.sqrt(result.inflation), 3)
-    mixture = not_worse(result.components, fix.t_ns, fix.T_ac, fix.C * np.outer(scale, scale), weight, noise)
+    mixture = not_worse(result.components, fix.t_ns, fix.T_ac, fix.C * np.outer(scale, scale), weight, noise, fix.orbit)
     if mixture is result.components:
         return result
     belief, _ = propagate(moments(mixture), result.belief.t_ns, *noise, fix.orbit)

@@ -14,7 +14,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import grasp_prediction, torque_density, translation
+from avsreplay.estimate.dynamics import forecast_of, grasp_prediction, torque_density, translation
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import measurement_jacobian, to_fixture
 from avsreplay.estimate.noise import cholesky_root
@@ -81,7 +81,7 @@ def carried(
     components: tuple[Component, ...],
     t_ns: int,
     pose: Pose,
-    C: Array,
+    root: Array,
     factors: Array,
     weight: float,
     noise: tuple[float, float],
@@ -93,26 +93,13 @@ def carried(
         components: after an earlier pose.
         t_ns: instant of the pose [ns].
         pose: measured T_ac.
-        C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
+        root: (6, 6), lower triangular; root' root is the information of d = [theta; v] in {C} [rad, m], T_true =
+            T_ac Exp(d). It may be singular.
         factors: (2,) on the standard deviations of attitude and position.
         weight: Cauchy weight of the pose.
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
         orbit: the relative orbit that the target is on; None for free motion.
     """
-    return _carried(components, t_ns, pose, np.linalg.inv(np.linalg.cholesky(C)), factors, weight, noise, orbit)
-
-
-def _carried(
-    components: tuple[Component, ...],
-    t_ns: int,
-    pose: Pose,
-    root: Array,
-    factors: Array,
-    weight: float,
-    noise: tuple[float, float],
-    orbit: RelativeOrbit | None = None,
-) -> tuple[Component, ...]:
-    """``carried`` with the information root' root of the pose; ``root`` is lower triangular."""
     pair, found = (float(factors[0]), float(factors[1])), []
     for c in components:
         density = torque_density(to_state(c.chart).sigma, noise[0])
@@ -129,7 +116,13 @@ def _carried(
 
 
 def not_worse(
-    components: tuple[Component, ...], t_ns: int, pose: Pose, C: Array, weight: float, noise: tuple[float, float]
+    components: tuple[Component, ...],
+    t_ns: int,
+    pose: Pose,
+    C: Array,
+    weight: float,
+    noise: tuple[float, float],
+    orbit: RelativeOrbit | None = None,
 ) -> tuple[Component, ...]:
     """The result of a fit, corrected by its last pose where it states that pose less precisely than it was measured.
 
@@ -145,27 +138,33 @@ def not_worse(
         C: (6, 6) covariance of d = [theta; v] in {C} [rad, m], T_true = T_ac Exp(d).
         weight: Cauchy weight of the pose.
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
+        orbit: the relative orbit that the target is on; None for free motion.
     """
-    after = _corrected(components, t_ns, pose, C, weight, noise)
-    if after is components or _corrected(after, t_ns, pose, _SMALL_EXCESS * C, weight, noise) is after:
-        return after
-    # the components lie further apart than C: the pose can only move each of them within its own covariance
-    return _corrected((_joined(components),), t_ns, pose, C, weight, noise)
-
-
-def _corrected(
-    components: tuple[Component, ...], t_ns: int, pose: Pose, C: Array, weight: float, noise: tuple[float, float]
-) -> tuple[Component, ...]:
-    """The components corrected by the pose in the directions in which the covariance of all exceeds C."""
-    belief = moments(components)
-    J = to_fixture(belief.x.T_ac.q, belief.x.q_bc) @ measurement_jacobian(belief.x)
-    whiten = np.linalg.inv(cholesky_root(C))
-    values, axes = np.linalg.eigh(whiten @ J @ belief.P @ J.T @ whiten.T)
+    whiten = np.asarray(np.linalg.inv(cholesky_root(C)), dtype=np.float64)
+    values, axes = _excess(components, whiten)
     if values[-1] <= 1.0:
         return components
-    G = np.sqrt(1.0 - 1.0 / np.maximum(values, 1.0))[:, None] * axes.T @ whiten  # C^-1 - S^-1 = G' G
+    root = _missing(values, axes, whiten)
+    after = carried(components, t_ns, pose, root, np.ones(2), weight, noise, orbit)
+    if _excess(after, whiten)[0][-1] <= _SMALL_EXCESS:
+        return after
+    # the components lie further apart than C: the pose can only move each of them within its own covariance
+    return carried((_joined(components),), t_ns, pose, root, np.ones(2), weight, noise, orbit)
+
+
+def _excess(components: tuple[Component, ...], whiten: Array) -> tuple[Array, Array]:
+    """Ascending eigenvalues of S in units of C, and their directions in columns; ``whiten`` C whiten' = 1."""
+    belief = moments(components)
+    J = whiten @ to_fixture(belief.x.T_ac.q, belief.x.q_bc) @ measurement_jacobian(belief.x)
+    values, axes = np.linalg.eigh(J @ belief.P @ J.T)
+    return values, axes
+
+
+def _missing(values: Array, axes: Array, whiten: Array) -> Array:
+    """Lower triangular root of C^-1 - S^-1 in the directions in which S exceeds C."""
+    G = np.sqrt(1.0 - 1.0 / np.maximum(values, 1.0))[:, None] * axes.T @ whiten
     _, upper = np.linalg.qr(G[:, ::-1])
-    return _carried(components, t_ns, pose, upper[::-1, ::-1].copy(), np.ones(2), weight, noise)
+    return np.ascontiguousarray(upper[::-1, ::-1])
 
 
 def mixture_forecast(
@@ -196,5 +195,4 @@ def mixture_forecast(
         turn = geometry.multiply(geometry.conjugate(centre[:, 6:]), motion[:, 6:])[:, :3]
         off = np.stack([(d * d).sum(axis=1) for d in (position, velocity, turn)], axis=1)
         total += component.weight * (variances + off)
-    position, velocity, half_angle = np.sqrt(np.maximum(total, 0.0)).T
-    return Forecast(times, position, velocity, 2.0 * half_angle)
+    return forecast_of(times, total)
