@@ -20,19 +20,75 @@ def with_stdout(handle: int, *args: object) -> tuple[int, str]:
     return done.returncode, done.stderr
 
 
+def with_closed_pipe(*args: object) -> tuple[int, str]:
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        return with_stdout(writer, *args)
+    finally:
+        os.close(writer)
+
+
 @posix
 @pytest.mark.parametrize(
     "args",
-    [("run", "tumble.mcap", "--n-scans", 3), ("run", "tumble.mcap", "--n-scans", 3, "--json"), ("info", "tumble.mcap")],
+    [
+        ("run", "tumble.mcap", "--n-scans", 3),
+        ("run", "tumble.mcap", "--n-scans", 3, "--json"),
+        ("info", "tumble.mcap"),
+        ("record", "tumble.mcap", "-o", "-"),
+    ],
 )
 def test_a_closed_pipe_is_not_a_failed_check(args: tuple[object, ...], fixtures_folder: Path) -> None:
-    reader, writer = os.pipe()
-    os.close(reader)
-    code, err = with_stdout(writer, args[0], fixtures_folder / str(args[1]), *args[2:])
-    os.close(writer)
-    assert code in (0, 141)
+    code, err = with_closed_pipe(args[0], fixtures_folder / str(args[1]), *args[2:])
+    assert code == 141
     assert "Traceback" not in err
     assert "Exception ignored" not in err
+
+
+@posix
+def test_a_closed_pipe_loses_no_output(fixtures_folder: Path, tmp_path: Path) -> None:
+    log, result = fixtures_folder / "tumble.mcap", tmp_path / "result"
+    whole, campaign = tmp_path / "whole", tmp_path / "campaign.toml"
+    campaign.write_text('[set]\n"scenario.duration_s" = 1.0\n', encoding="utf-8")
+    assert with_stdout(subprocess.DEVNULL, "run", log, "--n-scans", 3, "-o", whole, "--report")[0] == 0
+    outputs = {
+        result / "report.html": ("run", log, "--n-scans", 3, "-o", result, "--report"),
+        tmp_path / "page.html": ("report", whole, "-o", tmp_path / "page.html"),
+        tmp_path / "compared.html": ("compare", whole, whole, "-o", tmp_path / "compared.html"),
+        tmp_path / "rows.csv": ("export", whole, "--to", "csv", "-o", tmp_path / "rows.csv"),
+        tmp_path / "model.ply": ("model", log, "-o", tmp_path / "model.ply"),
+        tmp_path / "swept" / "report.html": ("sweep", campaign, "-o", tmp_path / "swept", "--workers", 0),
+    }
+    for output, command in outputs.items():
+        code, err = with_closed_pipe(*command)
+        assert code == 141, err
+        assert output.stat().st_size > 0, err
+    assert (result / "rows.jsonl").read_bytes() == (whole / "rows.jsonl").read_bytes()
+
+
+@posix
+def test_a_failed_check_is_reported_though_the_pipe_is_closed(fixtures_folder: Path) -> None:
+    golden = fixtures_folder / "spin-raster.rows.jsonl"
+    code, _ = with_closed_pipe("run", fixtures_folder / "tumble.mcap", "--n-scans", 3, "--golden", golden)
+    assert code == 1
+
+
+@posix
+def test_standard_output_that_the_shell_has_closed(fixtures_folder: Path) -> None:
+    words = " ".join([*AVSREPLAY, "info", str(fixtures_folder / "tumble.mcap")])
+    done = subprocess.run(["sh", "-c", f"{words} >&-"], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@posix
+def test_results_are_complete_though_standard_output_is_full(fixtures_folder: Path, tmp_path: Path) -> None:
+    log, page = fixtures_folder / "tumble.mcap", tmp_path / "report.html"
+    with Path("/dev/full").open("w", encoding="utf-8") as full:
+        code, err = with_stdout(full.fileno(), "run", log, "--n-scans", 3, "-o", tmp_path, "--overwrite", "--report")
+    assert code == 3
+    assert err.strip().endswith("avsreplay: standard output: No space left on device")
+    assert page.stat().st_size > 0
 
 
 @posix

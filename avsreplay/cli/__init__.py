@@ -17,6 +17,7 @@ import traceback
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -85,12 +86,8 @@ class _Commands(click.Group):
             raise UsageError("no command has an option of this name", where=f"environment {unknown[0]}", hint=hint)
         try:
             return super().invoke(ctx)
-        except BrokenPipeError:
-            raise StdoutClosed from None
-        except SystemExit as leaving:
-            if isinstance(leaving.__context__, BrokenPipeError):  # rich exits with 1
-                raise StdoutClosed from None
-            raise
+        except BrokenPipeError:  # of a log that is written to standard output; click exits with 1
+            return 141
 
     def _variables(self, ctx: click.Context) -> Iterator[str]:
         """Every environment variable that stands for an option."""
@@ -200,18 +197,30 @@ def _check_arithmetic() -> None:
         raise UsageError(f"{value[:40]!r} is unknown", where=f"environment {arithmetic.VARIABLE}", hint=f"use {known}")
 
 
-class StdoutClosed(BaseException):
-    """The reader of standard output closed it; not an OSError, which click and rich turn into exit code 1."""
+class _Discarding(io.FileIO):
+    """Standard output that takes what can no longer be written, so that a command completes its other outputs.
+
+    Attributes:
+        failure: why the first write failed; None while standard output can be written.
+    """
+
+    failure: OSError | None = None
+
+    def write(self, data: Any) -> int | None:  # type: ignore[override]
+        """Write the data, or discard them after a failed write; in both cases their number of bytes is returned."""
+        if self.failure is None:
+            try:
+                return super().write(data)
+            except OSError as error:
+                self.failure = error
+        return len(memoryview(data).cast("B"))
 
 
 def entry_point() -> None:
     """Run a command of the arguments of this process and exit with its code; every error is one line on stderr."""
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for the terminal
-    for stream in (sys.stdout, sys.stderr):  # a character that the encoding of the terminal does not have is escaped
-        with contextlib.suppress(OSError, ValueError):
-            if isinstance(stream, io.TextIOWrapper):
-                stream.reconfigure(errors="backslashreplace")
+    output = _standard_output()
     try:
         code = group.main(standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY")
     except AvsError as error:
@@ -220,32 +229,35 @@ def entry_point() -> None:
         code = _fail(error.format_message(), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         code = _fail("interrupted", 130)
-    except StdoutClosed:
-        code = _silence(141)
     except OSError as error:
-        code = _fail(f"{error.filename or 'standard output'}: {error.strerror or error}", 3)
-        code = code if error.filename else _silence(code)
+        code = _fail(f"{error.filename or 'output'}: {error.strerror or error}", 3)
     except Exception as error:
         code = _crash(error)
-    sys.exit(_flushed(code if isinstance(code, int) else 0))
+    code = code if isinstance(code, int) else 0
+    sys.stdout.flush()
+    if output and output.failure and not code:
+        closed = isinstance(output.failure, BrokenPipeError)
+        code = 141 if closed else _fail(f"standard output: {output.failure.strerror or output.failure}", 3)
+    sys.exit(code)
 
 
-def _flushed(code: int) -> int:
-    """Flush standard output; return ``code``, or 3 if the output cannot be written."""
+def _standard_output() -> _Discarding | None:
+    """Replace standard output by one whose failure does not end the command; None where it is not a file.
+
+    A character that the encoding of standard output or standard error does not have is written as an escape.
+    """
+    if sys.stdout is None:  # closed by the shell
+        sys.stdout = io.StringIO()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
-        sys.stdout.flush()
-    except BrokenPipeError:  # the command was finished
-        return _silence(code)
-    except OSError as error:
-        return _silence(_fail(f"standard output: {error.strerror or error}", 3))
-    return code
-
-
-def _silence(code: int) -> int:
-    """Discard what is still buffered for standard output, so that the interpreter does not report it at its end."""
-    with contextlib.suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return code
+        output = _Discarding(sys.stdout.fileno(), "wb", closefd=False)
+    except (OSError, ValueError):  # one that a test has put in its place
+        return None
+    encoding, lines = sys.stdout.encoding, bool(sys.stdout.line_buffering)
+    sys.stdout = io.TextIOWrapper(io.BufferedWriter(output), encoding, "backslashreplace", line_buffering=lines)
+    return output
 
 
 def _crash(error: Exception) -> int:

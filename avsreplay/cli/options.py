@@ -235,14 +235,8 @@ def interruptible(rows: Sequence[object], stop: Callable[[], None]) -> Iterator[
 _LIVE_HEAD = "  scan     t [s]  state             rms [mm]     nis pos err [mm] rot err [deg]"
 
 
-def say_live(row: Row) -> bool:
-    """Print a line about a scan of a log that is still written, the first one under a heading.
-
-    Returns:
-        False if the reader of standard output has ended, which the tables report later.
-    """
-    from avsreplay.cli import StdoutClosed
-
+def say_live(row: Row) -> None:
+    """Print a line about a scan of a log that is still written, the first one under a heading."""
     cells = [
         f"{_number(row.rms_m, 1000.0, '.2f'):>9}",
         f"{_number(row.nis, 1.0, '.2f'):>7}",
@@ -251,11 +245,7 @@ def say_live(row: Row) -> bool:
     ]
     state = "ok" if row.gamma else row.reason
     line = f"{row.seq:>6} {row.t_s:>9.3f}  {state:<16} {' '.join(cells)}"
-    try:
-        click.echo(line if row.seq else f"{_LIVE_HEAD}\n{line}")
-    except (OSError, StdoutClosed):
-        return False
-    return True
+    click.echo(line if row.seq else f"{_LIVE_HEAD}\n{line}")
 
 
 def _number(value: float | None, factor: float, form: str) -> str:

@@ -267,7 +267,7 @@ def _collect(found: Generator[Row], rows: list[Row], growing: GrowingLog | None 
         with closing(found), interruptible(rows, growing.stop if growing else lambda: None) as stopped:
             for row in found:
                 if live:
-                    live = say_live(row)
+                    say_live(row)
                 rows.append(row)
                 if stopped() and not growing:
                     return True
