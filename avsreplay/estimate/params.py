@@ -53,7 +53,8 @@ class EstimatorParams(Settings):
 
     torque_noise_radps15: float | None = setting(
         None,
-        "Root spectral density of the angular acceleration noise eps_tau.",
+        "Root spectral density of the angular acceleration noise eps_tau. With a larger value the estimate follows"
+        " disturbances faster and has larger standard deviations.",
         unit="rad/s^1.5",
         low=0.0,
         high=1e6,
@@ -61,23 +62,26 @@ class EstimatorParams(Settings):
     )
     force_noise_mps15: float | None = setting(
         None,
-        "Root spectral density of the linear acceleration noise eps_f.",
+        "Root spectral density of the linear acceleration noise eps_f. With a larger value the estimate follows"
+        " disturbances faster and has larger standard deviations.",
         unit="m/s^1.5",
         low=0.0,
         unset="estimated from the residuals of the poses",
     )
     acceleration_mps2: tuple[float, float, float] = setting(
-        (0.0, 0.0, 0.0), "Constant acceleration of the centre of mass in {A}, known: gravity, thrust.", unit="m/s2"
+        (0.0, 0.0, 0.0),
+        "Known constant acceleration of the centre of mass in {A}, for example gravity or thrust.",
+        unit="m/s2",
     )
     fit_acceleration: bool = setting(
         False,
-        "Fit that acceleration in a first pass to the poses up to the first manoeuvre; acceleration_mps2 is then not"
-        " used.",
+        "Fit this acceleration in a first pass, to the poses up to the first manoeuvre. acceleration_mps2 is then"
+        " not used.",
     )
     orbit_rate_radps: float = setting(
         0.0,
-        "Mean motion of the camera's circular orbit: the centre of mass moves by the equations of Clohessy and"
-        " Wiltshire; 0: free motion.",
+        "Mean motion of the camera's circular orbit. The centre of mass moves by the equations of Clohessy and"
+        " Wiltshire; 0 means free motion.",
         unit="rad/s",
         low=0.0,
         high=0.1,
@@ -88,61 +92,82 @@ class EstimatorParams(Settings):
     orbit_normal_a: tuple[float, float, float] = setting((0.0, 1.0, 0.0), "Unit normal of the orbit in {A}.")
     noise: NoiseSource = setting(
         NoiseSource.REGISTRATION,
-        "Source of the measurement noise: the covariance that registration reports, or the fixed R0.",
+        "Source of the measurement noise: the covariance that the registration computes (registration), or the"
+        " fixed R0 (r0).",
     )
     adapt: Adaptation = setting(
         Adaptation.SCALE,
         "Adaptation of the measurement noise to the residuals: one factor each for position and attitude (scale),"
         " the paper's whole matrix starting from R0 (matrix), or none (off).",
     )
-    window: int = setting(30, "Healthy scans in the window of the noise adaptation.", low=6)
+    window: int = setting(
+        30,
+        "Number of healthy scans to whose residuals the measurement noise is adapted. A larger value gives a"
+        " steadier noise level that follows changes more slowly.",
+        low=6,
+    )
     r0_pos_m: float | None = setting(
         None, "R0: 1 sigma of the measured position.", unit="m", above=0.0, high=1e6, of_extent=0.002
     )
     r0_rot_deg: float = setting(0.5, "R0: 1 sigma of the measured attitude about each axis.", unit="deg", above=0.0)
-    r_floor: float = setting(1e-6, "Smallest eigenvalue of R in units of R0.", above=0.0)
+    r_floor: float = setting(
+        1e-6, "Smallest eigenvalue of R in units of R0. A larger value limits the weight of precise poses.", above=0.0
+    )
     constraint: Constraint = setting(
         Constraint.CHART,
         "How the inertia ratios stay within their bounds: coordinates without bounds (chart), or the paper's scaling"
         " beta of the Kalman gain (gain).",
     )
     sigma_margin: float = setting(
-        0.01, "With constraint gain: |sigma| stays below 1 minus this margin.", above=0.0, below=0.5
+        0.01,
+        "With constraint gain: |sigma| stays below 1 minus this margin. A larger value excludes more of the"
+        " nearly flat or slender bodies.",
+        above=0.0,
+        below=0.5,
     )
     correlated_share: float | None = setting(
         None,
-        "Share of a registered pose's variance that is common to scans from nearly the same view.",
+        "Share of a registered pose's variance that is common to scans from nearly the same view. A larger value"
+        " gives such scans together less weight.",
         low=0.0,
         high=1.0,
         unset="computed from the number of inliers and their rms residual (docs/estimation.md, Noise)",
     )
     correlated_rad: float = setting(
-        0.4, "Rotation of the view over which that common error changes.", unit="rad", low=0.0
+        0.4,
+        "Rotation of the view over which this common error changes. A larger value gives the scans of a slowly"
+        " turning target less weight.",
+        unit="rad",
+        low=0.0,
     )
     start: Start = setting(
         Start.AUTO,
-        "Initialisation: from a given belief (near), by a batch fit to the first poses (cold), by the paper's filter"
-        " from zero (paper); auto is near where a belief is given and cold otherwise.",
+        "How the estimate begins: from a given belief (near), by a batch fit to the first poses (cold), or by the"
+        " paper's filter from zero (paper). auto is near if a belief is given and cold otherwise.",
     )
     refit_growth: float = setting(
         0.2,
-        "The batch fit is repeated when the number of healthy poses has grown by this share, until its likelihood is"
-        " close to Gaussian.",
+        "The batch fit is repeated when the number of healthy poses has grown by this share, until its likelihood"
+        " is close to Gaussian. A larger value takes less time and leaves more poses to linear updates between two"
+        " fits.",
         low=0.0,
         high=1.0,
     )
     audit_poses: int = setting(
-        1000, "Number of healthy poses up to which the filter is checked against a batch fit; 0 switches it off.", low=0
+        1000,
+        "Number of healthy poses up to which the filter is compared with a batch fit. A larger value continues"
+        " the comparison for longer and takes more time; 0 switches it off.",
+        low=0,
     )
     robust: bool = setting(
         True,
-        "Reduce the weight of a healthy pose whose NIS exceeds the 99.99 % point; the paper's initialisation never"
-        " does.",
+        "Reduce the weight of a healthy pose whose NIS exceeds its 99.99 % point; the paper's start never does.",
     )
     bias_s: float = setting(
         20.0,
-        "A step of the measured pose is the end of a sensor error before the estimate has lasted for this time, and the"
-        " beginning of one later, if the residuals of the registration do not distinguish them.",
+        "Time for which poses must have been consistent before a step of the measured pose counts as the beginning"
+        " of a sensor error; an earlier step counts as its end. It is used if the residuals of the registration do"
+        " not distinguish the two.",
         unit="s",
         low=0.0,
     )

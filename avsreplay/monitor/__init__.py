@@ -168,32 +168,52 @@ class FaultParams(Settings):
 
     policy: Policy = setting(
         Policy.ANY,
-        "How the fit test and the pose test are joined: either one alone is a fault (any), or a fault needs both to"
+        "How the fit test and the pose test are joined: a scan is faulty if either fails (any), or only if both"
         " fail, as printed in the paper (all).",
     )
     rms_max_m: float | None = setting(
-        None, "Rms residual of the fit from which a scan is faulty.", unit="m", above=0.0, of_extent=0.01
+        None,
+        "Rms distance of the inliers from the model from which a scan is faulty. A larger value accepts worse"
+        " registrations.",
+        unit="m",
+        above=0.0,
+        of_extent=0.01,
     )
     alpha_max_m: float | None = setting(
-        None, "Pose innovation, in the weighted norm, from which a scan is faulty.", unit="m", above=0.0, of_extent=0.02
+        None,
+        "Innovation of the pose, in the weighted norm, from which a scan is faulty. A larger value accepts"
+        " larger deviations from the prediction.",
+        unit="m",
+        above=0.0,
+        of_extent=0.02,
     )
     length_m: float | None = setting(
         None,
-        "Characteristic length that converts an angle to a length in the weighted norm.",
+        "Characteristic length that converts an angle to a length in the weighted norm. A larger value gives errors"
+        " of attitude more weight.",
         unit="m",
         above=0.0,
         of_extent=0.25,
     )
     sigmas: float = setting(
-        4.0, "The limit on the pose innovation is never below this multiple of its predicted 1 sigma.", above=0.0
-    )
-    min_inliers: int = setting(50, "Inliers that a healthy scan needs.", low=0)
-    split_nis_max: float = setting(
-        60.0,
-        "Normalised squared difference of the poses from two halves of the scan above which a scan is faulty.",
+        4.0,
+        "The limit on the innovation is never below this multiple of its predicted 1 sigma. A larger value"
+        " accepts more poses after a blackout.",
         above=0.0,
     )
-    min_inlier_ratio: float = setting(0.3, "Ratio of inliers to points that a healthy scan needs.", low=0.0, high=1.0)
+    min_inliers: int = setting(50, "Smallest number of inliers of a healthy scan.", low=0)
+    split_nis_max: float = setting(
+        60.0,
+        "A scan is faulty if the normalised squared difference of the poses from its two halves is above this value.",
+        above=0.0,
+    )
+    min_inlier_ratio: float = setting(
+        0.3,
+        "Smallest ratio of inliers to points of a healthy scan. A larger value rejects more scans with background"
+        " or clutter.",
+        low=0.0,
+        high=1.0,
+    )
 
 
 def weighted_norm(seen: Innovation, length_m: float) -> float:

@@ -26,17 +26,27 @@ _NOT_WORSE = 1.05  # a posterior 1 sigma may exceed that of the measurement by t
 class ConsistencyParams(Settings):
     """The innovation test that may withdraw ``converged``."""
 
-    window: int = setting(50, "Healthy scans in the window of the test.", low=2)
-    least: int = setting(15, "Healthy scans from which the test is made.", low=2)
+    window: int = setting(
+        50,
+        "Number of healthy scans in the window of the test. A larger value finds smaller deviations, but later.",
+        low=2,
+    )
+    least: int = setting(
+        15,
+        "Smallest number of healthy scans in the window for which the test is made; with fewer, converged stays false.",
+        low=2,
+    )
     level: float = setting(
         0.9999,
-        "Probability of the two-sided band in which the mean NIS of a correct filter lies.",
+        "Probability of the two-sided band in which the mean NIS of a correct filter lies. A larger value accepts"
+        " larger deviations.",
         above=0.0,
         below=1.0,
     )
     slack: float = setting(
         2.0,
-        "Factor by which the mean NIS may exceed the band, because registration errors are not quite white.",
+        "Factor by which the mean NIS may exceed the band, because registration errors are correlated. A larger"
+        " value accepts larger deviations.",
         low=1.0,
     )
 
@@ -62,29 +72,48 @@ class ConvergenceParams(Settings):
         "Test that decides: the covariance of every block, as in the paper (covariance), or the predicted 1 sigma of"
         " the grasp point over the horizon (predictive).",
     )
-    dwell_s: float = setting(2.0, "Time for which the test must hold without interruption.", unit="s", low=0.0)
-    horizon_s: float = setting(30.0, "predictive: How far ahead the grasp point is predicted.", unit="s", low=0.0)
-    horizon_steps: int = setting(6, "predictive: Number of instants over the horizon.", low=1, high=1000)
+    dwell_s: float = setting(
+        2.0,
+        "Time for which the test must be met without interruption before converged becomes true.",
+        unit="s",
+        low=0.0,
+    )
+    horizon_s: float = setting(
+        30.0,
+        "With predictive: time over which the grasp point is predicted. A larger value requires a more"
+        " precise estimate.",
+        unit="s",
+        low=0.0,
+    )
+    horizon_steps: int = setting(
+        6, "With predictive: number of instants of the horizon that are tested.", low=1, high=1000
+    )
     grasp_pos_m: float | None = setting(
-        None, "predictive: Limit on the grasp point's position.", unit="m", low=0.0, of_extent=0.01
+        None, "With predictive: largest 1 sigma of the grasp point's position.", unit="m", low=0.0, of_extent=0.01
     )
     grasp_vel_mps: float | None = setting(
-        None, "predictive: Limit on the grasp point's velocity.", unit="m/s", low=0.0, of_extent=0.002
+        None, "With predictive: largest 1 sigma of the grasp point's velocity.", unit="m/s", low=0.0, of_extent=0.002
     )
-    grasp_rot_deg: float = setting(3.0, "predictive: Limit on the grasp point's attitude.", unit="deg", low=0.0)
-    attitude_deg: float = setting(3.0, "covariance: Limit on the attitude of {B}.", unit="deg", low=0.0)
-    rate_radps: float = setting(0.003, "covariance: Limit on the angular rate.", unit="rad/s", low=0.0)
+    grasp_rot_deg: float = setting(
+        3.0, "With predictive: largest 1 sigma of the grasp point's attitude.", unit="deg", low=0.0
+    )
+    attitude_deg: float = setting(3.0, "With covariance: largest 1 sigma of the attitude of {B}.", unit="deg", low=0.0)
+    rate_radps: float = setting(0.003, "With covariance: largest 1 sigma of the angular rate.", unit="rad/s", low=0.0)
     position_m: float | None = setting(
-        None, "covariance: Limit on the position of the mass centre.", unit="m", low=0.0, of_extent=0.01
+        None, "With covariance: largest 1 sigma of the position of the mass centre.", unit="m", low=0.0, of_extent=0.01
     )
     velocity_mps: float | None = setting(
-        None, "covariance: Limit on the velocity of the mass centre.", unit="m/s", low=0.0, of_extent=0.001
+        None,
+        "With covariance: largest 1 sigma of the velocity of the mass centre.",
+        unit="m/s",
+        low=0.0,
+        of_extent=0.001,
     )
-    sigma: float = setting(0.05, "covariance: Limit on the two inertia ratios.", low=0.0)
+    sigma: float = setting(0.05, "With covariance: largest 1 sigma of the two inertia ratios.", low=0.0)
     varrho_m: float | None = setting(
-        None, "covariance: Limit on the fixture's position in {B}.", unit="m", low=0.0, of_extent=0.01
+        None, "With covariance: largest 1 sigma of varrho.", unit="m", low=0.0, of_extent=0.01
     )
-    mu_deg: float = setting(3.0, "covariance: Limit on the misalignment of the fixture.", unit="deg", low=0.0)
+    mu_deg: float = setting(3.0, "With covariance: largest 1 sigma of mu.", unit="deg", low=0.0)
 
     @property
     def times_s(self) -> Array:

@@ -33,14 +33,22 @@ class PlanParams(Settings):
     """Capability of the robot, and how it plans."""
 
     a_max_mps2: float = setting(0.05, "Largest acceleration of the end-effector.", unit="m/s2", above=0.0)
-    horizon_s: float = setting(120.0, "Latest capture considered, after the instant of planning.", unit="s", above=0.0)
+    horizon_s: float = setting(
+        120.0, "Latest time of capture that is considered, after the instant of planning.", unit="s", above=0.0
+    )
     latency_s: float = setting(
-        0.0, "Time between planning and the first thrust, in which the robot coasts.", unit="s", low=0.0
+        0.0, "Time between planning and the first thrust, during which the robot coasts.", unit="s", low=0.0
     )
     replan_period_s: float = setting(
         1.0, "A new plan is made at the first scan this long after the previous plan.", unit="s", above=0.0
     )
-    grid_s: float = setting(0.2, "Spacing of the samples of the goal trajectory.", unit="s", above=0.0)
+    grid_s: float = setting(
+        0.2,
+        "Spacing of the samples of the goal trajectory. A larger value takes less time and interpolates the"
+        " trajectory less accurately.",
+        unit="s",
+        above=0.0,
+    )
     robot_position_m: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0), "Position of the end-effector in {A} when planning.", unit="m"
     )

@@ -43,18 +43,22 @@ class SupervisorParams(Settings):
     )
     capture_angle_deg: float = setting(2.0, "Capture tolerance on the gripper's angle.", unit="deg", above=0.0)
     sigmas: float = setting(
-        3.0, "The predicted 1 sigma (root of the trace) times this must be within the tolerances.", above=0.0
+        3.0,
+        "The predicted 1 sigma (root of the trace) times this must be within the tolerances. A larger value"
+        " captures only with more precise predictions.",
+        above=0.0,
     )
     commit_s: float = setting(
-        0.5, "With less time to go than this the last plan is flown to its end.", unit="s", above=0.0
+        0.5, "The last plan is flown to its end if the time to go is less than this.", unit="s", above=0.0
     )
     patience_s: float = setting(
         1.5,
-        "Time without a healthy scan after which the prediction must be good enough to the end of the plan.",
+        "Time without a healthy scan after which the approach continues only if the prediction is within the"
+        " tolerances up to the end of the plan.",
         unit="s",
         above=0.0,
     )
-    recover_scans: int = setting(2, "Consecutive healthy scans that end a hold.", low=1)
+    recover_scans: int = setting(2, "Number of consecutive healthy scans that ends a hold.", low=1)
     hold_limit_s: float = setting(60.0, "A hold or retreat that lasts longer becomes an abort.", unit="s", above=0.0)
     attempts_max: int = setting(5, "Number of approaches after which the next withdrawal becomes an abort.", low=1)
     approach_limit_s: float = setting(

@@ -40,17 +40,29 @@ class RegistrationLimits:
 class AcquireParams(Settings):
     """Parameters of the global search: registration without an initial guess."""
 
-    starts: int = setting(600, "Attitudes tried; the second effort tries seven times as many.", low=1)
-    least_ratio: float = setting(0.7, "With a smaller inlier ratio no pose was found.", low=0.0, high=1.0)
+    starts: int = setting(
+        600,
+        "Number of initial attitudes of the search; its second round tries seven times as many. With more of them,"
+        " poses of difficult shapes are found more often, in more time.",
+        low=1,
+    )
+    least_ratio: float = setting(
+        0.7,
+        "Smallest inlier ratio of a pose that the search returns. A larger value rejects more wrong poses, and more"
+        " poses of partly hidden targets.",
+        low=0.0,
+        high=1.0,
+    )
     least_separate: float = setting(
         0.4,
-        "The same where the other points are well away from the model, as those of another object are.",
+        "The same limit if the other points are far from the model, as those of another object are.",
         low=0.0,
         high=1.0,
     )
     margin: float = setting(
         0.01,
-        "A second pose whose share of unexplained points exceeds the best one's by less makes the result ambiguous.",
+        "The result is ambiguous if the share of unexplained points of a second pose exceeds that of the best pose"
+        " by less. A larger value rejects more poses of nearly symmetric targets.",
         low=0.0,
         high=1.0,
     )
@@ -62,41 +74,73 @@ class RegisterParams(Settings):
 
     backend: str = setting("horn", "Registration back end, by its entry-point name ('avsreplay backends' lists them).")
     reach_m: float | None = setting(
-        None, "Rejection distance of a correspondence in the first iteration.", unit="m", above=0.0, of_extent=0.15
+        None,
+        "Rejection distance of a correspondence in the first iteration. A larger value corrects larger errors"
+        " of the initial guess, but uses more points that are not on the target.",
+        unit="m",
+        above=0.0,
+        of_extent=0.15,
     )
     gate_m: float | None = setting(
         None,
-        "Largest rejection distance in the last iteration; a point closer to the model than this is an inlier.",
+        "Largest rejection distance in the last iteration; a point closer to the model than this is an inlier. A"
+        " larger value accepts a less accurate model, but uses more points that are not on the target.",
         unit="m",
         above=0.0,
         of_extent=0.01,
     )
-    n_max: int = setting(200, "Iterations after which a registration counts as not converged.", low=1)
+    n_max: int = setting(
+        200,
+        "Iterations after which a registration counts as not converged. A larger value helps views with a weakly"
+        " determined direction and takes more time.",
+        low=1,
+    )
     eps_rad: float = setting(
-        1e-5, "The iteration ends when a step rotates the pose by less than this.", unit="rad", above=0.0
+        1e-5,
+        "The iteration ends when a step rotates the pose by less than this. A larger value ends it earlier, at"
+        " a less exact pose.",
+        unit="rad",
+        above=0.0,
     )
     eps_m: float | None = setting(
-        None, "The iteration ends when a step moves the pose by less than this.", unit="m", above=0.0, of_extent=1e-6
+        None,
+        "The iteration ends when a step moves the pose by less than this. A larger value ends it earlier, at a"
+        " less exact pose.",
+        unit="m",
+        above=0.0,
+        of_extent=1e-6,
     )
     noise_m: float | None = setting(
         None,
-        "1 sigma of a point's error normal to the surface.",
+        "1 sigma of a point's error normal to the surface. A larger value increases the covariance of the pose.",
         unit="m",
         above=0.0,
         unset="estimated from the residuals of each scan",
     )
-    min_inliers: int = setting(30, "With fewer inliers a scan has no overlap with the model.", low=1)
+    min_inliers: int = setting(
+        30, "Smallest number of inliers; a scan with fewer gets the status no_overlap and is not used.", low=1
+    )
     min_inlier_ratio: float = setting(
-        0.02, "With a smaller share of inliers a scan has no overlap with the model.", low=0.0, high=1.0
+        0.02,
+        "Smallest ratio of inliers to points; a scan with a smaller one gets the status no_overlap and is not used.",
+        low=0.0,
+        high=1.0,
     )
     camera: Camera = setting(
         Camera.AUTO, "Position of the camera: the origin of the scan's frame, unknown (none), or detected (auto)."
     )
     subsample_m: float = setting(
-        0.0, "Edge length of the voxels of which one point each is kept; 0 keeps all points.", unit="m", low=0.0
+        0.0,
+        "Edge length of the voxels in each of which one point is kept. A larger value takes less time and gives"
+        " a less accurate pose; 0 keeps all points.",
+        unit="m",
+        low=0.0,
     )
     split_every: int = setting(
-        5, "The poses from two halves of the scan are compared on every n-th scan (column split_nis).", low=1
+        5,
+        "The poses from two halves of the scan are compared on every n-th scan (column split_nis). A larger"
+        " value takes less time and tests fewer scans.",
+        low=1,
     )
     threads: int = setting(
         1, "Largest number of threads of a back end; the result does not depend on it.", low=1, high=1024

@@ -71,14 +71,16 @@ DEFAULTS: dict[Kind, tuple[float | None, bool]] = {  # strength and whether it i
 class InjectedFault(Settings):
     """One table [[fault]]: a kind of fault over [start_s, start_s + duration_s)."""
 
-    kind: Kind = setting(doc="What goes wrong.")
-    start_s: float = setting(doc="Begin of the fault, after the first scan is due.", unit="s", low=0.0, high=LONGEST_S)
+    kind: Kind = setting(doc="Kind of the fault.")
+    start_s: float = setting(
+        doc="Begin of the fault, after the time of the first scan.", unit="s", low=0.0, high=LONGEST_S
+    )
     duration_s: float = setting(doc="Length of the fault.", unit="s", above=0.0, high=LONGEST_S)
     strength: float | None = setting(
         None, "Strength; its meaning and range depend on the kind.", unset="the default of the kind"
     )
     harmful: bool | None = setting(
-        None, "Whether the label says that no good pose can come from such a scan.", unset="as usual for the kind"
+        None, "Whether the label states that such a scan gives no good pose.", unset="as usual for the kind"
     )
 
     def check(self) -> None:

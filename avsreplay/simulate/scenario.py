@@ -39,7 +39,7 @@ class StartParams(Settings):
     rate_offset_radps: Triple | None = setting(None, "Error of the angular rate.", unit="rad/s", unset=DRAWN)
     sigma_std: float = setting(0.05, "1 sigma of sigma_1 and sigma_2.", above=0.0, high=1.0)
     sigma_offset: tuple[float, float] | None = setting(
-        None, "Error of sigma_1 and sigma_2; the believed ratios must be between -1 and 1.", unset=DRAWN
+        None, "Error of sigma_1 and sigma_2; the initial estimate of both must be between -1 and 1.", unset=DRAWN
     )
     varrho_std_m: float = setting(0.05, "1 sigma of the fixture's position in {B}.", unit="m", above=0.0)
     varrho_offset_m: Triple | None = setting(None, "Error of the fixture's position.", unit="m", unset=DRAWN)

@@ -35,12 +35,19 @@ Triple = tuple[float, float, float]
 class Presence(Settings):
     """Something that is in the scene for the whole log or for a part of it."""
 
-    name: str = setting(doc="Its name, which is the kind of its label.")
-    start_s: float = setting(0.0, "Begin of its presence, after the first scan is due.", unit="s", low=0.0, high=1e8)
-    duration_s: float | None = setting(
-        None, "Length of its presence.", unit="s", above=0.0, high=1e8, unset="to the end of the log, without a label"
+    name: str = setting(doc="Name, which is also the kind in its label.")
+    start_s: float = setting(
+        0.0, "Time at which it appears, after the time of the first scan.", unit="s", low=0.0, high=1e8
     )
-    harmful: bool = setting(False, "Whether its label says that no good pose can come from such a scan.")
+    duration_s: float | None = setting(
+        None,
+        "Time for which it is present.",
+        unit="s",
+        above=0.0,
+        high=1e8,
+        unset="to the end of the log, without a label",
+    )
+    harmful: bool = setting(False, "Whether its label states that such a scan gives no good pose.")
 
     def check(self) -> None:
         """Raise ValueError where the name is empty."""
@@ -110,7 +117,7 @@ class Plume(Presence):
     from the axis is particles_per_metre (1 m / d)^2 exp(-(theta / half angle)^2) dl, as in a steady flow from a point.
     """
 
-    name: str = setting("plume", "Its name, which is the kind of its label.")
+    name: str = setting("plume", "Name, which is also the kind in its label.")
     nozzle_m: Triple = setting((0.0, -0.5, 0.0), "Position of the nozzle in the frame of the camera.", unit="m")
     direction: Triple = setting((0.0, 0.0, 1.0), "Unit vector of the flow in the frame of the camera.")
     half_angle_deg: float = setting(
@@ -159,7 +166,7 @@ class Limb(Presence):
     share of the field of view that it fills.
     """
 
-    name: str = setting("limb", "Its name, which is the kind of its label.")
+    name: str = setting("limb", "Name, which is also the kind in its label.")
     centre_a: Triple = setting((0.0, 0.0, 1.0), "Unit vector to the Earth's centre in {A} at the time 0.")
     rate_radps: Triple = setting(
         (0.0, 0.0, 0.0), "Constant angular rate of that vector, in the axes of {A}.", unit="rad/s"
@@ -168,10 +175,10 @@ class Limb(Presence):
         70.2, "Angular radius of the Earth; 70.2 at an altitude of 400 km.", unit="deg", above=0.0, high=90.0
     )
     false_ratio: float = setting(
-        0.01, "Share of the beams toward it without a surface that give a false return.", low=0.0, high=1.0
+        0.01, "Share of the beams toward the Earth that meet no surface and give a false return.", low=0.0, high=1.0
     )
     glare: float = setting(
-        1.0, "Factor on the 1 sigma of all ranges where it fills the whole field of view.", low=1.0, high=100.0
+        1.0, "Factor on the 1 sigma of all ranges if the Earth fills the whole field of view.", low=1.0, high=100.0
     )
 
     def check(self) -> None:

@@ -82,8 +82,8 @@ class SuccessCriterion(Settings):
 
     name: str = setting(doc="Name of the criterion in tables.")
     metric: str = setting(doc="A column of the results.")
-    min: float = setting(-math.inf, "Smallest value.", infinite=True)
-    max: float = setting(math.inf, "Largest value.", infinite=True)
+    min: float = setting(-math.inf, "Smallest value that counts as success.", infinite=True)
+    max: float = setting(math.inf, "Largest value that counts as success.", infinite=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,10 @@ class Campaign(Settings):
     config: str = setting("", "File with settings of the replay, as for 'avsreplay run --config'.")
     scans: bool = setting(True, "Keep one line per scan (scans.parquet), from which the ROC curves are made.")
     flights: int = setting(
-        0, "Whole flights after each run to targets drawn from its belief, as with 'avsreplay plan --flights'.", low=0
+        0,
+        "Number of simulated flights after each run, to targets drawn from its belief, as with 'avsreplay plan"
+        " --flights'.",
+        low=0,
     )
     set: Any = setting(dict, "Settings of every run.")
     grid: tuple[Axis, ...] = setting((), "What is varied.")
