@@ -1,11 +1,11 @@
-"""Binary files that are read without trusting them: arrays of numpy, and the state of an interrupted run.
+"""Binary files of unknown origin, read with checks: arrays of numpy, and the state of an interrupted run.
 
-Of an archive of arrays, sizes are checked against the bytes that are there before anything is allocated.
+The sizes of arrays are compared with the size of the file before memory is allocated.
 
 The state of an interrupted run, from which the run continues with the same bits, is a pickle that is read with a
-restricted reader: it creates objects of the classes of this package that hold data, and numpy arrays, and refuses
-everything else, so that a result from elsewhere cannot run code. Objects that a run builds from its input (model,
-stages) are not stored but named, and those of the continued run take their places.
+restricted reader: it creates objects of the classes of this package that hold data, and numpy arrays, and nothing else,
+so that a file from elsewhere cannot execute code. Objects that a run builds from its input (model, stages) are not
+stored but named, and those of the continued run take their places.
 """
 
 from __future__ import annotations

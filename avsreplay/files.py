@@ -2,7 +2,7 @@
 
 An output that is a regular file is written beside its place and renamed when it is complete. A symbolic link is
 followed and never replaced. A device, a FIFO and ``-`` (standard output) are written directly. Names that cannot be
-written are refused by ``check_output`` before any work is done.
+written raise an error in ``check_output``, before any work is done.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def is_stream(path: Path) -> bool:
 
 
 def check_output(path: Path, *, overwrite: bool = True, folder: bool = False) -> None:
-    """Refuse an output that cannot be written, before any work is done.
+    """Raise an error for an output that cannot be written, before any work is done.
 
     Args:
         path: the output.

@@ -17,8 +17,8 @@ from scipy.sparse.csgraph import connected_components
 from avsreplay.geometry import Array
 
 PAIRED_EDGES = 0.95  # least share of the edges of a closed part that two opposite half-edges form
-LEAST_VOLUME = 1e-9  # of a part that has an inside, times six, in units of its area to the power of 3/2
-LEAST_PART = 1e-3  # of the area of the mesh: smaller open parts are remains of meshing
+LEAST_VOLUME = 1e-9  # least volume of a part with an inside, times six, in units of its area to the power of 3/2
+LEAST_PART = 1e-3  # least area of an open part over that of the mesh; smaller parts are remains of meshing
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)]) - 1.0  # (26, 3)
 
 Faces = NDArray[np.int32]

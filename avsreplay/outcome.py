@@ -90,7 +90,7 @@ class Plan:
 
     @property
     def found(self) -> bool:
-        """Is there a capture to fly?"""
+        """Return whether there is a capture to fly."""
         return self.status in (PlanStatus.OPTIMAL, PlanStatus.FEASIBLE)
 
 
@@ -128,7 +128,7 @@ class MonitorReport:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Outcome:
-    """What the pipeline made of one scan.
+    """Result of the pipeline for one scan.
 
     Attributes:
         scan: the scan itself.  start_ns: instant of the first scan of the replay.

@@ -1,6 +1,6 @@
 """Checks before a run: unit of the model, background, truth, transforms and time stamps, each with the option to add.
 
-Sizes are compared as diameters (largest distance between two points), which do not depend on the attitude. A scan sees
+Sizes are compared as diameters (largest distance between two points), which do not depend on the attitude. A scan shows
 one side of the target, so that its diameter is between about 0.4 and 1.1 of the model's.
 """
 
@@ -26,8 +26,8 @@ _POSES = 200  # measured poses examined
 _LEAST, _MOST = 0.25, 1.3  # diameter of a scan over that of the model outside which something is wrong
 _WHOLE = 1.1  # no scan of the target alone is larger than this
 _FEW = 0.02  # share of background below which it does not explain too large a scan
-_LEFT_OVER = 2.0  # below it some background explains too large a scan better than feet (3.28) do
-_FEET = 0.36  # below it a model in feet explains the sizes as well as a view from a narrow side
+_LEFT_OVER = 2.0  # below this ratio, background explains too large a scan better than feet (3.28) do
+_FEET = 0.36  # below this ratio, a model in feet explains the sizes as well as a view from a narrow side
 _LARGEST_TARGET_M = 500.0
 _ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
 _UNITS = {
@@ -44,8 +44,8 @@ _POSE_TYPES = ("PoseStamped", "PoseWithCovarianceStamped", "Odometry", "Transfor
 _SAMPLED = 3000  # points of a scan that are grouped
 _SEARCHED = 20_000  # points of a scan in which the model is searched
 _LARGEST_SCENE = 300.0  # largest scan over the target in it, where the unit of the model is unknown
-_GAPS = 0.2, 0.3  # within and around a target of unknown unit, over its diameter
-_MARGIN = 0.25  # of the model's diameter around the target in a suggested crop
+_GAPS = 0.2, 0.3  # gaps within and around a target of unknown unit, over its diameter
+_MARGIN = 0.25  # space around the target in a suggested crop, over the model's diameter
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +255,7 @@ def _crop_of_located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar
     """The crop around the model where a search finds it; None if it is found in less than half of the scans.
 
     The search looks at the connected parts of the scan with the size of the model, and tests every pose: size alone
-    does not tell the target from other objects.
+        does not distinguish the target from other objects.
     """
     registrar, found = registrar or Registrar(surface), []
     for k, cloud in enumerate(clouds):

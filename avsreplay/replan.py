@@ -26,7 +26,7 @@ from avsreplay.records import Alignment, AlignStatus, Belief, State
 from avsreplay.report.page import Flight
 from avsreplay.saved_result import Saved
 
-FLIGHT_INSTANTS = 401  # of the flight on its page
+FLIGHT_INSTANTS = 401  # instants of the flight on its page
 SIGMA_BOUND = 0.99  # inertia ratios of the draws are limited to the physical range
 
 
@@ -230,7 +230,7 @@ class Replanning:
         return plan.Flights(count, numbers["captured"], numbers["outside"], numbers["abort"], touched)
 
     def _measured(self, belief: Belief, drawn: Belief, rng: np.random.Generator) -> Iterator[PlannerInput]:
-        """What guidance knows after each scan of a drawn target: the filter with poses of its own noise."""
+        """Inputs of guidance for a drawn target after each scan: the filter with poses that have its own noise."""
         params = replace(self.saved.estimator.params, noise=NoiseSource.R0)  # there is no registration
         estimator = Estimator(params, belief, self.saved.extent_m, self.saved.since_ns)
         motion, attitude = estimator.motion(drawn), estimator.attitude(drawn)

@@ -34,9 +34,9 @@ from avsreplay.rows import Row
 from avsreplay.run import Listener, ReplayedScan, Run
 from avsreplay.viewers import NewPaths, ResultLogWriter
 
-CHECKPOINT = "resume.bin"  # of an interrupted run
+CHECKPOINT = "resume.bin"  # checkpoint of an interrupted run
 _MOST_BELIEF_BYTES, _LARGEST = 1 << 30, 1e15
-VIEW_REACH = 0.05  # of the model's extent: residuals in the view are cut off there
+VIEW_REACH = 0.05  # largest residual in the view, over the model's extent
 _BLOCKS = (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4))
 MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in _BLOCKS for k in range(size))
 _DRIVEN = ("driven", "u", "P_u", "cross")  # arrays of beliefs.npz about beliefs with a constant acceleration

@@ -173,7 +173,7 @@ class Run:
             progress: shows the progress of the replay.
 
         Yields:
-            One row per selected scan; a scan that could not be used has a status that says why.
+            One row per selected scan; a scan that could not be used has a status with the reason.
 
         Raises:
             UnreadableInput: no scan is selected.
@@ -281,7 +281,7 @@ class Run:
         return stages(self.config, self.header, self.surface, self.registrar, self._true, clock)
 
     def _fitted_acceleration(self) -> AccelerationFit | None:
-        """Fit the acceleration to the measured poses of a first pass where it is asked for, and set it."""
+        """Fit the acceleration to the measured poses of a first pass if this is set, and use it."""
         if not self.config.estimator.fit_acceleration:
             return None
         self.config = with_acceleration(self.config, (0.0, 0.0, 0.0))

@@ -1,4 +1,4 @@
-"""Every value that needs ground truth: errors, NEES and plan misses. Runs after ``pipeline.step``, which never sees it.
+"""Every value that needs ground truth: errors, NEES and plan misses. ``pipeline.step`` has none of it.
 
 The reference is the truth in the log, or a motion fitted to all healthy poses of the log (``run.fit_reference``).
 """
@@ -195,7 +195,7 @@ def matched_truth(belief: Belief, truth: State) -> State:
 
 
 def _nees(outcome: Outcome, truth: State | None) -> tuple[float | None, Mapping[str, float]]:
-    """NEES of all states and of each block. A cold start's first poses are no normal belief yet and have none."""
+    """NEES of all states and of each block. A cold start's first poses have none: their belief is not normal."""
     if truth is None or outcome.estimator == "start":
         return None, {}
     belief = outcome.belief

@@ -138,7 +138,7 @@ def build(cls: type[T], document: Document, path: Sequence[str | int] = ()) -> T
         path: the keys from the root to the table; an absent table gives the defaults.
 
     Raises:
-        UsageError: a key is unknown or missing, a type is wrong, or the class refuses a value.
+        UsageError: a key is unknown or missing, a type is wrong, or a value is invalid for the class.
     """
     table: Any = document.table
     for part in path:

@@ -28,10 +28,10 @@ from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump
 
 PATH_POINTS = 41
-RESIDUAL_REACH = 0.05  # of the model's extent: larger residuals in the viewer log are cut to this
+RESIDUAL_REACH = 0.05  # largest residual in the viewer log, over the model's extent
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 _COLUMNS = tuple(column.name for column in columns())
-RERUN_PORT = 9876  # on which a Rerun viewer listens
+RERUN_PORT = 9876  # port of a Rerun viewer
 
 
 def message_covariance(belief: Belief) -> Array:

@@ -55,7 +55,7 @@ def test_a_back_end_that_returns_its_guess_is_no_sensor():
     with Run(Job(source=LOG, options=SourceOptions(n_scans=4))) as run:
         run.registrar._backend = type("Idle", (), {"align": staticmethod(lambda points, guess: Fit(guess, 1, True))})()
         rows = list(run.rows())
-    message = "back end 'horn' returned its guess unchanged; the scan asks for another pose"
+    message = "back end 'horn' returned its guess unchanged, although the residuals require a step"
     assert [(row.status, row.gamma, row.message) for row in rows[1:]] == [("failed", 0, message)] * 3
     verdict = verdict_of(rows, Summary.fold(rows))
     assert verdict.grade is Grade.FAIL

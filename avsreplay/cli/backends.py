@@ -100,7 +100,7 @@ HEADS = (
 
 @dataclass(slots=True)
 class Tally:
-    """What one back end did, scan by scan. Times are wall clock; errors are against the log's truth."""
+    """Results of one back end, scan by scan. Times are wall clock; errors are relative to the log's truth."""
 
     name: str
     build_s: float = 0.0

@@ -164,7 +164,7 @@ def take_run_settings(flags: dict[str, Any]) -> tuple[Path | None, tuple[str, ..
 EPILOG = """\b
 Examples:
   avsreplay config > run.toml                  then: avsreplay run LOG --config run.toml
-  avsreplay config tumble.mcap --policy all    with the settings that the log itself brings
+  avsreplay config tumble.mcap --policy all    with the settings in the log itself
   avsreplay config --json --set plan.a_max_mps2=0.02"""
 
 INTRODUCTION = """# Settings

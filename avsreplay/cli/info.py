@@ -70,7 +70,7 @@ def info_command(source: Path, as_json: bool, **reading: Any) -> None:
 
 
 def _advice(opened: Source, built: bool) -> list[Advice]:
-    """The checks before a run; for a log without a topic of scans, why a run would refuse it.
+    """The checks before a run; for a log without a topic of scans, why a run would fail.
 
     Args:
         opened: the log, opened for inspection.

@@ -58,7 +58,7 @@ def model_command(
     --model auto' builds the model and replays the log against it in one step.
     \f
     Raises:
-        MissingBackend: a mesh is asked for and Open3D is not installed.
+        MissingBackend: a mesh is requested and Open3D is not installed.
     """  # noqa: D301
     import numpy as np
 

@@ -1,4 +1,4 @@
-"""What commands share: options, sources, results, progress on stderr, and interruption between scans."""
+"""Shared parts of the commands: options, sources, results, progress on stderr, and interruption between scans."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ CHANGES = (
     ("plan.horizon_s", (2.0, 4.0)),
 )
 LATER_S = (1.0, 3.0, 10.0)
-MOST_CHANGES = 3  # settings that are named
+MOST_CHANGES = 3  # largest number of settings that are named
 EPILOG = """\b
 Examples:
   avsreplay plan results/                          from t_1 on, with the run's settings
@@ -87,7 +87,7 @@ Exit codes: 0 ok (also where no plan was found; the status says so),
     type=click.IntRange(0),
     default=0,
     show_default=True,
-    help="Number of whole flights with replanning, thrust errors and delay, to targets drawn from the belief.",
+    help="Number of simulated flights with replanning, thrust errors and delay, to targets drawn from the belief.",
 )
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of the draws.")
 @click.option(
@@ -168,7 +168,7 @@ def plan_command(
 
 
 def _usable(action: Any) -> Any:
-    """Return the result of an action; a value that the planner refuses is an error of the user."""
+    """Return the result of an action; a value that the planner rejects is an error of the user."""
     from avsreplay.errors import UsageError
 
     try:

@@ -44,7 +44,7 @@ class Answer:
         at_s: instant of planning [s after the first scan].
         made: the plan.
         spread: its distribution over the belief; None without a plan.
-        flown: whole flights; None where not asked for.
+        flown: simulated flights; None where not requested.
         joints: of an arm during the last metres; None without an arm.
         hindsight: plans at regular intervals with their errors.
         execution: the simulated approach; None without ground truth.

@@ -183,7 +183,7 @@ class Outdated(Exception):
 
 @dataclass(frozen=True, slots=True)
 class _Finished:
-    """What a replay gave; ``record`` is ``run.json``."""
+    """Result of a replay; ``record`` is the content of ``run.json``."""
 
     rows: Sequence[Row]
     summary: Summary

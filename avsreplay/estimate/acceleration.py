@@ -2,7 +2,8 @@
 
 Known. The estimator works in a frame that falls with the target: r' = r - a tau^2 / 2, v' = v - a tau with tau the time
 since the first scan. In that frame the motion is free, and the error states, their covariance and the innovations are
-the same as in {A}. ``FreeFall`` converts what enters and leaves the estimator; nothing else knows of it.
+the same as in {A}. ``FreeFall`` converts the input and the output of the estimator; no other code depends on the
+acceleration.
 
 Fitted. With measured attitudes R_k the position of the origin of {C} is linear in the unknowns,
 

@@ -1,4 +1,4 @@
-"""What the estimator does with a large innovation: it defers the scan, decides over the next ones, and acts.
+"""Treatment of large innovations: the scan is deferred, and a decision is made from the scans that follow.
 
 A scan whose NIS is above the 99.99 % point, scaled by the median NIS of the accepted scans, or whose pose jumps, is
 doubtful. It does not change the estimate. After three to five doubtful scans ``hypotheses`` decides. Free motion: the
@@ -55,7 +55,7 @@ _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decisio
 _OVER_FREE, _OVER_NEXT = 3.0, 2.0  # log odds over free motion, and over the next hypothesis, of an early decision
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 _NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
-_RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, in its spread, that tells which poses are biased
+_RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its spread, that shows which poses are biased
 _SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
@@ -162,8 +162,8 @@ class AnomalyTest:
         """Return whether a step in the pose is the beginning of a sensor error; it may as well be the end of one.
 
         A range error deforms the scan, so the rms residual steps with it where the scan is registered. Otherwise the
-        poses are trusted that have been consistent for longer than sensor errors usually last. A pose that the estimate
-        before a new start predicted ends the error that caused the new start.
+        poses that have been consistent for longer than sensor errors usually last are taken as correct. A pose that the
+        estimate before a new start predicted ends the error that caused the new start.
         """
         if self._previous_agrees(track):
             return False

@@ -1,7 +1,7 @@
 """Maximum likelihood of the 20 initial values over all healthy poses: Levenberg-Marquardt on the manifold.
 
-Before a few turns are seen, the minimum lies in a bent and narrow valley of the cost. A step therefore contains its
-second-order part (geodesic acceleration: Transtrum and Sethna, arXiv:1201.5885).
+Until the body has turned a few times, the minimum lies in a curved and narrow valley of the cost. A step therefore
+contains its second-order part (geodesic acceleration: Transtrum and Sethna, arXiv:1201.5885).
 
 The motion is taken as deterministic; the residuals d = [theta; v] are expressed in {C}, where their noise is given.
 Jacobians are H Phi, in the coordinates of ``chart``, which keep the inertia physical without a bound. A prior, given or

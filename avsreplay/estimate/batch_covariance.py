@@ -1,11 +1,11 @@
 """The covariance of a batch fit: corrected where the likelihood is not Gaussian, and with process noise.
 
-Before a few turns are seen, some directions of the inertia are determined so poorly that the minimum of the cost bends
-within its own 1 sigma; the curvature at the minimum then understates the uncertainty. Two sigma along each of the
-weakest directions the cost is compared with the Gaussian one. Along a non-Gaussian direction the fit is repeated with
-that direction fixed on either side (the profile likelihood) where the cost, minimised over everything else, has risen
-by 3/2, as it does at root three sigma of a Gaussian: with the Gauss-Hermite weights 1/6, 4/6, 1/6 the three fits, each
-with its remaining covariance, carry the second moments. They are propagated to the requested instant one by one.
+Until the body has turned a few times, some directions of the inertia are determined so poorly that the minimum of the
+cost bends within its own 1 sigma; the curvature at the minimum then understates the uncertainty. Two sigma along each
+of the weakest directions the cost is compared with the Gaussian one. Along a non-Gaussian direction the fit is repeated
+with that direction fixed on either side (the profile likelihood) where the cost, minimised over everything else, has
+risen by 3/2, as it does at root three sigma of a Gaussian: with the Gauss-Hermite weights 1/6, 4/6, 1/6 the three fits,
+each with its remaining covariance, carry the second moments. They are propagated to the requested instant one by one.
 
 The fit takes the motion as deterministic. About its trajectory the problem is linear, so one pass of a Kalman filter
 over the poses, with the disturbance's covariance between them, is the maximum likelihood with process noise. The
@@ -33,7 +33,11 @@ from avsreplay.geometry import Array
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
 _TRIAL = 2.0  # distance along a direction at which the cost is compared with the Gaussian one [sigma]
 _RISE, _TRIES, _LOST = 0.5 * _NODE**2, 6, 3.0
-_PIN_STEPS, _FEWEST_STEPS, _PIN_WORK = 15, 40, 12000  # of fits with one direction fixed; steps times poses and pieces
+_PIN_STEPS, _FEWEST_STEPS, _PIN_WORK = (
+    15,
+    40,
+    12000,
+)  # budget of the fits with one direction fixed: steps times poses and pieces
 _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied

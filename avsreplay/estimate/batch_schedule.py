@@ -101,7 +101,7 @@ class BatchSchedule:
             result = with_last_pose(result, track.fixes[-1], innovation.weight, self.noise_levels(track))
             rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
             track = replace(track, reinitialised=track.reinitialised + rejected)
-            remembers = forgot and track.levels.slack > 1.0  # the filter remembers what later fits cannot use
+            remembers = forgot and track.levels.slack > 1.0  # the filter keeps information that later fits cannot use
             return self._adopted(track, result, result.gaussian and (converged or remembers))
         if last.gaussian:
             belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
@@ -299,7 +299,7 @@ class BatchSchedule:
     def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
         """The poses within the fit's memory, including this one; of many poses the older half is joined in pairs."""
         oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns(track), key=_instant)
-        refines = track.drift is not None and track.mode == "filter"  # the test that does needs all
+        refines = track.drift is not None and track.mode == "filter"  # the test for a drift needs all of them
         fixes = track.fixes[0 if refines else oldest :]
         if len(fixes) >= MOST_FIXES:
             half, factors = MOST_FIXES // 2, np.array([track.window.factors[3], track.window.factors[0]])

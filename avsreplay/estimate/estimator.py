@@ -68,7 +68,7 @@ class Estimator:
         self.params = params.resolved(extent_m)
         if params.start is Start.NEAR and start is None:
             hint = "use start = cold, or a log whose scenario has a [start] table"
-            raise UsageError("a near start is asked for and the log gives none", where="estimator.start", hint=hint)
+            raise UsageError("a near start is requested and the log contains none", where="estimator.start", hint=hint)
         known = np.array(params.acceleration_mps2)
         self.fall = FreeFall(known, epoch_ns) if known.any() else None
         self.start = self._into(start) if start is not None and params.start in (Start.AUTO, Start.NEAR) else None

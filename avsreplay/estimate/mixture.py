@@ -22,8 +22,8 @@ from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, Forecast
 
-_SMALL_EXCESS = 1.1  # of the corrected covariance over that of the last pose
-_MOVED = 0.5  # sum of the changes of the weights from which the mixture is no longer a quadrature
+_SMALL_EXCESS = 1.1  # largest ratio of the corrected covariance to that of the last pose
+_MOVED = 0.5  # sum of the changes of the weights above which the mixture is not a quadrature
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,8 +12,8 @@ points by the average-information algorithm (Gilmour, Thompson and Cullis, Biome
 of freedom of the fit into account. Differences within the normal points give the independent part of the errors as
 well. The claimed noise is the prior, with the weight of a few poses.
 
-The poses often cannot tell a disturbance from none although it matters for the velocity. Therefore its density is not
-the most likely one, but the mean over all candidates, none among them, weighted by their likelihood.
+The poses often do not determine whether there is a disturbance, although it affects the velocity. Therefore its density
+is not the most likely one, but the mean over all candidates, none among them, weighted by their likelihood.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _SMALL = 0.3  # part of its standard deviation below which a disturbance may bec
 _MOST_FACTOR = 100.0  # largest factor on a claimed variance
 _WORK = 2 * MOST_POINTS**3  # sum of cubes of the numbers of points over the steps of an estimate
 _MOST_STEPS = 6
-_LARGEST = 4.0  # of the squared residuals with disturbances over their mean
+_LARGEST = 4.0  # largest squared residual with disturbances over the mean one
 BLOCKS = 2  # attitude, position
 
 

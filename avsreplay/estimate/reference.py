@@ -105,7 +105,7 @@ def rows_along(chart: Chart, epoch_ns: int, fixes: tuple[PoseFix, ...], t_ns: in
 
 
 def healthy_pose(track: Track, t_ns: int, T_ac: Pose, params: EstimatorParams) -> PoseFix:
-    """The pose of a healthy scan, at its own instant and with its covariance where the track remembers it."""
+    """The pose of a healthy scan, at its own instant and with its covariance if the track still contains it."""
     return track.fixes[-1] if track.fixes else PoseFix(t_ns, T_ac, r0_covariance(params))
 
 

@@ -164,7 +164,7 @@ def disturbance_levels(fixes: Sequence[PoseFix], extent_m: float) -> tuple[float
     The mean rates and velocities v_k between poses are differences of the pose over the interval h_k. White noise of
     root density q makes E (v_k+1 - v_k)^2 = q^2 (h_k + h_k+1) / 3 for each component. Errors that are independent from
     pose to pose give consecutive differences of v a correlation of -2/3, white disturbances of 1/4, and smooth motion a
-    correlation near 1: the sign tells a disturbed target from poses that contradict one another.
+    correlation near 1: the sign distinguishes a disturbed target from poses that contradict one another.
 
     Args:
         fixes: registered poses in the order of time, none of them used.

@@ -1,4 +1,4 @@
-"""What the estimator carries from scan to scan, its prediction for a scan, and the motion during a scan.
+"""State of the estimator between scans, its prediction for a scan, and the motion during a scan.
 
 Points measured at their own instants are moved to the scan's instant by the predicted motion (``deskew``). The error of
 the prediction moves with the points, so the scan's pose is not a measurement at the scan's instant alone:

@@ -229,7 +229,7 @@ def pose_limit(seen: Innovation, alpha_max_m: float, length_m: float, sigmas: fl
 
 
 class FaultDetector:
-    """Judges one scan at a time, without state.
+    """Decides on one scan at a time, without state.
 
     Args:
         params: limits; those left out are taken from ``extent_m``, the target's bounding diagonal [m].

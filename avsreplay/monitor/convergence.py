@@ -1,4 +1,4 @@
-"""Whether the covariance of the estimate can be trusted, and from when on the estimate may be used (t_1).
+"""Consistency of the estimate with its covariance, and the instant t_1 from which on the estimate may be used.
 
 Consistency: NIS of the innovations inside its chi-square band, and checks that hold for every correct estimate. They
 need no ground truth. Convergence: ``covariance`` is the paper's test, every parameter and motion block below its limit;

@@ -26,15 +26,15 @@ from avsreplay.plan.path import MOTION_FACTOR, RobotPath
 from avsreplay.plan.rendezvous import no_plan
 from avsreplay.plan.robot import Limits, RobotParams
 
-INSTANTS = 81  # of the last metres
+INSTANTS = 81  # instants of the last metres
 STARTS = 32  # joint configurations from which the inverse kinematics of the capture begins
 ITERATIONS = 200
 STALLED = 10  # iterations without a smaller error that end the inverse kinematics
-POSE_ERROR = 1e-8  # in metres and radians
+POSE_ERROR = 1e-8  # largest error of the inverse kinematics [m, rad]
 DAMPING = 1e-3
 CAPTURES = 16  # plans that are tried until the joints can fly one
 GRID_S = 0.25  # spacing of the instants at which the reach is bounded
-EXACT_M = 1e-9  # an offset is on an axis
+EXACT_M = 1e-9  # an offset within this distance is on an axis [m]
 STEP_S = 1.0  # spacing of the capture instants
 APPROACH = 9  # poses on the axis of the corridor at which a capture instant is tried
 QUICK = 8  # joint configurations from which the inverse kinematics of a capture instant begins

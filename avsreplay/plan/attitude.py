@@ -21,8 +21,8 @@ from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.records import Trajectory
 
 GRID_S = 0.1  # spacing of the samples of the relative attitude
-STEP_S = 1e-3  # of the difference quotients of the attitude
-INSTANTS = 201  # at which the angular acceleration of a turn is checked
+STEP_S = 1e-3  # step of the difference quotients of the attitude [s]
+INSTANTS = 201  # instants at which the angular acceleration of a turn is checked
 SAME_TIME_S = 1e-3  # a capture this soon after the turn is delayed by it
 REDUCTIONS = 8  # largest number of reductions of the bound on psi''
 

@@ -48,7 +48,7 @@ ROUGH_TOLERANCE = 2e-3  # the same while initial paths are compared, and where a
 SAME_PATH = 5e-3  # drafts whose end times differ by less, relative to them, have the same minimum
 LATER, LATER_S = 1.02, 0.1  # a renewed plan that is later than the earlier one by more starts the full search
 KEPT = 1  # earlier iterations whose aborts are required too: the worst moment may alternate
-NEAR_REFERENCE = 0.02  # relative change of the end time from which on the excess tightens the constraints
+NEAR_REFERENCE = 0.02  # relative change of the end time below which the excess tightens the constraints
 HOPELESS = 1.2  # an iteration this much later than the best path ends its initial path
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
 IMPROVED = 2  # drafts whose entry is moved
@@ -300,7 +300,7 @@ def _converged(
     rough: bool = False,
     rows: tuple[PointRows, ...] = (),
 ) -> StepPath | None:
-    """Iterate from a reference until the end time no longer changes; return the earliest feasible path seen.
+    """Iterate from a reference until the end time converges; return the earliest feasible path seen.
 
     The iterations end without a result where the end time remains later than ``latest_s``. The first iteration requires
     ``rows``, the aborts of an earlier path.

@@ -1,7 +1,7 @@
 """The robot under guidance: supervisor, planner and path in one state, advanced scan by scan.
 
-``Guidance.step`` takes what is known after a scan, never the ground truth, and returns the decision, the plan in force
-and the motion of the robot. The robot follows its path exactly; only the target is uncertain.
+``Guidance.step`` receives the estimate after a scan, never the ground truth, and returns the decision, the plan in
+force and the motion of the robot. The robot follows its path exactly; only the target is uncertain.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ from avsreplay.plan.supervisor import Action, Decision, Facts, Supervisor, Super
 from avsreplay.records import Forecast
 
 SEARCH_AGAIN = 1.1  # ratio to the time to go of the latest full search from which on all initial paths are searched
-UNCHANGED = 0.01  # of the capture tolerance: a plan whose end moved by less, without a measurement, is not renewed
+UNCHANGED = 0.01  # share of the capture tolerance: without a measurement, a plan whose end moved by less is not renewed
 
 _CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannerInput:
-    """What guidance knows after a scan.
+    """Input of guidance after a scan.
 
     Attributes:
         t_ns: Instant of the scan.
@@ -177,7 +177,7 @@ class Guidance:
             known: What is known after this scan.
 
         Returns:
-            The new state with decision, plan and segment. After the capture the state no longer changes.
+            The new state with decision, plan and segment. After the capture the state stays the same.
         """
         if state.captured_ns is not None:
             return state

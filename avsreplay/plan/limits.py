@@ -98,12 +98,12 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TargetGeometry:
-    """What guidance knows about the target's shape.
+    """Shape of the target for guidance.
 
     Attributes:
         axis_c: (3,) outward axis of the fixture in {C}, unit.
         hull_c: (n, 3) vertices of the convex hull in {C} [m].
-        surface: Closest points of the surface, see ``Scene``; None where no clearance is asked for.
+        surface: Closest points of the surface, see ``Scene``; None where no clearance is required.
     """
 
     axis_c: Array
@@ -144,7 +144,7 @@ class Margins:
         second: (n, 5) margins of the others [m], infinite where off: outside the range of the cone, outside that of the
             corridor, outside the sphere, at the clearance, inside the workspace.
         foot: (n, 3) closest points of the surface in {C} [m].  clearance: (n,) required clearance [m].
-        distance: (n,) signed distance to the surface [m], negative inside, infinite where far or not asked for.
+        distance: (n,) signed distance to the surface [m], negative inside, infinite where far or not required.
     """
 
     first: Array

@@ -57,7 +57,7 @@ class PlanParams(Settings):
     )
 
     def check(self) -> None:
-        """Raise ValueError where the latency leaves nothing of the horizon."""
+        """Raise ValueError where the latency is not below the horizon."""
         if self.latency_s >= self.horizon_s:
             raise ValueError(f"latency_s is {self.latency_s}, must be below horizon_s = {self.horizon_s}")
 

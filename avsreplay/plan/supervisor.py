@@ -78,7 +78,7 @@ class SupervisorParams(Settings):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Facts:
-    """What the supervisor knows after one scan.
+    """Input of the supervisor after one scan.
 
     Attributes:
         t_s: Time of the scan [s].
@@ -316,7 +316,7 @@ def resting(scene: Scene, r: Array, v: Array, least_m: float, a_max: float) -> S
     """Return the rest point of a hold, a retreat or an abort as the goal of a rendezvous.
 
     The robot brakes as hard as possible relative to the centre of mass. If it would stop closer to the sphere that
-    contains the target than asked for, the rest point has this distance, directly away from the target.
+    contains the target than required, the rest point has this distance, directly away from the target.
 
     Args:
         scene: The target now.

@@ -85,7 +85,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
 
     Raises:
         UnreadableInput: fewer than three usable scans, steps between scans that are too large, or a target that did not
-            turn or has no shape that fixes its pose; the message says which.
+            turn or has no shape that determines its pose; the message states which.
     """
     p = params or ReconstructionParams()
     survey = surveyed(scans, p.fewest_points, p.n_scans)
@@ -191,7 +191,7 @@ def _on_motion(views: Sequence[ScanView], poses: dict[int, Pose], motion: FreeMo
 
 
 def _refuse_undetermined(turned: float, weakest: Sequence[float]) -> None:
-    """A sphere is refused whatever its poses are: its attitude follows the noise, and drifts by degrees."""
+    """A sphere is an error for any poses, because its estimated attitude follows the noise and drifts by degrees."""
     what = f"the scans show a turn of {np.degrees(turned):.1f} deg only: the target is at rest"
     if float(np.median(weakest)) < WEAKEST:
         what = "the surface of the target does not determine its attitude, as that of a sphere"

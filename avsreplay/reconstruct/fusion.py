@@ -32,16 +32,16 @@ from avsreplay.register.size import normal_jacobian
 
 PAIR_TURN_RAD = np.radians(90.0)  # key scans seen from directions closer than this are compared in the refinement
 PAIRS = 12  # most key scans with which one is compared
-PAIR_POINTS = 600  # of a scan in one comparison
+PAIR_POINTS = 600  # points of a scan in one comparison
 FEWEST_COMMON = 30  # points that two scans must share to be compared
-FEWEST_KEYS = 40  # of a shorter log every scan is a key scan in the refinement
+FEWEST_KEYS = 40  # in a log with fewer key scans, every scan is a key scan in the refinement
 MERGED = 30  # nearest points of all key scans from which a normal is estimated
 MERGED_REACH = 0.03  # their largest distance as a share of the extent
-MOST_SIGHTS = 60  # scans that are asked whether they saw through a point
+MOST_SIGHTS = 60  # scans that are tested for rays through a point
 MOST_ASKED = 3000  # points of the model that are compared with one view
 LEAST_SHOWN = 0.8  # share of the model's visible points that a view must show, in units of the median of all views
 MOST_STEPS = 10  # evaluations of the motion that minimises the distances between views
-LEAST_DAMPING, LEAST_GAIN = 1e-3, 1e-4  # of these steps; share of the rms by which the last one improves it
+LEAST_DAMPING, LEAST_GAIN = 1e-3, 1e-4  # damping; relative improvement of the rms that ends the steps
 SUPPORT = 5  # of the ten nearest points that continue the surface of a point which one scan only has seen
 SPREAD_RAD = np.radians(30.0)  # a direction counts as covered if a scan was taken from within this angle of it
 
@@ -119,7 +119,7 @@ def joint_motion(
 
     The distances determine some directions of a pose much better than others: the turn of a cylinder about its axis is
     hardly seen. A motion that is fitted to the poses with equal weights spreads the errors of the bad directions over
-    the good ones; fitted to the distances it uses what all scans together say about each direction.
+    the good ones; fitted to the distances it uses the information of all scans about each direction.
 
     Args:
         views: with the normals of all key views together.
@@ -263,7 +263,7 @@ def contradicting(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """What a scan saw: points (n, 3) and position of the camera in {A} [m], and its pose."""
+    """The view of a scan: points (n, 3) and position of the camera in {A} [m], and its pose."""
 
     points: Array
     camera: Array

@@ -22,10 +22,10 @@ from avsreplay.reconstruct.views import averaged
 from avsreplay.records import BLOCKS, Surface
 
 PATCH = 0.04  # radius of a grasp patch as a share of the extent
-APPROACH = np.cos(np.radians(20.0))  # of the cone about the outward normal that must be free
+APPROACH = np.cos(np.radians(20.0))  # cosine of the half-angle of the cone about the outward normal that must be free
 MOST_REGIONS = 10
-FEWEST_IN_REGION = 10  # points
-FEWEST_EMPTY = 3.0  # scans without a return from a surface that they faced
+FEWEST_IN_REGION = 10  # least number of points of a region
+FEWEST_EMPTY = 3.0  # least number of scans without a return from a surface that they faced
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,7 +43,7 @@ class Reconstruction:
         notes: what limits the result, in sentences.
         motion: the free motion of a rigid body that the poses follow, None if they do not.
         T_oc: pose of {C} in the frame {C} to which ``motion`` refers.
-        sights: what a bounded number of scans saw.
+        sights: views of a bounded number of scans.
         frame: origin and axes of {C} in words.
     """
 

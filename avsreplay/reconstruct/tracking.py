@@ -127,11 +127,11 @@ def twists(t_ns: Sequence[int], poses: dict[int, Pose], motion: FreeMotion | Non
 
 KEEP_RATIO = 0.4  # share of the points of a scan that must lie on the model so far
 MOST_SHIFT = 0.4  # largest distance of the target's centre from its prediction, as a share of the extent
-SHIFT_PER_LOST = 0.01  # by which that share grows with every scan that was lost before
+SHIFT_PER_LOST = 0.01  # increase of that share with every scan that was lost before
 LEAST_EXPLAINED = 0.15  # share of the model's visible side that a scan must show
 MOST_VIOLATING = 0.12  # share of points that may lie in the free space in front of what another view has measured
 GRAZING = np.cos(np.radians(70.0))  # least cosine of the inclination to a line of sight for a test of free space
-MOST_TESTED = 600  # of a scan in one test of free space
+MOST_TESTED = 600  # points of a scan in one test of free space
 SEARCH_EVERY = 6  # while the target is lost, all attitudes are searched for two scans of this many
 MOST_RETRIES = 20  # lost scans that are tried again at the end
 KEY_TURN_RAD = np.radians(7.0)  # a scan seen from a direction that differs by this from all key scans becomes one
@@ -215,7 +215,7 @@ def _accepted(
 ) -> bool:
     """Whether scan and model explain each other and no measured ray passes through a surface of the other.
 
-    The target must also be near its predicted position: something else in front of it fits somewhere on a flat side.
+    The target must also be near its predicted position, because another object in front of it fits to some flat side.
     """
     if match.ratio < KEEP_RATIO or match.rms_m > 0.01 * extent:
         return False
@@ -281,7 +281,7 @@ def _searched(
 
 
 def _new_side(keys: Sequence[Pose], T_ac: Pose) -> bool:
-    """Whether the camera sees the target from a direction that no key view has."""
+    """Whether the direction of view differs from those of all key views."""
     return bool(min(turn(key, T_ac) for key in keys) > KEY_TURN_RAD)
 
 

@@ -47,7 +47,7 @@ class ScanView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Survey:
-    """What one pass over a log finds.
+    """Result of one pass over a log.
 
     Attributes:
         chosen: positions in the log of the scans that are used.  offered: number of scans in the log.

@@ -159,7 +159,7 @@ def measured_alignment(found: MeasuredPose) -> Alignment:
 
 
 class PoseBackend:
-    """The entry of ``poses`` in the list of back ends; it cannot align clouds."""
+    """The entry of ``poses`` in the list of back ends; it does not register clouds."""
 
     name = POSES
     same_bytes = True
@@ -169,7 +169,7 @@ class PoseBackend:
         """Take the target like every back end; it is not used."""
 
     def align(self, points: NDArray[Any], guess: Pose) -> Fit:  # noqa: ARG002 (the protocol names them)
-        """Refuse a cloud; it becomes the status FAILED of the scan.
+        """Raise an error for a cloud, so that its scan has the status FAILED.
 
         Args:
             points: (n, 3) in {A} [m].

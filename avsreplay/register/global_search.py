@@ -27,33 +27,33 @@ from avsreplay.register.sampling import attitudes, directions, sample, thin_to, 
 from avsreplay.register.surface_index import kernel_module
 
 MODEL_POINTS = 3000
-CLOUD_POINTS = 20  # times as many points of a cloud, evenly over its order, are thinned to so many
-COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # of the scan: first and second selection, final ranking
+CLOUD_POINTS = 20  # factor: the points of a cloud are first thinned evenly to this many times the number needed
+COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # points: first and second selection, final ranking
 COARSE_PASSES, MIDDLE_PASSES = 8, 12  # point-to-plane iterations for each attitude in the two selections
 MIDDLE_STARTS, FINE_STARTS = 50, 10  # attitudes kept for the second selection, and poses registered on the model
-CELLS = 40  # of the grid along the diagonal of the model
+CELLS = 40  # cells of the grid along the diagonal of the model
 COARSE_OF_EXTENT, MIDDLE_OF_EXTENT = 0.03, 0.02  # distances beyond which a point counts as unexplained
 START_OF_EXTENT, FALL = 0.3, 0.7  # rejection distance of the first pass, and its factor from pass to pass
-FIRST_PASSES, KEPT_AFTER_FIRST = 2, 3  # most starts are dropped after two passes with part of the points
-SECOND_PASSES, KEPT_AFTER_SECOND = 2, 8  # the same after more passes with all of them
+FIRST_PASSES, KEPT_AFTER_FIRST = 2, 3  # after two passes with part of the points one start in three is kept
+SECOND_PASSES, KEPT_AFTER_SECOND = 2, 8  # after two more passes with all of them one start in eight is kept
 MIDDLE_FIRST, MIDDLE_STRIDE, KEPT_IN_MIDDLE = 4, 2, 20  # passes with every second point, after which so many are left
 FIRST_STRIDES, THINNED = (2, 3, 3), (1, 2, 2)  # every n-th point, and every n-th attitude, by the round
 SYMMETRIC, SYMMETRIES = 0.3, 6  # largest unexplained share of the surface turned onto itself; most motions tried
 TURNED_PASSES, TURNED_RIVALS = 6, 2
 RIVALS, RIVAL_WITHIN = 6, 0.15  # poses that are registered to the end: share of unexplained points over the least
-SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05  # two poses nearer than that are the same
+SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05  # poses that differ by less are the same
 SIGMAS = 5.0
 FAVOURED = 5.0  # noise, in units of the extent, lowers the cost of a wrong pose with more surface nearby by up to this
-REFINED_POINTS = 500  # of the fine points, with which the last poses are registered
-FIRST_FINE, FINE_PASSES = 5, 15  # of all, then of the best; from a wrong pose it can take hundreds
+REFINED_POINTS = 500  # fine points with which the last poses are registered
+FIRST_FINE, FINE_PASSES = 5, 15  # passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
 RIVAL_AFTER, MOST_RIVALS = 0.05, 4  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
-LOOK_UPS = 4  # that cost as much as a search on the model
-ROUND_WORK = 60_000  # what a round costs besides: the last poses to the end, thinning and the interpreter
+LOOK_UPS = 4  # look-ups in the grid that cost as much as a search on the model
+ROUND_WORK = 60_000  # fixed cost of a round [searches]: registration of the last poses, thinning, interpreter
 APART = 0.6  # usual share of the starts of the second selection that are different poses
-FAR_WORK = 4  # searches that a pass from a wrong pose costs a point
+FAR_WORK = 4  # searches per point of a pass from a wrong pose
 CELL_OF_EXTENT = 0.02
 LEAST_COSINE = 0.05
-SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # of the starts across the direction to the camera
+SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # number and size of the shifts of the starts across the direction to the camera
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,8 +138,8 @@ class GlobalSearch:
             points: (n, 3) in {A} [m], finite, n >= 1.
             number: 0 assumes that the whole visible side is in the scan; 1 shifts the starts, for a target that is
                 partly outside the scan or hidden; 2 does not assume the position of the camera.
-            before: result of another round for the same points, whose poses take part.
-            known: a pose T_ca that takes part: another one is unique only if it explains the scan better.
+            before: result of another round for the same points, whose poses are compared as well.
+            known: a pose T_ca that is compared as well: another one is unique only if it explains the scan better.
         """
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
         few, some, fine = (

@@ -24,7 +24,7 @@ from avsreplay.records import Surface
 
 MAGIC = b"AVSINDEX"
 HEADER = 64  # the arrays of the payload are aligned to this in the file and in memory
-LEAST_PRIMITIVES = 20_000  # a smaller model is indexed faster than a file is found
+LEAST_PRIMITIVES = 20_000  # a smaller model is indexed faster than its file is read
 
 
 def user_folder() -> Path | None:

@@ -1,4 +1,4 @@
-"""Errors of the model that a run reveals: its size, a mirrored or a wrong shape.
+"""Errors of the model that the scans of a run show: a wrong size, a mirrored or a wrong shape.
 
 Size: along a run, the factor between target and model is estimated from the residuals of registered scans. With
 T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
@@ -28,7 +28,7 @@ from avsreplay.register.size import LEAST_ERROR, SIGMAS, fitted_size, noise_bias
 POINTS = 1500  # points used of each scan
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
-MOST_WEIGHT = 4.0  # of a scan, in units of the median weight
+MOST_WEIGHT = 4.0  # largest weight of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
 LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged
 
@@ -60,7 +60,7 @@ class ModelCheck:
         if found is None or not len(points):
             return
         if found.measured and found.inlier_ratio >= LEAST_ON_MODEL:
-            self._matched = True  # the scan is on the model, whatever keeps the pose from being accepted
+            self._matched = True  # the scan is on the model, although the pose is not accepted
         if found.status is AlignStatus.AMBIGUOUS:
             self._ambiguous = self._ambiguous or found.free_directions
         if found.status is not AlignStatus.ALIGNED:

@@ -8,7 +8,7 @@ the last digits; an unknown method name returns the identity.
 
 Properties of kiss-icp 1.2 and 1.3: correspondences reach over one voxel; ``kernel`` is used as a squared length; with
 more than one thread results are not repeatable to the bit; a guess whose rotation is not orthonormal by 2e-9, and
-points that are all of one instant where it deskews, abort the interpreter; it returns only a pose, and returns the
+points that all have one instant if it deskews, abort the interpreter; it returns only a pose, and returns the
 guess if nothing matched; scans are deskewed to the end of the sweep.
 """
 
@@ -31,12 +31,12 @@ MIN_INLIERS = 6
 SETTLED_GATE = 0.01  # the gate has settled once a pass changes it by less than this share
 SURFACE_POINTS = 100_000
 NEIGHBOURS = 20
-SETTLED = 10.0  # its steps do not become smaller than this many eps: the covariances are not smooth in the pose
+SETTLED = 10.0  # steps end at this many eps, because the covariances are not smooth in the pose
 LEAST_POINTS = 20  # fewer points have no neighbourhood of NEIGHBOURS
 POINTS_PER_VOXEL = 20
 SETTLED_OF_GATE = 0.01
-FINE_CALLS = 6  # with the finest map, each of at most n_max iterations
-STEP_OF_EPS = 10.0  # gives 1e-4, the default of the library: its last steps move from one map point to the next
+FINE_CALLS = 6  # calls with the finest map, each with at most n_max iterations
+STEP_OF_EPS = 10.0  # 1e-4 as by default in the library, whose last steps change from one map point to the next
 FAR_M = 1e9  # no part of the map is deleted because of its distance
 THINNED = 1.5  # voxel of the points used in the coarse stages over the voxel of the map, the rule of the library
 THRESHOLD_VOXELS = 2.0  # first threshold of the library over its voxel
@@ -272,8 +272,8 @@ class KissOdometry:
     Adaptive threshold, constant velocity, deskewing and the thinning by voxels are the library's. Lengths are given to
     it in voxels, so that its defaults (voxel 1, threshold 2, least motion 0.1, range 100) hold for a target of any
     size: the voxel is a hundredth of the extent. The first motion is that of the centroid, where the library would
-    begin at rest. {C} is parallel to {A} of the first scan, its origin at the centroid of that scan. What does not move
-    with the target must be cropped before.
+    begin at rest. {C} is parallel to {A} of the first scan, its origin at the centroid of that scan. Points that do not
+    move with the target must be cropped first.
     """
 
     def __init__(self, extent_m: float, deskew: bool = True) -> None:
@@ -311,7 +311,7 @@ class KissOdometry:
         return T_ca.inverse(), float(instants.max()) if timed else 0.0
 
     def _recentre(self, middle: Array) -> None:
-        """Keep the origin of what the library sees near the target, where its range has its usual meaning."""
+        """Keep the origin of the library's points near the target, so that its limit on the range applies as usual."""
         if self._odometry is None:
             from kiss_icp.config.parser import load_config
             from kiss_icp.kiss_icp import KissICP

@@ -14,8 +14,8 @@ Free-space violation
     measured in that direction lie behind it. Applied only where the camera position is known
     (``Visibility.camera_c``).
 Missing surface
-    Share of that surface in free space or in a direction without any point. It alone is no reason for a rejection,
-    because the field of view may end there; but it is one if in turn a part of the scan is not on the model.
+    Share of that surface in free space or in a direction without any point. A pose is rejected for it only if a part of
+    the scan is also not on the model, because the field of view may end there.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance
 NORMAL_QUANTILES = np.array([0.38532, 0.52440, 0.67449, 0.84162, 1.03643, 1.28155, 1.64485])  # for a standard normal
 REFINEMENTS = 2
 NOISE_OF_EXTENT = 0.012  # with more noise than this no pose is accepted
-LEAST_CONTRAST, LEAST_CONTRAST_OF_PART = 6.0, 15.0  # the second where more than MOST_MISSING of the points are off
+LEAST_CONTRAST, LEAST_CONTRAST_OF_PART = 6.0, 15.0  # the second if more than MOST_MISSING of the points are off
 MOST_VIOLATED = 0.15  # largest violated share of the surface that is either supported or violated
 MOST_MISSING = 0.1  # largest missing share, if at least as large a share of the scan is not on the model
 LEAST_SCAN_OF_EXTENT = 0.05  # a smaller scan is about as large as the rejection distance, and any face explains it
-SIZED_POINTS = 200  # of the scan, which are enough to tell for nearly every scan that it is not that small
+SIZED_POINTS = 200  # points of the scan that nearly always suffice to show that it is larger
 LEAST_COMPARED = 30  # with fewer surface points the test has no power
 LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of its incidence is larger
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
@@ -134,7 +134,7 @@ class PlausibilityTest:
         return replace(found, reason=self._reason(found))
 
     def measure(self, points: NDArray[Any], T_ca: Pose) -> Array:
-        """Return the distances (n,) [m] of points (n, 3) in {A} to what the camera sees, at most the reach."""
+        """Return the distances (n,) [m] of points (n, 3) in {A} to the visible faces, at most the reach."""
         camera_c = self._visibility.camera_c(self._index, points, T_ca)
         d2 = self._index.closest(T_ca.apply(points), camera_c=camera_c).d2
         return np.asarray(np.sqrt(np.minimum(d2, self._index.reach_m**2)))

@@ -35,12 +35,12 @@ TESTED_POINTS = 200
 PATCH_OF_EXTENT = 0.05  # residuals of points nearer to each other than this may be correlated
 LEAST_PATCHES = 24
 SIGMA_PER_MEDIAN = 1.4826  # standard deviation over median |e| for a normal e
-NOISE_FLOOR_OF_GATE = 1e-6  # an exact scan must not claim infinite information
-AS_MANY, AS_NEAR = 0.99, 1.02  # inliers and rms of a pose that fits as well
-SUGGESTED, SUGGESTED_SIGMAS = 0.4, 2.5  # an error of size by the sums of patches: share of the least one, and sigmas
+NOISE_FLOOR_OF_GATE = 1e-6  # keeps the information of an exact scan finite
+AS_MANY, AS_NEAR = 0.99, 1.02  # ratios of inliers and rms for which a pose fits as well
+SUGGESTED, SUGGESTED_SIGMAS = 0.4, 2.5  # error of size from sums of patches: over the least reported one, sigmas
 MANY_INLIERS = 0.9  # with a smaller share the sums of the inliers alone do not show the size
-UNCHANGED = 0.06  # of a statistic that is chi-square with 6 degrees of freedom at the true pose: smaller with p = 4e-6
-ACCURACY = (0.1, 1e-3)  # deg and share of the extent, of a back end that states none of its own
+UNCHANGED = 0.06  # a statistic that is chi-square with 6 degrees of freedom at the true pose is smaller with p = 4e-6
+ACCURACY = (0.1, 1e-3)  # accuracy [deg, share of the extent] of a back end that states none
 
 
 class Visibility:
@@ -212,7 +212,7 @@ def grade(
     found = _grade(index, visibility, points, fit, limits.gate_m, params, across, accuracy, systematic)
     if found.overlap and _same(fit.T_ca, guess) and found.statistic > UNCHANGED:
         failed = not_measured(len(points), AlignStatus.FAILED)
-        return replace(failed, message="returned its guess unchanged; the scan asks for another pose")
+        return replace(failed, message="returned its guess unchanged, although the residuals require a step")
     info, P, T_ca = found.total / found.noise_m**2, None, fit.T_ca
     weakest: tuple[str, ...] = ()
     free: Array | None = None
@@ -257,7 +257,7 @@ def grade(
 
 
 def _other_size(found: PoseQuality) -> bool:
-    """Whether another size is worth a fit: the sums of patches suggest one, or many points are not on the model."""
+    """Whether size is fitted: the sums of patches suggest another size, or many points are not on the model."""
     suggested = max(SUGGESTED * LEAST_ERROR, SUGGESTED_SIGMAS * found.size_1s)
     return found.inliers < MANY_INLIERS * found.points or abs(found.size) > suggested
 

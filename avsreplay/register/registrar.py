@@ -25,8 +25,8 @@ from avsreplay.register.surface_index import SurfaceIndex
 
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
 TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
-LEAST_TO_TURN = 0.2  # with fewer inliers turned starts have no prospect
-SURE_RATIO = 0.9  # a search with fewer inliers is followed by another
+LEAST_TO_TURN = 0.2  # with fewer inliers, rotated starts do not lead to the pose
+SURE_RATIO = 0.9  # after a search with fewer inliers another one follows
 NO_MOTION: Array = np.zeros((6, 0))
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
 
@@ -77,13 +77,14 @@ class Registrar:
 
         Args:
             points: (n, 3) in {A} [m], float32 or float64, possibly strided; points that are not finite are left out.
-            guess: predicted T_ac. ICP aligns the scan to the model, so its inverse goes in and the inverse comes out.
+            guess: predicted T_ac. ICP aligns the scan to the model, so it receives the inverse, and its result is
+                inverted.
             seq: number of the scan; two halves of it are compared if ``split_every`` divides it.
             carried: the points were carried to one instant by the predicted motion. An error of this motion distorts
                 the scan like a systematic error, but the estimator models it (``Alignment.instants``): the covariance
                 then leaves it out, so that it is not counted twice.
             effort: most work, in ordinary registrations; with 1 an implausible pose is neither restarted nor searched.
-            unknown: (6, k) motions d of the model about which the guess knows nothing; None for no motion. The scan
+            unknown: (6, k) motions d of the model of which the guess has no information; None for no motion. The scan
                 determines them only if no pose turned by a near-symmetry of the model explains it as well.
 
         Returns:
@@ -163,7 +164,8 @@ class Registrar:
     ) -> tuple[Alignment, bool]:
         """Register the result of a search of part of the scan on the whole scan, and test it.
 
-        Also whether what is not on the model is another object's: well away, or the visible side is complete.
+        Also returned: whether the points off the model belong to another object (far away, or the visible side is
+            complete).
         """
         few = self._restarter.part(part)
         start = self._restarter.measure(few, search.best)
@@ -226,7 +228,7 @@ class Registrar:
 
     @property
     def sided(self) -> bool:
-        """Return whether the side of a face that the camera sees is known."""
+        """Return whether the outer side of the faces is known."""
         return self._visibility.sided
 
     def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
@@ -274,8 +276,8 @@ class Registrar:
         reason = self._reason(few, final, budget)
         if not (reason or self._restarter.doubtful(few, guess, final)):
             return final, False
-        before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without, it may show something else
-        restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose must be searched in any case
+        before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without it, perhaps another object
+        restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
         work = self._global.work(len(scan), 0) + restarts.SCATTER_WORK * len(scan) if overlap else 0
         for step in () if budget.brief else steps:

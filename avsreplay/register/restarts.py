@@ -30,18 +30,18 @@ START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # neighbouring points: those in a cube of this side; cubes along the extent, at least
-VALLEY_STEPS, VALLEY_POINTS = 8, 400  # each way along the two least certain directions, by half a gate
+VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
 BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
-PASS_WORK = 1000  # what a pass of a restart costs besides its points, in point searches
+PASS_WORK = 1000  # fixed cost of a pass of a restart, in point searches
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
-NEAR, MOSTLY = 5.0, 0.9  # another object: of the points nearer than so many widths this share is on the model
-FAR_WORK, LEAST_NEAR = 3, 0.5  # searches that a pass costs a point while fewer points than this share are on the model
-SCATTER_WORK = 10  # what leaving out scattered points costs a point
-TEST_WORK = 15_000  # what a test of a pose costs
-VALLEY_WORK = 2 * 2 * VALLEY_STEPS * VALLEY_POINTS  # what the search along the valley costs
-HEALTHY_PASSES = 7  # searches a point that an ordinary registration and its quality cost
-LEAST_POINTS = 2000  # of an ordinary scan: one of fewer points may be that of a target that is mostly hidden
-FIXED_WORK = 15_000  # what a registration costs besides its points: quality, covariance
+NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
+FAR_WORK, LEAST_NEAR = 3, 0.5  # searches per point of a pass while less than this share of the points is on the model
+SCATTER_WORK = 10  # cost per point of leaving out scattered points
+TEST_WORK = 15_000  # cost of a test of a pose
+VALLEY_WORK = 2 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
+HEALTHY_PASSES = 7  # searches per point of an ordinary registration and its quality
+LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
+FIXED_WORK = 15_000  # fixed cost of a registration: quality, covariance
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
 
@@ -178,7 +178,7 @@ class Restarter:
         """Return whether an alignment may be a local minimum.
 
         After a failure, a poor fit of a part of the scan, or a poor fit of all away from the guess. A misfit of nearly
-        all points of which neighbours share less than half is noise, and no reason for doubt.
+        all points of which neighbours share less than half is noise and no sign of a local minimum.
 
         Args:
             points: (n, 3) in {A} [m], part of the scan.

@@ -30,11 +30,11 @@ from avsreplay.register.sampling import sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import kernel_module
 
-VERSION = 1  # of what is kept of a model
-SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # on the surface: to find marks, around those found, and kept
+VERSION = 1  # version of the kept data of a model
+SAMPLES, DENSE, MOST_MARKS = 4000, 20_000, 500  # points: to find marks, around marks, and kept
 MOST_MARKED = 0.15  # share of the surface; a body with more marks is not nearly symmetric
-TURNS, GENERIC_TURNS = 72, (5, 11, 23, 31, 43, 59)  # about an axis of revolution; those by which it is recognised
-REVOLVED, FITS = 0.02, 2  # of the extent: distance within which turned surface is on the model; fits of the axis
+TURNS, GENERIC_TURNS = 72, (5, 11, 23, 31, 43, 59)  # about an axis of revolution; to recognise the axis
+REVOLVED, FITS = 0.02, 2  # distance of turned surface on the model [extent]; fits of the axis
 TRIED = 16  # motions of a kind by which the marks are found
 AXIS_STRIDE = 3  # every n-th of these points determines the axis
 AROUND = 2.0  # more points are sampled within so many spacings of a point on a mark
@@ -45,9 +45,9 @@ CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
 LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
-STEPS = 24  # of the march from a mark to the camera
+STEPS = 24  # steps from a mark towards the camera
 NEIGHBOUR, EMPTY, SPACED = 8, 2.5, 500  # for the density of rays; no ray within so many spacings: nothing was measured
-MOST_POINTS, SCREENED = 6000, 150  # of the scan; of them, on and off the model, for the comparison of all motions
+MOST_POINTS, SCREENED = 6000, 150  # points of the scan; those on and off the model with which all motions are compared
 FINALISTS = 2  # poses of each kind of motion that are refined
 
 
@@ -85,7 +85,7 @@ class NearSymmetry:
     def _found(self) -> tuple[Array, Array]:
         """Points on the marks and their normals (2, n, 3); the share of the surface that they have, and a point's area.
 
-        Few points tell which parts are marks, and how large they are together; more are then sampled around these.
+        Few points show which parts are marks and how large they are together; more are then sampled around these.
         """
         surface, none = self._target.surface, np.zeros((2, 0, 3))
         if not len(self._kinds):
@@ -122,7 +122,7 @@ class NearSymmetry:
 
     @property
     def marked(self) -> bool:
-        """Whether the turned copies of the model can be told apart by a mark, and only by it."""
+        """Whether a mark distinguishes the turned copies of the model, and nothing else does."""
         return self.near and self._share > 0.0
 
     def work(self, points: int) -> int:
@@ -140,7 +140,7 @@ class NearSymmetry:
         Args:
             scan: (n, 3) in {A} [m].
             T_ca: registered pose.
-            others: other poses that explain the scan; None asks only for a pose that explains more of it.
+            others: other poses that explain the scan; with None only a pose that explains more of it is sought.
             complete: the visible side of the model is complete in the scan, so that empty directions count.
         """
         points = np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64)

@@ -32,10 +32,10 @@ LEAST_RESIDUALS = 50
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
 LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta| that is reported, by itself and in standard errors
 WIDTH_OF_EXTENT, ROUNDS, POINTS = 0.02, 3, 600  # larger residuals are not used; times that the points are matched
-LARGEST_ERROR = 0.3  # a fit that goes further has not converged
-LEAST_INFORMATION = 1e-3  # least share of n . p that the pose cannot explain: three faces of a box tell no size
+LARGEST_ERROR = 0.3  # a fit with a larger step has not converged
+LEAST_INFORMATION = 1e-3  # least share of n . p not explained by the pose: three faces of a box give no size
 PATCHES_OF_EXTENT = (0.05, 0.15)  # sides of the patches; the larger of the two standard errors counts
-LEAST_LEFT = 0.2  # a leverage above 0.8 enlarges the residual of a patch no further
+LEAST_LEFT = 0.2  # leverage is limited to 0.8 where it enlarges the residual of a patch
 OBSERVABLE = 0.05  # an amplitude that the pose and the size explain to all but this share of its norm is not fitted
 CAUCHY, CAUCHY_VARIANCE = 2.0, 1.56  # width of the weights in standard deviations; variance over the weighted one
 

@@ -61,7 +61,7 @@ class IcpParams(Settings):
     keep: bool = setting(True, "Keep a correspondence while it provably cannot change; does not change a result.")
 
     def check(self) -> None:
-        """Raise ValueError where more point-to-plane passes are asked for than passes."""
+        """Raise ValueError where ``n_plane`` exceeds ``n_max``."""
         if self.n_plane > self.n_max:
             raise ValueError(f"n_plane is {self.n_plane}, must not exceed n_max = {self.n_max}")
 

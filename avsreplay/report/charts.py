@@ -50,7 +50,7 @@ _DIRECT = (
 )
 _WINDOW = 10
 WIDE = 20.0  # largest over typical value from which an axis is logarithmic
-KINDS = {  # place: colour and pattern
+KINDS = {  # colour and pattern of each place
     "flagged": (
         *("not_aligned", "fit_error", "no_scan", "pose_jump", "few_inliers", "not_converged"),
         "halves_differ",

@@ -190,7 +190,7 @@ def different_inputs(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[
         ours, theirs = (header.get(part) or {} for header in (other, base))
         if ours.get("sha256") != theirs.get("sha256"):
             names = [str(given.get("name", "unknown")) for given in (ours, theirs)]
-            if names[0] == names[1]:  # then the first digits of their SHA-256 tell them apart
+            if names[0] == names[1]:  # then the first digits of their SHA-256 distinguish them
                 names = [f"{names[0]} {str(given.get('sha256'))[:8]}" for given in (ours, theirs)]
             found.append(f"{part} = {names[0]} (baseline {names[1]})")
     for part in ("selection", "config"):

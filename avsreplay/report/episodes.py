@@ -4,7 +4,7 @@ A label is *harmful* (the scan must be flagged) or not (either verdict is right)
 least one of its scans has gamma 0 or, where no scan came at all, where a gap covers it. A flagged scan without a
 label is a *false alarm*. A *gap* is an interval between scans longer than 1.5 times the median interval.
 
-Recovery is judged by gamma alone: an estimate that followed wrong poses agrees with the next ones and counts as
+Recovery is assessed by gamma alone: an estimate that followed wrong poses agrees with the next ones and counts as
 healthy. The effect of a fault is seen in the errors of the estimate over its flagged scans, its used scans and the
 scans after it.
 """

@@ -34,7 +34,7 @@ _MAX_TUM, _LEAST, _LARGEST, _UNIT, _LONGEST_S = 512 << 20, 1e-12, 1e15, 1e-3, 9_
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Result:
-    """What a run left behind.
+    """The result of a run as read from its directory.
 
     Attributes:
         name: of its folder.  header: content of ``run.json``, empty if the file does not exist.

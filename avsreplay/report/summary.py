@@ -33,8 +33,8 @@ from avsreplay.rows import Row
 
 NIS_BAND = (1.2373, 14.4494)  # 2.5 % and 97.5 % points of chi-square with 6 degrees of freedom
 NIS_LIMIT = 27.8563  # 99.99 % point of chi-square with 6 degrees of freedom, above which a pose gets a smaller weight
-BLOCK_BANDS = {2: (0.05064, 7.3778), 3: (0.2158, 9.3484)}  # the same with 2 and 3
-NEES_BAND = (9.5908, 34.1696)  # the same with 20
+BLOCK_BANDS = {2: (0.05064, 7.3778), 3: (0.2158, 9.3484)}  # the same points with 2 and 3 degrees of freedom
+NEES_BAND = (9.5908, 34.1696)  # the same points with 20 degrees of freedom
 _BY_STATE = ("pos_err_m", "rot_err_deg", "reg_pos_err_m", "reg_rot_err_deg", "nis", "rms_m", "iterations")
 _OF_ALL = ("nees", *(f"nees_{name}" for name in BLOCKS))
 _STATES = ("t_ns", "t_s", "gamma", "fault", "status", "reason", "cauchy_weight", "reference", "ogm_rank", "converged")

@@ -104,7 +104,7 @@ class RunVerdict:
 
 
 def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] | None = None) -> RunVerdict:
-    """Judge a run.
+    """Return the verdict on a run.
 
     Args:
         rows: one per scan.

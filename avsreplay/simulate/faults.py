@@ -33,7 +33,7 @@ from avsreplay.settings import Settings, setting
 from avsreplay.simulate.scanner import Returns
 
 NS = 1_000_000_000
-LONGEST_S = 1e8  # of a log, and of a window in it: its stamps fit the 31 bits of seconds of a ROS 2 time
+LONGEST_S = 1e8  # longest log or window: its stamps fit the 31 bits of seconds of a ROS 2 time
 PLATE_RETURN_RATIO = 0.05  # a dark plate: share of the rays it blocks that give a return
 PLATE_DEPTH_RATIO = 0.4  # range of the plate over the median range of the target
 PLATE_TILT = math.tan(math.radians(15.0))

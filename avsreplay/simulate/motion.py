@@ -27,7 +27,7 @@ from avsreplay.simulate.inertia import Body
 
 ORDER = 22
 STEP_RAD = 0.25
-MOST_STEPS = 100_000  # of the integration, 2 kB each: at least 4000 turns
+MOST_STEPS = 100_000  # largest number of steps of the integration, 2 kB each: at least 4000 turns
 Vector = tuple[float, ...]
 Rows = Sequence[Sequence[float]]
 

@@ -95,7 +95,7 @@ class FaceOptics:
         n = self.normals[faces]
         mirrored = directions - 2.0 * np.einsum("ni,ni->n", directions, n)[:, None] * n
         cosine = np.einsum("ni,ni->n", mirrored, sun)
-        angle = 0.5 * np.arccos(np.clip(cosine, -1.0, 1.0))  # of the normal from the bisector
+        angle = 0.5 * np.arccos(np.clip(cosine, -1.0, 1.0))  # cosine of the angle between the normal and the bisector
         return np.asarray((self.specular[faces] > 0.0) & (angle < self.width_rad[faces]))
 
 

@@ -1,4 +1,4 @@
-"""The table [scanner] of a scenario, and the rays: directions and times in the order of measurement, and what they hit.
+"""The table [scanner] of a scenario, and the rays: directions and times in the order of measurement, and triangles hit.
 
 The triangle is found by embreex where it is installed, by an exhaustive search elsewhere. Either engine only finds the
 triangle; the range is computed from the plane of that triangle in float64.
@@ -113,7 +113,7 @@ class RayCaster:
     def __init__(self, surface: Surface, engine: Engine = Engine.AUTO) -> None:
         corners = surface.vertices[surface.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        keep = np.linalg.norm(normals, axis=1) > 0.0  # a zero-area triangle cannot be hit
+        keep = np.linalg.norm(normals, axis=1) > 0.0  # no ray hits a triangle without area
         self._index = np.flatnonzero(keep)
         self._corners = np.ascontiguousarray(corners[keep])
         self._normals = normals[keep] / np.linalg.norm(normals[keep], axis=1, keepdims=True)
@@ -252,7 +252,7 @@ class ScannerParams(Settings):
     )
     merge_m: float = setting(
         math.inf,
-        "Returns of one beam that differ by less in range merge, weighted by intensity; else the strongest counts.",
+        "Returns of a beam merge, weighted by intensity, if their ranges differ by less; else the strongest counts.",
         unit="m",
         low=0.0,
         infinite=True,
@@ -274,7 +274,7 @@ class ScannerParams(Settings):
         low=0.0,
     )
     outlier_ratio: float = setting(
-        0.02, "Share of the returns with a range anywhere between range_min_m and range_max_m.", low=0.0, high=1.0
+        0.02, "Share of the returns with a random range from range_min_m to range_max_m.", low=0.0, high=1.0
     )
     dropout_ratio: float = setting(0.0, "Share of the returns that are lost.", low=0.0, high=1.0)
     max_incidence_deg: float = setting(
@@ -288,10 +288,13 @@ class ScannerParams(Settings):
     range_max_m: float = setting(12.0, "Largest range of a return.", unit="m", above=0.0)
     intensity: bool = setting(False, "Write the intensity of each return to the log.")
     returns: int = setting(
-        1, "Most returns of one beam, strongest first; more than one needs a divergence and merge_m.", low=1, high=7
+        1,
+        "Largest number of returns of a beam, strongest first; more than 1 needs divergence and merge_m.",
+        low=1,
+        high=7,
     )
     range_walk_m: float = setting(
-        0.0, "Error of the range by which it grows for each factor of ten that the intensity is below 1.", unit="m"
+        0.0, "Amount by which the range is too long for each factor of ten that the intensity is below 1.", unit="m"
     )
     crosstalk_ratio: float = setting(
         0.0, "Share of the strongest return of a scan that is added to every return as stray light.", low=0.0, below=1.0
@@ -300,7 +303,7 @@ class ScannerParams(Settings):
         math.inf, "Intensity from which a return saturates the detector and blooms.", above=0.0, infinite=True
     )
     bloom_deg: float = setting(
-        0.0, "Rays within this angle of a saturated return give its range instead of their own.", unit="deg", low=0.0
+        0.0, "Rays within this angle of a saturated return give the range of that return.", unit="deg", low=0.0
     )
     sun_a: tuple[float, float, float] | None = setting(
         None, "Unit vector to the sun in {A}; specular faces that mirror it return nothing.", unset="no sun"
@@ -308,7 +311,7 @@ class ScannerParams(Settings):
     engine: Engine = setting(Engine.AUTO, "Ray casting: embree, exact (numpy), or embree where it is installed (auto).")
 
     def check(self) -> None:
-        """Raise ValueError where the ranges, or pattern and duration, do not go together."""
+        """Raise ValueError where the ranges, or pattern and duration, contradict each other."""
         if self.range_min_m >= self.range_max_m:
             raise ValueError(f"range_min_m = {self.range_min_m} must be below range_max_m = {self.range_max_m}")
         if self.sun_a is not None and not is_unit(self.sun_a, 1e-6):

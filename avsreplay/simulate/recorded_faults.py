@@ -26,8 +26,8 @@ from avsreplay.records import Label, Scan, ScanStatus
 from avsreplay.simulate.faults import DEFAULTS, NS, Kind, clutter, fits, occlude
 from avsreplay.simulate.scanner import Returns
 
-OUTLIER_RANGES = 0.5, 1.5  # over the median range of the scan
-_NEIGHBOURS, _NOISE_SAMPLES = 9, 1000  # of the estimate of the range noise
+OUTLIER_RANGES = 0.5, 1.5  # limits of the range of an outlier, over the median range of the scan
+_NEIGHBOURS, _NOISE_SAMPLES = 9, 1000  # neighbours and samples for the estimate of the range noise
 _LEAST_AHEAD = 0.05  # cosine to the mean direction of the points, below which a point is not in front of the scanner
 
 

@@ -106,7 +106,7 @@ class Scanner:
         low, high = surface.vertices.min(axis=0), surface.vertices.max(axis=0)
         self.centre_c = frozen(0.5 * (low + high))
         reach = [float(np.max(np.linalg.norm(surface.vertices - self.centre_c, axis=1)))]
-        for each in appendages:  # wherever its hinge turns it
+        for each in appendages:  # for any angle of its hinge
             hinge = np.array(each.hinge_m)
             reach.append(np.linalg.norm(hinge - self.centre_c) + np.linalg.norm(surface.vertices - hinge, axis=1).max())
         self.radius_m, self._reach_m = reach[0], float(np.max(reach))
@@ -179,7 +179,7 @@ class Scanner:
         return Returns(self._rays[0][beams], ranges, self._times[beams], np.ones(n), least, np.zeros(n))
 
     def _particles(self, plume: Plume, met: TracedRays, rays: Array, rng: np.random.Generator) -> TracedRays:
-        """Rays (n, 3) on the particles of a plume in front of what they meet."""
+        """Rays (n, 3) on the particles of a plume that lie in front of the surfaces."""
         p = self.params
         ranges = plume.particles(rays, np.minimum(met.ranges, p.range_max_m), rng)
         seen = np.isfinite(ranges) & (ranges >= p.range_min_m)
@@ -204,7 +204,7 @@ class Scanner:
         return returns
 
     def _seen(self, poses: tuple[Array, Array], times_s: Array) -> tuple[Array, Array]:
-        """Poses (n, 3, 3), (n, 3) in the fixed frame as the moving camera sees them."""
+        """Poses (n, 3, 3), (n, 3) in the fixed frame seen from the moving camera."""
         if self._camera is None:
             return poses
         R_wa, t_wa = self._camera.poses(times_s)

@@ -179,7 +179,7 @@ def belief(start: StartParams, truth: State, t_ns: int, rng: np.random.Generator
     rate = _offset(start.rate_offset_radps, start.rate_std_radps, 3, rng)
     sigma = _offset(start.sigma_offset, start.sigma_std, 2, rng)
     if start.sigma_offset is not None and np.abs(truth.sigma + sigma).max() >= 1.0:
-        what = f"with it the believed inertia ratios are {[round(float(s), 4) for s in truth.sigma + sigma]}"
+        what = f"with it the estimated inertia ratios are {[round(float(s), 4) for s in truth.sigma + sigma]}"
         raise UsageError(what, where="start.sigma_offset", hint="they must be between -1 and 1, as those of any body")
     varrho = _offset(start.varrho_offset_m, start.varrho_std_m, 3, rng)
     mu = np.radians(_offset(start.mu_offset_deg, start.mu_std_deg, 3, rng))

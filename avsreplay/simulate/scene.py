@@ -2,8 +2,8 @@
 
 An object is a box, a launcher adapter or a mesh in its own frame {S}, which moves in {A} with constant velocity and
 angular rate. It blocks the rays to what is behind it and returns points itself. Particles of a plume do the same at
-random places. The Earth is too far for a return; its light causes false returns and noise. What is present in part of
-the log only is labelled in the log like a fault.
+random places. The Earth is too far for a return; its light causes false returns and noise. An item that is present in a
+part of the log only has a label in the log, like a fault.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from avsreplay.simulate.rays import Engine, RayCaster
 from avsreplay.simulate.target import adapter, box
 
 NS = 1_000_000_000
-_STATIONS = 64  # of the sum along a ray through a plume
+_STATIONS = 64  # points of the sum along a ray through a plume
 _NEAREST_M = 0.1  # distance from the nozzle below which the density of the particles is constant
 Triple = tuple[float, float, float]
 

@@ -33,12 +33,12 @@ class Shape(Enum):
 
 
 FROM_MESH = "from the mesh, of uniform density"
-LEAST_THICKNESS = 1e-9  # how far an inertia ratio is from -1 and 1, which no body reaches
+LEAST_THICKNESS = 1e-9  # least distance of an inertia ratio from -1 and 1, which no body reaches
 
 
 @dataclass(frozen=True, slots=True)
 class TargetParams(Settings):
-    """The table [target]: the model, and its mass properties where those of the mesh are not wanted."""
+    """The table [target]: the model, and mass properties that replace those of the mesh."""
 
     shape: Shape = setting(Shape.SATELLITE, "A built-in target; not used where a model is given.")
     model: str = setting(

@@ -27,7 +27,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.simulate import load_scenario, scenario_of
 from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
 
-FORMAT = 4  # of a run's result: one of an older format is made again
+FORMAT = 4  # format of a run's result; a result with another format is computed again
 _NAMED = ("scenario", "log", "case")  # axes that select a file or a case, not a key
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from avsreplay import settings
 from avsreplay.report.episodes import Episode, Peak
 
-LEVEL = 0.95  # of every interval
+LEVEL = 0.95  # confidence level of every interval
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ CRITERIA = (
 SCORES = {"rms_m": "rms_m", "alpha_m": "alpha_m", "outlier_ratio": "inlier_ratio", "nis": "nis"}  # score: its column
 FLIGHT_ENDS = ("captured", "outside", "aborted", "touched")
 STATES = 20
-WORST = 5  # runs that are listed
+WORST = 5  # number of runs that are listed
 _ERRORS = {"pose_healthy.position_m.max": "healthy scan", "worst_coast.pos_err_m": "coasting"}
 _BAD = ("crashed", "failed", "lossy")  # worst status first
 
