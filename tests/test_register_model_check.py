@@ -52,6 +52,15 @@ def test_a_correct_model_raises_no_note() -> None:
     assert checked(boxes(), boxes()).notes() == ()
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("factor", "used"), [(1.0, 16), (1.007, 20)])
+def test_the_size_is_measured_until_an_error_is_excluded(factor: float, used: int) -> None:
+    model = boxes()
+    check = checked(model, replace(model, vertices=factor * model.vertices), count=60)
+    assert len(check._deltas) == used
+    assert bool(check.notes()) == (factor != 1.0)
+
+
 def test_few_scans_say_nothing_of_the_size() -> None:
     check = checked(boxes(), boxes(), count=4)
     assert check.scale() is None

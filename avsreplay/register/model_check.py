@@ -27,6 +27,7 @@ from avsreplay.register.size import LEAST_ERROR, SIGMAS, fitted_size, noise_bias
 
 POINTS = 1500  # points used of each scan
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
+ENOUGH_SCANS = 16  # with which the check ends where they exclude an error of size that would be reported
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
 MOST_WEIGHT = 4.0  # largest weight of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
@@ -67,23 +68,34 @@ class ModelCheck:
             self._unmatched = points if self._unmatched is None else self._unmatched
             return
         self._aligned += 1
-        if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS:
+        if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and not self._settled():
             self._measure(points, found)
 
     def scale(self) -> tuple[float, float] | None:
         """Return the size of the target over that of the model and its standard error; None with too few scans."""
         if len(self._deltas) < LEAST_SCANS:
             return None
-        delta, weight = np.array(self._deltas), np.array(self._weights)
-        weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
-        mean = float(weight @ delta / weight.sum())
-        without = (weight @ delta - weight * delta) / (weight.sum() - weight)
-        n = len(delta)
-        spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
-        tried = np.linspace(0, n - 1, BIAS_SCANS).astype(np.intp)
+        mean, spread, weight = self._mean()
+        tried = np.linspace(0, len(weight) - 1, BIAS_SCANS).astype(np.intp)
         bias = [noise_bias(self._registrar.index, *self._points[k]) for k in tried]
         mean_bias = float(weight[tried] @ np.array(bias) / weight[tried].sum())
         return 1.0 + mean - mean_bias, float(np.hypot(spread, 0.5 * mean_bias))
+
+    def _mean(self) -> tuple[float, float, Array]:
+        """The weighted mean of the errors of size, its standard error (jackknife), and the weights of the scans."""
+        delta, weight = np.array(self._deltas), np.array(self._weights)
+        weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
+        without = (weight @ delta - weight * delta) / (weight.sum() - weight)
+        n = len(delta)
+        spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+        return float(weight @ delta / weight.sum()), spread, weight
+
+    def _settled(self) -> bool:
+        """Whether the scans so far exclude an error of size that would be reported."""
+        if len(self._deltas) < ENOUGH_SCANS:
+            return False
+        mean, spread, _ = self._mean()
+        return abs(mean) + SIGMAS * spread < LEAST_ERROR
 
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there are none."""
