@@ -30,6 +30,7 @@ MARKED = [page for page in PAGES if any(block["mark"] for block in _blocks(page)
 QUICK = {"docs/index.md"}
 SHORT = {"AVSREPLAY_RECORD_DURATION_S": "12", "AVSREPLAY_SWEEP_LIMIT": "2"}  # of what a page simulates itself
 ELSEWHERE = {  # command of a block that needs more than a folder: the test that runs such a command
+    "avsreplay record -o tumble.mcap": "test_docs.py::test_marked_blocks_run_in_order",  # of the README
     "avsreplay run long.mcap": "test_binary_files.py::test_a_continued_run_has_the_bytes_of_a_run_without_interruption",
     "avsreplay run tumble.mcap --rerun": "test_run.py::test_a_run_is_written_for_rerun",
     "avsreplay sweep docs/campaigns/blackouts.toml -o": "test_sweep_run.py::test_a_worker_killed_in_the_middle",
@@ -311,6 +312,30 @@ def test_links_lead_somewhere(page):
 def _anchors(page):
     heads = re.findall(r"^#+ (.+)$", page.read_text(encoding="utf-8"), flags=re.M)
     return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
+
+
+TO_SHORTEN = {"backends", "estimation", "faults", "kernel", "performance", "planning", "real", "reconstruction"}
+TO_SHORTEN |= {"reliability", "report", "scenario", "sweep"}  # pages with longer sentences, or with history
+PLAIN = [page for page in PAGES if page.stem not in TO_SHORTEN]
+HISTORY = re.compile(
+    r"\b(previously|formerly|no longer|before the change|earlier version|used to be|since then|until now)\b"
+    r"|(?:^|[.;:(|] ?)(?:Before|Now|Formerly),",
+    re.IGNORECASE | re.MULTILINE,
+)
+
+
+def _sentences(text):
+    """Sentences outside of code, as words; a heading, an entry of a list and a cell of a table are sentences."""
+    for part in re.split(r"\n\s*\n|\||\n(?=\s*(?:[-*#]|\d+\. ))|^#+ [^\n]*\n", text, flags=re.M):
+        joined = " ".join(re.sub(r"`[^`]*`", "code", part).split())
+        yield from (sentence.split() for sentence in re.split(r"(?<=[.!?:;])(?:\*\*)? +(?=[A-Zc*\[({])", joined))
+
+
+@pytest.mark.parametrize("page", PLAIN, ids=_name)
+def test_a_sentence_has_at_most_45_words_and_states_the_present(page):
+    text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
+    assert [" ".join(words) for words in _sentences(text) if len(words) > 45] == []
+    assert [found[0] for found in HISTORY.finditer(text)] == []
 
 
 def test_the_notebook_runs_from_top_to_bottom(folder):

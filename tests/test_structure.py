@@ -52,6 +52,17 @@ def test_no_module_exceeds_the_line_limit():
     assert not long, long
 
 
+def test_comments_and_docstrings_describe_computations_in_technical_terms():
+    person = r"(speaks|believe[sd]?|trust(?:s|ed)|knows|hopeless|remembers?|forgets?|wants|ask(?:s|ed)|refuse[sd]?)"
+    found = [
+        f"{path.name}: {text[:100]}"
+        for path in ROOT.glob("avsreplay/**/*.py")
+        for text in re.findall(r'""".*?"""|# [^\n]*', path.read_text(encoding="utf-8"), flags=re.S)
+        if re.search(rf"\b{person}\b", text)
+    ]
+    assert not found, found
+
+
 def test_the_diagrams_of_the_architecture_page_are_current():
     done = run(sys.executable, str(ROOT / "docs" / "architecture_diagrams.py"), "--check")
     assert done.returncode == 0, done.stderr

@@ -89,7 +89,7 @@ class GrowingLog:
             before.close()
 
     def take(self, scan: Scan, truth: Truth) -> None:
-        """Remember what was used of a scan and its truth.
+        """Store the values of a scan and its truth that were used.
 
         Args:
             scan: the scan; its points are not kept.

@@ -136,7 +136,7 @@ def _no_clouds(recording: Recording, path: Path, what: str) -> UnreadableInput:
     elif what == "PointCloud2" and any("packet" in t.type.lower() for t in topics):
         advice = "these are raw sensor packets: convert them with the sensor's own driver first; "
     elif recording.losses:
-        advice = f"{len(recording.losses)} part(s) of it could not be read, 'avsreplay doctor' says which; "
+        advice = f"{len(recording.losses)} part(s) of it could not be read, 'avsreplay doctor' lists them; "
     hint = f"{advice}topics here: {_named(topics) or 'none'}"
     return UnreadableInput(f"no {what} topic with a message", where=shown(path), hint=hint)
 

@@ -1,6 +1,6 @@
-"""What a source reads as it goes: clouds or measured poses in order, and true poses, states and sensor poses by time.
+"""Clouds or measured poses of a source in order, and its true poses, states and sensor poses by time.
 
-The clouds are decoded ahead on a second thread if asked.
+The clouds are decoded ahead on a second thread if requested.
 """
 
 from __future__ import annotations
