@@ -48,8 +48,8 @@ def state() -> str:
 def pin() -> None:
     """Pin the arithmetic of this process and of those that it starts; the process may be replaced by a new one.
 
-    Where ``AVSREPLAY_ARITHMETIC=native`` is set, where the system has no such variants, or where numpy has been
-    imported and it is too late, it only limits the number of threads, which takes effect if numpy is loaded later.
+    It only limits the number of threads if ``AVSREPLAY_ARITHMETIC=native`` is set, if the system has no such variants,
+    or if numpy has been imported already. The limit takes effect if numpy is loaded later.
     """
     os.environ[THREADS] = "1"  # the sums of a product on several threads depend on their number
     if os.environ.get(VARIABLE) == "native" or "numpy" in sys.modules or not sys.executable or not has_variants():

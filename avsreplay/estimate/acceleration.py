@@ -11,9 +11,9 @@ Fitted. With measured attitudes R_k the position of the origin of {C} is linear 
 
 with arm the vector from the centre of mass to that origin, in {C}. Generalised least squares give a and its covariance
 (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 3.4). The errors of
-the attitudes enter the noise of the equations, times the arm; that they also draw the arm towards zero is neglected,
-which is right as long as this part is not larger than the noise of the positions. The fit grows
-pose by pose and ends before the first poses that contradict it, so that an impact after a free flight has no effect.
+the attitudes enter the noise of the equations, times the arm. They also bias the arm towards zero, which is neglected:
+this is right if their part is not larger than the noise of the positions. The fit grows pose by pose and ends before
+the first poses that contradict it, so that an impact after a free flight has no effect.
 """
 
 from __future__ import annotations

@@ -5,11 +5,11 @@ contains its second-order part (geodesic acceleration: Transtrum and Sethna, arX
 
 The motion is taken as deterministic; the residuals d = [theta; v] are expressed in {C}, where their noise is given.
 Jacobians are H Phi, in the coordinates of ``chart``, which keep the inertia physical without a bound. A prior, given or
-weak, keeps directions finite that the poses do not determine yet. The likelihood is that of an M-estimator: a pose
+weak, keeps directions finite that the poses do not determine yet. The likelihood is that of an M-estimator. A pose
 above the 99.99 % point of chi-square with 6 degrees of freedom gets Huber's weight in the first descent and Cauchy's in
-the last; other poses keep the weight 1, so that Gaussian noise costs no efficiency. Two factors on the poses' noise,
-attitude and position, may be estimated from the residuals; where the residuals are correlated in time, as those of
-registration are, the covariance is inflated by their integrated autocorrelation.
+the last; other poses keep the weight 1, which is efficient for Gaussian noise. Two factors on the poses' noise,
+attitude and position, may be estimated from the residuals. The covariance is inflated by the integrated autocorrelation
+of the residuals, because those of registration are correlated.
 """
 
 from __future__ import annotations

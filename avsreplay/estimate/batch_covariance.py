@@ -1,11 +1,11 @@
 """The covariance of a batch fit: corrected where the likelihood is not Gaussian, and with process noise.
 
-Until the body has turned a few times, some directions of the inertia are determined so poorly that the minimum of the
-cost bends within its own 1 sigma; the curvature at the minimum then understates the uncertainty. Two sigma along each
-of the weakest directions the cost is compared with the Gaussian one. Along a non-Gaussian direction the fit is repeated
-with that direction fixed on either side (the profile likelihood) where the cost, minimised over everything else, has
-risen by 3/2, as it does at root three sigma of a Gaussian: with the Gauss-Hermite weights 1/6, 4/6, 1/6 the three fits,
-each with its remaining covariance, carry the second moments. They are propagated to the requested instant one by one.
+Until the body has turned a few times, some directions of the inertia are so poorly determined that the valley of the
+cost is curved within 1 sigma of its minimum. The curvature at the minimum then understates the uncertainty. The cost is
+compared with the Gaussian one at two sigma along each of the weakest directions. Along a non-Gaussian direction the fit
+is repeated with that direction fixed on either side (profile likelihood), where the cost, minimised over all others,
+has risen by 3/2, as at root three sigma of a Gaussian. With the Gauss-Hermite weights 1/6, 4/6, 1/6 the three fits and
+their remaining covariances have the second moments. Each of them is propagated to the requested instant.
 
 The fit takes the motion as deterministic. About its trajectory the problem is linear, so one pass of a Kalman filter
 over the poses, with the disturbance's covariance between them, is the maximum likelihood with process noise. The

@@ -1,6 +1,6 @@
 """When the batch fit runs: it provides the estimate at the start, and replaces a filter that it contradicts.
 
-The innovations of single steps cannot show every error: a biased scan or two that passed the fault rule move the
+The innovations of single steps cannot show every error. One or two biased scans that passed the fault rule move the
 parameters of a converged filter by many of its own sigma, and the next innovations look normal. A fit to the last poses
 gives such scans a low weight and does not share the error. Where the two differ by more than the covariance of the fit
 allows, the fit replaces the filter's estimate.

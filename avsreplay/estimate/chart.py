@@ -2,9 +2,9 @@
 
 Rate, arm and inertia are expressed in {C}, the inertia as a traceless symmetric matrix. The second mass moments of a
 body about its centre, E = tr(I)/2 1 - I, are positive definite exactly where the moments of inertia obey the triangle
-inequalities. Their logarithm M, traceless because scale has no effect, is an arbitrary symmetric 3x3 matrix: five
-numbers for (sigma, mu) that need no bounds, do not depend on the order of the axes, and have no singularity where two
-moments are equal. With the eigenvalues m of M, sigma1 = tanh((mz - my) / 2), sigma2 = tanh((mx - mz) / 2), sigma3 =
+inequalities. Their logarithm M, traceless because scale has no effect, is an arbitrary symmetric 3x3 matrix. Its five
+numbers replace (sigma, mu). They need no bounds, do not depend on the order of the axes, and have no singularity where
+two moments are equal. With the eigenvalues m of M, sigma1 = tanh((mz - my) / 2), sigma2 = tanh((mx - mz) / 2), sigma3 =
 tanh((my - mx) / 2); the eigenvectors are the principal axes, A(mu)'.
 
 Chart step y (20): half angle of eta in {C}, rate in {C}, position and velocity of the fixture in {A}, M (5), arm (3)
@@ -214,7 +214,7 @@ def body_parameters(belief: Belief) -> BodyParameters:
     """Inertia, mass centre and rate in {C} with their 1 sigma.
 
     The inertia is a nonlinear function of the chart's five numbers, so its standard deviations come from sigma points
-    (unscented transform); as the tensor is divided by its trace, they cannot leave the physical range.
+    (unscented transform). The tensor is divided by its trace, so that they stay in the physical range.
     """
     chart = to_chart(belief.x)
     T = to_errors(chart)
@@ -241,7 +241,7 @@ def body_parameters(belief: Belief) -> BodyParameters:
 def _limited_1s(belief: Belief, arm_variance: float) -> tuple[float, float, float, float]:
     """1 sigma of sigma1, sigma2, varrho and mu, at most that of a parameter about which nothing is known.
 
-    Without information sigma is uniform in (-1, 1), mu is uniform over all attitudes, and varrho has any direction: the
+    Without information sigma is uniform in (-1, 1), mu is uniform over all attitudes, and varrho has any direction. The
     linear covariance has no such limit where two moments are nearly equal and the axes are undetermined.
     """
     x, variance = belief.x, np.maximum(np.diagonal(belief.P), 0.0)

@@ -1,10 +1,10 @@
 """A persistent torque or force on the target: found in the residuals of the batch fit, with its onset and its size.
 
 A constant angular acceleration in {C} and a constant acceleration in {A}, both from an unknown instant on, are linear
-unknowns about the trajectory of the fit. The error states at the epoch that a unit acceleration since tau is equivalent
-to at t are B(t) - B(tau), B(t) being the integral of Phi(s, 0)^-1 G ds; the residuals of the poses depend on them as on
-the initial values themselves. With a Gaussian prior on the size the evidence against free motion is in closed form, as
-in ``hypotheses``. The noise of the poses is that of the residuals with the drift removed, correlation included.
+unknowns about the trajectory of the fit. A unit acceleration since tau has the same effect at t as the error states
+B(t) - B(tau) at the epoch, where B(t) is the integral of Phi(s, 0)^-1 G ds. The residuals of the poses depend on them
+as on the initial values. With a Gaussian prior on the size the evidence against free motion is in closed form, as in
+``hypotheses``. The noise of the poses is that of the residuals with the drift removed, correlation included.
 """
 
 from __future__ import annotations

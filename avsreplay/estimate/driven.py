@@ -1,9 +1,9 @@
 """A constant torque and a constant force as a part of the motion: its prediction, correction and forecast.
 
 The torque gives a constant angular acceleration of the body, in {C} because the fixture is known and the principal axes
-are not, and the force one of the centre of mass in {A}. The six are unknowns beside the 20 states: constants, of which
-the covariance with the states is carried along, so that the prediction contains their uncertainty and each pose
-corrects them (Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 4).
+are not, and the force one of the centre of mass in {A}. The six are constant unknowns beside the 20 states. Their
+covariance with the states is propagated, so that the prediction contains their uncertainty and each pose corrects them
+(Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, section 4).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The motion with a constant torque or force that fits all poses, and the belief at the last of them.
 
-The acceleration is removed from the poses: what is left is the fit of free motion (``batch``) to poses as they would be
-without it. About this fit the problem is linear in the initial values, the acceleration and its onset, so that one pass
-of a Kalman filter over the poses, with the disturbances between them, gives their joint mean and covariance.
+The acceleration is removed from the poses, and free motion (``batch``) is fitted to the poses as they would be without
+it. About this fit the problem is linear in the initial values, the acceleration and its onset. One pass of a Kalman
+filter over the poses, with the disturbances between them, gives their joint mean and covariance.
 """
 
 from __future__ import annotations

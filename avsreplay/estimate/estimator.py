@@ -271,8 +271,9 @@ class Estimator:
     def published(self, track: Track) -> Belief:
         """The belief in {A} with errors that later poses do not reduce and the filter therefore does not carry.
 
-        These are the error of the position along the line of sight that all poses may have in common, and the motions
-        of the model that no healthy scan determines, such as the rotation of a body of revolution about its axis.
+        One is the error of the position along the line of sight that all poses may have in common. The others are
+        motions of the model that no healthy scan determines, such as the rotation of a body of revolution about its
+        axis.
 
         Args:
             track: after a scan.

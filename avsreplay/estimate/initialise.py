@@ -1,8 +1,8 @@
 """Start without a belief: rate from the first poses, then a batch fit over all of them.
 
 The first belief has zero sigma and varrho, and mu is the identity. Its covariance is that of one linearised fit: the
-prior's information plus H' R^-1 H of each pose propagated back along the motion, so that rate, velocity and their
-correlations with the unknown parameters agree with the poses.
+prior's information plus H' R^-1 H of each pose, propagated back along the motion. Rate, velocity and their correlations
+with the unknown parameters thus agree with the poses.
 
 The fit is repeated each time the poses have grown by a stated share (``refit`` decides when). It is final once its
 likelihood is Gaussian (``batch_covariance`` finds no non-Gaussian direction) and every direction is determined by the

@@ -1,13 +1,13 @@
 """The measurement noise R: registration covariance or R0, adapted from residuals, and its correlation in time.
 
 Adaptation (eq:R_resudua2) uses a ring buffer that is summed anew at each epoch, so that rounding errors do not
-accumulate. Two rules. ``matrix`` is the paper's: R = Sigma + H P+ H', Sigma the mean of r r'. ``scale`` keeps the
-shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
-attitude: s^2 = sum of r' R_b^-1 r over the sum of the degrees of freedom that the update leaves, 3 - tr(R_b^-1 H P+ H')
-/ s^2 for a block, which is where the derivative of the likelihood of the innovations vanishes. The level of the last
-fit is its prior, with the weight of a few scans: under large disturbances the residuals hardly determine R. Two numbers
-are estimated from a window instead of 21, so that the scatter of the factors hardly affects the consistency. The sums
-use the weights of the updates, so that outliers do not increase R.
+accumulate. There are two rules. ``matrix`` is the paper's: R = Sigma + H P+ H', Sigma the mean of r r'. ``scale`` keeps
+the shape of the base R (the registration's own covariance, else R0) and adapts one factor for position and one for
+attitude. Its square s^2 is the sum of r' R_b^-1 r over the sum of the degrees of freedom that the update leaves, 3 -
+tr(R_b^-1 H P+ H') / s^2 for a block. There the derivative of the likelihood of the innovations vanishes. The level of
+the last fit is its prior, with the weight of a few scans: under large disturbances the residuals hardly determine R.
+Two numbers are estimated from a window instead of 21, so that the scatter of the factors hardly affects the
+consistency. The sums use the weights of the updates, so that outliers do not increase R.
 """
 
 from __future__ import annotations

@@ -20,9 +20,9 @@ _FEW = 48  # poses up to which none are joined
 def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _POINTS) -> Poses:
     """At most some hundred poses that carry the information of many: weighted means about a reference motion.
 
-    Neighbouring poses, while the body turns by a fraction of a radian, are replaced by the reference's pose at their
-    mean instant, corrected by the mean of their differences from it, with the inverse of the sum of their information
-    as covariance. The difference of two solutions of the motion changes little over such a turn, so the fit to the
+    Neighbouring poses, over a turn of a fraction of a radian, are replaced by one: the reference's pose at their mean
+        instant, corrected by the mean of their differences from it. Its covariance is the inverse of the sum of their
+        information. The difference of two solutions of the motion changes little over such a turn, so the fit to the
     normal points is the fit to the poses. Satellite laser ranging reduces its observations to normal points in the same
     way.
 

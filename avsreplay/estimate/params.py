@@ -209,9 +209,9 @@ class EstimatorParams(Settings):
     def at_interval(self, period_s: float, extent_m: float) -> EstimatorParams:
         """Return the settings with start and changes of the motion that fit to poses at short intervals.
 
-        Poses need no initial guess, so that any motion may be tracked: the rate and velocity expected at the start, and
-        with them the expected size of a manoeuvre, are at least those that turn the target by a quarter of a radian or
-        move it by a quarter of its extent between two poses. Settings that differ from their defaults are kept.
+        Poses need no initial guess, so that any motion may be tracked. The rate and velocity expected at the start, and
+        the expected size of a manoeuvre, therefore at least turn the target by a quarter of a radian and move it by a
+        quarter of its extent between two poses. Settings that differ from their defaults are kept.
 
         Args:
             period_s: interval between poses [s]; 0 if it is not known.

@@ -1,7 +1,7 @@
 """Reading of PLY files: ascii and both binary byte orders; unknown elements and properties are skipped.
 
-No library is used because the Stanford scans have a ``range_grid`` element that mesh readers do not support, and
-because every declared count must be checked against the bytes of the file before memory is allocated.
+No library is used. The Stanford scans have a ``range_grid`` element that mesh readers do not support, and every
+declared count must be compared with the bytes of the file before memory is allocated.
 """
 
 from __future__ import annotations

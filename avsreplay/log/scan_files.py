@@ -1,8 +1,7 @@
 """Scans stored as files: PLY, PCD, KITTI ``.bin``, ``.npy``, ``.npz``, ``.las`` and ``.laz``; the reader of PCD.
 
-PCD files (ascii, binary and binary_compressed by LZF, with any fields) are not read by a library, because every size
-that they declare must be checked against the bytes of the file before memory is allocated, also inside the compressed
-part.
+PCD files (ascii, binary and binary_compressed by LZF, with any fields) are not read by a library. Every size that they
+declare is compared with the bytes of the file before memory is allocated, also inside the compressed part.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Monitors of a replay: fault detection and the observability Gramian; consistency and convergence in ``convergence``.
 
 Fault rule (section 6 of the equations): gamma for each scan, and why it is 0. The pose test is
-|alpha|_W = sqrt(|d rho|^2 + (L theta)^2) against a limit. While the filter tracks, the limit is ``alpha_max_m``; where
-the prediction is uncertain (at the start, after a blackout) it grows to ``sigmas`` times the predicted 1 sigma of the
-same norm, sqrt(tr S_rho + (2 L)^2 tr S_half), so that the first healthy scan is accepted.
+|alpha|_W = sqrt(|d rho|^2 + (L theta)^2) against a limit. While the filter tracks, the limit is ``alpha_max_m``. Where
+the prediction is uncertain (at the start, after a blackout) it is ``sigmas`` times the predicted 1 sigma of the same
+norm, sqrt(tr S_rho + (2 L)^2 tr S_half). The first healthy scan is thus accepted.
 
 Observability (eq after [eq:S_recursive]): W_o = sum of (H Phi)' (H Phi). Its triangular root is stored,
 [root; H Phi] re-triangularised: the condition number of W_o is the square of the root's, so values up to 10^30 are

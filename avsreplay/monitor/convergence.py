@@ -1,10 +1,10 @@
 """Consistency of the estimate with its covariance, and the instant t_1 from which on the estimate may be used.
 
 Consistency: NIS of the innovations inside its chi-square band, and checks that hold for every correct estimate. They
-need no ground truth. Convergence: ``covariance`` is the paper's test, every parameter and motion block below its limit;
-``predictive`` tests what the capture needs, position, velocity and attitude of the grasp point over the planner's
-horizon, so that a body with unobservable parameters may pass. Either must hold for the dwell time, and only while the
-estimate is consistent.
+need no ground truth. Convergence: ``covariance`` is the paper's test, every parameter and motion block below its limit.
+``predictive`` tests position, velocity and attitude of the grasp point over the planner's horizon, which the capture
+needs; a body with unobservable parameters may pass it. Either must hold for the dwell time, and only while the estimate
+is consistent.
 """
 
 from __future__ import annotations

@@ -214,8 +214,8 @@ class Arm:
     ) -> tuple[Plan, JointPath | None]:
         """Return the earliest plan found whose last metres the joints can fly within all of their limits.
 
-        Where rates or torques are too large the acceleration is reduced; where the pose of the capture or the way to it
-        is out of reach, the next capture instant whose pose the arm reaches is tried.
+        If rates or torques are too large, the acceleration is reduced. If the pose of the capture or the way to it is
+        out of reach, the next capture instant is tried whose pose the arm reaches.
 
         Args:
             make: Plans for an earliest capture [s] with a share of the largest acceleration.

@@ -1,10 +1,10 @@
 """Time-optimal rendezvous with a moving goal under |u| <= a_max: the first root of a*(t_f) = a_max, with a certificate.
 
-For a fixed t_f the least thrust a* is the gauge of one convex set (``reachable_set``). If a normal P of this set
-separates the goal from it at time t, that is if G(t) = P.b(t) - a_max t^2 h(P) > 0, then the goal remains unreachable
-for as long as G stays positive. The search therefore advances from t to the next root of G and cannot skip a feasible
-time. P is optimal at the instant for which it was computed, so G is tangent to the true margin there and the steps
-converge quadratically to the first root from below.
+For a fixed t_f the least thrust a* is the gauge of one convex set (``reachable_set``). A normal P of this set separates
+the goal from it at time t if G(t) = P.b(t) - a_max t^2 h(P) > 0. The goal then remains unreachable for as long as G
+stays positive. The search therefore advances from t to the next root of G and cannot skip a feasible time. P is optimal
+at the instant for which it was computed, so G is tangent to the true margin there and the steps converge quadratically
+to the first root from below.
 """
 
 from __future__ import annotations

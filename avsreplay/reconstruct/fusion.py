@@ -292,9 +292,10 @@ def fused(
 ) -> tuple[Array, Array, Array, NDArray[np.int64], list[Sight]]:
     """Surface points, normals, standard errors along the normal, numbers of scans, and sights; one scan at a time.
 
-    Points seen through by more than a third as many scans as have seen them are left out, and points that one scan only
-    has seen and that do not continue the surface of their neighbours. Where voxels hold few points, their scatter is
-    joined with one square of the noise of a point: half the mean square ``rms_m`` of the distances between two scans.
+    Points are left out if the scans whose rays pass through them are more than a third of those that have measured
+    them. Points that only one scan has measured are left out if they do not continue the surface of their neighbours.
+    Where voxels hold few points, their scatter is joined with one square of the noise of a point: half the mean square
+    ``rms_m`` of the distances between two scans.
     """
     points, normals, owner, sights = [], [], [], list[Sight]()
     apart = max(1, len(twist) // MOST_SIGHTS)

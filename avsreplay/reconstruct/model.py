@@ -98,9 +98,9 @@ def at_grasp(made: Reconstruction, grasp: Array | None = None) -> Reconstruction
 
     Args:
         made: the reconstruction.
-        grasp: (3,) in {C} [m]; None chooses the flattest reachable patch: the one whose normals differ least within a
-            radius of 4 % of the extent, among patches that enough scans have seen and that can be approached, which
-            means that no other point lies within 20 degrees of the outward normal up to half the extent.
+        grasp: (3,) in {C} [m]; None chooses the flattest reachable patch, whose normals differ least within a radius of
+            4 % of the extent. Enough scans must have seen it, and no other point may lie within 20 degrees of its
+            outward normal up to half the extent.
 
     Raises:
         UsageError: the point is farther from the surface than 5 % of the extent.

@@ -4,10 +4,10 @@ With J = [p x n, n] and e = n . (p - closest point), the pose error d = [theta; 
 Two kinds of errors correlate the noise of points:
 
 Random errors
-    Alike within a patch (a detail that the model lacks, a stripe of a range image): the sandwich estimate with
-    patches as clusters, in the form without bias for independent noise (Bell and McCaffrey, Survey Methodology 28,
-    2002). From a few patches it is too small in some direction. It is therefore shrunk towards the covariance of
-    independent noise at the same mean level (Ledoit and Wolf, J. Multivariate Analysis 88, 2004).
+    They are alike within a patch (a detail that the model lacks, a stripe of a range image). Their covariance is the
+    sandwich estimate with patches as clusters, in the form without bias for independent noise (Bell and McCaffrey,
+    Survey Methodology 28, 2002). From a few patches it is too small in some direction. It is therefore shrunk towards
+    the covariance of independent noise at the same mean level (Ledoit and Wolf, J. Multivariate Analysis 88, 2004).
     Displacements that neighbouring patches share, independent from one block of 4 patches a side to the next, add a
     variance; it is estimated from the products of residuals of different patches of a block.
 Systematic errors
@@ -17,10 +17,10 @@ Systematic errors
     another. Their variances are maximum likelihood estimates (empirical Bayes), 0 if not significant.
 
 The covariance is an estimate from some hundred patches: the squared error of a pose in its metric is Hotelling's T^2,
-not chi-square. Its degrees of freedom are those of a Wishart matrix with the same mean and the same expected
-squared error, which Ledoit and Wolf estimate from the differences between the patches; for the sum with the systematic
-errors they follow from Welch and Satterthwaite, for matrices by Nel and van der Merwe (Communications in Statistics,
-Theory and Methods 15, 1986).
+not chi-square. Its degrees of freedom are those of a Wishart matrix with the same mean and the same expected squared
+error, which Ledoit and Wolf estimate from the differences between the patches. For the sum with the systematic errors
+they follow from Welch and Satterthwaite, for matrices by Nel and van der Merwe (Communications in Statistics, Theory
+and Methods 15, 1986).
 
 ``split_nis`` tests the result: pose from one half of the patches against the other, normalised with the covariance of
 their difference, in which common errors cancel. For normal errors it is chi-square with 6 degrees of freedom.

@@ -1,10 +1,10 @@
 """Global search: the pose from one scan alone, without a guess, for any attitude; and whether it is unique.
 
-The search goes from coarse to fine. Every start (an attitude, with the centroid of the scan placed on the centroid of
-the surface visible from there) is refined by a few point-to-plane passes with few points against points sampled from
-the model, whose nearest one is looked up in a grid; the best are refined with more points; the last few, all different
-poses, are registered to the model itself and ranked by the truncated distances that remain. If no pose explains the
-scan, more starts follow: shifted ones for a target that is partly hidden, and other positions of the camera.
+The search goes from coarse to fine. A start is an attitude with the centroid of the scan on the centroid of the surface
+visible from there. It is refined by a few point-to-plane passes with few points against points sampled from the model,
+which are looked up in a grid. The best starts are refined with more points. The last few, all different poses, are
+registered to the model itself and ranked by the truncated distances that remain. If no pose explains the scan, more
+starts follow: shifted ones for a target that is partly hidden, and other positions of the camera.
 """
 
 from __future__ import annotations

@@ -6,10 +6,10 @@ model, then applies Horn's closed-form motion. ``KissOdometry`` tracks scans whe
 Properties of small_gicp 1.0: clouds far apart are returned as converged with no inlier; one and two threads differ in
 the last digits; an unknown method name returns the identity.
 
-Properties of kiss-icp 1.2 and 1.3: correspondences reach over one voxel; ``kernel`` is used as a squared length; with
-more than one thread results are not repeatable to the bit; a guess whose rotation is not orthonormal by 2e-9, and
-points that all have one instant if it deskews, abort the interpreter; it returns only a pose, and returns the
-guess if nothing matched; scans are deskewed to the end of the sweep.
+Properties of kiss-icp 1.2 and 1.3: Correspondences reach over one voxel. ``kernel`` is used as a squared length. With
+more than one thread results are not repeatable to the bit. A guess whose rotation is not orthonormal by 2e-9 aborts the
+interpreter; so do points that all have one instant if it deskews. It returns only a pose, and the guess if nothing
+matched. Scans are deskewed to the end of the sweep.
 """
 
 from __future__ import annotations

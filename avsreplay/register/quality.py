@@ -203,8 +203,8 @@ def grade(
     Too few inliers give NO_OVERLAP, whatever the convergence flag of the back end is. ``halves``: compare the poses
     from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
     ``systematic``: the covariance includes errors that vary slowly over the target. ``guess``: T_ca from which the back
-    end began; a pose that equals this guess, although the residuals require a step, is FAILED, and the pose of a
-    degenerate view has its unobservable directions as in the guess, if the surface then fits as well.
+    end began. A pose that equals this guess, although the residuals require a step, is FAILED. The pose of a degenerate
+    view has its unobservable directions as in the guess, if the surface then fits as well.
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)

@@ -48,8 +48,8 @@ HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registratio
 def allowed_scans(failed: int) -> int:
     """Return the work allowed for a scan, in units of an ordinary registration, before the first accepted pose.
 
-    Restarts and searches are made on the first five scans and then after delays of at most half of the scans so far:
-    where no pose of the model explains any scan, because it is the wrong model, their total work stays small.
+    Restarts and searches are made on the first five scans and then after delays of at most half of the scans so far.
+    Their total work therefore stays small with a wrong model, of which no pose explains any scan.
 
     Args:
         failed: scans before this one on which no pose was accepted.

@@ -1,9 +1,10 @@
 """Decision between poses that differ by a near-symmetry of the model, by the rays that contradict each of them.
 
 A nearly symmetric body differs from its turned copies only by its marks: the parts that no near-symmetry carries onto
-the surface. Three kinds of rays decide between two poses: points on the model at one pose and well off it at the other;
-rays that pass through a mark of one pose, because the point measured in that direction lies behind it; and directions
-in which a mark should be visible and nothing was measured, if the visible side of the model is complete in the scan.
+the surface. Three kinds of rays decide between two poses. Some points are on the model at one pose and well off it at
+the other. Some rays pass through a mark of one pose, because the point measured in that direction lies behind it. In
+some directions a mark should be visible and nothing was measured; they count if the visible side of the model is
+complete in the scan.
 
 With a share e of rays that contradict the true pose (other objects, errors of the model), a ray that contradicts one
 pose only has the log likelihood ratio log((1 - e) / e). Poses whose sum is below ``LEAST_LIKELIHOOD`` stay rivals.

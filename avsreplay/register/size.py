@@ -4,9 +4,10 @@ With T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model,
 n . (p - c) = J d + delta n . p. Robust least squares give pose and delta; the points are matched again a few times,
 because the closest points move with both.
 
-Standard error: of the weighted residuals, which are correlated within a patch of the model (cluster-robust sandwich),
-and of other slowly varying errors of model and ranges, an anisotropic strain and an offset of the surface. Their
-amplitudes are fitted to what pose and size leave, and their variances enter with the change of delta that they cause.
+Standard error: one part is that of the weighted residuals, which are correlated within a patch of the model
+(cluster-robust sandwich). Another is that of slowly varying errors of model and ranges, an anisotropic strain and an
+offset of the surface. Their amplitudes are fitted to what pose and size leave, and their variances enter with the
+change of delta that they cause.
 
 Bias: the closest point is a nonlinear function of the measured one, so that noise makes curved and thin parts appear
 larger. The same fit to the closest points with artificial noise of the same size along the rays, with both signs, gives
