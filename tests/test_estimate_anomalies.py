@@ -106,9 +106,21 @@ def test_free_motion_explains_the_recent_scans_as_their_predictions_did(seconds:
         assert window
         assert all(ready(epoch.track) for epoch in window)
         priors = scan_window.ChangePriors(0.01, 0.02, 0.2, 0.05)
-        ranked = hypotheses.explain(window, len(window) - 1, priors, 1e-6, 0.0)
+        _, ranked = hypotheses.explain(window, len(window) - 1, priors, 1e-6, 0.0)
         free = next(e.chi2 for e in ranked if e.hypothesis is scan_window.Hypothesis.FREE_MOTION)
         assert 0.4 < free / sum(epoch.innovation.nis for epoch in window) < 2.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_wrong_poses_among_right_ones_are_rejected_one_by_one(seed: int) -> None:
+    """A quarter of the poses is off by 0.1 m: they are no disturbance, no manoeuvre and no noise of the others."""
+    result = surprises.run(surprises.Case("wrong", wrong=0.25, seconds=40.0), seed)
+    assert result.track is not None
+    assert result.track.manoeuvres == ()
+    later = [k for k, t in enumerate(result.t) if t >= 15.0]
+    assert 0.65 < np.mean([result.gamma[k] for k in later]) < 0.9
+    assert np.quantile([result.error[k][0] for k in later], 0.95) < 0.01
+    assert not any(result.converged[k] and result.ratio[k] > 4.0 for k in later)
 
 
 def test_three_poses_that_agree_replace_the_first_ones() -> None:
@@ -344,10 +356,10 @@ def test_changes_in_every_interval_and_a_single_change_are_told_apart(density: f
             prediction = Prediction(
                 Belief(round((k + 1) * 5e8), free, start.P), np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty()
             )
-            epochs.append(Epoch(Track(start, "filter"), prediction, Innovation(alpha, R, R, 0.0, 0.0, 0.0, 0.0), False))
+            epochs.append(Epoch(Track(start, "filter"), prediction, Innovation(alpha, R, R, 1e9, 0.0, 0.0, 0.0), False))
             drawn.append(push)
         priors = scan_window.ChangePriors(0.05, 0.2, 0.2, 0.05)
-        ranked = hypotheses.explain(epochs, n - 1, priors, 0.0, 0.0)
+        _, ranked = hypotheses.explain(epochs, n - 1, priors, 0.0, 0.0)
         found = {e.hypothesis: e for e in ranked}
         disturbed, change = found[scan_window.Hypothesis.DISTURBED], found[scan_window.Hypothesis.MANOEUVRE]
         if single:
@@ -373,9 +385,9 @@ def test_changes_that_cancel_are_no_manoeuvre(cancels: bool) -> None:
         prediction = Prediction(
             Belief(round((k + 1) * 5e8), free, start.P), np.eye(20), np.zeros((6, 20)), noise.NoiseWindow.empty()
         )
-        epochs.append(Epoch(Track(start, "filter"), prediction, Innovation(alpha, R, R, 0.0, 0.0, 0.0, 0.0), False))
+        epochs.append(Epoch(Track(start, "filter"), prediction, Innovation(alpha, R, R, 1e9, 0.0, 0.0, 0.0), False))
     priors = scan_window.ChangePriors(0.05, 0.2, 0.2, 0.05)
-    ranked = hypotheses.explain(epochs, 9, priors, 0.0, 0.0)
+    _, ranked = hypotheses.explain(epochs, 9, priors, 0.0, 0.0)
     change = next(e for e in ranked if e.hypothesis is scan_window.Hypothesis.MANOEUVRE)
     others = max(e.log_evidence for e in ranked if e is not change)
     if cancels:

@@ -412,7 +412,7 @@ def test_too_few_poses() -> None:
 def test_poses_can_be_cut() -> None:
     poses = poses_of(seen(tumbling.draw(0, seconds=10.0), 0))
     assert isinstance(poses, Poses)
-    assert len(poses.upto(5)) == 5
+    assert len(poses.some(slice(5))) == 5
 
 
 def test_a_body_at_rest_is_estimated() -> None:

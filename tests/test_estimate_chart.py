@@ -15,6 +15,8 @@ from avsreplay.estimate.chart import (
     nees,
     permute_axes,
     permute_covariance,
+    to_chart,
+    to_state,
 )
 from avsreplay.estimate.error_state import boxminus, boxplus
 from avsreplay.records import Belief, State
@@ -72,6 +74,17 @@ def test_nees_is_independent_of_the_axis_names(world: tumbling.World, naming: Ax
     assert np.abs(boxminus(named, x)).max() < 1e-12
     assert nees(belief, permute_axes(x, naming)) == pytest.approx(nees(belief, x), rel=1e-9)
     assert nees(belief, x) == pytest.approx(size, rel=0.05)
+
+
+@pytest.mark.parametrize("size", [1.0, 30.0, 1e3, 1e8])
+def test_the_inertia_stays_in_its_range_however_large_the_step(world: tumbling.World, size: float) -> None:
+    rng, chart = np.random.Generator(np.random.PCG64(3)), to_chart(world.states[0])
+    for _ in range(50):
+        step = np.zeros(20)
+        step[12:17] = size * rng.normal(size=5)
+        sigma = to_state(chart.moved(step)).sigma
+        assert np.abs(sigma).max() < 1.0
+        assert abs(dynamics.sigma3(sigma)) <= 1.0
 
 
 def test_a_covariance_of_zero_ends_in_no_error(world: tumbling.World) -> None:

@@ -20,7 +20,7 @@ from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import VEL, W, definite_product
-from avsreplay.estimate.hypotheses import explain, odds_over_free
+from avsreplay.estimate.hypotheses import NONLINEAR, explain, odds_over_free
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.mixture import moments
@@ -54,7 +54,6 @@ from avsreplay.settings import given
 _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decision; accepted scans kept
 _OVER_FREE, _OVER_NEXT = 3.0, 2.0  # log odds over free motion, and over the next hypothesis, of an early decision
 _EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
-_NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its spread, that shows which poses are biased
 _SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
@@ -100,11 +99,12 @@ class AnomalyTest:
         if not (large or track.doubtful or long_run((*track.recent, epoch), nis_scale(track))):
             return self._accepted(track, epoch, update), verdict
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
-        ranked = explain(window, first, self._priors, *self.batch.noise_levels(track), self.batch.orbit)
+        window, ranked = explain(window, first, self._priors, *self.batch.noise_levels(track), self.batch.orbit)
         best = ranked[0].hypothesis
         changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= _OVER_FREE
         changed = changed and (bool(track.doubtful) or _linear(window, ranked))
-        if (large or track.doubtful) and best is Hypothesis.DISTURBED and odds_over_free(ranked) >= _OVER_FREE:
+        disturbed = best is Hypothesis.DISTURBED and odds_over_free(ranked) >= _OVER_FREE and _explains(ranked[0])
+        if (large or track.doubtful) and disturbed:
             track, doubtful = self._disturbed(track, ranked[0]), self._disturbed(doubtful, ranked[0])
         if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
             return self._accepted(track, epoch, update), verdict
@@ -129,7 +129,7 @@ class AnomalyTest:
     def _decided(self, track: Track, window: tuple[Epoch, ...], ranked: list[Explanation]) -> tuple[Track, Verdict]:
         """The track after a decision, or still in doubt."""
         doubtful, in_doubt = len(track.doubtful), (track, Verdict(0, Reason.DOUBTFUL))
-        best, explained = ranked[0], ranked[0].chi2 < _EXPLAINED * ranked[0].dof
+        best, explained = ranked[0], _explains(ranked[0])
         certain = explained and best.log_evidence - ranked[1].log_evidence >= _OVER_NEXT
         certain = certain and (odds_over_free(ranked) >= _OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
         if doubtful < _MOST and not certain:
@@ -142,7 +142,7 @@ class AnomalyTest:
                 return reported, Verdict(0, Reason.DOUBTFUL)
         if doubtful < _FEWEST:
             return in_doubt
-        if best.hypothesis in (Hypothesis.FREE_MOTION, Hypothesis.DISTURBED):
+        if best.hypothesis is Hypothesis.FREE_MOTION or (best.hypothesis is Hypothesis.DISTURBED and explained):
             before = replace(with_history(track.doubtful[0].track, track), recent=track.recent, levels=track.levels)
             return self._used(before, track.doubtful), Verdict(1, Reason.OK)
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):
@@ -181,13 +181,13 @@ class AnomalyTest:
 
     def _biased(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
         """The estimate of the poses before the sensor error, propagated to the present."""
-        first, last = len(track.recent), window[-1]
+        first, last = len(window) - len(track.doubtful), window[-1]
         bias = SensorBias(best.size, best.P, last)
         if best.onset >= first:
             return replace(with_history(track, track), bias=bias)
         then = window[best.onset].track
         belief, _ = self.batch.propagated(track, then.belief, last.prediction.belief.t_ns)
-        return replace(with_history(then, track), belief=belief, recent=track.recent[: best.onset], bias=bias)
+        return replace(with_history(then, track), belief=belief, recent=window[: best.onset], bias=bias)
 
     def _by_agreement(self, track: Track) -> tuple[Track, Verdict]:
         """The track initialised anew from the doubtful poses if they agree with one another; else they are bad."""
@@ -333,13 +333,17 @@ def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
     return replace(bias, last=epoch) if still < min(GATE, ended + gain) else None
 
 
+def _explains(found: Explanation) -> bool:
+    return found.chi2 < _EXPLAINED * found.dof
+
+
 def _linear(window: tuple[Epoch, ...], ranked: list[Explanation]) -> bool:
     """Return whether the linearisation about the first prediction holds over scans that were all used.
 
     Of a linear system the chi-square of free motion is then the sum of the NIS, whatever moved the target.
     """
     free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
-    return free < _NONLINEAR * sum(e.innovation.nis for e in window)
+    return free < NONLINEAR * sum(e.innovation.nis for e in window)
 
 
 def _chi2(y: Array, C: Array) -> float:

@@ -94,16 +94,10 @@ class Poses:
         own = Problem(self, problem.prior, problem.factors)
         return own.core.residuals((problem.chart if chart is None else chart).flat)[2]
 
-    def upto(self, count: int) -> Poses:
-        """The first ``count`` poses."""
-        return Poses(
-            self.times_s[:count],
-            self.q[:count],
-            self.t[:count],
-            self.C[:count],
-            shares=None if self.shares is None else self.shares[:count],
-            arc=self.arc,
-        )
+    def some(self, which: slice | NDArray[np.bool_]) -> Poses:
+        """Some of measured poses."""
+        shares = None if self.shares is None else self.shares[which]
+        return Poses(self.times_s[which], self.q[which], self.t[which], self.C[which], shares=shares, arc=self.arc)
 
     def latest(self, count: int, epoch_s: float) -> Poses:
         """The last ``count`` poses, with times from ``epoch_s``."""

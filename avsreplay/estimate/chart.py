@@ -119,7 +119,8 @@ class Chart:
         )
 
     def moved(self, y: Array) -> Chart:
-        """Displaced by a step y (20,); a half-angle vector longer than 1 is cut to a half turn.
+        """Displaced by a step y (20,); a half-angle vector longer than 1 is cut to a half turn,
+        and a logarithm M of the mass moments longer than 12 to this length, so that |sigma| stays below 1.
 
         The columns of R_cb are the eigenvectors in the order and with the signs nearest to those before.
         """

@@ -33,6 +33,7 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief
 
+NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
 _PER_BAD_SCAN = math.log(1e-2)
 _INSTANTS, _FEWER, _LONG = 8, 4, 9  # instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
@@ -40,6 +41,7 @@ _LONGEST_SPREAD = 6  # latest scans over whose intervals a manoeuvre that is not
 _FINE, _REFINEMENTS, _NO_WEIGHT = 16, 5, 1e-4  # instants of a refined grid, refinements, share of evidence neglected
 _TAIL = 0.05  # probability that a manoeuvre is earlier, or later, than the interval in which it is allowed for
 _NOT_BY_CHANCE = 16.3  # 99.9 % point of chi-square with 3 degrees of freedom
+_A_CHANGE = 22.5  # 99.9 % point with 6 degrees of freedom
 _CHANGES = (slice(0, 3), slice(3, 6), slice(0, 6))  # rate, velocity, both
 _SPREAD = (0.7, 0.1, 0.1, 0.1)  # prior share of manoeuvres at one instant, and over one, two and three intervals
 _OFFSETS = (slice(6, 7), slice(0, 3), slice(0, 6))  # range, position, pose
@@ -52,11 +54,15 @@ def explain(
     torque: float,
     force: float,
     orbit: RelativeOrbit | None = None,
-) -> list[Explanation]:
-    """All hypotheses on a window of scans, most likely first.
+) -> tuple[tuple[Epoch, ...], list[Explanation]]:
+    """The scans that the hypotheses can be compared on, and all hypotheses on them, most likely first.
+
+    The hypotheses are linear about the motion predicted from the first scan. Where the accepted scans contradict this
+    motion although each agreed with its own prediction, the linearisation does not hold so long, and the older half of
+    the accepted scans is left out.
 
     Args:
-        epochs: consecutive measured scans, ``first_doubtful`` of them accepted, the others in doubt.
+        epochs: measured scans in the order of time, ``first_doubtful`` of them accepted, the others in doubt.
         first_doubtful: index of the first doubtful scan, 1 at least.
         priors: 1 sigma of the size of a change.
         torque: root density of the angular disturbance [rad/s^1.5].
@@ -66,6 +72,10 @@ def explain(
     start = epochs[0].track.belief
     window = window_of(epochs, start, torque, force, None if orbit is None else orbit.at(start.t_ns))
     white = window.whiten @ window.y
+    accepted = white[: 6 * first_doubtful]
+    if first_doubtful > 1 and accepted @ accepted > NONLINEAR * sum(e.innovation.nis for e in epochs[:first_doubtful]):
+        left_out = first_doubtful // 2
+        return explain(epochs[left_out:], first_doubtful - left_out, priors, torque, force, orbit)
     free = -0.5 * float(white @ white) + float(np.log(np.diagonal(window.whiten)).sum())
     n = len(epochs)
     found = [
@@ -76,7 +86,7 @@ def explain(
         _bad_scans(window, priors, first_doubtful, n),
         _frozen(window, first_doubtful, n),
     ]
-    return sorted(found, key=lambda e: -e.log_evidence)
+    return tuple(epochs), sorted(found, key=lambda e: -e.log_evidence)
 
 
 def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
@@ -235,10 +245,13 @@ def _thrust_like(instants: Array, columns: Array, white: Array, scale: Array) ->
     """Return whether changes at ``instants`` (m,) may be those of a thrust or an impact.
 
     The velocity during either lies between those before and after, give or take their difference. Changes that cancel
-    displace the target further than that: they imitate a step of the pose, which is an error of the sensor.
+    displace the target further than that, or leave no change of the velocity: they imitate a wrong pose.
     """
     m = len(instants)
     _, u, P = log_evidence(white, 0.0, np.hstack(list(columns)), np.tile(scale, m))
+    net, joined = u.reshape(m, 6).sum(axis=0), np.tile(np.eye(6), m)
+    if net @ np.linalg.solve(joined @ P @ joined.T, net) < _A_CHANGE:
+        return False
     v, acts = u.reshape(m, 6)[:, 3:], instants[-1] - instants
     change, moved = v.sum(axis=0), acts @ v
     size = float(np.linalg.norm(change))

@@ -44,6 +44,7 @@ from avsreplay.settings import given
 _PAIR_RAD = 0.7
 _DRAWS, _EDGE = 500, 0.99
 _LEVEL_STEPS, _LEVEL_TOL = 20, 0.1
+_GROSS = 100.0  # squared residual of a gross error over the median, or over its expectation
 _DETERMINED = 0.5  # a direction whose posterior sigma is above this share of the prior's is determined by the prior
 
 
@@ -288,7 +289,7 @@ def _position_noise(points: Poses) -> Array:
 def improved_levels(
     fixes: tuple[PoseFix, ...], result: BatchResult, start: Chart, params: EstimatorParams, levels: NoiseLevels
 ) -> NoiseLevels:
-    """Noise levels from the residuals of the poses.
+    """Noise levels from the residuals of the poses but those with gross errors, which are no noise.
 
     Args:
         fixes: healthy poses, oldest first.
@@ -300,6 +301,9 @@ def improved_levels(
     poses = poses_of(fixes)
     factors = levels.factors(result.share) * np.sqrt(result.inflation)
     prior, chart, gate = weak_prior(poses, params), start, factors * np.sqrt(levels.slack)
+    white = (poses.root @ (poses.residuals(Problem(poses, prior, factors), chart) / np.repeat(factors, 3))[:, :, None])
+    squares = (white * white).sum(axis=(1, 2))
+    poses = poses.some(squares < _GROSS * max(float(np.median(squares)), 6.0))
     for _ in range(2):  # about the last motion, then about the one that fits
         points = normal_points(poses, chart, gate, MOST_POINTS)
         problem = Problem(points, prior, factors, chart, np.inf)  # residuals with disturbances have the weight 1

@@ -124,7 +124,7 @@ def _grown(poses: Poses, start: Chart, params: EstimatorParams) -> BatchFit:
     prior, rules = weak_prior(poses, params), FitParams(max_steps=60)
     chart = start
     for count in _windows(poses, start):
-        chart = fit(poses.upto(count), chart, prior, replace(rules, rescale=False)).chart
+        chart = fit(poses.some(slice(count)), chart, prior, replace(rules, rescale=False)).chart
     return fit(poses, chart, prior, rules)
 
 

@@ -77,6 +77,7 @@ class Case:
     spin: int | None = None  # about this principal axis
     speed: float = 0.1  # rad/s
     hz: float = 2.0
+    wrong: float = 0.0  # share of the poses that are 0.1 m (1 sigma of each component) off
     correlated: float = 0.1  # share of the variance of the poses that neighbouring scans have in common
 
 
@@ -96,6 +97,7 @@ CASES = (
     Case("bias 5 cm from 60 to 75 s", at_s=60.0, until_s=75.0, bias=0.05, seconds=100.0),
     Case("noise x5 for 20 s", at_s=40.0, until_s=60.0, noise=5.0),
     Case("single outlier 0.1 m", at_s=45.0, until_s=45.4, bias=0.1),
+    Case("a quarter of the poses 0.1 m off", wrong=0.25),
     Case("spin about axis x", spin=0, seconds=150.0),
     Case("spin about axis y", spin=1, seconds=150.0),
     Case("spin about axis z", spin=2, seconds=150.0),
@@ -181,6 +183,8 @@ def measured(case: Case, times: list[float], states: list[State], seed: int) -> 
         T = x.T_ac @ Pose(geometry.exp(d[:3]), d[3:])
         if event and case.bias:
             T = Pose(T.q, T.t + case.bias * T.t / np.linalg.norm(T.t))
+        if case.wrong and rng.random() < case.wrong:
+            T = Pose(T.q, T.t + 0.1 * rng.normal(size=3))
         claimed = C * case.noise**2 if event else C
         out.append(Alignment(T, 5, True, 4000, 3900, 0.008, np.linalg.inv(claimed), AlignStatus.ALIGNED, claimed))
     return out

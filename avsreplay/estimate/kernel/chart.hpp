@@ -17,7 +17,7 @@ struct Chart {
 constexpr int CHART = 34;
 static_assert(sizeof(Chart) == CHART * sizeof(double), "a chart is copied as an array");
 
-// The chart displaced by a step y.
+// The chart displaced by a step y; M is shortened to the largest norm for which the inertia ratios are below 1.
 Chart moved(const Chart& c, const double y[DIM]);
 
 // The step y from `from` to c.
