@@ -119,10 +119,10 @@ class Chart:
         )
 
     def moved(self, y: Array) -> Chart:
-        """Displaced by a step y (20,); a half-angle vector longer than 1 is cut to a half turn,
-        and a logarithm M of the mass moments longer than 12 to this length, so that |sigma| stays below 1.
+        """Displaced by a step y (20,); a half-angle vector longer than 1 is cut to a half turn.
 
-        The columns of R_cb are the eigenvectors in the order and with the signs nearest to those before.
+        A logarithm M of the mass moments longer than 12 is cut to this length, so that |sigma| stays below 1. The
+        columns of R_cb are the eigenvectors in the order and with the signs nearest to those before.
         """
         return Chart.of(_motion.moved(self.flat, np.ascontiguousarray(y, dtype=np.float64)))
 

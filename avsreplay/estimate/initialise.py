@@ -301,7 +301,7 @@ def improved_levels(
     poses = poses_of(fixes)
     factors = levels.factors(result.share) * np.sqrt(result.inflation)
     prior, chart, gate = weak_prior(poses, params), start, factors * np.sqrt(levels.slack)
-    white = (poses.root @ (poses.residuals(Problem(poses, prior, factors), chart) / np.repeat(factors, 3))[:, :, None])
+    white = poses.root @ (poses.residuals(Problem(poses, prior, factors), chart) / np.repeat(factors, 3))[:, :, None]
     squares = (white * white).sum(axis=(1, 2))
     poses = poses.some(squares < _GROSS * max(float(np.median(squares)), 6.0))
     for _ in range(2):  # about the last motion, then about the one that fits
