@@ -23,9 +23,10 @@ from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import without_scattered_points
-from avsreplay.register.size import LEAST_ERROR, SIGMAS, fitted_size, noise_bias
+from avsreplay.register.size import SIGMAS, fitted_size, noise_bias
 
 POINTS = 1500  # points used of each scan
+LEAST_ERROR = 0.002  # least error of size that is reported; a single scan cannot show so small a one
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
 ENOUGH_SCANS = 16  # with which the check ends where they exclude an error of size that would be reported
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
@@ -112,11 +113,11 @@ class ModelCheck:
             return ()
         if abs(found[0] - 1.0) < max(LEAST_ERROR, SIGMAS * found[1]):
             return ()
-        small = "small" if found[0] > 1.0 else "large"
+        small, long = ("small", "long") if found[0] > 1.0 else ("large", "short")
         percent = 100.0 * abs(found[0] - 1.0)
         return (
             f"the model is {percent:.1f} % too {small} (1 sigma {100.0 * found[1]:.2g} %): "
-            f"multiply --model-scale by {found[0]:.4f}",
+            f"multiply --model-scale by {found[0]:.4f}, or the ranges of the sensor are too {long} by as much",
         )
 
     def _measure(self, points: NDArray[Any], alignment: Alignment) -> None:
