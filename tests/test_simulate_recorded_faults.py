@@ -7,7 +7,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.spatial.transform import Rotation
 
-from avsreplay.cli.record import record_command
+from avsreplay.cli.record import EPILOG, record_command
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.record import RecordOptions, record
 from avsreplay.records import Scan, ScanStatus
@@ -42,6 +42,11 @@ def faulty(given, *texts, seed=1, radius_m=None):
 
 def same(one, two):
     return one is not None and one.points.tobytes() == two.points.tobytes() and one.t_ns == two.t_ns
+
+
+def test_the_help_of_record_lists_every_kind_with_its_default_strength():
+    shown = {f"{kind}:{default:g}" if default is not None else kind for kind, (default, _) in RECORDED_KINDS.items()}
+    assert shown <= set(EPILOG.split())
 
 
 @pytest.mark.parametrize("kind", sorted(RECORDED_KINDS))
