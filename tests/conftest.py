@@ -1,4 +1,4 @@
-"""What tests share: the command line as a user calls it, built-in cases, real data where it is, made-up rows."""
+"""Shared fixtures: the command line, built-in cases, real data if it is available, constructed rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An interrupted run continues to the bytes of a run without an interruption; a foreign checkpoint runs no code."""
+"""A continued run gives the bytes of an uninterrupted run; a checkpoint of unknown origin executes no code."""
 
 from __future__ import annotations
 

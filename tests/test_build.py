@@ -1,4 +1,4 @@
-"""Where the first pose of a replay comes from. Ground truth is for scoring, unless it is asked for by name."""
+"""The source of the first pose of a replay: not the ground truth, unless the configuration names it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The bench: every back end on every scan in turn, graded against the truth."""
+"""``avsreplay bench``: every back end on every scan in turn, with errors relative to the truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bad input: one line (what, where, what to do), the documented exit code, no traceback, nothing half-written."""
+"""Bad input gives one line (what, where, what to do), the documented exit code, no traceback and no partial output."""
 
 import struct
 

@@ -1,4 +1,4 @@
-"""The last handler of the command line: closed pipes, a full standard output, unexpected errors."""
+"""Errors at the end of a command: closed pipes, a full standard output, unexpected exceptions."""
 
 from __future__ import annotations
 

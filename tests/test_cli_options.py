@@ -1,4 +1,4 @@
-"""What commands share: options, progress off a terminal, an interrupted replay, and a reader that stops reading."""
+"""Shared parts of the commands: options, progress without a terminal, interruption, a reader that stops reading."""
 
 from __future__ import annotations
 

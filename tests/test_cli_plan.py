@@ -1,4 +1,4 @@
-"""``avsreplay plan`` on a result that is made up: what it prints, exports and refuses."""
+"""``avsreplay plan`` on a constructed result: printed and exported values, and invalid options."""
 
 import base64
 import csv

@@ -1,4 +1,4 @@
-"""A log taken through rosbags into a ROS 1 bag, into sqlite3 and back gives the same scans and the same rows."""
+"""A log converted by rosbags to a ROS 1 bag, to sqlite3 and back gives the same scans and the same rows."""
 
 from __future__ import annotations
 

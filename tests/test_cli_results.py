@@ -1,4 +1,4 @@
-"""Saved results through the commands that read them: verified, and never an internal error or a silent pass."""
+"""Saved results read by the commands: they are verified, and no defect gives an internal error or passes unnoticed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Same input, same bytes: from run to run, for any hash seed and any number of threads."""
+"""The same input gives the same bytes: in repeated runs, for any hash seed and any number of threads."""
 
 import filecmp
 

@@ -1,4 +1,4 @@
-"""The docs hold: marked blocks run, every command line parses, every link leads somewhere, the site builds."""
+"""Documentation: marked blocks run, command lines parse, links lead somewhere, sentences are short, the site builds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A constant acceleration: the falling frame changes no statistic, and the fit is unbiased with an honest 1 sigma."""
+"""A constant acceleration: the falling frame changes no statistic; the fit is unbiased and its 1 sigma correct."""
 
 from __future__ import annotations
 

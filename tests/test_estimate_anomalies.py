@@ -1,4 +1,4 @@
-"""Large innovations: manoeuvres, sensor biases and bad scans are told apart, and clean logs are left alone."""
+"""Large innovations: manoeuvres, sensor biases and bad scans are distinguished, and clean logs give none of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a scan that should not have passed does to the estimate: little. And what pushes do to a fit."""
+"""Scheduling of the batch fit: the effect of accepted bad scans on the estimate, and of impulses on a fit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Physical parameters in {C}: right for a known body, the same for every axis permutation, inside their range."""
+"""Physical parameters in {C}: correct for a known body, equal for every axis permutation, inside their range."""
 
 from __future__ import annotations
 

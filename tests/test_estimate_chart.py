@@ -1,4 +1,4 @@
-"""The 24 names of the principal axes: the same motion, the same pose, the same NEES."""
+"""The 24 permutations of the principal axes: the same motion, the same pose, the same NEES."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A constant torque and force as a part of a belief's motion: against the motion pushed in small steps."""
+"""A constant torque and force as part of a belief's motion, against a motion with many small impulses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Points of a moving target, each seen at its own instant, brought to one."""
+"""Points of a moving target, each measured at its own instant, transformed to one instant."""
 
 from __future__ import annotations
 

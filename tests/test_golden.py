@@ -1,4 +1,4 @@
-"""Every built-in case through the real command line: the golden rows hold, and the gate can fail."""
+"""Every built-in case through the command line: the golden rows are reproduced, and the comparison can fail."""
 
 import json
 from pathlib import Path

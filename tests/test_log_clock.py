@@ -1,4 +1,4 @@
-"""The clock rule: which stamps are taken, which are replaced, and by what."""
+"""The clock rule: which stamps are used, which are replaced, and by which time."""
 
 from __future__ import annotations
 

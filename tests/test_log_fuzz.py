@@ -1,4 +1,4 @@
-"""The short fuzz campaign: mutated bytes end in scans or in one line, quickly and in little memory.
+"""The short fuzz campaign: mutated bytes give scans or a one-line error, within limits of time and memory.
 
 The long one is ``python tests/benchmarks/fuzz_logs.py``; docs/reliability.md has its figures.
 """

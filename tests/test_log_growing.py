@@ -1,4 +1,4 @@
-"""A log that grows: scans come when they are complete, and the rows are those of the whole log."""
+"""A growing log: scans are replayed when they are complete, and the rows are those of the whole log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The header record: exact both ways, and nothing that is not a header passes for one."""
+"""The header record: exact in both directions, and other records are not accepted as one."""
 
 from __future__ import annotations
 

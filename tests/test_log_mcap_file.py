@@ -1,4 +1,4 @@
-"""Damage of every kind, at every place, under every compression: all that is intact is read, each loss is listed."""
+"""Damage of every kind, at every place, under every compression: all intact data is read, and each loss is listed."""
 
 from __future__ import annotations
 

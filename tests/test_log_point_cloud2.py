@@ -1,4 +1,4 @@
-"""PointCloud2 of any layout, against a writer of its own kind: numpy records and struct."""
+"""PointCloud2 of any layout, against messages written with numpy records and struct."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Folders of scans in every format, their order, times and poses; models; and the real data where it is here."""
+"""Folders of scans in every format, their order, times and poses; models; real data if it is available."""
 
 from __future__ import annotations
 

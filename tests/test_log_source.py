@@ -1,4 +1,4 @@
-"""Logs that others wrote: ROS 1 and ROS 2 bags, split files, several topics, moving sensors, truth in every form."""
+"""Logs of other writers: ROS 1 and ROS 2 bags, split files, several topics, moving sensors, truth in every form."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is written comes back bit for bit, here and through the readers of others."""
+"""Written logs are read back bit for bit, by this package and by other readers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Chi-square bands that a right filter stays in and a wrong one leaves."""
+"""Chi-square bands that contain a consistent filter and not an inconsistent one."""
 
 from __future__ import annotations
 

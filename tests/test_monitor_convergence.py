@@ -1,4 +1,4 @@
-"""t_1: thresholds by block, the dwell, both criteria, and that an inconsistent filter may not claim it."""
+"""t_1: thresholds by block, the dwell time, both criteria; an inconsistent filter does not converge."""
 
 from __future__ import annotations
 

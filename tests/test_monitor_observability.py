@@ -1,4 +1,4 @@
-"""The Gramian's fold against its sum, ranks that can be known by hand, and words for what is not seen."""
+"""The Gramian's recursion against its sum, ranks with known values, and the names of unobservable directions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The joints of a manipulator during the last metres, against forward kinematics written here; needs pinocchio."""
+"""The joints of a manipulator during the last metres, against an independent forward kinematics; needs pinocchio."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cone programme of one iteration against an independent solver, and what the extension refuses."""
+"""The cone programme of one iteration against an independent solver, and invalid input of the extension."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Plans under limits: the limits hold between the nodes too, and what does not act changes nothing."""
+"""Plans under limits: the limits hold between the nodes, and inactive limits do not change a plan."""
 
 import math
 import sys

@@ -1,4 +1,4 @@
-"""The least-time rendezvous: its laws, and answers found another way."""
+"""The minimum-time rendezvous: its properties, and solutions computed by other methods."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The supervisor: every rule can apply, their order holds. Guidance: flights on a made-up estimate."""
+"""The supervisor: every rule can apply, and their order holds. Guidance: flights on a constructed estimate."""
 
 import dataclasses
 import math

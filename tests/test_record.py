@@ -1,4 +1,4 @@
-"""Recording through the real command: what goes in comes out, the same bytes every time, nothing half done."""
+"""Recording by the command: the log contains the input, with the same bytes every time, and no partial file remains."""
 
 import hashlib
 import json

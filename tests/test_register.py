@@ -1,4 +1,4 @@
-"""Registration by its laws: signs, frames, grading, what a view leaves free, what the camera can see."""
+"""Properties of registration: signs, frames, quality, unobservable directions of a view, visible faces."""
 
 from __future__ import annotations
 

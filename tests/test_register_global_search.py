@@ -1,4 +1,4 @@
-"""Acquisition: any attitude, no guess; sure where it can be, ambiguous where the target is symmetric."""
+"""Global search without a guess at any attitude: unique where possible, ambiguous for a symmetric target."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A saved index: the same bits as a built one, and trusted for nothing."""
+"""A saved index gives the same bits as a built one, and a damaged file is not used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""kiss-icp as its users know it: odometry without a model, deskewing, any size of the target."""
+"""kiss-icp as odometry: without a model, with deskewing, for any size of the target."""
 
 from __future__ import annotations
 

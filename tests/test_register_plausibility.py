@@ -1,4 +1,4 @@
-"""Wrong poses are rejected, correct ones are not: noise, contrast, free space, and the work that a scan may cost."""
+"""Wrong poses are rejected, correct ones are not: noise, contrast, free space, and the budget of a scan."""
 
 from __future__ import annotations
 

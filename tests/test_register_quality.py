@@ -1,4 +1,4 @@
-"""What the patches of the model say of a registered pose: its covariance, and which motions they hold."""
+"""Covariance and observable directions of a registered pose from the patches of the model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Side valleys: a far guess must not leave a pose beside the truth that a better one could replace."""
+"""Local minima: a far guess does not leave a wrong pose that a restart could replace."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Nearly symmetric bodies: the rays decide between poses that differ by a near-symmetry, or the result says so."""
+"""Nearly symmetric bodies: rays decide between poses that differ by a near-symmetry, or the result is ambiguous."""
 
 from __future__ import annotations
 

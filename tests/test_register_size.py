@@ -1,4 +1,4 @@
-"""Size of the target from one scan: said where it is wrong, not said where noise or another error looks like it."""
+"""Size of the target from one scan: reported if it is wrong, not if noise or another error has a similar effect."""
 
 from __future__ import annotations
 

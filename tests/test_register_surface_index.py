@@ -1,4 +1,4 @@
-"""Properties of the surface index and of its numpy oracle: recovery, invariance, meaning of the sums, refusals."""
+"""The surface index and its numpy reference: recovery, invariance, meaning of the sums, invalid input."""
 
 from __future__ import annotations
 

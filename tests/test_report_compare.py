@@ -1,4 +1,4 @@
-"""Runs side by side: figures, first divergence, gate rules, and what CI reads."""
+"""Comparison of runs: metrics, first difference, gate rules, and the formats for CI."""
 
 from __future__ import annotations
 

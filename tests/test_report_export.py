@@ -1,4 +1,4 @@
-"""Rows and poses to files and back: exact, ordered, whole or not at all."""
+"""Rows and poses written to files and read back: exact, in order, complete or absent."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Golden comparison: both ways, each column by its declared tolerance, nothing missing unseen."""
+"""Golden comparison: in both directions, each column by its declared tolerance, missing values included."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The viewer layout names only panels it has and topics the result log writes."""
+"""The viewer layout refers only to its own panels and to topics of the result log."""
 
 from __future__ import annotations
 

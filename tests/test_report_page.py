@@ -1,4 +1,4 @@
-"""The HTML page: self-contained, safe, small; and, in a real browser, alive."""
+"""The HTML page: self-contained, safe, small, and interactive in a real browser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tables: fit the width, say what they leave out, need no colour."""
+"""Tables fit the width, name the columns that are left out, and need no colour."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verdict: no run with a serious problem passes, and every reason says what, when and how bad."""
+"""The verdict: no run with a serious problem passes, and every reason states what, when and how large."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``avsreplay run`` as a user has it: tables, JSON, result directory, precedence of settings."""
+"""``avsreplay run``: tables, JSON, result directory, precedence of settings."""
 
 import json
 import re

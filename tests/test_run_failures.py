@@ -1,4 +1,4 @@
-"""A back end that fails: every scan has a row, the row says what happened, and the verdict repeats it."""
+"""A back end that fails: every scan has a row with the message, and the verdict repeats it."""
 
 from __future__ import annotations
 

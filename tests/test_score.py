@@ -1,4 +1,4 @@
-"""Ground truth decides the score of a run and nothing else."""
+"""Ground truth affects the score of a run and no other column."""
 
 from __future__ import annotations
 

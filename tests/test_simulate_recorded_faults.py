@@ -1,4 +1,4 @@
-"""Faults on recorded scans do what their label says, to the scans of their window only, and the same for a seed."""
+"""Faults on recorded scans change the scans of their window as labelled, equally for equal seeds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rays against the mesh, noise against its law, rolling scans against the true motion."""
+"""Rays against the mesh, range noise against its distribution, scans of finite duration against the true motion."""
 
 from dataclasses import replace
 

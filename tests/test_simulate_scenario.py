@@ -1,4 +1,4 @@
-"""Scenarios: strict reading, faults that do what their label says, same seed same scans."""
+"""Scenarios: strict reading, faults with the effect of their label, equal scans for equal seeds."""
 
 import hashlib
 import math

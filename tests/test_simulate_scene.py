@@ -1,4 +1,4 @@
-"""Objects, plumes and the Earth: what they hide and return, how they move, and their labels."""
+"""Objects, plumes and the Earth: occlusion, returns, motion and labels."""
 
 import math
 from dataclasses import replace

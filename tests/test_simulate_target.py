@@ -1,4 +1,4 @@
-"""Targets and mass properties: closed forms, trimesh as oracle, laws of the labelling."""
+"""Targets and mass properties: closed forms, trimesh as reference, properties of the axis order."""
 
 import hashlib
 

@@ -1,4 +1,4 @@
-"""How a run begins and what it is judged by: acquisition, cold start, deskewing, a fitted reference."""
+"""The start of a run and its reference: global search, cold start, deskewing, a fitted reference."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Campaign files and the runs that they stand for; no run is made here."""
+"""Campaign files and the runs that they describe; no run is executed here."""
 
 import tomllib
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The journal of a campaign: what is damaged is set aside and made again, everything else is kept."""
+"""The journal of a campaign: damaged lines are set aside and their runs repeated; everything else is kept."""
 
 import math
 import os

@@ -1,4 +1,4 @@
-"""The campaign's page: self-contained, well-formed, its figures where the numbers are."""
+"""The page of a campaign: self-contained, well-formed, with figures at their values."""
 
 import dataclasses
 import re

@@ -1,4 +1,4 @@
-"""Campaigns run for real: the same bytes with any number of workers, taken up after a kill, workers that die."""
+"""Whole campaigns: the same bytes with any number of workers, continuation after a kill, workers that die."""
 
 import json
 import os

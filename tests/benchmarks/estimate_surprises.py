@@ -1,4 +1,4 @@
-"""What the estimator does when the model does not hold.
+"""The estimator under conditions that its model does not contain.
 
 ``python tests/benchmarks/estimate_surprises.py [--bodies 20] [--cases name,name] [--without] [--free]``.
 

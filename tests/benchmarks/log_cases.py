@@ -1,4 +1,4 @@
-"""Small logs for the tests and campaigns of the door: seeded, with everything a log can carry."""
+"""Small logs for the tests and campaigns of the readers: seeded, with every kind of content."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The certified planner against a brute scan of feasibility, an independent integration, and direct transcription.
+"""The certified planner against an exhaustive search, an independent integration, and direct transcription.
 
 python tests/benchmarks/plan_solver.py [--quick] [--casadi N]      (N problems also through CasADi + IPOPT)
 Times are of the process, so that other work on the machine does not count.

@@ -1,4 +1,4 @@
-"""Whole runs on logs that no code of avsreplay has made: own dynamics, ray casting by Embree, written by rosbags.
+"""Whole runs on logs made without code of avsreplay: own dynamics, ray casting by Embree, written by rosbags.
 
 python tests/benchmarks/raycast_logs.py [--cases clean,push,...] [--seeds 0,1] [--hz 2] [--rate 0.1] [--keep FOLDER]
 

@@ -1,4 +1,4 @@
-"""What the benchmarks of registration share: scans, meshes, candidates that run in turn, and the peers."""
+"""Shared parts of the benchmarks of registration: scans, meshes, candidates that run in turn, and the peers."""
 
 from __future__ import annotations
 

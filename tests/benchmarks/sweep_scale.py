@@ -1,4 +1,4 @@
-"""How far one scheduler and one client carry a campaign.
+"""Limits of one scheduler and one client in a campaign.
 
 python tests/benchmarks/sweep_scale.py [--quick] [--seconds 5] [--runs 100000] [--workers 1000]
 

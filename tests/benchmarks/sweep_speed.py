@@ -1,4 +1,4 @@
-"""Many short runs on one worker and on two: speed-up, and what the machinery costs beside the runs.
+"""Many short runs on one worker and on two: speed-up, and the overhead beside the runs.
 
 python tests/benchmarks/sweep_speed.py [--runs 500] [--quick] [--pretend 0.2]
 

@@ -1,4 +1,4 @@
-"""A tumbling body through estimator and monitors, scan by scan, as the chain takes it: for the campaigns."""
+"""A tumbling body through estimator and monitors, scan by scan as in the pipeline, for the campaigns."""
 
 from __future__ import annotations
 
