@@ -20,6 +20,7 @@ from markupsafe import Markup
 from avsreplay.geometry import Array
 from avsreplay.records import State, Surface
 from avsreplay.report import charts
+from avsreplay.report.approach import approach_picture
 from avsreplay.report.conclusion import ComparedRun, Conclusion, changes_table, settings_table
 from avsreplay.report.export import StampedPose
 from avsreplay.report.gate import RuleOutcome, gate_table
@@ -153,7 +154,9 @@ def build_page(
         "scene": scene(rows, dict(poses), view),
     }
     errors, faults, manoeuvres, *others = summary_tables(summary, rows)
-    parts: list[Part] = [errors, *others, facts_table("Run", fact_lines(summary))]
+    picture = approach_picture(rows, view, header or {})
+    parts: list[Part] = [] if picture is None else [Section("Approach"), render("approach.svg", **picture)]
+    parts += [errors, *others, facts_table("Run", fact_lines(summary))]
     if header:
         text = json.dumps(header, indent=2, ensure_ascii=False, default=str)
         parts.append(Folded("Configuration and versions", text))
