@@ -78,6 +78,10 @@ class RunConfig(Settings):
         """The assumed robot in one line."""
         return self.robot.described(self.plan, self.limits)
 
+    def approach_limits(self, extent_m: float) -> Limits:
+        """The limits of every plan with those of the robot; lengths that are not set follow from the extent [m]."""
+        return self.robot.limited(self.limits).resolved(extent_m)
+
     def check(self) -> None:
         """Raise ValueError for an invalid initial pose, an axis that is not a unit vector, or an impossible robot."""
         if self.init not in ("log", "truth", "auto"):

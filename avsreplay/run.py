@@ -264,7 +264,6 @@ class Run:
     def facts(self) -> dict[str, Any]:
         """Return what ``run.json`` holds besides versions: effective configuration and hashes of what was read."""
         surface, losses = self.surface, self.source.losses
-        limits = self.config.robot.limited(self.config.limits).resolved(surface.extent)
         return {
             "arithmetic": arithmetic.state(),
             "log": {"name": self.job.source.name, "sha256": self.source.sha256, "scans": len(self.source)},
@@ -274,8 +273,7 @@ class Run:
             "losses": {"count": len(losses), "first": settings.dump(losses[:MOST_LOSSES])},
             "selection": settings.dump(self.job.options),
             "robot": self.config.robot_line,
-            "cones": limits.cones,
-            "mouth_m": limits.mouth_m,
+            "approach": settings.dump(self.config.approach_limits(surface.extent)),
             "config": settings.dump(self.config),
         }
 

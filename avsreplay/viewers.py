@@ -121,7 +121,7 @@ def approach_cones(run: Run) -> Array | None:
     Args:
         run: its configuration gives angles, lengths and the axis of the fixture.
     """
-    limits = run.config.robot.limited(run.config.limits).resolved(run.surface.extent)
+    limits = run.config.approach_limits(run.surface.extent)
     axis = np.array(run.config.fixture_axis_c)
     pieces = [cone_lines(axis, *cone, limits.mouth_m or 0.0) for cone in limits.cones]
     return np.concatenate(pieces) if pieces else None

@@ -55,7 +55,7 @@ def approach_picture(rows: Sequence[Row], view: View | None, header: Mapping[str
     Args:
         rows: one per scan.
         view: model and paths.
-        header: ``run.json``: ``cones`` as half-angle [deg] and length [m], ``mouth_m``, and the axis of the fixture.
+        header: ``run.json``: the limits of the approach and the axis of the fixture.
     """
     parts = [] if view is None else flown_parts(rows, view)
     if view is None or not parts:
@@ -63,8 +63,9 @@ def approach_picture(rows: Sequence[Row], view: View | None, header: Mapping[str
     axis = np.array(header.get("config", {}).get("fixture_axis_c", (1.0, 0.0, 0.0)))
     side = geometry.across(axis)
     body, corners = np.asarray(view.vertices, np.float64), view.faces
-    mouth_m = float(header.get("mouth_m") or 0.0)
-    outlines = [_outline(degrees, length, mouth_m) for degrees, length in header.get("cones", ())]
+    limits = header.get("approach", {})
+    cones = [(limits.get(f"{name}_deg"), limits.get(f"{name}_range_m")) for name in ("cone", "final")]
+    outlines = [_outline(*cone, limits.get("mouth_m") or 0.0) for cone in cones if None not in cone]
     panels = []
     for name, second in (("from one side", side), ("turned by 90° about the axis", np.cross(axis, side))):
         flat = np.stack([axis, second], axis=1)
