@@ -67,3 +67,4 @@ def test_the_picture_shows_path_begin_cone_and_body_to_scale() -> None:
 def test_without_a_flown_plan_there_is_no_picture() -> None:
     assert approach_picture(rows("stand_still"), view(), {}) is None
     assert approach_picture(rows(), None, {}) is None
+    assert approach_picture(rows(), replace(view(), paths=()), {}) is None

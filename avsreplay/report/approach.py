@@ -32,15 +32,14 @@ def flown_parts(rows: Sequence[Row], view: View) -> list[Array]:
     t = np.array([row.t_ns for row in rows], np.int64)
     r, q = (np.stack([values(rows, name) for name in names], axis=1) for names in (_POSITION, _ATTITUDE))
     y, flown = np.full((len(rows), 3), np.nan), np.array([row.action in FLOWN for row in rows])
-    for path, after in zip(view.paths, [*view.paths[1:], None], strict=True):
+    begins = [path.t_ns for path in view.paths[1:]]
+    for path, next_ns in zip(view.paths, [*begins, t[-1] + 1], strict=False):
         k = int(np.searchsorted(t, path.t_ns))
         t_go_s = rows[k].t_go_s if k < len(rows) and t[k] == path.t_ns else None
         if t_go_s is None:
             continue
         since = (t - path.t_ns) * 1e-9
-        on = np.flatnonzero(
-            flown & (since >= 0.0) & (since <= t_go_s) & (t < (t[-1] + 1 if after is None else after.t_ns))
-        )
+        on = np.flatnonzero(flown & (since >= 0.0) & (since <= t_go_s) & (t < next_ns))
         planned = np.linspace(0.0, t_go_s, len(path.points))
         at = np.stack([np.interp(since[on], planned, x) for x in path.points.T], axis=1)
         y[on] = geometry.rotate(geometry.matrix(geometry.conjugate(q[on])), at - r[on])
