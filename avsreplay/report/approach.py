@@ -33,7 +33,7 @@ def flown_parts(rows: Sequence[Row], view: View) -> list[Array]:
     r, q = (np.stack([values(rows, name) for name in names], axis=1) for names in (_POSITION, _ATTITUDE))
     y, flown = np.full((len(rows), 3), np.nan), np.array([row.action in FLOWN for row in rows])
     begins = [path.t_ns for path in view.paths[1:]]
-    for path, next_ns in zip(view.paths, [*begins, t[-1] + 1], strict=False):
+    for path, next_ns in zip(view.paths, [*begins, np.iinfo(np.int64).max], strict=False):
         k = int(np.searchsorted(t, path.t_ns))
         t_go_s = rows[k].t_go_s if k < len(rows) and t[k] == path.t_ns else None
         if t_go_s is None:
