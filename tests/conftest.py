@@ -11,11 +11,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
+import hypothesis
 import numpy as np
 import pytest
 from command_server import CommandServer
 
 from avsreplay.rows import Row
+
+hypothesis.settings.register_profile("without deadline", deadline=None)  # no test asserts a time
+hypothesis.settings.load_profile("without deadline")
 
 ROOT = Path(__file__).resolve().parents[1]
 SERVER = CommandServer()

@@ -56,7 +56,7 @@ def test_the_seeds_themselves_are_read(tmp_path: Path, name: str) -> None:
     assert check(name, CORPUS[name], tmp_path, deep=True) == "read"
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.binary(max_size=200), st.sampled_from(["cdr", "ros1"]))
 def test_any_bytes_as_a_message(data: bytes, encoding: str) -> None:
     """What is read from any bytes is no larger than they are, and finite where it must be; the rest is refused."""
@@ -77,7 +77,7 @@ def test_any_bytes_as_a_message(data: bytes, encoding: str) -> None:
 WORDS = st.sampled_from([0, 1, 2, 3, 12, 16, 255, 2**16, 2**31 - 1, 2**31, 2**32 - 1])
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=400)
 @given(st.lists(st.tuples(st.integers(0, 60), WORDS), min_size=1, max_size=4), st.booleans())
 def test_any_number_at_any_place_of_a_cloud(changes: list[tuple[int, int]], ros1: bool) -> None:
     points = scans(1, 5)[0].points
@@ -92,7 +92,7 @@ def test_any_number_at_any_place_of_a_cloud(changes: list[tuple[int, int]], ros1
     assert cloud.points.nbytes <= 64 * len(data) + 64
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=200)
 @given(st.binary(max_size=400), st.integers(0, 2000))
 def test_any_bytes_as_lzf(data: bytes, size: int) -> None:
     with suppress(BadFile):
@@ -113,7 +113,7 @@ HEADER_LINES = st.lists(
 )  # fmt: skip
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(HEADER_LINES, st.binary(max_size=120))
 @pytest.mark.slow
 def test_any_header_of_a_scan(lines: list[str], body: bytes) -> None:

@@ -37,7 +37,7 @@ def message(  # type: ignore[no-untyped-def]
     return bytes(store.serialize_cdr(cloud, "sensor_msgs/msg/PointCloud2", little_endian=encoding == "cdr"))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.data())
 def test_every_layout_gives_the_original_points(data: st.DataObject) -> None:
     height, width = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 9))

@@ -51,7 +51,7 @@ def normals(vertices: Array, faces: mesh.Faces) -> Array:
 
 
 @given(SEEDS)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_outward_faces_stay_and_any_reversed_ones_are_restored(seed: int) -> None:
     rng = np.random.default_rng(seed)
     vertices, faces = joined(bodies(rng))
@@ -65,7 +65,7 @@ def test_outward_faces_stay_and_any_reversed_ones_are_restored(seed: int) -> Non
 
 
 @given(SEEDS)
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=20)
 def test_repeated_vertices_and_repeated_faces_change_nothing(seed: int) -> None:
     rng = np.random.default_rng(seed)
     vertices, faces = joined(bodies(rng, 2))
@@ -146,7 +146,7 @@ def test_no_faces() -> None:
 
 
 @given(SEEDS)
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 def test_merged_vertices_are_those_of_a_dictionary(seed: int) -> None:
     rng = np.random.default_rng(seed)
     vertices = rng.integers(-2, 3, size=(40, 3)) * np.array([1.0, -0.5, 0.0])
