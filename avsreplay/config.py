@@ -50,15 +50,15 @@ class RunConfig(Settings):
         " (auto); or the pose of {C} in {A} as x,y,z,qx,qy,qz,qw.",
     )
     deskew: bool = setting(
-        True, "Move points that have their own times to the scan's instant, along the predicted motion."
+        True, "Transform points that have their own times to the instant of the scan, along the predicted motion."
     )
     reacquire: bool = setting(
         True, "Search globally when a scan is faulty and the prediction is too uncertain to be a guess."
     )
     reference: Against = setting(
         Against.TRUTH,
-        "What errors refer to: the log's true poses (truth), or one motion fitted to all healthy poses of a first"
-        " pass (fit).",
+        "Reference of the errors: the log's true poses (truth), or one motion fitted to all healthy poses of a"
+        " first pass (fit).",
     )
     register: RegisterParams = setting(RegisterParams, "Registration.")
     estimator: EstimatorParams = setting(EstimatorParams, "Estimation.")

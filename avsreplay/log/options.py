@@ -42,8 +42,8 @@ class SourceOptions(Settings):
     poses: bool = setting(False, "The source holds measured poses in place of clouds; '--backend poses' sets this.")
     pose_sigma: tuple[float, float] | None = setting(
         None,
-        "1 sigma of a measured pose: position along each axis [mm] and attitude about each axis [deg]; it replaces what"
-        " messages state.",
+        "1 sigma of a measured pose: position along each axis [mm] and attitude about each axis [deg]; it replaces"
+        " the covariance of the messages.",
         above=0.0,
         unset="the covariance of the message, else estimator.r0_pos_m and r0_rot_deg, adapted to the residuals",
     )
@@ -85,7 +85,7 @@ class SourceOptions(Settings):
     start_s: float | None = setting(None, "Begin at this time after the first scan.", unit="s")
     end_s: float | None = setting(None, "End before this time after the first scan.", unit="s", unset="the last scan")
     duration_s: float | None = setting(None, "Length of the part that is replayed.", unit="s", unset="up to the end")
-    n_scans: int | None = setting(None, "Number of scans at most.", low=1, unset="all")
+    n_scans: int | None = setting(None, "Largest number of scans.", low=1, unset="all")
     every: int = setting(1, "Take every n-th scan, each at its own time.", low=1)
     crop_box: tuple[float, float, float, float, float, float] | None = setting(
         None,
@@ -94,7 +94,11 @@ class SourceOptions(Settings):
         infinite=True,
     )
     crop_range: tuple[float, float] | None = setting(
-        None, "Keep the points at this distance from the origin of the cloud's frame.", unit="m", low=0.0, infinite=True
+        None,
+        "Keep the points between these two distances from the origin of the cloud's frame.",
+        unit="m",
+        low=0.0,
+        infinite=True,
     )
     fixed_frame: str | None = setting(
         None, "Frame of the /tf tree into which each cloud is transformed at its own time."

@@ -53,10 +53,12 @@ class Limits(Settings):
         above=0.0,
     )
     clearance_sigmas: float = setting(
-        3.0, "Predicted standard deviations of the surface's position added to the clearance.", low=0.0
+        3.0,
+        "Multiple of the predicted standard deviation of the surface's position that is added to the clearance.",
+        low=0.0,
     )
     abort: bool = setting(
-        True, "With a clearance: the robot keeps it if it aborts at any instant outside the final approach cone."
+        True, "Require that the robot keeps the clearance if it aborts at any instant outside the final approach cone."
     )
     base_m: tuple[float, float, float] = setting(
         (0.0, 0.0, 0.0), "Position of the robot's base in {A}, the centre of its workspace.", unit="m"
@@ -77,7 +79,11 @@ class Limits(Settings):
     base_attitude_xyzw: tuple[float, float, float, float] = setting(
         (0.0, 0.0, 0.0, 1.0), "Quaternion that takes coordinates of the robot's base to {A}."
     )
-    nodes: int = setting(40, "Thrust intervals of a constrained plan.", low=8)
+    nodes: int = setting(
+        40,
+        "Number of thrust intervals of a constrained plan. A larger value gives an earlier capture, in more time.",
+        low=8,
+    )
 
     def widened(self, radius_m: float) -> Limits:
         """Return the limits for an end-effector of a given size.
@@ -122,12 +128,18 @@ class RobotParams(Settings):
     """The robot that carries the end-effector. What is set here takes precedence over ``plan`` and ``limits``."""
 
     name: str = setting("point", "Name of the robot, printed with every plan.")
-    mass_kg: float | None = setting(None, "Mass.", unit="kg", above=0.0)
+    mass_kg: float | None = setting(None, "Mass, by which a thrust is divided.", unit="kg", above=0.0)
     thrust_max_n: float | None = setting(
-        None, "Largest thrust in any direction; divided by the mass.", unit="N", above=0.0
+        None,
+        "Largest thrust in any direction. Divided by the mass it is the largest acceleration.",
+        unit="N",
+        above=0.0,
     )
     thrust_axes_n: tuple[float, float, float] | None = setting(
-        None, "Largest thrust along each axis of the base; divided by the mass.", unit="N", above=0.0
+        None,
+        "Largest thrust along each axis of the base. Divided by the mass it is the largest acceleration.",
+        unit="N",
+        above=0.0,
     )
     accel_max_mps2: float | None = setting(
         None, "Largest acceleration in any direction.", unit="m/s2", above=0.0, unset="plan.a_max_mps2"
@@ -149,18 +161,21 @@ class RobotParams(Settings):
         (0.0, 0.0, 0.0, 1.0), "Quaternion that takes coordinates of the base to {A}."
     )
     start_position_m: tuple[float, float, float] | None = setting(
-        None, "Position of the end-effector in {A} when it begins.", unit="m", unset="plan.robot_position_m"
+        None, "Position of the end-effector in {A} at the start.", unit="m", unset="plan.robot_position_m"
     )
     start_velocity_mps: tuple[float, float, float] | None = setting(
-        None, "Velocity of the end-effector in {A} when it begins.", unit="m/s", unset="plan.robot_velocity_mps"
+        None, "Velocity of the end-effector in {A} at the start.", unit="m/s", unset="plan.robot_velocity_mps"
     )
     start_attitude_xyzw: tuple[float, float, float, float] = setting(
         (0.0, 0.0, 0.0, 1.0),
-        "Quaternion that takes coordinates of the gripper to {A} when it begins; at capture the gripper has the axes of"
-        " {C}.",
+        "Quaternion that takes coordinates of the gripper to {A} at the start; at capture the gripper has the axes"
+        " of {C}.",
     )
     radius_m: float = setting(
-        0.0, "Radius of the end-effector, added to limits.clearance_m; alone it is the clearance.", unit="m", low=0.0
+        0.0,
+        "Radius of the end-effector, added to limits.clearance_m; without that setting it is the clearance.",
+        unit="m",
+        low=0.0,
     )
     reach_max_m: float | None = setting(
         None,

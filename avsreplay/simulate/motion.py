@@ -51,7 +51,7 @@ class MotionParams(Settings):
     orbit_rate_radps: float = setting(
         0.0,
         "Mean motion of the camera's circular orbit, whose gravity gradient acts on the relative motion"
-        " (Clohessy-Wiltshire); 0: none.",
+        " (Clohessy-Wiltshire); 0 means no orbit.",
         unit="rad/s",
         low=0.0,
         high=0.1,
