@@ -86,7 +86,7 @@ class _Commands(click.Group):
             raise UsageError("no command has an option of this name", where=f"environment {unknown[0]}", hint=hint)
         try:
             return super().invoke(ctx)
-        except BrokenPipeError:  # of a log that is written to standard output; click exits with 1
+        except BrokenPipeError:  # a log on standard output; click exits with 1
             return 141
 
     def _variables(self, ctx: click.Context) -> Iterator[str]:

@@ -251,7 +251,7 @@ class AnomalyTest:
     def _manoeuvred(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
         """Rate and velocity fitted anew from the manoeuvre on; everything else is continuous."""
         start_ns, t_ns = window[0].track.belief.t_ns, last_change_ns(window, best)
-        at = window[best.onset].track.belief  # of all scans before the first change
+        at = window[best.onset].track.belief  # belief from all scans before the first change
         for after_s in best.changes_s:
             then_ns = start_ns + round(after_s * 1e9)
             at, _ = self.batch.propagated(track, at, then_ns)

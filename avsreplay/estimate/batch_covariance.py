@@ -262,7 +262,7 @@ def final_mixture(
         there = base.moved(share * move)
         P = P if pin is not None else _fixed(P, rows)
         if pin is None:
-            unseen = step @ unseen @ step.T  # that of free motion: about the other trajectories it does not hold
+            unseen = step @ unseen @ step.T  # valid about free motion only
         P = step @ P @ step.T + unseen + (1.0 - share) ** 2 * np.outer(move, move)
         if pin is not None and not least_eigenvalue(P) >= -ROUNDING:
             lost += weight  # about an unstable spin, rounding at the epoch has grown beyond the covariance

@@ -174,7 +174,7 @@ class Estimator:
         else:
             found = mixture_forecast(track.batch.components, track.belief.t_ns, times_s, *noise)
         turns, moves = (float(np.linalg.norm(half)) for half in np.split(track.undetermined, 2))
-        turn = np.minimum(np.hypot(found.rot_1s_rad, turns), 2.0 * ANY_HALF_RAD)  # that of an arbitrary attitude
+        turn = np.minimum(np.hypot(found.rot_1s_rad, turns), 2.0 * ANY_HALF_RAD)  # at most an arbitrary attitude
         position = np.hypot(np.hypot(found.pos_1s_m, float(np.linalg.norm(b))), moves)
         return replace(found, pos_1s_m=position, rot_1s_rad=turn)
 

@@ -29,7 +29,7 @@ from avsreplay.geometry import Array, Pose, conjugate, frozen, log, multiply
 from avsreplay.records import Belief
 
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
-_SCALES = (1.0, 0.1)  # of the prior standard deviations: a large or a small change
+_SCALES = (1.0, 0.1)  # factors on the prior standard deviations: a large or a small change
 FEWEST_DISTURBED = 8  # poses from which disturbances are estimated without a model of the motion
 _LONGEST = 3.0  # interval between two of them over the median
 _MOST_TURN, _MOST_MOVE = 0.35, 0.1  # change of the step between poses: angle [rad], and length over the extent
@@ -114,7 +114,7 @@ def window_of(
         H = measurement_jacobian(then)
         rows[k], by_u[k, :6] = H @ Phi, H @ by_u[k]
         inverse = np.linalg.inv(Phi)
-        back[k] = start.P + inverse @ process_noise(step, t, force) @ inverse.T  # what the noise at the start would be
+        back[k] = start.P + inverse @ process_noise(step, t, force) @ inverse.T  # noise as errors of the start
         R_ba.append(rotation(then.q_ab).T)
     C = ((rows @ back).reshape(6 * n, 20) @ rows.reshape(6 * n, 20).T).reshape(n, 6, n, 6)
     earlier = np.arange(n)[:, None] < np.arange(n)  # scans i before j: the noise until i is what they have in common

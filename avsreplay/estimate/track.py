@@ -31,7 +31,7 @@ _READY, _READY_AFTER_MANOEUVRE = 8, 3  # least number of poses of an estimate wh
 _RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 _NO_NOISE = frozen(np.zeros((6, 6)))
 _NO_MOTION = frozen(np.zeros((6, 0)))
-_TURN_WITHIN_RAD = 0.2  # of the other rotations, where a first determined one turns the whole track
+_TURN_WITHIN_RAD = 0.2  # largest change of the other rotations if a rotation that is first determined turns the track
 _ALIKE = 0.966  # cosine of 15 deg, between motions that count as the same
 
 

@@ -279,7 +279,7 @@ class Source:
         """Return a measured pose in the fixed frame, of the grasp point, with the covariance that applies."""
         options, C = self.options, found.covariance
         offset = np.zeros(3) if options.grasp is None else np.array(options.grasp)
-        if C is not None and options.grasp is not None:  # of the new origin: v' = v + theta x offset
+        if C is not None and options.grasp is not None:  # covariance at the new origin: v' = v + theta x offset
             J = np.eye(6)
             J[3:, :3] = -geometry.skew(offset)
             C = J @ C @ J.T

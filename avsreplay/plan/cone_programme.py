@@ -176,13 +176,13 @@ def _end(rows: _Rows, p: Subproblem, scale: float) -> None:
     """The terminal errors are within the slack; the goal moves with the end time."""
     n, axis, last = p.n, np.arange(3), np.full(4, p.n - 1)
     C, d = np.zeros((4, 11)), np.zeros(4)
-    shift = p.rate * n * p.h / scale  # of the goal with h/h_ref
+    shift = p.rate * n * p.h / scale  # shift of the goal per change of h/h_ref
     C[0, _SLACK] = C[1 + axis, axis] = C[1 + axis, _Q + axis] = 1.0
     C[1 + axis, _W + axis], C[1:, _H] = 0.5, -shift
     d[1:] = shift - p.rho / scale
     rows.put(4, last, C, d)
     C, d = np.zeros((4, 11)), np.zeros(4)
-    turn = p.acceleration * n * p.h  # of the goal's velocity with h/h_ref
+    turn = p.acceleration * n * p.h  # change of the goal's velocity per change of h/h_ref
     C[0, _SLACK] = 1.0 / n
     C[1 + axis, _Q + axis] = C[1 + axis, _W + axis] = 1.0
     C[1:, _H], d[1:] = -(p.rate + turn) * p.h / scale, turn * p.h / scale

@@ -232,7 +232,9 @@ class StepPath:
         """
         n, h = len(self.u), self.step_s
         rho, rate = goal(np.array([self.t_go_s]))
-        rows = np.stack([h * h * (n - np.arange(n) - 0.5), np.full(n, h)])  # of u_k on the last position and velocity
+        rows = np.stack(
+            [h * h * (n - np.arange(n) - 0.5), np.full(n, h)]
+        )  # effect of u_k on the last position and velocity
         errors = np.stack([rho[0] - self._nodes[0][-1], rate[0] - self._nodes[1][-1]])
         return replace(self, u=self.u + rows.T @ np.linalg.solve(rows @ rows.T, errors))
 

@@ -197,7 +197,7 @@ def _descend(P: list[float], b: list[float], tolerance: float) -> _Point:
 def _search(now: _Point, step: list[float], b: list[float]) -> _Point | None:
     """Return the first point along the step with sufficient decrease of h (Armijo), or of the residual at rounding."""
     size = min(1.0, 2.0 * _norm(now.P) / max(_norm(step), _FLOOR))
-    slope = _dot(now.residual, step)  # that of h: b.step is 0
+    slope = _dot(now.residual, step)  # slope of h, because b.step is 0
     P = now.P
     for _ in range(30):
         trial = [P[0] + size * step[0], P[1] + size * step[1], P[2] + size * step[2], P[3] + size * step[3]]

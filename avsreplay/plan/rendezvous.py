@@ -289,7 +289,7 @@ class _Margin:
         if first >= len(goal.times) or margin <= near * sag:
             return reach
         times = goal.times[first:]
-        bend = goal.curvature(self.n0, self.n1, times + goal.step) + 2.0 * a_max  # of the interval after each node
+        bend = goal.curvature(self.n0, self.n1, times + goal.step) + 2.0 * a_max  # for the interval after each node
         along = goal.dr[first:] @ (found.P0 - found.P1) + times * (goal.dv[first:] @ found.P1)
         positive = along - a_max * times * times > sag * bend
         stop = int(positive.argmin())

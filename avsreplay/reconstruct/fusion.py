@@ -42,7 +42,7 @@ MOST_ASKED = 3000  # points of the model that are compared with one view
 LEAST_SHOWN = 0.8  # share of the model's visible points that a view must show, in units of the median of all views
 MOST_STEPS = 10  # evaluations of the motion that minimises the distances between views
 LEAST_DAMPING, LEAST_GAIN = 1e-3, 1e-4  # damping; relative improvement of the rms that ends the steps
-SUPPORT = 5  # of the ten nearest points that continue the surface of a point which one scan only has seen
+SUPPORT = 5  # least number of the ten nearest points that continue the surface of a point from one scan
 SPREAD_RAD = np.radians(30.0)  # a direction counts as covered if a scan was taken from within this angle of it
 
 

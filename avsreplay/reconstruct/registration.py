@@ -14,7 +14,7 @@ from avsreplay.register.size import normal_jacobian
 
 SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
 MOST_POINTS = 1500  # points of a scan in one registration
-COARSE_POINTS, COARSE_PASSES, HALVED = 200, 8, (2, 4, 5)  # of a search over attitudes: points, passes, halving passes
+COARSE_POINTS, COARSE_PASSES, HALVED = 200, 8, (2, 4, 5)  # search over attitudes: points, passes, halving passes
 FINE_STARTS = 6  # poses of a search that are registered with all points
 
 

@@ -32,11 +32,11 @@ GROUP = "avsreplay.backends"
 POSES = "poses"
 
 PLANE_PASSES = 3
-CLOUD_PLANE_PASSES = 30  # of a second alignment to a model of points
+CLOUD_PLANE_PASSES = 30  # point-to-plane passes of a second alignment to a model of points
 TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
-FEW_POINTS = 600  # of a scan that has many more, for the first passes
+FEW_POINTS = 600  # points for the first passes on a scan that has many more
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -49,7 +49,7 @@ class ModelCheck:
         self._aligned, self._matched, self._ambiguous = 0, False, ""
         self._deltas: list[float] = []
         self._weights: list[float] = []
-        self._points: list[tuple[Array, Array | None]] = []  # of each scan that was measured, and the camera, in {C}
+        self._points: list[tuple[Array, Array | None]] = []  # points of each measured scan, and the camera, in {C}
         self._unmatched: NDArray[Any] | None = None
 
     def add(self, points: NDArray[Any], found: Alignment | None) -> None:

@@ -202,7 +202,7 @@ def _members(marks: Sequence[Mark], labels: Sequence[Label]) -> list[list[int]]:
     for k, mark in enumerate(marks):
         if same := kinds.get(mark.fault):
             place = bisect_right(starts[mark.fault], mark.t_ns)
-            # of windows that do not overlap only the neighbours of the stamp can be the nearest
+            # the windows do not overlap, so that only the neighbours of the stamp can be the nearest
             near = same[max(place - 1, 0) : place + 1] if apart[mark.fault] else same
             out[min(near, key=lambda i: (_distance(labels[i], mark.t_ns), i))].append(k)
     return out
