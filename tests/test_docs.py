@@ -338,6 +338,19 @@ def test_a_sentence_has_at_most_45_words_and_states_the_present(page):
     assert [found[0] for found in HISTORY.finditer(text)] == []
 
 
+def test_the_glossary_explains_terms_that_occur_and_names_sections_that_exist():
+    glossary = ROOT / "docs" / "glossary.md"
+    symbols, _, terms = glossary.read_text(encoding="utf-8").partition("## Terms")
+    files = [*(page for page in PAGES if page != glossary), *(ROOT / "avsreplay" / "register").glob("*.py")]
+    text = " ".join(" ".join(file.read_text(encoding="utf-8").lower().split()) for file in files)
+    named = [term for cell in re.findall(r"^\| ([^|]+) \| .*[.?] \|$", terms, flags=re.M) for term in cell.split(", ")]
+    assert len(named) > 40
+    assert [term for term in named if term.lower() not in text] == []
+    equations = (ROOT / "docs" / "equations.md").read_text(encoding="utf-8")
+    sections = set(re.findall(r"\| (\d) \|$", symbols, flags=re.M))
+    assert sections == set(re.findall(r"^## (\d)\. ", equations, flags=re.M))
+
+
 def test_the_notebook_runs_from_top_to_bottom(folder):
     notebook = json.loads((ROOT / "docs" / "first-steps.ipynb").read_text(encoding="utf-8"))
     cells = [cell for cell in notebook["cells"] if cell["cell_type"] == "code"]
