@@ -176,7 +176,7 @@ class Replanning:
         def planner(scene: Scene) -> Plan:
             return self._planned(scene, belief.t_ns, path)
 
-        futures = [plan.Future(self._scene(b)) for b in drawn]
+        futures = [self._scene(b) for b in drawn]
         noise = self.robot.thrust_noise * self.params.a_max_mps2
         disturbance = plan.Disturbance(noise, np.random.Generator(np.random.PCG64([seed, 1])))
         return plan.spread(path, futures, planner, self.tolerance, aimed, disturbance, self._body)

@@ -12,8 +12,7 @@ from scipy.interpolate import CubicSpline
 
 from avsreplay.plan import Limits, PlanParams, _cone, margins
 from avsreplay.plan.cone_programme import PointRows, Subproblem, solve
-from avsreplay.plan.convexification import convex_subproblem
-from avsreplay.plan.initial_paths import ReferencePath, interval_fractions
+from avsreplay.plan.convexification import ReferencePath, convex_subproblem, interval_fractions
 from avsreplay.plan.limits import Case, SampledScene
 
 sys.path.insert(0, str(Path(__file__).parent / "benchmarks"))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from avsreplay.geometry import exp, multiply
-from avsreplay.plan import Future, PlanParams, Scene, Tolerance, draws, path_of, rendezvous, spread
+from avsreplay.plan import PlanParams, Scene, Tolerance, draws, path_of, rendezvous, spread
 
 ORIGIN = np.zeros(3)
 PARAMS = PlanParams()
@@ -56,7 +56,7 @@ def test_a_singular_covariance_is_accepted_and_a_negative_one_refused():
 
 
 def test_a_certain_future_gives_no_spread():
-    found = spread(plan(), [Future(scene([4.0, 0, 0]))] * 5, planner(PARAMS), Tolerance())
+    found = spread(plan(), [scene([4.0, 0, 0])] * 5, planner(PARAMS), Tolerance())
     assert found.probability == 1.0
     assert found.miss_m.p95 < 1e-9
     assert found.t_go_s.std == pytest.approx(0.0, abs=1e-12)
@@ -67,7 +67,7 @@ def test_a_certain_future_gives_no_spread():
 def test_miss_and_probability_follow_the_rayleigh_distribution():
     rng = np.random.default_rng(3)
     sigma, count = 0.01, 1000
-    futures = [Future(scene([4.0, *(sigma * z)])) for z in rng.standard_normal((count, 2))]
+    futures = [scene([4.0, *(sigma * z)]) for z in rng.standard_normal((count, 2))]
     quick = PlanParams(grid_s=5.0)
     found = spread(plan(), futures, planner(quick), Tolerance(position_m=0.02))
     expected = 1.0 - math.exp(-0.5 * 2.0**2)  # Rayleigh
@@ -78,7 +78,7 @@ def test_miss_and_probability_follow_the_rayleigh_distribution():
 
 def test_end_time_spreads_as_its_slope_says():
     base, slope = 4.0, 1.0 / math.sqrt(4.0 * 0.05)  # t = 2 sqrt(x/a), dt/dx
-    futures = [Future(scene([base + d, 0, 0])) for d in (-0.05, 0.05)]
+    futures = [scene([base + d, 0, 0]) for d in (-0.05, 0.05)]
     found = spread(plan(), futures, planner(PARAMS), Tolerance())
     assert found.t_go_s.std == pytest.approx(0.05 * slope, rel=1e-3)
     assert found.probability == 0.0
@@ -87,15 +87,15 @@ def test_end_time_spreads_as_its_slope_says():
 def test_the_attitude_error_counts():
     q = exp([0.1, 0.2, 0.3])
     off = multiply(q, exp([0.0, math.radians(3.0), 0.0]))
-    futures = [Future(scene([4.0, 0, 0], q)), Future(scene([4.0, 0, 0], off))]
+    futures = [scene([4.0, 0, 0], q), scene([4.0, 0, 0], off)]
     found = spread(plan(), futures, planner(PARAMS), Tolerance(angle_deg=2.0), q)
     assert found.probability == 0.5
     assert found.angle_deg.mean == pytest.approx(1.5, abs=1e-6)
 
 
 def test_a_future_out_of_reach_is_counted():
-    away = Future(scene([900.0, 0, 0]))
-    found = spread(plan(), [away, Future(scene([4.0, 0, 0]))], planner(PARAMS), Tolerance())
+    away = scene([900.0, 0, 0])
+    found = spread(plan(), [away, scene([4.0, 0, 0])], planner(PARAMS), Tolerance())
     assert found.infeasible == 1
     assert found.probability == 0.5
     with pytest.raises(ValueError, match="no future"):

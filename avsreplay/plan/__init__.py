@@ -7,7 +7,6 @@ from avsreplay.plan.evaluation import (
     Flights,
     Miss,
     Motion,
-    Tolerance,
     closed_loop,
     execute,
     interpolated,
@@ -19,7 +18,7 @@ from avsreplay.plan.path import CostatePath, RobotPath, StepPath, path_of
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.plan.robot import Limits, RobotParams
 from avsreplay.plan.supervisor import RULES, Action, Decision, Facts, Supervisor, SupervisorMemory, SupervisorParams
-from avsreplay.plan.uncertainty import Disturbance, Future, Spread, draws, spread
+from avsreplay.plan.uncertainty import Disturbance, Spread, Tolerance, draws, spread
 
 __all__ = [
     "CONSTRAINTS",
@@ -31,7 +30,6 @@ __all__ = [
     "Execution",
     "Facts",
     "Flights",
-    "Future",
     "Guidance",
     "GuidanceState",
     "Limits",

@@ -19,22 +19,20 @@ from avsreplay.plan.cone_programme import PointRows, solve
 from avsreplay.plan.convexification import (
     ABORT_S,
     BETWEEN,
+    COARSE_NODES,
+    ReferencePath,
     aborted,
+    coarse_nodes,
     convex_subproblem,
     entry_fractions,
     excess,
     feasible,
-    margins_at,
-    worst_margin,
-)
-from avsreplay.plan.initial_paths import (
-    COARSE_NODES,
-    ReferencePath,
-    coarse_nodes,
     initial_references,
     interval_fractions,
     largest_change,
+    margins_at,
     warm_reference,
+    worst_margin,
 )
 from avsreplay.plan.limits import CONSTRAINTS, Case, SampledScene, Scene, largest_acceleration
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath, StepPath, path_of

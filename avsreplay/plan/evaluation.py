@@ -15,28 +15,14 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
-from avsreplay.plan.limits import Scene, margins
+from avsreplay.plan.limits import Scene
 from avsreplay.plan.path import CostatePath, RobotPath, StepPath
 from avsreplay.plan.robot import Limits
 from avsreplay.plan.supervisor import Action
+from avsreplay.plan.uncertainty import Tolerance, touches, wilson
 
 Motion = Callable[[Array], tuple[Array, Array, Array]]
 """Instants (n,) [s, on the log's clock] -> positions (n, 3), velocities (n, 3), attitudes (n, 4) of {C} in {A}."""
-
-
-@dataclass(frozen=True, slots=True)
-class Tolerance:
-    """Largest position error, relative speed and attitude error of a successful capture."""
-
-    position_m: float = 0.02
-    speed_mps: float = 0.01
-    angle_deg: float = 2.0
-
-    def __post_init__(self) -> None:
-        for name in ("position_m", "speed_mps", "angle_deg"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} is {value}, must be a finite number above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,14 +187,6 @@ def interpolated(times_s: Array, poses: Sequence[geometry.Pose]) -> Motion:
     return at
 
 
-def wilson(successes: int, count: int) -> tuple[float, float]:
-    """Return the Wilson 95 % interval of the fraction of ``successes`` in ``count`` trials, at least 1."""
-    z2 = 1.96**2
-    centre = (successes + 0.5 * z2) / (count + z2)
-    half = 1.96 / (count + z2) * math.sqrt(successes * (count - successes) / count + 0.25 * z2)
-    return max(centre - half, 0.0), min(centre + half, 1.0)
-
-
 @dataclass(frozen=True, slots=True)
 class Flights:
     """Results of whole flights with replanning.
@@ -338,12 +316,7 @@ def closed_loop(
 
 
 def _touched(scene: Scene, body: Limits, segment: Segment, start_ns: int, begin_ns: int, end_ns: int) -> bool:
-    """Return whether the end-effector touches the body outside the corridor between two scans, at ten instants."""
+    """Return whether the end-effector touches the body between two scans, at ten instants."""
     instants = np.linspace(begin_ns, end_ns, 10, endpoint=False).astype(np.int64)
     r = np.array([segment.at(int(t))[0] for t in instants if segment.path is None or t <= segment.end_ns])
-    if not len(r) or scene.attitude is None or scene.surface is None:
-        return False
-    times = np.asarray((instants[: len(r)] - start_ns) * 1e-9, dtype=np.float64)
-    R = geometry.matrix(scene.attitude(times))
-    y = np.einsum("nij,ni->nj", R, r - scene.goal(times)[0])
-    return bool(margins(scene, body, y, r).values[:, 3].min() < 0.0)
+    return touches(scene, body, np.asarray((instants[: len(r)] - start_ns) * 1e-9, dtype=np.float64), r)

@@ -15,19 +15,26 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
-from avsreplay.plan.evaluation import Tolerance, wilson
-from avsreplay.plan.limits import Scene, margins
+from avsreplay.plan.limits import Scene, in_fixture_axes, margins
 from avsreplay.plan.path import RobotPath
 from avsreplay.plan.robot import Limits
 
 CONTACT_INSTANTS = 401  # instants of a plan at which contact is checked
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Future:
-    """One possible motion of the target after the instant of planning; attitude errors need the scene's attitude."""
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """Largest position error, relative speed and attitude error of a successful capture."""
 
-    scene: Scene
+    position_m: float = 0.02
+    speed_mps: float = 0.01
+    angle_deg: float = 2.0
+
+    def __post_init__(self) -> None:
+        for name in ("position_m", "speed_mps", "angle_deg"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise ValueError(f"{name} is {value}, must be a finite number above 0")
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +165,7 @@ def _root(P: Array) -> Array:
 
 def spread(
     path: RobotPath,
-    futures: Sequence[Future],
+    futures: Sequence[Scene],
     planner: Callable[[Scene], Plan],
     tolerance: Tolerance,
     attitude: Array | None = None,
@@ -169,7 +176,7 @@ def spread(
 
     Args:
         path: Path planned for the mean of the belief.
-        futures: Possible motions of the target, equally probable.
+        futures: Possible motions of the target after the instant of planning, equally probable.
         planner: Plans for a future from the same start, under the same limits.
         tolerance: Largest errors of a capture.
         attitude: (4,) q_ac of the gripper at the end.
@@ -186,12 +193,12 @@ def spread(
     misses, touched = np.empty((len(futures), 3)), np.zeros(len(futures), dtype=bool)
     for k, future in enumerate(futures):
         dr, dv = disturbance.deviation(times) if disturbance else (0.0 * r, 0.0 * v)
-        misses[k] = _terminal_errors(future.scene, times[-1:], r[-1] + dr[-1], v[-1] + dv[-1], attitude)
-        touched[k] = limits is not None and _touches(future.scene, limits, times, r + dr)
-    own = np.array([planner(future.scene).t_go_s for future in futures])
+        misses[k] = _terminal_errors(future, times[-1:], r[-1] + dr[-1], v[-1] + dv[-1], attitude)
+        touched[k] = limits is not None and touches(future, limits, times[:-1], (r + dr)[:-1])
+    own = np.array([planner(future).t_go_s for future in futures])
     allowed = (tolerance.position_m, tolerance.speed_mps, tolerance.angle_deg)
     inside = np.all((misses <= allowed) | np.isnan(misses), axis=1)
-    checked = limits is not None and futures[0].scene.surface is not None
+    checked = limits is not None and futures[0].surface is not None
     return Spread(
         futures=len(futures),
         t_go_s=_band(own),
@@ -206,13 +213,27 @@ def spread(
     )
 
 
-def _touches(scene: Scene, limits: Limits, times: Array, r: Array) -> bool:
-    """Return whether the end-effector touches the body outside the corridor at one of the instants before the end."""
-    if scene.attitude is None or scene.surface is None:
+def touches(scene: Scene, limits: Limits, times: Array, r: Array) -> bool:
+    """Return whether the end-effector touches the body outside the corridor at one of the instants.
+
+    Args:
+        scene: The target.
+        limits: Resolved limits whose clearance is the radius of the end-effector.
+        times: (n,) [s].
+        r: (n, 3) positions in {A} [m].
+    """
+    if not len(r) or scene.attitude is None or scene.surface is None:
         return False
-    R = geometry.matrix(scene.attitude(times[:-1]))
-    y = np.einsum("nij,ni->nj", R, r[:-1] - scene.goal(times[:-1])[0])
-    return bool(margins(scene, limits, y, r[:-1]).values[:, 3].min() < 0.0)
+    y = in_fixture_axes(geometry.matrix(scene.attitude(times)), r - scene.goal(times)[0])
+    return bool(margins(scene, limits, y, r).values[:, 3].min() < 0.0)
+
+
+def wilson(successes: int, count: int) -> tuple[float, float]:
+    """Return the Wilson 95 % interval of the fraction of ``successes`` in ``count`` trials, at least 1."""
+    z2 = 1.96**2
+    centre = (successes + 0.5 * z2) / (count + z2)
+    half = 1.96 / (count + z2) * math.sqrt(successes * (count - successes) / count + 0.25 * z2)
+    return max(centre - half, 0.0), min(centre + half, 1.0)
 
 
 def _terminal_errors(
