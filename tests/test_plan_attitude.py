@@ -84,6 +84,16 @@ def test_attitude_and_rate_agree_at_the_end_within_the_bound(seed):
     assert angular_acceleration(turn) <= accel * (1 + 2e-3)
 
 
+@pytest.mark.parametrize("seed", [15, 51])
+def test_the_bound_holds_at_the_end_of_the_turn_where_the_acceleration_is_largest(seed):
+    accel = 0.004
+    turn = turn_to(tumbling(seed), IDENTITY, REST, accel, PlanParams(horizon_s=150.0), 0)
+    t = turn.ready_s(math.nan) - np.array([0.03, 0.02, 0.01])
+    before, middle, after = Rotation.from_quat(turn.at(t))
+    change = (middle.inv() * after).as_rotvec() - (before.inv() * middle).as_rotvec()
+    assert np.linalg.norm(change) / 0.01**2 <= accel * (1 + 2e-3)
+
+
 def test_the_capture_is_the_later_of_flight_and_turn():
     goal = lambda t: (np.stack([0 * t, 4.0 + 0.01 * t, 0 * t], 1), np.tile([0.0, 0.01, 0.0], (len(t), 1)))  # noqa: E731
     free = rendezvous(goal, REST, REST, PARAMS)

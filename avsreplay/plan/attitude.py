@@ -119,7 +119,8 @@ def angular_acceleration(turn: Turn) -> float:
     Args:
         turn: The turn; it must have a path.
     """
-    times = np.linspace(0.0, turn.ready_s(0.0), INSTANTS)[1:-1]
+    edge_s = 6.0 * STEP_S  # the quotients at the ends are those just inside the turn, where the largest often is
+    times = np.linspace(edge_s, max(turn.ready_s(0.0) - edge_s, edge_s), INSTANTS)
     rates = _rates(turn.at, np.concatenate([times - 5.0 * STEP_S, times + 5.0 * STEP_S]))
     before, after = rates[: len(times)], rates[len(times) :]
     return float(np.linalg.norm(after - before, axis=1).max(initial=0.0)) / (10.0 * STEP_S)
