@@ -72,9 +72,14 @@ def test_the_package_states_that_it_is_typed():
     assert (ROOT / "avsreplay" / "py.typed").is_file()
 
 
-def test_the_tests_that_the_reliability_page_names_exist():
-    page = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8")
-    named = set(re.findall(r"`(test_\w+)`", page))
+def test_the_tests_and_modules_that_the_documentation_names_exist():
+    pages = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "docs").glob("*.md"))
     code = "".join(path.read_text(encoding="utf-8") for path in sorted((ROOT / "tests").glob("test_*.py")))
-    assert len(named) > 30
+    named = set(re.findall(r"`(test_\w+)`", pages))
+    assert len(named) > 40
     assert {name for name in named if f"def {name}(" not in code} == set()
+    files = set(re.findall(r"`(?:tests/)?(test_\w+\.py|benchmarks/\w+\.py)\b", pages))
+    assert {name for name in files if not (ROOT / "tests" / name).exists()} == set()
+    packages = "cli|estimate|log|monitor|plan|reconstruct|register|report|simulate|sweep"
+    modules = set(re.findall(rf"`(?:avsreplay/)?((?:{packages})/[\w/]+\.\w+)`", pages))
+    assert {name for name in modules if not (ROOT / "avsreplay" / name).exists()} == set()
