@@ -18,8 +18,9 @@ from avsreplay.errors import AvsError, CheckFailed, UnreadableInput, UsageError
 from avsreplay.log import SourceOptions
 from avsreplay.log.options import ClockChoice, Unit
 from avsreplay.records import Label
-from avsreplay.report.compare import METRICS, changed_settings, first_divergence, metrics
+from avsreplay.report.compare import METRICS, changed_settings, metrics
 from avsreplay.report.gate import GateRule, RuleOutcome, check_gate, github_lines, judge, junit, load_rules
+from avsreplay.report.golden import compare_rows
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import build_comparison
 from avsreplay.report.result import load_result, write_manifest
@@ -57,9 +58,9 @@ def test_no_rows_have_no_figures_and_no_zeros(make_rows):
 def test_the_first_divergence_is_the_first_scan_beyond_tolerance(make_rows):
     rows = make_rows(40)
     other = [dataclasses.replace(r, x_m=r.x_m + (1e-9 if r.seq < 17 else 0.01)) for r in rows]
-    found = first_divergence(rows, other)
+    found = compare_rows(rows, other)
     assert (found.differences[0].seq, found.differences[0].column, found.count) == (17, "x_m", 23)
-    assert first_divergence(rows, rows).ok
+    assert compare_rows(rows, rows).ok
 
 
 BASE = {"pose_pos_rmse_m": 0.004, "false_alarms": 0.0, "t1_s": None, "healthy": 100.0}
@@ -212,7 +213,7 @@ def _run(*arguments):
     return CliRunner().invoke(compare_command, [str(a) for a in arguments])
 
 
-def test_the_table_shows_changes_and_the_first_divergence(runs):
+def test_the_table_shows_changes_and_the_compare_rows(runs):
     done = _run(runs / "base", runs / "same", runs / "worse")
     assert done.exit_code == 0, done.output
     assert "+100.0 %" in done.output

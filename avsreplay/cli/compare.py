@@ -15,7 +15,7 @@ from avsreplay.cli.options import PATH, read_result
 from avsreplay.errors import DataLost, UsageError
 from avsreplay.files import check_output, output_text
 from avsreplay.report import gate as gates
-from avsreplay.report.compare import METRICS, first_divergence, metrics
+from avsreplay.report.compare import METRICS, metrics
 from avsreplay.report.conclusion import Conclusion, conclude
 from avsreplay.report.result import Result
 from avsreplay.settings import dump
@@ -224,17 +224,6 @@ def _tables(
     return [*found, gates.gate_table(outcomes)]
 
 
-def _divergences(groups: Sequence[_Group]) -> list[str]:
-    from avsreplay.report.golden import divergence_line
-
-    base, others = groups[0], [group for group in groups[1:] if len(group.runs) == 1]
-    return [
-        divergence_line(base.name, other.name, first_divergence(base.runs[0].rows, other.runs[0].rows))
-        for other in others
-        if len(base.runs) == 1
-    ]
-
-
 def _print(
     groups: Sequence[_Group],
     conclusions: Sequence[Conclusion],
@@ -242,6 +231,7 @@ def _print(
     *,
     show_all: bool,
 ) -> None:
+    from avsreplay.report.golden import divergence_line
     from avsreplay.report.table import make_console, print_line, print_table
 
     console = make_console()
@@ -250,8 +240,9 @@ def _print(
     console.print()
     for table in _tables(groups, conclusions, outcomes, show_all=show_all):
         print_table(console, table)
-    for line in _divergences(groups):
-        print_line(console, line)
+    for group, conclusion in zip(groups[1:], conclusions, strict=True):
+        if conclusion.divergence:
+            print_line(console, divergence_line(groups[0].name, group.name, conclusion.divergence))
 
 
 def _markdown(
@@ -271,10 +262,9 @@ def _document(
         {"name": group.name, "runs": [{"name": run.name, "metrics": metrics(run.summary)} for run in group.runs]}
         for group in groups
     ]
-    for record, group, conclusion in zip(records[1:], groups[1:], conclusions, strict=True):
-        record["conclusion"] = dump(conclusion)
-        if len(group.runs) == len(groups[0].runs) == 1:
-            found = first_divergence(groups[0].runs[0].rows, group.runs[0].rows, first=1)
+    for record, conclusion in zip(records[1:], conclusions, strict=True):
+        record["conclusion"] = {k: v for k, v in dump(conclusion).items() if k != "divergence"}
+        if found := conclusion.divergence:
             first = dump(found.differences[0]) if found.differences else None
             record["divergence"] = {"cells": found.count, "by_column": dict(found.by_column), "first": first}
     whole = {"format": "avsreplay-compare/2", "results": records, "gate": dump(list(outcomes))}

@@ -1,4 +1,4 @@
-"""The metrics by which runs are compared and gated, and the first difference between the rows of two runs."""
+"""The metrics by which runs are compared and gated, and the settings in which they differ."""
 
 from __future__ import annotations
 
@@ -8,12 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from avsreplay.report.golden import GoldenResult, compare_records
-from avsreplay.report.jsonl import plain
 from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Statistics
 from avsreplay.report.table import Table, number
-from avsreplay.rows import Row, columns
 from avsreplay.settings import dump, entries
 
 
@@ -141,16 +138,6 @@ def metrics(summary: Summary) -> dict[str, float | None]:
 
 def _finite(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else value
-
-
-def first_divergence(baseline: Sequence[Row], other: Sequence[Row], *, first: int = 20) -> GoldenResult:
-    """Find the differences between the rows of two runs beyond the golden tolerances; ``first`` of them are kept."""
-    return compare_records(_records(baseline), _records(other), first=first)
-
-
-def _records(rows: Sequence[Row]) -> Mapping[int, Mapping[str, object]]:
-    names = [c.name for c in columns()]
-    return {row.seq: {name: plain(getattr(row, name)) for name in names} for row in rows}
 
 
 def flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

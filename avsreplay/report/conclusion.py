@@ -18,9 +18,11 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from avsreplay.report.compare import METRICS, different_inputs, first_divergence, metrics
+from avsreplay.geometry import Array
+from avsreplay.report.charts import values
+from avsreplay.report.compare import METRICS, different_inputs, metrics
+from avsreplay.report.golden import GoldenResult, compare_rows
 from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
@@ -48,13 +50,18 @@ _BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS, _RESAMPLES = 10, 5, 5, 5, 9999
 
 
 def _scanwise(
-    column: str, of: Callable[[float], float] = lambda v: v * v, *, healthy: bool = False
-) -> Callable[[Row], float | None]:
-    def value(row: Row) -> float | None:
-        found = getattr(row, column) if row.gamma or not healthy else None
-        return None if found is None else float(of(found))
+    column: str, of: Callable[[Array], Array] = np.square, *, healthy: bool = False
+) -> Callable[[Sequence[Row]], Array]:
+    def value(rows: Sequence[Row]) -> Array:
+        found = values(rows, column)
+        known = np.isfinite(found) & (values(rows, "gamma") == 1.0 if healthy else True)
+        return np.where(known, of(found), np.nan)
 
     return value
+
+
+def _inside(band: tuple[float, float]) -> Callable[[Array], Array]:
+    return lambda v: ((band[0] <= v) & (v <= band[1])).astype(np.float64)
 
 
 _ROOTS = {  # metrics that are the root of a mean over scans
@@ -66,10 +73,10 @@ _ROOTS = {  # metrics that are the root of a mean over scans
     "reg_rot_rmse_deg": _scanwise("reg_rot_err_deg", healthy=True),
 }
 _MEANS = {  # metrics that are a mean over scans
-    "healthy_ratio": lambda row: float(row.gamma),
-    "false_alarm_rate": lambda row: None if row.fault else 1.0 - row.gamma,
-    "nis_inside": _scanwise("nis", lambda v: NIS_BAND[0] <= v <= NIS_BAND[1], healthy=True),
-    "nees_inside": _scanwise("nees", lambda v: NEES_BAND[0] <= v <= NEES_BAND[1]),
+    "healthy_ratio": lambda rows: values(rows, "gamma"),
+    "false_alarm_rate": lambda rows: np.where([bool(r.fault) for r in rows], np.nan, 1.0 - values(rows, "gamma")),
+    "nis_inside": _scanwise("nis", _inside(NIS_BAND), healthy=True),
+    "nees_inside": _scanwise("nees", _inside(NEES_BAND)),
 }
 
 
@@ -126,6 +133,7 @@ class Conclusion:
         changes: of every metric that one of them has.
         settings: log, model, reading options and settings that differ, as ``key = value (baseline ...)``.
         pairs: number of paired runs.
+        divergence: of the rows of a single pair; None for several pairs.
     """
 
     name: str
@@ -134,6 +142,7 @@ class Conclusion:
     changes: tuple[Change, ...]
     settings: tuple[str, ...]
     pairs: int
+    divergence: GoldenResult | None
 
 
 def conclude(name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Conclusion:
@@ -149,9 +158,10 @@ def conclude(name: str, pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Con
     figures = [(metrics(base.summary), metrics(other.summary)) for base, other in pairs]
     changes = tuple(change for m in METRICS if (change := _change(m.name, figures, pairs)) is not None)
     settings = dict.fromkeys(text for base, other in pairs for text in different_inputs(base.header, other.header))
-    same = all(first_divergence(base.rows, other.rows, first=1).ok for base, other in pairs)
-    word, sentence = _overall(changes, same=same, rows=sum(len(other.rows) for _, other in pairs))
-    return Conclusion(name, word, f"{name}: {sentence}", changes, tuple(settings), len(pairs))
+    found = [compare_rows(base.rows, other.rows, first=1) for base, other in pairs]
+    word, sentence = _overall(changes, same=all(f.ok for f in found), rows=sum(len(other.rows) for _, other in pairs))
+    divergence = found[0] if len(found) == 1 else None
+    return Conclusion(name, word, f"{name}: {sentence}", changes, tuple(settings), len(pairs), divergence)
 
 
 def _change(
@@ -216,20 +226,26 @@ def _interval(
 
 
 def _blocks(
-    pair: tuple[ComparedRun, ComparedRun], value: Callable[[Row], float | None]
-) -> tuple[NDArray[np.float64], float, float] | None:
+    pair: tuple[ComparedRun, ComparedRun], value: Callable[[Sequence[Row]], Array]
+) -> tuple[Array, float, float] | None:
     """Mean differences in blocks of consecutive scans that both runs have, and both means; None for too few scans."""
-    base, other = ({row.t_ns: v for row in run.rows if (v := value(row)) is not None} for run in pair)
-    shared = sorted(base.keys() & other.keys())
+    stamps: list[Array] = []
+    found: list[Array] = []
+    for run in pair:
+        figures = value(run.rows)
+        known = np.flatnonzero(np.isfinite(figures))
+        stamps.append(np.array([run.rows[k].t_ns for k in known.tolist()]))
+        found.append(figures[known])
+    shared, *places = np.intersect1d(stamps[0], stamps[1], return_indices=True)
     count = min(_BLOCKS, len(shared) // _IN_BLOCK)
     if count < _LEAST_BLOCKS:
         return None
-    left, right = (np.array([side[t] for t in shared]) for side in (base, other))
+    left, right = (figures[at] for figures, at in zip(found, places, strict=True))
     blocks = np.array([part.mean() for part in np.array_split(right - left, count)])
     return blocks, float(left.mean()), float(right.mean())
 
 
-def _bootstrap(differences: NDArray[np.float64], *, correlated: bool = False) -> tuple[float, float]:
+def _bootstrap(differences: Array, *, correlated: bool = False) -> tuple[float, float]:
     """95 % interval of the mean by a bootstrap with a fixed seed; ``correlated``: the differences are a time series.
 
     The half widths are then multiplied by sqrt((1 + r) / (1 - r)), the factor of a first-order autoregressive series

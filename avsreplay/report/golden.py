@@ -6,10 +6,14 @@ difference; so is null against a value.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter, itemgetter
 from pathlib import Path
+from types import NoneType
 from typing import Any
+
+import numpy as np
 
 from avsreplay.errors import CheckFailed, UnreadableInput
 from avsreplay.report.jsonl import plain, read_records, write_rows
@@ -17,6 +21,7 @@ from avsreplay.report.table import Table, number
 from avsreplay.rows import Column, Row, columns
 
 ABSENT = "(absent)"
+_Cells = Mapping[str, Sequence[Any]]  # column -> its values, ABSENT where a row has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +78,18 @@ def compare_golden(expected_path: str | Path, rows: Iterable[Row], *, first: int
     if not path.is_file():
         raise UnreadableInput("no such golden file", where=str(path), hint="--update-golden writes it")
     expected = _by_seq(read_records(path))
-    names = [c.name for c in columns()]
-    got = {row.seq: {name: plain(getattr(row, name)) for name in names} for row in rows}
-    return compare_records(expected, got, first=first)
+    names = dict.fromkeys(name for record in expected.values() for name in record)
+    table = {name: [record.get(name, ABSENT) for record in expected.values()] for name in names}
+    return _compare({**table, "seq": list(expected)}, _table(list(rows)), first)
+
+
+def compare_rows(expected: Sequence[Row], got: Sequence[Row], *, first: int = 20) -> GoldenResult:
+    """Compare the rows of two runs by the tolerances of golden files; ``first`` differences are kept."""
+    return _compare(_table(expected), _table(got), first)
+
+
+def _table(rows: Sequence[Row]) -> _Cells:
+    return {c.name: list(map(attrgetter(c.name), rows)) for c in columns()}
 
 
 def _by_seq(records: Iterable[tuple[str, dict[str, Any]]]) -> dict[int, dict[str, Any]]:
@@ -92,60 +106,62 @@ def _by_seq(records: Iterable[tuple[str, dict[str, Any]]]) -> dict[int, dict[str
     return out
 
 
-def compare_records(
-    expected: Mapping[int, Mapping[str, Any]], got: Mapping[int, Mapping[str, Any]], *, first: int = 20
-) -> GoldenResult:
-    """Compare two sets of rows (scan number -> column -> value)."""
-    kept: list[Difference] = []
-    by_column: dict[str, int] = {}
-    for difference in _differences(expected, got):
-        by_column[difference.column] = by_column.get(difference.column, 0) + 1
-        if len(kept) < first:
-            kept.append(difference)
-    shared = len(expected.keys() & got.keys())
-    return GoldenResult(shared, tuple(kept), sum(by_column.values()), by_column)
-
-
-def _differences(
-    expected: Mapping[int, Mapping[str, Any]], got: Mapping[int, Mapping[str, Any]]
-) -> Iterator[Difference]:
+def _compare(expected: _Cells, got: _Cells, first: int) -> GoldenResult:
+    """Compare two tables column by column; ``got`` has every column. The differences of the first scans are kept."""
+    left, right = ({seq: k for k, seq in enumerate(side["seq"])} for side in (expected, got))
+    shared = sorted(left.keys() & right.keys())
+    places: list[Sequence[int]] = [[side[seq] for seq in shared] for side in (left, right)]
+    if shared == list(left) == list(right):
+        places = [range(len(shared))] * 2
+    alone = sorted(left.keys() ^ right.keys())
     declared = {c.name: c for c in columns()}
-    lacking = [n for n in declared if any(n not in r for r in (*expected.values(), *got.values()))]
-    yield from (_lacking(name, expected, got) for name in lacking)
-    for seq in sorted(expected.keys() | got.keys()):
-        if seq not in got:
-            yield Difference(seq, "row", "present", ABSENT)
-        elif seq not in expected:
-            yield Difference(seq, "row", ABSENT, "present")
-        else:
-            yield from _row_differences(seq, expected[seq], got[seq], declared)
+    lacking = [name for name in declared if ABSENT in expected.get(name, [ABSENT] * len(left))]
+    counts = {"row": len(alone)} | dict.fromkeys(lacking, 1)
+    kept = [(seq, 0, Difference(seq, "row", *_stated(seq in left))) for seq in alone[:first]]
+    for order, name in enumerate((*sorted(expected.keys() - declared.keys()), *declared), 1):
+        column = declared.get(name)
+        a, b = (_picked(side, name, at) for side, at in zip((expected, got), places, strict=True))
+        found = [k for k in _differing(column, a, b) if column is None or a[k] is not ABSENT]
+        counts[name] = counts.get(name, 0) + len(found)
+        kept += [(shared[k], order, _difference(column, shared[k], name, a[k], b[k])) for k in found[:first]]
+    whole = [Difference(None, name, *_stated(False)) for name in lacking]
+    listed = [*whole, *(difference for *_, difference in sorted(kept, key=itemgetter(0, 1)))]
+    by_column = {name: count for name, count in counts.items() if count}
+    return GoldenResult(len(shared), tuple(listed[:first]), sum(by_column.values()), by_column)
 
 
-def _lacking(name: str, expected: Mapping[int, Mapping[str, Any]], got: Mapping[int, Mapping[str, Any]]) -> Difference:
-    left, right = (ABSENT if any(name not in row for row in side.values()) else "present" for side in (expected, got))
-    return Difference(None, name, left, right)
+def _picked(side: _Cells, name: str, places: Sequence[int]) -> Sequence[Any]:
+    column = side.get(name) or [ABSENT] * len(side["seq"])
+    return column if places == range(len(column)) else [column[k] for k in places]
 
 
-def _row_differences(
-    seq: int, expected: Mapping[str, Any], got: Mapping[str, Any], declared: Mapping[str, Column]
-) -> Iterator[Difference]:
-    extra = sorted((expected.keys() | got.keys()) - declared.keys())
-    for name in extra:
-        yield Difference(seq, name, expected.get(name, ABSENT), got.get(name, ABSENT))
-    for name, column in declared.items():
-        if name in expected and name in got:
-            difference = _cell(seq, column, expected[name], got[name])
-            if difference is not None:
-                yield difference
+def _stated(expected: bool) -> tuple[str, str]:
+    return ("present", ABSENT) if expected else (ABSENT, "present")
 
 
-def _cell(seq: int, column: Column, expected: Any, got: Any) -> Difference | None:
-    tolerance = None
-    if _is_number(expected) and (column.rtol or column.atol):
-        tolerance = column.atol + column.rtol * abs(expected)
-    if _agree(expected, got, tolerance):
-        return None
-    return Difference(seq, column.name, expected, got, tolerance)
+def _differing(column: Column | None, expected: Sequence[Any], got: Sequence[Any]) -> list[int]:
+    """The places at which two columns differ."""
+    kinds = {*map(type, expected), *map(type, got)}
+    if column and (column.rtol or column.atol) and kinds <= {float, int, NoneType}:
+        a, b = (np.array(side, dtype=np.float64) for side in (expected, got))
+        near = np.abs(b - a) <= column.atol + column.rtol * np.abs(a)
+        known = np.isfinite(a), np.isfinite(b)
+        return np.flatnonzero(~np.where(known[0] & known[1], near, known[0] == known[1])).tolist()
+    pairs = enumerate(zip(expected, got, strict=True))
+    if any(kinds <= {kind, NoneType} for kind in (str, int, bool)):
+        return [k for k, (a, b) in pairs if a != b]
+    return [k for k, (a, b) in pairs if not _agree(plain(a), plain(b), _tolerance(column, a))]
+
+
+def _difference(column: Column | None, seq: int, name: str, expected: Any, got: Any) -> Difference:
+    expected, got = plain(expected), plain(got)
+    return Difference(seq, name, expected, got, _tolerance(column, expected))
+
+
+def _tolerance(column: Column | None, expected: Any) -> float | None:
+    if column and (column.rtol or column.atol) and _is_number(expected):
+        return float(column.atol + column.rtol * abs(expected))
+    return None
 
 
 def _agree(expected: Any, got: Any, tolerance: float | None) -> bool:
