@@ -50,18 +50,17 @@ _BLOCKS, _IN_BLOCK, _LEAST_BLOCKS, _LEAST_RUNS, _RESAMPLES = 10, 5, 5, 5, 9999
 
 
 def _scanwise(
-    column: str, of: Callable[[Array], Array] = np.square, *, healthy: bool = False
+    column: str, band: tuple[float, float] | None = None, *, healthy: bool = False
 ) -> Callable[[Sequence[Row]], Array]:
+    """A column squared, or whether it is inside a band; NaN where a scan has no value or is not to count."""
+
     def value(rows: Sequence[Row]) -> Array:
         found = values(rows, column)
         known = np.isfinite(found) & (values(rows, "gamma") == 1.0 if healthy else True)
-        return np.where(known, of(found), np.nan)
+        figures = np.square(found) if band is None else (band[0] <= found) & (found <= band[1])
+        return np.where(known, figures, np.nan)
 
     return value
-
-
-def _inside(band: tuple[float, float]) -> Callable[[Array], Array]:
-    return lambda v: ((band[0] <= v) & (v <= band[1])).astype(np.float64)
 
 
 _ROOTS = {  # metrics that are the root of a mean over scans
@@ -75,29 +74,22 @@ _ROOTS = {  # metrics that are the root of a mean over scans
 _MEANS = {  # metrics that are a mean over scans
     "healthy_ratio": lambda rows: values(rows, "gamma"),
     "false_alarm_rate": lambda rows: np.where([bool(r.fault) for r in rows], np.nan, 1.0 - values(rows, "gamma")),
-    "nis_inside": _scanwise("nis", _inside(NIS_BAND), healthy=True),
-    "nees_inside": _scanwise("nees", _inside(NEES_BAND)),
+    "nis_inside": _scanwise("nis", NIS_BAND, healthy=True),
+    "nees_inside": _scanwise("nees", NEES_BAND),
 }
 
 
 class ComparedRun(Protocol):
-    """What a comparison needs of a saved result."""
+    """What a comparison needs of a saved result: its name, rows (one per scan), their summary and ``run.json``."""
 
     @property
-    def name(self) -> str:
-        """What the run is called."""
-
+    def name(self) -> str: ...  # noqa: D102
     @property
-    def rows(self) -> Sequence[Row]:
-        """One per scan."""
-
+    def rows(self) -> Sequence[Row]: ...  # noqa: D102
     @property
-    def summary(self) -> Summary:
-        """Of the same rows."""
-
+    def summary(self) -> Summary: ...  # noqa: D102
     @property
-    def header(self) -> Mapping[str, Any]:
-        """``run.json``."""
+    def header(self) -> Mapping[str, Any]: ...  # noqa: D102
 
 
 @dataclass(frozen=True, slots=True)
