@@ -74,8 +74,8 @@ def is_closed(vertices: Array, faces: Faces) -> bool:
 def outward(vertices: Array, faces: Faces) -> tuple[Faces, int]:
     """Wind the faces consistently and outwards.
 
-    Within a part that is not consistent, the fewer faces are reversed. Then closed parts are reversed whose volume is
-    negative, unless they are a cavity inside another closed part. Open parts have no outer side.
+    Within a part that is not consistent, the fewer faces are reversed. Then closed parts with a negative volume are
+    reversed, unless they are a cavity inside another closed part. Open parts have no outer side.
 
     Args:
         vertices: (n, 3) [m].

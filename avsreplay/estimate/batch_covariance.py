@@ -127,9 +127,9 @@ def _profile(
 ) -> tuple[ProfilePoint | None, int]:
     """The fit with the direction fixed where the cost has risen by ``_RISE``: the best of ``_TRIES``, from ``side`` on.
 
-    A fit that ends far above that begins again nearer to the minimum: it did not follow the valley of the cost. None if
-    no fit came near within ``most`` steps: its covariance would not be that of a point in the valley. Also returned is
-    the number of steps.
+    A fit that ends far above that begins again nearer to the minimum: it did not follow the valley of the cost. The
+        result is None if no fit came near within ``most`` steps, because its covariance would not be that of a point in
+        the valley. The number of steps is returned as well.
     """
     there, found, spent = fitted.chart.moved(side * axis), [], 0
     for _ in range(_TRIES):

@@ -298,8 +298,8 @@ def forecast_of(times_s: Array, variances: Array) -> Forecast:
 def grasp_prediction(belief: Belief, times_s: Array, torque: float, force: float) -> tuple[Array, Array] | None:
     """Variances (n, 3) of the grasp point's position, velocity and half-angle attitude, and its motion (n, 10).
 
-    The motion is position [m], velocity [m/s] in {A}, and attitude q_ac. None where the target would turn by more than
-    ``MOST_RAD``.
+    The motion is position [m], velocity [m/s] in {A}, and attitude q_ac. The result is None where the target would turn
+    by more than ``MOST_RAD``.
 
     Args:
         belief: mean and covariance now.

@@ -161,8 +161,8 @@ def _camera(clouds: Sequence[Array]) -> Array:
 
     Scans that were moved toward the origin do not show where the camera was, only that it is the same place for all
     of them. It is then taken as far away along one line of sight: a surface is sampled in proportion to the cosine of
-    its inclination to that line, so the mean square of the cosine is largest along it. Of the two ends of the line the
-    one is chosen from which the surfaces are convex on average, because a camera sees the outside of the target.
+    its inclination to that line, so the mean square of the cosine is largest along it. The camera is at the end of the
+    line from which the surfaces are convex on average, because it sees the outside of the target.
     """
     extents = [extent_of(points) for points in clouds]
     distances = [float(np.linalg.norm(points.mean(axis=0))) for points in clouds]

@@ -64,7 +64,7 @@ def cache_path(folder: Path, layout: int | str, vertices: Array, faces: NDArray[
 
 
 Checksum = Callable[[NDArray[np.uint8]], int]
-"""Of the kernel: zlib's CRC-32 takes five times as long."""
+"""The checksum of the kernel, because zlib's CRC-32 takes five times as long."""
 
 
 def header(payload: bytes | NDArray[np.uint8], checksum: Checksum) -> bytes:

@@ -239,8 +239,8 @@ class _Cells:
 def robust_noise(distance: Array) -> float:
     """Return the standard deviation of a normal error with magnitudes ``distance`` (n,), outliers among them.
 
-    First the least of the estimates from the 30 % to the 90 % quantile: outliers only raise them, by a factor of three
-    if they are 60 %. Then the median of the magnitudes within three standard deviations.
+    The first estimate is the least of those from the 30 % to the 90 % quantile; outliers only raise them, by a factor
+    of three if they are 60 %. The result uses the median of the magnitudes within three standard deviations.
     """
     ordered = np.sort(distance)
     noise = float(np.min(np.interp(LEVELS * (len(ordered) - 1), np.arange(len(ordered)), ordered) / NORMAL_QUANTILES))

@@ -269,7 +269,7 @@ def _until_next(marks: Iterable[Mark], next_ns: int | None) -> Iterable[Mark]:
 
 
 def _nexts(labels: Sequence[Label]) -> list[int | None]:
-    """Of each label, when the next one after its end begins."""
+    """The begin of the next label after the end of each label."""
     starts = sorted(label.start_ns for label in labels)
     places = [bisect_left(starts, max(label.end_ns, label.start_ns + 1)) for label in labels]
     return [starts[k] if k < len(starts) else None for k in places]

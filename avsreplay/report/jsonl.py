@@ -214,7 +214,7 @@ def _checked_at_once(block: bytes, lines: int) -> list[Row] | None:
 def _decoder() -> Callable[[bytes], list[Row] | None] | None:
     """Decodes JSON lines into rows and checks names, types and ranges, without a call for each cell.
 
-    The function returns None where a line does not pass. None in its place where msgspec is not installed.
+    The function returns None where a line does not pass. Where msgspec is not installed, None takes its place.
     """
     try:
         import msgspec
