@@ -79,7 +79,11 @@ class RunConfig(Settings):
         return self.robot.described(self.plan, self.limits)
 
     def approach_limits(self, extent_m: float) -> Limits:
-        """The limits of every plan with those of the robot; lengths that are not set follow from the extent [m]."""
+        """Return the limits of every plan with those of the robot.
+
+        Args:
+            extent_m: diagonal of the target's bounding box [m]; lengths that are not set are proportional to it.
+        """
         return self.robot.limited(self.limits).resolved(extent_m)
 
     def check(self) -> None:
