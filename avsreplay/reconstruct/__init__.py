@@ -16,12 +16,14 @@ are read several times, one by one: memory holds thinned views and the full poin
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Pose
 from avsreplay.reconstruct.fusion import (
+    MOST_THROUGH,
     all_poses,
     contradicting,
     fused,
@@ -43,6 +45,7 @@ from avsreplay.reconstruct.tracking import (
     FreeMotion,
     ReconstructionParams,
     Tracked,
+    ambiguous,
     free_motion,
     track,
     twists,
@@ -67,7 +70,7 @@ __all__ = [
 WEAKEST = 1e-3  # below this ratio of the eigenvalues of a registration, a surface leaves three directions open
 AS_WELL = 1.01  # free motion replaces the refined poses if it increases the rms between scans by no more than this
 STILL_RAD = np.radians(5.0)  # a target that turned by less is at rest
-MOST_ROUNDS = 3  # times views that contradict the others are left out and the poses are refined again
+MOST_ROUNDS = 6  # times views that contradict the others are left out and the poses are refined again
 MOST_FUSED = 150  # scans whose points are averaged; more are thinned evenly
 Scans = Callable[[], Iterable[Scan]]
 
@@ -84,8 +87,9 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
         The model in {C}, with poses of the scans that were used.
 
     Raises:
-        UnreadableInput: fewer than three usable scans, steps between scans that are too large, or a target that did not
-            turn or has no shape that determines its pose; the message states which.
+        UnreadableInput: fewer than three usable scans, steps between scans that are too large, scans that contradict
+            one another, or a target that did not turn or has no shape that determines its pose; the message
+            states which.
     """
     p = params or ReconstructionParams()
     survey = surveyed(scans, p.fewest_points, p.n_scans)
@@ -97,7 +101,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
     for _ in range(MOST_ROUNDS):
         better, keys, rms, gate = refined(views, tracked, p, survey.extent)
         poses = all_poses(better, tracked, keys, p, survey.extent)
-        wrong = contradicting(better, poses, p, survey.extent)
+        wrong, through = contradicting(better, poses, p, survey.extent)
         if not wrong:
             break
         left_out += len(wrong)
@@ -106,6 +110,9 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
     turned, coverage = turn_and_coverage([views[k] for k in poses], list(poses.values()))
     _refuse_undetermined(turned, tracked.weakest)
     motion = free_motion([views[k].t_ns for k in sorted(poses)], [poses[k] for k in sorted(poses)], survey.extent)
+    _refuse_contradictions(bool(wrong), through, motion is not None)
+    if motion is None:
+        _refuse_unconfirmed(better, replace(tracked, poses=poses), p, survey.extent)
     if motion is not None:
         motion = joint_motion(better, sorted(keys), motion, gate, survey.extent)
         moved = _on_motion(views, poses, motion)
@@ -128,7 +135,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
         poses=found,
         used=len(found),
         offered=survey.offered,
-        searches=tracked.searches,
+        searches=len(tracked.searched),
         coverage=coverage,
         turn_deg=float(np.degrees(turned)),
         rms_m=rms,
@@ -183,6 +190,28 @@ def _refuse_few(tracked: Tracked, views: Sequence[ScanView]) -> None:
         turn = f"only {len(tracked.poses)} of {len(views)} scans could be registered to one another"
         hint = "the steps between scans are too large, or too much of the target is hidden: record more scans"
         raise UnreadableInput(turn, hint=hint)
+
+
+def _refuse_contradictions(wrong: bool, through: float, free: bool) -> None:
+    if wrong or through > MOST_THROUGH[not free]:
+        what = "the scans contradict one another at every pose that was found:"
+        what += f" {100.0 * through:.1f} % of the surface that others show is seen through"
+        hint = "steps between scans are too large, or other objects are in view: record more scans, or crop the target"
+        raise UnreadableInput(what, hint=hint)
+
+
+def _refuse_unconfirmed(views: Sequence[ScanView], tracked: Tracked, p: ReconstructionParams, extent: float) -> None:
+    """Poses that follow no free motion must be those of most scans, and the only ones at which the scans fit."""
+    what = (
+        f"only {len(tracked.poses)} of {len(views)} scans agree with one another, and their poses follow no free motion"
+    )
+    if 2 * len(tracked.poses) > len(views):
+        if not ambiguous(views, tracked, p, extent):
+            return
+        what = (
+            f"the poses of {len(tracked.searched)} scans come from a search, and the scans fit at other poses as well"
+        )
+    raise UnreadableInput(what, hint="record smaller steps between scans, or give a model with --model FILE")
 
 
 def _on_motion(views: Sequence[ScanView], poses: dict[int, Pose], motion: FreeMotion) -> dict[int, Pose]:

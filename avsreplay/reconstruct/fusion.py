@@ -40,6 +40,7 @@ MERGED_REACH = 0.03  # their largest distance as a share of the extent
 MOST_SIGHTS = 60  # scans that are tested for rays through a point
 MOST_ASKED = 3000  # points of the model that are compared with one view
 LEAST_SHOWN = 0.8  # share of the model's visible points that a view must show, in units of the median of all views
+MOST_THROUGH = (0.03, 0.01)  # share of them that half of the views may have seen through: of a free motion, of others
 MOST_STEPS = 10  # evaluations of the motion that minimises the distances between views
 LEAST_DAMPING, LEAST_GAIN = 1e-3, 1e-4  # damping; relative improvement of the rms that ends the steps
 SUPPORT = 5  # least number of the ten nearest points that continue the surface of a point from one scan
@@ -228,12 +229,13 @@ def all_poses(
 
 def contradicting(
     views: Sequence[ScanView], poses: dict[int, Pose], p: ReconstructionParams, extent: float
-) -> list[int]:
+) -> tuple[list[int], float]:
     """Views without the surface that faces them by all other views: their poses are wrong, or they show another object.
 
     Points of the joint model that face a view and that nothing hides must be in it. A pose that is wrong puts the
     surfaces of other views where this one has measured something farther away, or nothing. The share of the points that
-    are there is compared with the median over all views, because a scanner may lose returns everywhere.
+    are there is compared with the median over all views, because a scanner may lose returns everywhere. Surface that a
+    view has seen through, with a return from farther away, cannot be there whatever the scanner loses.
 
     Args:
         views: of the log.
@@ -242,23 +244,28 @@ def contradicting(
         extent: of the target [m].
 
     Returns:
-        The numbers of the views with less than LEAST_SHOWN of the median share.
+        The numbers of the views with less than LEAST_SHOWN of the median share, and the share of the points in their
+        direction that a view has seen through, in the median over all views.
     """
-    model = patchwork(views, Tracked(poses, sorted(poses), 0, 0, []), p.thin * extent)
+    model = patchwork(views, Tracked(poses, sorted(poses), [], 0, []), p.thin * extent)
     every, reach = max(1, len(model.points) // MOST_ASKED), 0.03 * extent
-    shown = []
+    shown, through = [], []
     for k in sorted(poses):
         q, n = poses[k].apply(model.points[::every]), model.normals[::every] @ poses[k].R.T
         lines, measured = views[k].camera - q, np.linalg.norm(views[k].points - views[k].camera, axis=1)
         far = np.linalg.norm(lines, axis=1)
         facing = np.einsum("ni,ni->n", n, lines) > 0.5 * far
         off, nearest = views[k].rays.query(-lines[facing] / far[facing, None])
-        behind = far[facing] - measured[nearest]
+        behind = measured[nearest] - far[facing]
         hit = np.asarray(off) * far[facing] <= reach
-        hidden, there = hit & (behind > reach), hit & (np.abs(behind) <= reach)
-        shown.append(float(there.sum()) / max(int((~hidden).sum()), 1))
+        hidden, there, seen = (
+            int((hit & where).sum()) for where in (behind < -reach, abs(behind) <= reach, behind > reach)
+        )
+        shown.append(there / max(len(hit) - hidden, 1))
+        through.append(seen / max(seen + there, 1))
     least = LEAST_SHOWN * float(np.median(shown))
-    return [k for k, share in zip(sorted(poses), shown, strict=True) if share < least]
+    wrong = [k for k, share in zip(sorted(poses), shown, strict=True) if share < least]
+    return wrong, float(np.median(through))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -133,6 +133,9 @@ MOST_VIOLATING = 0.12  # share of points that may lie in the free space in front
 GRAZING = np.cos(np.radians(70.0))  # least cosine of the inclination to a line of sight for a test of free space
 MOST_TESTED = 600  # points of a scan in one test of free space
 SEARCH_EVERY = 6  # while the target is lost, all attitudes are searched for two scans of this many
+MOST_CONFIRMED = 6  # scans whose pose a search has found that are searched again in the complete model
+RIVAL = 0.8  # such a pose is ambiguous if another one explains this share of the points that it explains
+DISTINCT_RAD = np.radians(60.0)  # starts nearer to the pose mostly lead back to it
 MOST_RETRIES = 20  # lost scans that are tried again at the end
 KEY_TURN_RAD = np.radians(7.0)  # a scan seen from a direction that differs by this from all key scans becomes one
 
@@ -160,11 +163,11 @@ class ReconstructionParams:
 
 @dataclass(slots=True, eq=False)
 class Tracked:
-    """Poses by number of the view, key views, searches made, scans lost in a row, ``weakest`` of every match."""
+    """Poses by number of the view, key views, views found by a search, scans lost in a row, ``weakest`` of a match."""
 
     poses: dict[int, Pose]
     keys: list[int]
-    searches: int
+    searched: list[int]
     lost: int
     weakest: list[float]
 
@@ -172,7 +175,7 @@ class Tracked:
 def track(views: Sequence[ScanView], p: ReconstructionParams, extent: float) -> Tracked:
     """Register every view against the model that the key views before it give; then try the lost ones once more."""
     origin = views[0].points.mean(axis=0)
-    found = Tracked({0: Pose(geometry.IDENTITY_QUAT, origin)}, [0], 0, 0, [])
+    found = Tracked({0: Pose(geometry.IDENTITY_QUAT, origin)}, [0], [], 0, [])
     model = patchwork(views, found, p.thin * extent)
     for k in range(1, len(views)):
         model = _tracked(views, found, k, model, p, extent)
@@ -196,11 +199,12 @@ def _tracked(
     guess = _predicted(views, found, k, extent)
     match = registered(views[k], model, guess, p.reach * extent, extent)
     if not _accepted(match, guess, views, found, k, model, extent):
-        found.searches += 1
-        match = _searched(views, found, k, model, guess, p, extent)
-    if not _accepted(match, guess, views, found, k, model, extent):
-        found.lost += 1
-        return model
+        searched = _searched(views, found, k, model, guess, p, extent)
+        if searched is None:
+            found.lost += 1
+            return model
+        match = searched
+        found.searched.append(k)
     found.lost = 0
     found.poses[k] = match.T_ac
     found.weakest.append(match.weakest)
@@ -267,7 +271,7 @@ def _searched(
     guess: Pose,
     p: ReconstructionParams,
     extent: float,
-) -> Match:
+) -> Match | None:
     """The best acceptable match from turned guesses: first about the prediction, then over all attitudes."""
     turned = [near_attitudes(guess.q)]
     if found.lost % SEARCH_EVERY < 2:
@@ -277,7 +281,32 @@ def _searched(
             fine = registered(views[k], model, start, p.reach * extent, extent)
             if _accepted(fine, guess, views, found, k, model, extent):
                 return fine
-    return Match(guess, 0.0, float("inf"), 0.0)
+    return None
+
+
+def ambiguous(views: Sequence[ScanView], found: Tracked, p: ReconstructionParams, extent: float) -> bool:
+    """Whether most of the views whose pose a search has found fit the complete model at another pose as well.
+
+    A search finds one of several poses of a target that looks alike from different sides, and a model that was joined
+    at a wrong one of them looks alike from both.
+
+    Args:
+        views: of the log.
+        found: their poses after the refinement.
+        p: resolution.
+        extent: of the target [m].
+    """
+    known = [k for k in found.searched if k in found.poses]
+    known = known[:: max(1, -(-len(known) // MOST_CONFIRMED))]
+    model, count = patchwork(views, replace(found, keys=sorted(found.poses)), p.thin * extent), 0
+    for k in known:
+        own = found.poses[k]
+        least = RIVAL * registered(views[k], model, own, p.reach * extent, extent).ratio
+        others = [q for q in sampling.attitudes(400) if turn(Pose(q, own.t), own) > DISTINCT_RAD]
+        starts = best_starts(views[k], model, np.array(others), 2.0 * p.reach * extent, extent)
+        fine = [registered(views[k], model, start, p.reach * extent, extent) for start in starts]
+        count += any(match.ratio > least and turn(match.T_ac, own) > 0.5 * DISTINCT_RAD for match in fine)
+    return 2 * count > len(known)
 
 
 def _new_side(keys: Sequence[Pose], T_ac: Pose) -> bool:
