@@ -354,3 +354,10 @@ def test_a_manoeuvre_that_is_withdrawn_is_not_listed(make_rows):
     rows = make_rows(10)
     rows[3] = dataclasses.replace(rows[3], manoeuvres=1, manoeuvre_s=0.3, manoeuvre_mps=0.02)
     assert Summary.fold(rows).velocity_changes == ()
+
+
+@pytest.mark.parametrize(("sigma", "reported"), [(1e-6, True), (3e-6, False)])
+def test_a_drift_is_reported_where_it_exceeds_two_standard_deviations(make_rows, sigma, reported):
+    rows = make_rows(5)
+    rows[-1] = dataclasses.replace(rows[-1], drift_s=2.0, drift_mps2=5e-6, drift_1s_mps2=sigma)
+    assert (Summary.fold(rows).drift is not None) == reported

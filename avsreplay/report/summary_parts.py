@@ -78,7 +78,7 @@ class Drifting:
 
     @classmethod
     def of(cls, row: Row) -> Drifting | None:
-        """Return the drift known at a row, None where there is none.
+        """Return the drift known at a row; None where there is none that exceeds 2 standard deviations.
 
         Args:
             row: the last row of a run.
@@ -86,7 +86,9 @@ class Drifting:
         if row.drift_s is None:
             return None
         found = (row.drift_1s_s, row.drift_mps2, row.drift_1s_mps2, row.drift_radps2, row.drift_1s_radps2)
-        return cls(row.drift_s, *(value or 0.0 for value in found))
+        drift = cls(row.drift_s, *(value or 0.0 for value in found))
+        force, torque = drift.force_mps2 > 2.0 * drift.force_1s_mps2, drift.torque_radps2 > 2.0 * drift.torque_1s_radps2
+        return drift if force or torque else None
 
     def __str__(self) -> str:
         parts = [
