@@ -178,3 +178,22 @@ def test_an_impossible_robot_is_one_line(tmp_path, text, what):
     ended = CliRunner().invoke(config_command, ["--robot", str(robot)])
     assert isinstance(ended.exception, UsageError)
     assert what in str(ended.exception)
+
+
+@pytest.mark.parametrize(
+    ("command", "output", "format_"),
+    [("record", "x.bag", "MCAP"), ("model", "m.obj", "PLY"), ("model", "m.STL", "PLY")],
+)
+def test_a_name_that_states_another_format_is_refused(cli, tmp_path, fixtures_folder, command, output, format_):
+    done = cli(command, fixtures_folder / "tumble.mcap", "-o", tmp_path / output)
+    assert done.code == 2
+    assert f"the format is {format_}" in done.err
+    assert not (tmp_path / output).exists()
+
+
+def test_a_scenario_and_a_result_are_no_logs(cli, tmp_path, fixtures_folder):
+    scenario = cli("run", fixtures_folder / "tumble.toml")
+    assert (scenario.code, "make a log of it: avsreplay record" in scenario.err) == (3, True)
+    assert cli("run", fixtures_folder / "tumble.mcap", "--n-scans", 2, "-o", tmp_path / "r").code == 0
+    result = cli("info", tmp_path / "r")
+    assert (result.code, "is the result of a run, not a log" in result.err) == (3, True)

@@ -177,3 +177,16 @@ def test_what_a_search_needs_is_kept_with_the_index_and_made_again_if_damaged(
         data[len(data) // 2] ^= 1
         path.write_bytes(bytes(data))
     assert _searched(Registrar(surface)) == built
+
+
+def test_arrays_that_another_program_wrote_are_ignored(tmp_path):
+    def checksum(payload):
+        return int(np.asarray(payload, np.uint64).sum())
+
+    path = tmp_path / "x.avsindex"
+    index_cache.write_arrays(path, {"a": np.arange(300.0)}, checksum)
+    payload = bytearray(index_cache.read(path, checksum).tobytes())
+    payload[1000] ^= 1
+    index_cache.write(path, bytes(payload), checksum)
+    assert index_cache.read(path, checksum) is not None
+    assert index_cache.read_arrays(path, checksum) == {}

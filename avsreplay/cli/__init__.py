@@ -249,8 +249,9 @@ def _standard_output() -> _Discarding | None:
     if sys.stdout is None:  # closed by the shell
         sys.stdout = io.StringIO()
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+        with contextlib.suppress(OSError, ValueError):
+            if isinstance(stream, io.TextIOWrapper):
+                stream.reconfigure(errors="backslashreplace")
     try:
         output = _Discarding(sys.stdout.fileno(), "wb", closefd=False)
     except (OSError, ValueError):  # one that a test has put in its place

@@ -136,7 +136,7 @@ class Tally:
 BENCH_EPILOG = """\b
 Examples:
   avsreplay bench tumble.mcap
-  avsreplay bench tumble.mcap --backends horn,small_gicp --scans 200
+  avsreplay bench tumble.mcap --backends horn,small_gicp --n-scans 200
   avsreplay bench own.bag --model target.stl --topic /camera/points --json
 
 \b
@@ -149,7 +149,12 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input."""
 @click.option("--model", type=click.Path(path_type=Path), help="Model of the target, if the log has none.")
 @click.option("--topic", help="The cloud topic, where there are several.")
 @click.option(
-    "--scans", default=50, show_default=True, type=click.IntRange(1), help="Number of scans, from the first one on."
+    "--n-scans",
+    "scans",
+    default=50,
+    show_default=True,
+    type=click.IntRange(1),
+    help="Number of scans, from the first one on.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 def bench_command(log: Path, backends: str, model: Path | None, topic: str | None, scans: int, as_json: bool) -> None:

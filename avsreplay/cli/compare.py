@@ -241,7 +241,7 @@ def _print(
     for table in _tables(groups, conclusions, outcomes, show_all=show_all):
         print_table(console, table)
     for group, conclusion in zip(groups[1:], conclusions, strict=True):
-        if conclusion.divergence:
+        if conclusion.divergence and not conclusion.divergence.ok:
             print_line(console, divergence_line(groups[0].name, group.name, conclusion.divergence))
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, Numbers, read_options, source_options, tracked
+from avsreplay.cli.options import PATH, Numbers, check_suffix, read_options, source_options, tracked
 from avsreplay.errors import MissingBackend, UsageError
 
 if TYPE_CHECKING:
@@ -69,6 +69,7 @@ def model_command(
 
     for each in (output, mesh):
         if each is not None:
+            check_suffix(each, ".ply")
             check_output(each, overwrite=overwrite)
     if mesh is not None and find_spec("open3d") is None:
         hint = "pip install 'avsreplay[open3d]'"

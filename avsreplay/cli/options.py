@@ -17,6 +17,7 @@ import click
 
 from avsreplay.cli.config import source_setting
 from avsreplay.errors import AvsError, UnreadableInput, UsageError
+from avsreplay.files import is_stream
 
 if TYPE_CHECKING:
     from avsreplay.log import GrowingLog, SourceOptions
@@ -168,6 +169,14 @@ def log_file(log: Path, *, follow: bool = False) -> Iterator[tuple[Path, Growing
             if path.is_file() and not path.stat().st_size and "broke off" not in error.what:
                 error.what, error.hint = "no data", "see the message of the program that writes to the pipe"
             raise
+
+
+def check_suffix(path: Path, suffix: str) -> None:
+    """Raise UsageError if the name of an output states another format than ``suffix``; devices may have any name."""
+    if path.suffix.lower() not in ("", suffix) and not is_stream(path):
+        raise UsageError(
+            f"the format is {suffix[1:].upper()}", where=str(path), hint=f"name a file that ends in {suffix}"
+        )
 
 
 def check_binary_output(output: Path) -> None:

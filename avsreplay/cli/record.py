@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, check_binary_output, read_options, read_result, source_options, tracked
+from avsreplay.cli.options import (
+    PATH,
+    check_binary_output,
+    check_suffix,
+    read_options,
+    read_result,
+    source_options,
+    tracked,
+)
 from avsreplay.errors import DataLost, UnreadableInput, UsageError
 from avsreplay.files import STDOUT, check_output
 from avsreplay.report import export
@@ -97,6 +105,7 @@ def record_command(
         fault_seed=seed or 0,
     )
     check_binary_output(output)
+    check_suffix(output, ".mcap")
     done = record(source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
     text = json.dumps(dataclasses.asdict(done), indent=2) if as_json else _sentence(done)
     click.echo(text, err=str(output) == "-")

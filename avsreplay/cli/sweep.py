@@ -185,9 +185,9 @@ def _plan_text(plan: Expansion) -> str:
 
 def _print(summary: SweepSummary, campaign: Path) -> None:
     from avsreplay.report.table import make_console, print_line, print_table
-    from avsreplay.sweep.page import cell_table, detector_table, kinds_table, worst_table
+    from avsreplay.sweep.page import KIND_PARTS, cell_table, columns_of, detector_table, kinds_table, worst_table
 
-    console = make_console(plain_width=120)
+    console = make_console()
     status = ", ".join(f"{count} {word}" for word, count in summary.status.items())
     print_line(console, f"{summary.name}: {summary.done} of {summary.planned} runs done ({status or 'none'})")
     cells = [(number, cell) for number, cell in enumerate(summary.cells) if cell.runs]
@@ -195,8 +195,10 @@ def _print(summary: SweepSummary, campaign: Path) -> None:
         print_table(console, cell_table(number, cell))
     if summary.detector is not None and summary.detector.harmful:
         print_table(console, detector_table(summary.detector))
-    print_table(console, kinds_table(cells), tight=True)
+    kinds = kinds_table(cells)
+    for part in KIND_PARTS:  # side by side they are wider than 80 columns
+        print_table(console, columns_of(kinds, part), tight=True)
     if summary.worst:
-        print_table(console, worst_table(summary.worst), tight=True)
-        run = summary.worst[0].id
+        print_table(console, worst_table(summary.worst, digits=8))
+        run = summary.worst[0].id[:8]
         click.echo(f"to make one again: avsreplay sweep {campaign} --run {run} -o worst/ --report")

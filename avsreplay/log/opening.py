@@ -62,6 +62,8 @@ def open_source(
 def _opened(path: Path, options: SourceOptions, inspect: bool, upto: int | None) -> Source:
     if not path.exists():
         raise UnreadableInput("no such file", where=shown(path), hint="check the path")
+    if (path / "run.json").is_file():
+        raise UnreadableInput("is the result of a run, not a log", where=shown(path), hint="name the log")
     if options.poses and path.is_file() and not _is_log(path):
         return _open_pose_file(path, options)
     if path.is_dir() and not _is_bag_folder(path):
@@ -115,8 +117,7 @@ def _cloud_topic(recording: Recording, options: SourceOptions, path: Path) -> st
     if not clouds:
         raise _no_clouds(recording, path, what)
     if wanted is None and len(clouds) > 1:
-        hint = f"choose one with --topic: {_named(clouds)}"
-        raise UsageError(f"{len(clouds)} {what} topics", where=shown(path), hint=hint)
+        raise UsageError(f"{len(clouds)} {what} topics", where=shown(path), hint=f"choose a --topic: {_named(clouds)}")
     chosen = next(t for t in clouds if wanted in (None, t.name))
     if chosen.encoding not in ("cdr", "ros1"):
         what = f"topic '{shown(chosen.name)}' has the unknown encoding '{shown(chosen.encoding)}'"
@@ -142,8 +143,7 @@ def _no_clouds(recording: Recording, path: Path, what: str) -> UnreadableInput:
 
 
 def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tuple[Loss, ...]]:
-    lost = list[Loss]()
-    header = LogHeader()
+    lost, header = list[Loss](), LogHeader()
     if HEADER_RECORD in recording.metadata:
         try:
             header = decode_header(recording.metadata[HEADER_RECORD])
@@ -181,14 +181,17 @@ def _pose_header(header: LogHeader, options: SourceOptions) -> LogHeader:
     return replace(header, surface=surface)
 
 
-def _is_log(path: Path) -> bool:
-    """Return whether a file starts like a log."""
+def _head(path: Path) -> bytes:
     try:
         with path.open("rb") as file:
-            head = file.read(16)
+            return file.read(16)
     except OSError as error:
         raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
-    return head.startswith((MAGIC, b"#ROSBAG", b"\x28\xb5\x2f\xfd")) or head == SQLITE_MAGIC
+
+
+def _is_log(path: Path) -> bool:
+    """Return whether a file starts like a log."""
+    return _head(path).startswith((MAGIC, b"#ROSBAG", b"\x28\xb5\x2f\xfd", SQLITE_MAGIC))
 
 
 def _open_pose_file(path: Path, options: SourceOptions) -> Source:
@@ -198,9 +201,7 @@ def _open_pose_file(path: Path, options: SourceOptions) -> Source:
         UnreadableInput: it is not a pose file, or has no valid pose.
         UsageError: a topic was requested.
     """
-    for flag, value in (("--topic", options.topic), ("--truth-topic", options.truth_topic)):
-        if value is not None:
-            raise UsageError("a pose file has no topics", where=f"{shown(path)}, {flag}", hint="leave it out")
+    _refuse_topics("a pose file", path, options)
     poses = streams.PoseFile(path, options.scan_rate_hz)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     header = LogHeader(
@@ -213,9 +214,14 @@ def _open_pose_file(path: Path, options: SourceOptions) -> Source:
     return Source(path, poses, _pose_header(header, options), options, truth, files=[path])
 
 
+def _refuse_topics(what: str, path: Path, options: SourceOptions) -> None:
+    for flag, value in (("--topic", options.topic), ("--truth-topic", options.truth_topic)):
+        if value is not None:
+            raise UsageError(f"{what} has no topics", where=f"{shown(path)}, {flag}", hint="leave it out")
+
+
 _STORAGE = (".mcap", ".db3")
 _LISTED = re.compile(r"^\s*-\s*(?:path:\s*)?[\"']?([^\"'\n]+?\.(?:mcap|db3)(?:\.zstd)?)[\"']?\s*$", re.MULTILINE)
-_MAX_METADATA = 4 << 20
 
 
 def _is_bag_folder(path: Path) -> bool:
@@ -232,11 +238,7 @@ def _open_recording(path: Path, limit: int, sinks: dict[str, Sink], upto: int | 
 
 
 def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = None) -> Recording:
-    try:
-        with path.open("rb") as file:
-            head = file.read(16)
-    except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+    head = _head(path)
     if head.startswith(ROS1_MAGIC):
         return Ros1Bag(path, limit, sinks)
     if head == SQLITE_MAGIC:
@@ -247,6 +249,8 @@ def _file(path: Path, limit: int, sinks: dict[str, Sink], upto: int | None = Non
         raise UnreadableInput("a zstd-compressed file", where=shown(path), hint="unpack it first: zstd -d")
     if not head.startswith(MAGIC) and path.suffix.lower() in (".ply", ".pcd", ".bin", ".npy", ".npz"):
         raise UnreadableInput("a single scan, not a log", where=shown(path), hint="give the folder it is in")
+    if not head.startswith(MAGIC) and path.suffix == ".toml":
+        raise UnreadableInput("a scenario, not a log", where=shown(path), hint="make a log of it: avsreplay record")
     return McapFile(path, limit, sinks, upto=upto)
 
 
@@ -270,21 +274,16 @@ def _files(path: Path) -> tuple[list[Path], list[Loss]]:
     metadata = path / "metadata.yaml"
     if not metadata.is_file():
         return there, []
-    text = metadata.read_bytes()[:_MAX_METADATA].decode("utf-8", "backslashreplace")
+    text = metadata.read_bytes()[: 4 << 20].decode("utf-8", "backslashreplace")
     listed = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
-    losses = [
-        Loss("a file named in the metadata of the bag is missing", 0, 0, file=name)
-        for name in listed
-        if not (path / name).is_file()
-    ]
-    packed = [name for name in listed if name.endswith(".zstd") and (path / name).is_file()]
-    if packed:
-        raise UnreadableInput("a zstd-compressed bag file", where=shown(path / packed[0]), hint="unpack it: zstd -d")
     named = [path / name for name in listed if (path / name).is_file()]
+    missing = [name for name in listed if path / name not in named]
+    losses = [Loss("a file named in the metadata of the bag is missing", 0, 0, file=name) for name in missing]
+    if packed := [file for file in named if file.suffix == ".zstd"]:
+        raise UnreadableInput("a zstd-compressed bag file", where=shown(packed[0]), hint="unpack it: zstd -d")
     return (named or there), losses
 
 
-_POSE_FILES = ("*.conf", "*.tum", "poses.txt")
 _TIME_FILE = "times.txt"
 _STAMPED = re.compile(r"^\d{9,10}\.\d+$|^\d{16,19}$")
 
@@ -300,9 +299,7 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
         UnreadableInput: there are no scans, or a pose or time file cannot be read.
         UsageError: a topic was requested, or there are several pose files and none was chosen.
     """
-    for flag, value in (("--topic", options.topic), ("--truth-topic", options.truth_topic)):
-        if value is not None:
-            raise UsageError("a folder of scans has no topics", where=f"{shown(path)}, {flag}", hint="leave it out")
+    _refuse_topics("a folder of scans", path, options)
     pose_file = options.truth_file or _pose_file(path)
     by_name = read_conf(pose_file) if pose_file is not None and pose_file.suffix == ".conf" else {}
     found = read_poses(pose_file) if pose_file is not None and not by_name else None
@@ -318,10 +315,13 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
 
 
 def _pose_file(path: Path) -> Path | None:
-    found = sorted({p for pattern in _POSE_FILES for p in path.glob(pattern) if p.is_file()})
+    found = sorted({p for pattern in ("*.conf", "*.tum", "poses.txt") for p in path.glob(pattern) if p.is_file()})
     if len(found) > 1:
-        names = ", ".join(shown(p.name) for p in found)
-        raise UsageError(f"several pose files: {names}", where=shown(path), hint="choose one with --truth")
+        raise UsageError(
+            f"several pose files: {', '.join(shown(p.name) for p in found)}",
+            where=shown(path),
+            hint="choose one with --truth",
+        )
     return found[0] if found else None
 
 

@@ -13,8 +13,10 @@ import io
 import os
 import sys
 import tempfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,8 +91,11 @@ def read_arrays(path: Path | None, checksum: Checksum) -> dict[str, Array]:
     payload = None if path is None else read(path, checksum)
     if payload is None:
         return {}
-    with np.load(io.BytesIO(payload.tobytes()), allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+    try:
+        with np.load(io.BytesIO(payload.tobytes()), allow_pickle=False) as arrays:
+            return {name: arrays[name] for name in arrays.files}
+    except (BadZipFile, zlib.error, ValueError, EOFError, OSError):  # another program wrote it
+        return {}
 
 
 def write_arrays(path: Path | None, arrays: dict[str, Array], checksum: Checksum) -> None:

@@ -183,9 +183,7 @@ def update_golden(path: str | Path, rows: Iterable[Row], *, first: int = 20) -> 
 
 
 def divergence_line(baseline: str, other: str, found: GoldenResult) -> str:
-    """Where the rows of two runs first differ, in one line."""
-    if found.ok:
-        return f"{other}: all {found.rows} rows agree with {baseline} within the columns' tolerances"
+    """Where the rows of two runs that differ first do so, in one line."""
     first = found.differences[0]
     scan = "every scan" if first.seq is None else f"scan {first.seq}"
     line = f"{other}: {found.count} cells differ from {baseline}, first at {scan}, column {first.column}"

@@ -290,8 +290,9 @@ def worst_moments(rows: Sequence[Row]) -> list[Moment]:
     """The five worst intervals: without a used scan, or with an error or NIS that stands out; no two overlap."""
     kept: list[Moment] = []
     for _, moment in sorted(_moments(rows), key=lambda item: -item[0]):
-        apart = (moment.end_s < other.start_s or other.end_s < moment.start_s for other in kept)
-        if len(kept) < MOMENTS and all(apart):
+        if len(kept) == MOMENTS:
+            break
+        if all(moment.end_s < other.start_s or other.end_s < moment.start_s for other in kept):
             kept.append(moment)
     return kept
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from markupsafe import Markup
@@ -23,6 +24,7 @@ _KIND_HEADS = (
     *("fault", "no.", "strength,\nlength", "scans\nflagged", "windows\nfound", "delay,\nworst", "recovery,\nworst"),
     *("lost", "worst\nflagged", "worst\nused", "worst\nafter"),
 )
+KIND_PARTS = ((0, 1, 2, 3, 4, 5, 6, 7), (0, 1, 8, 9, 10))  # columns: what was found and when; errors
 _KINDS_TEXT = """No.: the combination. None: the scans outside every window; what is flagged there is a false alarm.
 ~: harmless by its label. Found: windows with a flagged scan or, without any scan, a gap. Delay: from a window's first
 scan to its first flagged one [s], median and worst. Recovery: from the first scan after it to the first healthy one
@@ -53,13 +55,20 @@ def build_sweep_page(summary: SweepSummary) -> str:
     return build_html(summary.name, [_status_line(summary)], parts)
 
 
-def worst_table(worst: Sequence[WorstRun]) -> Table:
-    """A row per run that did not end well or has the largest errors, and how to make it again."""
+def worst_table(worst: Sequence[WorstRun], digits: int | None = None) -> Table:
+    """A row per run that did not end well or has the largest errors, with ``digits`` of its id (all if None)."""
     rows = tuple(
-        (run.id, str(run.cell), str(run.repeat), "" if run.seed is None else str(run.seed), run.status, run.reason)
+        (
+            run.id[:digits],
+            str(run.cell),
+            str(run.repeat),
+            "" if run.seed is None else str(run.seed),
+            run.status,
+            run.reason,
+        )
         for run in worst
     )
-    return Table("Worst runs", ("run", "combination", "repeat", "seed", "status", "reason"), rows, "lrrrl", wide=True)
+    return Table("Worst runs", ("run", "no.", "repeat", "seed", "status", "reason"), rows, "nrrrnl", wide=True)
 
 
 def words(values: Mapping[str, Any]) -> str:
@@ -96,17 +105,19 @@ def cell_table(number: int, cell: Cell) -> Table:
     rows: list[tuple[str, ...]] = []
     for name, found in cell.metrics.items():
         if found is not None:
-            points = (f"{v:.4g}" for v in (found.q05, found.median, found.q95))
+            points = (f"{v:.3g}" for v in (found.q05, found.median, found.q95))
             rows.append(
-                (HEADLINES[name], str(found.count), *points, _interval(found.median_low, found.median_high, ".4g"))
+                (HEADLINES[name], str(found.count), *points, _interval(found.median_low, found.median_high, ".3g"))
             )
     for name, share in cell.rates.items():
         if share is not None:
             span = _interval(share.low, share.high, ".1%")
             rows.append((name, f"{share.successes}/{share.count}", "", f"{share.share:.1%}", "", span))
     if cell.nees is not None:
-        nees, band = cell.nees, f"1 expected; {cell.nees.low:.3f} to {cell.nees.high:.3f}"
-        rows.append(("NEES per state at the end (mean)", str(nees.count), "", f"{nees.mean_per_dof:.3f}", "", band))
+        nees, band = cell.nees, f"{cell.nees.low:.3f} to {cell.nees.high:.3f}"
+        rows.append(
+            ("NEES per state at the end, 1 expected", str(nees.count), "", f"{nees.mean_per_dof:.3f}", "", band)
+        )
     title = f"{number}: {words(cell.values)} ({cell.runs} runs)"
     return Table(title, ("metric", "runs", "5 %", "median", "95 %", "95 % interval"), tuple(rows))
 
@@ -210,6 +221,12 @@ def kinds_table(cells: Sequence[tuple[int, Cell]]) -> Table:
     title = "By kind of fault: times in s, errors in mm and deg; ~: harmless by its label; none: outside every window"
     injected = any(cell.kinds.keys() - {NONE} for _, cell in cells)
     return Table(title, _KIND_HEADS, tuple(_kind_rows(cells)) if injected else (), wide=True)
+
+
+def columns_of(table: Table, kept: Sequence[int]) -> Table:
+    """Some columns of a table."""
+    heads, align = tuple(table.heads[k] for k in kept), "".join(table.letter(k) for k in kept)
+    return replace(table, heads=heads, align=align, rows=tuple(tuple(row[k] for k in kept) for row in table.rows))
 
 
 def _kind_rows(cells: Sequence[tuple[int, Cell]]) -> Iterator[tuple[str, ...]]:

@@ -12,6 +12,7 @@ import argparse
 import gc
 import json
 import os
+import sys
 import tempfile
 import threading
 from pathlib import Path
@@ -77,6 +78,7 @@ def main() -> int:
             rows += replay_once(number, log, folder)
             if (number + 1) % max(runs // SAMPLES, 1) == 0:
                 samples.append(sample())
+                print(f"{number + 1} runs: {samples[-1]}", file=sys.stderr, flush=True)
     growth = grown(samples)
     print(json.dumps({"runs": runs, "rows": rows, "samples": samples, "grown": growth}, indent=1))
     return 1 if growth else 0
