@@ -116,20 +116,18 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
     """
     header = header or {}
     extent_m = (header.get("model") or {}).get("extent_m")
-    stopped = header.get("interrupted_after")
+    stopped, checks = header.get("interrupted_after"), header.get("preflight") or ()
     outside = [Concern(Grade.CHECK, f"the replay was interrupted after {stopped} scans")] if stopped else []
     found = (
         _use(rows, summary),
         _errors(rows, extent_m),
         _faults(summary, extent_m),
         _filter(rows, summary),
-        _data(
-            rows, summary, clock_known=any(a["text"].startswith("time stamps") for a in header.get("preflight") or ())
-        ),
+        _data(rows, summary, clock_known=any(a["text"].startswith("time stamps") for a in checks)),
     )
     judged = list(chain.from_iterable(found))
     worst = Grade.FAIL if any(reason.grade is Grade.FAIL for reason in judged) else Grade.CHECK
-    for advice in header.get("preflight") or ():
+    for advice in checks:
         # a wrong unit or size explains the other reasons, so that it stands before them
         outside.append(Concern(worst if advice["grade"] == "fail" else Grade.CHECK, advice["text"]))
     reasons = sorted((*outside, *judged), key=lambda reason: reason.grade is not Grade.FAIL)
