@@ -1,9 +1,10 @@
-"""Wrong poses are rejected, correct ones are not: noise, contrast, free space, and the budget of a scan."""
+"""Wrong poses are rejected, correct ones are not: noise, contradictions, and the work that a scan may cost."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+import trimesh
 
 from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
@@ -66,10 +67,30 @@ def test_a_model_in_front_of_the_measured_surface_is_in_free_space(surface: Surf
     scan = hidden_view(surface, T_ac, 3000, rng)
     part = scan[scan[:, 0] < np.quantile(scan[:, 0], 0.4)]
     others = scan[scan[:, 0] >= np.quantile(scan[:, 0], 0.4)]
-    assert test.check(part, T_ac.inverse(), scan).violated < 0.1
+    assert test.check(part, T_ac.inverse(), scan).contradicted < 0.1
     behind = np.vstack([part, others * 1.6])
-    assert test.check(part, T_ac.inverse(), behind).violated > 0.3
-    assert "free space" in test.check(part, T_ac.inverse(), behind).reason
+    assert test.check(part, T_ac.inverse(), behind).contradicted > 0.5
+    assert "pass through it" in test.check(part, T_ac.inverse(), behind).reason
+
+
+def test_a_shift_along_a_direction_that_few_points_determine_is_contradicted(surface: Surface) -> None:
+    """Nearly all points stay on a long box that is shifted along its axis: its small end alone shows the shift."""
+    made = trimesh.creation.box((4.0, 1.0, 0.3))
+    box = Surface(np.array(made.vertices), np.array(made.faces, dtype=np.int32), "box", "")
+    index, visibility = SurfaceIndex.build(box, 0.6), Visibility(box)
+    test, rng = PlausibilityTest(box, index, visibility, 0.04), np.random.default_rng(SEED)
+    T_ac = Pose(exp(np.array([0.5, 0.6, 0.1])), np.array([0.0, 0.0, 12.0]))
+    scan = T_ac.apply(view(box, 3000, T_ac.inverse().t))  # convex, so that no part hides another
+    scan = scan + rng.normal(0.0, 0.005, scan.shape)
+    other = T_ac.apply(rng.uniform([-3.4, -0.4, -0.1], [-2.6, 0.4, 0.1], (len(scan) // 4, 3)))
+    both = np.vstack([scan, other])
+    assert test.check(both, T_ac.inverse()).reason == ""
+    for shift in (-0.3, -0.2, 0.2, 0.3):
+        wrong = (T_ac @ Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([shift, 0.0, 0.0]))).inverse()
+        found = test.check(both, wrong)
+        assert np.mean(test.measure(scan, wrong) < 0.04) > 0.8
+        assert found.contradicted > 0.4
+        assert "contradicts the pose" in found.reason
 
 
 @pytest.mark.parametrize("guess_deg", [0.1, 3.0])

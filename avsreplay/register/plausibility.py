@@ -1,21 +1,26 @@
-"""Tests that a registered pose must pass before it is called aligned, beyond the inlier ratio.
+"""Test that a registered pose must pass before it is called aligned, beyond the inlier ratio.
 
-A pose can be wrong and still have many inliers: in a local minimum, among outliers, on a wall. Four quantities
-separate such poses from correct ones. They do not use the guess, so they also hold after a global search.
+A pose can be wrong and still have many inliers: in a local minimum, among outliers, on a wall, or shifted along a
+direction that few points determine. One score compares what supports a pose with what contradicts it, in the direction
+of motion in which the pose is supported least. It does not use the guess, so it also holds after a global search.
 
-Noise
-    Robust standard deviation of the distances to the model, from their smaller quantiles: correct for up to 60 % of
-    outliers. A wrong pose spreads the distances.
-Contrast
-    Points within three standard deviations of the surface over points within the next three. Outliers alone, or a
-    surface that crosses the model, give a ratio near one.
-Free-space violation
-    Share of the model surface that should be visible, but through which the rays of the scan passed: the points
-    measured in that direction lie behind it. Applied only where the camera position is known
-    (``Visibility.camera_c``).
-Missing surface
-    Share of that surface in free space or in a direction without any point. A pose is rejected for it only if a part of
-    the scan is also not on the model, because the field of view may end there.
+Support
+    The points on the model, within w: three standard deviations of the noise, at least the gate.
+Contradictions
+    Points beside the model, between w and 2 w. Outliers, and a surface that crosses the model, give as many of them as
+    points on the model by chance.
+    Free space: model surface that should be visible, but lies where rays of the scan passed through, because the points
+    measured in that direction are behind it.
+    Missing surface: model surface in directions without any point, up to the number of points off the model. A field of
+    view that ends gives the first alone, a second object the second alone.
+
+Each of them has the information J'J, J = [p x n, n], of its points. The score is the largest generalized eigenvalue of
+the information of the contradictions and of that of everything without the points beside the model, because as many
+are on it by chance. Model surface counts with as many points as the same area that is in the scan has. Free space and
+missing surface are known only if the position of the camera is (``Visibility.camera_c``).
+
+The noise is the robust standard deviation of the distances to the model, from their smaller quantiles: correct for up
+to 60 % of outliers. A wrong pose spreads the distances, and above a limit no pose is accepted.
 """
 
 from __future__ import annotations
@@ -31,6 +36,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.quality import Visibility, not_measured
 from avsreplay.register.sampling import sample
+from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import SurfaceIndex
 
 SURFACE_POINTS = 1500
@@ -38,9 +44,10 @@ LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance
 NORMAL_QUANTILES = np.array([0.38532, 0.52440, 0.67449, 0.84162, 1.03643, 1.28155, 1.64485])  # for a standard normal
 REFINEMENTS = 2
 NOISE_OF_EXTENT = 0.012  # with more noise than this no pose is accepted
-LEAST_CONTRAST, LEAST_CONTRAST_OF_PART = 6.0, 15.0  # the second if more than MOST_MISSING of the points are off
-MOST_VIOLATED = 0.15  # largest violated share of the surface that is either supported or violated
-MOST_MISSING = 0.1  # largest missing share, if at least as large a share of the scan is not on the model
+MOST_CONTRADICTED = 0.4  # largest score of a pose that is accepted
+CHANCE = 0.01  # share of the points on the model, spread over all directions, that is added to the support
+MOST_MISSING = 0.1  # largest share of the visible surface that is missing in a complete scan
+CONTRADICTIONS = ("points beside the model", "rays that pass through it", "surface that is not in the scan")
 LEAST_SCAN_OF_EXTENT = 0.05  # a smaller scan is about as large as the rejection distance, and any face explains it
 SIZED_POINTS = 200  # points of the scan that nearly always suffice to show that it is larger
 LEAST_COMPARED = 30  # with fewer surface points the test has no power
@@ -48,28 +55,24 @@ LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of 
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
 POINTS_PER_CELL = 8.0
 GRID = 4096
+NEIGHBOUR, EMPTY, SPACED = 8, 2.5, 500  # for the density of rays; no ray within so many spacings: nothing was measured
+AMONG, SURROUNDED = 4, 2.0  # nearest rays, all of them within so many spacings: not beyond the border of the scan
 
 
 @dataclass(frozen=True, slots=True)
 class Plausibility:
-    """What the tests found at a pose.
+    """What the test found at a pose.
 
     Attributes:
         noise_m: robust standard deviation of the distances to the model [m].
-        contrast: points within 3 noise_m over points between 3 and 6 noise_m.
-        violated: share of the model surface that lies in free space; 0 if the camera position is unknown.
-        missing: share that lies in free space or where the scan has no point; 0 if the camera position is unknown.
+        contradicted: the score, between 0 and about 1.
         covered: enough of the model surface was compared, and little of it is missing.
-        unexplained: share of the points that are not on the model.
         reason: why the pose is rejected, "" if it is plausible.
     """
 
     noise_m: float
-    contrast: float
-    violated: float
-    missing: float
+    contradicted: float
     covered: bool
-    unexplained: float
     reason: str
 
 
@@ -78,8 +81,6 @@ class PlausibilityTest:
 
     def __init__(self, surface: Surface, index: SurfaceIndex, visibility: Visibility, gate_m: float) -> None:
         self._index, self._visibility, self._gate, self._extent = index, visibility, gate_m, surface.extent
-        # distances to a cloud contain the spacing of its points, which has a longer tail than noise
-        self._contrast_of_part = LEAST_CONTRAST_OF_PART if len(surface.faces) else LEAST_CONTRAST
         self._points, self._normals = sample(surface, SURFACE_POINTS)
         self._points = self._points[:: max(1, len(self._points) // SURFACE_POINTS)]
         self._normals = self._normals[: len(self._points)]
@@ -113,25 +114,40 @@ class PlausibilityTest:
             points: (n, 3) in {A} [m], n >= 1: the scan, or the part of it that may be the target; a few thousand points
                 are enough.
             T_ca: the pose to be tested.
-            scene: (m, 3) in {A} [m], the whole scan, for contrast and free space; ``points`` if None.
+            scene: (m, 3) in {A} [m], the whole scan, for the points beside the model and the rays; ``points`` if None.
 
         Returns:
-            The quantities and the reason of a rejection.
+            The score and the reason of a rejection.
         """
         camera_c = self._visibility.camera_c(self._index, points, T_ca)
-        distance = self.measure(points, T_ca)
-        noise = robust_noise(distance)
-        width = max(self._gate, 3.0 * noise)
-        inner = int(np.count_nonzero(distance < width))
-        around = distance if scene is None else self.measure(scene, T_ca)
-        on, near = (int(np.count_nonzero(around < factor * width)) for factor in (1.0, 2.0))
-        contrast = on / max(1, near - on)
+        noise = robust_noise(self.measure(points, T_ca))
         rays = np.asarray(points if scene is None else scene, dtype=np.float64)
-        free = None if camera_c is None else self._not_supported(rays, T_ca, noise)
-        violated, missing = free or (0.0, 0.0)
-        covered = free is not None and missing <= MOST_MISSING
-        found = Plausibility(noise, contrast, violated, missing, covered, 1.0 - inner / len(points), "")
-        return replace(found, reason=self._reason(found))
+        width = max(self._gate, 3.0 * noise)
+        p = T_ca.apply(rays)
+        found = self._index.closest(p, camera_c=camera_c, most_m=min(2.0 * width, self._index.reach_m))
+        on = found.d2 < width**2
+        if np.count_nonzero(on) < LEAST_COMPARED:
+            return Plausibility(noise, 1.0, False, f"fewer than {LEAST_COMPARED} of its points are on the model")
+        beside = ~on & (found.d2 < (2.0 * width) ** 2)
+        jacobian = _Jacobian(p[on])
+        support = jacobian.information(p[on], found.normal[on])
+        against, covered = [jacobian.information(p[beside], found.normal[beside])], False
+        compared = None if camera_c is None else self._compared(Rays(rays), T_ca, noise)
+        if compared is not None:
+            held, violated, empty = compared
+            each = np.count_nonzero(on) / max(1, held)  # points of the scan for a point of the surface
+            paired = min(each, np.count_nonzero(~on) / max(1, len(empty)))
+            for weight, k in ((each, violated), (paired, empty)):
+                against.append(weight * jacobian.information(self._points[k], self._normals[k]))
+            absent = len(violated) + len(empty)
+            covered = absent <= MOST_MISSING * (held + absent)
+        score, kind = _contradicted(support, np.array(against), CHANCE * np.count_nonzero(on))
+        reason = ""
+        if noise > NOISE_OF_EXTENT * self._extent:
+            reason = f"distances to the model spread by {noise:.3g} m"
+        elif score > MOST_CONTRADICTED:
+            reason = f"in one direction {100.0 * score:.0f} % contradicts the pose: {CONTRADICTIONS[kind]}"
+        return Plausibility(noise, score, covered, reason)
 
     def measure(self, points: NDArray[Any], T_ca: Pose) -> Array:
         """Return the distances (n,) [m] of points (n, 3) in {A} to the visible faces, at most the reach."""
@@ -139,28 +155,16 @@ class PlausibilityTest:
         d2 = self._index.closest(T_ca.apply(points), camera_c=camera_c).d2
         return np.asarray(np.sqrt(np.minimum(d2, self._index.reach_m**2)))
 
-    def _reason(self, found: Plausibility) -> str:
-        if found.noise_m > NOISE_OF_EXTENT * self._extent:
-            return f"distances to the model spread by {found.noise_m:.3g} m"
-        if found.contrast < (self._contrast_of_part if found.unexplained > MOST_MISSING else LEAST_CONTRAST):
-            return f"only {found.contrast:.1f} times as many points on the surface as beside it"
-        if found.violated > MOST_VIOLATED:
-            return f"{100.0 * found.violated:.0f} % of the visible model surface lies in free space"
-        if min(found.missing, found.unexplained) > MOST_MISSING:
-            off, missing = 100.0 * found.unexplained, 100.0 * found.missing
-            return (
-                f"{off:.0f} % of the points are not on the model and {missing:.0f} % of its surface is not in the scan"
-            )
-        return ""
+    def _compared(self, rays: Rays, T_ca: Pose, noise: float) -> tuple[int, NDArray[np.intp], NDArray[np.intp]] | None:
+        """How many of the visible surface points the scan has, those in free space, and those where it has no point.
 
-    def _not_supported(self, points: Array, T_ca: Pose, noise: float) -> tuple[float, float] | None:
-        """Shares of the visible surface that rays passed through, and missing; None with too few points to compare."""
+        None with too few to compare.
+        """
         from scipy.spatial import cKDTree
 
-        T_ac = T_ca.inverse()
-        image = _Image(points)
+        T_ac, points = T_ca.inverse(), rays.points
         surface, normals = T_ac.apply(self._points), self._normals @ T_ac.R.T
-        cells, expected = self._expected(image, surface, normals)
+        expected = self._expected(_Image(points), surface, normals)
         if not len(expected):
             return None
         tree = cKDTree(points)
@@ -168,25 +172,44 @@ class PlausibilityTest:
         near = max(self._gate, 3.0 * noise, 3.0 * spacing)
         supported = np.asarray(tree.query(surface[expected])[0]) < near
         missing = expected[~supported]
-        limits = np.linalg.norm(surface[missing], axis=1) + 2.0 * near
-        behind, empty = image.share_behind(cells, cells.of(surface[missing]), limits)
-        held, violated = int(np.count_nonzero(supported)), int(np.count_nonzero(behind >= 0.5))
-        absent = violated + int(np.count_nonzero(empty))
-        if held + violated < LEAST_COMPARED:
+        passed, empty = rays.through(surface[missing], 2.0 * near)
+        held = int(np.count_nonzero(supported))
+        if held + np.count_nonzero(passed) < LEAST_COMPARED:
             return None
-        return violated / (held + violated), absent / (held + absent)
+        return held, missing[passed], missing[empty]
 
-    def _expected(self, image: _Image, surface: Array, normals: Array) -> tuple[_Cells, NDArray[np.intp]]:
-        """The cells of the image, and the surface points (in {A}) that the camera should see."""
+    def _expected(self, image: _Image, surface: Array, normals: Array) -> NDArray[np.intp]:
+        """Which surface points (n, 3) in {A} the camera should see."""
         ranges = np.linalg.norm(surface, axis=1)
         cosine = -np.einsum("ij,ij->i", normals, surface) / ranges
         facing = np.flatnonzero((cosine > 0.02) & image.in_front(surface))
-        cells = _Cells(image, surface[facing])
-        _, cell = np.unique(cells.of(surface[facing]), return_inverse=True)
+        _, cell = np.unique(image.cells(surface[facing]), return_inverse=True)
         nearest = np.full(cell.max(initial=-1) + 1, np.inf)
         np.minimum.at(nearest, cell.reshape(-1), ranges[facing])
         visible = ranges[facing] < nearest[cell.reshape(-1)] + HIDDEN_OF_EXTENT * self._extent
-        return cells, facing[visible & (cosine[facing] > LEAST_COSINE)]
+        return np.asarray(facing[visible & (cosine[facing] > LEAST_COSINE)])
+
+
+class _Jacobian:
+    """Rows J of points of the model about the centroid of some of them, rotations in units of their rms radius."""
+
+    def __init__(self, points: Array) -> None:
+        self._centre = points.mean(axis=0)
+        self._radius = max(float(np.sqrt(np.mean((points - self._centre) ** 2) * 3.0)), np.finfo(float).tiny)
+
+    def information(self, points: Array, normals: Array) -> Array:
+        """Return the sum of J'J (6, 6) over points (n, 3) with normals (n, 3)."""
+        J = normal_jacobian((points - self._centre) / self._radius, normals)
+        return np.asarray(J.T @ J)
+
+
+def _contradicted(support: Array, against: Array, chance: float) -> tuple[float, int]:
+    """The largest generalized eigenvalue, and which of the contradictions (k, 6, 6) has the largest part in it."""
+    both = support + against[1:].sum(axis=0) + chance * np.eye(6)
+    W = np.linalg.inv(np.linalg.cholesky(both))
+    values, vectors = np.linalg.eigh(W @ against.sum(axis=0) @ W.T)
+    u = W.T @ vectors[:, -1]
+    return float(values[-1]), int(np.argmax(u @ against @ u))
 
 
 class _Image:
@@ -196,44 +219,63 @@ class _Image:
         towards = np.median(points, axis=0)
         towards /= np.linalg.norm(towards)
         self._axes = np.vstack([np.linalg.svd(towards[None])[2][1:], towards])
-        self._points = points[self.in_front(points)]
 
     def in_front(self, points: Array) -> NDArray[np.bool_]:
         """Return which points are within 70 deg of the viewing direction."""
         return np.asarray(points @ self._axes[2] > 0.34 * np.linalg.norm(points, axis=1))
 
-    def plane(self, points: Array) -> Array:
-        """Coordinates (n, 2) in the tangent plane."""
+    def cells(self, points: Array) -> NDArray[np.int64]:
+        """Return the number of the cell of each point (n, 3); a cell has about ``POINTS_PER_CELL`` of them."""
         turned = points @ self._axes.T
-        return np.asarray(turned[:, :2] / turned[:, 2:])
-
-    def share_behind(self, cells: _Cells, wanted: NDArray[np.int64], limits: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Share of the scan points in each wanted cell whose range exceeds the limit, and which cells have no point."""
-        codes, ranges = cells.of(self._points), np.linalg.norm(self._points, axis=1)
-        order = np.argsort(codes, kind="stable")
-        codes, ranges = codes[order], ranges[order]
-        first, last = np.searchsorted(codes, wanted), np.searchsorted(codes, wanted, side="right")
-        counts = last - first
-        which = np.repeat(np.arange(len(wanted)), counts)
-        member = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(first, counts)
-        behind = np.bincount(which, ranges[member] > limits[which], len(wanted))
-        return np.asarray(behind / np.maximum(counts, 1)), counts == 0
-
-
-class _Cells:
-    """Square cells of an image with about ``POINTS_PER_CELL`` of the given points each."""
-
-    def __init__(self, image: _Image, points: Array) -> None:
-        plane = image.plane(points) if len(points) else np.zeros((1, 2))
+        plane = turned[:, :2] / turned[:, 2:]
+        if not len(plane):
+            return np.zeros(0, dtype=np.int64)
         area = float(np.prod(np.maximum(np.ptp(plane, axis=0), 1e-9)))
-        self._size = max(np.sqrt(area * POINTS_PER_CELL / len(plane)), 1e-9)
-        self._low, self._image = plane.min(axis=0), image
-
-    def of(self, points: Array) -> NDArray[np.int64]:
-        """Number of the cell of each point; all cells outside the image share the border."""
-        k = np.floor((self._image.plane(points) - self._low) / self._size) + 1.0
-        k = np.clip(k, 0.0, GRID - 1.0).astype(np.int64)
+        size = max(np.sqrt(area * POINTS_PER_CELL / len(plane)), 1e-9)
+        k = np.minimum((plane - plane.min(axis=0)) / size, GRID - 1.0).astype(np.int64)
         return np.asarray(k[:, 0] * GRID + k[:, 1])
+
+
+class Rays:
+    """The points (n, 3) of a scan in {A} [m] by their directions.
+
+    Attributes:
+        points: those that are finite and not at the sensor, whose directions are not known.
+        ranges: (n,) [m].
+        tree: of the directions; None with too few.
+        spacing: angle between neighbouring rays [rad].
+    """
+
+    def __init__(self, points: Array) -> None:
+        """Find the directions and their spacing."""
+        from scipy.spatial import cKDTree
+
+        ranges = np.linalg.norm(points, axis=1)
+        known = np.isfinite(ranges) & (ranges > 0.0)
+        self.points, self.ranges = points[known], ranges[known]
+        self.tree, self.spacing = None, np.inf
+        if len(self.points) <= NEIGHBOUR:
+            return
+        directions = self.points / self.ranges[:, None]
+        self.tree = cKDTree(directions)
+        few = directions[:: max(1, len(directions) // SPACED)]
+        apart = np.asarray(self.tree.query(few, k=NEIGHBOUR + 1)[0])[:, -1]
+        self.spacing = float(np.median(apart)) * np.sqrt(np.pi / NEIGHBOUR)
+
+    def through(self, points: Array, behind_m: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return through which points (k, 3) in {A} rays passed, and which are in directions without rays.
+
+        Args:
+            points: where the model should be.
+            behind_m: rays passed through if the nearest ``AMONG`` were all measured so far behind, and all are near.
+        """
+        far = np.linalg.norm(points, axis=1)
+        if self.tree is None or not len(points):
+            return np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
+        angle, k = (np.asarray(each) for each in self.tree.query(points / far[:, None], k=AMONG))
+        empty = angle[:, 0] > EMPTY * self.spacing
+        near = angle[:, -1] < SURROUNDED * self.spacing
+        return near & (self.ranges[k] > (far + behind_m)[:, None]).all(axis=1), empty
 
 
 def robust_noise(distance: Array) -> float:

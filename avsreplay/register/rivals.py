@@ -26,7 +26,7 @@ from avsreplay.register.backend import Target
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
 from avsreplay.register.params import AcquireParams
-from avsreplay.register.plausibility import PlausibilityTest
+from avsreplay.register.plausibility import EMPTY, PlausibilityTest, Rays
 from avsreplay.register.sampling import sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import kernel_module
@@ -47,7 +47,6 @@ LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
 STEPS = 24  # steps from a mark towards the camera
-NEIGHBOUR, EMPTY, SPACED = 8, 2.5, 500  # for the density of rays; no ray within so many spacings: nothing was measured
 MOST_POINTS, SCREENED = 6000, 150  # points of the scan; those on and off the model with which all motions are compared
 FINALISTS = 2  # poses of each kind of motion that are refined
 
@@ -144,12 +143,9 @@ class NearSymmetry:
             others: other poses that explain the scan; with None only a pose that explains more of it is sought.
             complete: the visible side of the model is complete in the scan, so that empty directions count.
         """
-        points = np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64)
-        away = np.linalg.norm(points, axis=1)
-        points = points[np.isfinite(away) & (away > 0.0)]  # a point at the sensor has no direction
-        if not len(points):
+        rays = Rays(np.asarray(scan[:: max(1, len(scan) // MOST_POINTS)], dtype=np.float64))
+        if not len(rays.points):
             return T_ca, others or []
-        rays = _Rays(points)
         turned = self._turned(rays, T_ca, others is None)
         if others is None and not turned:
             return T_ca, []
@@ -206,7 +202,7 @@ class NearSymmetry:
         d2 = self._target.index.closest(moved.reshape(-1, 3), most_m=most_m).d2
         return np.sqrt(np.minimum(d2, most_m**2)).reshape(len(motions), -1)
 
-    def _turned(self, rays: _Rays, T_ca: Pose, better: bool) -> list[Pose]:
+    def _turned(self, rays: Rays, T_ca: Pose, better: bool) -> list[Pose]:
         """The best poses that the near-symmetries give, registered with the points off the model in their number.
 
         Of equal ones those are taken at which fewer than ``LEAST_RAYS`` rays pass through a mark. ``better``: only
@@ -233,10 +229,10 @@ class NearSymmetry:
                     break
         return [self._search.refined(part, start, width) for start in kept]
 
-    def _measured(self, rays: _Rays, T_ca: Pose) -> Contradicted:
+    def _measured(self, rays: Rays, T_ca: Pose) -> Contradicted:
         return Contradicted(T_ca, self._test.measure(rays.points, T_ca), *self._passed(rays, T_ca))
 
-    def _passed(self, rays: _Rays, T_ca: Pose) -> tuple[float, float]:
+    def _passed(self, rays: Rays, T_ca: Pose) -> tuple[float, float]:
         """Rays that passed through marks that should be visible at a pose, and those expected where nothing is."""
         seen = self._visible(T_ca)
         if not len(seen) or rays.tree is None:
@@ -267,22 +263,6 @@ class NearSymmetry:
             hidden[inside] |= distance < 0.25 * self._gate
             at[inside] += np.maximum(distance, 0.5 * self._gate)
         return seen[~hidden]
-
-
-class _Rays:
-    """The points (n, 3) of a scan in {A} [m] by their directions: ranges [m], tree (None: too few), spacing [rad]."""
-
-    def __init__(self, points: Array) -> None:
-        from scipy.spatial import cKDTree
-
-        self.points, self.ranges = points, np.linalg.norm(points, axis=1)
-        self.tree, self.spacing = None, np.inf
-        if len(points) <= NEIGHBOUR:
-            return
-        directions = points / self.ranges[:, None]
-        self.tree = cKDTree(directions)
-        apart = np.asarray(self.tree.query(directions[:: max(1, len(points) // SPACED)], k=NEIGHBOUR + 1)[0])[:, -1]
-        self.spacing = float(np.median(apart)) * np.sqrt(np.pi / NEIGHBOUR)
 
 
 def decides(better: Contradicted, other: Contradicted, width_m: float, complete: bool) -> bool:

@@ -79,8 +79,8 @@ void apply(const Store& s, const Step& step, double* T) {
 
 // Decides between Newton's and Horn's step after the plane passes. A Newton step stands while the sum of min(d^2, gate^2)
 // over the scan falls; else it is undone, Horn's step, which cannot raise the sum, is made in its place, and the next
-// Newton steps are limited to a quarter of the one that failed (a trust region). Once that is below `eps_m`, only Horn's steps
-// are made.
+// Newton steps are limited to a quarter of the one that failed (a trust region). Once that is below `eps_m`, only Horn's
+// steps are made.
 class Newton {
  public:
   struct Choice {
