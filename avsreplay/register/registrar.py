@@ -28,6 +28,7 @@ TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 LEAST_TO_TURN = 0.2  # with fewer inliers, rotated starts do not lead to the pose
 SURE_RATIO = 0.9  # after a search with fewer inliers another one follows
 NO_MOTION: Array = np.zeros((6, 0))
+PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
 
 
@@ -189,6 +190,8 @@ class Registrar:
         if rivals:
             words = turn_words(found.T_ac.inverse() @ rivals[0].inverse())
             found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
+        elif found.status is AlignStatus.DEGENERATE and self._visibility.sided and not at.covered:
+            found = replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=PART_ONLY)
         return found, alone
 
     def _rivals(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> list[Pose]:
@@ -254,9 +257,9 @@ class Registrar:
     def _far(self, guess: Pose, found: Alignment) -> bool:
         """A measured pose so far from the guess that another local minimum may be better."""
         angle = float(geometry.angle((guess.inverse() @ found.T_ac).q))
-        if not found.measured or found.status is AlignStatus.DEGENERATE or angle < TURNED_RAD:
+        if not found.measured or angle <= TURNED_RAD:
             return False
-        return angle > FAR_RAD or len(self._global.symmetries) > 0
+        return angle > FAR_RAD or (found.status is not AlignStatus.DEGENERATE and len(self._global.symmetries) > 0)
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""

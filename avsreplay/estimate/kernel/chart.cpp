@@ -7,9 +7,6 @@ namespace {
 
 constexpr int ETA = 0, RATE = 3, POSITION = 6, VELOCITY = 9, INERTIA = 12, ARM = 17;
 
-// Largest norm of M: mass moments that differ by a factor of exp(17). Beyond it sigma is 1 within rounding.
-constexpr double LARGEST_M = 12;
-
 // Orthonormal traceless symmetric matrices.
 const double H2 = std::sqrt(0.5), H6 = 1 / std::sqrt(6.0);
 const M3 BASIS[5] = {{{{H2, 0, 0}, {0, -H2, 0}, {0, 0, 0}}},
@@ -41,12 +38,7 @@ Chart moved(const Chart& c, const double y[DIM]) {
   for (int k = 0; k < 5; ++k)
     for (int i = 0; i < 3; ++i)
       for (int j = 0; j < 3; ++j) out.M.x[i][j] += y[INERTIA + k] * BASIS[k].x[i][j];
-  double square = 0;
-  for (const auto& row : out.M.x)
-    for (const double value : row) square += value * value;
-  if (square > LARGEST_M * LARGEST_M)
-    for (auto& row : out.M.x)
-      for (double& value : row) value *= LARGEST_M / std::sqrt(square);
+  shorten(out.M);
   out.R_cb = c.R_cb * matrix(eigenvectors(seen_by(transposed(c.R_cb), out.M)));
   return out;
 }

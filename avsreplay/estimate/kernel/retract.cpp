@@ -89,6 +89,7 @@ void retract(State& x, double P[DIM][DIM], const double d[DIM]) {
 
   M3 M = y.M;
   for (int k = 0; k < 3; ++k) M.x[k][k] += m[k];
+  shorten(M);
   const Quad turned = quad(x.q_ab) * half_angle(y.eta), p = eigenvectors(M);
   const M3 A = transposed(matrix(p)), D = seen_by(A, M);
   const double values[3] = {D.x[0][0], D.x[1][1], D.x[2][2]};

@@ -110,6 +110,18 @@ void order(const double* values, int* by) {
   }
 }
 
+// Largest norm of M: mass moments that differ by a factor of exp(17). Beyond it sigma is 1 within rounding.
+constexpr double LARGEST_M = 12;
+
+inline void shorten(M3& M) {
+  double square = 0;
+  for (const auto& row : M.x)
+    for (const double value : row) square += value * value;
+  if (square > LARGEST_M * LARGEST_M)
+    for (auto& row : M.x)
+      for (double& value : row) value *= LARGEST_M / std::sqrt(square);
+}
+
 // A body's axes: the ratios and their slopes by half the differences of M's eigenvalues, which are kept a hair apart.
 struct Axes {
   double m[3], sigma[2], slope[2];
