@@ -30,6 +30,7 @@ from avsreplay.estimate.mixture import moments
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.reference import reference_fit
+from avsreplay.estimate.work import whole
 from avsreplay.geometry import Pose
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams
 from avsreplay.records import Belief, State
@@ -303,7 +304,7 @@ def test_residuals_that_stay_widen_the_covariance() -> None:
 def at_the_end(found: BatchCovariance, poses: Poses, prior: Prior, seconds: float) -> Belief:
     """The belief at the last pose, without process noise."""
     problem = Problem(poses, prior, found.fitted.effective)
-    return moments(final_mixture(found, problem, poses.latest(12, seconds), (0.0, 0.0), 0, seconds))
+    return moments(whole(final_mixture(found, problem, poses.latest(12, seconds), (0.0, 0.0), 0, seconds)))
 
 
 def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
@@ -312,7 +313,7 @@ def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
     for seed in (3, 6, 9, 15, 2):
         world = tumbling.draw(seed, seconds=40.0)
         poses, fitted, prior = grown(seen(world, seed), 21, 41, 81)
-        found = covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams())
+        found = whole(covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams()))
         assert not found.gaussian
         plain.append(nees(at_the_end(replace(found, directions=()), poses, prior, 40.0), world.states[-1]) / 20)
         mended.append(nees(at_the_end(found, poses, prior, 40.0), world.states[-1]) / 20)
@@ -339,7 +340,7 @@ def test_an_unseen_torque_is_sought_in_what_the_motion_leaves_of_the_residuals(s
 def test_a_long_arc_settles() -> None:
     world = tumbling.draw(4)
     poses, fitted, prior = grown(seen(world, 4), 21, 81, 201)
-    found = covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams())
+    found = whole(covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams()))
     assert found.gaussian
     here = at_the_end(found, poses, prior, 100.0)
     assert nees(here, world.states[-1]) == pytest.approx(nees(Belief(0, fitted.x, fitted.P), world.states[0]), rel=0.2)

@@ -29,6 +29,7 @@ from avsreplay.estimate.initialise import (
 from avsreplay.estimate.measurement import innovation_of
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import Constraint, Start
+from avsreplay.estimate.work import whole
 from avsreplay.monitor.convergence import Consistency, ConsistencyParams
 from avsreplay.records import Belief, State
 
@@ -170,7 +171,7 @@ def test_the_estimate_of_a_disturbed_body_is_consistent(start: Start) -> None:
 
 def test_contradiction_counts_in_the_fits_own_spread() -> None:
     found = fixes(4, 100.0)
-    cold = batch_estimate(found, WHITE.resolved(2.0), FitParams(), NO_LEVELS)
+    cold = whole(batch_estimate(found, WHITE.resolved(2.0), FitParams(), NO_LEVELS))
     assert not contradicted(cold.belief, cold.belief)
     sizes = np.sqrt(np.linalg.eigvalsh(cold.belief.P))
     axis = np.linalg.eigh(cold.belief.P)[1][:, -1]
@@ -271,7 +272,7 @@ def test_joined_poses_give_the_estimate_of_all_poses(seed: int) -> None:
     assert pose_count(fewer) == pose_count(fixes) == len(fixes)
     assert sorted(f.t_ns for f in fewer) == [f.t_ns for f in fewer]
     params, rules = EstimatorParams().resolved(2.0), FitParams(rescale=False)
-    whole, part = (batch_estimate(some, params, rules, NO_LEVELS, start=reference) for some in (fixes, fewer))
+    whole, part = (whole(batch_estimate(some, params, rules, NO_LEVELS, start=reference)) for some in (fixes, fewer))
     assert part.count == whole.count == len(fixes)
     there = to_chart(whole.belief.x)
     size = to_errors(there) @ to_chart(part.belief.x).minus(there) / np.sqrt(np.diagonal(whole.belief.P))
@@ -312,7 +313,7 @@ def test_a_fit_to_a_long_unstable_spin_ends_with_a_covariance(seed: int, axis: i
         if a.covariance is not None
     )
     params, levels = EstimatorParams().resolved(4.0), NoiseLevels(torque=1e-7, count=100)
-    P = batch_estimate(fixes, params, FitParams(rescale=False), levels, start=to_chart(first)).belief.P
+    P = whole(batch_estimate(fixes, params, FitParams(rescale=False), levels, start=to_chart(first))).belief.P
     assert np.all(np.isfinite(P))
     scale = np.sqrt(np.diagonal(P))
     assert np.linalg.eigvalsh(P / np.outer(scale, scale))[0] > -1e-9

@@ -14,11 +14,12 @@ from avsreplay.estimate.batch import FitParams
 from avsreplay.estimate.chart import INERTIA, nees, to_chart, to_errors
 from avsreplay.estimate.drift import DrivenHypothesis, find_drift
 from avsreplay.estimate.driven import DrivenBelief, drift_equivalents
-from avsreplay.estimate.driven_fit import driven_belief, without_drift
+from avsreplay.estimate.driven_fit import driven_motion, without_drift
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import PoseFix, batch_estimate, poses_of
 from avsreplay.estimate.noise_levels import NO_LEVELS
 from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.work import whole
 from avsreplay.geometry import Pose
 from avsreplay.records import State
 
@@ -40,11 +41,13 @@ def found_in(
 ) -> tuple[DrivenHypothesis, DrivenBelief] | None:
     """The most likely hypothesis of the test, and the belief at the last pose."""
     start = to_chart(surprises.world_of(case, seed)[1][0])
-    found = find_drift(fixes, start, PARAMS, np.ones(2), (1e-3, 1e-3))
+    found = whole(find_drift(fixes, start, PARAMS, np.ones(2), (1e-3, 1e-3)))
     if found is None:
         return None
     best = found.hypotheses[0]
-    return best, driven_belief(best.fitted, best.onset_1s_s, found.widths, NO_LEVELS, fixes[0].t_ns, fixes[-1].t_ns)[0]
+    motion = whole(driven_motion(best.fitted, best.onset_1s_s, found.widths, NO_LEVELS))
+    assert motion is not None
+    return best, motion.belief(fixes[0].t_ns, fixes[-1].t_ns)
 
 
 @pytest.mark.parametrize("case", [surprises.Case("c"), surprises.Case("s", spin=2), surprises.Case("r", speed=1e-6)])
@@ -85,7 +88,7 @@ def test_the_equivalent_error_is_that_of_the_integrated_motion() -> None:
 
 def inertia_of(fixes: tuple[PoseFix, ...], truth: State, params: EstimatorParams) -> tuple[float, float]:
     """NEES per degree of freedom of the inertia at the last pose by a fit to all poses, and the trace of its P."""
-    found = batch_estimate(fixes, params, FitParams(rescale=False), NO_LEVELS).belief
+    found = whole(batch_estimate(fixes, params, FitParams(rescale=False), NO_LEVELS)).belief
     here = to_chart(found.x)
     T, off = to_errors(here), to_chart(truth).minus(here)[INERTIA]
     P = np.linalg.solve(T, np.linalg.solve(T, found.P).T)[INERTIA, INERTIA]

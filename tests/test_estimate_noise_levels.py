@@ -22,6 +22,7 @@ from avsreplay.estimate.noise_levels import (
 )
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.work import whole
 from avsreplay.geometry import Pose
 
 PARAMS = EstimatorParams().resolved(2.0)
@@ -53,7 +54,7 @@ def levels_of(found, truth, rounds: int = 4) -> tuple[NoiseLevels, Problem]:
         problem.core.descend(40, 1e-3)
         chart = problem.chart
         problem.core.linearise(chart.flat)
-        levels = estimate_levels(points, problem, levels, False, (None, None))
+        levels = whole(estimate_levels(points, problem, levels, False, (None, None)))
     return levels, problem
 
 
@@ -99,7 +100,7 @@ def test_a_given_density_is_not_changed() -> None:
     chart = to_chart(world.states[0])
     points = normal_points(poses, chart, np.ones(2), MOST_POINTS)
     problem = Problem(points, weak_prior(poses, PARAMS), np.ones(2), chart, np.inf)
-    levels = estimate_levels(points, problem, NO_LEVELS, True, (1e-5, 0.0))
+    levels = whole(estimate_levels(points, problem, NO_LEVELS, True, (1e-5, 0.0)))
     assert (levels.torque, levels.force) == (pytest.approx(1e-5), 0.0)
     assert levels.white == (1.0, 1.0)
 

@@ -47,6 +47,7 @@ from avsreplay.estimate.track import (
     with_history,
     with_nis,
 )
+from avsreplay.estimate.work import whole
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
 from avsreplay.settings import given
@@ -260,7 +261,7 @@ class AnomalyTest:
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
             at = replace(at, P=P)
         after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
-        anew = replace(track, since=0, recent=(), doubtful=(), pending=False)
+        anew = replace(track, since=0, recent=(), doubtful=(), pending=False, fitting=None, testing=None)
         if isinstance(at, DrivenBelief):  # the filter continues, with rate and velocity free
             return self._used(replace(anew, belief=at, mode="filter", fixes=()), after)
         chart = to_chart(at.x)
@@ -279,13 +280,12 @@ class AnomalyTest:
         inflation = np.ones(2) if track.inflation is None else track.inflation
         window = track.window.factors
         factors = np.array([window[3], window[0]]) * np.sqrt(inflation)
-        rules = FitParams(rescale=False)
-        fitted = fit(poses, prior.mean, prior, rules, factors)
+        fitted = fit(poses, prior.mean, prior, FitParams(rescale=False), factors)
         now_ns, noise = fixes[-1].scan_ns, self.batch.noise_levels(track)
         found = BatchCovariance(fitted, ())
         after_s = (now_ns - t_ns) * 1e-9
         problem, latest = Problem(poses, prior, fitted.effective), poses.latest(LATEST, after_s)
-        components = final_mixture(found, problem, latest, noise, now_ns, after_s)
+        components = whole(final_mixture(found, problem, latest, noise, now_ns, after_s))
         plain = np.array([window[3], window[0]])
         return BatchResult(t_ns, fitted.chart, len(fixes), plain, inflation, moments(components), True, components)
 

@@ -28,6 +28,7 @@ from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite
 from avsreplay.estimate.mixture import Component
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
 from avsreplay.estimate.relative_orbit import OrbitArc
+from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
@@ -79,8 +80,8 @@ class BatchCovariance:
         return not (self.directions or self.others)
 
 
-def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> BatchCovariance:
-    """Test the weakest directions of a fit (relative to the prior) and profile the non-Gaussian ones.
+def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Parts[BatchCovariance]:
+    """Test the weakest directions of a fit (relative to the prior) and profile the non-Gaussian ones, in parts.
 
     Args:
         problem: the cost that was fitted, at the noise factors ``fitted.effective``.
@@ -102,6 +103,7 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Batc
                     others = True  # its part of the covariance stays that of the fit
                     break
                 points.append(point)
+                yield steps * len(problem.poses)
             else:
                 directions.append(NonGaussianDirection(row, (points[0], points[1])))
     return BatchCovariance(fitted, tuple(directions), others)
@@ -226,8 +228,8 @@ def final_mixture(
     after_s: float,
     spread: Array | None = None,
     unseen: Array | None = None,
-) -> tuple[Component, ...]:
-    """The fit with process noise as a Gaussian mixture at the last pose; the first component has the published mean.
+) -> Parts[tuple[Component, ...]]:
+    """The fit with process noise as a Gaussian mixture at the last pose, in parts; the first has the published mean.
 
     Args:
         found: the fit and its non-Gaussian directions.
@@ -247,6 +249,7 @@ def final_mixture(
     recent = Problem(latest, problem.prior, fitted.effective)
     for weight, chart, pin in bases:
         y, P = process_noise_pass(chart, pin, problem, noise)
+        yield 3 * len(problem.poses)
         if not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < LARGEST_MOVE):  # far beyond what is linear
             if pin is not None:
                 lost += weight

@@ -8,9 +8,10 @@ allows, the fit replaces the filter's estimate.
 
 from __future__ import annotations
 
-import math
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 
 import numpy as np
@@ -18,19 +19,15 @@ import numpy as np
 from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_chart
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
-from avsreplay.estimate.drift import DriftFound, find_drift
-from avsreplay.estimate.driven import DrivenBelief, driven_moments, propagated
-from avsreplay.estimate.driven_fit import driven_belief, levels_of
+from avsreplay.estimate.driven import DrivenBelief, propagated
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import (
     BatchResult,
     PoseFix,
     batch_estimate,
     first_belief,
-    improved_levels,
     joined,
     pose_count,
-    with_last_pose,
 )
 from avsreplay.estimate.measurement import (
     chart_update,
@@ -39,29 +36,26 @@ from avsreplay.estimate.measurement import (
     measured_pose,
     measurement_jacobian,
 )
-from avsreplay.estimate.mixture import carried, moments, worn
+from avsreplay.estimate.mixture import carried, moments, not_worse, worn
 from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
-from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
-from avsreplay.estimate.params import Adaptation, EstimatorParams, Start
+from avsreplay.estimate.noise_levels import NoiseLevels
+from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Prediction, Track
+from avsreplay.estimate.work import Job, Parts, Work, whole
 from avsreplay.geometry import Array
-from avsreplay.records import Belief, Drift, Innovation
-from avsreplay.settings import given
+from avsreplay.records import Belief, Innovation
 
 FEWEST_TO_FIT = 3
 MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does not grow with the log
 FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
-FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a test of drift, and between two tests
+FEWEST_TO_SPREAD = 48  # poses from which a fit is spread over scans
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
-_DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
 _RECENT = 0.1  # largest age of a given start over the fit's memory; until then disturbances change it little
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
 _LEAST_TORQUE = 1e-6  # a fit looks back as far as this torque noise allows, even without disturbances [rad/s^1.5]
-_MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
-LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
 _LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
-_instant = attrgetter("t_ns")
+_instant, _scan = attrgetter("t_ns"), attrgetter("scan_ns")
 
 
 class BatchSchedule:
@@ -81,13 +75,14 @@ class BatchSchedule:
         self.checked_poses = 0 if params.start is Start.PAPER else params.audit_poses
         self._rules = FitParams(rescale=False)
         self._given_levels = params.disturbances
-        self._drift_scale = (1e-3, _DRIFT_OF_SPEED * given(params.start_vel_1s_mps))
 
-    def initialised(self, track: Track, prediction: Prediction, innovation: Innovation, converged: bool) -> Track:
+    def initialised(
+        self, track: Track, prediction: Prediction, innovation: Innovation, converged: bool, spread: bool = False
+    ) -> Track:
         """The track after a healthy pose while the fit is in use: a new fit if enough poses have come since the last.
 
         Between fits the filter's update is applied if the likelihood is Gaussian; otherwise every component of the
-        mixture is updated by itself.
+        mixture is updated by itself. ``spread``: a fit to many poses is left to ``advanced``.
         """
         track = replace(track, fixes=self._with(track, prediction, innovation), R=innovation.R, since=track.since + 1)
         if len(track.fixes) < FEWEST_TO_FIT:
@@ -95,14 +90,12 @@ class BatchSchedule:
         last = track.batch
         if last is None or track.since >= max(1.0, self._growth(last) * last.count) or worn(last.components):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
-            start = self.chart_at(prediction.belief, track.fixes[0].t_ns) if forgot else None
-            given = self._given(track)
-            result = batch_estimate(track.fixes, self.params, self._rules, self._levels(track), last, start, given)
-            result = with_last_pose(result, track.fixes[-1], innovation.weight, self.noise_levels(track))
-            rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
-            track = replace(track, reinitialised=track.reinitialised + rejected)
-            remembers = forgot and track.levels.slack > 1.0  # the filter keeps information that later fits cannot use
-            return self._adopted(track, result, result.gaussian and (converged or remembers))
+            finished = partial(self._fitted, forgot, converged)
+            if last is None or not spread or len(track.fixes) < FEWEST_TO_SPREAD:
+                return finished(track, whole(self._fit(track, prediction.belief, forgot)))
+            if not track.fitting:
+                job = Job(Work(self._fit(track, prediction.belief, forgot)), track.fixes[-1].t_ns, finished)
+                track = replace(track, fitting=job)
         if last.gaussian:
             belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
             return replace(track, belief=belief)
@@ -112,6 +105,27 @@ class BatchSchedule:
         mixture = carried(last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit)
         belief, _ = self.propagated(track, moments(mixture), prediction.belief.t_ns)
         return replace(track, belief=belief, batch=replace(last, components=mixture))
+
+    def _fit(self, track: Track, belief: Belief, forgot: bool) -> Parts[BatchResult]:
+        """The fit to all poses of a track, in parts. ``forgot``: the last fit began with an earlier pose."""
+        start = self.chart_at(belief, track.fixes[0].t_ns) if forgot else None
+        levels, given = self._levels(track), self._given(track)
+        return (yield from batch_estimate(track.fixes, self.params, self._rules, levels, track.batch, start, given))
+
+    def _fitted(self, forgot: bool, converged: bool, track: Track, result: BatchResult) -> Track:
+        """The track with a fit, which is corrected by the poses that came since it began."""
+        last, noise = track.batch, self.noise_levels(track)
+        result = with_last_pose(self._at_present(track, result), track.fixes[-1], noise)
+        rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
+        track = replace(track, reinitialised=track.reinitialised + rejected)
+        remembers = forgot and track.levels.slack > 1.0  # the filter keeps information that later fits cannot use
+        return self.adopted(track, result, result.gaussian and (converged or remembers))
+
+    def _at_present(self, track: Track, result: BatchResult) -> BatchResult:
+        """The result of a fit, corrected by the later poses of a track."""
+        later = track.fixes[bisect_right(track.fixes, result.components[0].t_ns, key=_scan) :]
+        result = with_later_poses(result, later, self.noise_levels(track))
+        return replace(result, count=pose_count(track.fixes))
 
     def _growth(self, last: BatchResult) -> float:
         """The share by which the poses grow until the next fit; a Gaussian likelihood is propagated well in between."""
@@ -147,90 +161,41 @@ class BatchSchedule:
         """The newest poses, for ``check_against_batch``."""
         return self._with(track, prediction, innovation)[-self.checked_poses :] if self.checked_poses else ()
 
-    def check_against_batch(self, track: Track) -> Track:
+    def check_against_batch(self, track: Track, spread: bool = False) -> Track:
         """The filter's track, or the fit's where a fit to the same poses contradicts it.
 
-        A fit with a non-Gaussian likelihood replaces the filter only where the poses themselves contradict the filter.
-        The noise window stays, since the noise of the last scans may differ from the level of all poses; with many
-        outliers its residuals are errors of the estimate.
+        ``spread``: a fit to many poses is left to ``advanced``.
         """
         enough = max(FEWEST_TO_CHECK, CHECK_GROWTH * len(track.fixes))
-        many_outliers = track.window.many_outliers
-        if (
-            not self.checked_poses
-            or track.drift is not None
-            or track.since < (FEWEST_WITH_OUTLIERS if many_outliers else enough)
-        ):
+        due = FEWEST_WITH_OUTLIERS if track.window.many_outliers else enough
+        if not self.checked_poses or track.drift is not None or track.since < due or track.fitting:
             return track
         epoch_ns = track.fixes[0].t_ns
         rejected = track.batch is not None and track.batch.prior_rejected
         begin, given = self.chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
         last = track.batch if track.batch is not None and track.batch.epoch_ns == epoch_ns else None
-        result = batch_estimate(
-            track.fixes, self.params, self._rules, self._levels(track), last, start=begin, given=given
-        )
+        parts = batch_estimate(track.fixes, self.params, self._rules, self._levels(track), last, begin, given)
+        finished = partial(self._checked, last is not None)
+        if not spread:
+            return finished(track, whole(parts))
+        return replace(track, fitting=Job(Work(parts), track.fixes[-1].t_ns, finished))
+
+    def _checked(self, whole_memory: bool, track: Track, result: BatchResult) -> Track:
+        """The track after the comparison with a fit. ``whole_memory``: the fit has all poses of the filter.
+
+        A fit with a non-Gaussian likelihood replaces the filter only where the poses themselves contradict the filter.
+        The noise window stays, since the noise of the last scans may differ from the level of all poses; with many
+        outliers its residuals are errors of the estimate.
+        """
+        many_outliers, linear = track.window.many_outliers, result.components[0].share == 1.0
+        result = self._at_present(track, result)
         sound = result.gaussian and _better_than_measured(result.belief, track.R)
         if (sound or many_outliers) and contradicted(track.belief, result.belief):
-            adopted = replace(self._adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
+            adopted = replace(self.adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
             return adopted if many_outliers else replace(adopted, window=track.window)
-        whole = last is not None and result.components[0].share == 1.0  # the fit has all poses of the filter
-        if sound and whole:
-            return replace(self._adopted(track, result, to_filter=True), window=track.window)
+        if sound and whole_memory and linear:
+            return replace(self.adopted(track, result, to_filter=True), window=track.window)
         return replace(track, since=0)
-
-    def between_fits(self, track: Track) -> Track:
-        """The track after a healthy scan with what is done between fits: noise levels, else the test for a drift."""
-        after = self.with_levels(track)
-        return after if after.unlevelled == 0 else self.check_for_drift(after)
-
-    def check_for_drift(self, track: Track) -> Track:
-        """The track with the constant torque or force that its poses show, tested each time they have grown enough.
-
-        From its first detection on it is part of the motion that the filter predicts, and the filter improves its
-        value. Later fits to all poses replace the estimate of the filter.
-        """
-        count, last, known = pose_count(track.fixes), track.batch, track.drift
-        due = max(FEWEST_TO_TEST, (DRIFT_GROWTH if known is None else CHECK_GROWTH) * count)
-        ready = bool(self.checked_poses) and last is not None and count >= FEWEST_WITH_DRIFT
-        if not ready or last is None or track.untested < due or track.since == 0:  # never in the same scan as a fit
-            return replace(track, untested=track.untested + 1)
-        track, epoch_ns, begun = replace(track, untested=0), track.fixes[0].t_ns, None
-        start = last.chart if last.epoch_ns == epoch_ns else self.chart_at(track.belief, epoch_ns)
-        factors = np.array([track.window.factors[3], track.window.factors[0]])
-        if known is not None:
-            if last.epoch_ns != epoch_ns or not isinstance(track.belief, DrivenBelief):
-                return track
-            begun = max(0.0, (known.t_ns - epoch_ns) * 1e-9), track.belief.u
-        try:
-            found = find_drift(track.fixes, start, self.params, factors, self._drift_scale, track.levels, begun)
-            return track if found is None else self._driven(track, last, found)
-        except np.linalg.LinAlgError:  # an unstable spin over so long a time that its motion cannot be inverted
-            return track
-
-    def _driven(self, track: Track, last: BatchResult, found: DriftFound) -> Track:
-        """The track with the estimate of a fit with a constant torque or force."""
-        epoch_ns, now_ns, known = track.fixes[0].t_ns, track.belief.t_ns, track.drift
-        best, widths, count = found.hypotheses[0], found.widths, pose_count(track.fixes)
-        claimed = self.params.adapt is Adaptation.OFF
-        levels = levels_of(best.fitted, track.levels, widths, claimed, self._given_levels)
-        parts = [
-            (h.weight, driven_belief(h.fitted, h.onset_1s_s, widths, levels, epoch_ns, now_ns))
-            for h in found.hypotheses
-        ]
-        inflation, belief = parts[0][1][1], driven_moments([(weight, each) for weight, (each, _) in parts])
-        if not np.isfinite(belief.P).all():
-            return track
-        onset_ns, spread = epoch_ns + round(best.fitted.onset_s * 1e9), found.onset_1s_s
-        if onset_ns == epoch_ns:  # it may have acted before the first of these poses
-            since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
-            onset_ns, spread = onset_ns - since_ns, math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0))
-        detected_ns = now_ns if known is None else known.detected_ns
-        drift = Drift(onset_ns, spread, belief.u[3:], belief.u[:3], belief.P_u, detected_ns)
-        plain, chart = levels.factors(last.share), best.fitted.chart
-        result = replace(last, epoch_ns=epoch_ns, chart=chart, count=count, belief=belief, factors=plain)
-        result = replace(result, inflation=inflation, components=(), points=None)
-        track = replace(track, drift=drift, levels=replace(levels, count=count))
-        return self._adopted(track, result, to_filter=True)
 
     def noise_levels(self, track: Track) -> tuple[float, float]:
         """Root densities of torque [rad/s^1.5] and force [m/s^1.5], given or estimated.
@@ -257,21 +222,6 @@ class BatchSchedule:
         torque, half = max(self.noise_levels(track)[0], _LEAST_TORQUE), np.trace(track.R[3:, 3:])
         return round(min(memory_s(torque, 2.0 * float(np.sqrt(half)) or 1.0), _LONGEST_S) * 1e9)
 
-    def with_levels(self, track: Track) -> Track:
-        """The track with new noise levels, where the poses have grown enough since they were last estimated."""
-        count, last = pose_count(track.fixes), track.batch
-        due = max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
-        ready = bool(self.checked_poses) and last is not None and count >= FEWEST and track.drift is None
-        if not ready or last is None or track.unlevelled < due or track.since == 0:
-            return replace(track, unlevelled=track.unlevelled + 1)
-        epoch_ns = track.fixes[0].t_ns
-        start = last.chart if last.epoch_ns == epoch_ns else self.chart_at(track.belief, epoch_ns)
-        levels = improved_levels(track.fixes, last, start, self.params, track.levels)
-        used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
-        more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
-        since = count if more else track.since  # the estimate so far does not allow for these disturbances: fit again
-        return replace(track, levels=levels, unlevelled=0, since=since)
-
     def _first(self, track: Track, prediction: Prediction, innovation: Innovation) -> Belief:
         """The belief after the first poses, too few for a fit."""
         if self.start is None:
@@ -288,7 +238,7 @@ class BatchSchedule:
         P = step @ track.prior.P @ step.T
         return Prior(mean, P) if float(np.sqrt(np.trace(P[:3, :3]))) < _GAUSSIAN_HALF_RAD else None
 
-    def _adopted(self, track: Track, result: BatchResult, to_filter: bool) -> Track:
+    def adopted(self, track: Track, result: BatchResult, to_filter: bool) -> Track:
         """The track with the estimate of a fit; ``to_filter``: the filter continues from it."""
         window = filled(self.noise.base(track.R, track.window), result.factors, self.params.window)
         mode = "filter" if to_filter else "fit"
@@ -316,7 +266,8 @@ class BatchSchedule:
         if lag_ns:
             then, _ = propagate_state(x, lag_ns * 1e-9)
             pose = then.T_ac @ x.T_ac.inverse() @ pose
-        return PoseFix(prediction.belief.t_ns + lag_ns, pose, C, lag_ns, innovation.share, orbit=self.orbit)
+        share, weight = innovation.share, innovation.weight
+        return PoseFix(prediction.belief.t_ns + lag_ns, pose, C, lag_ns, share, 1, self.orbit, weight)
 
     def propagated(self, track: Track, belief: Belief, t_ns: int) -> tuple[Belief, Array]:
         """A belief at another instant with the disturbances of a track, and the transition matrix (20, 20)."""
@@ -346,3 +297,38 @@ def contradicted(belief: Belief, fitted: Belief) -> bool:
     T = to_errors(there)
     y = T @ to_chart(belief.x).minus(there)
     return float(y @ np.linalg.solve(fitted.P, y)) > BOUND
+
+
+def with_last_pose(result: BatchResult, fix: PoseFix, noise: tuple[float, float]) -> BatchResult:
+    """The result of a fit, in no direction less precise at its last pose ``fix`` than that pose (``not_worse``).
+
+    Args:
+        result: the fit's result.
+        fix: the last of its poses.
+        noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
+    """
+    scale = np.repeat(result.factors * np.sqrt(result.inflation), 3)
+    C = fix.C * np.outer(scale, scale)
+    mixture = not_worse(result.components, fix.t_ns, fix.T_ac, C, fix.weight, noise, fix.orbit)
+    if mixture is result.components:
+        return result
+    belief, _ = propagated(moments(mixture), result.belief.t_ns, *noise, fix.orbit)
+    return replace(result, belief=belief, components=mixture)
+
+
+def with_later_poses(result: BatchResult, fixes: Sequence[PoseFix], noise: tuple[float, float]) -> BatchResult:
+    """The result of a fit, corrected by poses that came after those of the fit (``mixture.carried``).
+
+    Args:
+        result: the fit's result.
+        fixes: later poses, oldest first.
+        noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
+    """
+    mixture, factors = result.components, result.factors * np.sqrt(result.inflation)
+    for fix in fixes:
+        root = np.linalg.inv(np.linalg.cholesky(fix.C))
+        mixture = carried(mixture, fix.t_ns, fix.T_ac, root, factors, fix.weight, noise, fix.orbit)
+    if not fixes:
+        return result
+    belief, _ = propagated(moments(mixture), fixes[-1].scan_ns, *noise, fixes[-1].orbit)
+    return replace(result, belief=belief, components=mixture)

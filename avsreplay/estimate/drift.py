@@ -30,6 +30,7 @@ from avsreplay.estimate.noise import integrated_autocorrelation
 from avsreplay.estimate.noise_levels import MOST_POINTS, NO_LEVELS, NoiseLevels, disturbed_likelihood
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import EstimatorParams
+from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array
 
 _ONSETS, _FINER = 12, 9  # number of onsets tried, the first at the epoch, and around the most likely one
@@ -56,8 +57,10 @@ def find_drift(
     scale: tuple[float, float],
     levels: NoiseLevels = NO_LEVELS,
     known: tuple[float, Array] | None = None,
-) -> DriftFound | None:
-    """The drift that the poses show with the initial values of the motion, None where free motion explains them.
+) -> Parts[DriftFound | None]:
+    """The drift that the poses show with the initial values of the motion, in parts.
+
+    The result is None where free motion explains the poses.
 
     Args:
         fixes: healthy poses, oldest first.
@@ -71,19 +74,21 @@ def find_drift(
     poses, widths, prior = poses_of(fixes), np.repeat(scale, 3), weak_prior(poses_of(fixes), params)
     onset_s, u = (0.0, _NO_DRIFT) if known is None else known
     free = fit_driven(poses, start, prior, factors, onset_s, u)
-    frame, found, onsets = _descended(poses, prior, factors, widths, free)
+    yield _size(free)
+    frame, found, onsets = yield from _descended(poses, prior, factors, widths, free)
     best = max(found, key=lambda f: f.log_odds)
     if best.log_odds < _FOUND or not frame.u.any():
         return None
     if known is None:
         free = min(free, fit_driven(poses, frame.chart, prior, factors, 0.0, _NO_DRIFT), key=lambda f: f.cost)
-        if free.cost - frame.cost < _FOUND or not _constant(frame, free, levels, best, widths):
+        yield _size(free)
+        if free.cost - frame.cost < _FOUND or not (yield from _constant(frame, free, levels, best, widths)):
             return None
     within = _Onset(onsets, np.array([f.log_odds for f in found]))
     later = DrivenHypothesis(frame, 1.0, within.spread_s if frame.onset_s else 0.0)
     if frame.onset_s == 0.0:
         return DriftFound((later,), best.width * widths, within.spread_s)
-    always, _, _ = _descended(poses, prior, factors, widths, frame, np.zeros(1))
+    always, _, _ = yield from _descended(poses, prior, factors, widths, frame, np.zeros(1))
     columns = drift_columns(frame.G, frame.points.times_s, frame.chart, best.onset_s)
     noise = _remaining_noise(frame, columns.reshape(-1, 6), best)
     odds = (_cost(always, poses) - _cost(frame, poses)) / noise + math.log(within.width_s / float(poses.times_s[-1]))
@@ -135,7 +140,7 @@ _NO_DRIFT = np.zeros(6)
 
 def _descended(
     poses: Poses, prior: Prior, factors: Array, widths: Array, free: DrivenFit, only: Array | None = None
-) -> tuple[DrivenFit, list[_Found], Array]:
+) -> Parts[tuple[DrivenFit, list[_Found], Array]]:
     """The best frame of a descent from free motion, and the drifts from each onset (n,) on about it.
 
     Free motion fits the poses of a drifting body so poorly that a full step of the linearised problem often leads away
@@ -150,21 +155,31 @@ def _descended(
             break
         step, at, was, onset_s = best.y, frame.chart, frame.u, best.onset_s
         tried = ((at.moved(part * step), was + part * (best.u - was)) for part in _PARTS)
-        closer = (fit_driven(poses, start, prior, factors, onset_s, u) for start, u in tried)
-        limit = frame.cost if only is None or k else math.inf  # a given onset may be a less likely one
-        lower = next((f for f in closer if f.cost < limit), None)
-        if lower is None:
+        limit, gain = (frame.cost if only is None or k else math.inf), 0.0  # a given onset may be a less likely one
+        for start, u in tried:
+            closer = fit_driven(poses, start, prior, factors, onset_s, u)
+            yield _size(closer)
+            if closer.cost < limit:
+                frame, gain = closer, frame.cost - closer.cost
+                break
+        else:
             break
-        frame, gain = lower, frame.cost - lower.cost
     return frame, found, onsets
 
 
-def _constant(frame: DrivenFit, free: DrivenFit, levels: NoiseLevels, best: _Found, widths: Array) -> bool:
+def _size(fitted: DrivenFit) -> int:
+    """Work of a fit and of what follows from it, in linearised poses."""
+    return 12 * len(fitted.points) + len(fitted.poses)
+
+
+def _constant(frame: DrivenFit, free: DrivenFit, levels: NoiseLevels, best: _Found, widths: Array) -> Parts[bool]:
     """Return whether a constant disturbance alone explains the poses better than random ones do."""
-    return _evidence(frame, levels, best, widths) - _evidence(free, levels, best, None) >= _CONSTANT
+    random = yield from _evidence(free, levels, best, None)
+    constant = yield from _evidence(frame, levels, best, widths)
+    return constant - random >= _CONSTANT
 
 
-def _evidence(frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Array | None) -> float:
+def _evidence(frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Array | None) -> Parts[float]:
     """Log likelihood of the poses with a constant disturbance, or with random ones of the same kind.
 
     ``widths`` is the prior of the constant one; None for random ones.
@@ -173,14 +188,17 @@ def _evidence(frame: DrivenFit, levels: NoiseLevels, drift: _Found, widths: Arra
     points = normal_points(frame.poses, frame.chart, problem.factors, MOST_POINTS)
     coarse = Problem(points, problem.prior, problem.factors, frame.chart, np.inf)
     kinds, open_ = [k for k in (0, 1) if drift.u[3 * k : 3 * k + 3].any()], np.flatnonzero(drift.u)
-    if widths is None:
-        return min(disturbed_likelihood(points, coarse, levels, k)[1] for k in kinds)
-    unknown, size = drift_unknowns(frame, points, coarse, widths, open_)
-    each = [
-        [disturbed_likelihood(points, coarse, levels, k, (scale * unknown, size / scale))[0] for scale in _SCALES]
-        for k in kinds
-    ]
-    return min(float(np.logaddexp.reduce(found)) - math.log(len(_SCALES)) for found in each)
+    lowest = math.inf
+    for k in kinds:
+        if widths is None:
+            lowest = min(lowest, disturbed_likelihood(points, coarse, levels, k)[1])
+        else:
+            unknown, size = drift_unknowns(frame, points, coarse, widths, open_)
+            likely = ((scale * unknown, size / scale) for scale in _SCALES)
+            found = [disturbed_likelihood(points, coarse, levels, k, others)[0] for others in likely]
+            lowest = min(lowest, float(np.logaddexp.reduce(found)) - math.log(len(_SCALES)))
+        yield BUDGET // 2
+    return lowest
 
 
 def _cost(frame: DrivenFit, poses: Poses) -> float:

@@ -7,7 +7,6 @@ filter over the poses, with the disturbances between them, gives their joint mea
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,11 +31,12 @@ from avsreplay.estimate.measurement import GATE, measurement_jacobian, to_fixtur
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels, mean_share
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.relative_orbit import OrbitArc
+from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 
 _REACHED = 12  # error states that a disturbance reaches: attitude to velocity
-_PASSES, _SMALL = 4, 0.1  # most linearisations; size of a step, in 1 sigma, after which none follows
+_PASSES, _SMALL = 10, 0.1  # most linearisations; size of a step, in 1 sigma, after which none follows
 _U, _ONSET = slice(DIM, DIM + 6), DIM + 6  # the acceleration and its onset after the 20 initial values
 
 
@@ -127,8 +127,8 @@ def drift_columns(G: Array, times_s: Array, chart: Chart, onset_s: float) -> Arr
 
 def levels_of(
     fitted: DrivenFit, levels: NoiseLevels, widths: Array, claimed: bool, fixed: tuple[float | None, float | None]
-) -> NoiseLevels:
-    """Noise levels from the residuals of the poses about the motion with the acceleration.
+) -> Parts[NoiseLevels]:
+    """Noise levels from the residuals of the poses about the motion with the acceleration, in parts.
 
     Args:
         fitted: the fit.
@@ -142,7 +142,7 @@ def levels_of(
     problem = Problem(points, old.prior, old.factors, fitted.chart, np.inf)
     begin = replace(levels, torque=0.0, force=0.0)
     unknowns = drift_unknowns(fitted, points, problem, widths, kinds)
-    return estimate_levels(points, problem, begin, claimed, fixed, unknowns)
+    return (yield from estimate_levels(points, problem, begin, claimed, fixed, unknowns))
 
 
 def drift_unknowns(
@@ -154,44 +154,77 @@ def drift_unknowns(
     return columns[:, :, kinds], (fitted.u / widths)[kinds]
 
 
-def driven_belief(
-    fitted: DrivenFit,
-    onset_1s_s: float,
-    widths: Array,
-    levels: NoiseLevels,
-    epoch_ns: int,
-    now_ns: int,
-) -> tuple[DrivenBelief, Array]:
-    """The belief at the last pose, and the inflation (2,) of the noise for correlated errors.
+@dataclass(frozen=True, slots=True, eq=False)
+class DrivenMotion:
+    """The motion with an acceleration that fits all poses, about which the problem is linear.
+
+    Attributes:
+        levels: noise levels.
+        chart, u, onset_s: initial values, acceleration (6,) and onset [s], about which the problem is linearised.
+        seen: the poses, or their normal points.  scale: (2,) on their standard deviations.
+        inflation: (2,) of the noise for correlated errors.
+        v, P: (27,) steps of initial values, acceleration and onset by these poses, and their covariance (27, 27).
+    """
+
+    levels: NoiseLevels
+    chart: Chart
+    u: Array
+    onset_s: float
+    seen: Poses
+    scale: Array
+    inflation: Array
+    v: Array
+    P: Array
+
+    def belief(self, epoch_ns: int, now_ns: int, later: Poses | None = None) -> DrivenBelief:
+        """The belief at an instant after the last pose.
+
+        Args:
+            epoch_ns: instant of the first pose.
+            now_ns: the instant [ns].
+            later: poses after those of the fit.
+        """
+        v, P = self.v, self.P
+        if later is not None:
+            v, P = _smoothed(self, later, float(self.seen.times_s[-1]), v, P)
+        chart, u, onset_s = self.chart.moved(v[:DIM]), self.u + v[_U], max(0.0, self.onset_s + float(v[_ONSET]))
+        states, D = _followed(chart, u, onset_s, np.array([(now_ns - epoch_ns) * 1e-9]), self.seen.arc)
+        C = D[0] @ P @ D[0].T
+        return DrivenBelief(now_ns, states[0], definite(0.5 * (C + C.T)), u, P[_U, _U], D[0] @ P[:, _U])
+
+
+def driven_motion(
+    fitted: DrivenFit, onset_1s_s: float, widths: Array, levels: NoiseLevels
+) -> Parts[DrivenMotion | None]:
+    """The motion of a fit with an acceleration, with disturbances and an unknown onset, in parts.
+
+    The result is None where the steps do not become small: the problem is not linear about the motion found.
 
     Args:
         fitted: the fit.
         onset_1s_s: prior 1 sigma of the onset [s].
         widths: (6,) prior 1 sigma of the acceleration.
         levels: noise levels.
-        epoch_ns: instant of the first pose.
-        now_ns: instant of the last scan.
     """
-    points, prior, chart, u, onset_s = fitted.points, fitted.problem.prior, fitted.chart, fitted.u, fitted.onset_s
-    plain = levels.factors(mean_share(points))
+    points, chart, u, onset_s = fitted.points, fitted.chart, fitted.u, fitted.onset_s
+    prior, plain = fitted.problem.prior, levels.factors(mean_share(points))
     inflation = sandwich(Problem(points, prior, plain, chart, levels.slack), points, levels)[1]
-    seen = without_drift(points, fitted.about, onset_s, u, back=True)
-    root, gate = seen.root / np.repeat(plain * np.sqrt(inflation), 3), GATE * levels.slack
+    seen, scale = without_drift(points, fitted.about, onset_s, u, back=True), plain * np.sqrt(inflation)
+    before = np.zeros((_ONSET + 1, _ONSET + 1))
+    before[:DIM, :DIM], before[_ONSET, _ONSET] = prior.P, onset_1s_s**2
+    before[_U, _U] = np.diag(np.where(u != 0.0, widths, 0.0) ** 2)
+    motion = DrivenMotion(levels, chart, u, onset_s, seen, scale, inflation, np.zeros(_ONSET + 1), before)
     for _ in range(_PASSES):  # linearised about the motion of the fit, then about the one found
-        v, P = np.zeros(_ONSET + 1), np.zeros((_ONSET + 1, _ONSET + 1))
-        v[:DIM], v[_U], v[_ONSET] = -chart.minus(prior.mean), -u, fitted.onset_s - onset_s
-        P[:DIM, :DIM], P[_ONSET, _ONSET] = prior.P, onset_1s_s**2
-        P[_U, _U] = np.diag(np.where(fitted.u != 0.0, widths, 0.0) ** 2)
-        v, P = _smoothed(seen, root, gate, levels, (chart, u, onset_s), v, P)
+        off = np.concatenate([-chart.minus(prior.mean), -u, [fitted.onset_s - onset_s]])
+        motion = replace(motion, chart=chart, u=u, onset_s=onset_s)
+        v, P = _smoothed(motion, seen, float(seen.times_s[0]), off, before.copy())
+        yield 12 * len(seen)
         if not np.isfinite(v).all() or float(np.abs(v[:DIM]).max()) > LARGEST_MOVE:
             break
-        chart, u, onset_s = chart.moved(v[:DIM]), u + v[_U], max(0.0, onset_s + float(v[_ONSET]))
         if _small(v, P):
-            break
-    states, D = _followed(chart, u, onset_s, np.array([(now_ns - epoch_ns) * 1e-9]), points.arc)
-    C = D[0] @ P @ D[0].T
-    belief = DrivenBelief(now_ns, states[0], definite(0.5 * (C + C.T)), u, P[_U, _U], D[0] @ P[:, _U])
-    return belief, inflation
+            return replace(motion, v=v, P=P)
+        chart, u, onset_s = chart.moved(v[:DIM]), u + v[_U], max(0.0, onset_s + float(v[_ONSET]))
+    return None
 
 
 def _small(v: Array, P: Array) -> bool:
@@ -200,35 +233,38 @@ def _small(v: Array, P: Array) -> bool:
     return bool(np.all(np.abs(v[open_]) < _SMALL * np.sqrt(np.diagonal(P)[open_])))
 
 
-def _smoothed(
-    seen: Poses, root: Array, gate: float, levels: NoiseLevels, about: tuple[Chart, Array, float], v: Array, P: Array
-) -> tuple[Array, Array]:
+def _smoothed(motion: DrivenMotion, seen: Poses, since_s: float, v: Array, P: Array) -> tuple[Array, Array]:
     """Steps v (27,) of initial values, acceleration and onset with covariance P, from those before the poses.
 
-    The disturbance between two poses acts as one impulse in the middle, as in ``noise_levels``.
+    The disturbance between two poses acts as one impulse in the middle, as in ``noise_levels``. ``since_s``: instant of
+    the pose before the first one.
     """
-    times, n, one = seen.times_s, len(seen), np.eye(len(v))
-    lengths = np.diff(times, prepend=times[0])
-    order = np.argsort(np.concatenate([times - 0.5 * lengths, times]), kind="stable")
-    place = np.argsort(order)
-    states, D = _followed(*about, np.sort(np.concatenate([times - 0.5 * lengths, times])), seen.arc)
-    density = np.sqrt(torque_density(to_state(about[0]).sigma, levels.torque))
+    levels, one = motion.levels, np.eye(len(v))
+    times, n, gate = seen.times_s, len(seen), GATE * levels.slack
+    lengths = np.diff(times, prepend=since_s)
+    every = np.concatenate([times - 0.5 * lengths, times])
+    place = np.argsort(np.argsort(every, kind="stable"))
+    states, D = _followed(motion.chart, motion.u, motion.onset_s, np.sort(every), seen.arc)
+    density = np.sqrt(torque_density(to_state(motion.chart).sigma, levels.torque))
     push = np.zeros((DIM, 6))
     push[W, :3], push[VEL, 3:] = np.diag(density), levels.force * np.eye(3)
+    M = np.linalg.solve(D[place[:n]][:, :, :DIM], push) * np.sqrt(lengths)[:, None, None]
+    Q = M @ np.swapaxes(M, 1, 2)
+    here = [states[k] for k in place[n:]]
+    q, centre = (np.array([getattr(x.T_ac, name) for x in here]) for name in ("q", "t"))
+    theta = geometry.log(geometry.multiply(geometry.conjugate(seen.q), q))
+    moved = np.swapaxes(geometry.matrix(seen.q), 1, 2) @ (centre - seen.t)[:, :, None]
+    root = seen.root / np.repeat(motion.scale, 3)
+    e = (root @ np.concatenate([theta, moved[:, :, 0]], axis=1)[:, :, None])[:, :, 0]
+    H = np.array([to_fixture(x.T_ac.q, x.q_bc) @ measurement_jacobian(x) for x in here])
+    weight = np.sqrt(1.0 / np.maximum(1.0, (e * e).sum(axis=1) / gate))
+    e, rows = weight[:, None] * e, weight[:, None, None] * (root @ H @ D[place[n:]])
     for k in range(n):
-        x, J = states[place[n + k]], D[place[n + k]]
-        if lengths[k] > 0.0:
-            M = np.linalg.solve(D[place[k]][:, :DIM], push)
-            P[:DIM, :DIM] += lengths[k] * M @ M.T
-        theta = geometry.log(geometry.multiply(geometry.conjugate(seen.q[k]), x.T_ac.q))
-        d = np.concatenate([theta, geometry.matrix(seen.q[k]).T @ (x.T_ac.t - seen.t[k])])
-        e, rows = root[k] @ d, root[k] @ to_fixture(x.T_ac.q, x.q_bc) @ measurement_jacobian(x) @ J
-        weight = math.sqrt(1.0 / max(1.0, float(e @ e) / gate))
-        e, rows = weight * e, weight * rows
-        seen_by = rows @ P
-        K = np.linalg.solve(seen_by @ rows.T + np.eye(6), seen_by).T
-        left = one - K @ rows
-        v, P = v - K @ (e + rows @ v), left @ P @ left.T + K @ K.T
+        P[:DIM, :DIM] += Q[k]
+        seen_by = rows[k] @ P
+        K = np.linalg.solve(seen_by @ rows[k].T + np.eye(6), seen_by).T
+        left = one - K @ rows[k]
+        v, P = v - K @ (e[k] + rows[k] @ v), left @ P @ left.T + K @ K.T
     return v, P
 
 

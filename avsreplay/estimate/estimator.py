@@ -18,6 +18,7 @@ from avsreplay.estimate.acceleration import FreeFall, accelerated
 from avsreplay.estimate.anomalies import AnomalyTest
 from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
+from avsreplay.estimate.disturbance_schedule import DisturbanceSchedule
 from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast
 from avsreplay.estimate.error_state import RHO
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
@@ -71,10 +72,12 @@ class Estimator:
             raise UsageError("a near start is requested and the log contains none", where="estimator.start", hint=hint)
         known = np.array(params.acceleration_mps2)
         self.fall = FreeFall(known, epoch_ns) if known.any() else None
-        self.start = self._into(start) if start is not None and params.start in (Start.AUTO, Start.NEAR) else None
+        given = start if params.start in (Start.AUTO, Start.NEAR) else None
+        self.start = given if given is None or self.fall is None else self.fall.belief_into(given)
         self.noise = Noise(self.params, extent_m)
         self.batch = BatchSchedule(self.params, self.noise, self.start, RelativeOrbit.of(params, epoch_ns))
         self.anomalies = AnomalyTest(self.params, extent_m, self.batch, self._replayed)
+        self.disturbances = DisturbanceSchedule(self.batch)
         self._prior = None if self.start is None else given_prior(self.start)
         self._robust = params.robust and params.start is not Start.PAPER
         self._length_m = 0.25 * extent_m
@@ -155,11 +158,11 @@ class Estimator:
             return self.update(track, prediction, None, 0), verdict
         epoch = Epoch(replace(track, recent=(), doubtful=(), previous=None), prediction, innovation, converged)
         after, verdict = self.anomalies.step(
-            track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged)
+            track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged, True)
         )
         after = replace(after, undetermined=undetermined(track, innovation, verdict.gamma, self._length_m))
-        tested = verdict.gamma == 1 and self._robust and after.mode in ("fit", "filter")
-        return self.batch.between_fits(after) if tested else after, verdict
+        due = verdict.gamma == 1 and after.mode in ("fit", "filter")
+        return self.disturbances.advanced(after, self._robust) if due else after, verdict
 
     def track_forecast(self, track: Track, times_s: Array) -> Forecast:
         """Predicted 1 sigma of the grasp point after a scan, by components where the likelihood is not Gaussian.
@@ -239,19 +242,24 @@ class Estimator:
 
     def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
         """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""
-        prediction = self.predict(track, epoch.prediction.belief.t_ns)
-        prediction = replace(prediction, lag_s=epoch.prediction.lag_s, blur=epoch.prediction.blur)
-        pose = measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha)
-        alpha = innovation_vector(prediction.belief.x, pose)
+        old, prediction = epoch.prediction, self.predict(track, epoch.prediction.belief.t_ns)
+        prediction = replace(prediction, lag_s=old.lag_s, blur=old.blur)
+        alpha = innovation_vector(prediction.belief.x, measured_pose(epoch.prediction.belief.x, epoch.innovation.alpha))
         R = self.noise.rescaled(epoch.innovation.R, epoch.prediction.window, track.window)
-        seen = epoch.innovation
-        innovation = innovation_of(prediction.belief.P, prediction.H, alpha, R, self._robust, seen.share, seen.dof)
+        seen, P = epoch.innovation, prediction.belief.P
+        innovation = innovation_of(P, prediction.H, alpha, R, self._robust, seen.share, seen.dof)
         innovation = replace(innovation, rms_m=seen.rms_m)
         used = Epoch(replace(track, recent=(), doubtful=(), previous=None), prediction, innovation, epoch.converged)
         return self.update(track, prediction, innovation, 1, epoch.converged), used
 
     def update(
-        self, track: Track, prediction: Prediction, innovation: Innovation | None, gamma: int, converged: bool = True
+        self,
+        track: Track,
+        prediction: Prediction,
+        innovation: Innovation | None,
+        gamma: int,
+        converged: bool = True,
+        spread: bool = False,
     ) -> Track:
         """The posterior. With gamma 0 or no innovation it equals the prior exactly.
 
@@ -261,12 +269,13 @@ class Estimator:
             innovation: None where the scan gave no pose.
             gamma: 1 for a healthy scan, 0 for a faulty one.
             converged: t_1 was reached at the last scan. A fit hands over to the filter only then.
+            spread: a fit to many poses is left to the next scans (``step``).
         """
         if innovation is None or gamma == 0:
             return replace(track, belief=prediction.belief)
         if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
-            return self.batch.initialised(track, prediction, innovation, converged)
-        return self.batch.check_against_batch(self.batch.filtered(track, prediction, innovation))
+            return self.batch.initialised(track, prediction, innovation, converged, spread)
+        return self.batch.check_against_batch(self.batch.filtered(track, prediction, innovation), spread)
 
     def published(self, track: Track) -> Belief:
         """The belief in {A} with errors that later poses do not reduce and the filter therefore does not carry.
@@ -291,10 +300,6 @@ class Estimator:
             belief: as the estimator carries it, in the frame that falls with the target.
         """
         return belief if self.fall is None else self.fall.belief_out(belief)
-
-    def _into(self, belief: Belief) -> Belief:
-        """The inverse of ``in_camera``."""
-        return belief if self.fall is None else self.fall.belief_into(belief)
 
     def motion(self, belief: Belief) -> Trajectory:
         """The predicted path of the grasp point without disturbances.
@@ -329,8 +334,7 @@ class Estimator:
             belief: mean and covariance now.
             times_s: (n,) >= 0, ascending [s after the belief's instant].
         """
-        torque, force = (given or 0.0 for given in self.params.disturbances)
-        return driven_forecast(belief, times_s, torque, force)
+        return driven_forecast(belief, times_s, *(given or 0.0 for given in self.params.disturbances))
 
     def pose_covariance(self, belief: Belief) -> Array:
         """The covariance of the pose of {C}, H P H' (H of eq:innovation).

@@ -28,15 +28,16 @@ from avsreplay.estimate.batch_covariance import (
     unseen_torque,
 )
 from avsreplay.estimate.chart import Chart, to_chart
-from avsreplay.estimate.dynamics import propagate, propagate_state
+from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.error_state import DIM, boxplus, hamilton
 from avsreplay.estimate.measurement import in_camera, measurement_jacobian
-from avsreplay.estimate.mixture import Component, moments, not_worse
+from avsreplay.estimate.mixture import Component, moments
 from avsreplay.estimate.noise import BOUND
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
 from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import Adaptation, EstimatorParams
 from avsreplay.estimate.relative_orbit import RelativeOrbit
+from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State
 from avsreplay.settings import given
@@ -58,6 +59,7 @@ class PoseFix:
         correlated_share: the part of C that neighbouring poses have in common.
         count: number of poses that it stands for.
         orbit: the relative orbit that the target is on; None for free motion.
+        weight: Cauchy weight of the pose in the update.
     """
 
     t_ns: int
@@ -67,6 +69,7 @@ class PoseFix:
     correlated_share: float = 0.0
     count: int = 1
     orbit: RelativeOrbit | None = None
+    weight: float = 1.0
 
     @property
     def scan_ns(self) -> int:
@@ -229,8 +232,8 @@ def batch_estimate(
     last: BatchResult | None = None,
     start: Chart | None = None,
     given: Prior | None = None,
-) -> BatchResult:
-    """Fit all poses with noise of these levels, from ``start`` or the values of the last fit.
+) -> Parts[BatchResult]:
+    """Fit all poses with noise of these levels, from ``start`` or the values of the last fit, in parts.
 
     ``given`` is the prior at the first pose; it is left out once the poses contradict it.
     """
@@ -254,14 +257,16 @@ def batch_estimate(
         joint = fit(points, start, given, rules, factors, robust_start=first, slack=slack)
         rejected = _contradicts(points, fitted, weak, joint, given)
         fitted, prior = (fitted, weak) if rejected else (joint, given)
+    yield fitted.steps * len(points)
     problem = Problem(points, prior, factors, fitted.chart, slack)
-    found = covariance_of(problem, fitted, rules)
+    found = yield from covariance_of(problem, fitted, rules)
     problem.core.linearise(fitted.chart.flat)
     spread, inflation = sandwich(problem, points, levels)
     now_ns = fixes[-1].scan_ns
     after_s = (now_ns - fixes[0].t_ns) * 1e-9
     unseen = unseen_torque(problem, after_s) if params.torque_noise_radps15 is None else None
-    components = final_mixture(found, problem, poses.latest(LATEST, after_s), noise, now_ns, after_s, spread, unseen)
+    latest = poses.latest(LATEST, after_s)
+    components = yield from final_mixture(found, problem, latest, noise, now_ns, after_s, spread, unseen)
     gaussian = _determined(found, weak)
     return BatchResult(
         epoch_ns=fixes[0].t_ns,
@@ -288,8 +293,8 @@ def _position_noise(points: Poses) -> Array:
 
 def improved_levels(
     fixes: tuple[PoseFix, ...], result: BatchResult, start: Chart, params: EstimatorParams, levels: NoiseLevels
-) -> NoiseLevels:
-    """Noise levels from the residuals of the poses but those with gross errors, which are no noise.
+) -> Parts[NoiseLevels]:
+    """Noise levels from the residuals of the poses but those with gross errors, which are no noise, in parts.
 
     Args:
         fixes: healthy poses, oldest first.
@@ -310,26 +315,10 @@ def improved_levels(
         problem.core.descend(_LEVEL_STEPS, _LEVEL_TOL)
         chart = problem.chart
     problem.core.linearise(chart.flat)
+    yield BUDGET
     claimed = params.adapt is Adaptation.OFF
-    found = estimate_levels(points, problem, levels, claimed, params.disturbances)
+    found = yield from estimate_levels(points, problem, levels, claimed, params.disturbances)
     return replace(found, count=pose_count(fixes))
-
-
-def with_last_pose(result: BatchResult, fix: PoseFix, weight: float, noise: tuple[float, float]) -> BatchResult:
-    """The result of a fit, in no direction less precise at its last pose ``fix`` than that pose (``not_worse``).
-
-    Args:
-        result: the fit's result.
-        fix: the last of its poses.
-        weight: Cauchy weight of that pose.
-        noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
-    """
-    scale = np.repeat(result.factors * np.sqrt(result.inflation), 3)
-    mixture = not_worse(result.components, fix.t_ns, fix.T_ac, fix.C * np.outer(scale, scale), weight, noise, fix.orbit)
-    if mixture is result.components:
-        return result
-    belief, _ = propagate(moments(mixture), result.belief.t_ns, *noise, fix.orbit)
-    return replace(result, belief=belief, components=mixture)
 
 
 def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior) -> bool:

@@ -12,8 +12,7 @@ points by the average-information algorithm (Gilmour, Thompson and Cullis, Biome
 of freedom of the fit into account. Differences within the normal points give the independent part of the errors as
 well. The claimed noise is the prior, with the weight of a few poses.
 
-The poses often do not determine whether there is a disturbance, although it affects the velocity. Therefore its density
-is not the most likely one, but the mean over all candidates, none among them, weighted by their likelihood.
+The density of a disturbance is the mean over all candidates, none among them, weighted by their likelihood.
 """
 
 from __future__ import annotations
@@ -30,6 +29,7 @@ from avsreplay.estimate.batch import Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.dynamics import rotation_history, torque_density
 from avsreplay.estimate.error_state import RHO, VEL
+from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 MOST_POINTS = 24  # normal points of an estimate
@@ -115,32 +115,34 @@ def estimate_levels(
     claimed: bool,
     fixed: tuple[float | None, float | None],
     others: tuple[Array, Array] | None = None,
-) -> NoiseLevels:
-    """Improve variance components by a bounded number of steps, from those of an estimate with fewer poses.
+) -> Parts[NoiseLevels]:
+    """Improve variance components by a bounded number of steps, from those of an estimate with fewer poses, in parts.
 
     Args:
         points: normal points, at most ``MOST_POINTS``.
         problem: their cost, linearised at the fit.
         levels: the last estimate.
-        claimed: the noise of the poses is as claimed; only the disturbances are estimated.
+        claimed: only the disturbances are estimated.
         fixed: root densities of torque and force that are given; None to estimate them.
         others: columns and size of other unknowns, as in ``disturbed_likelihood``.
     """
     n, theta = len(points), _variances(levels)
     open_ = np.array([*([not claimed] * 4), *(f is None for f in fixed)])
     open_[2:4] &= points.shares is not None and bool(np.any(points.shares))
-    for k, given in enumerate(fixed):
-        theta[4 + k] = theta[4 + k] if given is None else given**2
+    theta[4:] = [old if given is None else given**2 for old, given in zip(theta[4:], fixed, strict=True)]
     data, parts = _linearised(points, problem, others)
     for _ in range(min(_MOST_STEPS, max(1, _WORK // n**3))):
         theta = _improved(theta, open_, parts, data, points)
+        yield n**3 // 40
     likely = theta.copy()
     for k in (k for k in (4, 5) if open_[k]):
         theta[k] = _expected(_marginal(likely, k, parts, data)[1]) ** 2
+        yield n**3 // 40
     white, common = (float(theta[0]), float(theta[1])), (float(theta[2]), float(theta[3]))
     slack = _slack(data.e, theta, parts) if theta[4] or theta[5] else 1.0
-    torque, force = float(theta[4]) ** 0.5, float(theta[5]) ** 0.5
-    return replace(levels, white=white, common=common, torque=torque, force=force, slack=slack)
+    return replace(
+        levels, white=white, common=common, torque=math.sqrt(theta[4]), force=math.sqrt(theta[5]), slack=slack
+    )
 
 
 def _expected(log_odds: Array) -> float:
@@ -158,8 +160,7 @@ def _expected(log_odds: Array) -> float:
 def _marginal(theta: Array, k: int, parts: Sequence[Array], data: _Residuals) -> tuple[float, Array]:
     """Log likelihood of the poses without disturbance k, and its increase (n,) with the squares of ``_DENSITIES``.
 
-    It is marginal over the initial values, without its constant. In the eigenvectors of what these leave of the
-    disturbance its effects are independent, so that one decomposition gives all densities.
+    It is marginal over the initial values, without its constant. One decomposition gives all densities.
     """
     without = theta.copy()
     without[k] = 0.0

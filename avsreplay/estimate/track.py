@@ -23,6 +23,7 @@ from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.measurement import measurement_jacobian, to_camera, to_fixture
 from avsreplay.estimate.noise import NoiseWindow, cholesky_root, line_of_sight_1s
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
+from avsreplay.estimate.work import Job
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre, State
 
@@ -84,6 +85,7 @@ class Track:
         drift: a constant torque or force on the target, None where none is found.  untested: healthy poses since the
             last test for one.
         levels: noise levels estimated so far.  unlevelled: healthy poses since the last estimate of them.
+        fitting, testing: a fit and a test that are spread over scans, None where none is under way.
         undetermined: (6, k) motions d of the model that neither the start nor any healthy scan so far determines, each
             as large as half the extent: 1 sigma.
     """
@@ -114,6 +116,8 @@ class Track:
     untested: int = 0
     levels: NoiseLevels = NO_LEVELS
     unlevelled: int = 0
+    fitting: Job | None = None
+    testing: Job | None = None
     undetermined: Array = field(default_factory=lambda: _NO_MOTION)
 
 
@@ -169,7 +173,8 @@ def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Tr
     x = replace(x, q_bc=geometry.multiply(x.q_bc, G.q), c_b=x.c_b + geometry.matrix(x.q_bc) @ G.t)
     fixes = tuple(replace(fix, T_ac=fix.T_ac @ G, C=adjoint @ fix.C @ adjoint.T) for fix in track.fixes)
     belief = replace(track.belief, x=x)
-    return replace(track, belief=belief, fixes=fixes, mode="start", batch=None, recent=(), doubtful=(), bias=None)
+    anew = replace(track, belief=belief, fixes=fixes, mode="start", batch=None, fitting=None, testing=None)
+    return replace(anew, recent=(), doubtful=(), bias=None)
 
 
 def common_1s(track: Track, r_a: Array) -> Array:

@@ -1,0 +1,149 @@
+"""When the noise levels are estimated and a constant torque is tested for, and the work that is spread over scans."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from avsreplay.estimate.batch_schedule import CHECK_GROWTH, FEWEST_TO_SPREAD, BatchSchedule
+from avsreplay.estimate.chart import Chart
+from avsreplay.estimate.drift import DriftFound, find_drift
+from avsreplay.estimate.driven import DrivenBelief, driven_moments
+from avsreplay.estimate.driven_fit import DrivenMotion, driven_motion, levels_of
+from avsreplay.estimate.initialise import BatchResult, improved_levels, pose_count, poses_of
+from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
+from avsreplay.estimate.params import Adaptation
+from avsreplay.estimate.track import Track
+from avsreplay.estimate.work import Job, Parts, Work, whole
+from avsreplay.geometry import Array
+from avsreplay.records import Drift
+from avsreplay.settings import given
+
+FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a test of drift, and between two tests
+LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
+_DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
+_MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Driven:
+    """A drift, the noise levels with it, and the motion of each hypothesis with its weight."""
+
+    found: DriftFound
+    levels: NoiseLevels
+    motions: list[tuple[float, DrivenMotion]]
+
+
+class DisturbanceSchedule:
+    """Runs the tests, and continues the work of a track scan by scan.
+
+    Args:
+        batch: runs the fits.
+    """
+
+    def __init__(self, batch: BatchSchedule) -> None:
+        self.batch, self.params = batch, batch.params
+        self._drift_scale = (1e-3, _DRIFT_OF_SPEED * given(batch.params.start_vel_1s_mps))
+
+    def advanced(self, track: Track, tested: bool) -> Track:
+        """The track after a healthy scan with the work of one scan: a part of a fit, else of a test.
+
+        Args:
+            track: after the scan.
+            tested: a test may begin.
+        """
+        if tested:
+            track = self._begun(replace(track, untested=track.untested + 1, unlevelled=track.unlevelled + 1))
+        job = track.fitting or track.testing
+        if job is None:
+            return track
+        work = job.work.continued()
+        after = None if work.done else replace(job, work=work)
+        track = replace(track, testing=after) if track.fitting is None else replace(track, fitting=after)
+        found: Track = job.finished(track, work.result) if work.done else track
+        return found
+
+    def _begun(self, track: Track) -> Track:
+        """The track with a test of the noise levels, else of a drift, if one is due and none is under way.
+
+        A drift is tested for each time the poses have grown enough. From its first detection on it is part of the
+        motion that the filter predicts, and the filter improves its value; fits to all poses replace that estimate.
+        """
+        count, last, known = pose_count(track.fixes), track.batch, track.drift
+        if not self.batch.checked_poses or last is None or track.testing is not None or track.since == 0:
+            return track
+        until_ns, epoch_ns = track.fixes[-1].t_ns, track.fixes[0].t_ns
+        start = last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
+        if count >= FEWEST and known is None and track.unlevelled > max(FEWEST_TO_TEST, LEVEL_GROWTH * count):
+            levels = improved_levels(track.fixes, last, start, self.params, track.levels)
+            if len(track.fixes) < FEWEST_TO_SPREAD:
+                return replace(self._levelled(track, whole(levels)), unlevelled=0)
+            return replace(track, testing=Job(Work(levels), until_ns, self._levelled), unlevelled=0)
+        due = max(FEWEST_TO_TEST, (DRIFT_GROWTH if known is None else CHECK_GROWTH) * count)
+        if count < FEWEST_WITH_DRIFT or track.untested <= due:
+            return track
+        begun = None
+        if known is not None:
+            if last.epoch_ns != epoch_ns or not isinstance(track.belief, DrivenBelief):
+                return replace(track, untested=0)
+            begun = max(0.0, (known.t_ns - epoch_ns) * 1e-9), track.belief.u
+        drift = Work(self._tested(track, start, begun))
+        return replace(track, testing=Job(drift, until_ns, partial(self._driven, epoch_ns, until_ns)), untested=0)
+
+    def _levelled(self, track: Track, levels: NoiseLevels) -> Track:
+        """The track with new noise levels."""
+        used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
+        more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
+        since = pose_count(track.fixes) if more else track.since  # the estimate does not allow for these: fit again
+        return replace(track, levels=levels, since=since)
+
+    def _tested(self, track: Track, start: Chart, begun: tuple[float, Array] | None) -> Parts[_Driven | None]:
+        """The test for a drift, in parts. ``begun``: onset and size of one that is known."""
+        factors = np.array([track.window.factors[3], track.window.factors[0]])
+        try:
+            found = yield from find_drift(
+                track.fixes, start, self.params, factors, self._drift_scale, track.levels, begun
+            )
+            if found is None:
+                return None
+            claimed, best, widths = self.params.adapt is Adaptation.OFF, found.hypotheses[0], found.widths
+            levels = yield from levels_of(best.fitted, track.levels, widths, claimed, self.params.disturbances)
+            motions = []
+            for h in found.hypotheses:
+                motion = yield from driven_motion(h.fitted, h.onset_1s_s, widths, levels)
+                if motion is None:
+                    return None
+                motions.append((h.weight, motion))
+            return _Driven(found, levels, motions)
+        except np.linalg.LinAlgError:  # an unstable spin over so long a time that its motion cannot be inverted
+            return None
+
+    def _driven(self, epoch_ns: int, until_ns: int, track: Track, driven: _Driven | None) -> Track:
+        """The track with the estimate of a fit with a constant torque or force, and the poses since it began."""
+        last, now_ns, known = track.batch, track.belief.t_ns, track.drift
+        if driven is None or last is None:
+            return track
+        best, count = driven.found.hypotheses[0], pose_count(track.fixes)
+        later = tuple(f for f in track.fixes if f.t_ns > until_ns)
+        poses = poses_of(later, epoch_ns) if later else None
+        parts = []
+        for weight, motion in driven.motions:
+            belief = motion.belief(epoch_ns, now_ns, poses)
+            if not np.isfinite(belief.P).all():
+                return track
+            parts.append((weight, belief))
+        inflation, moved = driven.motions[0][1].inflation, driven_moments(parts)
+        onset_ns, spread = epoch_ns + round(best.fitted.onset_s * 1e9), driven.found.onset_1s_s
+        if onset_ns == epoch_ns:  # it may have acted before the first of these poses
+            since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
+            onset_ns, spread = onset_ns - since_ns, math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0))
+        detected_ns = now_ns if known is None else known.detected_ns
+        drift = Drift(onset_ns, spread, moved.u[3:], moved.u[:3], moved.P_u, detected_ns)
+        plain, chart = driven.levels.factors(last.share), best.fitted.chart
+        result = BatchResult(epoch_ns, chart, count, plain, inflation, moved, last.gaussian)
+        result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
+        track = replace(track, drift=drift, levels=replace(driven.levels, count=count), fitting=None)
+        return self.batch.adopted(track, result, to_filter=True)
