@@ -418,12 +418,12 @@ def _swing(t: float) -> Pose:
 
 
 def test_a_part_on_a_cable_is_followed_although_its_motion_is_not_free(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Gravity and the cable accelerate it by 2 m/s^2: after eight rejected poses their level is estimated from them."""
+    """Gravity and the cable accelerate it by 2 m/s^2: after five rejected poses their level is estimated from them."""
     _poses_of(monkeypatch, _swing)
     result = surprises.run(surprises.Case("swing", hz=10.0, seconds=15.0), 0)
     assert result.track is not None
     last_rejected = max(k for k, gamma in enumerate(result.gamma) if not gamma)
-    assert result.t[last_rejected] < 2.5
+    assert result.t[last_rejected] < 2.0
     assert max(result.failed_at) < result.t[last_rejected]  # the estimate is then never worse than the measured pose
     assert not any(result.converged)  # the forces of the cable are not known in advance
 
@@ -451,12 +451,12 @@ def test_the_level_of_disturbances_is_found_from_differences_of_poses(interval_s
         places = np.cumsum(velocity * step, axis=0)[::fine]
         turned = np.cumsum(velocity[::fine, 0]) * interval_s
         fixes = [
-            PoseFix(round(k * interval_s * 1e9), Pose(geometry.exp([turn, 0.0, 0.0]), place), np.eye(6))
+            PoseFix(round(k * interval_s * 1e9), Pose(geometry.exp([turn, 0.0, 0.0]), place), 1e-12 * np.eye(6))
             for k, (turn, place) in enumerate(zip(turned, places, strict=True))
         ]
         levels = scan_window.disturbance_levels(fixes, 4.0)
         if levels is not None:
             found.append(levels[1])
-        assert scan_window.disturbance_levels(fixes[:7], 4.0) is None
+        assert scan_window.disturbance_levels(fixes[:4], 4.0) is None
     assert len(found) > 20
     assert 0.8 * density < np.sqrt(np.mean(np.square(found))) < 1.3 * density

@@ -28,7 +28,7 @@ from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.scan_window import (
-    FEWEST_DISTURBED,
+    MOST_DISTURBED,
     ChangePriors,
     Explanation,
     Hypothesis,
@@ -209,7 +209,7 @@ class AnomalyTest:
         last_ns = track.rejected[-1].scan_ns if track.rejected else -1
         later = (e for e in track.doubtful if e.prediction.belief.t_ns > last_ns)
         fixes = (self.batch.fix(e.prediction, e.innovation) for e in later)
-        return replace(track, rejected=(*track.rejected, *fixes)[-FEWEST_DISTURBED:])
+        return replace(track, rejected=(*track.rejected, *fixes)[-MOST_DISTURBED:])
 
     def _disturbed_start(self, track: Track) -> Track | None:
         """A new track from the last poses of a target that disturbances move, such as a part on a cable."""
