@@ -196,10 +196,10 @@ class AnomalyTest:
         if old is not None and self._previous_agrees(track):
             anew: Track | None = self._used(with_history(old, track), track.doubtful)
         else:
-            anew = self._initialised_anew(track)
-            if anew is None:
-                track = self._with_rejected(track)
-                anew = self._disturbed_start(track)
+            track = self._with_rejected(track)
+            levels = self._disturbances(track)
+            disturbed = self._started(track, track.doubtful[-_FEWEST:], levels) if levels.count else None
+            anew = self._initialised_anew(track, levels) or disturbed
         if anew is not None:
             return replace(anew, reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
         return replace(with_history(track, track), doubtful=track.doubtful[1 - _FEWEST :]), Verdict(0, Reason.POSE_JUMP)
@@ -211,12 +211,13 @@ class AnomalyTest:
         fixes = (self.batch.fix(e.prediction, e.innovation) for e in later)
         return replace(track, rejected=(*track.rejected, *fixes)[-MOST_DISTURBED:])
 
-    def _disturbed_start(self, track: Track) -> Track | None:
-        """A new track from the last poses of a target that disturbances move, such as a part on a cable."""
-        found = disturbance_levels(track.rejected, self._extent_m)
-        if found is None:
-            return None
-        return self._started(track, track.doubtful[-_FEWEST:], NoiseLevels(torque=found[0], force=found[1], count=1))
+    def _disturbances(self, track: Track) -> NoiseLevels:
+        """Levels of disturbances that the last poses show, such as those of a part on a cable, used or not."""
+        for poses in ((*track.fixes, *track.rejected)[-MOST_DISTURBED:], track.rejected):
+            found = disturbance_levels(poses, self._extent_m)
+            if found is not None:
+                return NoiseLevels(torque=found[0], force=found[1], count=1)
+        return NO_LEVELS
 
     def _previous_agrees(self, track: Track) -> bool:
         """Return whether the estimate before the last new start predicted the doubtful poses to within its errors."""
@@ -289,28 +290,27 @@ class AnomalyTest:
         plain = np.array([window[3], window[0]])
         return BatchResult(t_ns, fitted.chart, len(fixes), plain, inflation, moments(components), True, components)
 
-    def _initialised_anew(self, track: Track) -> Track | None:
+    def _initialised_anew(self, track: Track, levels: NoiseLevels) -> Track | None:
         """A new track from the doubtful poses alone, all or the last of them, that agree through free motion."""
         for first in range(len(track.doubtful) + 1 - _FEWEST):
-            anew = self._from_poses(track, track.doubtful[first:])
+            anew = self._from_poses(track, track.doubtful[first:], levels)
             if anew is not None:
                 return anew
         return None
 
-    def _from_poses(self, track: Track, epochs: tuple[Epoch, ...]) -> Track | None:
+    def _from_poses(self, track: Track, epochs: tuple[Epoch, ...], levels: NoiseLevels) -> Track | None:
         """A new track from some poses; None where they contradict one another."""
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in epochs)
         poses = poses_of(fixes)
         fitted = fit(poses, to_chart(rough_state(fixes)), weak_prior(poses, self.params), FitParams(rescale=False))
-        if 2.0 * fitted.half_chi2 > _EXPLAINED * (6 * len(fixes) - 12):
-            return None
-        return self._started(track, epochs)
+        agree = 2.0 * fitted.half_chi2 <= _EXPLAINED * (6 * len(fixes) - 12)
+        return self._started(track, epochs, levels) if agree else None
 
-    def _started(self, track: Track, epochs: tuple[Epoch, ...], levels: NoiseLevels = NO_LEVELS) -> Track:
+    def _started(self, track: Track, epochs: tuple[Epoch, ...], levels: NoiseLevels) -> Track:
         """A new track from some poses and noise levels, with the events of ``track``."""
-        first = epochs[0].prediction.belief
-        begin = Track(Belief(first.t_ns, first.x, first.P), "start", started_ns=first.t_ns, levels=levels)
-        out = self._used(begin, epochs)
+        prior = epochs[0].prediction.belief
+        begin = Belief(prior.t_ns, prior.x, prior.P)
+        out = self._used(Track(begin, "start", started_ns=prior.t_ns, levels=levels), epochs)
         old = replace(track, recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None
         out = replace(with_history(out, track), drift=track.drift, previous=old)
         return replace(out, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
