@@ -99,7 +99,8 @@ class Monitors:
         failed = self._violations(estimator, prior, innovation if gamma else None, track)
         consistent = window.consistent and not (track.window.many_outliers or track.doubtful or failed)
         forecast = estimator.track_forecast(track, self.convergence.params.times_s)
-        judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True)
+        surprising = window.surprising and gamma == 1
+        judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True, surprising)
         report = MonitorReport(
             ogm_rank=rank.rank,
             ogm_log10_cond=rank.log10_cond,

@@ -272,12 +272,12 @@ def test_joined_poses_give_the_estimate_of_all_poses(seed: int) -> None:
     assert pose_count(fewer) == pose_count(fixes) == len(fixes)
     assert sorted(f.t_ns for f in fewer) == [f.t_ns for f in fewer]
     params, rules = EstimatorParams().resolved(2.0), FitParams(rescale=False)
-    whole, part = (whole(batch_estimate(some, params, rules, NO_LEVELS, start=reference)) for some in (fixes, fewer))
-    assert part.count == whole.count == len(fixes)
-    there = to_chart(whole.belief.x)
-    size = to_errors(there) @ to_chart(part.belief.x).minus(there) / np.sqrt(np.diagonal(whole.belief.P))
+    every, part = (whole(batch_estimate(some, params, rules, NO_LEVELS, start=reference)) for some in (fixes, fewer))
+    assert part.count == every.count == len(fixes)
+    there = to_chart(every.belief.x)
+    size = to_errors(there) @ to_chart(part.belief.x).minus(there) / np.sqrt(np.diagonal(every.belief.P))
     assert np.abs(size).max() < 0.2
-    ratio = np.sqrt(np.diagonal(part.belief.P) / np.diagonal(whole.belief.P))
+    ratio = np.sqrt(np.diagonal(part.belief.P) / np.diagonal(every.belief.P))
     np.testing.assert_allclose(ratio, 1.0, atol=0.1)
 
 
