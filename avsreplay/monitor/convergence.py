@@ -256,10 +256,14 @@ class Consistency:
         kept = track.white[max(0, len(track.white) + 1 - self.params.window) :]
         return ConsistencyTrack(frozen(np.vstack([kept, white])))
 
-    def judge(self, track: ConsistencyTrack) -> ConsistencyReport:
+    def judge(self, track: ConsistencyTrack, gamma: int = 1) -> ConsistencyReport:
         """Test the window. Only a mean NIS above its band (times the slack) is inconsistent.
 
         A mean below the band results from a covariance that is too large, which is safe.
+
+        Args:
+            track: the window.
+            gamma: 1 if the last scan is in it.
         """
         n = len(track.white)
         if n < self.params.least:
@@ -268,7 +272,7 @@ class Consistency:
         mean = float(np.einsum("ij,ij->", track.white, track.white)) / n
         lag = float(np.einsum("ij,ij->", track.white[1:], track.white[:-1]) / (mean * (n - 1)))
         squares = np.einsum("ij,ij->i", track.white, track.white)
-        surprising = bool(squares[-1] > _SURPRISING * max(1.0, float(np.median(squares)) / _MEDIAN_CHI2))
+        surprising = gamma == 1 and bool(squares[-1] > _SURPRISING * max(1.0, float(np.median(squares)) / _MEDIAN_CHI2))
         return ConsistencyReport(mean <= self.params.slack * band[1], mean, band, lag, surprising)
 
     def _band(self, n: int) -> tuple[float, float]:
