@@ -314,7 +314,7 @@ def _anchors(page):
     return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
 
 
-TO_SHORTEN = {"backends", "estimation", "faults", "kernel", "real", "reconstruction"}
+TO_SHORTEN = {"backends", "faults", "kernel", "real", "reconstruction"}
 TO_SHORTEN |= {"reliability", "report", "scenario", "sweep"}  # pages with longer sentences, or with history
 PLAIN = [page for page in PAGES if page.stem not in TO_SHORTEN]
 HISTORY = re.compile(
