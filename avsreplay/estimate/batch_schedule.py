@@ -103,6 +103,8 @@ class BatchSchedule:
         noise = self.noise_levels(track)
         root = np.linalg.inv(np.linalg.cholesky(fix.C))
         mixture = carried(last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit)
+        C = fix.C * np.outer(np.repeat(factors, 3), np.repeat(factors, 3))  # the components may lie further apart
+        mixture = not_worse(mixture, fix.t_ns, fix.T_ac, C, innovation.weight, noise, self.orbit)
         belief, _ = self.propagated(track, moments(mixture), prediction.belief.t_ns)
         return replace(track, belief=belief, batch=replace(last, components=mixture))
 
