@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit
@@ -35,7 +34,7 @@ from avsreplay.estimate.measurement import in_camera, measurement_jacobian
 from avsreplay.estimate.mixture import Component, moments
 from avsreplay.estimate.noise import BOUND
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
-from avsreplay.estimate.normal_points import normal_points
+from avsreplay.estimate.normal_points import gross_errors, normal_points
 from avsreplay.estimate.params import Adaptation, EstimatorParams
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.work import BUDGET, Parts
@@ -46,8 +45,6 @@ from avsreplay.settings import given
 _PAIR_RAD = 0.7
 _DRAWS, _EDGE = 500, 0.99
 _LEVEL_STEPS, _LEVEL_TOL = 20, 0.1
-_NEIGHBOURS = 5  # poses with whose median a pose is compared
-_GROSS = 100.0  # squared difference of a gross error over the median of all poses, or over its expectation
 _DETERMINED = 0.5  # a direction whose posterior sigma is above this share of the prior's is determined by the prior
 
 
@@ -308,7 +305,7 @@ def improved_levels(
     poses = poses_of(fixes)
     factors = levels.factors(result.share) * np.sqrt(result.inflation)
     prior, chart, gate = weak_prior(poses, params), start, factors * np.sqrt(levels.slack)
-    poses = poses.some(~_gross_errors(poses, poses.residuals(Problem(poses, prior, factors), chart), factors))
+    poses = poses.some(~gross_errors(poses, poses.residuals(Problem(poses, prior, factors), chart), factors))
     for _ in range(2):  # about the last motion, then about the one that fits
         points = normal_points(poses, chart, gate, MOST_POINTS)
         problem = Problem(points, prior, factors, chart, np.inf)  # residuals with disturbances have the weight 1
@@ -319,21 +316,6 @@ def improved_levels(
     claimed = params.adapt is Adaptation.OFF
     found = yield from estimate_levels(points, problem, levels, claimed, params.disturbances)
     return replace(found, count=pose_count(fixes))
-
-
-def _gross_errors(poses: Poses, d: Array, factors: Array) -> NDArray[np.bool_]:
-    """Return which poses lie apart from their neighbours; disturbances move neighbours alike.
-
-    Args:
-        poses: the n poses.
-        d: (n, 6) residuals.
-        factors: (2,) noise factors of attitude and position.
-    """
-    first = np.clip(np.arange(len(d)) - _NEIGHBOURS // 2, 0, max(0, len(d) - _NEIGHBOURS))
-    around = d[np.minimum(first[:, None] + np.arange(_NEIGHBOURS), len(d) - 1)]
-    white = (poses.root @ ((d - np.median(around, axis=1)) / np.repeat(factors, 3))[:, :, None])[:, :, 0]
-    squares = (white * white).sum(axis=1)
-    return np.asarray(squares > _GROSS * max(float(np.median(squares)), 6.0))
 
 
 def _contradicts(poses: Poses, fitted: BatchFit, weak: Prior, joint: BatchFit, given: Prior) -> bool:

@@ -15,6 +15,8 @@ from avsreplay.geometry import Array
 
 _POINTS, _SPAN_RAD = 128, 0.25  # most normal points, and least rotation over which poses are joined [rad]
 _FEW = 48  # poses up to which none are joined
+_NEIGHBOURS = 5  # poses with whose median a pose is compared
+_GROSS = 100.0  # squared difference of a gross error over the median of all poses, or over its expectation
 
 
 def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _POINTS) -> Poses:
@@ -63,6 +65,21 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
         within,
         poses.arc,
     )
+
+
+def gross_errors(poses: Poses, d: Array, factors: Array) -> NDArray[np.bool_]:
+    """Return which poses lie apart from their neighbours; disturbances move neighbours alike.
+
+    Args:
+        poses: the n poses.
+        d: (n, 6) residuals.
+        factors: (2,) noise factors of attitude and position.
+    """
+    first = np.clip(np.arange(len(d)) - _NEIGHBOURS // 2, 0, max(0, len(d) - _NEIGHBOURS))
+    around = d[np.minimum(first[:, None] + np.arange(_NEIGHBOURS), len(d) - 1)]
+    white = (poses.root @ ((d - np.median(around, axis=1)) / np.repeat(factors, 3))[:, :, None])[:, :, 0]
+    squares = (white * white).sum(axis=1)
+    return np.asarray(squares > _GROSS * max(float(np.median(squares)), 6.0))
 
 
 def _parts(turned: Array, most: int) -> NDArray[np.int64]:
