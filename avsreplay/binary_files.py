@@ -143,6 +143,7 @@ _LIBRARY = {
     ("builtins", "set"),
 }
 _ACCUMULATORS = {  # classes that collect values scan by scan and are no dataclasses
+    ("avsreplay.estimate.work", "Work"),
     ("avsreplay.register.model_check", "ModelCheck"),
     ("avsreplay.report.summary", "SummaryFold"),
     ("avsreplay.report.summary_parts", "CaptureFold"),

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import estimate_surprises as surprises
 import numpy as np
 import pytest
 
+from avsreplay.binary_files import pack_state, unpack
+from avsreplay.estimate import Estimator
 from avsreplay.estimate.disturbance_schedule import DisturbanceSchedule
 from avsreplay.estimate.track import Track
 from avsreplay.estimate.work import BUDGET, Parts, Work, whole
@@ -22,9 +28,10 @@ def counted(sizes: list[int], log: list[int]) -> Parts[int]:
 
 def test_each_scan_does_the_parts_of_its_budget() -> None:
     log: list[int] = []
-    work, done = Work(counted([BUDGET, BUDGET // 2, BUDGET // 2, 3 * BUDGET, 1], log)), []
+    work, done = Work[int](), []
+    begin = partial(counted, [BUDGET, BUDGET // 2, BUDGET // 2, 3 * BUDGET, 1], log)
     while not work.done:
-        work = work.continued()
+        work = work.continued(begin)
         done.append(len(log))
     assert done == [1, 3, 4, 5]
     assert work.result == 5
@@ -33,12 +40,44 @@ def test_each_scan_does_the_parts_of_its_budget() -> None:
 
 def test_an_earlier_state_may_be_continued_again() -> None:
     log: list[int] = []
-    first = Work(counted([BUDGET, BUDGET], log))
-    second = first.continued()
-    third = second.continued()
-    assert first.continued() is second
-    assert second.continued() is third
+    begin = partial(counted, [BUDGET, BUDGET], log)
+    first = Work[int]()
+    second = first.continued(begin)
+    third = second.continued(begin)
+    assert first.continued(begin) is second
+    assert second.continued(begin) is third
     assert log == [0, 1]
+
+
+@pytest.mark.parametrize("packed", range(4))
+def test_a_computation_continues_from_a_checkpoint(packed: int) -> None:
+    begin = partial(counted, [BUDGET, BUDGET // 2, BUDGET // 2, BUDGET], [])
+    work, scans = Work[int](), 0
+    while not work.done:
+        work = pickle.loads(pickle.dumps(work)) if scans == packed else work
+        work, scans = work.continued(begin), scans + 1
+    assert (work.result, scans) == (4, 4)
+
+
+def test_a_track_that_is_read_from_a_checkpoint_after_every_scan_has_the_same_bits(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    case = surprises.Case("torque", torque=1e-4, seconds=45.0)
+    want, step, spread = surprises.run(case, 3).track, Estimator.step, []
+
+    def packed(self: Estimator, track: Track, *rest: Any) -> Any:
+        spread.append(track.fitting is not None or track.testing is not None)
+        (tmp_path / "track").write_bytes(pack_state(track, {}))
+        return step(self, unpack(tmp_path / "track", {}), *rest)
+
+    monkeypatch.setattr(Estimator, "step", packed)
+    found = surprises.run(case, 3).track
+    assert want is not None
+    assert found is not None
+    assert any(spread)
+    assert (found.belief.P == want.belief.P).all()
+    assert (found.belief.x.q_ab == want.belief.x.q_ab).all()
+    assert (found.belief.x.c_b == want.belief.x.c_b).all()
 
 
 @pytest.mark.parametrize("budget", [BUDGET, 10**9])

@@ -11,7 +11,6 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from operator import attrgetter
 
 import numpy as np
@@ -42,7 +41,7 @@ from avsreplay.estimate.noise_levels import NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.track import Prediction, Track
-from avsreplay.estimate.work import Job, Parts, Work, whole
+from avsreplay.estimate.work import Computation, ComputationKind, Parts, whole
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, Innovation
 
@@ -90,11 +89,10 @@ class BatchSchedule:
         last = track.batch
         if last is None or track.since >= max(1.0, self._growth(last) * last.count) or worn(last.components):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
-            finished = partial(self._fitted, forgot, converged)
             if last is None or not spread or len(track.fixes) < FEWEST_TO_SPREAD:
-                return finished(track, whole(self._fit(track, prediction.belief, forgot)))
+                return self.fitted(forgot, converged, track, whole(self.fit(track, prediction.belief, forgot)))
             if not track.fitting:
-                job = Job(Work(self._fit(track, prediction.belief, forgot)), track.fixes[-1].t_ns, finished)
+                job = Computation(ComputationKind.FIT, (track, prediction.belief, forgot), (forgot, converged))
                 track = replace(track, fitting=job)
         if last.gaussian:
             belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
@@ -108,13 +106,13 @@ class BatchSchedule:
         belief, _ = self.propagated(track, moments(mixture), prediction.belief.t_ns)
         return replace(track, belief=belief, batch=replace(last, components=mixture))
 
-    def _fit(self, track: Track, belief: Belief, forgot: bool) -> Parts[BatchResult]:
+    def fit(self, track: Track, belief: Belief, forgot: bool) -> Parts[BatchResult]:
         """The fit to all poses of a track, in parts. ``forgot``: the last fit began with an earlier pose."""
         start = self.chart_at(belief, track.fixes[0].t_ns) if forgot else None
         levels, given = self._levels(track), self._given(track)
         return (yield from batch_estimate(track.fixes, self.params, self._rules, levels, track.batch, start, given))
 
-    def _fitted(self, forgot: bool, converged: bool, track: Track, result: BatchResult) -> Track:
+    def fitted(self, forgot: bool, converged: bool, track: Track, result: BatchResult) -> Track:
         """The track with a fit, which is corrected by the poses that came since it began."""
         last, noise = track.batch, self.noise_levels(track)
         result = with_last_pose(self._at_present(track, result), track.fixes[-1], noise)
@@ -176,13 +174,23 @@ class BatchSchedule:
         rejected = track.batch is not None and track.batch.prior_rejected
         begin, given = self.chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
         last = track.batch if track.batch is not None and track.batch.epoch_ns == epoch_ns else None
-        parts = batch_estimate(track.fixes, self.params, self._rules, self._levels(track), last, begin, given)
-        finished = partial(self._checked, last is not None)
+        poses, finish = (track.fixes, self._levels(track), last, begin, given), (last is not None,)
         if not spread:
-            return finished(track, whole(parts))
-        return replace(track, fitting=Job(Work(parts), track.fixes[-1].t_ns, finished))
+            return self.checked(*finish, track, whole(self.check(*poses)))
+        return replace(track, fitting=Computation(ComputationKind.CHECK, poses, finish))
 
-    def _checked(self, whole_memory: bool, track: Track, result: BatchResult) -> Track:
+    def check(
+        self,
+        fixes: tuple[PoseFix, ...],
+        levels: NoiseLevels,
+        last: BatchResult | None,
+        start: Chart,
+        given: Prior | None,
+    ) -> Parts[BatchResult]:
+        """The fit with which the filter is compared, in parts; arguments as of ``batch_estimate``."""
+        return batch_estimate(fixes, self.params, self._rules, levels, last, start, given)
+
+    def checked(self, whole_memory: bool, track: Track, result: BatchResult) -> Track:
         """The track after the comparison with a fit. ``whole_memory``: the fit has all poses of the filter.
 
         A fit with a non-Gaussian likelihood replaces the filter only where the poses themselves contradict the filter.

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -17,7 +19,7 @@ from avsreplay.estimate.initialise import BatchResult, improved_levels, pose_cou
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
 from avsreplay.estimate.params import Adaptation
 from avsreplay.estimate.track import Track
-from avsreplay.estimate.work import Job, Parts, Work, whole
+from avsreplay.estimate.work import Computation, ComputationKind, Parts, whole
 from avsreplay.geometry import Array
 from avsreplay.records import Drift
 from avsreplay.settings import given
@@ -46,6 +48,12 @@ class DisturbanceSchedule:
 
     def __init__(self, batch: BatchSchedule) -> None:
         self.batch, self.params = batch, batch.params
+        self._jobs: dict[ComputationKind, tuple[Callable[..., Parts[Any]], Callable[..., Track]]] = {
+            ComputationKind.FIT: (batch.fit, batch.fitted),
+            ComputationKind.CHECK: (batch.check, batch.checked),
+            ComputationKind.LEVELS: (improved_levels, self._levelled),
+            ComputationKind.DRIFT: (self._tested, self._driven),
+        }
         self._drift_scale = (1e-3, _DRIFT_OF_SPEED * given(batch.params.start_vel_1s_mps))
 
     def advanced(self, track: Track, tested: bool) -> Track:
@@ -60,11 +68,11 @@ class DisturbanceSchedule:
         job = track.fitting or track.testing
         if job is None:
             return track
-        work = job.work.continued()
+        begin, finish = self._jobs[job.kind]
+        work = job.work.continued(partial(begin, *job.begin))
         after = None if work.done else replace(job, work=work)
         track = replace(track, testing=after) if track.fitting is None else replace(track, fitting=after)
-        found: Track = job.finished(track, work.result) if work.done else track
-        return found
+        return finish(*job.finish, track, work.result) if work.done else track
 
     def _begun(self, track: Track) -> Track:
         """The track with a test of the noise levels, else of a drift, if one is due and none is under way.
@@ -75,13 +83,13 @@ class DisturbanceSchedule:
         count, last, known = pose_count(track.fixes), track.batch, track.drift
         if not self.batch.checked_poses or last is None or track.testing is not None or track.since == 0:
             return track
-        until_ns, epoch_ns = track.fixes[-1].t_ns, track.fixes[0].t_ns
+        epoch_ns = track.fixes[0].t_ns
         start = last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
         if count >= FEWEST and known is None and track.unlevelled > max(FEWEST_TO_TEST, LEVEL_GROWTH * count):
-            levels = improved_levels(track.fixes, last, start, self.params, track.levels)
+            poses = track.fixes, last, start, self.params, track.levels
             if len(track.fixes) < FEWEST_TO_SPREAD:
-                return replace(self._levelled(track, whole(levels)), unlevelled=0)
-            return replace(track, testing=Job(Work(levels), until_ns, self._levelled), unlevelled=0)
+                return replace(self._levelled(track, whole(improved_levels(*poses))), unlevelled=0)
+            return replace(track, testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
         due = max(FEWEST_TO_TEST, (DRIFT_GROWTH if known is None else CHECK_GROWTH) * count)
         if count < FEWEST_WITH_DRIFT or track.untested <= due:
             return track
@@ -90,8 +98,8 @@ class DisturbanceSchedule:
             if last.epoch_ns != epoch_ns or not isinstance(track.belief, DrivenBelief):
                 return replace(track, untested=0)
             begun = max(0.0, (known.t_ns - epoch_ns) * 1e-9), track.belief.u
-        drift = Work(self._tested(track, start, begun))
-        return replace(track, testing=Job(drift, until_ns, partial(self._driven, epoch_ns, until_ns)), untested=0)
+        job = Computation(ComputationKind.DRIFT, (track, start, begun), (epoch_ns, track.fixes[-1].t_ns))
+        return replace(track, testing=job, untested=0)
 
     def _levelled(self, track: Track, levels: NoiseLevels) -> Track:
         """The track with new noise levels."""

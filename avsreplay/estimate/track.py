@@ -23,7 +23,7 @@ from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.measurement import measurement_jacobian, to_camera, to_fixture
 from avsreplay.estimate.noise import NoiseWindow, cholesky_root, line_of_sight_1s
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
-from avsreplay.estimate.work import Job
+from avsreplay.estimate.work import Computation
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation, Manoeuvre, State
 
@@ -116,8 +116,8 @@ class Track:
     untested: int = 0
     levels: NoiseLevels = NO_LEVELS
     unlevelled: int = 0
-    fitting: Job | None = None
-    testing: Job | None = None
+    fitting: Computation | None = None
+    testing: Computation | None = None
     undetermined: Array = field(default_factory=lambda: _NO_MOTION)
 
 

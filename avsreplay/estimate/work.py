@@ -9,7 +9,8 @@ later ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import Enum
 from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
@@ -30,36 +31,63 @@ def whole(parts: Parts[T]) -> T:
 
 
 class Work(Generic[T]):
-    """A computation up to some part. ``continued`` leaves it as it is: any track that holds it may continue it."""
+    """A computation up to some part. ``continued`` leaves it as it is: any track that holds it may continue it.
 
-    def __init__(self, parts: Parts[T]) -> None:
-        self._parts = parts
-        self._after: Work[T] | None = None
+    A checkpoint contains the number of its parts only. A run that continues from there computes them again.
+    """
+
+    def __init__(self, count: int = 0) -> None:
+        self.count = count
         self.result: T | None = None
         self.done = False
+        self._parts: Parts[T] | None = None
+        self._after: Work[T] | None = None
 
-    def continued(self) -> Work[T]:
-        """Return the computation after the parts of one more scan."""
+    def __getstate__(self) -> int:
+        return self.count
+
+    def __setstate__(self, count: int) -> None:
+        Work.__init__(self, count)
+
+    def continued(self, begin: Callable[[], Parts[T]]) -> Work[T]:
+        """Return the computation after the parts of one more scan. ``begin`` begins it."""
         if self._after is None:
-            after, left = Work(self._parts), BUDGET
+            parts = self._parts or begin()
+            for _ in range(0 if self._parts else self.count):
+                next(parts)
+            after, left = Work[T](self.count), BUDGET
             try:
                 while left > 0:
-                    left -= next(self._parts)
+                    left -= next(parts)
+                    after.count += 1
+                after._parts = parts
             except StopIteration as end:
                 after.done, after.result = True, end.value
-            self._after = after
+            self._after, self._parts = after, None
         return self._after
 
 
+class ComputationKind(Enum):
+    """What is computed in parts."""
+
+    FIT = "fit"
+    CHECK = "check"  # the fit with which the filter is compared
+    LEVELS = "levels"
+    DRIFT = "drift"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
-class Job:
+class Computation:
     """A computation that a track carries on, and what its result changes.
 
     Attributes:
-        work: so far.  until_ns: instant of the last pose it uses.
-        finished: the track with the result, from the track at the end.
+        kind: of the computation.
+        begin: its arguments.
+        finish: the arguments, besides track and result, of the change of the track when it has ended.
+        work: the computation so far.
     """
 
-    work: Work[Any]
-    until_ns: int
-    finished: Callable[[Any, Any], Any]
+    kind: ComputationKind
+    begin: tuple[Any, ...]
+    finish: tuple[Any, ...] = ()
+    work: Work[Any] = field(default_factory=Work)
