@@ -95,11 +95,11 @@ class Monitors:
         gramian = self._gramian(state.gramian, estimator, prior, innovation if gamma else None, track)
         rank = monitor.measure(gramian)
         consistency = self.consistency.observe(state.consistency, innovation, gamma)
-        window = self.consistency.judge(consistency, gamma)
+        window = self.consistency.judge(consistency)
         failed = self._violations(estimator, prior, innovation if gamma else None, track)
         consistent = window.consistent and not (track.window.many_outliers or track.doubtful or failed)
         forecast = estimator.track_forecast(track, self.convergence.params.times_s)
-        judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True, window.surprising)
+        judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True)
         report = MonitorReport(
             ogm_rank=rank.rank,
             ogm_log10_cond=rank.log10_cond,

@@ -5,15 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from avsreplay.monitor.convergence import (
-    Consistency,
-    ConsistencyParams,
-    Convergence,
-    ConvergenceParams,
-    Criterion,
-    block_1s,
-)
-from avsreplay.records import BLOCKS, Belief, Forecast, Innovation, State
+from avsreplay.monitor.convergence import Convergence, ConvergenceParams, Criterion, block_1s
+from avsreplay.records import BLOCKS, Belief, Forecast, State
 
 X = State([0, 0, 0, 1.0], *[np.zeros(3)] * 3, np.zeros(2), np.zeros(3), [0, 0, 0, 1.0])
 PAPER = ConvergenceParams(criterion=Criterion.COVARIANCE)
@@ -108,25 +101,3 @@ def test_params() -> None:
         ConvergenceParams(dwell_s=-1.0)
     with pytest.raises(ValueError, match="horizon_steps"):
         ConvergenceParams(horizon_steps=0)
-
-
-def test_a_surprising_scan_is_no_claim_and_the_dwell_continues() -> None:
-    convergence = Convergence(PAPER, 8.0)
-    track = fold(convergence, [(belief(t),) for t in range(9)])
-    assert track.converged
-    surprised = convergence.judge(track, belief(9), surprising=True)
-    assert not surprised.converged
-    assert surprised.since_ns == track.since_ns
-    assert convergence.judge(surprised, belief(10)).converged
-
-
-def test_an_innovation_beyond_its_99_5_percent_point_is_surprising() -> None:
-    """Relative to the other innovations, whose errors may be larger than claimed."""
-    consistency = Consistency(ConsistencyParams())
-    for scale, expected in ((1.0, True), (4.0, False)):
-        track = consistency.initial()
-        for size in [scale] * 20 + [4.5]:
-            alpha = size * np.ones(6) / np.sqrt(6.0) * np.sqrt(5.348 if size == scale else 1.0)
-            chi2 = float(alpha @ alpha)
-            track = consistency.observe(track, Innovation(alpha, np.eye(6), np.eye(6), chi2, chi2, 0.0, 0.0), 1)
-        assert consistency.judge(track).surprising is expected

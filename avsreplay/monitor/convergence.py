@@ -19,7 +19,6 @@ from avsreplay.geometry import Array, frozen
 from avsreplay.records import BLOCKS, Belief, Forecast, Innovation
 from avsreplay.settings import Settings, given, setting
 
-_SURPRISING, _MEDIAN_CHI2 = 18.5, 5.348  # 99.5 % point and median of chi-square with 6 degrees of freedom
 _NOT_WORSE = 1.05  # a posterior 1 sigma may exceed that of the measurement by this factor
 
 
@@ -216,14 +215,12 @@ class ConsistencyReport:
     Attributes:
         consistent: the mean NIS is not above its band.  nis_mean: mean NIS.  band: its two-sided chi-square band.
         autocorrelation: of the whitened innovations one healthy epoch apart, 0 where white.
-        surprising: the last innovation is improbable, although not so much as to reject the scan.
     """
 
     consistent: bool | None
     nis_mean: float | None = None
     band: tuple[float, float] | None = None
     autocorrelation: float | None = None
-    surprising: bool = False
 
 
 class Consistency:
@@ -256,14 +253,10 @@ class Consistency:
         kept = track.white[max(0, len(track.white) + 1 - self.params.window) :]
         return ConsistencyTrack(frozen(np.vstack([kept, white])))
 
-    def judge(self, track: ConsistencyTrack, gamma: int = 1) -> ConsistencyReport:
+    def judge(self, track: ConsistencyTrack) -> ConsistencyReport:
         """Test the window. Only a mean NIS above its band (times the slack) is inconsistent.
 
         A mean below the band results from a covariance that is too large, which is safe.
-
-        Args:
-            track: the window.
-            gamma: 1 if the last scan is in it.
         """
         n = len(track.white)
         if n < self.params.least:
@@ -271,9 +264,7 @@ class Consistency:
         band = self._band(n)
         mean = float(np.einsum("ij,ij->", track.white, track.white)) / n
         lag = float(np.einsum("ij,ij->", track.white[1:], track.white[:-1]) / (mean * (n - 1)))
-        squares = np.einsum("ij,ij->i", track.white, track.white)
-        surprising = gamma == 1 and bool(squares[-1] > _SURPRISING * max(1.0, float(np.median(squares)) / _MEDIAN_CHI2))
-        return ConsistencyReport(mean <= self.params.slack * band[1], mean, band, lag, surprising)
+        return ConsistencyReport(mean <= self.params.slack * band[1], mean, band, lag)
 
     def _band(self, n: int) -> tuple[float, float]:
         if n not in self._bands:
@@ -317,12 +308,7 @@ class Convergence:
         return ConvergenceTrack()
 
     def judge(
-        self,
-        track: ConvergenceTrack,
-        belief: Belief,
-        forecast: Forecast | None = None,
-        consistent: bool = True,
-        surprising: bool = False,
+        self, track: ConvergenceTrack, belief: Belief, forecast: Forecast | None = None, consistent: bool = True
     ) -> ConvergenceTrack:
         """Return the state after one more scan. An inconsistent estimate is not converged.
 
@@ -331,8 +317,6 @@ class Convergence:
             belief: the estimate after the scan.
             forecast: predicted 1 sigma of the grasp point; needed by the predictive criterion.
             consistent: of the consistency tests.
-            surprising: the last innovation is improbable. Convergence is not claimed at this scan: a change of the
-                target's motion may have begun that later scans show.
         """
         one_sigma = block_1s(belief.P)
         unknown = tuple(name for name, limit in self._limits.items() if not one_sigma[name] <= limit)
@@ -343,7 +327,7 @@ class Convergence:
         since = belief.t_ns if track.since_ns is None else track.since_ns
         converged = (belief.t_ns - since) * 1e-9 >= self.params.dwell_s
         t1 = since if converged and track.t1_ns is None else track.t1_ns
-        return ConvergenceTrack(converged and not surprising, t1, since, not unknown, predictive, unknown)
+        return ConvergenceTrack(converged, t1, since, not unknown, predictive, unknown)
 
     def _predicted(self, forecast: Forecast) -> bool:
         predicted = (forecast.pos_1s_m, forecast.vel_1s_mps, forecast.rot_1s_rad)

@@ -110,7 +110,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
     turned, coverage = turn_and_coverage([views[k] for k in poses], list(poses.values()))
     _refuse_undetermined(turned, tracked.weakest)
     motion = free_motion([views[k].t_ns for k in sorted(poses)], [poses[k] for k in sorted(poses)], survey.extent)
-    _refuse_contradictions(bool(wrong), through, motion is not None)
+    _refuse_contradictions(bool(wrong), through, motion is not None or not tracked.searched)
     if motion is None:
         _refuse_unconfirmed(better, replace(tracked, poses=poses), p, survey.extent)
     if motion is not None:
@@ -192,8 +192,9 @@ def _refuse_few(tracked: Tracked, views: Sequence[ScanView]) -> None:
         raise UnreadableInput(turn, hint=hint)
 
 
-def _refuse_contradictions(wrong: bool, through: float, free: bool) -> None:
-    if wrong or through > MOST_THROUGH[not free]:
+def _refuse_contradictions(wrong: bool, through: float, confirmed: bool) -> None:
+    """``confirmed``: by free motion, or because every scan was registered from its prediction."""
+    if wrong or through > MOST_THROUGH[not confirmed]:
         what = "the scans contradict one another at every pose that was found:"
         what += f" {100.0 * through:.1f} % of the surface that others show is seen through"
         hint = "steps between scans are too large, or other objects are in view: record more scans, or crop the target"

@@ -209,8 +209,7 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
         spent = time.process_time() - begun
         result.seconds, result.worst_ms = result.seconds + spent, max(result.worst_ms, 1e3 * spent)
         seen_so_far = watch.observe(seen_so_far, innovation, verdict.gamma)
-        window = watch.judge(seen_so_far, verdict.gamma)
-        honest = window.consistent is True and not track.window.many_outliers
+        honest = watch.judge(seen_so_far).consistent is True and not track.window.many_outliers
         failed = ()
         found = estimator.residual_after(track, prediction, innovation) if verdict.gamma else None
         if found is not None:
@@ -220,7 +219,7 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
         result.failed_at += [t] * len(failed)
         honest = honest and not track.doubtful and not failed
         forecast = estimator.track_forecast(track, test.params.times_s)
-        word = test.judge(word, track.belief, forecast, honest, window.surprising)
+        word = test.judge(word, track.belief, forecast, honest)
         score(result, t, x, track, verdict.gamma, verdict.reason.value, word.converged)
         if any(abs(t - mark) < 0.5 / case.hz for mark in NEES_S):
             result.nees.append(nees_of(estimator.published(track), x))
