@@ -171,7 +171,7 @@ def box_scan(rng, T_ac: Pose, marks) -> np.ndarray:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [6, 12])
-@pytest.mark.parametrize("step_deg", [60.0, 90.0, 120.0, 143.0])
+@pytest.mark.parametrize("step_deg", [60.0, 143.0])
 @pytest.mark.parametrize("body", ["irregular", "nearly symmetric"])
 def test_large_steps_end_with_the_right_poses_or_with_a_refusal(step_deg, count, body):
     marks = [
