@@ -13,14 +13,14 @@ import io
 import os
 import sys
 import tempfile
-import zlib
 from collections.abc import Callable
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.binary_files import parse_npy, read_members
+from avsreplay.files import BadFile
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
 
@@ -92,9 +92,9 @@ def read_arrays(path: Path | None, checksum: Checksum) -> dict[str, Array]:
     if payload is None:
         return {}
     try:
-        with np.load(io.BytesIO(payload.tobytes()), allow_pickle=False) as arrays:
-            return {name: arrays[name] for name in arrays.files}
-    except (BadZipFile, zlib.error, ValueError, EOFError, OSError):  # another program wrote it
+        members = read_members(payload.tobytes(), payload.nbytes)
+        return {name.removesuffix(".npy"): parse_npy(member) for name, member in members.items()}
+    except BadFile:  # another program wrote it
         return {}
 
 
