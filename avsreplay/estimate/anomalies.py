@@ -20,7 +20,7 @@ from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import VEL, W, definite_product
-from avsreplay.estimate.hypotheses import NONLINEAR, explain, odds_over_free
+from avsreplay.estimate.hypotheses import explain, linear, odds_over_free
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.mixture import moments
@@ -103,7 +103,8 @@ class AnomalyTest:
         window, ranked = explain(window, first, self._priors, *self.batch.noise_levels(track), self.batch.orbit)
         best = ranked[0].hypothesis
         changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= _OVER_FREE
-        changed = changed and (bool(track.doubtful) or _linear(window, ranked))
+        free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
+        changed = changed and (bool(track.doubtful) or linear(free, window))
         disturbed = best is Hypothesis.DISTURBED and odds_over_free(ranked) >= _OVER_FREE and _explains(ranked[0])
         if (large or track.doubtful) and disturbed:
             track, doubtful = self._disturbed(track, ranked[0]), self._disturbed(doubtful, ranked[0])
@@ -198,8 +199,9 @@ class AnomalyTest:
         else:
             track = self._with_rejected(track)
             levels = self._disturbances(track)
-            disturbed = self._started(track, track.doubtful[-_FEWEST:], levels) if levels.count else None
-            anew = self._initialised_anew(track, levels) or disturbed
+            anew = self._initialised_anew(track, levels)
+            if anew is None and levels.count:
+                anew = self._started(track, track.doubtful[-_FEWEST:], levels)
         if anew is not None:
             return replace(anew, reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
         return replace(with_history(track, track), doubtful=track.doubtful[1 - _FEWEST :]), Verdict(0, Reason.POSE_JUMP)
@@ -335,15 +337,6 @@ def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
 
 def _explains(found: Explanation) -> bool:
     return found.chi2 < _EXPLAINED * found.dof
-
-
-def _linear(window: tuple[Epoch, ...], ranked: list[Explanation]) -> bool:
-    """Return whether the linearisation about the first prediction holds over scans that were all used.
-
-    Of a linear system the chi-square of free motion is then the sum of the NIS, whatever moved the target.
-    """
-    free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
-    return free < NONLINEAR * sum(e.innovation.nis for e in window)
 
 
 def _chi2(y: Array, C: Array) -> float:

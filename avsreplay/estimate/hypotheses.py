@@ -33,7 +33,7 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief
 
-NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
+_NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
 _PER_BAD_SCAN = math.log(1e-2)
 _INSTANTS, _FEWER, _LONG = 8, 4, 9  # instants tried for a manoeuvre between two scans; fewer in a window of _LONG scans
@@ -73,7 +73,7 @@ def explain(
     window = window_of(epochs, start, torque, force, None if orbit is None else orbit.at(start.t_ns))
     white = window.whiten @ window.y
     accepted = white[: 6 * first_doubtful]
-    if first_doubtful > 1 and accepted @ accepted > NONLINEAR * sum(e.innovation.nis for e in epochs[:first_doubtful]):
+    if first_doubtful > 1 and not linear(float(accepted @ accepted), epochs[:first_doubtful]):
         left_out = first_doubtful // 2
         return explain(epochs[left_out:], first_doubtful - left_out, priors, torque, force, orbit)
     free = -0.5 * float(white @ white) + float(np.log(np.diagonal(window.whiten)).sum())
@@ -87,6 +87,14 @@ def explain(
         _frozen(window, first_doubtful, n),
     ]
     return tuple(epochs), sorted(found, key=lambda e: -e.log_evidence)
+
+
+def linear(chi2: float, epochs: Sequence[Epoch]) -> bool:
+    """Return whether the linearisation about the first prediction holds over scans that were all used.
+
+    Of a linear system the chi-square of free motion is the sum of the NIS, whatever moved the target.
+    """
+    return chi2 < _NONLINEAR * sum(e.innovation.nis for e in epochs)
 
 
 def _manoeuvre(window: Window, start: Belief, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
