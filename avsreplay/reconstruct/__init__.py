@@ -113,7 +113,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
     _refuse_contradictions(bool(wrong), through, motion is not None or not tracked.searched)
     if motion is None:
         _refuse_unconfirmed(better, replace(tracked, poses=poses), p, survey.extent)
-    if motion is not None:
+    else:
         motion = joint_motion(better, sorted(keys), motion, gate, survey.extent)
         moved = _on_motion(views, poses, motion)
         used = {k: moved[k] for k in keys if k in moved}

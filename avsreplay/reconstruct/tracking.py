@@ -297,6 +297,8 @@ def ambiguous(views: Sequence[ScanView], found: Tracked, p: ReconstructionParams
         extent: of the target [m].
     """
     known = [k for k in found.searched if k in found.poses]
+    if not known:
+        return False
     known = known[:: max(1, -(-len(known) // MOST_CONFIRMED))]
     model, count = patchwork(views, replace(found, keys=sorted(found.poses)), p.thin * extent), 0
     for k in known:
