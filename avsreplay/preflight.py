@@ -255,7 +255,7 @@ def _crop_of_located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar
     """The crop around the model where a search finds it; None if it is found in less than half of the scans.
 
     The search looks at the connected parts of the scan with the size of the model, and tests every pose: size alone
-        does not distinguish the target from other objects.
+    does not distinguish the target from other objects.
     """
     registrar, found = registrar or Registrar(surface), []
     for k, cloud in enumerate(clouds):

@@ -34,11 +34,8 @@ from avsreplay.geometry import Array
 _NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
 _TRIAL = 2.0  # distance along a direction at which the cost is compared with the Gaussian one [sigma]
 _RISE, _TRIES, _LOST = 0.5 * _NODE**2, 6, 3.0
-_PIN_STEPS, _FEWEST_STEPS, _PIN_WORK = (
-    15,
-    40,
-    12000,
-)  # budget of the fits with one direction fixed: steps times poses and pieces
+_PIN_STEPS, _FEWEST_STEPS = 15, 40  # budget of a fit with one direction fixed, and least budget of all of them
+_PIN_WORK = 12_000  # budget of all of them in steps times poses and pieces
 _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
 _LINEAR_RAD = 0.05  # largest rotation by disturbances for which the problem about the fitted trajectory is linear
 _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
@@ -130,8 +127,8 @@ def _profile(
     """The fit with the direction fixed where the cost has risen by ``_RISE``: the best of ``_TRIES``, from ``side`` on.
 
     A fit that ends far above that begins again nearer to the minimum: it did not follow the valley of the cost. The
-        result is None if no fit came near within ``most`` steps, because its covariance would not be that of a point in
-        the valley. The number of steps is returned as well.
+    result is None if no fit came near within ``most`` steps, because its covariance would not be that of a point in
+    the valley. The number of steps is returned as well.
     """
     there, found, spent = fitted.chart.moved(side * axis), [], 0
     for _ in range(_TRIES):

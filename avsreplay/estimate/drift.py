@@ -37,10 +37,8 @@ _ONSETS, _FINER = 12, 9  # number of onsets tried, the first at the epoch, and a
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
 _CONSTANT = 6.0  # log odds over random disturbances from which it is reported
-_ROUNDS, _LEAST_GAIN = (
-    10,
-    0.5,
-)  # largest number of linearisations; decrease of the cost (half chi-square) above which another follows
+_ROUNDS = 10  # largest number of linearisations
+_LEAST_GAIN = 0.5  # decrease of the cost (half chi-square) above which another linearisation follows
 _PARTS = (1.0, 0.3, 0.1, 0.03)  # parts of a step, of which the first that decreases the cost is taken
 _WIDTHS = (1.0, 0.1)  # factors on the prior 1 sigma: a large or a small drift
 _SCALES = (1.0, 0.1, 0.01)  # the same, where a drift is compared with disturbances of any density

@@ -23,8 +23,8 @@ def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _P
     """At most some hundred poses that carry the information of many: weighted means about a reference motion.
 
     Neighbouring poses, over a turn of a fraction of a radian, are replaced by one: the reference's pose at their mean
-        instant, corrected by the mean of their differences from it. Its covariance is the inverse of the sum of their
-        information. The difference of two solutions of the motion changes little over such a turn, so the fit to the
+    instant, corrected by the mean of their differences from it. Its covariance is the inverse of the sum of their
+    information. The difference of two solutions of the motion changes little over such a turn, so the fit to the
     normal points is the fit to the poses. Satellite laser ranging reduces its observations to normal points in the same
     way.
 

@@ -276,7 +276,7 @@ class Source:
         return pose
 
     def _measured(self, found: MeasuredPose, t_ns: int, frame: str) -> MeasuredPose:
-        """Return a measured pose in the fixed frame, of the grasp point, with the covariance that applies."""
+        """Return a measured pose of the grasp point in the fixed frame with its covariance or that of the settings."""
         options, C = self.options, found.covariance
         offset = np.zeros(3) if options.grasp is None else np.array(options.grasp)
         if C is not None and options.grasp is not None:  # covariance at the new origin: v' = v + theta x offset

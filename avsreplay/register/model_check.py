@@ -26,7 +26,7 @@ from avsreplay.register.sampling import without_scattered_points
 from avsreplay.register.size import SIGMAS, fitted_size, noise_bias
 
 POINTS = 1500  # points used of each scan
-LEAST_ERROR = 0.002  # least error of size that is reported; a single scan cannot show so small a one
+_LEAST_RUN_ERROR = 0.002  # least error of size that is reported; a single scan cannot show so small a one
 EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
 ENOUGH_SCANS = 16  # with which the check ends where they exclude an error of size that would be reported
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
@@ -96,7 +96,7 @@ class ModelCheck:
         if len(self._deltas) < ENOUGH_SCANS:
             return False
         mean, spread, _ = self._mean()
-        return abs(mean) + SIGMAS * spread < LEAST_ERROR
+        return abs(mean) + SIGMAS * spread < _LEAST_RUN_ERROR
 
     def notes(self) -> tuple[str, ...]:
         """Return the errors of the model that the run shows, one line each; empty if there are none."""
@@ -111,7 +111,7 @@ class ModelCheck:
         found = self.scale()
         if found is None:
             return ()
-        if abs(found[0] - 1.0) < max(LEAST_ERROR, SIGMAS * found[1]):
+        if abs(found[0] - 1.0) < max(_LEAST_RUN_ERROR, SIGMAS * found[1]):
             return ()
         small, long = ("small", "long") if found[0] > 1.0 else ("large", "short")
         percent = 100.0 * abs(found[0] - 1.0)

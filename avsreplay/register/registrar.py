@@ -165,8 +165,8 @@ class Registrar:
     ) -> tuple[Alignment, bool]:
         """Register the result of a search of part of the scan on the whole scan, and test it.
 
-        Also returned: whether the points off the model belong to another object (far away, or the visible side is
-            complete).
+        Also returned: whether the points off the model belong to another object, which is far away or beside a
+        complete visible side.
         """
         few = self._restarter.part(part)
         start = self._restarter.measure(few, search.best)
