@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import signal
 import sys
 import tempfile
@@ -133,7 +132,6 @@ def read_result(path: Path) -> Result:
     """Read and verify a saved result; warn on stderr if it could not be verified or its log was damaged."""
     from avsreplay.report.result import load_result
 
-    gc.set_threshold(100_000)  # rows are millions of values without cycles, which each full collection would visit
     result = load_result(path)
     for line in result.warnings:
         click.echo(f"avsreplay: warning: {line}", err=True)
