@@ -114,11 +114,10 @@ def from_trajectory(scale: Array, rows: Array, R: Array, Phi_k0: Array) -> Grami
 
 def _added(state: Gramian, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
     white = np.linalg.solve(np.linalg.cholesky(R), rows)
-    roots = [
-        np.asarray(np.linalg.qr(np.vstack([old, new.reshape(-1, state.scale.size)]), mode="r"))
-        for old, new in ((state.root, rows), (state.white, white))
-    ]
-    return Gramian(roots[0], roots[1], Phi_k0, state.scale)
+    n = state.scale.size
+    added = np.stack([rows.reshape(-1, n), white.reshape(-1, n)])
+    root, whitened = np.linalg.qr(np.concatenate([np.stack([state.root, state.white]), added], axis=1), mode="r")
+    return Gramian(root, whitened, Phi_k0, state.scale)
 
 
 def measure(state: Gramian) -> Observability:
@@ -127,8 +126,7 @@ def measure(state: Gramian) -> Observability:
     rank, n = int(np.sum(told > 1.0)), state.scale.size
     if rank < n:
         return Observability(rank, n, None, None)
-    raw = np.linalg.svd(state.root, compute_uv=False)
-    scaled = np.linalg.svd(state.root * state.scale, compute_uv=False)
+    raw, scaled = np.linalg.svd(np.stack([state.root, state.root * state.scale]), compute_uv=False)
     return Observability(rank, n, _log10_cond(raw), _log10_cond(scaled))
 
 
