@@ -232,3 +232,22 @@ def test_motion_between_samples_is_the_cubic_spline():
         np.testing.assert_allclose(turn.reshape(-1, 9), expected[:, 3:], atol=1e-12)
     with pytest.raises(ValueError, match="pieces"):
         _cone.motion(np.ascontiguousarray(spline.c), x[:-1], times, 0)
+
+
+@pytest.mark.parametrize("n", [4, 5, 60])
+def test_coefficients_and_values_are_those_of_the_spline_of_scipy(n):
+    rng = np.random.default_rng(n)
+    x, y = np.cumsum(rng.uniform(0.1, 1.0, n)), rng.normal(size=(n, 3))
+    spline, pieces, times = CubicSpline(x, y), _cone.spline(x, y), rng.uniform(x[0], x[-1], 100)
+    np.testing.assert_allclose(pieces, spline.c, atol=1e-11 * np.abs(spline.c).max())
+    for order in (0, 1):
+        np.testing.assert_allclose(_cone.values(pieces, x, times, order), spline(times, order), atol=1e-11)
+
+
+def test_nodes_of_a_spline_ascend_and_are_at_least_four():
+    x = np.arange(5.0)
+    for nodes, values in ((x[:3], x[:3]), (x, x[:4]), (x[::-1].copy(), x), (np.array([0.0, 1.0, 1.0, 2.0]), x[:4])):
+        with pytest.raises(ValueError, match="spline"):
+            _cone.spline(nodes, values[:, None].copy())
+    with pytest.raises(ValueError, match="pieces"):
+        _cone.values(_cone.spline(x, x[:, None]), x[:-1], x, 0)

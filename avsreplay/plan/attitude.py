@@ -16,6 +16,7 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
+from avsreplay.plan import _cone
 from avsreplay.plan.path import CostatePath
 from avsreplay.plan.rendezvous import PlanParams, rendezvous
 from avsreplay.records import Trajectory
@@ -137,8 +138,6 @@ def _relative(target: Attitude, q0: Array, horizon_s: float, winding: int) -> tu
 
     A rotation by theta about e is also one by theta - 2 pi; ``winding`` selects the branch at the begin.
     """
-    from scipy.interpolate import CubicSpline
-
     times = np.linspace(0.0, horizon_s, math.ceil(horizon_s / GRID_S) + 1)
     psi = np.array(geometry.log(geometry.multiply(geometry.conjugate(q0), target(times))))
     size = np.maximum(np.linalg.norm(psi, axis=1, keepdims=True), 1e-12)
@@ -151,8 +150,9 @@ def _relative(target: Attitude, q0: Array, horizon_s: float, winding: int) -> tu
     last = int(jumps[0]) if len(jumps) else len(times) - 1
     if last < 4:
         return (lambda t: (np.zeros((len(t), 3)), np.zeros((len(t), 3)))), 0.0
-    spline = CubicSpline(times[: last + 1], taken[: last + 1])
-    return (lambda t: (np.asarray(spline(t)), np.asarray(spline(t, 1)))), float(times[last])
+    nodes = times[: last + 1]
+    pieces = _cone.spline(nodes, taken[: last + 1])
+    return (lambda t: (_cone.values(pieces, nodes, t, 0), _cone.values(pieces, nodes, t, 1))), float(times[last])
 
 
 def next_turn(before: Turn, target: Attitude, accel_radps2: float, params: PlanParams, t_ns: int) -> Turn:

@@ -150,6 +150,8 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
     """Return the plan without constraints where it satisfies all of them; None where it does not."""
     path, limits = path_of(free, case.r0, case.v0), case.limits
     times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * limits.nodes + 1)
+    if margins_at(case, path, times[::BETWEEN]).values.min() < 0.0:  # few instants show most violations
+        return None
     if not case.within_axes(path.thrust(times)):
         return None
     if float(np.linalg.norm(path.at(times)[1], axis=1).max()) > (limits.speed_max_mps or math.inf):
@@ -159,8 +161,6 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
         relative = path.thrust(times[-1:])[0] - (rate[0] - rate[1]) / 1e-4
         if float(np.linalg.norm(relative)) > limits.contact_accel_mps2:
             return None
-    if margins_at(case, path, times[::BETWEEN]).values.min() < 0.0:  # few instants show most violations
-        return None
     worst, name = worst_margin(case, path)
     abort = aborted(case, path)
     if worst < 0.0 or abort.short > 0.0:

@@ -14,6 +14,7 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
+from avsreplay.plan import _cone
 from avsreplay.plan.guidance import Guidance, GuidanceState, PlannerInput, Segment
 from avsreplay.plan.limits import Scene
 from avsreplay.plan.path import CostatePath, RobotPath, StepPath
@@ -167,19 +168,18 @@ def interpolated(times_s: Array, poses: Sequence[geometry.Pose]) -> Motion:
     Raises:
         ValueError: There are too few poses, or the times do not ascend.
     """
-    from scipy.interpolate import CubicSpline
-    from scipy.spatial.transform import Rotation, Slerp
-
     times = np.asarray(times_s, dtype=np.float64)
     if len(times) < 4 or len(times) != len(poses) or np.any(np.diff(times) <= 0.0):
         raise ValueError(f"{len(poses)} poses at {len(times)} instants, must be at least 4 at ascending instants")
-    line = CubicSpline(times, np.array([p.t for p in poses]))
-    turn = Slerp(times, Rotation.from_quat(np.array([p.q for p in poses])))
+    line, q = _cone.spline(times, np.array([p.t for p in poses])), np.array([p.q for p in poses])
+    turns = geometry.log(geometry.multiply(geometry.conjugate(q[:-1]), q[1:]))  # (n - 1, 3) between the poses
 
     def at(instants: Array) -> tuple[Array, Array, Array]:
         inside = (instants >= times[0]) & (instants <= times[-1])
-        position, velocity = line(instants), line(instants, 1)
-        attitude = turn(np.clip(instants, times[0], times[-1])).as_quat()
+        position, velocity = (_cone.values(line, times, instants, order) for order in (0, 1))
+        k = np.clip(np.searchsorted(times, instants, "right") - 1, 0, len(turns) - 1)
+        share = np.clip((instants - times[k]) / (times[k + 1] - times[k]), 0.0, 1.0)
+        attitude = geometry.multiply(q[k], geometry.exp(share[:, None] * turns[k]))
         for values in (position, velocity, attitude):
             values[~inside] = np.nan
         return position, velocity, attitude

@@ -274,14 +274,11 @@ class SampledScene:
         return np.interp(times, grid, position), np.interp(times, grid, attitude)
 
     def _joined(self, end_s: float) -> tuple[Array, Array]:
-        from scipy.interpolate import CubicSpline  # coefficients (4, n, 12), highest power first
-
         times = np.linspace(0.0, end_s, max(math.ceil(end_s / self._step_s), 4) + 1)
         turn = np.tile(np.eye(3).ravel(), (len(times), 1))
         if self.scene.attitude is not None:
             turn = geometry.matrix(self.scene.attitude(times)).reshape(-1, 9)
-        spline = CubicSpline(times, np.concatenate([self.scene.goal(times)[0], turn], axis=1))
-        return np.ascontiguousarray(spline.c), times
+        return _cone.spline(times, np.concatenate([self.scene.goal(times)[0], turn], axis=1)), times
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -99,6 +99,30 @@ nb::object motion(const In<double, 4, -1, 12>& c, const In<double, -1>& x, const
                         nb::ndarray<nb::numpy, double>(R, 3, shape, own_R));
 }
 
+// Coefficients (4, n - 1, width) of the cubic spline through values (n, width).
+nb::object spline_of(const In<double, -1>& x, const In<double, -1, -1>& y) {
+  const size_t n = x.shape(0), width = y.shape(1);
+  if (n < 4 || y.shape(0) != n) throw nb::value_error("a spline has at least 4 nodes, each with its values");
+  for (size_t i = 0; i + 1 < n; ++i)
+    if (!(x(i + 1) > x(i))) throw nb::value_error("the nodes of a spline ascend");
+  double* c = new double[4 * (n - 1) * width];
+  nb::capsule own(c, [](void* p) noexcept { delete[] static_cast<double*>(p); });
+  spline(x.data(), y.data(), n, width, c);
+  const size_t shape[3] = {4, n - 1, width};
+  return nb::cast(nb::ndarray<nb::numpy, double>(c, 3, shape, own));
+}
+
+// Values (m, width) of cubic pieces (4, n, width), or their derivatives.
+nb::object values(const In<double, 4, -1, -1>& c, const In<double, -1>& x, const In<double, -1>& times, int order) {
+  const size_t n = c.shape(1), width = c.shape(2), m = times.shape(0);
+  if (n < 1 || x.shape(0) != n + 1 || order < 0 || order > 1) throw nb::value_error("pieces and limits differ");
+  double* out = new double[m * width];
+  nb::capsule own(out, [](void* p) noexcept { delete[] static_cast<double*>(p); });
+  piecewise(c.data(), x.data(), n, width, times.data(), m, order, width, out, out);
+  const size_t shape[2] = {m, width};
+  return nb::cast(nb::ndarray<nb::numpy, double>(out, 2, shape, own));
+}
+
 }  // namespace
 
 NB_MODULE(_cone, m) {
@@ -106,4 +130,6 @@ NB_MODULE(_cone, m) {
         nb::arg("cones"));
   m.def("rows", &rows);
   m.def("motion", &motion);
+  m.def("spline", &spline_of);
+  m.def("values", &values);
 }

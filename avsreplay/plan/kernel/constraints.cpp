@@ -140,6 +140,45 @@ void constraint_rows(const ReferencePoints& at, const ConstraintFrame& frame, co
   Maker(at, frame, limits, planes, cones).run();
 }
 
+// de Boor, "A Practical Guide to Splines", 1978, chapter IV: a tridiagonal system for the slopes at the nodes. Each
+// pivot is positive, so it is eliminated without exchanges.
+void spline(const double* x, const double* y, size_t n, size_t width, double* c) {
+  const size_t stride = (n - 1) * width;
+  double *c3 = c, *c2 = c + stride, *s = c + 2 * stride, *c0 = c + 3 * stride;  // slopes in place of the linear term
+  std::vector<double> upper(n), last(width);
+  const auto step = [x](size_t i) { return x[i + 1] - x[i]; };
+  for (size_t i = 0; i + 1 < n; ++i)  // mean slopes in place of the cubic term
+    for (size_t j = 0; j < width; ++j) c3[i * width + j] = (y[(i + 1) * width + j] - y[i * width + j]) / step(i);
+  const auto rise = [&](size_t i, size_t j) { return c3[i * width + j]; };
+  const double first = step(0) + step(1);
+  upper[0] = first / step(1);
+  for (size_t j = 0; j < width; ++j)
+    s[j] = ((step(0) + 2 * first) * step(1) * rise(0, j) + step(0) * step(0) * rise(1, j)) / first / step(1);
+  for (size_t i = 1; i + 1 < n; ++i) {
+    const double a = step(i - 1), b = step(i), pivot = 2 * (a + b) - b * upper[i - 1];
+    upper[i] = a / pivot;
+    for (size_t j = 0; j < width; ++j)
+      s[i * width + j] = (3 * (b * rise(i - 1, j) + a * rise(i, j)) - b * s[(i - 1) * width + j]) / pivot;
+  }
+  const double a = step(n - 3), b = step(n - 2), both = a + b, pivot = a - both * upper[n - 2];
+  for (size_t j = 0; j < width; ++j) {
+    const double right = (b * b * rise(n - 3, j) + (2 * both + b) * a * rise(n - 2, j)) / both;
+    last[j] = (right - both * s[(n - 2) * width + j]) / pivot;
+  }
+  for (size_t i = n - 1; i-- > 0;) {
+    const double h = step(i);
+    for (size_t j = 0; j < width; ++j) {
+      const size_t at = i * width + j;
+      s[at] -= upper[i] * last[j];
+      const double slope = rise(i, j), bend = (s[at] + last[j] - 2 * slope) / h;
+      c3[at] = bend / h;
+      c2[at] = (slope - s[at]) / h - bend;
+      c0[at] = y[at];
+      last[j] = s[at];
+    }
+  }
+}
+
 void piecewise(const double* c, const double* x, size_t n, size_t width, const double* times, size_t m, int order,
                size_t split, double* a, double* b) {
   const size_t stride = n * width;

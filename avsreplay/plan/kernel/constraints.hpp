@@ -48,6 +48,10 @@ struct ReferencePoints {
 void constraint_rows(const ReferencePoints& at, const ConstraintFrame& frame, const ConstraintLimits& limits,
                      PointRows& planes, PointRows& cones);
 
+// Coefficients (4, n - 1, width), highest power first, of the cubic spline through n >= 4 values (n, width) at ascending x
+// whose third derivative is continuous also at the second node from each end ("not a knot").
+void spline(const double* x, const double* y, size_t n, size_t width, double* c);
+
 // Value (order 0) or derivative (order 1) of cubic pieces at m instants: coefficients c (4, n, width), highest power
 // first, of t - x[k] in [x[k], x[k + 1]]; the first ``split`` values of an instant go to ``a``, the others to ``b``.
 void piecewise(const double* c, const double* x, size_t n, size_t width, const double* times, size_t m, int order,
