@@ -19,7 +19,7 @@ from avsreplay import geometry, monitor
 from avsreplay.config import Guess
 from avsreplay.estimate import Estimator, Prediction, Track
 from avsreplay.estimate.chart import body_parameters
-from avsreplay.estimate.track import deskew, with_scan_duration
+from avsreplay.estimate.track import deskew, in_doubt, with_scan_duration
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor import FaultDetector, Gramian
 from avsreplay.monitor.convergence import Consistency, ConsistencyTrack, Convergence, ConvergenceTrack, violations
@@ -97,7 +97,7 @@ class Monitors:
         consistency = self.consistency.observe(state.consistency, innovation, gamma)
         window = self.consistency.judge(consistency)
         failed = self._violations(estimator, prior, innovation if gamma else None, track)
-        consistent = window.consistent and not (track.window.many_outliers or track.doubtful or failed)
+        consistent = window.consistent and not (track.window.many_outliers or in_doubt(track) or failed)
         forecast = estimator.track_forecast(track, self.convergence.params.times_s)
         judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True)
         report = MonitorReport(

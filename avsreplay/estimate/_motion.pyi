@@ -26,6 +26,17 @@ def correct(
     R: Array,
     colour: tuple[float, float],
 ) -> tuple[Array, Array, Array, Array, Array, Array, Array, Array]: ...
+def change(
+    Phi: Array,
+    P: Array,
+    H: Array,
+    alpha: Array,
+    S: Array,
+    R: Array,
+    colour: Array,
+    one_sigma: tuple[float, float],
+    scale: float,
+) -> tuple[float, Array]: ...
 def forecast(
     q_ab: Array,
     w_b: Array,

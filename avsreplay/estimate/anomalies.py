@@ -34,6 +34,7 @@ from avsreplay.estimate.scan_window import (
     Hypothesis,
     disturbance_levels,
     last_change_ns,
+    possible_change,
     scans_after,
 )
 from avsreplay.estimate.track import (
@@ -111,6 +112,12 @@ class AnomalyTest:
         if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
             return self._accepted(track, epoch, update), verdict
         return self._decided(doubtful, window, ranked)
+
+    def with_possible_change(self, track: Track) -> Track:
+        """The track with the possible change of the velocities within its accepted scans."""
+        recent = track.recent if self.enabled and ready(track) else ()
+        probability, P = possible_change(recent, nis_scale(track), self._priors)
+        return replace(track, change_probability=probability, change_P=P)
 
     def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:
         """A scan that agrees with the prediction: the doubtful scans before it were bad.

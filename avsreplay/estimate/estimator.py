@@ -161,6 +161,7 @@ class Estimator:
             track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged, True)
         )
         after = replace(after, undetermined=undetermined(track, innovation, verdict.gamma, self._length_m))
+        after = self.anomalies.with_possible_change(after) if verdict.gamma else after
         due = verdict.gamma == 1 and after.mode in ("fit", "filter")
         return self.disturbances.advanced(after, self._robust) if due else after, verdict
 
@@ -272,24 +273,24 @@ class Estimator:
             spread: a fit to many poses is left to the next scans (``step``).
         """
         if innovation is None or gamma == 0:
-            return replace(track, belief=prediction.belief)
+            return replace(track, belief=prediction.belief, change_P=prediction.Phi @ track.change_P @ prediction.Phi.T)
         if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
             return self.batch.initialised(track, prediction, innovation, converged, spread)
         return self.batch.check_against_batch(self.batch.filtered(track, prediction, innovation), spread)
 
     def published(self, track: Track) -> Belief:
-        """The belief in {A} with errors that later poses do not reduce and the filter therefore does not carry.
+        """The belief in {A} with errors that the filter does not carry.
 
-        One is the error of the position along the line of sight that all poses may have in common. The others are
-        motions of the model that no healthy scan determines, such as the rotation of a body of revolution about its
-        axis.
+        Later poses do not reduce the error of the position along the line of sight that all poses may have in common,
+        nor motions of the model that no healthy scan determines, such as the rotation of a body of revolution about its
+        axis. Later poses decide on a change of the velocities that the last scans make possible.
 
         Args:
             track: after a scan.
         """
         belief = self.in_camera(track.belief)
         b = common_1s(track, belief.x.T_ac.t)
-        P = belief.P + motion_covariance(track.undetermined, belief.x.q_bc)
+        P = belief.P + motion_covariance(track.undetermined, belief.x.q_bc) + track.change_P
         P[RHO, RHO] += np.outer(b, b)
         return replace(belief, P=P)
 

@@ -16,6 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from avsreplay.estimate import _motion
 from avsreplay.estimate.batch_covariance import SPHERE
 from avsreplay.estimate.driven import DrivenBelief, driven_steps
 from avsreplay.estimate.dynamics import process_noise
@@ -24,11 +25,12 @@ from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.measurement import innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.noise import cholesky_root, correlated_noise
 from avsreplay.estimate.relative_orbit import OrbitArc
-from avsreplay.estimate.track import Epoch
+from avsreplay.estimate.track import NO_CHANGE, Epoch
 from avsreplay.geometry import Array, Pose, conjugate, frozen, log, multiply
 from avsreplay.records import Belief
 
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
+_SUSPECTED, _PRIOR_CHANGE = 3, 0.02  # last scans in which a change may have begun, and its prior probability
 _SCALES = (1.0, 0.1)  # factors on the prior standard deviations: a large or a small change
 FEWEST_DISTURBED, MOST_DISTURBED = 5, 8  # poses from which disturbances are estimated without a model of the motion
 _DENSITIES, _ERRORS = np.logspace(-6.0, 2.0, 81), np.logspace(0.0, 4.0, 41)  # compared; errors over the claimed ones
@@ -130,6 +132,43 @@ def window_of(
     flat = 0.5 * (flat + flat.T)
     whiten = np.asarray(np.linalg.inv(cholesky_root(flat)), dtype=np.float64)
     return Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, tuple(R_ba))
+
+
+def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors) -> tuple[float, Array]:
+    """The probability of a change of rate or velocity within the last accepted scans, and what it adds to the variance.
+
+    The estimate is wrong before a change can be detected. By the law of total covariance, the second moments of the
+    error that the change would cause are added to the covariance, times its probability. This is done where the
+    likelihood ratio of a change in one of the last three intervals is above 1: in 1.6 % of the scans without a change.
+
+    Args:
+        epochs: accepted scans in the order of time.
+        scale: factor on the covariance of their innovations (``nis_scale``).
+        priors: 1 sigma of the size of a change.
+
+    Returns:
+        The probability, and (20, 20); both 0 where the ratio is 1 or less, or without scans.
+    """
+    if not epochs:
+        return 0.0, NO_CHANGE
+    last = epochs[-_SUSPECTED:]
+    seen = [e.innovation for e in last]
+    inflation = [np.ones(2) if e.track.inflation is None else e.track.inflation for e in last]
+    ratio, P = _motion.change(
+        np.array([e.prediction.Phi for e in last]),
+        np.array([e.prediction.belief.P for e in last]),
+        np.array([e.prediction.H for e in last]),
+        np.array([i.alpha for i in seen]),
+        np.array([i.S for i in seen]),
+        np.array([i.R for i in seen]),
+        np.array([c / i.weight for c, i in zip(inflation, seen, strict=True)]),
+        (priors.rate_radps, priors.velocity_mps),
+        scale * (1.0 + (len(last) - 1) * seen[-1].share),
+    )
+    if not ratio > 1.0:
+        return 0.0, NO_CHANGE
+    probability = _PRIOR_CHANGE * ratio / (1.0 - _PRIOR_CHANGE + _PRIOR_CHANGE * ratio)
+    return probability, frozen(probability * P)
 
 
 def log_evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float, Array, Array]:

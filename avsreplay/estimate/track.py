@@ -32,6 +32,7 @@ _READY, _READY_AFTER_MANOEUVRE = 8, 3  # least number of poses of an estimate wh
 _RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 _NO_NOISE = frozen(np.zeros((6, 6)))
 _NO_MOTION = frozen(np.zeros((6, 0)))
+NO_CHANGE = frozen(np.zeros((20, 20)))
 _TURN_WITHIN_RAD = 0.2  # largest change of the other rotations if a rotation that is first determined turns the track
 _ALIKE = 0.966  # cosine of 15 deg, between motions that count as the same
 
@@ -88,6 +89,7 @@ class Track:
         fitting, testing: a fit and a test that are spread over scans, None where none is under way.
         undetermined: (6, k) motions d of the model that neither the start nor any healthy scan so far determines, each
             as large as half the extent: 1 sigma.
+        change_probability, change_P: of a change of the velocities in the last scans, and what it adds to P (20, 20).
     """
 
     belief: Belief
@@ -119,6 +121,8 @@ class Track:
     fitting: Computation | None = None
     testing: Computation | None = None
     undetermined: Array = field(default_factory=lambda: _NO_MOTION)
+    change_probability: float = 0.0
+    change_P: Array = field(default_factory=lambda: NO_CHANGE)
 
 
 def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
@@ -215,6 +219,11 @@ class Prediction:
 def confirmed(track: Track) -> tuple[Manoeuvre, ...]:
     """The manoeuvres without one that is still pending."""
     return track.manoeuvres[:-1] if track.pending else track.manoeuvres
+
+
+def in_doubt(track: Track) -> bool:
+    """Return whether a scan is not decided on, or a change of the motion is more likely than none."""
+    return bool(track.doubtful) or track.change_probability > 0.5
 
 
 def with_history(then: Track, now: Track) -> Track:

@@ -25,6 +25,7 @@ from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.chart import ARM, ETA, INERTIA, RATE, to_chart, to_errors
 from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.measurement import measurement_jacobian
+from avsreplay.estimate.track import in_doubt
 from avsreplay.geometry import Array, Pose
 from avsreplay.monitor import FaultDetector, FaultParams
 from avsreplay.monitor.convergence import (
@@ -217,23 +218,24 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
             failed = violations(track.belief, covariance, *found)
         result.violations += list(failed)
         result.failed_at += [t] * len(failed)
-        honest = honest and not track.doubtful and not failed
+        honest = honest and not in_doubt(track) and not failed
         forecast = estimator.track_forecast(track, test.params.times_s)
         word = test.judge(word, track.belief, forecast, honest)
-        score(result, t, x, track, verdict.gamma, verdict.reason.value, word.converged)
+        published = estimator.published(track)
+        score(result, t, x, published, verdict.gamma, verdict.reason.value, word.converged)
         if any(abs(t - mark) < 0.5 / case.hz for mark in NEES_S):
-            result.nees.append(nees_of(estimator.published(track), x))
+            result.nees.append(nees_of(published, x))
         if case.at_s <= t < case.until_s:
-            result.squares.append(squares_of(estimator.published(track), x))
+            result.squares.append(squares_of(published, x))
         result.grasp.append(float(forecast.pos_1s_m.max()))
     result.track = track
     return result
 
 
-def score(result: Result, t: float, x: State, track: Track, gamma: int, reason: str, converged: bool) -> None:
+def score(result: Result, t: float, x: State, belief: Belief, gamma: int, reason: str, converged: bool) -> None:
     """The error of the estimated pose, and its size in claimed sigma (position and attitude, whichever is larger)."""
-    pose, truth, H = track.belief.x.T_ac, x.T_ac, measurement_jacobian(track.belief.x)
-    S = H @ track.belief.P @ H.T
+    pose, truth, H = belief.x.T_ac, x.T_ac, measurement_jacobian(belief.x)
+    S = H @ belief.P @ H.T
     position = float(np.linalg.norm(pose.t - truth.t))
     angle = float(geometry.angle(geometry.multiply(geometry.conjugate(truth.q), pose.q)))
     claimed = np.sqrt(np.trace(S[:3, :3])), 2.0 * np.sqrt(np.trace(S[3:, 3:]))

@@ -70,15 +70,32 @@ void joseph(double P[DIM][DIM], const double H[SEEN][DIM], const double HP[SEEN]
     for (int c = 0; c <= r; ++c) P[r][c] = P[c][r] = 0.5 * (X[r][c] + GK[r][c] + X[c][r] + GK[c][r]);
 }
 
-}  // namespace
-
-void correct(State& x, double P[DIM][DIM], const Pose& seen, const double colour[2]) {
-  double R[SEEN][SEEN], S[SEEN][SEEN], HP[SEEN][DIM], Kt[SEEN][DIM], d[DIM] = {};
+// R and S of a pose whose noise is widened by `colour`.
+void widened(const Pose& seen, const double colour[2], double R[SEEN][SEEN], double S[SEEN][SEEN]) {
   for (int r = 0; r < SEEN; ++r)
     for (int c = 0; c < SEEN; ++c) {
       R[r][c] = seen.R[r][c] * std::sqrt(colour[r < 3] * colour[c < 3]);
       S[r][c] = seen.S[r][c] + (R[r][c] - seen.R[r][c]);
     }
+}
+
+}  // namespace
+
+void seen_at(const double P[DIM][DIM], const Pose& pose, const double colour[2], Used& out) {
+  double R[SEEN][SEEN], S[SEEN][SEEN], HP[SEEN][DIM], one[SEEN][DIM] = {};
+  widened(pose, colour, R, S);
+  product<SEEN, DIM>(pose.H, P, HP);
+  gain(HP, S, out.Kt);
+  for (int r = 0; r < SEEN; ++r) one[r][r] = 1;
+  solve(pose.S, one);
+  for (int r = 0; r < SEEN; ++r) std::memcpy(out.info[r], one[r], sizeof out.info[r]);
+  std::memcpy(out.H, pose.H, sizeof out.H);
+  std::memcpy(out.alpha, pose.alpha, sizeof out.alpha);
+}
+
+void correct(State& x, double P[DIM][DIM], const Pose& seen, const double colour[2]) {
+  double R[SEEN][SEEN], S[SEEN][SEEN], HP[SEEN][DIM], Kt[SEEN][DIM], d[DIM] = {};
+  widened(seen, colour, R, S);
   product<SEEN, DIM>(seen.H, P, HP);
   gain(HP, S, Kt);
   for (int i = 0; i < SEEN; ++i)

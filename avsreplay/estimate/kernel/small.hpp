@@ -188,6 +188,16 @@ inline double log_of(double x) {
   return f * atanh_of((x - 1) / (x + 1));
 }
 
+// exp(x) for |x| <= 700: 2^n times the series of the remainder.
+inline double exp_of(double x) {
+  if (!(x > -700)) return 0;
+  const double n = std::nearbyint(x * 1.4426950408889634);
+  const double r = (x - n * 0.693147180369123816490) - n * 1.90821492927058770002e-10;
+  double s = 1;
+  for (int k = 14; k > 0; --k) s = 1 + s * r / k;
+  return std::ldexp(s, (int)n);
+}
+
 // Arc tangent of x in [0, 1].
 inline double atan_of(double x) {
   double f = 1, s = 1.0 / 17;

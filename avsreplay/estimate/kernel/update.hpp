@@ -32,6 +32,20 @@ struct Pose {
 // x and P once a pose has been seen, its noise widened by `colour` (attitude, position), through the chart: measurement.py.
 void correct(State& x, double P[DIM][DIM], const Pose& seen, const double colour[2]);
 
+// A scan that was used: the transition since the one before, Jacobian and innovation of its pose, the inverse of the
+// innovation's covariance, and the transposed gain.
+struct Used {
+  double Phi[DIM][DIM], H[SEEN][DIM], alpha[SEEN], info[SEEN][SEEN], Kt[SEEN][DIM];
+};
+
+// The Used of a pose at a prior covariance P, its noise widened by `colour` in the update.
+void seen_at(const double P[DIM][DIM], const Pose& pose, const double colour[2], Used& out);
+
+// Likelihood ratio of a change of rate or velocity within one of the intervals before the last scans, to none, and the
+// second moments P of the estimate's error after the last of them if there was one. `one_sigma` is that of the rate and
+// of the velocity; `scale` is the factor on the covariance of the innovations.
+double change_ratio(const Used* scans, int count, const double one_sigma[2], double scale, double P[DIM][DIM]);
+
 // y and P once rows e + H y of unit variance have been seen, P of the motion having grown by Q before.
 void pass(double y[DIM], double P[DIM][DIM], const double e[SEEN], const double H[SEEN][DIM],
           const double Q[MOTION][MOTION]);

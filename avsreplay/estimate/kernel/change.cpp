@@ -1,0 +1,115 @@
+// The likelihood ratio of a change of the velocities within the last intervals between scans (scan_window.py).
+#include <cmath>
+#include <cstring>
+#include <vector>
+
+#include "small.hpp"
+#include "update.hpp"
+
+namespace avs {
+namespace {
+
+constexpr int SIZES = 2;  // prior standard deviations of a change that are compared: a large and a small one
+constexpr double SIZE[SIZES] = {1, 0.1}, PART[2] = {0.875, 0.125};  // parts of an interval that the change has acted for
+constexpr double NO_WEIGHT = 1e-3;  // share of the evidence of a change whose covariance is left out
+
+// One change: the log of its likelihood ratio, and its effect F u on the estimate's error, E uu' = moment.
+struct Candidate {
+  double log_ratio, F[DIM][3], moment[3][3];
+};
+
+// Log evidence of white unknowns v in size A v = b, over none, and the second moments of their posterior times size^2.
+void evidence(const double A[SEEN][SEEN], const double b[SEEN], int first, double size, Candidate& out) {
+  double L[3][3], D[3], det = 1, v[3], gain = 0, inverse[3][3];
+  for (int r = 0; r < 3; ++r)
+    for (int c = 0; c <= r; ++c) {
+      double s = (r == c) + size * size * A[first + r][first + c];
+      for (int i = 0; i < c; ++i) s -= L[r][i] * D[i] * L[c][i];
+      if (c < r) L[r][c] = s / D[c];
+      else det *= D[r] = s;
+    }
+  for (int column = 0; column < 4; ++column) {  // the three columns of the inverse, then the mean
+    double x[3];
+    for (int r = 0; r < 3; ++r) {
+      x[r] = column < 3 ? r == column : size * b[first + r];
+      for (int i = 0; i < r; ++i) x[r] -= L[r][i] * x[i];
+    }
+    for (int r = 2; r >= 0; --r) {
+      x[r] /= D[r];
+      for (int i = r + 1; i < 3; ++i) x[r] -= L[i][r] * x[i];
+    }
+    for (int r = 0; r < 3; ++r) (column < 3 ? inverse[r][column] : v[r]) = x[r];
+  }
+  for (int r = 0; r < 3; ++r) {
+    gain += 0.5 * size * b[first + r] * v[r];
+    for (int c = 0; c < 3; ++c) out.moment[r][c] = size * size * (inverse[r][c] + v[r] * v[c]);
+  }
+  out.log_ratio = gain - 0.5 * log_of(std::max(det, 1.0));
+}
+
+}  // namespace
+
+double change_ratio(const Used* scans, int count, const double one_sigma[2], double scale, double P[DIM][DIM]) {
+  std::vector<Candidate> found;
+  for (int k = 0; k < count; ++k)
+    for (const double part : PART) {
+      double F[DIM][SEEN], A[SEEN][SEEN] = {}, b[SEEN] = {};
+      for (int r = 0; r < DIM; ++r)
+        for (int c = 0; c < SEEN; ++c)  // rate and velocity change; attitude and position follow for part of the interval
+          F[r][c] = scans[k].Phi[r][c < 3 ? 3 + c : 6 + c] * (r < 3 || (r >= 6 && r < 9) ? part : 1.0);
+      for (int j = k; j < count; ++j) {
+        const Used& scan = scans[j];
+        double M[SEEN][SEEN] = {}, SM[SEEN][SEEN] = {};
+        if (j > k) {
+          double before[DIM][SEEN];
+          std::memcpy(before, F, sizeof F);
+          std::memset(F, 0, sizeof F);
+          for (int r = 0; r < DIM; ++r)
+            for (int i = 0; i < DIM; ++i)
+              for (int c = 0; c < SEEN; ++c) F[r][c] += scan.Phi[r][i] * before[i][c];
+        }
+        for (int r = 0; r < SEEN; ++r)
+          for (int i = 0; i < DIM; ++i)
+            for (int c = 0; c < SEEN; ++c) M[r][c] += scan.H[r][i] * F[i][c];
+        for (int r = 0; r < SEEN; ++r)
+          for (int i = 0; i < SEEN; ++i)
+            for (int c = 0; c < SEEN; ++c) SM[r][c] += scan.info[r][i] * M[i][c];
+        for (int r = 0; r < SEEN; ++r)
+          for (int i = 0; i < SEEN; ++i) {
+            b[r] += SM[i][r] * scan.alpha[i] / scale;
+            for (int c = 0; c < SEEN; ++c) A[r][c] += M[i][r] * SM[i][c] / scale;
+          }
+        for (int r = 0; r < DIM; ++r)  // what the update leaves of the error
+          for (int i = 0; i < SEEN; ++i)
+            for (int c = 0; c < SEEN; ++c) F[r][c] -= scan.Kt[i][r] * M[i][c];
+      }
+      for (int kind = 0; kind < 2; ++kind)
+        for (const double size : SIZE) {
+          Candidate one;
+          evidence(A, b, 3 * kind, size * one_sigma[kind], one);
+          for (int r = 0; r < DIM; ++r)
+            for (int c = 0; c < 3; ++c) one.F[r][c] = F[r][3 * kind + c];
+          found.push_back(one);
+        }
+    }
+  double top = found[0].log_ratio, total = 0;
+  for (const Candidate& one : found) top = std::max(top, one.log_ratio);
+  for (Candidate& one : found) total += one.log_ratio = exp_of(one.log_ratio - top);
+  std::memset(P, 0, DIM * DIM * sizeof(double));
+  for (const Candidate& one : found) {
+    const double weight = one.log_ratio / total;
+    if (!(weight > NO_WEIGHT)) continue;
+    double FM[DIM][3] = {};
+    for (int r = 0; r < DIM; ++r)
+      for (int i = 0; i < 3; ++i)
+        for (int c = 0; c < 3; ++c) FM[r][c] += weight * one.F[r][i] * one.moment[i][c];
+    for (int r = 0; r < DIM; ++r)
+      for (int c = 0; c < DIM; ++c)
+        for (int i = 0; i < 3; ++i) P[r][c] += FM[r][i] * one.F[c][i];
+  }
+  for (int r = 0; r < DIM; ++r)
+    for (int c = 0; c < r; ++c) P[r][c] = P[c][r] = 0.5 * (P[r][c] + P[c][r]);
+  return exp_of(std::min(top, 600.0)) * total / (double)found.size();
+}
+
+}  // namespace avs
