@@ -146,7 +146,6 @@ _ACCUMULATORS = {  # classes that collect values scan by scan and are no datacla
     ("avsreplay.estimate.work", "Work"),
     ("avsreplay.register.model_check", "ModelCheck"),
     ("avsreplay.report.summary", "SummaryFold"),
-    ("avsreplay.report.summary_parts", "CaptureFold"),
     ("avsreplay.result_dir", "Beliefs"),
     ("avsreplay.viewers", "NewPaths"),
     ("avsreplay.result_dir", "ViewWriter"),

@@ -16,6 +16,7 @@ from avsreplay import geometry
 from avsreplay.records import State
 from avsreplay.report.episodes import Episode
 from avsreplay.report.summary import NEES_BAND, NIS_BAND
+from avsreplay.report.summary_parts import add_rows
 from avsreplay.rows import Row
 
 _TYPES = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "i2": "<i2", "u4": "<u4", "u1": "u1"}
@@ -68,7 +69,9 @@ _FIRST_PATTERN = {"flagged": 0, "injected": 1, "action": 3}
 
 def derived(rows: Sequence[Row]) -> Columns:
     """Every column that a chart draws, (n,) each; empty ones are left out."""
-    out = {name: values(rows, name) for name in _DIRECT}
+    taken: dict[str, list[Any]] = {name: [] for name in _DIRECT}
+    add_rows(taken, rows)
+    out = {name: np.array(column, dtype=np.float64) for name, column in taken.items()}
     out |= {f"mu_{axis}_deg": column for axis, column in zip("xyz", _attitude(rows), strict=True)}
     for name, sigma in (("sigma1", "sigma1_1s"), ("sigma2", "sigma2_1s"), *((f"c{a}_m", "c_1s_m") for a in "xyz")):
         _band(out, name, values(rows, sigma))

@@ -226,7 +226,7 @@ def _blocks(
     for run in pair:
         figures = value(run.rows)
         known = np.flatnonzero(np.isfinite(figures))
-        stamps.append(np.array([run.rows[k].t_ns for k in known.tolist()]))
+        stamps.append(np.array([row.t_ns for row in run.rows])[known])
         found.append(figures[known])
     shared, *places = np.intersect1d(stamps[0], stamps[1], return_indices=True)
     count = min(_BLOCKS, len(shared) // _IN_BLOCK)

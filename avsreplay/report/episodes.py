@@ -15,6 +15,7 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise, takewhile
+from typing import NamedTuple
 
 from avsreplay.records import Label
 from avsreplay.report.summary_parts import median
@@ -22,8 +23,7 @@ from avsreplay.report.summary_parts import median
 GAP = 1.5
 
 
-@dataclass(frozen=True, slots=True)
-class Mark:
+class Mark(NamedTuple):
     """The part of a row that the fault account needs."""
 
     t_ns: int

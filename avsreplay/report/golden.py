@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter, itemgetter
+from operator import itemgetter
 from pathlib import Path
 from types import NoneType
 from typing import Any
@@ -17,6 +17,7 @@ import numpy as np
 
 from avsreplay.errors import CheckFailed, UnreadableInput
 from avsreplay.report.jsonl import plain, read_records, write_rows
+from avsreplay.report.summary_parts import add_rows
 from avsreplay.report.table import Table, number
 from avsreplay.rows import Column, Row, columns
 
@@ -89,7 +90,9 @@ def compare_rows(expected: Sequence[Row], got: Sequence[Row], *, first: int = 20
 
 
 def _table(rows: Sequence[Row]) -> _Cells:
-    return {c.name: list(map(attrgetter(c.name), rows)) for c in columns()}
+    table: dict[str, list[Any]] = {c.name: [] for c in columns()}
+    add_rows(table, rows)
+    return table
 
 
 def _by_seq(records: Iterable[tuple[str, dict[str, Any]]]) -> dict[int, dict[str, Any]]:
@@ -121,7 +124,9 @@ def _compare(expected: _Cells, got: _Cells, first: int) -> GoldenResult:
     for order, name in enumerate((*sorted(expected.keys() - declared.keys()), *declared), 1):
         column = declared.get(name)
         a, b = (_picked(side, name, at) for side, at in zip((expected, got), places, strict=True))
-        found = [k for k in _differing(column, a, b) if column is None or a[k] is not ABSENT]
+        found = _differing(column, a, b)
+        if name in lacking:
+            found = [k for k in found if a[k] is not ABSENT]
         counts[name] = counts.get(name, 0) + len(found)
         kept += [(shared[k], order, _difference(column, shared[k], name, a[k], b[k])) for k in found[:first]]
     whole = [Difference(None, name, *_stated(False)) for name in lacking]
@@ -139,7 +144,7 @@ def _stated(expected: bool) -> tuple[str, str]:
     return ("present", ABSENT) if expected else (ABSENT, "present")
 
 
-def _differing(column: Column | None, expected: Sequence[Any], got: Sequence[Any]) -> list[int]:
+def _differing(column: Column | None, expected: Sequence[Any], got: Sequence[Any]) -> Sequence[int]:
     """The places at which two columns differ."""
     kinds = {*map(type, expected), *map(type, got)}
     if column and (column.rtol or column.atol) and kinds <= {float, int, NoneType}:

@@ -206,7 +206,10 @@ def _checked_at_once(block: bytes, lines: int) -> list[Row] | None:
     found = decode(block) if decode else None
     if found is None or len(found) != lines:
         return None
-    texts = {text for name, (kind, _) in field_types().items() if kind is str for text in map(attrgetter(name), found)}
+    texts: set[str | None] = set()
+    for name, (kind, _) in field_types().items():
+        if kind is str:
+            texts.update(map(attrgetter(name), found))
     return found if all(text is None or text.isprintable() for text in texts) else None
 
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import compress, pairwise, repeat
-from operator import attrgetter, not_
+from itertools import compress, pairwise
+from operator import not_
 from typing import Any
 
 import numpy as np
@@ -20,14 +20,13 @@ from avsreplay.records import BLOCKS, Label, State
 from avsreplay.report.episodes import Coast, FaultAccount, Mark, account, coasts, gaps
 from avsreplay.report.summary_parts import (
     Capture,
-    CaptureFold,
     Drifting,
     Parameter,
     Statistics,
     VelocityChange,
+    add_rows,
     median,
     parameters,
-    with_manoeuvre,
 )
 from avsreplay.rows import Row
 
@@ -38,8 +37,7 @@ NEES_BAND = (9.5908, 34.1696)  # the same points with 20 degrees of freedom
 _BY_STATE = ("pos_err_m", "rot_err_deg", "reg_pos_err_m", "reg_rot_err_deg", "nis", "rms_m", "iterations")
 _OF_ALL = ("nees", *(f"nees_{name}" for name in BLOCKS))
 _STATES = ("t_ns", "t_s", "gamma", "fault", "status", "reason", "cauchy_weight", "reference", "ogm_rank", "converged")
-_TAKEN = (*_STATES, *_BY_STATE, *_OF_ALL)
-_OF_ROW = attrgetter(*_TAKEN)
+_TAKEN = (*_STATES, *_BY_STATE, *_OF_ALL, *Capture.COLUMNS, *VelocityChange.COLUMNS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,8 +142,7 @@ class Summary:
     ) -> Summary:
         """Summarise rows in their order; the arguments are those of SummaryFold."""
         fold = SummaryFold(labels=labels, truth=truth, counts=counts)
-        for row in rows:
-            fold.add(row)
+        fold.extend(list(rows))
         return fold.result()
 
     @property
@@ -171,28 +168,27 @@ class SummaryFold:
         counts: Mapping[str, int] | None = None,
     ) -> None:
         self._labels, self._truth, self._counts = labels, truth, dict(counts or {})
-        self._taken: list[tuple[Any, ...]] = []
+        self._taken: dict[str, list[Any]] = {name: [] for name in _TAKEN}
         self._last: Row | None = None
-        self._changes: tuple[VelocityChange, ...] = ()
-        self._capture = CaptureFold()
 
-    def anew(self, rows: Iterable[Row]) -> SummaryFold:
+    def anew(self, rows: Sequence[Row]) -> SummaryFold:
         """A fold with the same labels and truth over other rows."""
         fold = SummaryFold(labels=self._labels, truth=self._truth, counts=self._counts)
-        for row in rows:
-            fold.add(row)
+        fold.extend(rows)
         return fold
 
     def add(self, row: Row) -> None:
         """Take the next row."""
-        self._taken.append(_OF_ROW(row))
-        self._changes = with_manoeuvre(self._changes, row)
-        self._capture.add(row)
-        self._last = row
+        self.extend((row,))
+
+    def extend(self, rows: Sequence[Row]) -> None:
+        """Take the next rows."""
+        add_rows(self._taken, rows)
+        self._last = rows[-1] if rows else self._last
 
     def result(self, truth: State | None = None) -> Summary:
         """The summary of all rows so far; ``truth`` in place of the one given at the start."""
-        taken = dict(zip(_TAKEN, zip(*self._taken, strict=True) if self._taken else repeat(()), strict=False))
+        taken = self._taken
         marks = list(map(Mark, *(taken[name] for name in ("t_ns", "gamma", "fault", "pos_err_m", "rot_err_deg"))))
         stamps, times_s, flagged = taken["t_ns"], taken["t_s"], [gamma == 0 for gamma in taken["gamma"]]
         steps = [b - a for a, b in pairwise(stamps) if b > a]
@@ -223,7 +219,7 @@ class SummaryFold:
             weighed_down=sum(w is not None and w < 1.0 for w in compress(taken["cauchy_weight"], map(not_, flagged))),
             reinitialised=last.reinitialised if last else None,
             manoeuvres=last.manoeuvres if last else None,
-            velocity_changes=self._changes,
+            velocity_changes=VelocityChange.of(taken),
             drift=Drifting.of(last) if last else None,
             violations=last.violations if last else None,
             nis=_share(figures["nis/healthy"], NIS_BAND),
@@ -236,7 +232,7 @@ class SummaryFold:
                 at_end=bool(last and last.converged),
                 withdrawn=sum(a and not b for a, b in pairwise(taken["converged"])),
             ),
-            capture=self._capture.result(),
+            capture=Capture.of(taken),
             counts=self._counts,
         )
 

@@ -9,6 +9,9 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
+from operator import attrgetter
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +19,21 @@ from numpy.typing import ArrayLike
 from avsreplay import geometry
 from avsreplay.records import State
 from avsreplay.rows import Row
+
+_BLOCK = 256  # rows whose values are taken together, so that they are read from the cache
+
+
+def add_rows(table: Mapping[str, list[Any]], rows: Sequence[Row]) -> None:
+    """Append the values of some rows to columns.
+
+    Args:
+        table: column name -> its values so far.
+        rows: the next rows.
+    """
+    for begin in range(0, len(rows), _BLOCK):
+        block = rows[begin : begin + _BLOCK]
+        for name, column in table.items():
+            column.extend(map(attrgetter(name), block))
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +52,27 @@ class VelocityChange:
     rate_radps: float
     rate_1s_radps: float
 
+    COLUMNS: ClassVar = (
+        *("manoeuvres", "t_s", "manoeuvre_s", "manoeuvre_1s_s"),
+        *("manoeuvre_mps", "manoeuvre_1s_mps", "manoeuvre_radps", "manoeuvre_1s_radps"),
+    )
+
+    @classmethod
+    def of(cls, taken: Mapping[str, Sequence[Any]]) -> tuple[VelocityChange, ...]:
+        """Return the manoeuvres that the rows of a run report: each row counts them and describes the last one.
+
+        Args:
+            taken: the values of ``COLUMNS`` in all rows.
+        """
+        found: list[tuple[int, int]] = []  # the first and the last row that describe each manoeuvre
+        for k, (count, instant) in enumerate(zip(taken["manoeuvres"], taken["manoeuvre_s"], strict=True)):
+            if count and instant is not None:
+                found[count - 1 :] = [(found[count - 1][0] if len(found) >= count else k, k)]
+            else:
+                del found[count or 0 :]
+        columns = [taken[name] for name in cls.COLUMNS[2:]]
+        return tuple(cls(taken["t_s"][first], *(column[last] or 0.0 for column in columns)) for first, last in found)
+
     @property
     def significance(self) -> float:
         """Return the larger of the two changes in standard deviations."""
@@ -47,22 +86,6 @@ class VelocityChange:
         )
         clear = [size for size in sizes if size[0] > 3.0 * size[1]] or sizes
         return " and ".join(f"{value:.3g} +- {sigma:.2g} {unit}" for value, sigma, unit in clear)
-
-
-def with_manoeuvre(known: tuple[VelocityChange, ...], row: Row) -> tuple[VelocityChange, ...]:
-    """Return the manoeuvres reported up to a row.
-
-    Args:
-        known: those reported up to the row before.
-        row: the next row; it counts the manoeuvres and describes the last one.
-    """
-    count = row.manoeuvres or 0
-    if not count or row.manoeuvre_s is None:
-        return known[:count]
-    reported_s = known[count - 1].reported_s if len(known) >= count else row.t_s
-    sizes = (row.manoeuvre_mps, row.manoeuvre_1s_mps, row.manoeuvre_radps, row.manoeuvre_1s_radps)
-    values = (value or 0.0 for value in (row.manoeuvre_1s_s, *sizes))
-    return (*known[: count - 1], VelocityChange(reported_s, row.manoeuvre_s, *values))
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,40 +308,32 @@ class Capture:
     miss: CaptureMiss | None = None
     actions: Mapping[str, int] = field(default_factory=dict)
 
+    COLUMNS: ClassVar = (
+        *("plan_status", "capture_time_s", "plan_miss_m", "action"),
+        *("capture_miss_m", "capture_miss_mps", "capture_miss_deg"),
+    )
 
-class CaptureFold:
-    """Takes rows one by one."""
+    @classmethod
+    def of(cls, taken: Mapping[str, Sequence[Any]]) -> Capture:
+        """Return the captures that the rows of a run plan.
 
-    def __init__(self) -> None:
-        self._plans: list[tuple[str | None, float | None]] = []
-        self._hindsight: list[float] = []
-        self._actions: Counter[str] = Counter()
-        self._miss: CaptureMiss | None = None
-
-    def add(self, row: Row) -> None:
-        """Take the next row."""
-        plan = (row.plan_status, row.capture_time_s)
-        if plan != (None, None) and (not self._plans or plan != self._plans[-1]):
-            self._plans.append(plan)
-        if row.plan_miss_m is not None:
-            self._hindsight.append(row.plan_miss_m)
-        if row.action:
-            self._actions[row.action] += 1
-        if row.capture_miss_m is not None:
-            self._miss = CaptureMiss(row.capture_miss_m, row.capture_miss_mps, row.capture_miss_deg)
-
-    def result(self) -> Capture:
-        """The summary of the rows so far."""
-        instants = [t for _, t in self._plans if t is not None]
+        Args:
+            taken: the values of ``COLUMNS`` in all rows.
+        """
+        planned = zip(taken["plan_status"], taken["capture_time_s"], strict=True)
+        plans = [plan for plan, _ in groupby(plan for plan in planned if plan != (None, None))]
+        instants = [t for _, t in plans if t is not None]
         spread = Statistics.of(instants)
-        return Capture(
+        misses = zip(*(taken[name] for name in cls.COLUMNS[4:]), strict=True)
+        miss = next((found for found in reversed(list(misses)) if found[0] is not None), None)
+        return cls(
             replans=len(instants),
             first_s=instants[0] if instants else None,
             last_s=instants[-1] if instants else None,
             std_s=spread.std if spread else None,
             range_s=spread.max - spread.min if spread else None,
-            status=self._plans[-1][0] if self._plans else None,
-            plan_miss_m=Statistics.of(self._hindsight),
-            miss=self._miss,
-            actions=dict(sorted(self._actions.items())),
+            status=plans[-1][0] if plans else None,
+            plan_miss_m=Statistics.of([miss_m for miss_m in taken["plan_miss_m"] if miss_m is not None]),
+            miss=None if miss is None else CaptureMiss(*miss),
+            actions=dict(sorted(Counter(filter(None, taken["action"])).items())),
         )

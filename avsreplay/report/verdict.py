@@ -9,10 +9,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from heapq import nlargest
 from itertools import chain, groupby
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Array
+from avsreplay.report.charts import values
 from avsreplay.report.summary import NIS_LIMIT, Summary
 from avsreplay.report.summary_parts import events, length_text, times
 from avsreplay.rows import Row
@@ -143,14 +147,13 @@ def verdict_of(rows: Sequence[Row], summary: Summary, header: Mapping[str, Any] 
 
 def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
     """Scans that updated the filter; those with a harmful fault are not expected to."""
+    common = max(summary.reasons, key=lambda name: summary.reasons[name], default="no scan")
     if not summary.healthy:
-        common = max(summary.reasons, key=lambda name: summary.reasons[name], default="no scan")
         yield Concern(Grade.FAIL, f"none of the {summary.scans} scans was used (mostly {_plain(common)})")
         return
     expected = summary.scans - (summary.faults.harmful_scans if summary.faults.known else 0)
     share = min(summary.healthy / expected, 1.0) if expected else 1.0
     if share < USED_CHECK:
-        common = max(summary.reasons, key=lambda name: summary.reasons[name])
         grade = Grade.FAIL if share < USED_FAIL else Grade.CHECK
         text = f"only {summary.healthy} of {summary.scans} scans were used (mostly {_plain(common)})"
         yield Concern(grade, text)
@@ -161,7 +164,7 @@ def _use(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
 
 def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     """Errors over all scans, coasting included, and the fit to the model."""
-    position, turn = _median(rows, "pos_err_m"), _median(rows, "rot_err_deg")
+    position, turn = _median(values(rows, "pos_err_m")), _median(values(rows, "rot_err_deg"))
     if position is not None and extent_m and position > ERROR_CHECK * extent_m:
         grade = Grade.FAIL if position > ERROR_FAIL * extent_m else Grade.CHECK
         share = 100 * position / extent_m
@@ -169,7 +172,7 @@ def _errors(rows: Sequence[Row], extent_m: float | None) -> Iterator[Concern]:
     if turn is not None and turn > TURN_CHECK:
         grade = Grade.FAIL if turn > TURN_FAIL else Grade.CHECK
         yield Concern(grade, f"the median attitude error of all scans is {turn:.3g} deg")
-    fit = _median([row for row in rows if row.gamma == 1], "rms_m")
+    fit = _median(values([row for row in rows if row.gamma == 1], "rms_m"))
     if fit is not None and extent_m and fit > FIT_CHECK * extent_m:
         share = 100 * fit / extent_m
         text = f"the scans fit the model badly: median rms {length_text(fit)}, {share:.1f} % of its extent"
@@ -203,9 +206,8 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
             low = "too small (overconfident)" if share.median > share.high else "too large (conservative)"
             where = f"the covariance is {low}: " if not share.low <= share.median <= share.high else ""
             yield Concern(Grade.CHECK, f"{where}only {100 * share.inside:.0f} % of {name} inside the 95 % band")
-    inconsistent = [row for row in rows if row.consistent is False]
-    if len(inconsistent) > 0.1 * len(rows):
-        begin = inconsistent[0].t_s
+    if len(inconsistent := [row.t_s for row in rows if row.consistent is False]) > 0.1 * len(rows):
+        begin = inconsistent[0]
         text = f"the innovations are inconsistent in {len(inconsistent)} of {len(rows)} scans, first at {begin:.1f} s"
         yield Concern(Grade.CHECK, text)
     if summary.reinitialised:
@@ -237,12 +239,9 @@ def _data(rows: Sequence[Row], summary: Summary, *, clock_known: bool) -> Iterat
     if failed:
         grade = Grade.FAIL if len(failed) > 0.5 * len(rows) else Grade.CHECK
         yield Concern(grade, f"{len(failed)} of {len(rows)} registrations failed, the first: {failed[0].message}")
-    for name, text in (
-        ("losses", "damaged places of the log were left out"),
-        ("stamps_unset", "scans have no time stamp"),
-        ("stamps_back", "time stamps go backwards"),
-        ("stamps_jumped", "time stamps jump"),
-    ):
+    counted = {"losses": "damaged places of the log were left out", "stamps_unset": "scans have no time stamp",
+               "stamps_back": "time stamps go backwards", "stamps_jumped": "time stamps jump"}  # fmt: skip
+    for name, text in counted.items():
         if summary.counts.get(name) and not (clock_known and name.startswith("stamps")):
             yield Concern(Grade.CHECK, f"{summary.counts[name]} {text}")
 
@@ -251,9 +250,9 @@ def _plain(name: str) -> str:
     return "no points" if name == "no_scan" else name.replace("_", " ")
 
 
-def _median(rows: Sequence[Row], column: str) -> float | None:
-    values = sorted(v for row in rows if (v := getattr(row, column)) is not None)
-    return values[len(values) // 2] if values else None
+def _median(figures: Array) -> float | None:
+    known = np.sort(figures[np.isfinite(figures)])
+    return float(known[len(known) // 2]) if len(known) else None
 
 
 def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
@@ -279,9 +278,9 @@ def _robot(header: Mapping[str, Any]) -> str:
         return ""
     if header.get("robot"):
         return str(header["robot"])
-    facts = [f"a_max {plan['a_max_mps2']:g} m/s2"] if isinstance(plan.get("a_max_mps2"), (int, float)) else []
-    facts += [f"latency {plan['latency_s']:g} s"] if isinstance(plan.get("latency_s"), (int, float)) else []
-    return ", ".join(["default robot", *facts])
+    figures = (("a_max", "a_max_mps2", "m/s2"), ("latency", "latency_s", "s"))
+    known = [(name, plan[key], unit) for name, key, unit in figures if isinstance(plan.get(key), (int, float))]
+    return ", ".join(["default robot", *(f"{name} {value:g} {unit}" for name, value, unit in known)])
 
 
 def worst_moments(rows: Sequence[Row]) -> list[Moment]:
@@ -301,22 +300,24 @@ def _moments(rows: Sequence[Row]) -> Iterator[tuple[float, Moment]]:
         places = list(group)
         if flagged:
             yield _flagged_moment(rows, places)
-    used = [k for k, row in enumerate(rows) if row.gamma]  # the others belong to their interval
+    used = values(rows, "gamma") != 0.0  # the others belong to their interval
     for column, name in (("pos_err_m", "position error"), ("rot_err_deg", "attitude error")):
-        typical = _median(rows, column)
-        for value, k in _largest(rows, used, column):
+        typical = _median(figures := values(rows, column))
+        for value, k in _largest(figures, used):
             if typical and value > 3.0 * typical:
                 size = length_text(value) if column == "pos_err_m" else f"{value:.3g} deg"
                 text = f"{name} {size}, {value / typical:.0f} times the median"
                 yield value / typical, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
-    for value, k in _largest(rows, used, "nis"):
+    for value, k in _largest(values(rows, "nis"), used):
         if value > NIS_LIMIT:
             text = f"NIS {value:.3g}, above its 99.99 % point {NIS_LIMIT:.1f}"
             yield 3.0 * value / NIS_LIMIT, Moment(k, rows[k].t_s, rows[k].t_s, text, _cause(rows, k))
 
 
-def _largest(rows: Sequence[Row], places: Sequence[int], column: str) -> list[tuple[float, int]]:
-    return nlargest(MOMENTS, ((value, k) for k in places if (value := getattr(rows[k], column)) is not None))
+def _largest(figures: Array, used: NDArray[np.bool_]) -> list[tuple[float, int]]:
+    places = np.flatnonzero(used & np.isfinite(figures))
+    chosen = places[np.argsort(figures[places], kind="stable")[: -MOMENTS - 1 : -1]]
+    return list(zip(figures[chosen].tolist(), chosen.tolist(), strict=True))
 
 
 def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, Moment]:
