@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -19,18 +20,19 @@ from avsreplay.plan.cone_programme import PointRows, solve
 from avsreplay.plan.convexification import (
     ABORT_S,
     BETWEEN,
-    COARSE_NODES,
     ReferencePath,
     aborted,
     coarse_nodes,
     convex_subproblem,
     entry_fractions,
     excess,
+    expected_s,
     feasible,
     initial_references,
     interval_fractions,
     largest_change,
     margins_at,
+    shortened,
     warm_reference,
     worst_margin,
 )
@@ -91,17 +93,21 @@ def constrained(
     limits = limits.resolved(extent_m)
     scene.check(limits)
     strongest = replace(params, a_max_mps2=largest_acceleration(limits, params))
-    free = rendezvous(scene.goal, r0, v0, strongest, t_ns, earliest_s)
+    unbound = free = rendezvous(scene.goal, r0, v0, strongest, t_ns)
+    if free.found and earliest_s > free.t_go_s:
+        free = rendezvous(scene.goal, r0, v0, strongest, t_ns, earliest_s)
+    else:  # no capture is earlier in any case
+        earliest_s = 0.0
     if not free.found or not limits.any or free.t_go_s <= params.latency_s:
         return free
     r0, v0 = np.asarray(r0, float), np.asarray(v0, float)
     free = _necessary(scene, free, r0, params, limits)
     if not free.found:
         return free
-    span_s = 1.5 * free.t_go_s + (0.0 if limits.clearance_m is None else ABORT_S)
+    span_s = 1.5 * unbound.t_go_s + (0.0 if limits.clearance_m is None else ABORT_S)
     sampled = SampledScene(scene, params.horizon_s, params.grid_s, span_s)
     case = Case(sampled, limits, params, r0, v0, 1e-5 * extent_m, earliest_s=earliest_s)
-    return _free_plan(case, free) or _graded(case, free, _best_path(case, free, warm), t_ns)
+    return _free_plan(case, free) or _graded(case, free, _best_path(case, free, unbound, warm), t_ns)
 
 
 def _necessary(scene: Scene, free: Plan, r0: Array, params: PlanParams, limits: Limits) -> Plan:
@@ -192,55 +198,54 @@ def _graded(case: Case, free: Plan, found: StepPath | None, t_ns: int) -> Plan:
     )
 
 
-def _best_path(case: Case, free: Plan, warm: tuple[RobotPath, float] | None) -> StepPath | None:
+def _best_path(case: Case, free: Plan, unbound: Plan, warm: tuple[RobotPath, float] | None) -> StepPath | None:
     """Return the earliest capture found: that of a warm start where it converges to about the same end time.
 
-    Otherwise initial paths are iterated on a coarse grid and the results are refined in the order of their arrival.
+    Otherwise all initial paths are searched. Where the earliest capture allowed is before that of every draft, the
+    search without this bound, from the unconstrained plan ``unbound``, has the better initial paths.
     """
     best: StepPath | None = None
     if warm is not None:
-        again = _shortened(case, *warm)
+        again = shortened(case, *warm)
         best = _refined(again, *warm, rough=True)
-        if best is not None and best.t_go_s <= LATER * max(_expected(case, *warm), case.earliest_s) + LATER_S:
+        if best is not None and best.t_go_s <= LATER * max(expected_s(case, *warm), case.earliest_s) + LATER_S:
             return best
     coarse = replace(case, limits=replace(case.limits, nodes=coarse_nodes(case, free.t_go_s)), coarse=True)
-    drafts: list[StepPath] = []
-    earliest_s = math.inf
-    for reference in initial_references(coarse, free):
-        draft = _converged(coarse, reference, 1.1 * earliest_s)
-        if draft is not None:
-            drafts.append(draft)
-        earliest_s = min((d.t_go_s for d in drafts), default=math.inf)
-        if reference.t > 1.5 * earliest_s or earliest_s <= case.earliest_s + SAME_TIME_S:
-            break
-    drafts = _different(drafts)
-    drafts[:IMPROVED] = [_moved(coarse, draft) for draft in drafts[:IMPROVED]]
-    for draft in sorted(drafts, key=_duration):
-        for trust in (TRUST, CAREFUL):
-            if best is None or best.t_go_s > (draft.t_go_s if trust == TRUST else LATER * draft.t_go_s):
-                best = min(filter(None, (best, _refined(case, draft, trust=trust))), key=_duration, default=None)
+    drafts = _drafts(coarse, free)
+    if case.earliest_s > 0.0 and (not drafts or drafts[0].t_go_s > case.earliest_s + SAME_TIME_S):
+        other = _best_path(replace(case, earliest_s=0.0, sampled=case.sampled.anew()), unbound, unbound, None)
+        if other is not None and other.t_go_s >= case.earliest_s:
+            return other
+    best = _improved(case, coarse, drafts, best)
     for reference in initial_references(case, free) if drafts and best is None else ():
         best = best or _converged(case, reference)
     return best if best is None else _moved(case, best)
 
 
-def _duration(path: RobotPath) -> float:
-    return path.t_go_s
+def _drafts(coarse: Case, free: Plan) -> list[StepPath]:
+    """Return the different captures found on the coarse grid from the initial paths, in the order of their arrival."""
+    drafts, earliest_s = list[StepPath](), math.inf
+    for reference in initial_references(coarse, free):
+        draft = _converged(coarse, reference, 1.1 * earliest_s)
+        if draft is not None:
+            drafts.append(draft)
+            earliest_s = min(earliest_s, draft.t_go_s)
+        if reference.t > 1.5 * earliest_s or earliest_s <= coarse.earliest_s + SAME_TIME_S:
+            break
+    return _different(drafts)
 
 
-def _shortened(case: Case, path: RobotPath, since_s: float) -> Case:
-    """Return the case with the interval length of an earlier path: the rest of its flight needs fewer intervals."""
-    if not isinstance(path, StepPath):
-        return case
-    left = math.ceil((path.t_go_s - since_s - case.wait_s) / path.step_s)
-    n = min(max(left, COARSE_NODES), case.limits.nodes)
-    return replace(case, limits=replace(case.limits, nodes=n))
+def _improved(case: Case, coarse: Case, drafts: list[StepPath], best: StepPath | None) -> StepPath | None:
+    """Return the earliest of ``best`` and of the drafts, which are refined in the order of their arrival."""
+    drafts[:IMPROVED] = [_moved(coarse, draft) for draft in drafts[:IMPROVED]]
+    for draft in sorted(drafts, key=_duration):
+        for trust in (TRUST, CAREFUL):
+            if best is None or best.t_go_s > (draft.t_go_s if trust == TRUST else LATER * draft.t_go_s):
+                best = min(filter(None, (best, _refined(case, draft, trust=trust))), key=_duration, default=None)
+    return best
 
 
-def _expected(case: Case, path: RobotPath, since_s: float) -> float:
-    """Return the time to go expected from an earlier path: what is left of it, all of it for a robot off it."""
-    away = float(np.linalg.norm(path.at(np.array([since_s]))[0][0] - case.r0))
-    return path.t_go_s - (since_s if away <= (case.limits.mouth_m or 0.0) else 0.0)
+_duration = attrgetter("t_go_s")
 
 
 def _different(drafts: list[StepPath]) -> list[StepPath]:

@@ -117,6 +117,21 @@ def warm_reference(case: Case, path: RobotPath, since_s: float) -> ReferencePath
     return ReferencePath(t, r[1:] + first + (s * s)[:, None] * (last - first))
 
 
+def shortened(case: Case, path: RobotPath, since_s: float) -> Case:
+    """Return the case with the interval length of an earlier path: the rest of its flight needs fewer intervals."""
+    if not isinstance(path, StepPath):
+        return case
+    left = math.ceil((path.t_go_s - since_s - case.wait_s) / path.step_s)
+    n = min(max(left, COARSE_NODES), case.limits.nodes)
+    return replace(case, limits=replace(case.limits, nodes=n))
+
+
+def expected_s(case: Case, path: RobotPath, since_s: float) -> float:
+    """Return the time to go expected from an earlier path: what is left of it, all of it for a robot off it."""
+    away = float(np.linalg.norm(path.at(np.array([since_s]))[0][0] - case.r0))
+    return path.t_go_s - (since_s if away <= (case.limits.mouth_m or 0.0) else 0.0)
+
+
 def largest_change(case: Case, reference: ReferencePath, most: float) -> float:
     """Return the largest relative change of the end time, at most ``most``: the target may turn by TURN_RAD."""
     turn = turn_rate(case, case.wait_s + reference.t) * reference.t

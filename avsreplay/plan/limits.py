@@ -246,14 +246,17 @@ class SampledScene:
 
     def __init__(self, scene: Scene, horizon_s: float, step_s: float, span_s: float) -> None:
         self.scene, self._horizon_s, self._step_s, self._span_s = scene, horizon_s, step_s, span_s
-        self._end_s = 0.0
-        self._pieces: tuple[Array, Array] | None = None
+        self._end_s, self._pieces = -1.0, (np.empty((4, 0, 12)), np.empty(1))
         self._sigma: tuple[Array, Array, Array] | None = None
+
+    def anew(self) -> SampledScene:
+        """Return the same motion with the first grid."""
+        return SampledScene(self.scene, self._horizon_s, self._step_s, self._span_s)
 
     def at(self, times: Array, order: int = 0) -> tuple[Array, Array]:
         """Return rho (n, 3) and R_ac (n, 3, 3), or their first derivatives (order 1), at times (n,) [s]."""
         last = float(times.max())
-        if self._pieces is None or last > self._end_s:
+        if last > self._end_s:
             self._end_s = min(max(1.5 * last, self._span_s), max(self._horizon_s, last))
             self._pieces = self._joined(self._end_s)
         return _cone.motion(*self._pieces, times, order)
