@@ -193,12 +193,14 @@ class Fit:
     Attributes:
         T_ca: pose that takes the scan {A} into the model {C}.  iterations: passes made.  converged: its own flag.
         matches: ``IcpResult.matches`` of the last pass, None if there is none; saves time, never changes a result.
+        work: counted in ordinary point searches; 0 if the back end does not count it.
     """
 
     T_ca: Pose
     iterations: int
     converged: bool
     matches: Any = None
+    work: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

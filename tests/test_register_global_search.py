@@ -15,6 +15,7 @@ from avsreplay.log import read_surface
 from avsreplay.log.ply import read_ply
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar
+from avsreplay.register.backend import healthy_work
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import (
     Candidate,
@@ -23,7 +24,7 @@ from avsreplay.register.global_search import (
     VisibleCentroids,
 )
 from avsreplay.register.params import AcquireParams
-from avsreplay.register.restarts import FIXED_WORK, HEALTHY_PASSES, HEALTHY_SCANS
+from avsreplay.register.restarts import HEALTHY_SCANS
 from avsreplay.register.sampling import attitudes, directions, sample, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 
@@ -137,7 +138,7 @@ def test_a_search_that_fails_stops_at_the_budget(registrar: Registrar, monkeypat
     found = registrar.acquire(scan)
     assert not found.measured
     assert found.status is AlignStatus.BUDGET_EXHAUSTED
-    assert sum(spent) <= HEALTHY_SCANS * (HEALTHY_PASSES * len(scan) + FIXED_WORK)
+    assert sum(spent) <= HEALTHY_SCANS * healthy_work(len(scan))
 
 
 # --- the parts
@@ -159,7 +160,7 @@ def test_a_looked_up_distance_is_that_to_the_sampled_surface(registrar: Registra
 
 
 def test_a_body_with_a_near_symmetry_is_known_to_have_it() -> None:
-    search = Registrar(_box((2.0, 1.0, 0.6)))._global
+    search = Registrar(_box((2.0, 1.0, 0.6)))._symmetry.search
     turns = [float(np.degrees(geometry.angle(Pose.from_matrix(T).q))) for T in search.symmetries]
     assert turns
     assert all(angle > 175.0 for angle in turns)
@@ -272,7 +273,7 @@ def test_a_difference_that_noise_alone_can_cause_does_not_make_a_pose_unique(
     off = distance.copy()
     off[:45] = 0.1 * extent
     turned = Pose(exp([0.0, 0.0, np.pi]), np.zeros(3))
-    found = registrar._global._verdict([Candidate(turned, off), Candidate(Pose.identity(), distance)])
+    found = registrar._symmetry.search._verdict([Candidate(turned, off), Candidate(Pose.identity(), distance)])
     assert np.array_equal(found.best.matrix, np.eye(4))
     assert bool(found.rivals) is not unique
 
@@ -282,7 +283,7 @@ def test_a_known_pose_takes_part_in_a_search(registrar: Registrar) -> None:
     model, T_ac = boxes(), example_pose()
     scan = T_ac.apply(view(model, 2000, T_ac.inverse().t))
     apart = Pose(exp([0.0, 0.0, 1.0]), np.zeros(3)) @ T_ac.inverse()
-    found = registrar._global.search(scan, known=apart)
+    found = registrar._symmetry.search.search(scan, known=apart)
     assert any(np.array_equal(each.T_ca.matrix, apart.matrix) for each in found.candidates)
     assert not found.rivals
 

@@ -141,13 +141,15 @@ def test_a_registrar_keeps_the_index_of_a_large_model_unless_told_not_to(
     Registrar(large, RegisterParams(index_cache=False))
     Registrar(small)
     assert not list(tmp_path.iterdir())
-    Registrar(large)
-    assert len(list((tmp_path / "avsreplay").iterdir())) == 2  # the index, and what a search needs
+    registrar = Registrar(large)
+    assert len(list((tmp_path / "avsreplay").iterdir())) == 1  # the index
+    registrar.acquire(large.vertices[:200])
+    assert len(list((tmp_path / "avsreplay").iterdir())) == 2  # and what a search needs
 
 
 def _searched(registrar: Registrar) -> list[bytes]:
-    search, symmetry = registrar._global, registrar._symmetry
-    arrays = [search.symmetries, *symmetry._kinds, symmetry._marks, symmetry._normals]
+    symmetry = registrar._symmetry
+    arrays = [symmetry.search.symmetries, *symmetry._kinds, symmetry._marks, symmetry._normals]
     return [a.tobytes() for a in arrays] + [repr((symmetry._share, symmetry._area)).encode()]
 
 

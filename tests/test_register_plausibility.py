@@ -10,10 +10,11 @@ from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar, allowed_scans
+from avsreplay.register.backend import FIXED_WORK, HEALTHY_PASSES
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.quality import Visibility
-from avsreplay.register.restarts import FIXED_WORK, HEALTHY_PASSES, HEALTHY_SCANS, Budget
+from avsreplay.register.restarts import HEALTHY_SCANS, Budget
 from avsreplay.register.sampling import segments, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 

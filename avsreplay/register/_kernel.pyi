@@ -92,6 +92,7 @@ class Index:
         facing: bool = False,
         newton: bool = False,
         few: int = 0,
+        most_work: int = ...,
     ) -> tuple[Any, ...]: ...
     def normal_equations(
         self,

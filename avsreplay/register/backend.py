@@ -37,6 +37,10 @@ TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
 FEW_POINTS = 600  # points for the first passes on a scan that has many more
+HEALTHY_PASSES = 7  # searches per point of an ordinary registration and its quality
+LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
+FIXED_WORK = 15_000  # fixed cost of a registration: quality, covariance
+ALIGN_SCANS, WITHIN_SCANS = 4, 2  # most work of an alignment, and of one with a fixed gate, in ordinary registrations
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,14 +141,20 @@ class HornBackend:
         rule = self._rules[facing]
         plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, MOST_WITHIN)
         within = replace(rule, n_max=most, n_plane=plane, few=few, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
-        return self._with(points, guess, within)
+        return self._with(points, guess, within, WITHIN_SCANS * healthy_work(len(points)))
 
     def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams]) -> Fit:
-        return self._with(points, guess, rules[self._visibility.camera_c(self._index, points, guess) is not None])
+        rule = rules[self._visibility.camera_c(self._index, points, guess) is not None]
+        return self._with(points, guess, rule, ALIGN_SCANS * healthy_work(len(points)))
 
-    def _with(self, points: NDArray[Any], guess: Pose, rule: IcpParams) -> Fit:
-        found = self._index.icp(points, guess, rule)
-        return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches)
+    def _with(self, points: NDArray[Any], guess: Pose, rule: IcpParams, most_work: int) -> Fit:
+        found = self._index.icp(points, guess, rule, most_work)
+        return Fit(Pose.from_matrix(found.T_ca), found.iterations, found.converged, found.matches, found.work)
+
+
+def healthy_work(points: int) -> int:
+    """Return the work of an ordinary registration of a scan of so many points, in point searches."""
+    return HEALTHY_PASSES * max(points, LEAST_POINTS) + FIXED_WORK
 
 
 def measured_alignment(found: MeasuredPose) -> Alignment:

@@ -19,15 +19,14 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Surface
+from avsreplay.records import Fit
 from avsreplay.register.backend import HornBackend, Target
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
-from avsreplay.register.sampling import attitudes, directions, sample, thin_to, without_sparse_points
+from avsreplay.register.sampling import attitudes, directions, sample_evenly, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 
 MODEL_POINTS = 3000
-CLOUD_POINTS = 20  # factor: the points of a cloud are first thinned evenly to this many times the number needed
 COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # points: first and second selection, final ranking
 COARSE_PASSES, MIDDLE_PASSES = 8, 12  # point-to-plane iterations for each attitude in the two selections
 MIDDLE_STARTS, FINE_STARTS = 50, 10  # attitudes kept for the second selection, and poses registered on the model
@@ -47,10 +46,11 @@ FAVOURED = 5.0  # noise, in units of the extent, lowers the cost of a wrong pose
 REFINED_POINTS = 500  # fine points with which the last poses are registered
 FIRST_FINE, FINE_PASSES = 5, 15  # passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
 RIVAL_AFTER, MOST_RIVALS = 0.05, 4  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
-LOOK_UPS = 4  # look-ups in the grid that cost as much as a search on the model
-ROUND_WORK = 60_000  # fixed cost of a round [searches]: registration of the last poses, thinning, interpreter
+LOOK_UPS = 3  # look-ups in the grid that cost as much as a search on the model
+ROUND_WORK = 30_000  # fixed cost of a round [searches]: thinning, interpreter
+MEASURED_WORK = 4  # cost of measuring a point at a pose, in point searches
 APART = 0.6  # usual share of the starts of the second selection that are different poses
-FAR_WORK = 4  # searches per point of a pass from a wrong pose
+REGISTERED_WORK = 100  # usual cost of registering the last poses, for each point with which they are measured
 CELL_OF_EXTENT = 0.02
 LEAST_COSINE = 0.05
 SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # number and size of the shifts of the starts across the direction to the camera
@@ -79,6 +79,7 @@ class SearchResult:
         width_m: distance beyond which a point is not on the model; it follows the noise.
         inlier_ratio: share of the points of the scan on the model at the best pose.
         candidates: all poses that were registered to the end, for a further round.
+        work: of the round, in point searches.
     """
 
     best: Pose
@@ -86,6 +87,7 @@ class SearchResult:
     width_m: float
     inlier_ratio: float
     candidates: tuple[Candidate, ...]
+    work: int
 
 
 class GlobalSearch:
@@ -101,7 +103,7 @@ class GlobalSearch:
         self._extent = target.surface.extent
         self._sided = target.visibility.sided
         if "sampled" not in kept:
-            kept["sampled"] = np.stack(_sampled(target.surface))
+            kept["sampled"] = np.stack(sample_evenly(target.surface, MODEL_POINTS))
         points, normals = kept["sampled"]
         planes = normals if self._sided else target.index.closest(points).normal
         self._field = kernel_module().Field(points, np.ascontiguousarray(planes), CELLS)
@@ -110,6 +112,7 @@ class GlobalSearch:
         if "symmetries" not in kept:
             kept["symmetries"] = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
         self.symmetries = kept["symmetries"]
+        self._spent = 0  # work of the round so far
         self._brief, self._refine = (
             HornBackend(replace(target, limits=replace(target.limits, n_max=min(passes, target.limits.n_max))))
             for passes in (FIRST_FINE, FINE_PASSES)
@@ -117,8 +120,12 @@ class GlobalSearch:
 
     def work(self, points: int, number: int) -> int:
         """Return the usual cost of round ``number`` in point searches, for a scan of so many points."""
+        return self._looked(points, number) + REGISTERED_WORK * min(points, FINE_POINTS)
+
+    def _looked(self, points: int, number: int) -> int:
+        """The cost of a round without that of the poses that are registered to the model."""
         p = self._params
-        few, some, fine = (min(points, most) for most in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS))
+        few, some = (min(points, most) for most in (COARSE_POINTS, MIDDLE_POINTS))
         starts, stride = p.starts * (1, SHIFTS, 7)[number] // THINNED[number], FIRST_STRIDES[number]
         halved = p.starts // KEPT_AFTER_FIRST * (1 + SECOND_PASSES)
         halved += p.starts // KEPT_AFTER_SECOND * (1 + COARSE_PASSES - SECOND_PASSES)
@@ -126,8 +133,7 @@ class GlobalSearch:
         looked += some * int(APART * MIDDLE_STARTS) * (1 + MIDDLE_FIRST) // MIDDLE_STRIDE
         looked += some * KEPT_IN_MIDDLE * (1 + MIDDLE_PASSES - MIDDLE_FIRST)
         looked += some * len(self.symmetries) * (1 + TURNED_PASSES)
-        registered = RIVALS * (FAR_WORK // 2 * FIRST_FINE * min(fine, REFINED_POINTS) + fine) + FINE_STARTS * some
-        return ROUND_WORK + looked // LOOK_UPS + registered
+        return ROUND_WORK + looked // LOOK_UPS
 
     def search(
         self, points: NDArray[Any], number: int = 0, before: SearchResult | None = None, known: Pose | None = None
@@ -141,6 +147,7 @@ class GlobalSearch:
             before: result of another round for the same points, whose poses are compared as well.
             known: a pose T_ca that is compared as well: another one is unique only if it explains the scan better.
         """
+        self._spent = self._looked(len(points), number)
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
         few, some, fine = (
             np.ascontiguousarray(thin_to(scan, count)) for count in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS)
@@ -216,28 +223,28 @@ class GlobalSearch:
     def _refined(self, some: Array, fine: Array, poses: list[Pose], facing: bool) -> list[Candidate]:
         """The poses measured on the model; the best, and the very best by a near-symmetry, are registered to it."""
         width = MIDDLE_OF_EXTENT * self._extent
-        part = np.ascontiguousarray(fine[:: max(1, len(fine) // REFINED_POINTS)])
         found = [self._measured(some, T_ca) for T_ca in poses]
         ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         most = float(ranked[0].unexplained(width).mean()) + RIVAL_WITHIN
         best = [each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most]
-        found = self._to_the_end(part, fine, best, width)
+        found = self._to_the_end(fine, best, width)
         first = min(found, key=lambda each: float(each.unexplained(width).mean())).T_ca
         if not len(self.symmetries):
             return found
         rule = (FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
         turned, costs = self._field.refine(some, self.symmetries @ first.matrix, TURNED_PASSES, 4.0 * width, *rule)
         rivals = [Pose.from_matrix(T) for T in _best(turned, costs, TURNED_RIVALS)]
-        return [*found, *self._to_the_end(part, fine, rivals, width)]
+        return [*found, *self._to_the_end(fine, rivals, width)]
 
-    def _to_the_end(self, part: Array, fine: Array, poses: list[Pose], width_m: float) -> list[Candidate]:
+    def _to_the_end(self, fine: Array, poses: list[Pose], width_m: float) -> list[Candidate]:
         """The poses registered to the model by a few passes, and to the end those that may be as good as the best."""
-        found = [self._measured(fine, self._brief.align_within(part, T_ca, width_m).T_ca) for T_ca in poses]
+        part = np.ascontiguousarray(fine[:: max(1, len(fine) // REFINED_POINTS)])
+        found = [self._measured(part, self._counted(self._brief.align_within(part, T_ca, width_m))) for T_ca in poses]
         costs = np.array([each.unexplained(width_m).mean() for each in found])
-        order = np.argsort(costs, kind="stable")
-        last = [k for k in order[:MOST_RIVALS] if costs[k] < costs[order[0]] + RIVAL_AFTER]
-        ended = [self._refine.align_within(part, found[k].T_ca, width_m, near=True).T_ca for k in last]
-        return [*(self._measured(fine, T_ca) for T_ca in ended), *(found[k] for k in order if k not in last)]
+        order = [k for k in np.argsort(costs, kind="stable") if costs[k] < costs.min() + 2.0 * RIVAL_AFTER]
+        last = [k for k in order[:MOST_RIVALS] if costs[k] < costs.min() + RIVAL_AFTER]
+        ended = [self._counted(self._refine.align_within(part, found[k].T_ca, width_m, near=True)) for k in last]
+        return [self._measured(fine, T_ca) for T_ca in (*ended, *(found[k].T_ca for k in order if k not in last))]
 
     def _near_symmetries(self, points: Array) -> Array:
         """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, without the identity: the best few."""
@@ -253,7 +260,12 @@ class GlobalSearch:
         target = self._target
         camera_c = target.visibility.camera_c(target.index, points, T_ca)
         d2 = target.index.closest(T_ca.apply(points), camera_c=camera_c).d2
+        self._spent += MEASURED_WORK * len(points)
         return Candidate(T_ca, np.sqrt(np.minimum(d2, target.index.reach_m**2)))
+
+    def _counted(self, fit: Fit) -> Pose:
+        self._spent += fit.work
+        return fit.T_ca
 
     def _verdict(self, found: Sequence[Candidate]) -> SearchResult:
         noise = self.noise_of(found)
@@ -262,7 +274,7 @@ class GlobalSearch:
         margin = self.margin(noise)
         others = (other for other in rest if not self.same(best.T_ca, other.T_ca))
         rivals = tuple(other.T_ca for other in takewhile(lambda other: as_good(best, other, width, margin), others))
-        return SearchResult(best.T_ca, rivals, width, float(np.mean(best.distance < width)), tuple(found))
+        return SearchResult(best.T_ca, rivals, width, float(np.mean(best.distance < width)), tuple(found), self._spent)
 
     def noise_of(self, found: Sequence[Candidate]) -> float:
         """Return the least robust noise [m] of the poses."""
@@ -334,11 +346,3 @@ def _axes(points: Array) -> list[Array]:
     """Both directions of each principal axis of a scan: one of them is near the direction to the camera."""
     axes = np.linalg.eigh(np.cov(points.T))[1].T if len(points) > 3 else np.eye(3)
     return [*axes, *-axes]
-
-
-def _sampled(surface: Surface) -> tuple[Array, Array]:
-    points, normals = sample(surface, MODEL_POINTS)
-    if len(surface.faces):
-        return points, normals
-    thinned = thin_to(points[:: max(1, len(points) // (CLOUD_POINTS * MODEL_POINTS))], MODEL_POINTS)
-    return thinned, np.zeros_like(thinned)

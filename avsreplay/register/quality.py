@@ -6,6 +6,7 @@ appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -197,6 +198,7 @@ def grade(
     accuracy: tuple[float, float] = ACCURACY,
     systematic: bool = True,
     guess: Pose | None = None,
+    sized: Callable[[float, float], bool] | None = None,
 ) -> Alignment:
     """Measure the quality of the pose of a back end.
 
@@ -204,7 +206,8 @@ def grade(
     from two halves of the scan. ``accuracy``: of the back end on an exact scan [deg, share of the extent].
     ``systematic``: the covariance includes errors that vary slowly over the target. ``guess``: T_ca from which the back
     end began. A pose that equals this guess, although the residuals require a step, is FAILED. The pose of a degenerate
-    view has its unobservable directions as in the guess, if the surface then fits as well.
+    view has its unobservable directions as in the guess, if the surface then fits as well. ``sized``: whether the size
+    is fitted, from the share of inliers and their rms [m]; a pose that is not the last one of its scan needs no size.
     """
     if not (np.isfinite(fit.T_ca.t).all() and np.isfinite(fit.T_ca.q).all()):
         return not_measured(len(points), AlignStatus.FAILED)
@@ -235,7 +238,8 @@ def grade(
             T_ca = kept if fits else T_ca
     settled = P is None or not found.beyond
     size = None
-    if P is not None and settled and systematic and _other_size(found):
+    share = found.inliers / max(1, found.points)
+    if P is not None and settled and systematic and _other_size(found) and (sized is None or sized(share, found.rms_m)):
         size = size_error(index, points, fit.T_ca, visibility.camera_c(index, points, fit.T_ca))
         P = P if size is None else P + np.outer(size.shift, size.shift)
     return Alignment(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from itertools import islice
 from typing import Any
 
@@ -13,13 +15,13 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache, quality, restarts
-from avsreplay.register.backend import Target, aligned, create_backend, load_backend
+from avsreplay.register.backend import WITHIN_SCANS, Target, aligned, create_backend, healthy_work, load_backend
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import Budget, Restart, Restarter
-from avsreplay.register.rivals import LEAST_RAYS, prepared
+from avsreplay.register.rivals import LEAST_RAYS, NearSymmetry, prepared
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 
@@ -56,14 +58,13 @@ class Registrar:
         factory = load_backend(self.params.backend)  # before the index, so that a wrong name is reported at once
         self._visibility = quality.Visibility(surface, self.params.camera)
         surface = self._visibility.surface
-        cache_dir = index_cache.folder_for(surface) if self.params.index_cache else None
+        self._cache_dir = cache_dir = index_cache.folder_for(surface) if self.params.index_cache else None
         self._index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
         self._target = Target(surface, self._index, self.limits, self._visibility)
         self._accuracy: tuple[float, float] = getattr(factory, "accuracy", quality.ACCURACY)
         self._backend = create_backend(self.params.backend, factory, self._target)
         self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
         self._restarter = Restarter(self._target, self._test)
-        self._global, self._symmetry = prepared(self._target, self._test, self.params.acquire, cache_dir)
 
     def register(
         self,
@@ -89,24 +90,22 @@ class Registrar:
                 determines them only if no pose turned by a near-symmetry of the model explains it as well.
 
         Returns:
-            The pose T_ac with its quality. A failure is reported as its status, never as an exception. Where nothing
-            was measured T_ac is the guess.
+            The pose T_ac with its quality. A failure is its status, never an exception; T_ac is then the guess.
         """
         scan = self._scan(points)
         if refused := self._test.refused(scan, len(points), guess):
             return refused
         halves = seq % self.params.split_every == 0
-        first = self._graded(scan, guess, halves=halves, carried=carried)
+        budget = Budget(len(scan), effort)
+        first = self._graded(scan, guess, budget, None, halves, carried, self._restarter.healthy)
         if first.status is AlignStatus.FAILED:
             return first
-        budget = Budget(len(scan), effort)
-        budget.registered(first)
-        healthy = self._restarter.healthy(first)
+        healthy = self._restarter.healthy(first.inlier_ratio, first.rms_m)
         found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried, budget)
         if self._far(guess, found) and not searched:
             return self._searched(scan, found, carried, budget)
         free = NO_MOTION if unknown is None else unknown
-        return found if searched or effort <= 1 else self._settled(scan, found, halves, carried, free)
+        return found if searched or effort <= 1 else self._settled(scan, found, budget, halves, carried, free)
 
     def acquire(self, points: NDArray[Any], effort: int = restarts.HEALTHY_SCANS) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
@@ -133,15 +132,14 @@ class Registrar:
         """The best plausible result of the searches that the budget allows, the first in any case; ``known``: T_ca."""
         target = without_scattered_points(np.asarray(scan, dtype=np.float64))
         budget.spend(restarts.SCATTER_WORK * len(scan))
-        few = self._restarter.part(target)
+        few, results = self._restarter.part(target), list[Alignment]()
         whole: SearchResult | None = None
-        results: list[Alignment] = []
         for part, number in islice(attempts(target, self._index.extent_m), rounds):
-            work = self._global.work(len(part), number)
+            work = self._symmetry.search.work(len(part), number)
             if results and not budget.allows(work):
                 break
-            budget.spend(work + restarts.TEST_WORK)
-            search = self._global.search(part, number, whole if part is target else None, known)
+            search = self._symmetry.search.search(part, number, whole if part is target else None, known)
+            budget.spend(search.work + restarts.TEST_WORK)
             whole = search if part is target else whole
             found, alone = self._acquired(scan, part, search, budget, carried)
             results.append(found)
@@ -170,7 +168,7 @@ class Registrar:
         """
         few = self._restarter.part(part)
         start = self._restarter.measure(few, search.best)
-        found = self._regraded(scan, few, start, budget, carried=carried)
+        found = self._regraded(scan, few, start, budget, True, carried)
         if found.status is AlignStatus.FAILED:
             return found, False
         at, p = self._test.check(few, found.T_ac.inverse(), self._restarter.part(scan)), self.params.acquire
@@ -184,23 +182,15 @@ class Registrar:
         if self._symmetry.marked:
             best, rivals = self._symmetry.decided(part, best, rivals, at.covered)
             budget.spend(self._symmetry.work(len(part)))
-            if not self._global.same(best, found.T_ac.inverse()):
-                found = self._regraded(scan, few, self._restarter.measure(few, best), budget, carried=carried)
-        rivals = self._rivals(scan, found, rivals)
+            if not self._symmetry.search.same(best, found.T_ac.inverse()):
+                found = self._regraded(scan, few, self._restarter.measure(few, best), budget, True, carried)
+        rivals = self._symmetry.distinct(scan, found, rivals)
         if rivals:
             words = turn_words(found.T_ac.inverse() @ rivals[0].inverse())
             found = replace(found, status=AlignStatus.AMBIGUOUS, covariance=None, free_directions=words)
         elif found.status is AlignStatus.DEGENERATE and self._visibility.sided and not at.covered:
             found = replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=PART_ONLY)
         return found, alone
-
-    def _rivals(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> list[Pose]:
-        """The rivals that differ from a degenerate view not only along its unobservable directions; else all."""
-        if found.status is not AlignStatus.DEGENERATE or not rivals:
-            return rivals
-        at = found.T_ac.inverse()
-        free = quality.view_directions(self._index, self._visibility, scan, at, self.limits.gate_m)
-        return [T_ca for T_ca in rivals if not self._global.same(T_ca, free.nearest(at, T_ca))]
 
     def instants(self, points: NDArray[Any], times_s: NDArray[Any], T_ac: Pose) -> Array:
         """Return the effective measurement time of each direction, (6, 6) [s], see ``quality.instants``.
@@ -224,6 +214,11 @@ class Registrar:
         d2 = self._index.closest(T_ac.inverse().apply(points), most_m=most_m).d2
         return np.asarray(np.sqrt(np.minimum(d2, most_m**2)))
 
+    @cached_property
+    def _symmetry(self) -> NearSymmetry:
+        """The near-symmetries of the model and its search, prepared when a scan needs them for the first time."""
+        return prepared(self._target, self._test, self.params.acquire, self._cache_dir)
+
     @property
     def index(self) -> SurfaceIndex:
         """Return the index of the model."""
@@ -239,7 +234,9 @@ class Registrar:
         scan = points if finite.all() else points[finite.all(axis=1)]
         return thin(scan, self.params.subsample_m) if self.params.subsample_m > 0.0 else scan
 
-    def _settled(self, scan: NDArray[Any], found: Alignment, halves: bool, carried: bool, unknown: Array) -> Alignment:
+    def _settled(
+        self, scan: NDArray[Any], found: Alignment, budget: Budget, halves: bool, carried: bool, unknown: Array
+    ) -> Alignment:
         """The pose turned by a near-symmetry of the model, if the points off the model decide for it.
 
         DEGENERATE in the motions that the guess leaves unknown, if other poses explain the scan as well.
@@ -249,8 +246,9 @@ class Registrar:
         if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.near:
             return found
         T_ca, part = found.T_ac.inverse(), self._restarter.part(scan)
+        budget.spend(self._symmetry.work(len(scan)))
         best, rivals = self._symmetry.decided(scan, T_ca, [] if unsure else None, self._test.check(part, T_ca).covered)
-        turned = found if best is T_ca else self._graded(scan, best.inverse(), None, halves, carried)
+        turned = found if best is T_ca else self._graded(scan, best.inverse(), budget, None, halves, carried)
         found = turned if unsure or turned.status is AlignStatus.ALIGNED else found
         return quality.left_undetermined(found, unknown) if unsure and rivals else found
 
@@ -259,7 +257,9 @@ class Registrar:
         angle = float(geometry.angle((guess.inverse() @ found.T_ac).q))
         if not found.measured or angle <= TURNED_RAD:
             return False
-        return angle > FAR_RAD or (found.status is not AlignStatus.DEGENERATE and len(self._global.symmetries) > 0)
+        return angle > FAR_RAD or (
+            found.status is not AlignStatus.DEGENERATE and len(self._symmetry.search.symmetries) > 0
+        )
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
@@ -282,7 +282,8 @@ class Registrar:
         before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without it, perhaps another object
         restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
-        work = self._global.work(len(scan), 0) + restarts.SCATTER_WORK * len(scan) if overlap else 0
+        last = WITHIN_SCANS * healthy_work(len(scan))  # the best pose is registered once more
+        work = self._symmetry.search.work(len(scan), 0) + restarts.SCATTER_WORK * len(scan) if overlap else 0
         for step in () if budget.brief else steps:
             if step == "search":
                 if overlap:
@@ -292,7 +293,7 @@ class Registrar:
                 continue
             if before and np.mean(before.distance < self.limits.gate_m) < LEAST_TO_TURN:
                 break
-            kept = work if reason and step == "restart" and restart else 0  # a search follows
+            kept = last + (work if reason and step == "restart" and restart else 0)  # a search follows
             before = self._restarter.best(few, guess.inverse(), final.T_ac.inverse(), budget, before, kept)
             if before.T_ca.matrix.tobytes() != final.T_ac.inverse().matrix.tobytes():
                 final = self._regraded(scan, few, before, budget, halves, carried)
@@ -311,30 +312,29 @@ class Registrar:
         return self._test.check(few, found.T_ac.inverse()).reason if found.measured else ""
 
     def _regraded(
-        self,
-        scan: NDArray[Any],
-        few: NDArray[Any],
-        kept: Restart,
-        budget: Budget,
-        halves: bool = True,
-        carried: bool = False,
+        self, scan: NDArray[Any], few: NDArray[Any], kept: Restart, budget: Budget, halves: bool, carried: bool
     ) -> Alignment:
         """Register with a rejection distance that follows the noise; among other objects also along the valley."""
         width = self._restarter.width(kept)
-        found = self._graded(scan, kept.T_ca.inverse(), width, halves, carried)
-        budget.registered(found)
+        found = self._graded(scan, kept.T_ca.inverse(), budget, width, halves, carried)
         if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= restarts.LEAST_RATIO or budget.brief:
             return found
         budget.spend(restarts.VALLEY_WORK)
         moved = self._restarter.along_valley(few, found.T_ac.inverse())
         if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
             return found
-        both = (found, self._graded(scan, moved.inverse(), width, halves, carried))
-        budget.registered(both[1])
+        both = (found, self._graded(scan, moved.inverse(), budget, width, halves, carried))
         return min(both, key=lambda each: self._restarter.measure(few, each.T_ac.inverse()).cost(width))
 
     def _graded(
-        self, scan: NDArray[Any], guess: Pose, width_m: float | None = None, halves: bool = True, carried: bool = False
+        self,
+        scan: NDArray[Any],
+        guess: Pose,
+        budget: Budget,
+        width_m: float | None,
+        halves: bool,
+        carried: bool,
+        sized: Callable[[float, float], bool] | None = None,
     ) -> Alignment:
         """Register and measure the quality; ``width_m``: rejection distance from the first pass on, and of inliers."""
         start = guess.inverse()
@@ -342,9 +342,9 @@ class Registrar:
         if isinstance(fit, str):
             return replace(quality.not_measured(len(scan), AlignStatus.FAILED, guess), message=fit)
         limits = self.limits if width_m is None else replace(self.limits, gate_m=width_m)
-        found = quality.grade(
-            self._index, self._visibility, scan, fit, limits, self.params, halves, self._accuracy, not carried, start
-        )
+        options = (self.params, halves, self._accuracy, not carried, start, sized)
+        found = quality.grade(self._index, self._visibility, scan, fit, limits, *options)
+        budget.registered(fit, found)
         if found.status is AlignStatus.FAILED:
             found = replace(found, T_ac=guess, message=f"back end '{self.params.backend}' {found.message}")
         return found

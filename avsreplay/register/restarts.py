@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Alignment, AlignStatus
-from avsreplay.register.backend import Target
+from avsreplay.records import Alignment, AlignStatus, Fit
+from avsreplay.register.backend import FIXED_WORK, Target, healthy_work
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest, robust_noise
 from avsreplay.register.size import LEAST_RESIDUALS
@@ -35,13 +35,12 @@ BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is bel
 PASS_WORK = 1000  # fixed cost of a pass of a restart, in point searches
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
-FAR_WORK, LEAST_NEAR = 3, 0.5  # searches per point of a pass while less than this share of the points is on the model
+FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
 SCATTER_WORK = 10  # cost per point of leaving out scattered points
-TEST_WORK = 15_000  # cost of a test of a pose
-VALLEY_WORK = 2 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
-HEALTHY_PASSES = 7  # searches per point of an ordinary registration and its quality
-LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
-FIXED_WORK = 15_000  # fixed cost of a registration: quality, covariance
+TEST_WORK = 20_000  # cost of a test of a pose
+VALLEY_WORK = 5 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
+SIZE_WORK = 20_000  # cost of fitting the size, which is done where many points are off the model
+MEASURED_WORK = 4  # cost of measuring a point at a pose, in point searches
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
 
@@ -70,17 +69,18 @@ class Budget:
 
     def __init__(self, points: int, scans: int = HEALTHY_SCANS) -> None:
         self.brief = scans <= 1
-        self._left = scans * (HEALTHY_PASSES * max(points, LEAST_POINTS) + FIXED_WORK)
+        self._left = scans * healthy_work(points)
         self.exhausted = False
 
     def spend(self, searches: int) -> None:
         """Subtract work that was done."""
         self._left -= searches
 
-    def registered(self, found: Alignment) -> None:
-        """Subtract the work of an alignment and of its quality."""
+    def registered(self, fit: Fit, found: Alignment) -> None:
+        """Subtract the work of an alignment and of its quality; that of back ends that do not count is estimated."""
         share = FAR_WORK if found.inlier_ratio < LEAST_NEAR else 1
-        self.spend(found.iterations * found.points * share + FIXED_WORK)
+        size = SIZE_WORK if found.inlier_ratio < LEAST_RATIO else 0
+        self.spend((fit.work or fit.iterations * found.points * share) + FIXED_WORK + size)
 
     def allows(self, searches: int, kept: int = 0) -> bool:
         """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""
@@ -170,9 +170,9 @@ class Restarter:
         shared = float(sums.prod(axis=1).sum()) / max(float(counts.prod(axis=1).sum()), 1.0)
         return float(np.sqrt(max(shared, 0.0)))
 
-    def healthy(self, found: Alignment) -> bool:
+    def healthy(self, inlier_ratio: float, rms_m: float) -> bool:
         """Return whether an alignment is a close fit of nearly all points, which needs no further test."""
-        return found.inlier_ratio >= LEAST_RATIO and found.rms_m <= POOR_OF_GATE * self._target.limits.gate_m
+        return inlier_ratio >= LEAST_RATIO and rms_m <= POOR_OF_GATE * self._target.limits.gate_m
 
     def doubtful(self, points: NDArray[Any], guess: Pose, found: Alignment) -> bool:
         """Return whether an alignment may be a local minimum.
@@ -232,7 +232,8 @@ class Restarter:
             facing = self._target.visibility.camera_c(index, points, T_ca) is not None
             found = index.icp(points, T_ca, rules[facing])
             T_ca = Pose.from_matrix(found.T_ca)
-            budget.spend(found.iterations * (len(points) + PASS_WORK))
+            budget.spend(found.work + PASS_WORK)
+        budget.spend(MEASURED_WORK * len(points))
         return self.measure(points, T_ca)
 
     def best(
@@ -257,7 +258,7 @@ class Restarter:
         found = [self.measure(points, result), *([before] if before else [])]
         tested: Restart | None = None  # the last pose that was tested, and is not plausible
         for T_ca, start in self._starts(guess, result, points.mean(axis=0), before is not None):
-            if not budget.allows(self.work(start) * (len(points) + PASS_WORK), kept):
+            if not budget.allows(self.work(start) * FAR_WORK * len(points), kept):
                 break
             found.append(self.graduated(points, T_ca, start, budget))
             best = self._least(found)

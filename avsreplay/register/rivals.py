@@ -14,19 +14,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Surface
+from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache
 from avsreplay.register.backend import Target
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.global_search import FINE_PASSES, Candidate, GlobalSearch, as_good
 from avsreplay.register.params import AcquireParams
 from avsreplay.register.plausibility import EMPTY, PlausibilityTest, Rays
+from avsreplay.register.quality import view_directions
 from avsreplay.register.sampling import sample
 from avsreplay.register.size import normal_jacobian
 from avsreplay.register.surface_index import kernel_module
@@ -65,11 +67,15 @@ class Contradicted(Candidate):
 
 
 class NearSymmetry:
-    """The motions that carry most of a model onto itself, and its marks."""
+    """The motions that carry most of a model onto itself, and its marks.
+
+    Attributes:
+        search: the global search of the same target.
+    """
 
     def __init__(self, target: Target, test: PlausibilityTest, search: GlobalSearch, kept: dict[str, Array]) -> None:
         """Find the axis of revolution, if there is one, and sample the marks; or take both from ``kept``."""
-        self._target, self._test, self._search, self._gate = target, test, search, target.limits.gate_m
+        self._target, self._test, self.search, self._gate = target, test, search, target.limits.gate_m
         surface = target.surface
         if "kinds" not in kept:
             kinds = self._all_motions(*sample(surface, SAMPLES)) if len(surface.faces) else []
@@ -150,23 +156,31 @@ class NearSymmetry:
         if others is None and not turned:
             return T_ca, []
         found = [self._measured(rays, pose) for pose in (T_ca, *(others or ()), *turned)]
-        noise, best = self._search.noise_of(found), found[0]
+        noise, best = self.search.noise_of(found), found[0]
         width = max(NEAR * self._target.index.extent_m, 3.0 * noise)
         for each in found[1:]:
             best = each if decides(each, best, width, complete) else best
-        margin = self._search.margin(noise)
+        margin = self.search.margin(noise)
         rivals = [
             each.T_ca
             for each in found
-            if not self._search.same(best.T_ca, each.T_ca)
+            if not self.search.same(best.T_ca, each.T_ca)
             and as_good(best, each, max(self._gate, width), margin)
             and not decides(best, each, width, complete)
         ]
         return best.T_ca, rivals
 
+    def distinct(self, scan: NDArray[Any], found: Alignment, rivals: list[Pose]) -> list[Pose]:
+        """Return the rivals that differ from a degenerate view not only along its unobservable directions; else all."""
+        if found.status is not AlignStatus.DEGENERATE or not rivals:
+            return rivals
+        at, target = found.T_ac.inverse(), self._target
+        free = view_directions(target.index, target.visibility, scan, at, self._gate)
+        return [T_ca for T_ca in rivals if not self.search.same(T_ca, free.nearest(at, T_ca))]
+
     def _all_motions(self, points: Array, normals: Array) -> list[Array]:
         """The near-symmetries (k, 4, 4) without the identity: turns about an axis of revolution, and the others."""
-        found = self._search.symmetries
+        found = self.search.symmetries
         axis = self._axis(points[::AXIS_STRIDE], normals[::AXIS_STRIDE]) if len(found) else None
         if axis is None:
             return [found[k::FINALISTS] for k in range(min(FINALISTS, len(found)))]
@@ -221,13 +235,13 @@ class NearSymmetry:
             most, order = len(kept) + FINALISTS, np.argsort(cost, kind="stable")
             for k in order[cost[order] < here - LEAST_RAYS] if better else order:
                 start = Pose.from_matrix(motions[k]) @ T_ca
-                if any(self._search.same(start, other) for other in (T_ca, *kept)):
+                if any(self.search.same(start, other) for other in (T_ca, *kept)):
                     continue
                 if self._passed(rays, start)[0] < LEAST_RAYS:
                     kept.append(start)
                 if len(kept) == most:
                     break
-        return [self._search.refined(part, start, width) for start in kept]
+        return [self.search.refined(part, start, width) for start in kept]
 
     def _measured(self, rays: Rays, T_ca: Pose) -> Contradicted:
         return Contradicted(T_ca, self._test.measure(rays.points, T_ca), *self._passed(rays, T_ca))
@@ -284,10 +298,8 @@ def decides(better: Contradicted, other: Contradicted, width_m: float, complete:
     return bool(enough and against <= MOST_AGAINST * rays_for)
 
 
-def prepared(
-    target: Target, test: PlausibilityTest, params: AcquireParams, folder: Path | None
-) -> tuple[GlobalSearch, NearSymmetry]:
-    """Return the search of a target and its near-symmetries, which are kept in a folder where one is given.
+def prepared(target: Target, test: PlausibilityTest, params: AcquireParams, folder: Path | None) -> NearSymmetry:
+    """Return the near-symmetries of a target with its search. They are kept in a folder where one is given.
 
     Args:
         target: what is searched.
@@ -305,7 +317,7 @@ def prepared(
     symmetry = NearSymmetry(target, test, search, kept)
     if len(kept) > known:
         index_cache.write_arrays(path, kept, kernel.checksum)
-    return search, symmetry
+    return symmetry
 
 
 def surface_area(surface: Surface) -> float:

@@ -12,6 +12,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, bounding_diagonal
 from avsreplay.records import Surface
 
+CLOUD_POINTS = 20  # factor: the points of a cloud are first thinned evenly to this many times the number needed
 EVEN_ROUNDS, EVEN_WITHIN = 10, (0.85, 1.2)
 STRAY_SHARE, STRAY_VOXELS, STRAY_POINTS = 0.15, 150, 10
 R2 = np.array([0.7548776662466927, 0.5698402909980532])  # plastic-number sequence: low discrepancy in the unit square
@@ -46,6 +47,15 @@ def sample(surface: Surface, count: int) -> tuple[Array, Array]:
     u, v = np.where(fold, 1.0 - u, u)[:, None], np.where(fold, 1.0 - v, v)[:, None]
     points = a[face] + u * (b - a)[face] + v * (c - a)[face]
     return points, cross[face] / np.maximum(twice_area[face], np.finfo(float).tiny)[:, None]
+
+
+def sample_evenly(surface: Surface, count: int) -> tuple[Array, Array]:
+    """Return about ``count`` points and normals as :func:`sample`; the points of a cloud are thinned to this number."""
+    points, normals = sample(surface, count)
+    if len(surface.faces):
+        return points, normals
+    thinned = thin_to(points[:: max(1, len(points) // (CLOUD_POINTS * count))], count)
+    return thinned, np.zeros_like(thinned)
 
 
 def attitudes(count: int) -> Array:

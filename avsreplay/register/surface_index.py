@@ -83,11 +83,9 @@ class IcpResult:
     Attributes:
         T_ca: (4, 4) scan {A} into model {C}.
         iterations: passes over all points; those over a part count as its share of the points, rounded up together.
-        converged: the stopping rule held before n_max.
-        inliers, rms_m: of the last pass, before its step (distance between point and closest point).
-        gate_m: rejection distance after the last pass.  step_rad, step_m: the last step.
-        ignored: points with a coordinate that is not finite.
-        searched: neighbour searches made over all passes.
+        converged: the stopping rule held before n_max.  inliers, rms_m: of the last pass, before its step.
+        gate_m: rejection distance after the last pass.  step_rad, step_m: the last step.  ignored: points not finite.
+        searched: neighbour searches made over all passes.  work: of all passes, counted in ordinary searches.
         matches: opaque; shortens the search of :meth:`SurfaceIndex.evidence` for the same points.
     """
 
@@ -101,6 +99,7 @@ class IcpResult:
     step_m: float
     ignored: int
     searched: int
+    work: int = 0
     matches: Any = None
 
 
@@ -226,20 +225,22 @@ class SurfaceIndex:
         camera = None if camera_c is None else tuple(float(x) for x in np.reshape(camera_c, 3))
         return Closest(*self._index.closest(_points(points), threads, camera, most_m))
 
-    def icp(self, points: NDArray[Any], T_ca: ArrayLike | Pose, params: IcpParams | None = None) -> IcpResult:
+    def icp(
+        self, points: NDArray[Any], T_ca: Any, params: IcpParams | None = None, most_work: int = 2**62
+    ) -> IcpResult:
         """Align the scan ``points`` (n, 3) [m] in {A} to the model from the guess ``T_ca`` (4, 4).
 
         Point-to-plane passes, then Newton's method to the fixed point of Horn's point-to-point iteration (eq:ICP), a
         stationary point of the sum of squared distances. A Newton step that raises the sum is replaced by Horn's. The
         last pass is Horn's over all points and verifies the fixed point.
-        The rotation of the guess is re-orthonormalised. With fewer than 6 inliers the loop ends, not converged.
+        The guess is re-orthonormalised. With fewer than 6 inliers, or after ``most_work``, it ends, not converged.
         """
         params = params or IcpParams()
         gate = min(self.reach_m, self.reach_m if params.gate_m is None else params.gate_m)
         floor = self.extent_m / 500.0 if params.floor_m is None else params.floor_m
         eps_m = 1e-6 * self.extent_m if params.eps_m is None else params.eps_m
         rule = (params.n_max, params.n_plane, gate, params.tighten, floor, params.eps_rad, eps_m)
-        flags = (params.threads, params.keep, params.facing, params.newton, params.few)
+        flags = (params.threads, params.keep, params.facing, params.newton, params.few, most_work)
         return IcpResult(*self._index.icp(_points(points), _rigid(T_ca), *rule, *flags))
 
     def normal_equations(
@@ -270,8 +271,7 @@ class SurfaceIndex:
         """Return sums over the inliers of ``points`` (n, 3) in {A} at ``T_ca`` (4, 4).
 
         A patch is what lies in one cube of side ``patch_m`` [m] in {C}; with at most ``least_patches`` occupied cubes
-        each point is a patch. ``facing``: as in :class:`IcpParams`. ``matches``: of an alignment of the same points;
-        it does not change the result.
+        each point is a patch. ``facing``: as in :class:`IcpParams`. ``matches``: of an alignment of the same points.
         """
         gate = min(gate_m, self.reach_m)
         rule = (gate, patch_m, least_patches, facing, threads, matches)

@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <limits>
 #include <stdexcept>
 
 #include "build.hpp"
@@ -157,12 +158,12 @@ class Index {
 
   nb::tuple icp(nb::handle points, const Doubles& T_ca, int n_max, int n_plane, double gate, double tighten,
                 double floor, double eps_rad, double eps_m, int threads, bool keep, bool facing, bool newton,
-                int64_t few) const {
+                int64_t few, int64_t most_work) const {
     const Cloud cloud(points);
     const View v = cloud.view();
     const Rows T = rows(T_ca);
     require(few == 0 || few >= 6, "a part of the scan must have at least 6 points");
-    const Rule rule{n_max, n_plane, few, gate, tighten, floor, eps_rad, eps_m, facing, keep, newton};
+    const Rule rule{n_max, n_plane, few, gate, tighten, floor, eps_rad, eps_m, facing, keep, newton, most_work};
     Outcome o;
     Matches matches;
     {
@@ -172,7 +173,7 @@ class Index {
     }
     const int64_t part = o.few_passes ? (o.few_passes * few + v.n - 1) / v.n : 0;
     return nb::make_tuple(matrix(o.T), o.passes - o.few_passes + part, o.converged, o.inliers, o.rms, o.gate, o.turn, o.move, o.ignored,
-                          o.searched, nb::cast(std::move(matches)));
+                          o.searched, o.work(), nb::cast(std::move(matches)));
   }
 
   nb::tuple normal_equations(nb::handle points, const Doubles& T_ca, double gate, int threads, bool facing) const {
@@ -459,7 +460,7 @@ NB_MODULE(_kernel, m) {
       .def("icp", &Index::icp, nb::arg("points"), nb::arg("T_ca"), nb::arg("n_max"), nb::arg("n_plane"),
            nb::arg("gate_m"), nb::arg("tighten"), nb::arg("floor_m"), nb::arg("eps_rad"), nb::arg("eps_m"),
            nb::arg("threads") = 1, nb::arg("keep") = false, nb::arg("facing") = false, nb::arg("newton") = false,
-           nb::arg("few") = 0)
+           nb::arg("few") = 0, nb::arg("most_work") = std::numeric_limits<int64_t>::max())
       .def("normal_equations", &Index::normal_equations, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"),
            nb::arg("threads") = 1, nb::arg("facing") = false)
       .def("evidence", &Index::evidence, nb::arg("points"), nb::arg("T_ca"), nb::arg("gate_m"), nb::arg("patch_m"),

@@ -164,7 +164,7 @@ double Field::refine(const double* points, int64_t m, const CoarseRule& rule, do
         continue;
       }
       unexplained += std::min(1.0, found.d2 / (rule.beyond * rule.beyond));
-      if (found.d2 > gate * gate) continue;
+      if (pass == rule.passes || found.d2 > gate * gate) continue;  // the last pass gives the cost only
       const float* n = found.sample->n;
       const double r[3] = {p[0] - c[0], p[1] - c[1], p[2] - c[2]};
       const double J[6] = {r[1] * n[2] - r[2] * n[1], r[2] * n[0] - r[0] * n[2], r[0] * n[1] - r[1] * n[0], n[0], n[1], n[2]};

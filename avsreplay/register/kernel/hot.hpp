@@ -28,12 +28,13 @@ struct Look {
 };
 
 // Sums over a chunk or a scan; p, foot relative to the model's centre, e = n . (foot - p), J = [p x n, n].
-//   always: [0] inliers, [1] sum d2, [2] points not finite, [3] searches made, [4..6] sum p
+//   always: [0] inliers, [1] sum d2, [2] points not finite, [3] searches made, [4..6] sum p,
+//           [50] blocks and nodes of the tree that the searches compared
 //   point:  [7..9] sum foot, [10..18] sum p foot', row by row
 //   newton: those, [19..39] lower triangle of sum sign J'J with v in the place of n, [40] sum whole, [41..43] sum whole p,
 //           [44..49] lower triangle of sum whole p p'; see Stiffness
 //   plane:  [7..27] lower triangle of sum J'J, row by row, [28..33] sum J'e, [34] sum e^2
-constexpr int SUMS = 50;
+constexpr int SUMS = 51;
 struct Sums {
   double v[SUMS];
 };

@@ -142,11 +142,12 @@ class Passes {
     Newton newton;
     double before[12];
     const int most = few ? rule_.n_max / 2 : rule_.n_max, last_plane = o_.passes + rule_.n_plane;
-    while (o_.passes < most && !o_.converged) {
+    while (o_.passes < most && o_.work() < most_work() && !o_.converged) {
       if (sides_.look_from(o_.T)) memory.forget_radii();
       const Pass kind = plane ? Pass::plane : rule_.newton ? Pass::newton : Pass::point;
       const Look look{o_.T, o_.gate, memory.lead(o_.turn, o_.move), kind, rule_.facing, &sides_.facing()};
       const Sums sums = run_pass(s_, code_, v, look, memory.data(), team_);
+      o_.moved += v.n;
       if (!note(sums)) return false;
       const double gate = rule_.tighten > 0 ? std::min(o_.gate, std::max(rule_.floor, rule_.tighten * o_.rms)) : o_.gate;
       const bool steady = gate >= 0.99 * o_.gate;
@@ -178,12 +179,20 @@ class Passes {
 
  private:
   static constexpr int64_t MIN_INLIERS = 6;
+  static constexpr double NEAR = 0.1;  // of the first rejection distance
 
   bool note(const Sums& sums) {
     ++o_.passes;
     o_.inliers = (int64_t)sums.v[0], o_.ignored = (int64_t)sums.v[2], o_.searched += (int64_t)sums.v[3];
+    o_.compared += (int64_t)sums.v[50];
     o_.rms = o_.inliers ? std::sqrt(sums.v[1] / sums.v[0]) : std::numeric_limits<double>::quiet_NaN();
     return o_.inliers >= MIN_INLIERS;
+  }
+
+  // Near the surface, as the rejection distance tells, the passes are soon at their end and may take twice the work.
+  int64_t most_work() const {
+    const bool near = rule_.tighten > 0 && o_.gate < NEAR * rule_.gate;
+    return near && rule_.most_work < std::numeric_limits<int64_t>::max() / 2 ? 2 * rule_.most_work : rule_.most_work;
   }
 
   // Whether a step is below the standard error of a mean over the inliers.

@@ -12,6 +12,7 @@ struct Rule {
   int64_t few;  // points of the passes that come first, see `icp`; 0: all points from the first pass on
   double gate, tighten, floor, eps_rad, eps_m;
   bool facing, keep, newton;
+  int64_t most_work;  // after the pass that reaches it the loop ends, not converged
 };
 
 struct Outcome {
@@ -20,6 +21,11 @@ struct Outcome {
   int few_passes;  // of those the ones over a part
   bool converged;
   int64_t inliers, ignored, searched;
+  int64_t compared;  // blocks and nodes of the tree, by all searches
+  int64_t moved;     // points, over all passes
+
+  // In ordinary searches, each of which moves one point and compares about two blocks.
+  int64_t work() const { return (moved + searched + compared) / 4; }
   double rms, gate, turn, move;
 };
 

@@ -79,9 +79,11 @@ static inline int32_t keep_one(const Scope& o, const Query& q, uint32_t block) {
 static inline float squared(float room) { return room > 0.f ? room * room * 0.9999f : -1.f; }
 
 template <class Kind>
-static inline int32_t search_one(const Scope& o, const Query& q, const uint32_t* list, int32_t seed, Kept* kept) {
+static inline int32_t search_one(const Scope& o, const Query& q, const uint32_t* list, int32_t seed, Kept* kept,
+                                 int64_t& compared) {
   Search<Kind> search(o, q);
   search.run(list, seed);
+  compared += search.compared();
   if (kept) {
     typename Search<Kind>::Room room{0.f, 0.f};
     if (o.lead > 0.f) room = search.room();
@@ -110,11 +112,16 @@ static inline void fetch_ahead(const Store& s, Treat treat, const uint32_t* list
   for (uint32_t k = 1; k <= n && k <= 2; ++k) Kind::prefetch_block(s, list[k] & (MOST_BLOCKS - 1));
 }
 
-// The primitive of every point of the chunk; returns how many were searched for. `remember`: where, for later passes.
+// What the searches of a chunk took.
+struct Effort {
+  int64_t searched = 0, compared = 0;  // searches made, and the blocks and nodes that they compared
+};
+
+// Finds the primitive of every point of the chunk. `remember`: where, for later passes.
 template <class Kind>
-static int search(const Scope& o, int64_t first, int n, const Kept* kept, Kept* remember, Chunk& c) {
+static Effort search(const Scope& o, int64_t first, int n, const Kept* kept, Kept* remember, Chunk& c) {
   int32_t last = -1;
-  int searched = 0;
+  Effort effort;
   const auto own = [&](int i) { return kept ? kept[first + i].lane : -1; };
   for (int i = 0; i < n; ++i) {
     if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.search[i + AHEAD], c.list[i + AHEAD], own(i + AHEAD));
@@ -128,12 +135,12 @@ static int search(const Scope& o, int64_t first, int n, const Kept* kept, Kept* 
     } else {
       const int32_t seed = lane < 0 && !c.list[i] ? last : lane;
       Kept* memory = remember ? remember + first + i : nullptr;
-      c.lane[i] = search_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), c.list[i], seed, memory);
-      ++searched;
+      c.lane[i] = search_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), c.list[i], seed, memory, effort.compared);
+      ++effort.searched;
     }
     last = c.lane[i];
   }
-  return searched;
+  return effort;
 }
 
 // Calls put(i, points, feet, which of them are nearer than the bound) for every four points of the chunk.
@@ -232,10 +239,11 @@ static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last
   const Vec3 eye{look.T[3], look.T[7], look.T[11]};
   Scope o = scope_of(s, *look.facing, false, look.gate, look.lead);
   if (look.sided && s.mesh) o.eye = &eye;
-  out.v[3] = search<Kind>(o, first, n, kept, kept, c);
+  const Effort effort = search<Kind>(o, first, n, kept, kept, c);
   settle<Kind>(o, n, look.kind == Pass::point ? Ask::FOOT : look.kind == Pass::plane ? Ask::NORMAL : Ask::STIFFNESS, c);
   look.kind == Pass::plane ? sum_plane(n, c, out) : sum_point(n, c, out);
   if (look.kind == Pass::newton) sum_newton(n, c, out);
+  out.v[3] = (double)effort.searched, out.v[50] = (double)effort.compared;
 }
 
 // Searches for the points whose kept neighbour is not nearer than `known`: what is kept says nothing of places farther
@@ -244,10 +252,11 @@ template <class Kind>
 static bool search_beyond(const Scope& o, int n, double known, Chunk& c) {
   if (known >= o.bound) return false;
   bool any = false;
+  int64_t compared = 0;
   for (int i = 0; i < n; ++i) {
     if (c.search[i] < IN_BLOCK || (c.take[i] > 0 && c.d2[i] < known * known)) continue;
     const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
-    c.lane[i] = search_one<Kind>(o, q, list_of(o.s, word_at(o.s, q.x, q.y, q.z)), c.lane[i], nullptr);
+    c.lane[i] = search_one<Kind>(o, q, list_of(o.s, word_at(o.s, q.x, q.y, q.z)), c.lane[i], nullptr, compared);
     any = true;
   }
   return any;

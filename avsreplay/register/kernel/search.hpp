@@ -75,6 +75,9 @@ class Search {
   // The nearest, -1: none. Whether its distance is below the bound is not always decided yet.
   int32_t lane() const { return lane_; }
 
+  // Blocks and nodes of the tree that were compared with the query: a measure of the work, the same on every machine.
+  int64_t compared() const { return compared_; }
+
   // How far the query may move before another primitive (`lane`), or one of another block (`block`), can be the nearest,
   // or one come within the bound. An eye that stays within the margin of `Facing` makes no difference.
   struct Room {
@@ -142,6 +145,7 @@ class Search {
         continue;
       }
       const Node& n = s_.nodes[t.child];
+      ++compared_;
       const F8 d = box_distance2(n, q_);
       unsigned open = bits(d < f8(limit_)) & o_.facing.alive[t.child];
       if (!open) continue;
@@ -161,6 +165,7 @@ class Search {
 
   // Measures the lanes of a block in single precision; those that may be the nearest wait for `resolve`.
   void visit(uint32_t block) {
+    ++compared_;
     F8 d = Kind::distance2(s_, block, q_);
     const unsigned may = o_.facing.may[block], sure = o_.facing.sure[block];
     if (may != 0xffu) d = select(expand(may), d, f8(FAR));
@@ -249,6 +254,7 @@ class Search {
   uint32_t first_block_ = 0;
   F8 first_lanes_{};    // squared distances in that block
   int waiting_ = 0;
+  int64_t compared_ = 0;
   uint32_t wait_block_[MOST_WAITING];
   F8 wait_[MOST_WAITING];
 };
