@@ -14,7 +14,7 @@ import re
 import shutil
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, BinaryIO
@@ -23,6 +23,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 
 STDOUT = Path("-")
 _NAME_BYTES = 255
+_MOST_MANIFEST = 64 << 20
 _PART = re.compile(r"\..+\.\d+\.\d+\.part", re.DOTALL)
 _CLEANED: set[Path] = set()
 _COUNTER = itertools.count()
@@ -43,39 +44,44 @@ def is_stream(path: Path) -> bool:
     return stat.S_ISCHR(mode) or stat.S_ISFIFO(mode) or stat.S_ISBLK(mode)
 
 
-def check_output(path: Path, *, overwrite: bool = True, folder: bool = False) -> None:
+def check_output(path: Path, *, overwrite: bool = True, folder: bool = False, inputs: Iterable[Path] = ()) -> None:
     """Raise an error for an output that cannot be written, before any work is done.
 
     Args:
         path: the output.
         overwrite: whether an existing file or folder may be replaced.
         folder: whether the output is a folder; its parents are created.
+        inputs: files and folders that are read; the output must be none of them and no file of such a folder.
 
     Raises:
-        UsageError: the name is unusable, the output exists, or its folder does not.
+        UsageError: the name is unusable, the output exists, is an input, or its folder does not exist.
         UnreadableInput: its folder cannot be written.
     """
     name = os.fsencode(path)
     if not path.name or path.name == ".." or b"\0" in name:
         raise UsageError("is not the name of an output", where=repr(str(path)), hint="name a file")
-    if not _is_text(str(path)):
+    if str(path).encode("utf-8", "replace") != name:
         raise UsageError("is not a UTF-8 name", where=ascii(str(path)), hint="name another output")
     if len(os.fsencode(path.name)) > _NAME_BYTES:
         where = f"{path.name[:40]}..."
         raise UsageError(f"the name is longer than {_NAME_BYTES} bytes", where=where, hint="name another output")
     try:
         _check_place(path, overwrite, folder)
+        if not is_stream(path) and any(_replaces(path.resolve(), each.resolve()) for each in inputs):
+            raise UsageError("is an input or a part of one", where=str(path), hint="name another output")
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of symbolic links
         what = f"cannot be written: {getattr(error, 'strerror', None) or 'a loop of symbolic links'}"
         raise UsageError(what, where=str(path)[:200], hint="name another output") from None
 
 
-def _is_text(text: str) -> bool:
-    try:
-        text.encode("utf-8")
-    except UnicodeEncodeError:
-        return False
-    return True
+def _replaces(place: Path, source: Path) -> bool:
+    """Whether an output replaces an input, a scan in a folder that is read, or a file that its run.json lists."""
+    if place == source or place.parent != source or not place.is_file():
+        return place == source
+    manifest = source / "run.json"
+    if manifest.is_file() and place != manifest:
+        return os.fsencode(f'"{place.name}"') in read_limited(manifest, _MOST_MANIFEST, "name a result of a run")
+    return place.suffix != ".html"
 
 
 def _check_place(path: Path, overwrite: bool, folder: bool) -> None:

@@ -52,6 +52,35 @@ def rewrite_manifest(result: Path, **changes: object) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **changes}), encoding="utf-8")
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("report", "RESULT", "-o", "RESULT/rows.jsonl", "--overwrite"),
+        ("report", "RESULT/rows.jsonl", "-o", "RESULT/rows.jsonl", "--overwrite"),
+        ("export", "RESULT", "--to", "csv", "-o", "RESULT/run.json", "--overwrite"),
+        ("compare", "RESULT", "RESULT", "-o", "RESULT/truth.tum", "--overwrite"),
+        ("compare", "RESULT", "RESULT", "--gate", "GATE", "--junit", "GATE"),
+        ("plan", "RESULT", "--export", "RESULT/beliefs.npz", "--overwrite"),
+        ("odometry", "RESULT/result.mcap", "-o", "RESULT/result.mcap", "--overwrite"),
+    ],
+)
+def test_an_output_never_replaces_what_the_command_reads(words: tuple[str, ...], result: Path) -> None:
+    gate = result.parent / "gate.toml"
+    gate.write_text('[[rule]]\nmetric = "healthy"\nmin = 0.0\n')
+    files = [gate, *result.iterdir()]
+    before = [path.read_bytes() for path in files]
+    done = run(*(word.replace("RESULT", str(result)).replace("GATE", str(gate)) for word in words))
+    assert isinstance(done.exception, UsageError), done.exception
+    assert "is an input or a part of one" in str(done.exception)
+    assert [path.read_bytes() for path in files] == before
+
+
+def test_pages_and_exports_in_the_folder_of_a_result_can_be_made_again(result: Path) -> None:
+    for words in (("report", result), ("export", result, "--to", "tum", "-o", result / "mine.tum")):
+        for _ in range(2):
+            assert run(*words, "--overwrite").exception is None
+
+
 @pytest.mark.parametrize("command", READERS)
 def test_an_intact_result_is_read_without_a_warning(command: str, result: Path) -> None:
     done = read(command, result)

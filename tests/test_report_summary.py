@@ -361,3 +361,19 @@ def test_a_drift_is_reported_where_it_exceeds_two_standard_deviations(make_rows,
     rows = make_rows(5)
     rows[-1] = dataclasses.replace(rows[-1], drift_s=2.0, drift_mps2=5e-6, drift_1s_mps2=sigma)
     assert (Summary.fold(rows).drift is not None) == reported
+
+
+def test_without_a_scan_free_of_faults_no_rate_of_false_alarms_is_stated(clean):
+    rows = [dataclasses.replace(r, fault="occlusion", gamma=0, reason="fit_error") for r in clean]
+    summary = Summary.fold(rows)
+    assert "no scan without a fault" in in_one_line(summary)
+    assert dict(fact_lines(summary))["false alarms"] == "unknown: every scan carries a fault"
+
+
+def test_manoeuvres_are_those_that_the_last_rows_describe(clean):
+    """A row counts the manoeuvres and describes the last one; a later count of fewer withdraws the others."""
+    described = [(0, None), (1, 1.0), (1, 1.1), (2, 4.0), (2, None), (2, 4.2), (1, 1.2)]
+    rows = [dataclasses.replace(r, manoeuvres=n, manoeuvre_s=t) for r, (n, t) in zip(clean, described, strict=False)]
+    two, one = (Summary.fold(rows[:n]).velocity_changes for n in (6, 7))
+    assert [(c.reported_s, c.t_s) for c in two] == [(rows[1].t_s, 1.1), (rows[3].t_s, 4.2)]
+    assert [(c.reported_s, c.t_s) for c in one] == [(rows[1].t_s, 1.2)]

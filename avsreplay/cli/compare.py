@@ -106,10 +106,11 @@ def compare_command(
     """  # noqa: D301
     if (junit or github) and not gate:
         raise UsageError("--junit and --github need --gate", hint="name the rules with --gate rules.toml")
+    inputs = [*results, *([gate] if gate else ())]
     if output:
-        check_output(output, overwrite=overwrite)
+        check_output(output, overwrite=overwrite, inputs=inputs)
     if junit:
-        check_output(junit)
+        check_output(junit, inputs=inputs)
     groups = _with_distinct_names([_group(path) for path in results])
     rules = gates.load_rules(gate) if gate else ()
     pairs = [(other, _paired(groups[0], other)) for other in groups[1:]]

@@ -70,7 +70,7 @@ def model_command(
     for each in (output, mesh):
         if each is not None:
             check_suffix(each, ".ply")
-            check_output(each, overwrite=overwrite)
+            check_output(each, overwrite=overwrite, inputs=[log])
     if mesh is not None and find_spec("open3d") is None:
         hint = "pip install 'avsreplay[open3d]'"
         raise MissingBackend("a mesh needs Open3D, which is not installed", where="--mesh", hint=hint)
@@ -212,7 +212,7 @@ def odometry_command(
     from avsreplay.register.peers import KissOdometry
     from avsreplay.report.export import write_tum
 
-    check_output(output, overwrite=overwrite)
+    check_output(output, overwrite=overwrite, inputs=[log])
     load_backend("kiss")  # reports where the library is not installed
     odometry, poses = None, []
     with open_source(log, read_options(reading)) as source:

@@ -139,7 +139,7 @@ def plan_command(
             raise UsageError(f"{value} is not above 0", where=name, hint="give a finite number above 0")
     for target in (export, animate):
         if target:
-            check_output(target, overwrite=overwrite)
+            check_output(target, overwrite=overwrite, inputs=[result])
     of_robot = () if robot_file is None else robot_settings(robot_file)
     saved = with_settings(load_saved(result, extent_m), (*of_robot, *assignments))
     for line in saved.warnings:

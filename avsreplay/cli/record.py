@@ -170,7 +170,7 @@ def export_command(result: Path, kind: str, poses: str, output: Path, overwrite:
         UnreadableInput: RESULT cannot be read.
         MissingBackend: pyarrow is needed and not installed.
     """  # noqa: D301
-    check_output(output, overwrite=overwrite)
+    check_output(output, overwrite=overwrite, inputs=[result])
     found, quiet = read_result(result), output == STDOUT
     if kind in ("csv", "parquet"):
         (export.write_csv if kind == "csv" else export.write_parquet)(output, found.rows)
@@ -216,7 +216,7 @@ def report_command(result: Path, output: Path | None, title: str | None, overwri
     the effective configuration.
     """
     page = output or (result if result.is_dir() else result.parent) / "report.html"
-    check_output(page, overwrite=overwrite)
+    check_output(page, overwrite=overwrite, inputs=[result])
     click.echo(write_page(result, page, title), err=page == STDOUT)
 
 

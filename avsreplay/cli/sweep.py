@@ -12,6 +12,7 @@ import click
 
 from avsreplay.cli.options import PATH
 from avsreplay.errors import DataLost, UsageError
+from avsreplay.files import check_output
 
 if TYPE_CHECKING:
     from avsreplay.sweep import Expansion, Journal
@@ -98,6 +99,7 @@ def sweep_command(
     if run_id is not None:
         _make_again(plan, run_id, output, page)
         return
+    check_output(output, folder=True)
     arrow()  # raises before anything runs, not after
     journal = Journal(output)
     with journal:

@@ -230,9 +230,10 @@ def _fault_words(summary: Summary) -> list[str]:
     if not faults.known:
         return [f"{faults.false_alarms} flagged"] if faults.false_alarms else []
     found = f"{faults.detected} of {faults.injected} harmful faults detected"
+    alarms = f"{faults.false_alarms} false alarms ({100 * faults.false_alarm_rate:.2f} %)"
     return [
         found if faults.injected else "no harmful fault injected",
-        f"{faults.false_alarms} false alarms ({100 * faults.false_alarm_rate:.2f} %)",
+        alarms if faults.unlabelled else "no scan without a fault",
     ]
 
 
@@ -279,9 +280,10 @@ def _fault_facts(summary: Summary) -> Iterable[tuple[str, str]]:
         return
     events = f"{faults.injected} injected, {faults.detected} detected, {faults.missed} missed"
     scans = f"{faults.harmful_scans - faults.missed_scans} of {faults.harmful_scans} harmful scans flagged"
-    rate = 100.0 * faults.false_alarm_rate
+    alarms = f"{faults.false_alarms} of {faults.unlabelled} scans without a fault"
     yield "harmful faults", f"{events}; {scans}"
-    yield "false alarms", f"{faults.false_alarms} of {faults.unlabelled} scans without a fault ({rate:.2f} %)"
+    rate = f"{alarms} ({100.0 * faults.false_alarm_rate:.2f} %)"
+    yield "false alarms", rate if faults.unlabelled else "unknown: every scan carries a fault"
     if faults.longest_recovery_s is not None:
         yield "recovery", f"at most {faults.longest_recovery_s:.2f} s after the first scan past a fault"
 
