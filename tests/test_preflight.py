@@ -7,6 +7,7 @@ import json
 
 import numpy as np
 import pytest
+import trimesh
 
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
@@ -277,3 +278,13 @@ def test_a_model_in_millimetres_is_said_before_any_table(cli, fixtures_folder, m
     right = cli("run", log, "--model", model_in_mm, "--model-unit", "mm", "--n-scans", 5)
     assert "model-unit" not in right.err.splitlines()[0]
     assert "5 healthy" in right.out
+
+
+def test_a_wrong_model_is_the_first_reason_of_a_run_without_used_scans(cli, fixtures_folder, tmp_path):
+    trimesh.creation.icosphere(subdivisions=2, radius=1.2).export(tmp_path / "ball.stl")
+    options = ["--model", tmp_path / "ball.stl", "--init", "auto", "--n-scans", 3, "--json"]
+    done = cli("run", fixtures_folder / "tumble.mcap", *options)
+    assert done.code == 0, done.err
+    verdict = json.loads(done.out)["verdict"]
+    assert verdict["grade"] == "FAIL"
+    assert "is it the right model" in verdict["reasons"][0]["text"]

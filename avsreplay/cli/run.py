@@ -224,7 +224,8 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
         summary = run.summary()
         record = _record(run, summary)
         record["preflight"] = [{"grade": a.grade, "text": a.sentence} for a in advice]
-        record["preflight"] += [{"grade": "check", "text": note} for note in _model_notes(run, advice)]
+        grade = "check" if summary.healthy else "fail"  # a wrong model explains why no scan was used
+        record["preflight"] += [{"grade": grade, "text": note} for note in _model_notes(run, advice)]
         if interrupted:
             record["interrupted_after"] = len(rows)
             how = "; add --resume to continue" if target and not growing else ""

@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
 from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import without_scattered_points
-from avsreplay.register.size import SIGMAS, fitted_size, noise_bias
+from avsreplay.register.size import SIGMAS, diameter, fitted_size, noise_bias
 
 POINTS = 1500  # points used of each scan
 _LEAST_RUN_ERROR = 0.002  # least error of size that is reported; a single scan cannot show so small a one
@@ -138,8 +137,8 @@ class ModelCheck:
         mirrored = replace(self._surface, vertices=self._surface.vertices * [-1.0, 1.0, 1.0])
         if len(scan) and self._fits(replace(mirrored, faces=mirrored.faces[:, ::-1]), scan):
             return "the scans fit the mirror image of the model: is an axis of the model or of the scans inverted?"
-        measures = geometry.bounding_diagonal(scan) if len(scan) else 0.0
-        sizes = f"the first of them measures {measures:.3g} m, the model {self._surface.extent:.3g} m"
+        own = diameter(self._surface.vertices, trimmed=False)
+        sizes = f"the first of them measures {diameter(scan):.3g} m, the model {own:.3g} m"
         return f"no pose of the model explains the scans ({sizes}): is it the right model, in metres?"
 
     def _fits(self, surface: Surface, scan: Array) -> bool:
