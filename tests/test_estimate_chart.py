@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tumbling
@@ -15,10 +17,12 @@ from avsreplay.estimate.chart import (
     nees,
     permute_axes,
     permute_covariance,
+    separated,
     to_chart,
+    to_errors,
     to_state,
 )
-from avsreplay.estimate.error_state import boxminus, boxplus
+from avsreplay.estimate.error_state import DMU, DQ, boxminus, boxplus
 from avsreplay.records import Belief, State
 
 EACH = pytest.mark.parametrize("naming", AXIS_PERMUTATIONS, ids=lambda n: "".join(map(str, n.perm)))
@@ -106,3 +110,28 @@ def test_a_fixture_turned_by_180_degrees_is_distinguished(world: tumbling.World)
     x = world.states[0]
     turned = State(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, geometry.multiply([1.0, 0, 0, 0], x.q_bc))
     assert nees(Belief(0, turned, np.eye(20) * 1e-4), x) > 5e3
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_nearly_equal_moments_are_separated_by_a_small_part_of_their_standard_deviation(seed: int) -> None:
+    """The error of the pose is half the sum of those of attitude and mu, computed without a loss of precision."""
+    rng = np.random.default_rng(seed)
+    x = tumbling.draw(seed, seconds=1.0).states[0]
+    chart = to_chart(replace(x, sigma=rng.normal(size=2) * 10.0 ** rng.uniform(-12.0, -4.0)))
+    root = np.diag(10.0 ** np.concatenate([rng.uniform(-5.0, -3.0, 12), rng.uniform(-1.0, 0.5, 8)]))
+    root[12:17, 12:17] @= rng.normal(size=(5, 5))
+    P = root @ root.T
+    moved = separated(chart, P)
+    y = moved.minus(chart)
+    assert float(y @ np.linalg.solve(P, y)) <= 0.1**2 + 1e-9
+    T = to_errors(moved)
+    E = T @ P @ T.T
+    assert E[DMU, DMU].max() < 1e3
+    of_pose = E[DQ, DQ] + E[DMU, DMU] + E[DQ, DMU] + E[DMU, DQ]
+    R = moved.R_cb
+    np.testing.assert_allclose(of_pose, R.T @ P[:3, :3] @ R, rtol=1e-3, atol=1e-12)
+
+
+def test_moments_that_are_known_to_differ_stay_as_they_are(world: tumbling.World) -> None:
+    chart = to_chart(world.states[0])
+    assert separated(chart, 1e-4 * np.eye(20)) is chart

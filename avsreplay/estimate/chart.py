@@ -38,6 +38,7 @@ ETA, RATE, POSITION, VELOCITY = (slice(k, k + 3) for k in (0, 3, 6, 9))
 INERTIA, ARM = slice(12, 17), slice(17, 20)
 ANY_HALF_RAD = 0.5 * float(np.sqrt(np.pi**2 / 3.0 + 2.0))  # rms half angle of a uniformly distributed attitude
 _LARGEST_1S = 3.0  # largest 1 sigma of the logarithm of the mass moments; above it the inertia is undetermined
+_LEAST_GAP, _MOST_MOVED = 0.02, 0.1  # least difference of two values of M, and largest move for its sake [sigma]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -149,6 +150,34 @@ def to_state(c: Chart) -> State:
 def to_errors(c: Chart) -> Array:
     """Jacobian T (20, 20): error states d = T y of ``to_state`` for a small chart step y."""
     return _motion.errors(c.flat)
+
+
+def separated(c: Chart, P: Array) -> Chart:
+    """The chart, moved by a small part of its standard deviation if two principal moments are too nearly equal.
+
+    The error of the principal axes is an error of M over the difference of two of its eigenvalues. Without a bound, the
+    covariances of the error states of attitude and mu grow beyond the precision in which their sum, the error of a
+    pose, can be computed. The move is the most likely one that separates the eigenvalues.
+
+    Args:
+        c: mean.
+        P: (20, 20) covariance of the chart.
+    """
+    S, values = P[INERTIA, INERTIA], np.diagonal(c.R_cb.T @ c.M @ c.R_cb)
+    order = np.argsort(values, kind="stable")
+    gaps = np.diff(values[order])
+    if float(gaps.min()) >= _LEAST_GAP * float(np.sqrt(np.trace(S))):
+        return c
+    axes = c.R_cb[:, order].T
+    first, second = axes[:-1], axes[1:]
+    across = np.sqrt(2.0) * np.einsum("nij,ki,kj->kn", _BASIS, first, second)
+    missing = np.maximum(_LEAST_GAP * np.sqrt(np.einsum("kn,nm,km->k", across, S, across)) - gaps, 0.0)
+    if not missing.any():
+        return c
+    along = np.einsum("nij,ki,kj->kn", _BASIS, second, second) - np.einsum("nij,ki,kj->kn", _BASIS, first, first)
+    weights = np.linalg.solve(along @ S @ along.T, missing)
+    part = min(1.0, _MOST_MOVED / float(np.sqrt(missing @ weights)))
+    return c.moved(part * (P[:, INERTIA] @ (along.T @ weights)))
 
 
 def permute_axes(x: State, permutation: AxisPermutation) -> State:

@@ -13,7 +13,7 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate import _motion
-from avsreplay.estimate.chart import Chart, to_errors, to_state
+from avsreplay.estimate.chart import Chart, separated, to_errors, to_state
 from avsreplay.estimate.dynamics import forecast_of, grasp_prediction, torque_density, translation
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import measurement_jacobian, to_fixture
@@ -49,9 +49,10 @@ class Component:
     @property
     def belief(self) -> Belief:
         """Mean, and covariance of the error states."""
-        T = to_errors(self.chart)
+        chart = separated(self.chart, self.P)
+        T = to_errors(chart)
         P = T @ self.P @ T.T
-        return Belief(self.t_ns, to_state(self.chart), 0.5 * (P + P.T))
+        return Belief(self.t_ns, to_state(chart), 0.5 * (P + P.T))
 
 
 def moments(components: tuple[Component, ...]) -> Belief:
