@@ -228,6 +228,8 @@ def final_mixture(
 ) -> Parts[tuple[Component, ...]]:
     """The fit with process noise as a Gaussian mixture at the last pose, in parts; the first has the published mean.
 
+    A direction of which a profile fit cannot be propagated is treated as Gaussian.
+
     Args:
         found: the fit and its non-Gaussian directions.
         problem: the cost that was fitted.
@@ -241,35 +243,48 @@ def final_mixture(
     fitted, n = found.fitted, len(found.directions)
     bases: list[tuple[float, Chart, Pin | None]] = [(1.0 - 2.0 * _WEIGHT * n, fitted.chart, None)]
     bases += [(_WEIGHT, p.chart, p.pin) for d in found.directions for p in d.points]
-    out, lost, rows = [], 0.0, [d.row for d in found.directions]
-    unseen = np.zeros((DIM, DIM)) if unseen is None else _fixed(unseen, rows)
+    out, rows = [], [d.row for d in found.directions]
+    added = np.zeros((DIM, DIM)) if unseen is None else _fixed(unseen, rows)
     recent = Problem(latest, problem.prior, fitted.effective)
     for weight, chart, pin in bases:
         y, P = process_noise_pass(chart, pin, problem, noise)
         yield 3 * len(problem.poses)
-        if not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < LARGEST_MOVE):  # far beyond what is linear
-            if pin is not None:
-                lost += weight
-                continue
-            y, P = np.zeros(DIM), fitted.P_chart
+        lost = not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < LARGEST_MOVE)  # far beyond what is linear
         if pin is None:
+            y, P = (np.zeros(DIM), fitted.P_chart) if lost else (y, P)
             P = definite(P if spread is None else spread @ P @ spread.T)  # spread: for the trajectory of the fit alone
-        base, step = propagate_chart(chart, after_s, problem.poses.arc)
-        move = step @ y
-        share = 1.0
-        if least_eigenvalue(P) < ROUNDING or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
-            share = _accepted_share(base, move, recent)
-        there = base.moved(share * move)
-        P = P if pin is not None else _fixed(P, rows)
-        if pin is None:
-            unseen = step @ unseen @ step.T  # valid about free motion only
-        P = step @ P @ step.T + unseen + (1.0 - share) ** 2 * np.outer(move, move)
-        if pin is not None and not least_eigenvalue(P) >= -ROUNDING:
-            lost += weight  # about an unstable spin, rounding at the epoch has grown beyond the covariance
-            continue
+        if pin is None or not lost:
+            there, share, step, beyond = _moved_on(chart, y, P, problem, recent, after_s)
+            if pin is None:
+                P, added = _fixed(P, rows), step @ added @ step.T  # added is valid about free motion only
+            P = step @ P @ step.T + added + beyond
+            lost = not least_eigenvalue(P) >= -ROUNDING  # about an unstable spin, by rounding at the epoch
+        if pin is not None and lost:
+            left = _without(found, pin)
+            return (yield from final_mixture(left, problem, latest, noise, t_ns, after_s, spread, unseen))
         out.append(Component(weight, weight, t_ns, there, definite(P), share))
-    first = out[0].weight + lost
-    return (replace(out[0], weight=first, quadrature=first), *out[1:])
+    return tuple(out)
+
+
+def _without(found: BatchCovariance, pin: Pin) -> BatchCovariance:
+    """The covariance without the direction that ``pin`` fixes: the variance along it stays that of the Gaussian."""
+    kept = tuple(d for d in found.directions if all(point.pin is not pin for point in d.points))
+    return replace(found, directions=kept, others=True)
+
+
+def _moved_on(
+    chart: Chart, y: Array, P: Array, problem: Problem, recent: Problem, after_s: float
+) -> tuple[Chart, float, Array, Array]:
+    """The trajectory of a fit ``after_s`` after the epoch, with the part of its correction y (20,) that it contains.
+
+    Returns:
+        The chart, that part, the transition (20, 20), and the second moments of what it does not contain.
+    """
+    base, step = propagate_chart(chart, after_s, problem.poses.arc)
+    move, share = step @ y, 1.0
+    if least_eigenvalue(P) < ROUNDING or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
+        share = _accepted_share(base, move, recent)
+    return base.moved(share * move), share, step, (1.0 - share) ** 2 * np.outer(move, move)
 
 
 def _fixed(P: Array, rows: list[Array]) -> Array:
