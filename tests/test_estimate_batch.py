@@ -12,7 +12,7 @@ from scipy.stats import chi2
 
 from avsreplay import geometry
 from avsreplay.errors import UsageError
-from avsreplay.estimate import Estimator, EstimatorParams
+from avsreplay.estimate import Estimator, EstimatorParams, batch_covariance
 from avsreplay.estimate.batch import FitParams, Pin, Poses, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import (
     BatchCovariance,
@@ -31,7 +31,7 @@ from avsreplay.estimate.normal_points import normal_points
 from avsreplay.estimate.params import Start
 from avsreplay.estimate.reference import reference_fit
 from avsreplay.estimate.work import whole
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams
 from avsreplay.records import Belief, State
 
@@ -320,6 +320,24 @@ def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
     assert np.mean(plain) > 3.0
     assert np.mean(mended) < 1.6
     assert max(mended) < 3.0
+
+
+def test_a_direction_of_which_a_profile_fit_cannot_be_propagated_keeps_its_variance(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The variance along it is that of the Gaussian; without its components it was 0."""
+    world = tumbling.draw(3, seconds=20.0)
+    poses, fitted, prior = grown(seen(world, 3), 21, 41)
+    found = whole(covariance_of(Problem(poses, prior, fitted.effective), fitted, FitParams()))
+    others = at_the_end(replace(found, directions=found.directions[1:]), poses, prior, 20.0)
+    lost = found.directions[0].points[1].pin
+
+    def passed(chart: Chart, pin: Pin | None, problem: Problem, noise: tuple[float, float]) -> tuple[Array, Array]:
+        y, P = process_noise_pass(chart, pin, problem, noise)
+        return y, P * np.nan if pin is lost else P
+
+    monkeypatch.setattr(batch_covariance, "process_noise_pass", passed)
+    assert at_the_end(found, poses, prior, 20.0).P.tobytes() == others.P.tobytes()
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -11,10 +11,18 @@ import tumbling
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.estimate.chart import to_chart, to_errors
+from avsreplay.estimate.disturbance_schedule import no_worse_than_pose
 from avsreplay.estimate.driven import DrivenBelief, driven_forecast, driven_moments, propagated
 from avsreplay.estimate.dynamics import grasp_forecast, propagate, propagate_state
 from avsreplay.estimate.error_state import boxminus, boxplus
-from avsreplay.estimate.measurement import chart_update, innovation_of, innovation_vector, measurement_jacobian
+from avsreplay.estimate.initialise import PoseFix
+from avsreplay.estimate.measurement import (
+    chart_update,
+    in_camera,
+    innovation_of,
+    innovation_vector,
+    measurement_jacobian,
+)
 from avsreplay.geometry import Array
 from avsreplay.records import Belief, State
 
@@ -132,3 +140,18 @@ def test_a_mixture_has_the_moments_of_its_parts() -> None:
     assert boxminus(found.x, first.x) == pytest.approx(0.3 * d, rel=1e-2, abs=1e-8)
     assert np.diagonal(found.P) == pytest.approx(np.diagonal(first.P + 0.21 * np.outer(d, d)), rel=1e-2)
     assert driven_moments([(1.0, first)]) is first
+
+
+def test_a_belief_with_a_torque_is_no_less_precise_than_the_last_pose() -> None:
+    """In the directions in which its pose is less precise, the pose is used as far as is missing, and no further."""
+    belief, C = belief_of(3), np.diag(np.repeat([2e-2, 6e-2], 3) ** 2)
+    pose = belief.x.T_ac @ geometry.Pose(geometry.exp(np.array([0.01, -0.02, 0.01])), np.array([0.03, 0.0, -0.02]))
+    H = measurement_jacobian(belief.x)
+    before = np.linalg.eigvals(np.linalg.solve(in_camera(C, pose.q, belief.x.q_bc), H @ belief.P @ H.T)).real
+    assert before.min() < 1.0 < before.max()
+    after = no_worse_than_pose(belief, PoseFix(0, pose, C), np.ones(2))
+    T, U = to_errors(to_chart(belief.x)), to_errors(to_chart(after.x))
+    P = T @ np.linalg.solve(U, np.linalg.solve(U, after.P).T) @ T.T
+    found = np.linalg.eigvals(np.linalg.solve(in_camera(C, pose.q, belief.x.q_bc), H @ P @ H.T)).real
+    assert np.sort(found) == pytest.approx(np.sort(np.minimum(before, 1.0)), rel=1e-4)
+    assert np.trace(after.P_u) < np.trace(belief.P_u)

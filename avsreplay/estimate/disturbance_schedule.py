@@ -15,7 +15,15 @@ from avsreplay.estimate.chart import Chart
 from avsreplay.estimate.drift import DriftFound, find_drift
 from avsreplay.estimate.driven import DrivenBelief, driven_moments
 from avsreplay.estimate.driven_fit import DrivenMotion, driven_motion, levels_of
-from avsreplay.estimate.initialise import BatchResult, improved_levels, pose_count, poses_of
+from avsreplay.estimate.initialise import BatchResult, PoseFix, improved_levels, pose_count, poses_of
+from avsreplay.estimate.measurement import (
+    chart_update,
+    in_camera,
+    innovation_of,
+    innovation_vector,
+    measurement_jacobian,
+)
+from avsreplay.estimate.noise import NO_INFLATION
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
 from avsreplay.estimate.params import Adaptation
 from avsreplay.estimate.track import Track
@@ -27,6 +35,7 @@ from avsreplay.settings import given
 FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a test of drift, and between two tests
 LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
 _DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
+_LEAST_EXCESS = 1e-6  # of the variance of a belief over that of a pose, in whose direction it is used
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
 
 
@@ -143,15 +152,32 @@ class DisturbanceSchedule:
             if not np.isfinite(belief.P).all():
                 return track
             parts.append((weight, belief))
-        inflation, moved = driven.motions[0][1].inflation, driven_moments(parts)
+        inflation, plain = driven.motions[0][1].inflation, driven.levels.factors(last.share)
+        moved = no_worse_than_pose(driven_moments(parts), track.fixes[-1], plain * np.sqrt(inflation))
         onset_ns, spread = epoch_ns + round(best.fitted.onset_s * 1e9), driven.found.onset_1s_s
         if onset_ns == epoch_ns:  # it may have acted before the first of these poses
             since_ns = (epoch_ns - min(track.started_ns, epoch_ns)) // 2
             onset_ns, spread = onset_ns - since_ns, math.hypot(spread, since_ns * 1e-9 / math.sqrt(3.0))
         detected_ns = now_ns if known is None else known.detected_ns
         drift = Drift(onset_ns, spread, moved.u[3:], moved.u[:3], moved.P_u, detected_ns)
-        plain, chart = driven.levels.factors(last.share), best.fitted.chart
-        result = BatchResult(epoch_ns, chart, count, plain, inflation, moved, last.gaussian)
+        result = BatchResult(epoch_ns, best.fitted.chart, count, plain, inflation, moved, last.gaussian)
         result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
         track = replace(track, drift=drift, levels=replace(driven.levels, count=count), fitting=None)
         return self.batch.adopted(track, result, to_filter=True)
+
+
+def no_worse_than_pose(belief: DrivenBelief, fix: PoseFix, factors: Array) -> DrivenBelief:
+    """The belief, in no direction less precise at its pose than the last pose ``fix``, as by ``mixture.not_worse``.
+
+    ``factors`` (2,) are on the standard deviations of attitude and position.
+    """
+    x, scale, H = belief.x, np.repeat(factors, 3), measurement_jacobian(belief.x)
+    root = np.linalg.cholesky(in_camera(fix.C * np.outer(scale, scale), fix.T_ac.q, x.q_bc))
+    whiten = np.linalg.inv(root)
+    values, axes = np.linalg.eigh(whiten @ H @ belief.P @ H.T @ whiten.T)
+    if values[-1] <= 1.0 or fix.lag_ns:
+        return belief
+    half = root @ axes / np.sqrt(fix.weight * (1.0 - 1.0 / np.maximum(values, 1.0 + _LEAST_EXCESS)))
+    innovation = innovation_of(belief.P, H, innovation_vector(x, fix.T_ac), half @ half.T)
+    found = chart_update(belief, H, innovation, NO_INFLATION)
+    return found if isinstance(found, DrivenBelief) else belief
