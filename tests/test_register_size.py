@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from oracles.residuals import summed
 
 from avsreplay.geometry import Array, Pose
@@ -103,6 +104,7 @@ def test_an_error_of_aspect_is_not_called_an_error_of_size() -> None:
     assert not any(remarks(model, stretched, 0.002, range(8)))
 
 
+@pytest.mark.slow
 def test_three_faces_of_a_box_tell_no_size() -> None:
     """Points on three planes fit a box of any size; only a face behind the others would tell."""
     planes = [np.random.default_rng(k).uniform(0.1, 0.9, (200, 2)) for k in range(3)]
@@ -115,3 +117,15 @@ def test_three_faces_of_a_box_tell_no_size() -> None:
 def cube_faces() -> np.ndarray:
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))], dtype=np.int32)
+
+
+@pytest.mark.slow
+def test_three_faces_of_a_box_do_not_show_its_size_and_the_row_says_so():
+    shape = trimesh.creation.box((2.0, 1.0, 0.6))
+    box = Surface(np.array(shape.vertices), np.array(shape.faces, dtype=np.int32), "box", "")
+    larger = replace(box, vertices=1.05 * box.vertices)
+    for measured in (box, larger):
+        said = remarks(box, measured, 0.002, range(3))
+        assert said
+        assert all("does not show an error of the size" in each for each in said)
+    assert not any(remarks(boxes(), boxes(), 0.002, range(3)))

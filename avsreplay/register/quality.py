@@ -26,7 +26,7 @@ from avsreplay.register.covariance import (
 )
 from avsreplay.register.degenerate import FREE_BELOW, Directions, motion_words, unbounded_directions
 from avsreplay.register.params import Camera, RegisterParams, RegistrationLimits
-from avsreplay.register.size import LEAST_ERROR, SizeError, normal_jacobian, size_error
+from avsreplay.register.size import LEAST_ERROR, SIGMAS, UNSEEN_ERROR, SizeError, normal_jacobian, size_error
 from avsreplay.register.surface_index import Closest, SurfaceIndex
 
 CLEARANCE_OF_EXTENT = 0.25
@@ -254,7 +254,7 @@ def grade(
         covariance=None if P is None else frozen(P),
         free_directions=", ".join(weakest),
         split_nis=None if np.isnan(found.split_nis) else found.split_nis,
-        message=_message(settled, size),
+        message=_message(settled, size, found.size_1s if P is not None and systematic else 0.0),
         dof=np.inf if P is None else found.dof,
         free=free if weakest else None,
     )
@@ -266,10 +266,12 @@ def _other_size(found: PoseQuality) -> bool:
     return found.inliers < MANY_INLIERS * found.points or abs(found.size) > suggested
 
 
-def _message(settled: bool, size: SizeError | None) -> str:
+def _message(settled: bool, size: SizeError | None, size_1s: float) -> str:
     if not settled:
         return "the back end reports convergence, but its pose is not at a minimum of the distances"
-    return "" if size is None else size.message
+    if size is not None or SIGMAS * size_1s <= UNSEEN_ERROR:
+        return "" if size is None else size.message
+    return f"the view does not show an error of the size below {100.0 * SIGMAS * size_1s:.1f} %"
 
 
 def _same(T_ca: Pose, guess: Pose | None) -> bool:

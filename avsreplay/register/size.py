@@ -32,6 +32,7 @@ from avsreplay.register.surface_index import SurfaceIndex
 LEAST_RESIDUALS = 50
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
 LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta| that is reported, by itself and in standard errors
+UNSEEN_ERROR = 0.03  # a view in which a larger error would not be significant does not determine the size
 WIDTH_OF_EXTENT, ROUNDS, POINTS = 0.02, 3, 600  # larger residuals are not used; times that the points are matched
 LARGEST_ERROR = 0.3  # a fit with a larger step has not converged
 LEAST_INFORMATION = 1e-3  # least share of n . p not explained by the pose: three faces of a box give no size

@@ -8,7 +8,8 @@ cylinder with closed ends) and a box. Every view is ray-cast from a random side 
 the extent along the ray. The scenes add walls, outliers, occlusion, a second object, noise, an error of scale or a bad
 guess. "Correct": within 2 deg and 0.02 of the extent of the true pose, or of a pose that differs by a symmetry of the
 mesh. With an error of scale up to 10 % the pose counts; with a factor of 1000 no pose is correct. "Accepted": status
-aligned. "Wrong": accepted, not correct, and the row does not say that the scan fits a target of another size. Time is
+aligned. "Wrong": accepted, not correct, and the row says neither that the scan fits a target of another size nor that
+the view does not determine the size. Time is
 processor time; "x" is the ratio to the median of the clean scans of the same mesh. A row per scene over all meshes,
 and with --each one per scene and mesh.
 """
@@ -331,8 +332,9 @@ def _one(
     score.cases += 1
     score.right += right
     score.accepted += accepted
-    score.wrong += accepted and not right and "than the model" not in found.message
-    score.said += "than the model" in found.message
+    said = any(text in found.message for text in ("than the model", "error of the size"))
+    score.wrong += accepted and not right and not said
+    score.said += said
     score.statuses += " " + ("+" if right else "-") + found.status.value
     score.seconds.append(spent)
     score.ratios.append(spent / healthy)
