@@ -1,16 +1,18 @@
 """``avsreplay`` and ``python -m avsreplay``: pin the arithmetic, then run the command line."""
 
-import gc
+import sys
 
 from avsreplay import arithmetic
 
 
 def main() -> None:
     """Entry point of the command."""
-    arithmetic.pin()  # before anything imports numpy
-    gc.set_threshold(100_000)  # commands create many objects and few cycles; a full collection visits every object
-    from avsreplay import cli
-
+    try:
+        arithmetic.pin()  # before anything imports numpy
+        from avsreplay import cli
+    except KeyboardInterrupt:
+        print("avsreplay: interrupted", file=sys.stderr)  # noqa: T201
+        sys.exit(130)
     cli.entry_point()
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from avsreplay import cli
+from avsreplay import arithmetic, cli
+from avsreplay.__main__ import main
 
 posix = pytest.mark.skipif(os.name != "posix", reason="devices and pipes of POSIX")
 AVSREPLAY = [sys.executable, "-m", "avsreplay"]
@@ -140,3 +141,16 @@ def test_characters_that_the_output_cannot_encode_are_escaped(cli, fixtures_fold
     done = cli("info", log, env={"PYTHONIOENCODING": encoding})
     assert (done.code, done.err) == (0, "")
     assert "\\u03c0.mcap" in done.out
+
+
+def test_ctrl_c_while_the_command_is_loaded_is_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(arithmetic, "pin", interrupted)
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+    assert capsys.readouterr().err == "avsreplay: interrupted\n"
