@@ -16,20 +16,20 @@ are read several times, one by one: memory holds thinned views and the full poin
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.fusion import (
-    MOST_THROUGH,
+    MISSED,
     all_poses,
     contradicting,
     fused,
     joint_motion,
-    pair_rms,
     refined,
+    refuted,
     turn_and_coverage,
 )
 from avsreplay.reconstruct.model import (
@@ -41,6 +41,7 @@ from avsreplay.reconstruct.model import (
     reconstruction_ply,
     surface_of,
 )
+from avsreplay.reconstruct.registration import pair_rms
 from avsreplay.reconstruct.tracking import (
     FreeMotion,
     ReconstructionParams,
@@ -75,6 +76,33 @@ MOST_FUSED = 150  # scans whose points are averaged; more are thinned evenly
 Scans = Callable[[], Iterable[Scan]]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Assembly:
+    """Views that agree with one another.
+
+    Attributes:
+        views: with the normals of all key views together.
+        tracked: the views that were not left out.
+        keys: T_ac of the key views.  poses: T_ac of all views that are used.
+        motion: free motion that the poses follow, or None.
+        rms: of the distances between the views [m].  gate: largest distance that counted [m].
+        missed: share of the surface in the direction of each view that contradicts it.
+        refuted: whether views contradict one another after MOST_ROUNDS.
+        left_out: number of views that were left out.
+    """
+
+    views: list[ScanView]
+    tracked: Tracked
+    keys: dict[int, Pose]
+    poses: dict[int, Pose]
+    motion: FreeMotion | None
+    rms: float
+    gate: float
+    missed: Array
+    refuted: bool
+    left_out: int
+
+
 def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Reconstruction:
     """Build a model of the target from its scans.
 
@@ -97,50 +125,36 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
         what = f"only {len(survey.chosen)} of {survey.offered} scans have {p.fewest_points} points or more"
         raise UnreadableInput(what, hint="a model needs three at least")
     views, tracked = _tracked(scans, survey, p)
-    left_out = 0
-    for _ in range(MOST_ROUNDS):
-        better, keys, rms, gate = refined(views, tracked, p, survey.extent)
-        poses = all_poses(better, tracked, keys, p, survey.extent)
-        wrong, through = contradicting(better, poses, p, survey.extent)
-        if not wrong:
-            break
-        left_out += len(wrong)
-        tracked = without(tracked, wrong)
-        _refuse_few(tracked, views)
+    found = _assembled(views, tracked, p, survey.extent)
+    poses, motion, tracked, rms = found.poses, found.motion, found.tracked, found.rms
     turned, coverage = turn_and_coverage([views[k] for k in poses], list(poses.values()))
     _refuse_undetermined(turned, tracked.weakest)
-    motion = free_motion([views[k].t_ns for k in sorted(poses)], [poses[k] for k in sorted(poses)], survey.extent)
-    _refuse_contradictions(bool(wrong), through, motion is not None or not tracked.searched)
+    _refuse_contradictions(found)
     if motion is None:
-        _refuse_unconfirmed(better, replace(tracked, poses=poses), p, survey.extent)
+        _refuse_unconfirmed(found.views, replace(tracked, poses=poses), p, survey.extent)
     else:
-        motion = joint_motion(better, sorted(keys), motion, gate, survey.extent)
-        moved = _on_motion(views, poses, motion)
-        used = {k: moved[k] for k in keys if k in moved}
-        if len(used) > 2 and pair_rms(better, used, gate) < AS_WELL * pair_rms(
-            better, {k: keys[k] for k in used}, gate
-        ):
-            poses = moved
+        motion = joint_motion(found.views, sorted(found.keys), motion, found.gate, survey.extent)
+        poses = _on_motion(found, motion)
     chosen = dict(sorted(poses.items())[:: max(1, -(-len(poses) // MOST_FUSED))])
     twist = twists([view.t_ns for view in views], poses, motion if survey.timed else None)
     points, normals, one_sigma_m, seen, sights = fused(
         selected(scans, survey), survey, {k: twist[k] for k in chosen}, p.voxel * survey.extent, rms
     )
-    found = tuple((views[k].t_ns, T) for k, T in sorted(poses.items()))
+    each = tuple((views[k].t_ns, T) for k, T in sorted(poses.items()))
     return Reconstruction(
         points,
         normals,
         one_sigma_m,
         seen,
-        poses=found,
-        used=len(found),
+        poses=each,
+        used=len(each),
         offered=survey.offered,
         searches=len(tracked.searched),
         coverage=coverage,
         turn_deg=float(np.degrees(turned)),
         rms_m=rms,
         voxel_m=p.voxel * survey.extent,
-        notes=_notes(len(poses), len(views), left_out, coverage),
+        notes=_notes(len(poses), len(views), found.left_out, coverage),
         motion=motion,
         sights=tuple(sights),
         frame="origin at the centroid of the first scan, axes parallel to those of the camera at that scan",
@@ -192,11 +206,34 @@ def _refuse_few(tracked: Tracked, views: Sequence[ScanView]) -> None:
         raise UnreadableInput(turn, hint=hint)
 
 
-def _refuse_contradictions(wrong: bool, through: float, confirmed: bool) -> None:
-    """``confirmed``: by free motion, or because every scan was registered from its prediction."""
-    if wrong or through > MOST_THROUGH[not confirmed]:
-        what = "the scans contradict one another at every pose that was found:"
-        what += f" {100.0 * through:.1f} % of the surface that others show is seen through"
+def _assembled(views: Sequence[ScanView], tracked: Tracked, p: ReconstructionParams, extent: float) -> Assembly:
+    """Refine the poses; while views contradict the others, leave these out and refine again.
+
+    If the views contradict one another, but none far more often than the others, the worst one is left out.
+    """
+    left_out = 0
+    for _ in range(MOST_ROUNDS):
+        better, keys, rms, gate = refined(views, tracked, p, extent)
+        poses = all_poses(better, tracked, keys, p, extent)
+        used = sorted(poses)
+        motion = free_motion([views[k].t_ns for k in used], [poses[k] for k in used], extent)
+        wrong, shares = contradicting(better, poses, p, extent)
+        missed = shares[:, 0 if motion is not None or not tracked.searched else 1]
+        if not wrong and refuted(missed):
+            wrong = [used[int(np.argmax(missed))]]
+        if not wrong:
+            break
+        left_out += len(wrong)
+        tracked = without(tracked, wrong)
+        _refuse_few(tracked, views)
+    return Assembly(better, tracked, keys, poses, motion, rms, gate, missed, bool(wrong), left_out)
+
+
+def _refuse_contradictions(found: Assembly) -> None:
+    if found.refuted:
+        count = int((found.missed > MISSED).sum())
+        what = f"the scans contradict one another at every pose that was found: {count} of {len(found.missed)} scans"
+        what += f" do not show more than {100.0 * MISSED:.0f} % of the surface that the others show in their direction"
         hint = "steps between scans are too large, or other objects are in view: record more scans, or crop the target"
         raise UnreadableInput(what, hint=hint)
 
@@ -215,9 +252,15 @@ def _refuse_unconfirmed(views: Sequence[ScanView], tracked: Tracked, p: Reconstr
     raise UnreadableInput(what, hint="record smaller steps between scans, or give a model with --model FILE")
 
 
-def _on_motion(views: Sequence[ScanView], poses: dict[int, Pose], motion: FreeMotion) -> dict[int, Pose]:
-    """Poses of the free motion at the views whose own poses agree with it."""
-    return {k: motion.at(views[k].t_ns) for k, agrees in zip(sorted(poses), motion.agrees, strict=True) if agrees}
+def _on_motion(found: Assembly, motion: FreeMotion) -> dict[int, Pose]:
+    """Poses of the free motion at the views that agree with it, if it explains the distances between them as well."""
+    agreeing = [k for k, agrees in zip(sorted(found.poses), motion.agrees, strict=True) if agrees]
+    moved = {k: motion.at(found.views[k].t_ns) for k in agreeing}
+    keys = [k for k in found.keys if k in moved]
+    if len(keys) < 3:
+        return found.poses
+    before, after = (pair_rms(found.views, {k: at[k] for k in keys}, found.gate) for at in (found.keys, moved))
+    return moved if after < AS_WELL * before else found.poses
 
 
 def _refuse_undetermined(turned: float, weakest: Sequence[float]) -> None:

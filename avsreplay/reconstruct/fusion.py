@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from avsreplay.estimate.chart import to_chart, to_state
 from avsreplay.geometry import Array, Pose
-from avsreplay.reconstruct.registration import SAME_SIDE, between, moved, registered
+from avsreplay.reconstruct.registration import SAME_SIDE, moved, overlapping, pair_equations, registered
 from avsreplay.reconstruct.tracking import KEEP_RATIO, FreeMotion, ReconstructionParams, Tracked, patchwork
 from avsreplay.reconstruct.views import (
     NEIGHBOURS,
@@ -28,19 +29,18 @@ from avsreplay.reconstruct.views import (
 )
 from avsreplay.records import Scan
 from avsreplay.register import sampling
-from avsreplay.register.size import normal_jacobian
 
-PAIR_TURN_RAD = np.radians(90.0)  # key scans seen from directions closer than this are compared in the refinement
-PAIRS = 12  # most key scans with which one is compared
-PAIR_POINTS = 600  # points of a scan in one comparison
-FEWEST_COMMON = 30  # points that two scans must share to be compared
+MOTION_POINTS = 1500  # points of a scan in one comparison for the fit of the motion
 FEWEST_KEYS = 40  # in a log with fewer key scans, every scan is a key scan in the refinement
 MERGED = 30  # nearest points of all key scans from which a normal is estimated
 MERGED_REACH = 0.03  # their largest distance as a share of the extent
+LEAST_VARIANCE = 0.1  # least variance of a point along its normal, in units of the median
+LONELY = 0.25  # weight of a point with too few neighbours for a variance
 MOST_SIGHTS = 60  # scans that are tested for rays through a point
 MOST_ASKED = 3000  # points of the model that are compared with one view
 LEAST_SHOWN = 0.8  # share of the model's visible points that a view must show, in units of the median of all views
-MOST_THROUGH = (0.03, 0.01)  # share of them that half of the views may have seen through: of a free motion, of others
+MISSED = 0.05  # share of the surface in its direction that a view of a right model seldom contradicts
+SELDOM, FALSE_ALARM = 0.1, 0.01  # largest probability that it does; probability that a right model is refused
 MOST_STEPS = 10  # evaluations of the motion that minimises the distances between views
 LEAST_DAMPING, LEAST_GAIN = 1e-3, 1e-4  # damping; relative improvement of the rms that ends the steps
 SUPPORT = 5  # least number of the ten nearest points that continue the surface of a point from one scan
@@ -52,13 +52,15 @@ def refined(
 ) -> tuple[list[ScanView], dict[int, Pose], float, float]:
     """Poses of the key views that minimise the distances between overlapping pairs.
 
-    The pairs of one view are spread evenly over the angles up to PAIR_TURN_RAD: pairs of views of nearly the same side
-    do not show a common displacement of all scans along the line of sight. After a first adjustment the normals are
-    estimated again, from the points of all key scans together.
+    The pairs of one view are spread evenly over the angles up to 90 degrees: pairs of views of nearly the same side do
+    not show a common displacement of all scans along the line of sight. After a first adjustment the normals are
+    estimated again, from the points of all key scans together. The weights of the result are inverse variances of the
+    points about the planes of their neighbours. They serve the fit of the motion only: a wrong pose makes the surface
+    rough where it lies, and with such weights in the adjustment of the poses it would stay there.
 
     Returns:
-        The views with the better normals, T_ac by number of the key view, the rms of the distances that is left, and
-        the gate that was used for them [m].
+        The views with the better normals and these weights, T_ac by number of the key view, the rms of the distances
+        that is left, and the gate that was used for them [m].
     """
     keys, known = list(tracked.keys), sorted(tracked.poses)
     if len(keys) < FEWEST_KEYS:
@@ -66,9 +68,9 @@ def refined(
         keys = sorted(keys + others[:: max(1, -(-len(others) // (FEWEST_KEYS - len(keys))))])
     poses, better = {k: tracked.poses[k] for k in keys}, list(views)
     gate, rms = 0.03 * extent, 0.0
-    for _ in range(2):
+    for last in (False, True):
         poses, rms, gate = _adjusted(better, poses, p, extent, gate)
-        for k, view in _with_merged_normals(better, poses, extent).items():
+        for k, view in _with_merged_normals(better, poses, extent, last).items():
             better[k] = view
     return better, poses, rms, gate
 
@@ -79,9 +81,10 @@ def _adjusted(
     """Gauss-Newton iterations of the poses of all key views; the gate [m] follows the distances."""
     keys = sorted(start)
     poses, rms = [start[k].inverse() for k in keys], 0.0
+    pairs = overlapping([views[k] for k in keys], poses)
     scale = np.tile(np.array([1.0 / extent] * 3 + [1.0] * 3), len(keys))
     for _ in range(p.refinements):
-        N, g, every = _normal_equations(views, keys, poses, gate)
+        N, g, every, _ = pair_equations(views, keys, poses, gate, pairs)
         N[:6, :6] += np.eye(6) * max(np.trace(N), 1.0)  # the first view defines the frame
         N = N * np.outer(scale, scale)
         N[np.diag_indices_from(N)] += 1e-6 * np.trace(N) / len(N)
@@ -96,8 +99,14 @@ def _adjusted(
     return {k: T.inverse() for k, T in zip(keys, poses, strict=True)}, rms, gate
 
 
-def _with_merged_normals(views: Sequence[ScanView], poses: dict[int, Pose], extent: float) -> dict[int, ScanView]:
-    """The key views with normals from the nearest points of all of them that lie on the same side of the target."""
+def _with_merged_normals(
+    views: Sequence[ScanView], poses: dict[int, Pose], extent: float, weighted: bool
+) -> dict[int, ScanView]:
+    """The key views with normals from the nearest points of all of them that lie on the same side of the target.
+
+    If ``weighted``, the weight of a point is the inverse of the variance of these points along the normal, in units of
+    the median variance: points at edges and of thin parts, whose neighbours lie on different faces, count little.
+    """
     keys = sorted(poses)
     p = np.vstack([poses[k].inverse().apply(views[k].points) for k in keys])
     n = np.vstack([views[k].normals @ poses[k].R for k in keys])
@@ -106,11 +115,18 @@ def _with_merged_normals(views: Sequence[ScanView], poses: dict[int, Pose], exte
     count = near.sum(axis=1)
     off = np.where(near[:, :, None], p[index], 0.0)
     off = np.where(near[:, :, None], off - off.sum(axis=1, keepdims=True) / count[:, None, None], 0.0)
-    normals = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))[1][:, :, 0]
+    squares, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
+    normals, good = vectors[:, :, 0], count >= NEIGHBOURS
     normals *= np.where(np.einsum("ni,ni->n", normals, n) < 0.0, -1.0, 1.0)[:, None]
-    normals = np.where((count >= NEIGHBOURS)[:, None], normals, n)
+    normals = np.where(good[:, None], normals, n)
+    weight = np.concatenate([views[k].weight for k in keys])
+    if weighted and good.any():
+        variance = np.maximum(squares[:, 0], 0.0) / np.maximum(count - 3, 1)
+        typical = float(np.median(variance[good]))
+        weight = np.where(good, typical / np.maximum(variance, LEAST_VARIANCE * typical), LONELY)
     ends = np.cumsum([len(views[k].points) for k in keys])[:-1]
-    return {k: replace(views[k], normals=m @ poses[k].R.T) for k, m in zip(keys, np.split(normals, ends), strict=True)}
+    split = zip(keys, np.split(normals, ends), np.split(weight, ends), strict=True)
+    return {k: replace(views[k], normals=m @ poses[k].R.T, weight=w) for k, m, w in split}
 
 
 def joint_motion(
@@ -133,12 +149,13 @@ def joint_motion(
         The motion after Levenberg-Marquardt steps in the 20 initial values.
     """
     instants, chart, damping = [views[k].t_ns for k in keys], to_chart(start.state), LEAST_DAMPING
+    pairs = overlapping([views[k] for k in keys], [start.at(t_ns).inverse() for t_ns in instants])
     best, best_rms = start, np.inf
     for _ in range(MOST_STEPS):
         tried = replace(start, state=to_state(chart))
         poses = [tried.at(t_ns) for t_ns in instants]
-        N, g, every = _normal_equations(views, keys, [T.inverse() for T in poses], gate)
-        rms = float(np.sqrt(np.mean(every**2)))
+        T_ca = [T.inverse() for T in poses]
+        N, g, _, rms = pair_equations(views, keys, T_ca, gate, pairs, MOTION_POINTS)
         if rms < best_rms:
             small = rms > (1.0 - LEAST_GAIN) * best_rms
             best, best_rms, damping = tried, rms, max(0.1 * damping, LEAST_DAMPING)
@@ -151,63 +168,6 @@ def joint_motion(
         step = np.linalg.solve(A + damping * np.diag(np.diagonal(A)), b)
         chart = to_chart(best.state).moved(np.asarray(step))
     return best
-
-
-def pair_rms(views: Sequence[ScanView], poses: dict[int, Pose], gate: float) -> float:
-    """Rms of the distances between all overlapping pairs of views at poses T_ac [m]."""
-    keys = sorted(poses)
-    _, _, every = _normal_equations(views, keys, [poses[k].inverse() for k in keys], gate)
-    return float(np.sqrt(np.mean(every**2)))
-
-
-def _normal_equations(
-    views: Sequence[ScanView], keys: Sequence[int], poses: Sequence[Pose], gate: float
-) -> tuple[Array, Array, Array]:
-    """Normal matrix (6n, 6n) and right side (6n,) of the steps of all poses T_ca, and the distances [m].
-
-    A distance is that of a point of view i to the nearest point of view j, along the mean of the two normals.
-    """
-    count, first = len(keys), np.cumsum([0] + [len(views[k].points) for k in keys])
-    p = np.vstack([T.apply(views[k].points) for k, T in zip(keys, poses, strict=True)])
-    n = np.vstack([views[k].normals @ T.R.T for k, T in zip(keys, poses, strict=True)])
-    weight = np.concatenate([views[k].weight for k in keys])
-    pairs = np.array(_pairs(sight_lines([views[k] for k in keys], poses)), dtype=np.int64).reshape(-1, 2)
-    found = [np.zeros((3, 0), dtype=np.int64)]
-    for number, (i, j) in enumerate(pairs):
-        own = np.arange(first[i], first[i + 1], max(1, (first[i + 1] - first[i]) // PAIR_POINTS))
-        d, index = views[keys[j]].tree.query((p[own] - poses[j].t) @ poses[j].R, distance_upper_bound=gate)
-        near = np.isfinite(d)
-        near[near] = np.einsum("ni,ni->n", n[own[near]], n[first[j] + index[near]]) > SAME_SIDE
-        if near.sum() >= FEWEST_COMMON:
-            found.append(np.stack([own[near], first[j] + index[near], np.full(int(near.sum()), number)]))
-    a, b, pair = np.hstack(found)
-    if not len(a):
-        return np.eye(6 * count), np.zeros(6 * count), np.zeros(1)
-    along = between(n[a], n[b])
-    e = np.einsum("ni,ni->n", along, p[b] - p[a])
-    w = np.maximum(1.0 - (e / gate) ** 2, 0.0) ** 2 * weight[a] * weight[b]
-    J = normal_jacobian(p[a], along)
-    begin = np.flatnonzero(np.diff(pair, prepend=-1))
-    M = np.add.reduceat((J * w[:, None])[:, :, None] * J[:, None, :], begin, axis=0)
-    r = np.add.reduceat(J * (w * e)[:, None], begin, axis=0)
-    i, j = pairs[pair[begin]].T
-    N, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
-    for u, v, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
-        np.add.at(N, (u, v), sign * M)
-    np.add.at(g, i, r)
-    np.add.at(g, j, -r)
-    return N.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.ravel(), np.asarray(e)
-
-
-def _pairs(directions: Array) -> list[tuple[int, int]]:
-    """Ordered pairs of key views whose directions of view differ by less than PAIR_TURN_RAD, PAIRS each."""
-    found = []
-    for i, at in enumerate(directions):
-        cosine = directions @ at
-        order = [int(j) for j in np.argsort(-cosine, kind="stable") if j != i and cosine[j] > np.cos(PAIR_TURN_RAD)]
-        if order:
-            found += [(i, order[int(k)]) for k in np.unique(np.linspace(0, len(order) - 1, PAIRS).round())]
-    return found
 
 
 def all_poses(
@@ -229,13 +189,12 @@ def all_poses(
 
 def contradicting(
     views: Sequence[ScanView], poses: dict[int, Pose], p: ReconstructionParams, extent: float
-) -> tuple[list[int], float]:
+) -> tuple[list[int], Array]:
     """Views without the surface that faces them by all other views: their poses are wrong, or they show another object.
 
     Points of the joint model that face a view and that nothing hides must be in it. A pose that is wrong puts the
     surfaces of other views where this one has measured something farther away, or nothing. The share of the points that
-    are there is compared with the median over all views, because a scanner may lose returns everywhere. Surface that a
-    view has seen through, with a return from farther away, cannot be there whatever the scanner loses.
+    are there is compared with the median over all views, because a scanner may lose returns everywhere.
 
     Args:
         views: of the log.
@@ -244,12 +203,14 @@ def contradicting(
         extent: of the target [m].
 
     Returns:
-        The numbers of the views with less than LEAST_SHOWN of the median share, and the share of the points in their
-        direction that a view has seen through, in the median over all views.
+        The numbers of the views with less than LEAST_SHOWN of the median share, and for every view (n, 2) the share of
+        the points in its direction that it has seen through, with a return from farther away, and the share that it
+        has seen through or where it has no return. A surface without a return contradicts poses that nothing else
+        confirms; materials that return no light, and the limits of the field of view, also cause it.
     """
     model = patchwork(views, Tracked(poses, sorted(poses), [], 0, []), p.thin * extent)
     every, reach = max(1, len(model.points) // MOST_ASKED), 0.03 * extent
-    shown, through = [], []
+    shown, missed = [], []
     for k in sorted(poses):
         q, n = poses[k].apply(model.points[::every]), model.normals[::every] @ poses[k].R.T
         lines, measured = views[k].camera - q, np.linalg.norm(views[k].points - views[k].camera, axis=1)
@@ -262,10 +223,24 @@ def contradicting(
             int((hit & where).sum()) for where in (behind < -reach, abs(behind) <= reach, behind > reach)
         )
         shown.append(there / max(len(hit) - hidden, 1))
-        through.append(seen / max(seen + there, 1))
+        missed.append((seen / max(seen + there, 1), 1.0 - shown[-1]))
     least = LEAST_SHOWN * float(np.median(shown))
     wrong = [k for k, share in zip(sorted(poses), shown, strict=True) if share < least]
-    return wrong, float(np.median(through))
+    return wrong, np.array(missed)
+
+
+def refuted(missed: Array) -> bool:
+    """Whether more views contradict a model than are expected of a right one, by a binomial test.
+
+    A view of a right model misses more than the share MISSED of the surface in its direction with a probability of at
+    most SELDOM. The model is refuted if as many views as have missed more have a probability below FALSE_ALARM.
+
+    Args:
+        missed: (n,) shares of the surface in the direction of each view.
+    """
+    n, count = len(missed), int((missed > MISSED).sum())
+    tail = sum(comb(n, k) * SELDOM**k * (1.0 - SELDOM) ** (n - k) for k in range(count, n + 1))
+    return tail < FALSE_ALARM
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -319,7 +294,7 @@ def fused(
     p, n, who = np.vstack(points).astype(np.float64), np.vstack(normals).astype(np.float64), np.concatenate(owner)
     mean, normal, cell = averaged(p, n, size_m)
     count = np.bincount(cell)
-    seen = np.bincount(np.unique(np.column_stack([cell, who]), axis=0)[:, 0], minlength=len(count))
+    seen = np.bincount(np.unique(cell * (who.max() + 1) + who) // (who.max() + 1), minlength=len(count))
     height = np.einsum("ni,ni->n", p - mean[cell], normal[cell])
     wide = 1.5 * size_m  # rays of one scan are farther apart than points of all scans
     through = sum((s.seen_through(mean, 1.5 * wide) > 6.0 * wide).astype(np.float64) for s in sights)

@@ -1,20 +1,26 @@
-"""Registration of one scan to the model so far: ICP from one guess, and a search over many attitudes."""
+"""Registration of one scan to the model so far, search over many attitudes, and distances between pairs of scans."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.reconstruct.views import ScanView
+from avsreplay.reconstruct.views import ScanView, sight_lines
 from avsreplay.register.size import normal_jacobian
 
 SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
 MOST_POINTS = 1500  # points of a scan in one registration
 COARSE_POINTS, COARSE_PASSES, HALVED = 200, 8, (2, 4, 5)  # search over attitudes: points, passes, halving passes
+PAIR_TURN_RAD = np.radians(90.0)  # key scans seen from directions closer than this are compared in the refinement
+PAIRS = 12  # most key scans with which one is compared
+PAIR_POINTS = 600  # points of a scan in one comparison
+FEWEST_COMMON = 30  # points that two scans must share to be compared
 FINE_STARTS = 6  # poses of a search that are registered with all points
 
 
@@ -168,3 +174,77 @@ def near_attitudes(q_ac: Array) -> Array:
 def _axes() -> list[Array]:
     every = [np.array((x, y, z), dtype=np.float64) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
     return [a / np.linalg.norm(a) for a in every if a.any()]
+
+
+def pair_rms(views: Sequence[ScanView], poses: dict[int, Pose], gate: float) -> float:
+    """Weighted rms of the distances between all overlapping pairs of views at poses T_ac [m]."""
+    keys = sorted(poses)
+    T_ca = [poses[k].inverse() for k in keys]
+    return pair_equations(views, keys, T_ca, gate, overlapping([views[k] for k in keys], T_ca))[3]
+
+
+def pair_equations(
+    views: Sequence[ScanView],
+    keys: Sequence[int],
+    poses: Sequence[Pose],
+    gate: float,
+    pairs: NDArray[np.int64],
+    most: int = PAIR_POINTS,
+) -> tuple[Array, Array, Array, float]:
+    """Normal equations of the distances between pairs of views.
+
+    A distance is that of a point of view i to the nearest point of view j, along the mean of the two normals.
+
+    Args:
+        views: of the log.
+        keys: numbers of the n views that are compared.
+        poses: their poses T_ca.
+        gate: largest distance that counts [m].
+        pairs: (m, 2) places in ``keys``, as given by ``overlapping``.
+        most: points of a view in one comparison.
+
+    Returns:
+        Normal matrix (6n, 6n) and right side (6n,) of steps [theta; v] in {C} of all poses, the distances [m], and
+        their weighted rms [m] by Tukey's function, whose square the steps minimise.
+    """
+    count, first = len(keys), np.cumsum([0] + [len(views[k].points) for k in keys])
+    p = np.vstack([T.apply(views[k].points) for k, T in zip(keys, poses, strict=True)])
+    n = np.vstack([views[k].normals @ T.R.T for k, T in zip(keys, poses, strict=True)])
+    weight = np.concatenate([views[k].weight for k in keys])
+    found = [np.zeros((3, 0), dtype=np.int64)]
+    for number, (i, j) in enumerate(pairs):
+        own = np.arange(first[i], first[i + 1], max(1, (first[i + 1] - first[i]) // most))
+        d, index = views[keys[j]].tree.query((p[own] - poses[j].t) @ poses[j].R, distance_upper_bound=gate)
+        near = np.isfinite(d)
+        near[near] = np.einsum("ni,ni->n", n[own[near]], n[first[j] + index[near]]) > SAME_SIDE
+        if near.sum() >= FEWEST_COMMON:
+            found.append(np.stack([own[near], first[j] + index[near], np.full(int(near.sum()), number)]))
+    a, b, pair = np.hstack(found)
+    if not len(a):
+        return np.eye(6 * count), np.zeros(6 * count), np.zeros(1), 0.0
+    along = between(n[a], n[b])
+    e = np.einsum("ni,ni->n", along, p[b] - p[a])
+    inside, own = np.maximum(1.0 - (e / gate) ** 2, 0.0), weight[a] * weight[b]
+    w, square = inside**2 * own, float(np.sum(own * (1.0 - inside**3)) / np.sum(own)) * gate**2 / 3.0
+    J = normal_jacobian(p[a], along)
+    begin = np.flatnonzero(np.diff(pair, prepend=-1))
+    M = np.add.reduceat((J * w[:, None])[:, :, None] * J[:, None, :], begin, axis=0)
+    r = np.add.reduceat(J * (w * e)[:, None], begin, axis=0)
+    i, j = pairs[pair[begin]].T
+    N, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
+    for u, v, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
+        np.add.at(N, (u, v), sign * M)
+    np.add.at(g, i, r)
+    np.add.at(g, j, -r)
+    return N.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.ravel(), np.asarray(e), float(np.sqrt(square))
+
+
+def overlapping(views: Sequence[ScanView], poses: Sequence[Pose]) -> NDArray[np.int64]:
+    """Ordered pairs (m, 2) of views at poses T_ca whose directions of view differ by less than PAIR_TURN_RAD."""
+    found, directions = [], sight_lines(views, poses)
+    for i, at in enumerate(directions):
+        cosine = directions @ at
+        order = [int(j) for j in np.argsort(-cosine, kind="stable") if j != i and cosine[j] > np.cos(PAIR_TURN_RAD)]
+        if order:
+            found += [(i, order[int(k)]) for k in np.unique(np.linspace(0, len(order) - 1, PAIRS).round())]
+    return np.array(found, dtype=np.int64).reshape(-1, 2)

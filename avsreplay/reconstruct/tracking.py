@@ -150,7 +150,7 @@ class ReconstructionParams:
         reach: largest distance of corresponding points at the first iteration.
         fewest_points: scans with fewer points are not used.
         n_scans: most scans that are used; a longer log is thinned evenly.
-        refinements: Gauss-Newton iterations of the batch refinement.
+        refinements: most Gauss-Newton iterations of one of the two adjustments of all poses.
     """
 
     voxel: float = 1.0 / 300.0
@@ -158,7 +158,7 @@ class ReconstructionParams:
     reach: float = 0.06
     fewest_points: int = 100
     n_scans: int = 400
-    refinements: int = 12
+    refinements: int = 4
 
 
 @dataclass(slots=True, eq=False)
