@@ -16,7 +16,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.reconstruct import at_grasp, deviations, reconstruct, surface_of, true_frame
-from avsreplay.reconstruct.fusion import continues, contradicting
+from avsreplay.reconstruct.fusion import continues, contradicting, refuted
 from avsreplay.reconstruct.registration import between
 from avsreplay.reconstruct.tracking import ReconstructionParams, free_motion
 from avsreplay.reconstruct.views import SAMPLE, Twist, extent_of, full_cloud, surveyed, thinned_view
@@ -200,6 +200,14 @@ def test_a_scan_with_a_wrong_pose_contradicts_the_others():
     assert contradicting(views, poses, p, survey.extent)[0] == []
     poses[5] = poses[5] @ Pose(geometry.exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
     assert contradicting(views, poses, p, survey.extent)[0] == [5]
+
+
+def test_a_model_is_refuted_by_more_contradicting_views_than_are_expected_of_a_right_one():
+    """At one view in ten, four of eight views have a probability of 0.5 %, and three of eight one of 3.8 %."""
+    assert not refuted(np.array([0.2] * 3 + [0.01] * 5))
+    assert refuted(np.array([0.2] * 4 + [0.01] * 4))
+    assert not refuted(np.array([0.2] * 10 + [0.01] * 50))
+    assert refuted(np.array([0.2] * 13 + [0.01] * 47))
 
 
 def test_points_that_one_scan_only_has_seen_are_kept_where_they_continue_a_surface():

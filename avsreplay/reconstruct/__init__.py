@@ -72,6 +72,7 @@ WEAKEST = 1e-3  # below this ratio of the eigenvalues of a registration, a surfa
 AS_WELL = 1.01  # free motion replaces the refined poses if it increases the rms between scans by no more than this
 STILL_RAD = np.radians(5.0)  # a target that turned by less is at rest
 MOST_ROUNDS = 6  # times views that contradict the others are left out and the poses are refined again
+CONFIRMING = 10  # fewest poses that test the 20 parameters of a free motion
 MOST_FUSED = 150  # scans whose points are averaged; more are thinned evenly
 Scans = Callable[[], Iterable[Scan]]
 
@@ -218,7 +219,8 @@ def _assembled(views: Sequence[ScanView], tracked: Tracked, p: ReconstructionPar
         used = sorted(poses)
         motion = free_motion([views[k].t_ns for k in used], [poses[k] for k in used], extent)
         wrong, shares = contradicting(better, poses, p, extent)
-        missed = shares[:, 0 if motion is not None or not tracked.searched else 1]
+        tested = motion is not None and motion.agrees.sum() >= CONFIRMING
+        missed = shares[:, 0 if tested or not tracked.searched else 1]
         if not wrong and refuted(missed):
             wrong = [used[int(np.argmax(missed))]]
         if not wrong:
@@ -246,9 +248,7 @@ def _refuse_unconfirmed(views: Sequence[ScanView], tracked: Tracked, p: Reconstr
     if 2 * len(tracked.poses) > len(views):
         if not ambiguous(views, tracked, p, extent):
             return
-        what = (
-            f"the poses of {len(tracked.searched)} scans come from a search, and the scans fit at other poses as well"
-        )
+        what = "the poses come from a search or follow large steps, and the scans fit at other poses as well"
     raise UnreadableInput(what, hint="record smaller steps between scans, or give a model with --model FILE")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -133,7 +134,8 @@ MOST_VIOLATING = 0.12  # share of points that may lie in the free space in front
 GRAZING = np.cos(np.radians(70.0))  # least cosine of the inclination to a line of sight for a test of free space
 MOST_TESTED = 600  # points of a scan in one test of free space
 SEARCH_EVERY = 6  # while the target is lost, all attitudes are searched for two scans of this many
-MOST_CONFIRMED = 6  # scans whose pose a search has found that are searched again in the complete model
+LARGE_STEP_RAD = np.radians(30.0)  # a registration after a larger step may end at another pose of a similar side
+MOST_CONFIRMED = 6  # scans whose poses are not certain that are searched again in the complete model
 RIVAL = 0.8  # such a pose is ambiguous if another one explains this share of the points that it explains
 DISTINCT_RAD = np.radians(60.0)  # starts nearer to the pose mostly lead back to it
 MOST_RETRIES = 20  # lost scans that are tried again at the end
@@ -205,8 +207,7 @@ def _tracked(
             return model
         match = searched
         found.searched.append(k)
-    found.lost = 0
-    found.poses[k] = match.T_ac
+    found.lost, found.poses[k] = 0, match.T_ac
     found.weakest.append(match.weakest)
     if not _new_side([found.poses[j] for j in found.keys], match.T_ac):
         return model
@@ -285,10 +286,10 @@ def _searched(
 
 
 def ambiguous(views: Sequence[ScanView], found: Tracked, p: ReconstructionParams, extent: float) -> bool:
-    """Whether most of the views whose pose a search has found fit the complete model at another pose as well.
+    """Whether most of the views whose poses are not certain fit the complete model at another pose as well.
 
-    A search finds one of several poses of a target that looks alike from different sides, and a model that was joined
-    at a wrong one of them looks alike from both.
+    A search, or a registration after a large step, finds one of several poses of a target that looks alike from
+    different sides. A model that was joined at a wrong one of them looks alike from both.
 
     Args:
         views: of the log.
@@ -296,11 +297,13 @@ def ambiguous(views: Sequence[ScanView], found: Tracked, p: ReconstructionParams
         p: resolution.
         extent: of the target [m].
     """
-    known = [k for k in found.searched if k in found.poses]
+    used = sorted(found.poses)
+    known = [k for k in used if k in found.searched]
+    known = known or [k for j, k in pairwise(used) if turn(found.poses[j], found.poses[k]) > LARGE_STEP_RAD]
     if not known:
         return False
     known = known[:: max(1, -(-len(known) // MOST_CONFIRMED))]
-    model, count = patchwork(views, replace(found, keys=sorted(found.poses)), p.thin * extent), 0
+    model, count = patchwork(views, replace(found, keys=used), p.thin * extent), 0
     for k in known:
         own = found.poses[k]
         least = RIVAL * registered(views[k], model, own, p.reach * extent, extent).ratio
