@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import socket
 import stat
 import sys
@@ -221,13 +222,19 @@ def two_writers(case: tuple[str, str], seeds: Path, root: Path) -> str:
 
 
 def kill(case: tuple[str, str], seeds: Path, root: Path, kills: int, rng: np.random.Generator) -> Iterator[str]:
-    """Write an output, then kill ``kills`` further writers at random moments; every fifth time one may finish."""
+    """Write an output, then kill ``kills`` further writers at random moments; every fifth time one may finish.
+
+    A campaign continues where it was killed and must have the summary of one without a disturbance when it is complete;
+    then it begins anew.
+    """
     place = Path(tempfile.mkdtemp(dir=root))
     path = output_of(case, place)
     line = command_line(case, seeds, str(path))
     start = time.monotonic()
     finished(line, place)
     seconds = time.monotonic() - start
+    campaign = case == ("sweep", "output")
+    summary = (path / "summary.json").read_bytes() if campaign else b""
     number = hits = 0
     while hits < kills and number < 5 * kills:
         number += 1
@@ -235,7 +242,11 @@ def kill(case: tuple[str, str], seeds: Path, root: Path, kills: int, rng: np.ran
         time.sleep(float(rng.uniform(0.0, 1.0)) * seconds)
         killed = writer.kill()
         hits += killed
-        if case != ("sweep", "output") and not is_complete(case, path):
+        if campaign and not killed:
+            if (path / "summary.json").read_bytes() != summary:
+                yield f"FINDING {case}: another summary after kill -9"
+            shutil.rmtree(path)
+        if not campaign and not is_complete(case, path):
             yield f"FINDING {case}: after kill -9 the output is neither the old nor the new one"
         elif number % 5 == 4 and (problem := _again(case, line, path)):
             yield problem
