@@ -122,7 +122,7 @@ def test_classes_that_act_when_created_are_refused(tmp_path):
     assert victim.read_text() == "x"
 
 
-@pytest.mark.parametrize("name", [b"_taken", b"_hindsight", b"_unmatched", b"_captured_ns", b"_clouds", b"_known"])
+@pytest.mark.parametrize("name", [b"_taken", b"_unmatched", b"_captured_ns", b"_clouds", b"_known"])
 def test_a_checkpoint_with_another_attribute_is_one_line(fixtures_folder, tmp_path, name):
     """The bytes of one name are changed, and the SHA-256 of the file is made to fit."""
     work = job(fixtures_folder / "tumble.mcap", n_scans=4)

@@ -42,8 +42,6 @@ def test_closed_loop_keeps_the_track_at_48_degrees_where_open_loop_loses_scans(d
     assert [r["gamma"] for r in closed] == [1] * 8
     assert rms([r["rot_err_deg"] for r in closed[1:]]) < 0.5
     assert sum(r["gamma"] for r in opened) < 8
-    passes = [sum(r["iterations"] for r in rows[2:]) for rows in (closed, opened)]
-    assert passes[0] < passes[1]  # a good guess also saves work
 
 
 def test_72_degree_steps_are_kept(dragon, cli):

@@ -396,9 +396,13 @@ outlier_ratio = 0.0
 
 
 @pytest.mark.slow
-def test_the_motion_is_fitted_to_the_distances_where_the_poses_are_weakly_determined():
-    """A rocket stage hardly shows its turn about its axis: single poses are degrees off, one motion of all is not."""
-    scenario = scenario_of(toml_document.parse(WEAK, "s.toml"))
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_the_motion_is_fitted_to_the_distances_where_the_poses_are_weakly_determined(seed):
+    """A rocket stage hardly shows its turn about its axis: single poses are degrees off, one motion of all is not.
+
+    Seeds 2 and 3 end 3.6 and 2.7 deg off if the poses are adjusted by twelve iterations without the motion.
+    """
+    scenario = scenario_of(toml_document.parse(WEAK, "s.toml"), seed)
     simulation = simulate(scenario, builtin_surface(scenario.params.target.shape))
     scans = list(simulation.scans())
     made = reconstruct(lambda: scans)
@@ -407,7 +411,7 @@ def test_the_motion_is_fitted_to_the_distances_where_the_poses_are_weakly_determ
     turns = [float(geometry.angle(geometry.multiply(geometry.conjugate((true[t] @ X).q), T.q))) for t, T in made.poses]
     shifts = [float(np.linalg.norm((true[t] @ X).t - T.t)) for t, T in made.poses]
     assert made.used >= 20
-    assert np.degrees(np.sqrt(np.mean(np.square(turns)))) < 0.3  # 2.9 deg with equal weights of all directions
+    assert np.degrees(np.sqrt(np.mean(np.square(turns)))) < 0.5  # 2.9 deg with equal weights of all directions (seed 4)
     assert np.sqrt(np.mean(np.square(shifts))) < 0.003  # 7.6 mm
 
 

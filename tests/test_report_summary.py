@@ -251,6 +251,8 @@ def test_t1_rank_and_withdrawals(make_rows):
     summary = Summary.fold(rows)
     assert (summary.convergence.t1_s, summary.convergence.at_end) == (rows[10].t_s, True)
     assert summary.observability.full_rank_s == rows[20].t_s
+    unknown = [dataclasses.replace(row, ogm_rank=None) for row in rows]
+    assert Summary.fold(unknown).observability.full_rank_s is None
     rows[30] = dataclasses.replace(rows[30], converged=False)
     assert Summary.fold(rows).convergence.withdrawn == 1
 

@@ -192,6 +192,7 @@ class SummaryFold:
         marks = list(map(Mark, *(taken[name] for name in ("t_ns", "gamma", "fault", "pos_err_m", "rot_err_deg"))))
         stamps, times_s, flagged = taken["t_ns"], taken["t_s"], [gamma == 0 for gamma in taken["gamma"]]
         steps = [b - a for a, b in pairwise(stamps) if b > a]
+        full = [rank == 20 for rank in taken["ogm_rank"]]
         last = self._last
         healthy = taken["gamma"].count(1)
         figures = _figures(taken)
@@ -226,7 +227,7 @@ class SummaryFold:
             nees=_share(figures["nees"], NEES_BAND),
             nees_blocks=_blocks(figures),
             reference=next(filter(None, reversed(taken["reference"])), None),
-            observability=_observability(last, next(compress(times_s, map((20).__eq__, taken["ogm_rank"])), None)),
+            observability=_observability(last, next(compress(times_s, full), None)),
             convergence=ConvergenceSummary(
                 t1_s=next(compress(times_s, taken["converged"]), None),
                 at_end=bool(last and last.converged),
