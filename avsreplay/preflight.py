@@ -172,8 +172,11 @@ def _sizes(
     said = f"the scans measure {_metres(scan_m)}, the model {_metres(model_m)}"
     if _LEAST <= ratio <= _WHOLE:
         return [_agreeing(said, scan_m, ratio)]
-    if ratio > _MOST and _unit(ratio) is None and (crop := _crop_of_located(clouds, surface, registrar)):
-        return [crop]
+    left = ratio < _LEFT_OVER or _unit(ratio) is None  # background, not a wrong unit, explains the size
+    if ratio > _MOST and left and (found := _located(clouds, surface, registrar)):
+        why = f"the model was found in {len(found)} of {len(clouds)} examined scans"
+        among = Advice("ok", "size", f"{said}; {why}, among other points")
+        return [_crop_advice(clouds, found, why) or among]
     targets = [_target(cloud, model_m) for cloud in clouds] if ratio > _MOST else []
     inside = [points for points in targets if points is not None]
     grouped = len(inside) * 2 > len(clouds)
@@ -251,8 +254,8 @@ def _of_size(model_m: float) -> str:
     return f"a group of points has the size of the model ({_metres(model_m)})"
 
 
-def _crop_of_located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Registrar | None) -> Advice | None:
-    """The crop around the model where a search finds it; None if it is found in less than half of the scans.
+def _located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Registrar | None) -> list[Array]:
+    """The model's vertices where a search finds them in the scans; empty if they are found in less than half of them.
 
     The search looks at the connected parts of the scan with the size of the model, and tests every pose: size alone
     does not distinguish the target from other objects.
@@ -263,8 +266,8 @@ def _crop_of_located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar
         if pose.measured:
             found.append(pose.T_ac.apply(surface.vertices))
         if 2 * (k + 1 - len(found)) > len(clouds):
-            return None
-    return _crop_advice(clouds, found, f"the model was found in {len(found)} of {len(clouds)} examined scans")
+            return []
+    return found
 
 
 def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], why: str) -> Advice | None:

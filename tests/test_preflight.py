@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import types
 
 import numpy as np
 import pytest
 import trimesh
 
+import avsreplay.preflight
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
 from avsreplay.log.header import parse_surface, scaled, surface_bytes
@@ -110,6 +112,30 @@ def test_a_wall_is_background_and_the_crop_keeps_the_target(surface):
         target = cloud[:, 2] < 20.0
         assert kept[target].mean() > 0.99
         assert kept[~target].mean() < 0.05
+
+
+class Located:
+    """A registrar that finds the target of `_seen` in every scan, whose poses follow one another."""
+
+    def __init__(self, surface):
+        self.scans = 0
+
+    def acquire(self, cloud):
+        pose = Pose(exp([0.3 * self.scans, 0.2, 0.1]), [0.3 * self.scans, 0.0, 12.0])
+        self.scans += 1
+        return types.SimpleNamespace(measured=True, T_ac=pose)
+
+
+def test_points_that_remain_inside_the_suggested_crop_lead_to_no_other_crop(surface, monkeypatch):
+    rng = np.random.default_rng(3)
+    clouds = _seen(surface, n=5)
+    low, high = np.min([c.min(axis=0) for c in clouds], axis=0), np.max([c.max(axis=0) for c in clouds], axis=0)
+    around = 0.15 * surface.extent
+    cluttered = [np.vstack([cloud, rng.uniform(low - around, high + around, (600, 3))]) for cloud in clouds]
+    monkeypatch.setattr(avsreplay.preflight, "Registrar", Located)
+    found = _found(preflight(Log(cluttered), surface), "size")
+    assert (found.grade, found.option) == ("ok", "")
+    assert "the model was found in 5 of 5 examined scans" in found.text
 
 
 @pytest.mark.parametrize(("factor", "grade"), [(0.7, "check"), (0.8, "check"), (1.0, "ok"), (1.05, "ok")])

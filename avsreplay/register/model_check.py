@@ -137,9 +137,11 @@ class ModelCheck:
         mirrored = replace(self._surface, vertices=self._surface.vertices * [-1.0, 1.0, 1.0])
         if len(scan) and self._fits(replace(mirrored, faces=mirrored.faces[:, ::-1]), scan):
             return "the scans fit the mirror image of the model: is an axis of the model or of the scans inverted?"
-        own = diameter(self._surface.vertices, trimmed=False)
-        sizes = f"the first of them measures {diameter(scan):.3g} m, the model {own:.3g} m"
-        return f"no pose of the model explains the scans ({sizes}): is it the right model, in metres?"
+        own, seen = diameter(self._surface.vertices, trimmed=False), diameter(scan)
+        sizes = f"the first of them measures {seen:.3g} m, the model {own:.3g} m"
+        # the limit of `preflight` beyond which a scan is too large for the target alone
+        cause = "is background left around the target, and is it" if seen > 1.3 * own else "is it"
+        return f"no pose of the model explains the scans ({sizes}): {cause} the right model, in metres?"
 
     def _fits(self, surface: Surface, scan: Array) -> bool:
         """Whether nearly all of a scan is on a model, in one pose only and with its size."""
