@@ -314,7 +314,7 @@ def _anchors(page):
     return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
 
 
-TO_SHORTEN = {"backends", "scenario"}  # pages with longer sentences, or with history
+TO_SHORTEN = {"scenario"}  # pages with longer sentences, or with history
 PLAIN = [page for page in PAGES if page.stem not in TO_SHORTEN]
 HISTORY = re.compile(
     r"\b(previously|formerly|no longer|before the change|earlier version|used to be|since then|until now)\b"
