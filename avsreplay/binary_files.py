@@ -15,6 +15,7 @@ import io
 import math
 import pickle
 import re
+import stat
 import zipfile
 import zlib
 from collections.abc import Collection, Mapping
@@ -26,7 +27,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput
-from avsreplay.files import BadFile, read_limited
 
 _MAX_NPY_HEADER = 4096
 _LEAST_ARRAYS, _MAX_RATIO = 96 << 20, 8  # arrays may take 96 MiB, or eight times the size of their archive
@@ -36,6 +36,33 @@ _NPY_HEADER = re.compile(
 )
 _NPY_TYPE = re.compile(r"[<>|=]?(?:f[248]|[iu][1248])")
 _ZIP_ERRORS = (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError, OSError, ValueError)
+
+
+class BadFile(ValueError):
+    """A file whose bytes do not match its header or its name."""
+
+
+def read_limited(path: Path, limit: int, hint: str) -> bytes:
+    """Return the bytes of a regular file.
+
+    Args:
+        path: the file.
+        limit: largest size that is accepted [bytes].
+        hint: what the error message advises.
+
+    Raises:
+        UnreadableInput: it is not a regular file, is larger, or cannot be read.
+    """
+    try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise UnreadableInput("is not a regular file", where=str(path), hint=hint)
+        if found.st_size > limit:
+            raise UnreadableInput(f"larger than {limit >> 20} MiB", where=str(path), hint=hint)
+        return path.read_bytes()
+    except OSError as error:
+        what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
+        raise UnreadableInput(what, where=str(path), hint=hint) from None
 
 
 def parse_npy(data: bytes) -> NDArray[Any]:

@@ -1,20 +1,20 @@
-"""Files at the boundary of the program: outputs that are complete or absent, and limits on what is read.
+"""Outputs that are complete or absent: a regular file is written beside its place and renamed when it is complete.
 
-An output that is a regular file is written beside its place and renamed when it is complete. A symbolic link is
-followed and never replaced. A device, a FIFO and ``-`` (standard output) are written directly. Names that cannot be
-written raise an error in ``check_output``, before any work is done.
+A symbolic link is followed and never replaced. A device, a FIFO and ``-`` (standard output) are written directly. Names
+that cannot be written raise an error in ``check_output``, before any work is done.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import itertools
 import os
 import re
 import shutil
 import stat
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, BinaryIO
@@ -27,10 +27,6 @@ _MOST_MANIFEST = 64 << 20
 _PART = re.compile(r"\..+\.\d+\.\d+\.part", re.DOTALL)
 _CLEANED: set[Path] = set()
 _COUNTER = itertools.count()
-
-
-class BadFile(ValueError):
-    """A file whose bytes do not match its header or its name."""
 
 
 def is_stream(path: Path) -> bool:
@@ -68,7 +64,9 @@ def check_output(path: Path, *, overwrite: bool = True, folder: bool = False, in
     try:
         _check_place(path, overwrite, folder)
         if not is_stream(path) and any(_replaces(path.resolve(), each.resolve()) for each in inputs):
-            raise UsageError("is an input or a part of one", where=str(path), hint="name another output")
+            raise UsageError(
+                "is an input, a part of one, or another output", where=str(path), hint="name another output"
+            )
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of symbolic links
         what = f"cannot be written: {getattr(error, 'strerror', None) or 'a loop of symbolic links'}"
         raise UsageError(what, where=str(path)[:200], hint="name another output") from None
@@ -80,7 +78,7 @@ def _replaces(place: Path, source: Path) -> bool:
         return place == source
     manifest = source / "run.json"
     if manifest.is_file() and place != manifest:
-        return os.fsencode(f'"{place.name}"') in read_limited(manifest, _MOST_MANIFEST, "name a result of a run")
+        return manifest.stat().st_size > _MOST_MANIFEST or os.fsencode(f'"{place.name}"') in manifest.read_bytes()
     return place.suffix != ".html"
 
 
@@ -160,11 +158,12 @@ def output_text(path: str | Path, *, overwrite: bool = True) -> Iterator[IO[str]
 
 
 @contextmanager
-def output_folder(path: Path) -> Iterator[Path]:
+def output_folder(path: Path, own: Collection[str] = ()) -> Iterator[Path]:
     """Yield a temporary folder; on success it replaces the folder ``path``, on failure ``path`` is unchanged.
 
     Args:
         path: the folder.
+        own: names that may be in such a folder; everything else in the former folder is kept in the new one.
 
     Raises:
         UsageError: the folder cannot be written (see ``check_output``).
@@ -176,15 +175,18 @@ def output_folder(path: Path) -> Iterator[Path]:
         place.parent.mkdir(parents=True, exist_ok=True)
         with _part(place, folder=True) as part:
             yield part
+            _keep_others(place, part, own)
             _swap(part, place)
     except OSError as error:
         raise _unwritable(path, error) from None
 
 
 def _swap(part: Path, place: Path) -> None:
-    """Put ``part`` in the place of an existing folder, which is kept until the new one is there."""
+    """Put ``part`` in the place of an existing folder, in one step where the system has one (Linux)."""
     old = _beside(place)
     if place.exists():
+        if _exchange(part, place):  # the former folder is removed with the temporary name
+            return
         place.rename(old)
     try:
         part.rename(place)
@@ -195,10 +197,36 @@ def _swap(part: Path, place: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
+def _exchange(one: Path, other: Path) -> bool:
+    """Exchange two names in one step; return False if the system or the file system cannot."""
+    try:
+        rename = ctypes.CDLL(None).renameat2
+    except (AttributeError, OSError, TypeError):  # macOS; Windows
+        return False
+    return int(rename(-100, os.fsencode(one), -100, os.fsencode(other), 2)) == 0  # AT_FDCWD, RENAME_EXCHANGE
+
+
+def _keep_others(place: Path, part: Path, own: Collection[str]) -> None:
+    """Link everything in the former folder that is not its own into the new one."""
+    for entry in place.iterdir() if place.is_dir() else ():
+        if entry.name in own or _PART.fullmatch(entry.name) or (part / entry.name).exists():
+            continue
+        if entry.is_dir() and not entry.is_symlink():
+            shutil.copytree(entry, part / entry.name, symlinks=True, copy_function=_link)
+        else:
+            _link(entry, part / entry.name)
+
+
+def _link(source: str | Path, target: str | Path) -> None:
+    try:
+        os.link(source, target, follow_symlinks=False)
+    except OSError:  # a file system without hard links
+        shutil.copy2(source, target, follow_symlinks=False)
+
+
 def _publish(part: Path, place: Path, overwrite: bool) -> None:
-    if place.exists():
-        with contextlib.suppress(OSError):
-            shutil.copymode(place, part)
+    with contextlib.suppress(OSError):
+        shutil.copymode(place, part)
     if overwrite:
         part.replace(place)
         return
@@ -211,10 +239,8 @@ def _publish(part: Path, place: Path, overwrite: bool) -> None:
 
 
 def _unwritable(path: Path, error: OSError) -> UnreadableInput:
-    what = f"cannot be written: {error.strerror or error}"
-    return UnreadableInput(
-        what, where=str(path), hint="nothing was changed; check the folder, its rights and its space"
-    )
+    hint = "nothing was changed; check the folder, its rights and its space"
+    return UnreadableInput(f"cannot be written: {error.strerror or error}", where=str(path), hint=hint)
 
 
 def _beside(place: Path) -> Path:
@@ -317,31 +343,6 @@ def _remove_stale(folder: Path) -> None:
 
 
 def _remove(path: Path) -> None:
+    shutil.rmtree(path, ignore_errors=True)  # without effect on a file or a link
     with contextlib.suppress(OSError):
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
-
-
-def read_limited(path: Path, limit: int, hint: str) -> bytes:
-    """Return the bytes of a regular file.
-
-    Args:
-        path: the file.
-        limit: largest size that is accepted [bytes].
-        hint: what the error message advises.
-
-    Raises:
-        UnreadableInput: it is not a regular file, is larger, or cannot be read.
-    """
-    try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
-            raise UnreadableInput("is not a regular file", where=str(path), hint=hint)
-        if found.st_size > limit:
-            raise UnreadableInput(f"larger than {limit >> 20} MiB", where=str(path), hint=hint)
-        return path.read_bytes()
-    except OSError as error:
-        what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
-        raise UnreadableInput(what, where=str(path), hint=hint) from None
+        path.unlink()

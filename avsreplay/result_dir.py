@@ -8,7 +8,7 @@ checkpoint, ``resume.bin``.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from itertools import pairwise
@@ -35,6 +35,8 @@ from avsreplay.run import Listener, ReplayedScan, Run
 from avsreplay.viewers import NewPaths, ResultLogWriter
 
 CHECKPOINT = "resume.bin"  # checkpoint of an interrupted run
+OWN = frozenset({"rows.jsonl", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz", "view.npz", "run.json",
+                 "result.mcap", "result.layout.json", "report.html", CHECKPOINT})  # fmt: skip
 _MOST_BELIEF_BYTES, _LARGEST = 1 << 30, 1e15
 VIEW_REACH = 0.05  # largest residual in the view, over the model's extent
 _BLOCKS = (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4))
@@ -178,15 +180,16 @@ class ViewWriter:
 class ResultDirectory:
     """The folder of a result; it appears when the ``with`` block ends without an error, and not otherwise."""
 
-    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
+    def __init__(self, path: Path, *, overwrite: bool = False, inputs: Iterable[Path] = ()) -> None:
         """Check that the folder can be written.
 
         Args:
             path: the folder.
-            overwrite: whether an existing result may be replaced.
+            overwrite: whether an existing result may be replaced; files that are not ``OWN`` are kept.
+            inputs: files that the run reads; none of them may be a file of the result.
 
         Raises:
-            UsageError: the folder exists, is not a result, or its name cannot be used.
+            UsageError: the folder exists, is not a result, contains an input, or its name cannot be used.
         """
         self.path, self._stack = path, ExitStack()
         check_output(path, folder=True)
@@ -194,9 +197,12 @@ class ResultDirectory:
             raise UsageError("already exists", where=str(path), hint="choose another name, or add --overwrite")
         if path.exists() and not _replaceable(path):
             raise UsageError("is not a result directory", where=str(path), hint="name another; it is left alone")
+        for each in inputs:
+            if each.resolve().parent == path.resolve() and each.name in OWN:
+                raise UsageError("contains an input of this run", where=str(path), hint="name another output")
 
     def __enter__(self) -> ResultDirectory:
-        self._part = self._stack.enter_context(output_folder(self.path))
+        self._part = self._stack.enter_context(output_folder(self.path, OWN))
         return self
 
     def __exit__(

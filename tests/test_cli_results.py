@@ -9,11 +9,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from avsreplay.cli import group
+from avsreplay.cli import SUMMARIES, group
 from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
 
 READERS = {
@@ -71,8 +72,83 @@ def test_an_output_never_replaces_what_the_command_reads(words: tuple[str, ...],
     before = [path.read_bytes() for path in files]
     done = run(*(word.replace("RESULT", str(result)).replace("GATE", str(gate)) for word in words))
     assert isinstance(done.exception, UsageError), done.exception
-    assert "is an input or a part of one" in str(done.exception)
+    assert "is an input, a part of one, or another output" in str(done.exception)
     assert [path.read_bytes() for path in files] == before
+
+
+OUTPUTS = {"output", "update_golden", "junit", "export", "mesh", "animate"}
+NEEDED = {  # arguments without which a command is refused earlier
+    "export": ("--to", "csv"),
+    "compare": ("--gate", "FILE"),
+    "model": ("-o", "other.ply"),
+    "run": ("-o", "other"),
+}
+
+
+def pairs() -> list[tuple[str, str, str]]:
+    """Every output file of every command with each other path that the command takes."""
+    found = []
+    for name in SUMMARIES:
+        command = group.get_command(click.Context(group), name)
+        paths = [param for param in command.params if isinstance(param.type, click.Path)]
+        words = [param.opts[0] if isinstance(param, click.Option) else "" for param in paths]
+        outputs = [w for p, w in zip(paths, words, strict=True) if p.name in OUTPUTS and (name, w) not in FOLDERS]
+        found += [(name, output, word) for output in outputs for word in words if word != output]
+    return found
+
+
+FOLDERS = {("run", "-o"), ("sweep", "-o")}
+
+
+@pytest.mark.parametrize(("command", "output", "other"), pairs())
+def test_no_output_is_another_path_of_its_command(
+    command: str, output: str, other: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / {"record": "a.mcap", "model": "a.ply"}.get(command, "a.file")
+    path.write_text("mine")
+    if (command, other) == ("run", "-o"):  # a folder is no file
+        path.unlink()
+    more = [path if word == "FILE" else word for word in NEEDED.get(command, ())]
+    if output in more or other in more:
+        more = []
+    (tmp_path / "source").touch()
+    words = [command, "source" if other else path, *more, output, path, *([other, path] if other else [])]
+    done = run(*words, *(["--overwrite"] if command != "run" else []))
+    assert isinstance(done.exception, UsageError), done.exception
+    assert "another output" in str(done.exception) or "exclude each other" in str(done.exception)
+    assert not path.exists() or path.read_text() == "mine"
+
+
+@pytest.mark.parametrize("option", ["--golden", "--update-golden"])
+def test_an_unusable_golden_file_is_refused_before_the_replay(
+    option: str, fixtures_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("avsreplay.run.Run.rows", None)
+    golden = tmp_path / "golden.jsonl"
+    golden.write_text("[1]\n")
+    done = run("run", fixtures_folder / "tumble.mcap", option, golden)
+    assert isinstance(done.exception, UnreadableInput), done.exception
+    assert golden.read_text() == "[1]\n"
+
+
+def test_a_result_that_is_replaced_keeps_the_files_of_others(fixtures_folder: Path, result: Path) -> None:
+    (result / "notes.txt").write_text("mine")
+    (result / "folder").mkdir()
+    (result / "folder" / "a.txt").write_text("mine, too")
+    (result / "report.html").write_text("a page of the former result")
+    words = ("run", fixtures_folder / "tumble.mcap", "--n-scans", 1, "-o", result, "--overwrite")
+    refused = run(*words, "--golden", result / "rows.jsonl")
+    assert isinstance(refused.exception, UsageError)
+    assert "contains an input" in str(refused.exception)
+    assert run(*words).exception is None
+    assert (result / "notes.txt").read_text() == "mine"
+    assert (result / "folder" / "a.txt").read_text() == "mine, too"
+    assert not (result / "report.html").exists()
+    assert len((result / "rows.jsonl").read_text().splitlines()) == 1
+    done = read("compare", result)
+    assert "warning" not in done.stderr
+    assert sorted(p.name for p in result.parent.iterdir()) == ["gate.toml", "result"]
 
 
 def test_pages_and_exports_in_the_folder_of_a_result_can_be_made_again(result: Path) -> None:

@@ -224,6 +224,30 @@ def test_a_folder_is_replaced_when_it_is_complete(tmp_path: Path) -> None:
     assert only(tmp_path, "result")
 
 
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems have no such call")
+def test_a_folder_is_replaced_in_one_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that is killed leaves the former folder or the new one, never none."""
+    place = tmp_path / "result"
+    place.mkdir()
+    (place / "file").write_text("one")
+    monkeypatch.setattr(Path, "rename", None)
+    with output_folder(place) as part:
+        (part / "file").write_text("two")
+    assert (place / "file").read_text() == "two"
+    assert only(tmp_path, "result")
+
+
+def test_a_folder_that_the_system_cannot_exchange_is_replaced_in_two_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "_exchange", lambda *_: False)
+    for text in ("one", "two"):
+        with output_folder(tmp_path / "result", ["file"]) as part:
+            (part / "file").write_text(text)
+    assert (tmp_path / "result" / "file").read_text() == "two"
+    assert only(tmp_path, "result")
+
+
 @posix
 def test_a_link_to_a_folder_is_followed(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()

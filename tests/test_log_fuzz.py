@@ -19,7 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from log_cases import scans
 
-from avsreplay.files import BadFile
+from avsreplay.binary_files import BadFile
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import point_cloud2
 from avsreplay.log.ply import read_ply

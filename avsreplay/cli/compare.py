@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, read_result
+from avsreplay.cli.options import PATH, check_outputs, read_result
 from avsreplay.errors import DataLost, UsageError
-from avsreplay.files import check_output, output_text
+from avsreplay.files import output_text
 from avsreplay.report import gate as gates
 from avsreplay.report.compare import METRICS, metrics
 from avsreplay.report.conclusion import Conclusion, conclude
@@ -106,13 +106,10 @@ def compare_command(
     """  # noqa: D301
     if (junit or github) and not gate:
         raise UsageError("--junit and --github need --gate", hint="name the rules with --gate rules.toml")
-    inputs = [*results, *([gate] if gate else ())]
-    if output:
-        check_output(output, overwrite=overwrite, inputs=inputs)
-    if junit:
-        check_output(junit, inputs=inputs)
-    groups = _with_distinct_names([_group(path) for path in results])
+    check_outputs("junit")
+    check_outputs("output", overwrite=overwrite)
     rules = gates.load_rules(gate) if gate else ()
+    groups = _with_distinct_names([_group(path) for path in results])
     pairs = [(other, _paired(groups[0], other)) for other in groups[1:]]
     conclusions = [conclude(other.name, listed) for other, listed in pairs]
     outcomes = _outcomes(rules, groups[0], pairs)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.config import source_setting
-from avsreplay.cli.options import pose_options, read_options, source_options
+from avsreplay.cli.options import check_outputs, pose_options, read_options, source_options
 
 if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss, Source
@@ -247,6 +247,7 @@ def doctor_command(
         options = SourceOptions(topic=topic, max_message_mib=max_message_mib)
     except ValueError as error:
         raise UsageError(str(error), where="--max-message-mib", hint="give a whole number of MiB") from None
+    check_outputs("output", overwrite=overwrite)
     _, findings = examine(source, options)
     done = None
     if output is not None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from avsreplay.cli.options import PATH, Numbers, check_suffix, read_options, source_options, tracked
+from avsreplay.cli.options import PATH, Numbers, check_outputs, check_suffix, read_options, source_options, tracked
 from avsreplay.errors import MissingBackend, UsageError
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def model_command(
     """  # noqa: D301
     import numpy as np
 
-    from avsreplay.files import check_output, output_path
+    from avsreplay.files import output_path
     from avsreplay.log import open_source, read_surface
     from avsreplay.log.header import surface_bytes
     from avsreplay.reconstruct import at_grasp, deviations, meshed, reconstruct, reconstruction_ply
@@ -70,7 +70,7 @@ def model_command(
     for each in (output, mesh):
         if each is not None:
             check_suffix(each, ".ply")
-            check_output(each, overwrite=overwrite, inputs=[log])
+    check_outputs("output", "mesh", overwrite=overwrite)
     if mesh is not None and find_spec("open3d") is None:
         hint = "pip install 'avsreplay[open3d]'"
         raise MissingBackend("a mesh needs Open3D, which is not installed", where="--mesh", hint=hint)
@@ -205,14 +205,14 @@ def odometry_command(
         MissingBackend: kiss-icp is not installed.
         UsageError: no scan has enough points.
     """  # noqa: D301
-    from avsreplay.files import STDOUT, check_output
+    from avsreplay.files import STDOUT
     from avsreplay.geometry import bounding_diagonal
     from avsreplay.log import open_source
     from avsreplay.register.backend import load_backend
     from avsreplay.register.peers import KissOdometry
     from avsreplay.report.export import write_tum
 
-    check_output(output, overwrite=overwrite, inputs=[log])
+    check_outputs("output", overwrite=overwrite)
     load_backend("kiss")  # reports where the library is not installed
     odometry, poses = None, []
     with open_source(log, read_options(reading)) as source:

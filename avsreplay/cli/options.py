@@ -16,7 +16,7 @@ import click
 
 from avsreplay.cli.config import source_setting
 from avsreplay.errors import AvsError, UnreadableInput, UsageError
-from avsreplay.files import is_stream
+from avsreplay.files import check_output, is_stream
 
 if TYPE_CHECKING:
     from avsreplay.log import GrowingLog, SourceOptions
@@ -167,6 +167,37 @@ def log_file(log: Path, *, follow: bool = False) -> Iterator[tuple[Path, Growing
             if path.is_file() and not path.stat().st_size and "broke off" not in error.what:
                 error.what, error.hint = "no data", "see the message of the program that writes to the pipe"
             raise
+
+
+def given_paths(*others: str) -> list[Path]:
+    """Return all paths that the current command was given, except the values of the parameters ``others``."""
+    context = click.get_current_context()
+    found: list[Path] = []
+    for param in context.command.params:
+        value = context.params.get(str(param.name))
+        if isinstance(param.type, click.Path) and param.name not in others and value is not None:
+            found += value if isinstance(value, (list, tuple)) else [value]
+    return found
+
+
+def check_outputs(*names: str, overwrite: bool = True) -> None:
+    """Raise an error for outputs of the current command that cannot be written, before any work is done.
+
+    Args:
+        names: parameters of the command that are files to write. None of them may be an input, which is every other
+            parameter that is a path, or the file of another output.
+        overwrite: whether an existing file may be replaced.
+
+    Raises:
+        UsageError: see ``files.check_output``.
+        UnreadableInput: the folder of an output cannot be written.
+    """
+    inputs = given_paths(*names)
+    for name in names:
+        output = click.get_current_context().params.get(name)
+        if output is not None:
+            check_output(output, overwrite=overwrite, inputs=inputs)
+            inputs.append(output)
 
 
 def check_suffix(path: Path, suffix: str) -> None:

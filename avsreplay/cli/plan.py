@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.config import robot_option, setting_option
-from avsreplay.cli.options import Numbers
+from avsreplay.cli.options import Numbers, check_outputs
 
 if TYPE_CHECKING:
     from avsreplay.cli.plan_output import Answer, PossibleChange
@@ -130,16 +130,13 @@ def plan_command(
     from avsreplay.cli.plan_output import Answer, document, print_answer
     from avsreplay.config import robot_settings
     from avsreplay.errors import UsageError
-    from avsreplay.files import check_output
     from avsreplay.plan.arm import with_arm
     from avsreplay.saved_result import load_saved, with_settings
 
     for name, value in (("--every", every_s), ("--extent", extent_m)):
         if value is not None and not 0.0 < value < float("inf"):
             raise UsageError(f"{value} is not above 0", where=name, hint="give a finite number above 0")
-    for target in (export, animate):
-        if target:
-            check_output(target, overwrite=overwrite, inputs=[result])
+    check_outputs("export", "animate", overwrite=overwrite)
     of_robot = () if robot_file is None else robot_settings(robot_file)
     saved = with_settings(load_saved(result, extent_m), (*of_robot, *assignments))
     for line in saved.warnings:

@@ -14,6 +14,7 @@ import click
 from avsreplay.cli.options import (
     PATH,
     check_binary_output,
+    check_outputs,
     check_suffix,
     read_options,
     read_result,
@@ -105,6 +106,7 @@ def record_command(
         fault_seed=seed or 0,
     )
     check_binary_output(output)
+    check_outputs("output", overwrite=overwrite)
     check_suffix(output, ".mcap")
     done = record(source, output, seed=seed, options=options, reading=_reading(reading), ticker=_progress)
     text = json.dumps(dataclasses.asdict(done), indent=2) if as_json else _sentence(done)
@@ -170,7 +172,7 @@ def export_command(result: Path, kind: str, poses: str, output: Path, overwrite:
         UnreadableInput: RESULT cannot be read.
         MissingBackend: pyarrow is needed and not installed.
     """  # noqa: D301
-    check_output(output, overwrite=overwrite, inputs=[result])
+    check_outputs("output", overwrite=overwrite)
     found, quiet = read_result(result), output == STDOUT
     if kind in ("csv", "parquet"):
         (export.write_csv if kind == "csv" else export.write_parquet)(output, found.rows)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from avsreplay.cli.config import run_settings, take_run_settings
-from avsreplay.cli.options import PATH, StartMode, log_file, pose_options, read_options, run_source_options
-from avsreplay.errors import CheckFailed, DataLost, UnreadableInput, UsageError
-from avsreplay.files import check_output
+from avsreplay.cli.options import PATH, StartMode, check_outputs, given_paths, log_file, pose_options, read_options
+from avsreplay.cli.options import run_source_options as source_options
+from avsreplay.errors import CheckFailed, DataLost, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
@@ -49,26 +49,18 @@ Exit codes: 0 ok, 1 the golden file differs or the verdict is worse than require
     "--start", "starts", type=StartMode(), multiple=True, help="Initialisation (cold, near, paper) or start time [s]."
 )
 @click.option("--paper", is_flag=True, help="Use the method as printed in the paper (docs/paper.md).")
-@run_source_options
+@source_options
 @pose_options
 @click.option("--golden", type=PATH, help="Compare the rows with this golden file; exit code 1 if they differ.")
 @click.option("--update-golden", type=PATH, help="Write the rows to this golden file.")
-@click.option(
-    "-o",
-    "--output",
-    type=PATH,
-    help="Write rows, trajectories, beliefs and settings to this directory.",
-)
+@click.option("-o", "--output", type=PATH, help="Write rows, trajectories, beliefs and settings to this directory.")
 @click.option("--report", "page", is_flag=True, help="Add the HTML page, report.html, to the result directory.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing result directory.")
 @click.option("--resume", is_flag=True, help="Continue the interrupted run in the result directory.")
 @click.option("--follow", is_flag=True, help="LOG is still being written: replay each scan as soon as it is complete.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON document and nothing else.")
 @click.option(
-    "--require",
-    "least",
-    type=click.Choice(["pass", "check"]),
-    help="Exit with code 1 if the verdict is worse than this.",
+    "--require", "least", type=click.Choice(["pass", "check"]), help="Exit with code 1 if the verdict is worse."
 )
 @click.option("--every", "table_every", type=click.IntRange(1), help="Print every N-th scan.")
 @click.option("--all", "table_all", is_flag=True, help="Print every scan.")
@@ -90,7 +82,8 @@ def run_command(log: Path, **flags: Any) -> None:
     wanted = Wanted(**{field.name: flags.pop(field.name) for field in fields(Wanted)})
     wanted.check()
     again = wanted.overwrite or wanted.resume
-    target = ResultDirectory(wanted.output, overwrite=again) if wanted.output else None
+    inputs = given_paths("output", "update_golden")
+    target = ResultDirectory(wanted.output, overwrite=again, inputs=inputs) if wanted.output else None
     with log_file(log, follow=wanted.follow) as (path, growing):
         job = _job(path, flags)
         streamed = growing is not None and job.options.model != Path("auto") and not wanted.resume
@@ -139,17 +132,19 @@ class Wanted:
     least: str | None
 
     def check(self) -> None:
-        """Raise UsageError if two options contradict each other, UnreadableInput without the golden file."""
+        """Raise UsageError if two options contradict each other, UnreadableInput for an unusable golden file."""
+        from avsreplay.report.golden import read_golden
+
         if self.golden and self.update_golden:
             raise UsageError("--golden and --update-golden exclude each other", hint="give one of them")
         if self.page and self.output is None:
             raise UsageError("--report needs a result directory", hint="add -o DIR")
         if self.resume and self.output is None:
             raise UsageError("--resume needs the result directory of the interrupted run", hint="add -o DIR")
-        if self.update_golden:
-            check_output(self.update_golden)
-        if self.golden and not self.golden.is_file():
-            raise UnreadableInput("no such golden file", where=str(self.golden), hint="--update-golden writes it")
+        check_outputs("update_golden")
+        for golden in (self.golden, self.update_golden):
+            if golden and (golden == self.golden or golden.is_file()):
+                read_golden(golden)
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Job:

@@ -25,8 +25,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import mesh
+from avsreplay.binary_files import BadFile
 from avsreplay.errors import UnreadableInput
-from avsreplay.files import BadFile
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply

@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.binary_files import parse_npy, read_members
+from avsreplay.binary_files import BadFile, parse_npy, read_members
 from avsreplay.errors import MissingBackend, UnreadableInput
-from avsreplay.files import BadFile
 from avsreplay.log.bytes_io import shown
 from avsreplay.log.ply import read_ply
 

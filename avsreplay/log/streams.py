@@ -14,8 +14,8 @@ from typing import TypeVar
 
 import numpy as np
 
+from avsreplay.binary_files import BadFile
 from avsreplay.errors import UsageError
-from avsreplay.files import BadFile
 from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.index import Recording, Sink

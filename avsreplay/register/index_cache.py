@@ -19,8 +19,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.binary_files import parse_npy, read_members
-from avsreplay.files import BadFile
+from avsreplay.binary_files import BadFile, parse_npy, read_members
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
 

@@ -75,13 +75,24 @@ def compare_golden(expected_path: str | Path, rows: Iterable[Row], *, first: int
     Raises:
         UnreadableInput: the file does not exist, or does not hold rows.
     """
-    path = Path(expected_path)
-    if not path.is_file():
-        raise UnreadableInput("no such golden file", where=str(path), hint="--update-golden writes it")
-    expected = _by_seq(read_records(path))
+    expected = read_golden(Path(expected_path))
     names = dict.fromkeys(name for record in expected.values() for name in record)
     table = {name: [record.get(name, ABSENT) for record in expected.values()] for name in names}
     return _compare({**table, "seq": list(expected)}, _table(list(rows)), first)
+
+
+def read_golden(path: Path) -> dict[int, dict[str, Any]]:
+    """Return the rows of a golden file by the number of their scan.
+
+    Args:
+        path: the file.
+
+    Raises:
+        UnreadableInput: the file does not exist, or does not hold rows.
+    """
+    if not path.is_file():
+        raise UnreadableInput("no such golden file", where=str(path), hint="--update-golden writes it")
+    return _by_seq(read_records(path))
 
 
 def compare_rows(expected: Sequence[Row], got: Sequence[Row], *, first: int = 20) -> GoldenResult:

@@ -19,8 +19,9 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Annotated, Any
 
+from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput
-from avsreplay.files import output_text, read_limited
+from avsreplay.files import output_text
 from avsreplay.rows import Row
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))

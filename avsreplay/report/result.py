@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.files import read_limited
 from avsreplay.geometry import Array, Pose, bounding_diagonal
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.export import StampedPose

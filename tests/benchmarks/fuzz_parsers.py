@@ -16,7 +16,7 @@ import atheris
 with atheris.instrument_imports(include=["avsreplay.log"]):
     from fuzz_inputs import seeds
 
-    from avsreplay.files import BadFile
+    from avsreplay.binary_files import BadFile
     from avsreplay.log.bytes_io import BadMessage
     from avsreplay.log.ply import read_ply
     from avsreplay.log.point_cloud2 import decode_cloud
