@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from avsreplay.geometry import Pose
 from avsreplay.log.result_log import ResultFrame, ResultLog
 from avsreplay.records import Surface
 from avsreplay.report.export import write_layout
-from avsreplay.rows import columns
+from avsreplay.rows import Row
 
 
 def _leaves(node):
@@ -33,7 +34,7 @@ def test_the_tree_holds_every_panel_once(layout):
 def _topics(tmp_path):
     path = tmp_path / "result.mcap"
     surface = Surface(np.eye(3), np.array([[0, 1, 2]], np.int32), "m", "0" * 64)
-    log = ResultLog(path, surface, {"version": "1"}, np.eye(3)[[0, 1]])
+    log = ResultLog(path, surface, {"version": "1"}, np.eye(3)[[0, 1]], ("nis",))
     pose = Pose.identity()
     log.write(
         ResultFrame(
@@ -47,7 +48,7 @@ def _topics(tmp_path):
             healthy=True,
             message="ok",
             values={"rms_m": 0.1},
-            columns={column.name: 1.0 for column in columns()},
+            columns=(1.0,),
         )
     )
     log.close()
@@ -60,4 +61,10 @@ def test_every_topic_it_names_is_written(layout, tmp_path):
     named = set(re.findall(r'"(/[a-z0-9_/]+)', json.dumps(layout)))
     assert named
     assert named <= _topics(tmp_path)
-    assert {"/plan/cone", "/truth/model", "/rosout", "/rows/nis"} <= named
+    assert {"/plan/cone", "/truth/model", "/rosout", "/rows"} <= named
+
+
+def test_every_column_it_plots_is_a_numeric_column_of_the_rows(layout):
+    plotted = set(re.findall(r'"/rows\.([a-z0-9_]+)"', json.dumps(layout)))
+    assert {"nis", "pos_err_m"} <= plotted
+    assert plotted <= {field.name for field in fields(Row) if not field.type.startswith("str")}
