@@ -245,7 +245,7 @@ def merged(ranges: Array, intensities: Array, merge_m: float) -> tuple[Array, Ar
     return np.where(total > 0.0, mean, np.inf), total / len(ranges), weights
 
 
-def separated(ranges: Array, intensities: Array, merge_m: float, returns: int) -> list[tuple[Array, Array, Array]]:
+def kept_returns(ranges: Array, intensities: Array, merge_m: float, returns: int) -> list[tuple[Array, Array, Array]]:
     """The strongest returns of each beam, as of ``merged``; each ray takes part in one return at most.
 
     Args:

@@ -26,8 +26,8 @@ from avsreplay.simulate.optics import (
     bloomed,
     crosstalk,
     face_optics,
+    kept_returns,
     part_of,
-    separated,
 )
 from avsreplay.simulate.rays import Engine, Pattern, RayCaster, ScannerParams, ray_grid
 from avsreplay.simulate.scene import Appendage, Limb, MovingCamera, Plume, SceneBody, appendage_faces
@@ -217,7 +217,7 @@ class Scanner:
         if len(rays) == 1:
             groups = [(ranges[0], intensities[0], np.ones((1, len(near))))]
         else:
-            groups = separated(ranges, intensities, self.params.merge_m, self.params.returns)
+            groups = kept_returns(ranges, intensities, self.params.merge_m, self.params.returns)
         found = None
         for mean, intensity, weights in groups:
             cosines = (weights * np.stack([r.cosines for r in rays])).sum(axis=0)
