@@ -314,8 +314,6 @@ def _anchors(page):
     return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
 
 
-TO_SHORTEN = {"scenario"}  # pages with longer sentences, or with history
-PLAIN = [page for page in PAGES if page.stem not in TO_SHORTEN]
 HISTORY = re.compile(
     r"\b(previously|formerly|no longer|before the change|earlier version|used to be|since then|until now)\b"
     r"|(?:^|[.;:(|] ?)(?:Before|Now|Formerly),",
@@ -330,7 +328,7 @@ def _sentences(text):
         yield from (sentence.split() for sentence in re.split(r"(?<=[.!?:;])(?:\*\*)? +(?=[A-Zc*\[({])", joined))
 
 
-@pytest.mark.parametrize("page", PLAIN, ids=_name)
+@pytest.mark.parametrize("page", PAGES, ids=_name)
 def test_a_sentence_has_at_most_45_words_and_states_the_present(page):
     text = re.sub(r"^```.*?^```$", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
     assert [" ".join(words) for words in _sentences(text) if len(words) > 45] == []
