@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import socket
 import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +23,14 @@ from avsreplay.plan.guidance import Segment
 from avsreplay.records import Belief
 from avsreplay.report.export import row_poses
 from avsreplay.report.view import cone_lines
-from avsreplay.rows import Row
+from avsreplay.rows import Row, columns
 from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump
 
 PATH_POINTS = 41
 RESIDUAL_REACH = 0.05  # largest residual in the viewer log, over the model's extent
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
-_NUMERIC = tuple(field.name for field in fields(Row) if str(field.type).split(" ")[0] in ("float", "int", "bool"))
+_COLUMNS = tuple(column.name for column in columns())
 RERUN_PORT = 9876  # port of a Rerun viewer
 
 
@@ -72,7 +70,7 @@ class ResultLogWriter:
         settings = dump(run.config)
         del settings["register"]["threads"]  # the file is the same for any number of threads
         facts = {"configuration": json.dumps(settings, sort_keys=True), "version": __version__}
-        self._log, self.paths = ResultLog(path, run.surface, facts, approach_cones(run), _NUMERIC), NewPaths()
+        self._log, self.paths = ResultLog(path, run.surface, facts, approach_cones(run)), NewPaths()
         self._registrar, self._reach_m = run.registrar, RESIDUAL_REACH * run.surface.extent
 
     def resume(self, written: Path, paths: NewPaths, last: Row) -> None:
@@ -111,9 +109,10 @@ class ResultLogWriter:
         )
 
 
-def _numbers(row: Row) -> list[float]:
-    """The numeric columns of a row, NaN where it has no value."""
-    return [math.nan if (value := getattr(row, name)) is None else float(value) for name in _NUMERIC]
+def _numbers(row: Row) -> dict[str, float]:
+    """The numeric columns of a row that have a value."""
+    found = ((name, getattr(row, name)) for name in _COLUMNS)
+    return {name: float(value) for name, value in found if isinstance(value, (int, float))}
 
 
 def approach_cones(run: Run) -> Array | None:
@@ -182,7 +181,8 @@ class RerunStream:
         path = self._paths.of(scan.state)
         if path is not None:
             rr.log("camera/plan", rr.LineStrips3D([path[1]]))
-        self._show(row)
+        for name, value in _numbers(row).items():
+            rr.log(f"rows/{name}", rr.Scalars(value))
         if row.gamma == 0:
             rr.log("rows/reason", rr.TextLog(row.reason))
 
@@ -190,16 +190,12 @@ class RerunStream:
         """Send the columns of rows again that had other values when their scans were shown."""
         for row in (rows[k] for k in changed):
             self._rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
-            self._show(row)
+            for name, value in _numbers(row).items():
+                self._rr.log(f"rows/{name}", self._rr.Scalars(value))
 
     def close(self) -> None:
         """Send what is still buffered."""
         self._rr.disconnect()
-
-    def _show(self, row: Row) -> None:
-        for name, value in zip(_NUMERIC, _numbers(row), strict=True):
-            if not math.isnan(value):
-                self._rr.log(f"rows/{name}", self._rr.Scalars(value))
 
     def _place(self, path: str, pose: Pose) -> None:
         self._rr.log(path, self._rr.Transform3D(translation=pose.t, quaternion=pose.q))

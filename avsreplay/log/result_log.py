@@ -3,14 +3,14 @@
 Frames: ``map`` over ``camera`` (identity, so that a viewer finds a root) and ``target`` under ``camera`` at each
 estimate, ``target_true`` at each true pose. The cloud is given in ``target``: if the estimate is right, it lies on the
 model; its field ``residual`` is the distance to it [m]. ``/plan/cone`` holds the cones in which the planned approach
-stays. ``/rows`` has one field for each numeric column.
+stays. Each numeric column has a topic ``/rows/NAME``.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,6 @@ CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
 LIBRARY = "avsreplay"
 CHUNK_BYTES = 1 << 20
 _TRIANGLE_LIST, _POINTS, _LINES = 11, 8, 5  # visualization_msgs Marker types
-_ROWS = "/rows"
 _TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/tf": "tf2_msgs/msg/TFMessage",
@@ -39,8 +38,9 @@ _TOPICS = {
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
     "/truth/model": "visualization_msgs/msg/Marker",
     "/rosout": "rcl_interfaces/msg/Log",
-    _ROWS: "avsreplay/msg/Row",
 }
+_ROWS = "/rows/"
+_FLOAT64 = struct.Struct("<xBxxd")  # encapsulation of little-endian CDR, then the value
 _INFO, _WARN = 20, 30  # levels of rcl_interfaces/msg/Log
 
 
@@ -60,7 +60,7 @@ class ResultFrame:
         values: scalars by name.
         residuals: (n,) distances of the points to the model at the estimate [m].
         intensities: (n,) of the points, None if the scanner gives none.
-        columns: the numeric columns of the row, NaN where it has no value.
+        columns: numeric columns of the row by name.
     """
 
     t_ns: int
@@ -75,19 +75,14 @@ class ResultFrame:
     values: Mapping[str, float | int | str]
     residuals: NDArray[Any] | None = None
     intensities: NDArray[Any] | None = None
-    columns: Sequence[float] = ()
+    columns: Mapping[str, float] = field(default_factory=dict)
 
 
 class ResultLog:
     """Writer of ``result.mcap``; ``close`` finishes the file. The bytes depend only on what is written."""
 
     def __init__(
-        self,
-        path: Path,
-        surface: Surface,
-        metadata: Mapping[str, str] | None = None,
-        cone: Array | None = None,
-        columns: Sequence[str] = (),
+        self, path: Path, surface: Surface, metadata: Mapping[str, str] | None = None, cone: Array | None = None
     ) -> None:
         """Create the file and write the model.
 
@@ -96,7 +91,6 @@ class ResultLog:
             surface: the target model, written as a marker.
             metadata: of the run, by name, for example its configuration as JSON.
             cone: (m, 3) ends of line pieces in {C} [m] that show the cones of the approach; None without a cone.
-            columns: names of the numeric columns of a row.
 
         Raises:
             UnreadableInput: the file cannot be written.
@@ -114,7 +108,7 @@ class ResultLog:
         self._writer.start(profile="ros2", library=LIBRARY)
         if metadata:
             self._writer.add_metadata("avsreplay", dict(metadata))
-        self._surface, self._cone, self._columns, self._count, self._state = surface, cone, columns, 0, ""
+        self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
 
@@ -152,13 +146,12 @@ class ResultLog:
         if frame.path is not None:
             self._append("/plan", t, _path(t, *frame.path))
         self._append("/diagnostics", t, _status(frame))
-        if self._columns:
-            self._append(_ROWS, t, _row(frame.columns))
+        self._append_columns(frame.columns, t)
         if frame.message != self._state:
             self._append("/rosout", t, _said(frame))
         self._state = frame.message
 
-    def copy(self, written: Path, state: str, changed: Mapping[int, Sequence[float]] | None = None) -> None:
+    def copy(self, written: Path, state: str, changed: Mapping[int, Mapping[str, float]] | None = None) -> None:
         """Append all messages of another log of this kind, so that this one continues it.
 
         Args:
@@ -171,29 +164,26 @@ class ResultLog:
         self._state = state
         with written.open("rb") as stream:
             for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
-                columns = (changed or {}).get(message.sequence - 1) if channel.topic == _ROWS else None
-                self._count = message.sequence
-                self._append(channel.topic, message.log_time, message.data if columns is None else _row(columns))
+                columns = (changed or {}).get(message.sequence - 1) if channel.topic.startswith(_ROWS) else None
+                if columns is None:
+                    self._count = message.sequence
+                    self._append(channel.topic, message.log_time, message.data)
+                elif channel.topic == _ROWS + next(iter(columns)):  # the first of the row stands for all
+                    self._append_columns(columns, message.log_time)
+
+    def _append_columns(self, columns: Mapping[str, float], t_ns: int) -> None:
+        for name, value in columns.items():
+            self._append(_ROWS + name, t_ns, _FLOAT64.pack(1, value))
 
     def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
         if topic not in self._channels:
-            kind = _TOPICS[topic]
+            kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
             if kind not in self._schemas:
-                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", self._definition(kind).encode())
+                text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
             qos = {"offered_qos_profiles": ""}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
         self._writer.add_message(self._channels[topic], t_ns, payload, t_ns, self._count)
-
-    def _definition(self, kind: str) -> str:
-        if kind == _TOPICS[_ROWS]:
-            return "".join(f"float64 {name}\n" for name in self._columns)
-        text: str = self._definitions.generate_msgdef(kind, ros_version=2)[0]
-        return text
-
-
-def _row(columns: Sequence[float]) -> bytes:
-    """Return the message of the numeric columns of a row in CDR: encapsulation of little-endian CDR, then doubles."""
-    return struct.pack(f"<xBxx{len(columns)}d", 1, *columns)
 
 
 def _path(t_ns: int, times_s: Array, positions: Array) -> bytes:
