@@ -2,7 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
-#include <unordered_map>
+#include <memory>
 
 namespace avs {
 namespace {
@@ -10,12 +10,6 @@ namespace {
 struct Cube {
   int64_t x, y, z;
   bool operator==(const Cube& o) const { return x == o.x && y == o.y && z == o.z; }
-};
-
-struct CubeHash {
-  size_t operator()(const Cube& c) const {
-    return (size_t)((uint64_t)c.x * 73856093u ^ (uint64_t)c.y * 19349663u ^ (uint64_t)c.z * 83492791u);
-  }
 };
 
 constexpr double NEARER = 0.999;  // of the gate of an alignment: neighbours this near are the nearest whatever the gate
@@ -37,7 +31,7 @@ class Matcher {
   int64_t chunks() const { return (v_.n + CHUNK - 1) / CHUNK; }
 
   // The inliers of a chunk, in the order of the scan; returns how many.
-  int inliers(int64_t chunk, Match (&out)[CHUNK]) const {
+  int inliers(int64_t chunk, Match* out) const {
     const int64_t first = chunk * CHUNK, last = std::min(v_.n, first + CHUNK);
     const View part{v_.data + first * v_.row, last - first, v_.row, v_.column, v_.single};
     return code_.match(s_, part, 0, part.n, look_, kept_ ? kept_ + first : nullptr, out);
@@ -62,40 +56,80 @@ Cube cube_of(const Match& m, double per_m) {
   return {cell(m.p[0]), cell(m.p[1]), cell(m.p[2])};
 }
 
-void add(const PatchSums& from, PatchSums& to) {
-  for (int r = 0; r < 6; ++r)
-    for (int c = 0; c < 8; ++c) to.rows[r][c] += from.rows[r][c];
-  for (int k = 0; k < 4; ++k) to.last[k] += from.last[k];
-  to.points += from.points;
-}
-
-// Sums by cube, in the order in which the cubes first came.
-class Patches {
+// Numbers cubes in the order in which they first come.
+class Numbers {
  public:
-  PatchSums& at(const Cube& cube) {
-    if (sums_.empty() || !(cube == cubes_[last_])) {
-      last_ = number_.try_emplace(cube, sums_.size()).first->second;
-      if (last_ == sums_.size()) cubes_.push_back(cube), sums_.emplace_back();
-    }
-    return sums_[last_];
+  uint32_t of(const Cube& cube) {
+    if (!cubes_.empty() && cube == cubes_[last_]) return last_;
+    size_t at = hash(cube) & (slots_.size() - 1);
+    while (slots_[at] != EMPTY && !(cubes_[slots_[at]] == cube)) at = (at + 1) & (slots_.size() - 1);
+    if (slots_[at] != EMPTY) return last_ = slots_[at];
+    slots_[at] = last_ = (uint32_t)cubes_.size();
+    cubes_.push_back(cube);
+    if (2 * cubes_.size() > slots_.size()) grow();
+    return last_;
   }
-  void add(const Patches& o) {
-    for (size_t k = 0; k < o.sums_.size(); ++k) avs::add(o.sums_[k], at(o.cubes_[k]));
-  }
-  std::vector<PatchSums>& sums() { return sums_; }
+  size_t size() const { return cubes_.size(); }
 
  private:
-  std::unordered_map<Cube, size_t, CubeHash> number_;
+  static constexpr uint32_t EMPTY = UINT32_MAX;
+
+  static size_t hash(const Cube& c) {
+    const uint64_t h = ((uint64_t)c.x * 73856093u ^ (uint64_t)c.y * 19349663u ^ (uint64_t)c.z * 83492791u) * 0x9e3779b97f4a7c15u;
+    return (size_t)(h >> 32);
+  }
+
+  void grow() {
+    slots_.assign(2 * slots_.size(), EMPTY);
+    for (uint32_t k = 0; k < (uint32_t)cubes_.size(); ++k) {
+      size_t at = hash(cubes_[k]) & (slots_.size() - 1);
+      while (slots_[at] != EMPTY) at = (at + 1) & (slots_.size() - 1);
+      slots_[at] = k;
+    }
+  }
+
   std::vector<Cube> cubes_;
-  std::vector<PatchSums> sums_;
-  size_t last_ = 0;
+  std::vector<uint32_t> slots_ = std::vector<uint32_t>(1024, EMPTY);
+  uint32_t last_ = 0;
 };
 
 // What one chunk adds.
 struct Part {
-  Patches patches;
-  int64_t inliers = 0;
-  double sum_d2 = 0, sum[3] = {0, 0, 0}, errors[CHUNK];
+  int inliers = 0;
+  double sum_d2 = 0, sum[3] = {0, 0, 0};
+};
+
+constexpr int64_t BLOCK = 32;  // chunks whose matches are held at a time
+
+// The inliers of some chunks, sorted by the patches: those of a patch in the order of the scan.
+class Sorted {
+ public:
+  explicit Sorted(int64_t chunks)
+      : matches_(new Match[(size_t)(chunks * CHUNK)]), patch_((size_t)(chunks * CHUNK)), order_((size_t)(chunks * CHUNK)) {}
+
+  Match* chunk(int64_t k) { return matches_.get() + k * CHUNK; }
+
+  // Adds the inliers of the first chunks to the sums of their patches.
+  void add(const Code& code, const Part* parts, int64_t chunks, double per_m, Numbers& numbers, std::vector<PatchSums>& sums) {
+    begin_.assign(numbers.size() + 1, 0);
+    for (int64_t k = 0; k < chunks; ++k)
+      for (int64_t i = k * CHUNK; i < k * CHUNK + parts[k].inliers; ++i) {
+        const uint32_t p = patch_[(size_t)i] = numbers.of(cube_of(matches_[(size_t)i], per_m));
+        if (begin_.size() < p + 2) begin_.resize(p + 2, 0);
+        ++begin_[p + 1];
+      }
+    for (size_t p = 1; p < begin_.size(); ++p) begin_[p] += begin_[p - 1];
+    next_ = begin_;
+    for (int64_t k = 0; k < chunks; ++k)
+      for (int64_t i = k * CHUNK; i < k * CHUNK + parts[k].inliers; ++i) order_[next_[patch_[(size_t)i]]++] = (uint32_t)i;
+    sums.resize(numbers.size());
+    for (size_t p = 0; p < sums.size(); ++p)
+      if (begin_[p + 1] > begin_[p]) code.add(matches_.get(), order_.data() + begin_[p], begin_[p + 1] - begin_[p], sums[p]);
+  }
+
+ private:
+  std::unique_ptr<Match[]> matches_;
+  std::vector<uint32_t> patch_, order_, begin_, next_;
 };
 
 double median(std::vector<double>& x) {
@@ -110,44 +144,42 @@ double median(std::vector<double>& x) {
 Evidence evidence(const Store& s, const Code& code, const View& v, const double* T, const PatchRule& rule, Team& team,
                   const Matches* matches) {
   const Matcher matcher(s, code, v, T, rule, matches);
-  std::vector<Part> parts((size_t)matcher.chunks());
-  const double per_m = 1 / rule.side;
-  team.each(matcher.chunks(), [&](int64_t k) {
-    Match found[CHUNK];
-    Part& part = parts[(size_t)k];
-    const int n = matcher.inliers(k, found);
-    part.inliers = n;
-    for (int i = 0; i < n; ++i) {
-      const Match& m = found[i];
-      part.sum_d2 += m.d2, part.errors[i] = std::fabs(m.e);
-      for (int a = 0; a < 3; ++a) part.sum[a] += m.p[a];
-    }
-    Cube next = n ? cube_of(found[0], per_m) : Cube{};
-    for (int i = 0, end; i < n; i = end) {  // points that follow each other are often in one cube
-      const Cube cube = next;
-      for (end = i + 1; end < n && (next = cube_of(found[end], per_m)) == cube;) ++end;
-      code.add(found + i, end - i, part.patches.at(cube));
-    }
-  });
+  const int64_t chunks = matcher.chunks();
+  std::vector<Part> parts((size_t)chunks);
+  std::vector<double> errors;
+  errors.reserve((size_t)v.n);
+  Sorted sorted(std::min(chunks, BLOCK));
+  Numbers numbers;
   Evidence out;
   out.points = v.n;
-  Patches all;
-  std::vector<double> errors;
-  for (const Part& part : parts) {
-    out.inliers += part.inliers, out.sum_d2 += part.sum_d2;
-    for (int a = 0; a < 3; ++a) out.centre[a] += part.sum[a];
-    errors.insert(errors.end(), part.errors, part.errors + part.inliers);
-    all.add(part.patches);
+  for (int64_t first = 0; first < chunks; first += BLOCK) {
+    const int64_t many = std::min(BLOCK, chunks - first);
+    team.each(many, [&](int64_t k) {
+      const Match* found = sorted.chunk(k);
+      Part& part = parts[(size_t)(first + k)];
+      part.inliers = matcher.inliers(first + k, sorted.chunk(k));
+      for (const Match* m = found; m != found + part.inliers; ++m) {
+        part.sum_d2 += m->d2;
+        for (int a = 0; a < 3; ++a) part.sum[a] += m->p[a];
+      }
+    });
+    for (int64_t k = 0; k < many; ++k) {
+      const Part& part = parts[(size_t)(first + k)];
+      out.inliers += part.inliers, out.sum_d2 += part.sum_d2;
+      for (int a = 0; a < 3; ++a) out.centre[a] += part.sum[a];
+      for (int i = 0; i < part.inliers; ++i) errors.push_back(std::fabs(sorted.chunk(k)[i].e));
+    }
+    sorted.add(code, parts.data() + first, many, 1 / rule.side, numbers, out.patches);
   }
   for (double& x : out.centre) x = out.inliers ? x / (double)out.inliers : 0;
   out.median = median(errors);
-  out.patches = std::move(all.sums());
   if (out.patches.size() > (size_t)rule.least) return out;
   out.patches.clear();  // too few cubes: every point is a patch
-  for (int64_t k = 0; k < matcher.chunks(); ++k) {
+  const uint32_t one = 0;
+  for (int64_t k = 0; k < chunks; ++k) {
     Match found[CHUNK];
     const int n = matcher.inliers(k, found);
-    for (int i = 0; i < n; ++i) code.add(found + i, 1, out.patches.emplace_back());
+    for (int i = 0; i < n; ++i) code.add(found + i, &one, 1, out.patches.emplace_back());
   }
   return out;
 }

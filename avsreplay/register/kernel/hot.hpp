@@ -86,7 +86,8 @@ struct Code {
   // The inliers among a chunk's points, in their order; returns how many. `kept`: where the searches begin, or null; what
   // is said there must hold for the eye of `look`, and below its `known`.
   int (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out);
-  void (*add)(const Match*, int64_t n, PatchSums&);
+  // Adds the n matches that `order` names, ascending; partial sums of those of a chunk are added in the order of chunks.
+  void (*add)(const Match*, const uint32_t* order, int64_t n, PatchSums&);
 };
 
 const Code& code_base();

@@ -284,18 +284,21 @@ static int match_kind(const Store& s, const View& v, int64_t first, int64_t last
   return found;
 }
 
-static void add(const Match* matches, int64_t n, PatchSums& to) {
-  D4 rows[6][2], last = load4(to.last);
-  for (int r = 0; r < 6; ++r) rows[r][0] = load4(to.rows[r]), rows[r][1] = load4(to.rows[r] + 4);
-  for (const Match* m = matches; m != matches + n; ++m) {
-    const double *p = m->p, *v = m->n;
+static void add(const Match* matches, const uint32_t* order, int64_t n, PatchSums& to) {
+  const D4 zero = d4(0);
+  D4 low[6] = {zero, zero, zero, zero, zero, zero}, high[6] = {zero, zero, zero, zero, zero, zero}, last = zero;
+  const auto put = [](double* sum, D4 part) { store4(sum, load4(sum) + part); };
+  for (int64_t k = 0; k < n; ++k) {
+    const Match& m = matches[order[k]];
+    const double *p = m.p, *v = m.n;
     const double J[6] = {p[1] * v[2] - p[2] * v[1], p[2] * v[0] - p[0] * v[2], p[0] * v[1] - p[1] * v[0], v[0], v[1], v[2]};
-    const D4 low = d4(J[0], J[1], J[2], J[3]), high = d4(J[4], J[5], m->e, 1);
-    for (int r = 0; r < 6; ++r) rows[r][0] = rows[r][0] + d4(J[r]) * low, rows[r][1] = rows[r][1] + d4(J[r]) * high;
-    last = last + d4(p[0], p[1], p[2], m->e);
+    const D4 first = d4(J[0], J[1], J[2], J[3]), rest = d4(J[4], J[5], m.e, 1);
+    for (int r = 0; r < 6; ++r) low[r] = low[r] + d4(J[r]) * first, high[r] = high[r] + d4(J[r]) * rest;
+    last = last + d4(p[0], p[1], p[2], m.e);
+    if (k + 1 < n && order[k + 1] / CHUNK == order[k] / CHUNK) continue;
+    for (int r = 0; r < 6; ++r) put(to.rows[r], low[r]), put(to.rows[r] + 4, high[r]), low[r] = high[r] = zero;
+    put(to.last, last), last = zero;
   }
-  for (int r = 0; r < 6; ++r) store4(to.rows[r], rows[r][0]), store4(to.rows[r] + 4, rows[r][1]);
-  store4(to.last, last);
   to.points += n;
 }
 
