@@ -107,6 +107,72 @@ def test_a_misfit_that_neighbours_share_is_told_from_noise():
     assert restarter.structure(exact, T_ac.inverse() @ shift) > 0.4 * noise
 
 
+def test_points_of_a_wrong_pose_share_their_distances_and_those_of_the_true_pose_do_not() -> None:
+    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(3)
+    scan, restarter = seen(surface, T_ac, 0.002, rng), Registrar(surface)._restarter
+    beside = T_ac @ Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.full(3, 0.004 * surface.extent))
+    assert not restarter.misfit(scan, T_ac.inverse())
+    assert restarter.misfit(scan, beside.inverse())
+
+
+def behind_a_plate(points: Array, visible: float, extent: float, rng: np.random.Generator) -> Array:
+    """The points of one side, and as many points of a plate half an extent in front of the rest as it hides."""
+    across = points[:, 0] / points[:, 2]
+    left = across <= np.quantile(across, visible)
+    ranges = np.linalg.norm(points[~left], axis=1, keepdims=True)
+    middle = np.median(np.linalg.norm(points, axis=1)) - 0.5 * extent
+    return np.vstack(
+        [points[left], points[~left] / ranges * (middle + 0.002 * extent * rng.standard_normal(ranges.shape))]
+    )
+
+
+@pytest.mark.parametrize("visible", [0.25, 0.35])
+def test_a_scan_of_a_target_that_is_mostly_hidden_is_used_at_the_predicted_pose(visible: float) -> None:
+    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(8)
+    registrar, whole = Registrar(surface), seen(surface, T_ac, 0.002, rng)
+    scan, guess = behind_a_plate(whole, visible, surface.extent, rng), near(T_ac, 0.3, 0.002 * surface.extent)
+    found, complete = registrar.register(scan, guess), registrar.register(whole, guess)
+    error = found.T_ac.inverse() @ T_ac
+    d = np.concatenate([geometry.log(error.q), error.t])
+    assert found.status is AlignStatus.ALIGNED
+    assert found.inlier_ratio < visible + 0.02
+    assert d @ np.linalg.solve(found.covariance, d) < 20.0
+    assert np.trace(found.covariance) > 4.0 * np.trace(complete.covariance)
+
+
+@pytest.mark.parametrize("degrees", [4.0, 30.0])
+def test_a_mostly_hidden_target_away_from_the_prediction_is_not_called_aligned(degrees: float) -> None:
+    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(8)
+    scan = behind_a_plate(seen(surface, T_ac, 0.002, rng), 0.2, surface.extent, rng)
+    found = Registrar(surface).register(scan, near(T_ac, degrees, 0.02 * surface.extent))
+    error = found.T_ac.inverse() @ T_ac
+    assert found.status is not AlignStatus.ALIGNED or np.degrees(geometry.angle(error.q)) < 1.0
+
+
+def test_a_wall_in_place_of_the_target_is_not_called_aligned() -> None:
+    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(9)
+    whole = seen(surface, T_ac, 0.002, rng)
+    ranges = np.linalg.norm(whole, axis=1, keepdims=True)
+    wall = whole / ranges * (T_ac.t[2] / (whole[:, 2:] / ranges)) * (1.0 + 1e-3 * rng.standard_normal(ranges.shape))
+    found = Registrar(surface).register(wall, T_ac)
+    assert found.status is not AlignStatus.ALIGNED
+
+
+def test_a_covariance_is_no_smaller_than_the_distances_at_the_prediction_show() -> None:
+    surface, T_ac, rng = boxes(), example_pose(), np.random.default_rng(10)
+    scan = behind_a_plate(seen(surface, T_ac, 0.002, rng), 0.2, surface.extent, rng)
+    registrar = Registrar(surface)
+    guess = near(T_ac, 0.05, 0.0005 * surface.extent)
+    found = registrar.register(scan, guess)
+    error = found.T_ac.inverse() @ guess
+    d = np.concatenate([geometry.log(error.q), error.t])
+    sure = replace(found, covariance=1e-4 * found.covariance)
+    wider = registrar._restarter.consistent(scan, guess, sure).covariance
+    assert d @ np.linalg.solve(sure.covariance, d) > 100.0 * d @ np.linalg.solve(wider, d)
+    assert np.all(np.linalg.eigvalsh(wider - sure.covariance) > -1e-12)
+    assert registrar._restarter.consistent(scan, T_ac @ T_ac, sure) is sure
+
+
 def test_a_pose_beside_the_truth_is_left_along_the_valley():
     """A stage with one fin, turned about its axis: the cost is nearly flat there and has its minimum at the truth."""
     angle = 2.0 * np.pi * np.arange(48) / 48.0

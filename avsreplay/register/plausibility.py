@@ -50,6 +50,10 @@ MOST_MISSING = 0.1  # largest share of the visible surface that is missing in a 
 CONTRADICTIONS = ("points beside the model", "rays that pass through it", "surface that is not in the scan")
 LEAST_SCAN_OF_EXTENT = 0.05  # a smaller scan is about as large as the rejection distance, and any face explains it
 SIZED_POINTS = 200  # points of the scan that nearly always suffice to show that it is larger
+LEAST_ALONE = 0.9  # share on the model of the points that do not hide it: missing surface is then hidden, not elsewhere
+BEFORE_OF_EXTENT = 0.25  # a point that hides the model is this much nearer; a part of the model is less, as a rule
+PREDICTED = 1.0  # a pose whose surface is in the mean within so many gates of the predicted one agrees with it
+NEAR_OF_EXTENT, MOST_HIDDEN = 0.05, 0.5  # where fewer points are nearer, the noise at a predicted pose is theirs
 LEAST_COMPARED = 30  # with fewer surface points the test has no power
 LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of its incidence is larger
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
@@ -107,7 +111,26 @@ class PlausibilityTest:
         text = f"the scan measures {size:.3g} m, the model {self._extent:.3g} m: is --model-unit right?"
         return replace(not_measured(points, AlignStatus.IMPLAUSIBLE, guess), message=text)
 
-    def check(self, points: NDArray[Any], T_ca: Pose, scene: NDArray[Any] | None = None) -> Plausibility:
+    def noise(self, points: NDArray[Any], T_ca: Pose, guess: Pose | None) -> float:
+        """Return the robust noise [m] of ``points`` (n, 3) in {A}; of those near the model where most are not.
+
+        The latter only at the predicted pose ``guess``: elsewhere the points near the model may be so by chance.
+        """
+        distance = self.measure(points, T_ca)
+        near = distance[distance < NEAR_OF_EXTENT * self._extent]
+        few = LEAST_COMPARED <= len(near) < MOST_HIDDEN * len(distance)
+        return robust_noise(near if few and self.predicted(T_ca, guess) else distance)
+
+    def predicted(self, T_ca: Pose, guess: Pose | None) -> bool:
+        """Return whether a pose T_ca agrees with the predicted T_ac ``guess``; False where the camera is not known."""
+        if guess is None or not self._visibility.may_be_camera(T_ca):
+            return False
+        moved = T_ca.inverse().apply(self._points) - guess.apply(self._points)
+        return float(np.linalg.norm(moved, axis=1).mean()) < PREDICTED * self._gate
+
+    def check(
+        self, points: NDArray[Any], T_ca: Pose, scene: NDArray[Any] | None = None, guess: Pose | None = None
+    ) -> Plausibility:
         """Test the pose.
 
         Args:
@@ -115,12 +138,14 @@ class PlausibilityTest:
                 are enough.
             T_ca: the pose to be tested.
             scene: (m, 3) in {A} [m], the whole scan, for the points beside the model and the rays; ``points`` if None.
+            guess: predicted T_ac. At a pose that agrees with it, points far from the model are no contradictions, and
+                missing surface is none where nearly all points are on the model or in front of it and hide it.
 
         Returns:
             The score and the reason of a rejection.
         """
         camera_c = self._visibility.camera_c(self._index, points, T_ca)
-        noise = robust_noise(self.measure(points, T_ca))
+        noise = self.noise(points, T_ca, guess)
         rays = np.asarray(points if scene is None else scene, dtype=np.float64)
         width = max(self._gate, 3.0 * noise)
         p = T_ca.apply(rays)
@@ -136,7 +161,8 @@ class PlausibilityTest:
         if compared is not None:
             held, violated, empty = compared
             each = np.count_nonzero(on) / max(1, held)  # points of the scan for a point of the surface
-            paired = min(each, np.count_nonzero(~on) / max(1, len(empty)))
+            hidden = self.predicted(T_ca, guess) and self._alone(rays, on, T_ca)
+            paired = 0.0 if hidden else min(each, np.count_nonzero(~on) / max(1, len(empty)))
             for weight, k in ((each, violated), (paired, empty)):
                 against.append(weight * jacobian.information(self._points[k], self._normals[k]))
             absent = len(violated) + len(empty)
@@ -177,6 +203,18 @@ class PlausibilityTest:
         if held + np.count_nonzero(passed) < LEAST_COMPARED:
             return None
         return held, missing[passed], missing[empty]
+
+    def _alone(self, points: Array, on: NDArray[np.bool_], T_ca: Pose) -> bool:
+        """Whether nearly all points (n, 3) in {A} are on the model or hide it, well in front of it."""
+        T_ac = T_ca.inverse()
+        surface = T_ac.apply(self._points)
+        seen = Rays(surface[self._expected(_Image(surface), surface, self._normals @ T_ac.R.T)])
+        off = Rays(points[~on])
+        if seen.tree is None or not len(off.points):
+            return bool(on.all())
+        angle, k = (np.asarray(each) for each in seen.tree.query(off.points / off.ranges[:, None]))
+        hiding = (angle < EMPTY * seen.spacing) & (off.ranges < seen.ranges[k] - BEFORE_OF_EXTENT * self._extent)
+        return int(np.count_nonzero(on)) >= LEAST_ALONE * (len(points) - int(np.count_nonzero(hiding)))
 
     def _expected(self, image: _Image, surface: Array, normals: Array) -> NDArray[np.intp]:
         """Which surface points (n, 3) in {A} the camera should see."""

@@ -134,7 +134,7 @@ class Registrar:
         budget.spend(restarts.SCATTER_WORK * len(scan))
         few, results = self._restarter.part(target), list[Alignment]()
         whole: SearchResult | None = None
-        for part, number in islice(attempts(target, self._index.extent_m), rounds):
+        for part, number in islice(attempts(target, self._index.extent_m, lambda: results[0].measured), rounds):
             work = self._symmetry.search.work(len(part), number)
             if results and not budget.allows(work):
                 break
@@ -145,18 +145,17 @@ class Registrar:
             results.append(found)
             if found.status is AlignStatus.FAILED:
                 return found
-            little = search.inlier_ratio >= SURE_RATIO or (alone and not search.rivals)  # left to explain
+            fits = alone and not search.rivals and not self._restarter.misfit(few, found.T_ac.inverse())
+            little = search.inlier_ratio >= SURE_RATIO or fits  # left to explain
             if found.measured and little and search.width_m <= self.limits.gate_m:
                 break
         measured = [(each, self._restarter.measure(few, each.T_ac.inverse())) for each in results if each.measured]
-        if measured:
-            width = max(self.limits.gate_m, 3.0 * min(restart.noise_m for _, restart in measured))
-            return min(measured, key=lambda each: each[1].cost(width))[0]
-        first = results[0]
-        if not budget.exhausted:
-            return first
+        width = max(self.limits.gate_m, 3.0 * min((restart.noise_m for _, restart in measured), default=0.0))
+        best = min(measured, key=lambda each: each[1].cost(width))[0] if measured else results[0]
+        if not budget.exhausted or (measured and not self._restarter.misfit(few, best.T_ac.inverse())):
+            return best
         message = "no pose of the model explains the scan, and no work is left for a longer search"
-        return replace(first, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=message)
+        return replace(best, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=message)
 
     def _acquired(
         self, scan: NDArray[Any], part: Array, search: SearchResult, budget: Budget, carried: bool
@@ -273,12 +272,12 @@ class Registrar:
     ) -> tuple[Alignment, bool]:
         """Register again within a distance that follows the noise; restart if implausible. Whether it was searched."""
         few = self._restarter.part(scan)
-        at = self._restarter.measure(few, first.T_ac.inverse())
+        at = self._restarter.nearer(few, first, guess)
         hopeful = first.measured and at.noise_m <= NOISE_OF_EXTENT * self._index.extent_m
         final = self._regraded(scan, few, at, budget, halves, carried) if hopeful else first
-        reason = self._reason(few, final, budget)
+        reason = self._reason(few, final, budget, guess)
         if not (reason or self._restarter.doubtful(few, guess, final)):
-            return final, False
+            return self._restarter.consistent(few, guess, final), False
         before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without it, perhaps another object
         restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
@@ -297,19 +296,19 @@ class Registrar:
             before = self._restarter.best(few, guess.inverse(), final.T_ac.inverse(), budget, before, kept)
             if before.T_ca.matrix.tobytes() != final.T_ac.inverse().matrix.tobytes():
                 final = self._regraded(scan, few, before, budget, halves, carried)
-                reason = self._reason(few, final, budget)
+                reason = self._reason(few, final, budget, guess)
             if final.measured and not reason:
-                return final, False
+                return self._restarter.consistent(few, guess, final), False
         if not reason:
             return final, False
         ended = budget.exhausted or budget.brief
         status = AlignStatus.BUDGET_EXHAUSTED if ended else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason), False
 
-    def _reason(self, few: NDArray[Any], found: Alignment, budget: Budget) -> str:
+    def _reason(self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose) -> str:
         """Why a pose is not plausible; "" if it is, or nothing was measured."""
         budget.spend(restarts.TEST_WORK)
-        return self._test.check(few, found.T_ac.inverse()).reason if found.measured else ""
+        return self._test.check(few, found.T_ac.inverse(), None, guess).reason if found.measured else ""
 
     def _regraded(
         self, scan: NDArray[Any], few: NDArray[Any], kept: Restart, budget: Budget, halves: bool, carried: bool

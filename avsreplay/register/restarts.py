@@ -20,7 +20,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.backend import FIXED_WORK, Target, healthy_work
 from avsreplay.register.degenerate import scaled_information
-from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest, robust_noise
+from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.size import LEAST_RESIDUALS
 from avsreplay.register.surface_index import IcpParams
 
@@ -30,6 +30,7 @@ START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # neighbouring points: those in a cube of this side; cubes along the extent, at least
+SHARED = 0.5  # of the rms distance; a correct pose of a correct model has less than 0.4 in common to neighbours
 VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
 BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
 PASS_WORK = 1000  # fixed cost of a pass of a restart, in point searches
@@ -131,10 +132,44 @@ class Restarter:
         """Return about ``POINTS`` points of the scan (n, 3), evenly over its order."""
         return points[np.linspace(0, len(points) - 1, POINTS).astype(np.intp)] if len(points) > POINTS else points
 
-    def measure(self, points: NDArray[Any], T_ca: Pose) -> Restart:
-        """Return the distances of ``points`` (n, 3) in {A} at a pose."""
-        distance = self._test.measure(points, T_ca)
-        return Restart(T_ca, distance, robust_noise(distance))
+    def measure(self, points: NDArray[Any], T_ca: Pose, guess: Pose | None = None) -> Restart:
+        """Return the distances of ``points`` (n, 3) in {A} at a pose; ``guess``: as of ``PlausibilityTest.noise``."""
+        return Restart(T_ca, self._test.measure(points, T_ca), self._test.noise(points, T_ca, guess))
+
+    def nearer(self, points: NDArray[Any], first: Alignment, guess: Pose) -> Restart:
+        """Return the better one of a registered pose and its guess T_ac for ``points`` (n, 3) in {A}.
+
+        The wide rejection distance of the first passes can lead away from a good guess on a target that is hidden.
+        """
+        at, before = (self.measure(points, T_ac.inverse(), guess) for T_ac in (first.T_ac, guess))
+        whole = first.inlier_ratio >= LEAST_RATIO
+        return at if whole or at.cost(self.width(at)) <= before.cost(self.width(at)) else before
+
+    def consistent(self, points: NDArray[Any], guess: Pose, found: Alignment) -> Alignment:
+        """Return the alignment with a covariance that is not contradicted by the distances at the predicted pose.
+
+        Where little of the target is in the scan, the distances can be nearly as small along a curve of poses, far
+        beyond the covariance at its lowest point. With d the step to the prediction, x its chi-square by the
+        distances and y that by the covariance P, P + d d' (1 / x - 1 / y) has the chi-square x if x < y.
+
+        Args:
+            points: (n, 3) in {A} [m], part of the scan.
+            guess: predicted T_ac.
+            found: the alignment.
+        """
+        P = found.covariance
+        if P is None or found.inlier_ratio >= LEAST_RATIO or not self._test.predicted(found.T_ac.inverse(), guess):
+            return found
+        at, before = (self.measure(points, T_ac.inverse(), guess) for T_ac in (found.T_ac, guess))
+        step = found.T_ac.inverse() @ guess
+        d = np.concatenate([geometry.log(step.q), step.t])
+        width, noise = self.width(at), max(at.noise_m, before.noise_m, np.finfo(float).tiny)
+        by_distances = found.points * (before.cost(width) - at.cost(width)) * (width / noise) ** 2
+        missing = 1.0 / max(by_distances, 1.0) - 1.0 / max(float(d @ np.linalg.solve(P, d)), np.finfo(float).tiny)
+        if missing <= 0.0:
+            return found
+        wider = P + missing * np.outer(d, d)
+        return replace(found, covariance=geometry.frozen(wider), info=geometry.frozen(np.linalg.inv(wider)))
 
     def width(self, at: Restart) -> float:
         """Return the rejection distance [m] for a scan that is not clean: three standard deviations of its noise.
@@ -144,7 +179,16 @@ class Restarter:
         noise = min(at.noise_m, NOISE_OF_EXTENT * self._extent)
         return max(min(self._target.limits.gate_m, STOP_OF_EXTENT * self._extent), 3.0 * noise)
 
-    def structure(self, points: NDArray[Any], T_ca: Pose) -> float:
+    def misfit(self, points: NDArray[Any], T_ca: Pose) -> bool:
+        """Return whether neighbouring points on the model share most of their distances from it, (n, 3) in {A}.
+
+        Then the pose or the model is wrong, and another pose may fit better, however few points are off the model.
+        """
+        distance, gate = self._test.measure(points, T_ca), self._target.limits.gate_m
+        shared, rms = self.structure(points, T_ca, gate), np.sqrt(np.mean(distance[distance < gate] ** 2))
+        return bool(np.isfinite(shared) and shared > SHARED * rms)
+
+    def structure(self, points: NDArray[Any], T_ca: Pose, most_m: float = np.inf) -> float:
         """Return the rms [m] of the part of the residuals that neighbouring points share at a pose.
 
         From the products of the sums of two halves of each patch: noise of single points cancels in the mean, a wrong
@@ -153,13 +197,14 @@ class Restarter:
         Args:
             points: (n, 3) in {A} [m].
             T_ca: the pose.
+            most_m: points farther from the model are left out [m], as are those farther than ``START_OF_EXTENT``.
 
         Returns:
             The rms; inf for a cloud, whose normals have no sign, and with fewer than 50 points near the model.
         """
         target, p = self._target, T_ca.apply(points)
         found = target.index.closest(p, camera_c=target.visibility.camera_c(target.index, points, T_ca))
-        near = found.d2 < (START_OF_EXTENT * self._extent) ** 2
+        near = found.d2 < min(most_m, START_OF_EXTENT * self._extent) ** 2
         if np.count_nonzero(near) < LEAST_RESIDUALS or not len(target.surface.faces):
             return float("inf")
         e = np.einsum("ij,ij->i", found.normal[near], p[near] - found.foot[near])
@@ -276,8 +321,7 @@ class Restarter:
 
     def _confirmed(self, best: Restart, found: list[Restart]) -> bool:
         """Whether two starts led to the best pose."""
-        same = (self._same(best.T_ca, other.T_ca) for other in found if other is not best)
-        return any(same)
+        return any(self._same(best.T_ca, other.T_ca) for other in found if other is not best)
 
     def _least(self, found: list[Restart]) -> Restart:
         width = max(self._target.limits.gate_m, 3.0 * min(each.noise_m for each in found))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import islice
 
 import numpy as np
@@ -138,15 +138,17 @@ def without_scattered_points(points: Array) -> Array:
     return points[distance < SCATTERED * float(np.quantile(distance, DENSE_QUANTILE))]
 
 
-def attempts(target: Array, extent_m: float) -> Iterator[tuple[Array, int]]:
+def attempts(target: Array, extent_m: float, found: Callable[[], bool]) -> Iterator[tuple[Array, int]]:
     """Yield what is searched and by which round of the search: the whole scan, its parts, then with other starts.
 
     Args:
         target: (n, 3) the scan without scattered points.
         extent_m: of the model.
+        found: whether the first round gave a plausible pose.
     """
     small = geometry.bounding_diagonal(target) <= LARGER * extent_m  # probably the target alone
     yield target, 0
+    small = small or found()
     if small:
         yield target, 1
     for part in islice(segments(target, extent_m), MOST_SEGMENTS):
