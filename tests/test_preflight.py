@@ -4,21 +4,28 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import runpy
+import subprocess
+import sys
 import types
+from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from rosbags.rosbag1 import Writer
 
-import avsreplay.preflight
+import avsreplay.model_size
 from avsreplay.geometry import Pose, exp
 from avsreplay.log import open_source
 from avsreplay.log.header import parse_surface, scaled, surface_bytes
 from avsreplay.log.options import LogInfo, SourceOptions, TopicInfo, Unit
 from avsreplay.preflight import preflight
 from avsreplay.records import Scan, ScanStatus
-from avsreplay.register.contract import boxes
+from avsreplay.register.contract import boxes, view
 from avsreplay.register.size import diameter
+
+EXAMPLE = Path(__file__).parents[1] / "docs" / "examples" / "own_bag.py"
 
 
 @dataclasses.dataclass
@@ -35,6 +42,9 @@ class Log:
 
     def info(self):
         return LogInfo("x", "mcap", 1, self.topics, 0, 1, truth=self.truth)
+
+    def in_own_frame(self, scan):
+        return scan.points
 
     def scan_at(self, seq):
         return Scan(seq, seq * 100_000_000, np.asarray(self.clouds[seq], np.float64), ScanStatus.OK)
@@ -132,7 +142,7 @@ def test_points_that_remain_inside_the_suggested_crop_lead_to_no_other_crop(surf
     low, high = np.min([c.min(axis=0) for c in clouds], axis=0), np.max([c.max(axis=0) for c in clouds], axis=0)
     around = 0.15 * surface.extent
     cluttered = [np.vstack([cloud, rng.uniform(low - around, high + around, (600, 3))]) for cloud in clouds]
-    monkeypatch.setattr(avsreplay.preflight, "Registrar", Located)
+    monkeypatch.setattr(avsreplay.model_size, "Registrar", Located)
     found = _found(preflight(Log(cluttered), surface), "size")
     assert (found.grade, found.option) == ("ok", "")
     assert "the model was found in 5 of 5 examined scans" in found.text
@@ -191,6 +201,99 @@ def test_unit_and_background_are_found_together(surface):
     found = preflight(Log(_seen(surface, wall=True)), small)
     assert _found(found, "unit").option == "--model-scale 1000"
     assert _found(found, "background").option.startswith("--crop-")
+
+
+@pytest.mark.parametrize("given", ["m", "inch"])
+def test_the_registration_decides_between_two_units_that_explain_the_sizes(surface, given):
+    """With its wall a scan has the size of the model in centimetres, a group of points that in millimetres."""
+    rng, clouds = np.random.default_rng(1), []
+    for k in range(3):
+        T_ac = Pose(exp([0.3 * k, 0.2, 0.1]), [0.0, 0.0, 20.0])
+        target = T_ac.apply(view(surface, 3000, T_ac.inverse().t))
+        wall = np.column_stack([rng.uniform(-20.0, 20.0, (6000, 2)), np.full(6000, 33.0)])
+        clouds.append(0.1 * np.concatenate([target, wall]))
+    options = SourceOptions(model_unit=Unit(given))
+    read = dataclasses.replace(surface, vertices=100.0 * surface.vertices * options.model_factor)
+    found = preflight(Log(clouds, options=options), read, search=True)
+    assert _found(found, "unit").option == "--model-unit mm"
+    assert _found(found, "background").option.startswith("--crop-")
+    assert _found(found, "pose").grade == "ok"
+
+
+def test_a_model_that_no_scan_shows_is_doubtful_though_the_sizes_agree(surface):
+    cloud = np.random.default_rng(1).normal([0.0, 0.0, 12.0], 1.0, (2000, 3))
+    found = preflight(Log([cloud]), surface, search=True)
+    assert _found(found, "size").grade == "ok"
+    assert _found(found, "pose").grade == "check"
+    assert "is it the right model" in _found(found, "pose").text
+
+
+@pytest.fixture(scope="module")
+def own_bag(tmp_path_factory):
+    """The log and the model of the tutorial: a camera that moves, a wall, a model in millimetres."""
+    folder = tmp_path_factory.mktemp("own")
+    subprocess.run([sys.executable, EXAMPLE, folder], check=True)
+    return folder
+
+
+def _checks(folder, **options):
+    wanted = SourceOptions(model=folder / "target.stl", model_unit=Unit.MM, **options)
+    with open_source(folder / "own.bag", wanted, inspect=True) as source:
+        return {advice.about: advice for advice in preflight(source, source.header.surface)}
+
+
+def test_truth_at_other_times_and_in_another_frame_is_doubtful(own_bag, tmp_path):
+    assert _checks(own_bag, truth_topic="/mocap/pose")["truth"].option == "--fixed-frame map"
+    assert _checks(own_bag, truth_topic="/mocap/pose", fixed_frame="map")["truth"].grade == "ok"
+    late = tmp_path / "late.tum"
+    late.write_text("1700007200 0 0 0 0 0 0 1\n1700007201 0 0 0 0 0 0 1\n", encoding="utf-8")
+    truth = _checks(own_bag, truth_file=late)["truth"]
+    assert truth.grade == "check"
+    assert "they begin 7200 s after the first" in truth.text
+    late.write_text("1699999999 0 0 0 0 0 0 1\n1700007201 0 0 0 0 0 0 1\n", encoding="utf-8")
+    assert _checks(own_bag, truth_file=late)["truth"].option == "--truth-gap SECONDS"
+
+
+def test_a_crop_refers_to_the_frame_of_the_cloud_also_with_a_fixed_frame(own_bag):
+    suggested = [_checks(own_bag, fixed_frame=frame)["background"].option for frame in (None, "map")]
+    assert suggested[0] == suggested[1]
+
+
+def test_background_is_the_first_reason_of_a_run_without_used_scans(cli, own_bag):
+    model = ("--model", own_bag / "target.stl", "--model-unit", "mm")
+    done = cli("run", own_bag / "own.bag", *model, "--fixed-frame", "map", "--n-scans", 3, "--json")
+    assert done.code == 0, done.err
+    verdict = json.loads(done.out)["verdict"]
+    assert verdict["grade"] == "FAIL"
+    assert "add --crop-range" in verdict["reasons"][0]["text"]
+    assert "right model" not in done.err
+
+
+def test_the_options_are_printed_in_one_line_and_are_accepted(cli, own_bag):
+    done = cli("info", own_bag / "own.bag", "--model", own_bag / "target.stl")
+    (line,) = [line for line in done.out.splitlines() if line.startswith("options to add: ")]
+    options = line.removeprefix("options to add: ").split()
+    assert options[:2] == ["--model-unit", "mm"]
+    again = cli("info", own_bag / "own.bag", "--model", own_bag / "target.stl", *options, "--json")
+    assert {check["grade"] for check in json.loads(again.out)["checks"]} == {"ok"}
+
+
+def test_of_several_topics_that_which_shows_the_target_is_suggested(cli, surface, tmp_path):
+    """One topic shows the room, of the size of the model in its file, and comes first."""
+    example, rng, target = runpy.run_path(str(EXAMPLE)), np.random.default_rng(3), _seen(surface, 4)
+    store, cloud = example["STORE"], example["cloud"]
+    with Writer(tmp_path / "two.bag") as bag:
+        kind = "sensor_msgs/msg/PointCloud2"
+        topics = {name: bag.add_connection(name, kind, typestore=store) for name in ("/another", "/camera")}
+        for k, points in enumerate(target):
+            t_ns = (1_700_000_000 + k) * 10**9
+            for name, seen in (("/another", rng.uniform(-100.0, 100.0, (2000, 3))), ("/camera", points)):
+                bag.write(topics[name], t_ns, store.serialize_ros1(cloud(t_ns, seen), kind))
+    in_inches = dataclasses.replace(scaled(surface, 1.0 / 0.0254), data=b"")
+    (tmp_path / "m.ply").write_bytes(surface_bytes(in_inches))
+    done = cli("info", tmp_path / "two.bag", "--model", tmp_path / "m.ply", "--json")
+    checks = {check["about"]: check for check in json.loads(done.out)["checks"]}
+    assert (checks["topic"]["option"], checks["unit"]["option"]) == ("--topic /camera", "--model-unit inch")
 
 
 def test_some_background_around_the_target_is_not_taken_for_a_unit(surface):

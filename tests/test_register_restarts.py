@@ -197,6 +197,15 @@ def test_a_pose_beside_the_truth_is_left_along_the_valley():
     assert np.degrees(geometry.angle((T_ac.inverse() @ moved.inverse()).q)) < 1.5
 
 
+def test_a_pose_with_one_point_on_the_model_has_no_valley():
+    """One inlier has no radius about its own mean, so that rotations have no scale."""
+    surface, T_ac = boxes(), example_pose()
+    scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))[:40]
+    scan[1:] += [0.0, 0.0, 50.0]
+    kept = Registrar(surface)._restarter.along_valley(scan, T_ac.inverse())
+    assert kept.t.tobytes() == T_ac.inverse().t.tobytes()
+
+
 def test_a_target_of_another_size_is_said_and_covered():
     surface, T_ac = boxes(), example_pose()
     grown = replace(surface, vertices=1.05 * surface.vertices)

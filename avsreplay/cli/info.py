@@ -16,7 +16,7 @@ from avsreplay.cli.options import check_outputs, pose_options, read_options, sou
 if TYPE_CHECKING:
     from avsreplay.log import ClockSummary, LogInfo, Loss, Source
     from avsreplay.log.doctor import Finding, Repaired
-    from avsreplay.preflight import Advice
+    from avsreplay.model_size import Advice
     from avsreplay.report.table import Table
 
 WIDTH = 120  # fixed if the output is not a terminal, so that the text is always the same
@@ -78,11 +78,16 @@ def _advice(opened: Source, built: bool) -> list[Advice]:
     """
     from avsreplay.errors import AvsError
     from avsreplay.log import open_source
-    from avsreplay.preflight import Advice, preflight
+    from avsreplay.log.index import CLOUD_TYPES
+    from avsreplay.model_size import Advice
+    from avsreplay.preflight import preflight
 
     info = opened.info()
+    topics = [topic.name for topic in info.topics if topic.type in CLOUD_TYPES and topic.count]
+    if not info.cloud_topic and len(topics) > 1 and not opened.options.poses:
+        return _advice_of_topics(opened, built, topics)
     if info.cloud_topic or info.scans:
-        found = preflight(opened, opened.header.surface)
+        found = preflight(opened, opened.header.surface, search=True)
         text = "'avsreplay run' builds it from the scans if these show several sides of the target"
         auto = Advice("ok", "model", text, "--model auto")
         return [auto if built and a.about == "model" else a for a in found]
@@ -91,6 +96,26 @@ def _advice(opened: Source, built: bool) -> list[Advice]:
     except AvsError as error:
         return [Advice("fail", "scans", f"{error.what}; {error.hint}" if error.hint else error.what)]
     return []
+
+
+def _advice_of_topics(opened: Source, built: bool, topics: list[str]) -> list[Advice]:
+    """The checks of the topic of clouds in which the model is found, or its size fits, and the option that selects it.
+
+    At most four topics are examined.
+    """
+    from avsreplay.log import open_source
+    from avsreplay.log.bytes_io import shown
+    from avsreplay.model_size import Advice
+
+    checked = dict[str, list[Advice]]()
+    for topic in topics[:4]:
+        with open_source(opened.path, dataclasses.replace(opened.options, topic=topic), inspect=True) as source:
+            checked[topic] = _advice(source, built)
+    wrong = {"size": 1, "pose": 2, "scans": 3}
+    best = min(checked, key=lambda name: sum(wrong.get(a.about, 0) for a in checked[name] if a.grade != "ok"))
+    others = ", ".join(shown(topic) for topic in topics if topic != best)
+    text = f"{len(topics)} topics have clouds; the next findings are those of {shown(best)}, not of {others}"
+    return [Advice("check", "topic", text, f"--topic {shown(best)}"), *checked[best]]
 
 
 def _document(info: LogInfo) -> dict[str, Any]:
@@ -127,6 +152,9 @@ def _print(info: LogInfo, advice: list[Advice]) -> None:
     print_table(console, _topics(info))
     print_table(console, _faults(info))
     print_table(console, _checks(advice))
+    options = [a.option for a in advice if a.option and not any(w.isupper() and w.isalpha() for w in a.option.split())]
+    if len(options) > 1:
+        click.echo(f"options to add: {' '.join(dict.fromkeys(options))}")
     for loss in info.losses:
         print_line(console, "lost: " + loss_line(loss))
 

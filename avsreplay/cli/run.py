@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Generator, Sequence
 
     from avsreplay.log import GrowingLog
-    from avsreplay.preflight import Advice
+    from avsreplay.model_size import Advice
     from avsreplay.report.golden import GoldenResult
     from avsreplay.report.summary import Summary
     from avsreplay.report.verdict import RunVerdict
@@ -224,9 +224,8 @@ def _replayed(run: Run, advice: list[Advice], target: ResultDirectory | None, wa
         if interrupted:
             record["interrupted_after"] = len(rows)
             how = "; add --resume to continue" if target and not growing else ""
-            click.echo(
-                f"avsreplay: interrupted; the results of {len(rows)} of {len(run)} scans are kept{how}", err=True
-            )
+            text = f"interrupted; the results of {len(rows)} of {len(run)} scans are kept{how}"
+            click.echo(f"avsreplay: {text}", err=True)
         if keeper:
             keeper.finish(rows, record, resumable=interrupted and not growing)
     return _Finished(rows, summary, record, verdict_of(rows, summary, record), (len(rows) - kept) / seconds)
@@ -242,8 +241,8 @@ def _resumed(run: Run, keeper: ResultWriter) -> list[Row]:
 
 
 def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
-    """Return the findings on the model from the rows, unless its size is wrong; they are also printed on stderr."""
-    if any(a.about in ("unit", "size") for a in advice):
+    """Return the findings on the model from the rows unless size or background explain them; also said on stderr."""
+    if any(a.about in ("unit", "size") or (a.about == "background" and a.grade == "fail") for a in advice):
         return ()
     notes = run.model_check.notes()
     for note in notes:

@@ -151,10 +151,25 @@ class PoseTrack:
         self._order: list[int] | None = None
         self._sorted: list[int] = []
         self.damaged = 0
-        self.frames: tuple[str, str] | None = None
+        self.frame = ""  # in which the poses are given, by the first message
 
     def __len__(self) -> int:
         return len(self._times)
+
+    def uncovered(self, times_ns: Sequence[int]) -> tuple[str, bool]:
+        """Return why none of some times has a pose, and whether that is the width of the gaps between the poses.
+
+        Args:
+            times_ns: at least one time without a pose [ns], ascending.
+        """
+        if not self._times:
+            return "", False
+        first, last = min(self._times), max(self._times)
+        if any(first <= t_ns <= last for t_ns in times_ns):
+            return f": gaps between the true poses exceed {self._gap_ns * 1e-9:g} s", True
+        if first > times_ns[0]:
+            return f": they begin {(first - times_ns[0]) * 1e-9:.6g} s after the first of them", False
+        return f": they end {(times_ns[0] - last) * 1e-9:.6g} s before the first of them", False
 
     def take(self, kind: str, encoding: str, log_ns: int, payload: bytes | memoryview) -> None:
         """Add a pose message (a Sink); one that cannot be decoded is counted in ``damaged``."""
@@ -163,7 +178,7 @@ class PoseTrack:
         except BadMessage:
             self.damaged += 1
             return
-        self.frames = self.frames or (found.parent, found.child)
+        self.frame = self.frame or found.parent
         unset = found.t_ns == 0 and log_ns > self._gap_ns
         self.add(log_ns if self._by_log or unset else found.t_ns, found.pose, found.twist)
 

@@ -9,15 +9,17 @@ from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.clock import Placed, place
-from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
+from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import Cloud
 from avsreplay.log.streams import CloudStream, GroundTruth, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
@@ -134,13 +136,13 @@ class Source:
         return ahead(scans, prefetch) if prefetch else scans
 
     def scan_at(self, seq: int) -> Scan:
-        """Return one selected scan.
+        """Return one selected scan, without points and with the status DAMAGED if it cannot be decoded.
 
         Args:
             seq: index among the selected scans, from 0.
 
         Returns:
-            The scan; without points and with the status DAMAGED if it cannot be decoded.
+            The scan.
 
         Raises:
             IndexError: there is no such scan.
@@ -159,6 +161,33 @@ class Source:
         lookup, place = self._ground_truth.truth, self._selected[scan.seq]
         pose = None if lookup is None else lookup(scan.t_ns, place, scan.frame)
         return Truth(pose, self._body_at(scan.t_ns), self._fault(scan.log_ns))
+
+    def truth_problem(self, scans: Sequence[Scan]) -> tuple[str, str] | None:
+        """Return why none of some scans has a true pose, or why the errors would refer to another frame.
+
+        Args:
+            scans: scans of this source.
+
+        Returns:
+            The problem and the option that may solve it, "" if there is none; None without a problem.
+        """
+        track, options = self._ground_truth.track, self.options
+        if all(self.truth_of(scan).pose is None for scan in scans):
+            why, gap = ("", False) if track is None else track.uncovered([scan.t_ns for scan in scans])
+            stamps = why and not gap and options.truth_file is None and options.clock is ClockChoice.HEADER
+            option = "--truth-gap SECONDS" if gap else "--clock log" if stamps else ""
+            return (f"none of the {len(scans)} examined scans has a true pose{why}", option) if scans else None
+        at = "" if track is None or options.truth_file or options.sensor_topic else track.frame.lstrip("/")
+        clouds, frames = (options.fixed_frame or scans[0].frame).lstrip("/"), self._ground_truth.frames
+        transforms = any(topic.type.endswith("TFMessage") and topic.count for topic in self._clouds.topics())
+        if at in ("", clouds) or not clouds or not (at in frames if frames else transforms):
+            return None
+        return f"the true poses are in '{shown(at)}', the clouds in '{shown(clouds)}'", f"--fixed-frame {shown(at)}"
+
+    def in_own_frame(self, scan: Scan) -> NDArray[Any]:
+        """Return the points (n, 3) of a scan in the frame of its cloud, to which crops refer [m]."""
+        moved = len(scan.points) and self._ground_truth.sensor is not None
+        return self._sensor(scan.t_ns, scan.frame).inverse().apply(scan.points) if moved else scan.points
 
     def moving_in(self, frame: str) -> str | None:
         """Return the root frame in which a frame moves; None if it is fixed or the transforms were not collected.

@@ -237,7 +237,7 @@ TruthLookup = Callable[[int, int, str], Pose | None]
 class GroundTruth:
     """Lookups by time for one source; None if it has no such data. ``track`` is the truth if it is a single track.
 
-    ``moving_in`` gives the root frame in which a frame moves, where the transforms were collected.
+    Where the transforms were collected, ``moving_in`` gives the root in which a frame moves, and ``frames`` all names.
     """
 
     truth: TruthLookup | None = None
@@ -245,6 +245,7 @@ class GroundTruth:
     body: PoseTrack | None = None
     sensor: Callable[[int, str], Pose | None] | None = None
     moving_in: Callable[[str], str | None] = lambda _frame: None
+    frames: Sequence[str] = ()
 
 
 @dataclass(slots=True)
@@ -292,7 +293,7 @@ class TruthCollector:
         """Return the lookups, after the log was read."""
         truth, track = self._truth_lookup()
         body = self._body if len(self._body) else None
-        return GroundTruth(truth, track, body, self._sensor_lookup(), self._tf.moving_in)
+        return GroundTruth(truth, track, body, self._sensor_lookup(), self._tf.moving_in, self._tf.frames())
 
     @property
     def _wants_tf(self) -> bool:

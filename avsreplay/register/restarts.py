@@ -31,6 +31,7 @@ FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes 
 TURN_RAD = np.radians(4.0)
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # neighbouring points: those in a cube of this side; cubes along the extent, at least
 SHARED = 0.5  # of the rms distance; a correct pose of a correct model has less than 0.4 in common to neighbours
+LEAST_TO_DETERMINE = 6  # points that determine a pose; fewer have no radius about their mean
 VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
 BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
 PASS_WORK = 1000  # fixed cost of a pass of a restart, in point searches
@@ -257,8 +258,10 @@ class Restarter:
         on = here.distance < gate
         facing = target.visibility.camera_c(index, few, T_ca) is not None
         sums = index.normal_equations(few, T_ca, gate, facing=facing)
-        centre = T_ca.apply(few[on]).mean(axis=0) if on.any() else self._middle
-        info, radius = scaled_information(sums.info, max(1, sums.inliers), centre)
+        if sums.inliers < LEAST_TO_DETERMINE:
+            return T_ca
+        centre = T_ca.apply(few[on]).mean(axis=0)
+        info, radius = scaled_information(sums.info, sums.inliers, centre)
         floor = np.linalg.eigh(info)[1][:, :2].T
         steps = 0.5 * gate * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
         tried = [T_ca]

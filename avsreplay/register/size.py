@@ -30,6 +30,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.register.surface_index import SurfaceIndex
 
 LEAST_RESIDUALS = 50
+GROUPED = 3000  # points of a scan in which connected groups are looked for
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
 LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta| that is reported, by itself and in standard errors
 UNSEEN_ERROR = 0.03  # a view in which a larger error would not be significant does not determine the size
@@ -272,3 +273,28 @@ def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:
     first = points[np.argmax(away)]
     second = points[np.argmax(np.linalg.norm(points - first, axis=1))]
     return float(np.linalg.norm(points - second, axis=1).max())
+
+
+def part_of_size(points: NDArray[Any], size_m: float, share: tuple[float, float], gap: float = 0.1) -> Array | None:
+    """Return the largest connected group of points with the size of the model.
+
+    Args:
+        points: (n, 3) [m]; about ``GROUPED`` of them are examined.
+        size_m: diameter of the model [m].
+        share: least and largest diameter of the group over ``size_m``.
+        gap: largest distance over ``size_m`` between neighbours of one group.
+
+    Returns:
+        The points (k, 3) [m]; None if no group of at least ten points, and of 1 % of them, has the size.
+    """
+    from scipy.sparse import csr_matrix
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
+    few = np.asarray(points[:: max(len(points) // GROUPED, 1)], dtype=np.float64)
+    edges = cKDTree(few).query_pairs(gap * size_m, output_type="ndarray")
+    graph = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(few), len(few)))
+    _, member = connected_components(graph, directed=False)
+    groups = [few[member == k] for k in np.flatnonzero(np.bincount(member) >= max(10, len(few) // 100))]
+    fitting = [group for group in groups if share[0] <= diameter(group, trimmed=False) / size_m <= share[1]]
+    return max(fitting, key=len, default=None)

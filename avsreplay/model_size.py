@@ -1,0 +1,273 @@
+"""Size of the scans against that of the model: unit, background and crop, each with the option to add.
+
+Sizes are compared as diameters (largest distance between two points), which do not depend on the attitude. A scan shows
+one side of the target, so that its diameter is between about 0.4 and 1.1 of the model's. Where sizes permit several
+units, a search for the pose decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay.geometry import Array
+from avsreplay.log import SourceOptions
+from avsreplay.log.header import scaled
+from avsreplay.log.options import Unit
+from avsreplay.records import AlignStatus, Surface
+from avsreplay.register import RegisterParams, Registrar
+from avsreplay.register.size import diameter, part_of_size
+
+_LEAST, _MOST = 0.25, 1.3  # diameter of a scan over that of the model outside which something is wrong
+_WHOLE = 1.1  # no scan of the target alone is larger than this
+_FEW = 0.02  # share of background below which it does not explain too large a scan
+_MOST_BACKGROUND = 0.5  # share of background from which on scans are rejected for too few inliers
+_LEFT_OVER = 2.0  # below this ratio, background explains too large a scan better than feet (3.28) do
+_FEET = 0.36  # below this ratio, a model in feet explains the sizes as well as a view from a narrow side
+_LARGEST_TARGET_M = 500.0
+_ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
+SEARCHED, SEARCHED_SCANS = 20_000, 3  # points of a scan in which the model is searched, and scans
+_SCENE = 0.11  # factor of a unit from which on a scan that seems to show the target only may show its surroundings
+_LARGEST_SCENE = 300.0  # largest scan over the target in it, where the unit of the model is unknown
+_GAPS = 0.2, 0.3  # gaps within and around a target of unknown unit, over its diameter
+_MARGIN = 0.25  # space around the target in a suggested crop, over the model's diameter
+_UNITS = {
+    0.001: "millimetres",
+    1.0: "metres",
+    1000.0: "kilometres, or the scans are in millimetres",
+    0.01: "centimetres",
+    100.0: "units of 100 m, or the scans are in centimetres",
+    0.0254: "inches",
+    39.3701: "units of 39.37 m, or the scans are in inches",
+    0.3048: "feet",
+    3.28084: "units of 3.28 m, or the scans are in feet",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """One finding.
+
+    Attributes:
+        grade: "ok", "check" or "fail".
+        about: what was checked.
+        text: what was found.
+        option: the exact option to add, "" if there is none.
+    """
+
+    grade: str
+    about: str
+    text: str
+    option: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """The finding with its option."""
+        return f"{self.text}; add {self.option}" if self.option else self.text
+
+
+def compare_sizes(
+    clouds: Sequence[NDArray[Any]], surface: Surface | None, registrar: Registrar | None, options: SourceOptions
+) -> list[Advice]:
+    """Compare the size of scans with that of the model.
+
+    Args:
+        clouds: finite points (n, 3) of some scans in the frame of the sensor [m].
+        surface: model of the target, None if there is none.
+        registrar: of the model; one is made if it is None and needed.
+        options: how the log is read: unit and crop.
+
+    Returns:
+        The findings.
+    """
+    if not clouds:
+        cropped = options.crop_range is not None or options.crop_box is not None
+        empty = "no points are left in the examined scans; widen the crop"
+        return [Advice("check", "scans", empty if cropped else "the examined scans hold no points")]
+    scan_m = float(np.median([diameter(cloud) for cloud in clouds]))
+    if surface is None:
+        text = f"there is no model; the scans measure {_metres(scan_m)}"
+        return [Advice("fail", "model", text, "--model FILE or --model auto")]
+    model_m = diameter(surface.vertices, trimmed=False)
+    ratio = scan_m / model_m if model_m else np.inf
+    said = f"the scans measure {_metres(scan_m)}, the model {_metres(model_m)}"
+    unit = options.model_unit.metres
+    if _LEAST <= ratio <= _WHOLE:
+        groups = _grouped_units(clouds, model_m, ratio, unit, most=_SCENE)
+        other = groups and _unit_advice({unit: [], **groups}, clouds, surface, unit, said)
+        return other or [_agreeing(said, scan_m, ratio)]
+    whole = _units(ratio, unit)
+    left = ratio < _LEFT_OVER or not whole  # background, not a wrong unit, explains the size
+    if ratio > _MOST and left and (found := _located(clouds, surface, registrar)):
+        why = f"the model was found in {len(found)} of {len(clouds)} examined scans"
+        among = Advice("ok", "size", f"{said}; {why}, among other points")
+        return [_crop_advice(clouds, found, why) or among]
+    targets = [part_of_size(cloud, model_m, _ONE_SIDE) for cloud in clouds] if ratio > _MOST else []
+    inside = [points for points in targets if points is not None]
+    if ratio > _LEFT_OVER and len(inside) * 2 <= len(clouds):
+        inside = _groups(clouds, model_m)
+    grouped = len(inside) * 2 > len(clouds)
+    if grouped and (crop := _crop_advice(clouds, inside, _of_size(model_m))):
+        return [crop]
+    if grouped or _WHOLE < ratio <= _MOST:
+        text = f"{said}: the model is too small (then --model-scale {ratio:.2f} or more), or background is left"
+        return [Advice("check", "size", text)]
+    if _MOST < ratio < _LEFT_OVER:
+        text = f"{said}: points around the target seem to be left; a narrower --crop-box or --crop-range removes them"
+        return [Advice("check", "background", text)]
+    units = {**dict.fromkeys(whole, ()), **_grouped_units(clouds, model_m, ratio, unit)}
+    if not units:
+        hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (ratio > _MOST)
+        return [Advice("fail", "size", f"{said}; no common unit explains the difference{hint}")]
+    return _unit_advice(units, clouds, surface, unit, said)
+
+
+def find_model(
+    clouds: Sequence[NDArray[Any]], surface: Surface, found: Sequence[Advice], options: SourceOptions
+) -> list[Advice]:
+    """Look for the model in some scans, which may show other objects too.
+
+    Args:
+        clouds: as for ``compare_sizes``.
+        surface: model of the target.
+        found: findings of ``compare_sizes``; the unit that they suggest is used.
+        options: how the log is read.
+
+    Returns:
+        One finding: the number of scans in which the model is found.
+    """
+    named = [advice.option.split()[-1] for advice in found if advice.option.startswith("--model-unit ")]
+    scale = Unit(named[0]).metres if named and " " not in named[0] else options.model_unit.metres
+    model = scaled(surface, scale / options.model_unit.metres)
+    few = _few(clouds)
+    one, any_pose = _fitting(few, model)
+    text = f"the model is found in {any_pose} of {len(few)} searched scans"
+    if not any_pose:
+        return [Advice("check", "pose", f"{text}: is it the right model, and does the topic show the target?")]
+    return [Advice("ok", "pose", text + ("" if one else ", each time in more than one pose"))]
+
+
+def _few(clouds: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
+    """Points of scans in which the model is searched."""
+    chosen = np.unique(np.linspace(0, len(clouds) - 1, SEARCHED_SCANS).astype(int)).tolist()
+    return [clouds[k][:: max(len(clouds[k]) // SEARCHED, 1)] for k in chosen]
+
+
+def _agreeing(said: str, scan_m: float, ratio: float) -> Advice:
+    """Sizes that agree, though both may be in millimetres, or the model in feet."""
+    if scan_m > _LARGEST_TARGET_M:
+        text = f"{said}: if both are in millimetres, all lengths are 1000 times too large; convert them to metres"
+        return Advice("check", "unit", text)
+    feet = "; if more than a narrow side is seen, the model is in feet (--model-scale 0.3048)"
+    return Advice("ok", "size", said + feet * (ratio < _FEET))
+
+
+def _unit_option(scale: float, given: float) -> str:
+    unit = next((unit for unit in Unit if unit.metres == scale), None)
+    return (
+        f"{'--model-unit m ' * (given != 1.0)}--model-scale {scale:g}" if unit is None else f"--model-unit {unit.value}"
+    )
+
+
+def _units(ratio: float, given: float) -> list[float]:
+    """Units in which the model has the size of the scans, best first; ``ratio`` is that with the ``given`` unit."""
+    low, high = _ONE_SIDE
+    fitting = [scale for scale in _UNITS if scale != given and low <= ratio * given / scale <= high]
+    return sorted(fitting, key=lambda scale: abs(np.log(ratio * given / scale / 0.9)))
+
+
+def _grouped_units(
+    clouds: Sequence[NDArray[Any]], model_m: float, ratio: float, given: float, most: float = np.inf
+) -> dict[float, Sequence[Array]]:
+    """Units, at most ``most`` times the given one, in which groups of points in most scans have the model's size."""
+    units = dict[float, Sequence[Array]]()
+    for scale in _UNITS:
+        factor = scale / given
+        if scale == given or factor > most or not _MOST < ratio / factor < _LARGEST_SCENE:
+            continue
+        if len(groups := _groups(clouds, factor * model_m)) * 2 > len(clouds):
+            units[scale] = groups
+    return units
+
+
+def _groups(clouds: Sequence[NDArray[Any]], size_m: float) -> list[Array]:
+    """Groups of points of a size, one of a scan; a group that grows with the gap is a part of something larger."""
+    found = [[part_of_size(cloud, size_m, _ONE_SIDE, gap) for gap in _GAPS] for cloud in clouds]
+    return [one for one, two in found if one is not None and two is not None and len(two) < 1.2 * len(one)]
+
+
+def _unit_advice(
+    units: Mapping[float, Sequence[Array]], clouds: Sequence[NDArray[Any]], surface: Surface, given: float, said: str
+) -> list[Advice]:
+    """The unit, and the crop around its groups of points; empty if it is the given one.
+
+    Between several units the registration decides: that in which most scans fit the model, the first of equal ones.
+    """
+    scale, groups = next(iter(units.items()))
+    if len(units) > 1:
+        few = _few(clouds)
+        fits = {each: _fitting(few, scaled(surface, each / given))[0] for each in units}
+        scale, groups = max(units.items(), key=lambda item: fits[item[0]])
+    if scale == given:
+        return []
+    unit = Advice("fail", "unit", f"{said}: the model seems to be in {_UNITS[scale]}", _unit_option(scale, given))
+    size = scale / given * diameter(surface.vertices, trimmed=False)
+    crop = _crop_advice(clouds, groups, _of_size(size)) if groups else None
+    return [unit, crop] if crop else [unit]
+
+
+def _fitting(clouds: Sequence[NDArray[Any]], surface: Surface) -> tuple[int, int]:
+    """The numbers of scans in which a search finds one pose of the model, and one pose or more."""
+    registrar = Registrar(surface, RegisterParams(index_cache=False))
+    found = [registrar.acquire(cloud) for cloud in clouds]
+    return sum(each.status is AlignStatus.ALIGNED for each in found), sum(each.measured for each in found)
+
+
+def _of_size(model_m: float) -> str:
+    return f"a group of points has the size of the model ({_metres(model_m)})"
+
+
+def _located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Registrar | None) -> list[Array]:
+    """The model's vertices where a search finds them in the scans; empty if they are found in less than half of them.
+
+    The search looks at the connected parts of the scan with the size of the model, and tests every pose: size alone
+    does not distinguish the target from other objects.
+    """
+    registrar, found = registrar or Registrar(surface), []
+    for k, cloud in enumerate(clouds):
+        pose = registrar.acquire(cloud[:: max(len(cloud) // SEARCHED, 1)])
+        if pose.measured:
+            found.append(pose.T_ac.apply(surface.vertices))
+        if 2 * (k + 1 - len(found)) > len(clouds):
+            return []
+    return found
+
+
+def _crop_advice(clouds: Sequence[NDArray[Any]], targets: Sequence[Array], why: str) -> Advice | None:
+    """The crop that keeps the target in all examined scans; None if hardly any point lies outside it."""
+    margin = _MARGIN * max(diameter(points, trimmed=False) for points in targets)
+    ranges = [np.linalg.norm(points, axis=1) for points in targets]
+    low, high = max(min(r.min() for r in ranges) - margin, 0.0), max(r.max() for r in ranges) + margin
+    everything = np.concatenate([np.asarray(cloud, dtype=np.float64) for cloud in clouds])
+    away = np.linalg.norm(everything, axis=1)
+    by_range = (away >= low) & (away <= high)
+    corner = np.min([points.min(axis=0) for points in targets], axis=0) - margin
+    other = np.max([points.max(axis=0) for points in targets], axis=0) + margin
+    by_box = ((everything >= corner) & (everything <= other)).all(axis=1)
+    box = ",".join(f"{v:.2f}" for v in (*corner, *other))
+    use_range = by_range.mean() <= 1.2 * by_box.mean()
+    option = f"--crop-range {low:.2f},{high:.2f}" if use_range else f"--crop-box {box}"
+    share = 1.0 - (by_range if use_range else by_box).mean()
+    if share < _FEW:
+        return None
+    text = f"{100 * share:.0f} % of the points are background; {why}"
+    return Advice("fail" if share > _MOST_BACKGROUND else "check", "background", text, option)
+
+
+def _metres(length: float) -> str:
+    """Three significant figures without an exponent."""
+    return f"{float(f'{length:.3g}'):.10g} m"
