@@ -31,7 +31,6 @@ FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes 
 TURN_RAD = np.radians(4.0)
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # neighbouring points: those in a cube of this side; cubes along the extent, at least
 SHARED = 0.5  # of the rms distance; a correct pose of a correct model has less than 0.4 in common to neighbours
-LEAST_TO_DETERMINE = 6  # points that determine a pose; fewer have no radius about their mean
 VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
 BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
 PASS_WORK = 1000  # fixed cost of a pass of a restart, in point searches
@@ -255,10 +254,9 @@ class Restarter:
         few = points[:: max(1, len(points) // VALLEY_POINTS)]
         here = self.measure(few, T_ca)
         gate, width = target.limits.gate_m, self.width(here)
-        on = here.distance < gate
-        facing = target.visibility.camera_c(index, few, T_ca) is not None
-        sums = index.normal_equations(few, T_ca, gate, facing=facing)
-        if sums.inliers < LEAST_TO_DETERMINE:
+        on, camera_c = here.distance < gate, target.visibility.camera_c(index, few, T_ca)
+        sums = index.normal_equations(few, T_ca, gate, facing=camera_c is not None)
+        if min(sums.inliers, int(on.sum())) < 6:  # fewer do not determine a pose
             return T_ca
         centre = T_ca.apply(few[on]).mean(axis=0)
         info, radius = scaled_information(sums.info, sums.inliers, centre)
@@ -268,7 +266,6 @@ class Restarter:
         for step in np.multiply.outer(steps, floor).reshape(-1, 6):
             turn = geometry.exp(step[:3] / radius)
             tried.append(Pose(turn, centre + step[3:] - geometry.matrix(turn) @ centre) @ T_ca)
-        camera_c = target.visibility.camera_c(index, few, T_ca)  # the steps are short
         moved = np.concatenate([each.apply(few) for each in tried])
         d2 = index.closest(moved, camera_c=camera_c, most_m=width).d2.reshape(len(tried), -1)
         return tried[int(np.argmin(np.minimum(d2, width**2).mean(axis=1)))]
