@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tumbling
+from scipy.stats import chi2
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator, EstimatorParams, dynamics
 from avsreplay.estimate.batch_covariance import propagate_chart
-from avsreplay.estimate.chart import to_chart, to_errors
+from avsreplay.estimate.chart import nees, to_chart, to_errors
 from avsreplay.estimate.measurement import (
     chart_update,
     in_camera,
@@ -20,8 +23,9 @@ from avsreplay.estimate.measurement import (
 )
 from avsreplay.estimate.mixture import Component, carried, moments, not_worse, worn
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
+from avsreplay.estimate.track import Track
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Belief, State
+from avsreplay.records import Belief, Reason, State, Verdict
 
 C = np.diag(np.repeat([1e-3, 2e-3], 3) ** 2)
 ROOT = np.linalg.inv(np.linalg.cholesky(C))
@@ -132,3 +136,41 @@ def test_a_fit_is_corrected_by_its_last_pose_where_it_is_less_precise_than_that_
     assert moved == pytest.approx(asked, abs=2e-3 * np.abs(white @ off).max())
     precise = (Component(1.0, 1.0, T_NS, to_chart(x), 1e-3 * P * 0.1),)
     assert not_worse(precise, T_NS, pose, 1.1 * C, 1.0, (0.0, 0.0)) is precise
+
+
+def after_scans(times: Array, states: list[State], seed: int) -> tuple[Estimator, Track]:
+    """A cold estimate after poses of 2 mm and 0.1 deg."""
+    rng, estimator = np.random.default_rng(seed), Estimator(EstimatorParams(), None, 4.0)
+    track = estimator.initial(0, states[0].T_ac)
+    for t, x in zip(times, states, strict=True):
+        prediction = estimator.predict(track, round(t * 1e9))
+        seen = estimator.innovate(prediction, tumbling.alignment(x.T_ac, rng, 2e-3, np.radians(0.1)))
+        track, _ = estimator.step(track, prediction, seen, Verdict(1, Reason.OK), False)
+    return estimator, track
+
+
+@pytest.mark.parametrize("seed", [41, 43, 44])
+def test_a_gap_before_convergence_leaves_the_estimate_consistent(seed: int) -> None:
+    """Poses for 20 s, then none for 30 s; about the mean alone NEES is 150 to 1,100."""
+    world = tumbling.draw(seed, seconds=50.0, hz=2.0, sigma_max=0.85)
+    estimator, track = after_scans(world.times[:41], world.states[:41], seed)
+    assert track.batch is not None
+    assert len(track.batch.components) > 1
+    bound = chi2.ppf(0.999, 20)
+    at_once = estimator.predict(track, round(world.times[-1] * 1e9)).belief
+    assert nees(at_once, world.states[-1]) < bound
+    for t in world.times[41:]:
+        track = estimator.update(track, estimator.predict(track, round(t * 1e9)), None, 0)
+    assert nees(track.belief, world.states[-1]) < bound
+
+
+def test_no_weight_of_a_mixture_in_a_pure_spin_is_negative() -> None:
+    """More than three directions are not Gaussian: the weights of Gauss-Hermite would give the mean a negative one."""
+    world = tumbling.draw(54, seconds=60.0, hz=1.0, sigma_max=0.85)
+    spin = replace(world.states[0], w_b=np.array([0.0, 0.1, 0.0]))
+    _, track = after_scans(world.times, tumbling.follow(world.times, world.moments, spin), 54)
+    assert track.batch is not None
+    weights = np.array([c.quadrature for c in track.batch.components])
+    assert len(weights) > 7
+    assert weights.min() >= 0.0
+    assert weights.sum() == pytest.approx(1.0)

@@ -46,7 +46,7 @@ class FitParams(Settings):
         1.0, "Smallest factor by which the correlation of pose errors in time inflates their covariance.", above=0.0
     )
     try_directions: int = setting(
-        3, "Number of directions, least observable first, in which the profile likelihood is tested.", low=0
+        5, "Number of directions, least observable first, in which the profile likelihood is tested.", low=0
     )
     bend_max: float = setting(
         2.0, "Ratio of the cost at 2 sigma to that of a Gaussian from which a direction is non-Gaussian.", above=0.0

@@ -5,7 +5,8 @@ cost is curved within 1 sigma of its minimum. The curvature at the minimum then 
 compared with the Gaussian one at two sigma along each of the weakest directions. Along a non-Gaussian direction the fit
 is repeated with that direction fixed on either side (profile likelihood), where the cost, minimised over all others,
 has risen by 3/2, as at root three sigma of a Gaussian. With the Gauss-Hermite weights 1/6, 4/6, 1/6 the three fits and
-their remaining covariances have the second moments. Each of them is propagated to the requested instant.
+their remaining covariances have the second moments. Of more than three such directions, n, the fits lie at the root of
+n sigma with the weights 1 / (2 n), so that no weight is negative. Each of them is propagated to the requested instant.
 
 The fit takes the motion as deterministic. About its trajectory the problem is linear, so one pass of a Kalman filter
 over the poses, with the disturbance's covariance between them, is the maximum likelihood with process noise. The
@@ -31,9 +32,9 @@ from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
-_NODE, _WEIGHT = np.sqrt(3.0), 1.0 / 6.0
+_LEAST_NODE2 = 3.0  # square of the distance of the profile fits of at most three directions [sigma]
 _TRIAL = 2.0  # distance along a direction at which the cost is compared with the Gaussian one [sigma]
-_RISE, _TRIES, _LOST = 0.5 * _NODE**2, 6, 3.0
+_TRIES, _LOST = 6, 3.0
 _PIN_STEPS, _FEWEST_STEPS = 15, 40  # budget of a fit with one direction fixed, and least budget of all of them
 _PIN_WORK = 12_000  # budget of all of them in steps times poses and pieces
 _PIN_1S = 0.02  # standard deviation of a fixed direction in units of its sigma
@@ -65,11 +66,15 @@ class NonGaussianDirection:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BatchCovariance:
-    """A fit with its non-Gaussian directions: those that could be profiled, and whether there are others."""
+    """A fit with its non-Gaussian directions: those that could be profiled, and whether there are others.
+
+    The profile fits lie at the root of ``node2`` sigma.
+    """
 
     fitted: BatchFit
     directions: tuple[NonGaussianDirection, ...]
     others: bool = False
+    node2: float = _LEAST_NODE2
 
     @property
     def gaussian(self) -> bool:
@@ -87,23 +92,24 @@ def covariance_of(problem: Problem, fitted: BatchFit, params: FitParams) -> Part
     """
     scale = problem.prior.one_sigma
     values, vectors = np.linalg.eigh(fitted.P_chart / np.outer(scale, scale))
+    weakest = zip(values[::-1][: params.try_directions], vectors.T[::-1], strict=False)
+    scaled = [(v * scale * math.sqrt(max(float(value), 0.0)), value) for value, v in weakest]
+    bent = [(axis, axis / scale**2 / value) for axis, value in scaled if _non_gaussian(problem, fitted, params, axis)]
+    node2 = max(_LEAST_NODE2, float(len(bent)))
     directions, others, left = [], False, _affordable_steps(problem, fitted)
-    for value, vector in zip(values[::-1][: params.try_directions], vectors.T[::-1], strict=False):
-        axis = vector * scale * np.sqrt(max(float(value), 0.0))
-        if _non_gaussian(problem, fitted, params, axis):
-            row = vector / scale / np.sqrt(value)  # row @ axis = 1
-            points = []
-            for side in (_NODE, -_NODE):
-                point, steps = _profile(problem, fitted, params, axis, row, side, left)
-                left -= steps
-                if point is None:
-                    others = True  # its part of the covariance stays that of the fit
-                    break
-                points.append(point)
-                yield steps * len(problem.poses)
-            else:
-                directions.append(NonGaussianDirection(row, (points[0], points[1])))
-    return BatchCovariance(fitted, tuple(directions), others)
+    for axis, row in bent:  # row @ axis = 1
+        points = []
+        for side in (math.sqrt(node2), -math.sqrt(node2)):
+            point, steps = _profile(problem, fitted, params, axis, row, side, left)
+            left -= steps
+            if point is None:
+                others = True  # its part of the covariance stays that of the fit
+                break
+            points.append(point)
+            yield steps * len(problem.poses)
+        else:
+            directions.append(NonGaussianDirection(row, (points[0], points[1])))
+    return BatchCovariance(fitted, tuple(directions), others, node2)
 
 
 def _affordable_steps(problem: Problem, fitted: BatchFit) -> int:
@@ -124,13 +130,13 @@ def _non_gaussian(problem: Problem, fitted: BatchFit, params: FitParams, axis: A
 def _profile(
     problem: Problem, fitted: BatchFit, params: FitParams, axis: Array, row: Array, side: float, most: int
 ) -> tuple[ProfilePoint | None, int]:
-    """The fit with the direction fixed where the cost has risen by ``_RISE``: the best of ``_TRIES``, from ``side`` on.
+    """The fit with the direction fixed where the cost has risen by side^2 / 2, the best of ``_TRIES`` from ``side`` on.
 
     A fit that ends far above that begins again nearer to the minimum: it did not follow the valley of the cost. The
     result is None if no fit came near within ``most`` steps, because its covariance would not be that of a point in
     the valley. The number of steps is returned as well.
     """
-    there, found, spent = fitted.chart.moved(side * axis), [], 0
+    there, found, spent, wanted = fitted.chart.moved(side * axis), [], 0, 0.5 * side**2
     for _ in range(_TRIES):
         if spent >= most:
             break
@@ -138,11 +144,11 @@ def _profile(
         there, P, steps = problem.pinned(there, params, pin, min(_PIN_STEPS, most - spent))
         spent += steps
         rise = problem.cost(there) - fitted.half_chi2
-        found.append((abs(float(np.log(max(rise, 1e-9) / _RISE))), ProfilePoint(there, P, pin)))
-        if abs(rise - _RISE) < 0.2 * _RISE:
+        found.append((abs(float(np.log(max(rise, 1e-9) / wanted))), ProfilePoint(there, P, pin)))
+        if abs(rise - wanted) < 0.2 * wanted:
             break
-        side *= float(np.clip(np.sqrt(_RISE / max(rise, 1e-9)), 0.4, 2.5))
-        if rise > _LOST * _RISE:
+        side *= float(np.clip(np.sqrt(wanted / max(rise, 1e-9)), 0.4, 2.5))
+        if rise > _LOST * wanted:
             there = fitted.chart.moved(side * axis)
     near = [f for f in found if f[0] < float(np.log(_LOST))]
     return (min(near, key=lambda f: f[0])[1] if near else None), spent
@@ -241,8 +247,8 @@ def final_mixture(
         unseen: (20, 20) in chart steps at the epoch, added to the covariance of each component (``unseen_torque``).
     """
     fitted, n = found.fitted, len(found.directions)
-    bases: list[tuple[float, Chart, Pin | None]] = [(1.0 - 2.0 * _WEIGHT * n, fitted.chart, None)]
-    bases += [(_WEIGHT, p.chart, p.pin) for d in found.directions for p in d.points]
+    bases: list[tuple[float, Chart, Pin | None]] = [(1.0 - n / found.node2, fitted.chart, None)]
+    bases += [(0.5 / found.node2, p.chart, p.pin) for d in found.directions for p in d.points]
     out, rows = [], [d.row for d in found.directions]
     added = np.zeros((DIM, DIM)) if unseen is None else _fixed(unseen, rows)
     recent = Problem(latest, problem.prior, fitted.effective)

@@ -54,6 +54,8 @@ _RECENT = 0.1  # largest age of a given start over the fit's memory; until then 
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
 _LEAST_TORQUE = 1e-6  # a fit looks back as far as this torque noise allows, even without disturbances [rad/s^1.5]
 _LONGEST_S = 1e9  # longest memory, which is converted to 64-bit nanoseconds
+_GAP = 2  # intervals between poses after which a mixture is propagated by its components
+_NO_POSE = np.zeros((6, 6))  # root of the information of a scan without a pose
 _instant, _scan = attrgetter("t_ns"), attrgetter("scan_ns")
 
 
@@ -97,8 +99,7 @@ class BatchSchedule:
         if last.gaussian:
             belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
             return replace(track, belief=belief)
-        fix, factors = track.fixes[-1], last.factors * np.sqrt(last.inflation)
-        noise = self.noise_levels(track)
+        fix, factors, noise = track.fixes[-1], last.factors * np.sqrt(last.inflation), self.noise_levels(track)
         root = np.linalg.inv(np.linalg.cholesky(fix.C))
         mixture = carried(last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit)
         C = fix.C * np.outer(np.repeat(factors, 3), np.repeat(factors, 3))  # the components may lie further apart
@@ -124,8 +125,7 @@ class BatchSchedule:
     def _at_present(self, track: Track, result: BatchResult) -> BatchResult:
         """The result of a fit, corrected by the later poses of a track."""
         later = track.fixes[bisect_right(track.fixes, result.components[0].t_ns, key=_scan) :]
-        result = with_later_poses(result, later, self.noise_levels(track))
-        return replace(result, count=pose_count(track.fixes))
+        return replace(with_later_poses(result, later, self.noise_levels(track)), count=pose_count(track.fixes))
 
     def _growth(self, last: BatchResult) -> float:
         """The share by which the poses grow until the next fit; a Gaussian likelihood is propagated well in between."""
@@ -174,21 +174,11 @@ class BatchSchedule:
         rejected = track.batch is not None and track.batch.prior_rejected
         begin, given = self.chart_at(track.belief, epoch_ns), None if rejected else self._given(track)
         last = track.batch if track.batch is not None and track.batch.epoch_ns == epoch_ns else None
-        poses, finish = (track.fixes, self._levels(track), last, begin, given), (last is not None,)
-        if not spread:
-            return self.checked(*finish, track, whole(self.check(*poses)))
-        return replace(track, fitting=Computation(ComputationKind.CHECK, poses, finish))
-
-    def check(
-        self,
-        fixes: tuple[PoseFix, ...],
-        levels: NoiseLevels,
-        last: BatchResult | None,
-        start: Chart,
-        given: Prior | None,
-    ) -> Parts[BatchResult]:
-        """The fit with which the filter is compared, in parts; arguments as of ``batch_estimate``."""
-        return batch_estimate(fixes, self.params, self._rules, levels, last, start, given)
+        poses = track.fixes, self.params, self._rules, self._levels(track), last, begin, given
+        finish = (last is not None,)
+        if spread:
+            return replace(track, fitting=Computation(ComputationKind.CHECK, poses, finish))
+        return self.checked(*finish, track, whole(batch_estimate(*poses)))
 
     def checked(self, whole_memory: bool, track: Track, result: BatchResult) -> Track:
         """The track after the comparison with a fit. ``whole_memory``: the fit has all poses of the filter.
@@ -251,10 +241,8 @@ class BatchSchedule:
     def adopted(self, track: Track, result: BatchResult, to_filter: bool) -> Track:
         """The track with the estimate of a fit; ``to_filter``: the filter continues from it."""
         window = filled(self.noise.base(track.R, track.window), result.factors, self.params.window)
-        mode = "filter" if to_filter else "fit"
-        return replace(
-            track, belief=result.belief, mode=mode, window=window, batch=result, since=0, inflation=result.inflation
-        )
+        track = replace(track, mode="filter" if to_filter else "fit", window=window, since=0)
+        return replace(track, belief=result.belief, batch=result, inflation=result.inflation)
 
     def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
         """The poses within the fit's memory, including this one; of many poses the older half is joined in pairs."""
@@ -274,8 +262,7 @@ class BatchSchedule:
         if prediction.blur is not None:
             C = C + prediction.blur
         if lag_ns:
-            then, _ = propagate_state(x, lag_ns * 1e-9)
-            pose = then.T_ac @ x.T_ac.inverse() @ pose
+            pose = propagate_state(x, lag_ns * 1e-9)[0].T_ac @ x.T_ac.inverse() @ pose
         share, weight = innovation.share, innovation.weight
         return PoseFix(prediction.belief.t_ns + lag_ns, pose, C, lag_ns, share, 1, self.orbit, weight)
 
@@ -283,11 +270,24 @@ class BatchSchedule:
         """A belief at another instant with the disturbances of a track, and the transition matrix (20, 20)."""
         return propagated(belief, t_ns, *self.noise_levels(track), self.orbit)
 
+    def predicted(self, track: Track, t_ns: int) -> tuple[Belief, Array]:
+        """The belief of a track at a later instant, and the transition matrix (20, 20) about its mean.
+
+        After a gap a mixture has moved as each of its components has, which a propagation about the mean does not show.
+        """
+        belief, Phi = self.propagated(track, track.belief, t_ns)
+        last, times = track.batch, [fix.t_ns for fix in track.fixes[-2:]]
+        mixed = track.mode == "fit" and last is not None and len(last.components) > 1 and len(times) == 2
+        if last is None or not mixed or t_ns - times[1] <= _GAP * (times[1] - times[0]):
+            return belief, Phi
+        noise = self.noise_levels(track)
+        mixture = carried(last.components, t_ns, belief.x.T_ac, _NO_POSE, NO_INFLATION, 1.0, noise, self.orbit)
+        return moments(mixture), Phi
+
     def chart_at(self, belief: Belief, t_ns: int) -> Chart:
         """The belief's mean propagated to another instant, as a starting point of a fit."""
         arc = None if self.orbit is None else self.orbit.at(belief.t_ns)
-        there, _ = propagate_state(belief.x, (t_ns - belief.t_ns) * 1e-9, arc)
-        return to_chart(there)
+        return to_chart(propagate_state(belief.x, (t_ns - belief.t_ns) * 1e-9, arc)[0])
 
 
 def _better_than_measured(belief: Belief, R: Array) -> bool:
@@ -334,11 +334,11 @@ def with_later_poses(result: BatchResult, fixes: Sequence[PoseFix], noise: tuple
         fixes: later poses, oldest first.
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
     """
+    if not fixes:
+        return result
     mixture, factors = result.components, result.factors * np.sqrt(result.inflation)
     for fix in fixes:
         root = np.linalg.inv(np.linalg.cholesky(fix.C))
         mixture = carried(mixture, fix.t_ns, fix.T_ac, root, factors, fix.weight, noise, fix.orbit)
-    if not fixes:
-        return result
     belief, _ = propagated(moments(mixture), fixes[-1].scan_ns, *noise, fixes[-1].orbit)
     return replace(result, belief=belief, components=mixture)

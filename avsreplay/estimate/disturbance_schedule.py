@@ -15,7 +15,7 @@ from avsreplay.estimate.chart import Chart
 from avsreplay.estimate.drift import DriftFound, find_drift
 from avsreplay.estimate.driven import DrivenBelief, driven_moments
 from avsreplay.estimate.driven_fit import DrivenMotion, driven_motion, levels_of
-from avsreplay.estimate.initialise import BatchResult, PoseFix, improved_levels, pose_count, poses_of
+from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, improved_levels, pose_count, poses_of
 from avsreplay.estimate.measurement import (
     chart_update,
     in_camera,
@@ -59,7 +59,7 @@ class DisturbanceSchedule:
         self.batch, self.params = batch, batch.params
         self._jobs: dict[ComputationKind, tuple[Callable[..., Parts[Any]], Callable[..., Track]]] = {
             ComputationKind.FIT: (batch.fit, batch.fitted),
-            ComputationKind.CHECK: (batch.check, batch.checked),
+            ComputationKind.CHECK: (batch_estimate, batch.checked),
             ComputationKind.LEVELS: (improved_levels, self._levelled),
             ComputationKind.DRIFT: (self._tested, self._driven),
         }

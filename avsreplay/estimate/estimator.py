@@ -108,7 +108,7 @@ class Estimator:
         Raises:
             UsageError: the instant is too far from the last scan to predict the rotation.
         """
-        belief, Phi = self.batch.propagated(track, track.belief, t_ns)
+        belief, Phi = self.batch.predicted(track, t_ns)
         return Prediction(belief, Phi, measurement_jacobian(belief.x), track.window)
 
     def determined(self, track: Track, prediction: Prediction, alignment: Alignment) -> tuple[Track, Prediction]:

@@ -1,8 +1,10 @@
-"""Coasting through blackouts. ``python tests/benchmarks/estimate_blackout.py [--quick]``.
+"""Coasting through blackouts. ``python tests/benchmarks/estimate_blackout.py [--quick] [--early]``.
 
 Random bodies at 0.1 rad/s, seen at 5 Hz with 5 mm and 0.3 deg of white noise for 80 s from a cold start; then nothing.
 For each length: error of the predicted pose at the end, its predicted 1 sigma, share inside 3 sigma (position and
-attitude together, chi-square with 6 degrees of freedom at the 3 sigma level of 99.73 %).
+attitude together, chi-square with 6 degrees of freedom at the 3 sigma level of 99.73 %). ``--early``: gaps long before
+convergence, 24 bodies with 2 mm and 0.1 deg at 2 Hz: NEES per degree of freedom of a propagation about the mean alone,
+and of the estimator.
 """
 
 from __future__ import annotations
@@ -15,12 +17,14 @@ from scipy.stats import chi2
 from watched import fold
 
 from avsreplay.estimate import Estimator, EstimatorParams
+from avsreplay.estimate.chart import nees
 from avsreplay.estimate.measurement import innovation_vector, measurement_jacobian
 from avsreplay.estimate.params import Start
 from avsreplay.monitor.convergence import Convergence, ConvergenceParams
 
 LENGTHS = (5.0, 10.0, 20.0, 30.0, 60.0)
 SEEN_S = 80.0
+EARLY = (10.0, 12.0), (15.0, 12.0), (20.0, 12.0), (20.0, 30.0)  # time with scans, and without [s]
 
 
 def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]]:
@@ -53,11 +57,39 @@ def one(seed: int) -> tuple[bool, list[tuple[float, float, float, float, float]]
     return words[0].converged, found
 
 
+def early(seed: int, seen_s: float, gap_s: float) -> tuple[float, float]:
+    """NEES per degree of freedom at the end of a gap: of a propagation about the mean alone, and of the estimator."""
+    world = tumbling.draw(seed, seconds=seen_s + gap_s, hz=2.0, sigma_max=0.85)
+    seen = int(np.searchsorted(world.times, seen_s, side="right"))
+    lit = tumbling.World(world.times[:seen], world.states[:seen], world.moments)
+    rng, estimator = np.random.Generator(np.random.PCG64([seed, 12])), Estimator(EstimatorParams(), None, 4.0)
+    tests = [Convergence(ConvergenceParams(), 4.0)]
+    for _, _, track, _ in fold(lit, estimator, tests, rng, (0.002, np.radians(0.1))):  # noqa: B007
+        pass
+    then_ns = round(world.times[-1] * 1e9)
+    beliefs = (
+        estimator.batch.propagated(track, track.belief, then_ns)[0],
+        estimator.predict(track, then_ns).belief,
+    )
+    linear, used = (nees(belief, world.states[-1]) / 20.0 for belief in beliefs)
+    return linear, used
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="4 bodies instead of 100")
     parser.add_argument("--seeds", type=int, default=100)
+    parser.add_argument("--early", action="store_true", help="gaps long before convergence")
     given = parser.parse_args()
+    if given.early:
+        for seen_s, gap_s in EARLY:
+            found = np.array([early(seed, seen_s, gap_s) for seed in range(1000, 1024)])
+            cells = [f"{column.mean():.2f} ({column.max():.1f})" for column in found.T]
+            print(
+                f"{seen_s:.0f} s of scans, {gap_s:.0f} s without: about the mean {cells[0]}, used {cells[1]}",
+                flush=True,
+            )
+        return
     runs = [one(seed) for seed in range(4 if given.quick else given.seeds)]
     sure = [found for converged, found in runs if converged]
     print(f"{len(sure)} of {len(runs)} bodies converged at {SEEN_S:.0f} s")
