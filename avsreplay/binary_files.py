@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from avsreplay.errors import UnreadableInput
 
 _MAX_NPY_HEADER = 4096
+_MOST_STATE = 16 << 30
 _LEAST_ARRAYS, _MAX_RATIO = 96 << 20, 8  # arrays may take 96 MiB, or eight times the size of their archive
 _NPY_HEADER = re.compile(
     r"\{\s*'descr':\s*'(?P<descr>[^']{1,8})',\s*'fortran_order':\s*(?P<fortran>True|False),"
@@ -42,24 +43,27 @@ class BadFile(ValueError):
     """A file whose bytes do not match its header or its name."""
 
 
-def read_limited(path: Path, limit: int, hint: str) -> bytes:
-    """Return the bytes of a regular file.
+def read_limited(path: Path, limit: int, hint: str, *, pipe: bool = False) -> bytes:
+    """Return the bytes of a regular file; a device may have no end.
 
     Args:
         path: the file.
         limit: largest size that is accepted [bytes].
         hint: what the error message advises.
+        pipe: whether a pipe is read as well.
 
     Raises:
         UnreadableInput: it is not a regular file, is larger, or cannot be read.
     """
     try:
         found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
+        if not stat.S_ISREG(found.st_mode) and not (pipe and stat.S_ISFIFO(found.st_mode)):
             raise UnreadableInput("is not a regular file", where=str(path), hint=hint)
-        if found.st_size > limit:
+        with path.open("rb") as stream:
+            data = stream.read(limit + 1) if found.st_size <= limit else b""
+        if max(found.st_size, len(data)) > limit:
             raise UnreadableInput(f"larger than {limit >> 20} MiB", where=str(path), hint=hint)
-        return path.read_bytes()
+        return data
     except OSError as error:
         what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
         raise UnreadableInput(what, where=str(path), hint=hint) from None
@@ -210,7 +214,7 @@ def unpack(path: Path, named: Mapping[str, object], like: object = None) -> Any:
         UnreadableInput: the file is missing, damaged, of another version, or contains what a checkpoint never contains.
     """
     try:
-        found = _Unpacker(io.BytesIO(path.read_bytes()), named).load()
+        found = _Unpacker(io.BytesIO(read_limited(path, _MOST_STATE, _HINT)), named).load()
         _check_alike(found, like)
         return found
     except Exception as error:  # a damaged pickle raises almost any error

@@ -32,6 +32,7 @@ from avsreplay.report.result import load_result, write_manifest
 from avsreplay.report.view import CloudView, PathView, View, thin_cloud, thin_surface, write_view
 from avsreplay.rows import Row
 from avsreplay.run import Listener, ReplayedScan, Run
+from avsreplay.settings import dump
 from avsreplay.viewers import NewPaths, ResultLogWriter
 
 CHECKPOINT = "resume.bin"  # checkpoint of an interrupted run
@@ -281,7 +282,7 @@ class ResultWriter:
             hint = "leave out --resume; only a run that was interrupted can be resumed"
             raise UsageError("no interrupted run", where=f"--resume {folder}", hint=hint)
         record = load_result(folder).header
-        different = [name for name, value in facts.items() if record.get(name) != json.loads(json.dumps(value))]
+        different = [name for name, value in facts.items() if record.get(name) != json.loads(json.dumps(dump(value)))]
         if different:
             hint = "give the same options as at first, or start anew with --overwrite"
             what = f"the interrupted run differs in: {', '.join(different)}"

@@ -249,4 +249,6 @@ def dump(value: Any) -> Any:
         return {str(k): dump(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [dump(v) for v in value]
-    return str(value) if isinstance(value, Path) else value
+    if isinstance(value, (str, Path)):  # a name of a file may contain bytes that are not UTF-8
+        return str(value).encode("utf-8", "backslashreplace").decode("utf-8")
+    return value

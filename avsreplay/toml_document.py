@@ -62,9 +62,11 @@ def load(path: str | Path) -> Document:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_BYTES:
+        with path.open("rb") as stream:
+            data = stream.read(MAX_BYTES + 1)  # a pipe or a device has no size
+        if len(data) > MAX_BYTES:
             raise UnreadableInput("larger than 1 MiB, not a settings file", where=str(path), hint="name a TOML file")
-        text = path.read_bytes().decode("utf-8")
+        text = data.decode("utf-8")
     except FileNotFoundError:
         raise UnreadableInput("no such file", where=str(path), hint="check the path") from None
     except UnicodeDecodeError:

@@ -57,6 +57,7 @@ def pinned_script(before: str, **variables: str) -> list[str]:
 @needs_variants
 def test_the_process_starts_once_more_and_keeps_other_tunables():
     lines = pinned_script("", GLIBC_TUNABLES="glibc.malloc.check=0:glibc.cpu.hwcaps=-AVX512F")
+    assert lines[:-1] == ["start", "start"]
     assert lines[-1] == f"pinned glibc.malloc.check=0:{arithmetic.PINS['GLIBC_TUNABLES']}"
     assert len(pinned_script("", **arithmetic.PINS)) == 2, "nothing is started again if the variables are set already"
 

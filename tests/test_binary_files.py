@@ -138,6 +138,23 @@ def test_a_checkpoint_with_another_attribute_is_one_line(fixtures_folder, tmp_pa
         replay(work, tmp_path / "r", resume=True)
 
 
+def test_a_damaged_log_of_an_interrupted_run_is_one_line(fixtures_folder, tmp_path):
+    """A text in a record is no longer UTF-8, and the SHA-256 of the file is made to fit."""
+    work = job(fixtures_folder / "tumble.mcap", n_scans=4)
+    replay(work, tmp_path / "r", 2)
+    path = tmp_path / "r" / "result.mcap"
+    data = path.read_bytes()
+    assert b"/pose" in data[:200_000]
+    path.write_bytes(data.replace(b"std_msgs", b"std\x80msgs"))
+    record = json.loads((tmp_path / "r" / "run.json").read_text())
+    (tmp_path / "r" / "run.json").unlink()
+    write_manifest(tmp_path / "r", record, 2)
+    before = sorted(p.name for p in tmp_path.iterdir())
+    with pytest.raises(UnreadableInput, match="is damaged"):
+        replay(work, tmp_path / "r", resume=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+
+
 @pytest.mark.parametrize("cut", [0, 1, 20, -1])
 def test_a_damaged_checkpoint_is_one_line(tmp_path, cut):
     data = pack_state({"a": np.arange(10.0), "b": Pose.identity()}, {})

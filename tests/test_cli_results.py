@@ -7,6 +7,7 @@ import shutil
 import stat
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import click
@@ -16,6 +17,8 @@ from click.testing import CliRunner, Result
 
 from avsreplay.cli import SUMMARIES, group
 from avsreplay.errors import AvsError, DataLost, UnreadableInput, UsageError
+from avsreplay.log import open_source
+from avsreplay.log.header import surface_bytes
 
 READERS = {
     "report": ("report", "RESULT", "-o", "OUT"),
@@ -118,6 +121,57 @@ def test_no_output_is_another_path_of_its_command(
     assert isinstance(done.exception, UsageError), done.exception
     assert "another output" in str(done.exception) or "exclude each other" in str(done.exception)
     assert not path.exists() or path.read_text() == "mine"
+
+
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    """Limit the memory of the process, so that reading without an end is a MemoryError and does not end the machine."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + (1 << 30), before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+ENDLESS = [
+    *(("run", "LOG", *more) for more in (
+        ("--model", "x.ply"), ("--config", "x.toml"), ("--robot", "x.toml"), ("--truth", "x.tum"),
+        ("--truth", "x.conf"), ("--golden", "x.jsonl"))),
+    ("run", "x.mcap"), ("run", "x.tum", "--backend", "poses"), ("info", "x.bag"), ("doctor", "x.db3"),
+    ("record", "x.toml", "-o", "a.mcap"), ("sweep", "x.toml", "--plan"), ("sweep", "campaign.toml", "--plan"),
+    ("compare", "nothing", "--gate", "x.toml"), ("plan", "nothing", "--robot", "x.toml"), ("report", "x.jsonl"),
+    ("model", "LOG", "--against", "x.ply", "-o", "a.ply"), ("bench", "LOG", "--model", "x.ply"),
+]  # fmt: skip
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the test reads /proc")
+@pytest.mark.usefixtures("little_memory")
+@pytest.mark.parametrize("words", ENDLESS)
+def test_an_input_without_an_end_is_one_line(
+    words: tuple[str, ...], fixtures_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for word in words:
+        if word.startswith("x."):
+            Path(word).symlink_to("/dev/zero")
+    Path("x.mcap").is_symlink() or Path("x.mcap").symlink_to("/dev/zero")
+    Path("campaign.toml").write_text('logs = ["x.mcap"]\n')
+    done = run(*(fixtures_folder / "tumble.mcap" if word == "LOG" else word for word in words))
+    assert isinstance(done.exception, (UnreadableInput, UsageError)), repr(done.exception)
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="other systems have no such names")
+def test_a_result_of_a_log_whose_name_is_not_utf_8_can_be_read(fixtures_folder: Path, tmp_path: Path) -> None:
+    log, model = (tmp_path / f"x{chr(0xDCFF)}{suffix}" for suffix in (".mcap", ".ply"))
+    shutil.copyfile(fixtures_folder / "tumble.mcap", log)
+    with open_source(log) as source:
+        model.write_bytes(surface_bytes(source.header.surface))
+    path = tmp_path / "result"
+    assert run("run", log, "--model", model, "--n-scans", 6, "-o", path).exception is None
+    for command in ("report", "compare", "plan"):
+        done = read(command, path)
+        assert done.exception is None, done.exception
 
 
 @pytest.mark.parametrize("option", ["--golden", "--update-golden"])

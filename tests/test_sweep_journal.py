@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.sweep import Journal
 from avsreplay.sweep.execute import SCAN_COLUMNS, RunResult
+from avsreplay.sweep.journal import RESULTS
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed")
 SCAN = (0, None, True, 1, 0.5, 0.1, 0.9, None, 20.0, 0.01, 1.0)
@@ -57,6 +58,27 @@ def test_a_line_cut_off_anywhere_is_removed_and_its_run_made_again(tmp_path):
             assert journal.damaged == []
             journal.add(result(2, scans=0))
         assert path.read_bytes() == whole
+
+
+def test_what_another_process_has_written_before_the_lock_is_read(tmp_path):
+    late = Journal(tmp_path)
+    with Journal(tmp_path) as journal:
+        journal.add(result(1))
+        journal.add(result(2))
+    with late:
+        late.add(result(3))
+    for found in (late, Journal(tmp_path)):
+        assert all(same(found.result(result(k).id), result(k)) for k in (1, 2, 3))
+    assert not late.damaged
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_folder_of_other_results_is_left_alone(tmp_path, name):
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(UsageError, match="but no journal"):
+        Journal(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
 
 
 def test_one_changed_byte_costs_at_most_the_two_runs_that_it_touches(tmp_path):

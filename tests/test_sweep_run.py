@@ -328,9 +328,11 @@ def test_results_hold_a_few_runs_in_memory(campaign, reference, tmp_path, monkey
 @pytest.mark.slow
 def test_dask_listens_on_the_loopback_only():
     psutil = pytest.importorskip("psutil")
+    from avsreplay.cli.sweep import sweep_command
     from avsreplay.sweep.execute import _client
 
-    with _client(1, None, "127.0.0.1:0") as client:
+    dashboard = next(param.default for param in sweep_command.params if param.name == "dashboard")
+    with _client(1, None, dashboard) as client:
         me = psutil.Process()
         found = [c for p in (me, *me.children(recursive=True)) for c in p.net_connections("inet")]
         assert client.dashboard_link.startswith("http://127.0.0.1:")

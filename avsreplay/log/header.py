@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import mesh
-from avsreplay.binary_files import BadFile
+from avsreplay.binary_files import BadFile, read_limited
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, frozen
 from avsreplay.log.bytes_io import shown
@@ -166,14 +166,7 @@ def read_surface(path: str | Path, cloud_ok: bool = False) -> Surface:
             although they are needed.
     """
     path = Path(path)
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise UnreadableInput("larger than 512 MiB", where=shown(path), hint="decimate the model")
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise UnreadableInput("no such file", where=shown(path), hint="check the path of the model") from None
-    except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+    data = read_limited(path, MAX_BYTES, "name a model file of at most 512 MiB")
     return _parsed(data, path.name, shown(path), cloud_ok)
 
 

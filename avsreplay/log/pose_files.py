@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import MeasuredPose, Pose, matrix, normalise
 from avsreplay.log.bytes_io import BadMessage, shown
@@ -79,12 +80,7 @@ def _whole_ns(word: str) -> int:
 
 def _lines(path: Path) -> Iterator[tuple[str, list[str], bool]]:
     """Yield (file and line, words, whether it has commas) of each line that is not empty or a comment."""
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise UnreadableInput("larger than 256 MiB, not a pose file", where=shown(path), hint="check the file")
-        text = path.read_bytes().decode("utf-8", "backslashreplace")
-    except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
+    text = read_limited(path, _MAX_BYTES, "name a file of poses", pipe=True).decode("utf-8", "backslashreplace")
     for number, line in enumerate(text.splitlines(), 1):
         stripped = line.strip()
         if stripped and not stripped.startswith("#"):
@@ -128,12 +124,7 @@ _MAX_CONF_BYTES = 16 << 20
 
 def read_conf(path: Path) -> dict[str, Pose]:
     """Read a ``.conf`` file: T_ac of each scan by file name. Raises UnreadableInput with file and line."""
-    try:
-        raw = path.read_bytes()[: _MAX_CONF_BYTES + 1]
-    except OSError as error:
-        raise UnreadableInput(error.strerror or "cannot be read", where=shown(path), hint="check the path") from None
-    if len(raw) > _MAX_CONF_BYTES:
-        raise UnreadableInput("larger than 16 MiB, not a pose file", where=shown(path), hint="check the file")
+    raw = read_limited(path, _MAX_CONF_BYTES, "name a file of poses", pipe=True)
     poses: dict[str, Pose] = {}
     for number, line in enumerate(raw.decode("utf-8", "backslashreplace").splitlines(), 1):
         words = line.split()

@@ -158,13 +158,25 @@ class ResultLog:
             written: the other log.
             state: message of its last scan.
             changed: numeric columns of the rows that have other values than in that log, by the index of the scan.
+
+        Raises:
+            UnreadableInput: the other log is damaged.
         """
+        self._state = state
+        try:
+            self._copy(written, changed or {})
+        except OSError:  # this one cannot be written
+            raise
+        except Exception as error:  # the library has no common class of errors
+            hint = "start anew with --overwrite"
+            raise UnreadableInput(f"is damaged: {error}"[:200], where=str(written), hint=hint) from None
+
+    def _copy(self, written: Path, changed: Mapping[int, Mapping[str, float]]) -> None:
         from mcap.reader import NonSeekingReader
 
-        self._state = state
         with written.open("rb") as stream:
             for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
-                columns = (changed or {}).get(message.sequence - 1) if channel.topic.startswith(_ROWS) else None
+                columns = changed.get(message.sequence - 1) if channel.topic.startswith(_ROWS) else None
                 if columns is None:
                     self._count = message.sequence
                     self._append(channel.topic, message.log_time, message.data)

@@ -62,11 +62,11 @@ class Arm:
             hint = "pip install 'avsreplay[arm]', or leave robot.urdf out and give robot.reach_max_m"
             what = "a manipulator needs pinocchio, which is not installed"
             raise UsageError(what, where="robot.urdf", hint=hint) from None
+        if not urdf.is_file():
+            hint = "a relative path refers to the file that states it; name the robot again with --robot"
+            raise UnreadableInput("no such URDF", where=str(urdf), hint=hint)
         try:
             self._model = self._pin.buildModelFromXML(urdf.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            hint = "a relative path refers to the file that states it; name the robot again with --robot"
-            raise UnreadableInput("no such URDF", where=str(urdf), hint=hint) from None
         except (OSError, ValueError, RuntimeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise UnreadableInput(f"no URDF: {reason}", where=str(urdf), hint="check the file") from None

@@ -25,6 +25,7 @@ from avsreplay.report.jsonl import read_json, read_rows
 from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, read_view
 from avsreplay.rows import Row
+from avsreplay.settings import dump
 
 _STATE = {"q_ab": 4, "w_b": 3, "r_a": 3, "v_a": 3, "sigma": 2, "c_b": 3, "q_bc": 4}
 _TABLES = ("log", "model", "clock", "losses", "selection", "config", "versions", "files", "limits")
@@ -110,7 +111,7 @@ def _label_record(label: Label) -> dict[str, Any]:
 def write_manifest(folder: Path, record: Mapping[str, Any], rows: int) -> None:
     """Write ``run.json``: ``record``, the number of rows, and size and SHA-256 of every file in the folder."""
     files = {path.name: {"bytes": path.stat().st_size, "sha256": sha256(path)} for path in sorted(folder.iterdir())}
-    text = json.dumps({**record, "rows": rows, "files": files}, indent=1, allow_nan=False)
+    text = json.dumps(dump({**record, "rows": rows, "files": files}), indent=1, allow_nan=False)
     (folder / "run.json").write_text(text + "\n", encoding="utf-8")
 
 

@@ -183,6 +183,8 @@ def _models_of(scenario: str, folder: Path) -> tuple[str, ...]:
 
 
 def _sha256(path: Path) -> str:
+    if path.exists() and not path.is_file():
+        raise UnreadableInput("is not a regular file", where=str(path), hint="name a file")
     try:
         with path.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()

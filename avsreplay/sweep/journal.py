@@ -84,6 +84,7 @@ def read_scans(path: Path) -> list[tuple[Any, ...]]:
 
 
 T = TypeVar("T")
+RESULTS = ("results.parquet", "scans.parquet", "summary.json", "report.html")  # written from a journal
 
 
 class Journal:
@@ -109,23 +110,26 @@ class Journal:
 
         Raises:
             UnreadableInput: The journal cannot be read.
+            UsageError: The folder has no journal, but a file that a campaign would replace.
         """
         self.folder = folder
         self.path = folder / "journal.txt"
         self.status: dict[str, str] = {}
         self.damaged: list[bytes] = []
         self._places: dict[str, tuple[int, int]] = {}
-        self._end = 0
-        self._torn = b""
         self._stream: BinaryIO | None = None
         self._lock: BinaryIO | None = None
-        if self.path.exists():
-            self._guarded(self._index)
+        self._guarded(self._read)
+        foreign = [name for name in RESULTS if (folder / name).exists()]
+        if foreign and not self.path.exists():
+            hint = "name another directory; it is left alone"
+            raise UsageError(f"contains '{foreign[0]}', but no journal", where=str(folder), hint=hint)
 
     def __enter__(self) -> Journal:
         def begin() -> BinaryIO:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = _locked(self.folder / "lock")
+            self._read()  # another process may have written it before this one had the lock
             if self.damaged or self._torn:
                 self._set_aside()
             return self.path.open("ab")
@@ -248,6 +252,12 @@ class Journal:
                     source.seek(start)
                     target.write(source.read(size))
             source.close()  # Windows does not replace an open file
+
+    def _read(self) -> None:
+        self.status, self.damaged, self._places = {}, [], {}
+        self._end, self._torn = 0, b""
+        if self.path.exists():
+            self._index()
 
     def _index(self) -> None:
         """Read place and status of every intact line; the other lines are collected separately."""
