@@ -27,8 +27,7 @@ from avsreplay.register.surface_index import SurfaceIndex
 
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
 TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
-LEAST_TO_TURN = 0.2  # with fewer inliers, rotated starts do not lead to the pose
-SURE_RATIO = 0.9  # after a search with fewer inliers another one follows
+LEAST_TO_TURN, SURE_RATIO = 0.2, 0.9  # with fewer inliers no rotated starts are tried; another search follows
 NO_MOTION: Array = np.zeros((6, 0))
 PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
@@ -160,10 +159,9 @@ class Registrar:
     def _acquired(
         self, scan: NDArray[Any], part: Array, search: SearchResult, budget: Budget, carried: bool
     ) -> tuple[Alignment, bool]:
-        """Register the result of a search of part of the scan on the whole scan, and test it.
+        """Register the result of a search of a part on the whole scan, and test it.
 
-        Also returned: whether the points off the model belong to another object, which is far away or beside a
-        complete visible side.
+        Also returned: whether the points off the model are another object's: far away, or the visible side is complete.
         """
         few = self._restarter.part(part)
         start = self._restarter.measure(few, search.best)
@@ -256,9 +254,8 @@ class Registrar:
         angle = float(geometry.angle((guess.inverse() @ found.T_ac).q))
         if not found.measured or angle <= TURNED_RAD:
             return False
-        return angle > FAR_RAD or (
-            found.status is not AlignStatus.DEGENERATE and len(self._symmetry.search.symmetries) > 0
-        )
+        known = found.status is not AlignStatus.DEGENERATE
+        return angle > FAR_RAD or (known and len(self._symmetry.search.symmetries) > 0)
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
@@ -272,9 +269,10 @@ class Registrar:
     ) -> tuple[Alignment, bool]:
         """Register again within a distance that follows the noise; restart if implausible. Whether it was searched."""
         few = self._restarter.part(scan)
-        at = self._restarter.nearer(few, first, guess)
-        hopeful = first.measured and at.noise_m <= NOISE_OF_EXTENT * self._index.extent_m
-        final = self._regraded(scan, few, at, budget, halves, carried) if hopeful else first
+        starts = self._restarter.starts(few, first, guess)
+        hopeful = first.measured and starts[0].noise_m <= NOISE_OF_EXTENT * self._index.extent_m
+        tried = [self._regraded(scan, few, at, budget, halves, carried) for at in starts] if hopeful else [first]
+        final = tried[0] if len(tried) == 1 else self._nearest(few, tried, self.limits.gate_m)
         reason = self._reason(few, final, budget, guess)
         if not (reason or self._restarter.doubtful(few, guess, final)):
             return self._restarter.consistent(few, guess, final), False
@@ -301,8 +299,7 @@ class Registrar:
                 return self._restarter.consistent(few, guess, final), False
         if not reason:
             return final, False
-        ended = budget.exhausted or budget.brief
-        status = AlignStatus.BUDGET_EXHAUSTED if ended else AlignStatus.IMPLAUSIBLE
+        status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted or budget.brief else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason), False
 
     def _reason(self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose) -> str:
@@ -322,8 +319,12 @@ class Registrar:
         moved = self._restarter.along_valley(few, found.T_ac.inverse())
         if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
             return found
-        both = (found, self._graded(scan, moved.inverse(), budget, width, halves, carried))
-        return min(both, key=lambda each: self._restarter.measure(few, each.T_ac.inverse()).cost(width))
+        return self._nearest(few, [found, self._graded(scan, moved.inverse(), budget, width, halves, carried)], width)
+
+    def _nearest(self, few: NDArray[Any], found: list[Alignment], width_m: float) -> Alignment:
+        """The second alignment if the points, none farther than ``width_m``, are nearer to the model there."""
+        cost = [self._restarter.measure(few, each.T_ac.inverse()).cost(width_m) for each in found]
+        return found[cost[1] < restarts.NEARER * cost[0]]
 
     def _graded(
         self,

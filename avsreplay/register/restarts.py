@@ -32,7 +32,7 @@ TURN_RAD = np.radians(4.0)
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # neighbouring points: those in a cube of this side; cubes along the extent, at least
 SHARED = 0.5  # of the rms distance; a correct pose of a correct model has less than 0.4 in common to neighbours
 VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
-BETTER_THAN = 0.9  # a restart replaces the first result only if its cost is below this share
+BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
 PASS_WORK = 1000  # fixed cost of a pass of a restart, in point searches
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
@@ -136,14 +136,14 @@ class Restarter:
         """Return the distances of ``points`` (n, 3) in {A} at a pose; ``guess``: as of ``PlausibilityTest.noise``."""
         return Restart(T_ca, self._test.measure(points, T_ca), self._test.noise(points, T_ca, guess))
 
-    def nearer(self, points: NDArray[Any], first: Alignment, guess: Pose) -> Restart:
-        """Return the better one of a registered pose and its guess T_ac for ``points`` (n, 3) in {A}.
+    def starts(self, points: NDArray[Any], first: Alignment, guess: Pose) -> list[Restart]:
+        """Return a registered pose, and its guess T_ac if part of ``points`` (n, 3) in {A} is off and it is as near.
 
         The wide rejection distance of the first passes can lead away from a good guess on a target that is hidden.
         """
         at, before = (self.measure(points, T_ac.inverse(), guess) for T_ac in (first.T_ac, guess))
-        whole = first.inlier_ratio >= LEAST_RATIO
-        return at if whole or at.cost(self.width(at)) <= before.cost(self.width(at)) else before
+        worse = BETTER_THAN * before.cost(self._target.limits.gate_m) > at.cost(self._target.limits.gate_m)
+        return [at] if worse or first.inlier_ratio >= LEAST_RATIO else [at, before]
 
     def consistent(self, points: NDArray[Any], guess: Pose, found: Alignment) -> Alignment:
         """Return the alignment with a covariance that is not contradicted by the distances at the predicted pose.
