@@ -219,12 +219,19 @@ def _parts(edges: _Edges) -> _Parts:
 
 
 def _components(nodes: int, a: NDArray[np.int64], b: NDArray[np.int64]) -> NDArray[np.int64]:
-    from scipy.sparse import coo_array  # takes as long to import as the package
-    from scipy.sparse.csgraph import connected_components
+    """Number of the connected component of each node, in the order of the first nodes; edges from ``a`` to ``b``.
 
-    graph = coo_array((np.ones(len(a), np.int8), (a, b)), shape=(nodes, nodes))
-    labels: NDArray[np.int64] = connected_components(graph, directed=False)[1].astype(np.int64)
-    return labels
+    Each node is linked to one of a lower number in its component until all are linked to the first.
+    """
+    first = np.arange(nodes)
+    while len(a):
+        low, high = np.minimum(first[a], first[b]), np.maximum(first[a], first[b])
+        apart = low != high
+        a, b = a[apart], b[apart]
+        np.minimum.at(first, high[apart], low[apart])
+        while not np.array_equal(further := first[first], first):
+            first = further
+    return np.unique(first, return_inverse=True)[1]
 
 
 def _share(paired: NDArray[np.bool_], of: NDArray[np.int64]) -> Array:

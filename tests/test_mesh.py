@@ -7,6 +7,8 @@ import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from avsreplay import mesh
 from avsreplay.geometry import Array, Pose
@@ -25,6 +27,13 @@ def bodies(rng: np.random.Generator, count: int = 4) -> list[trimesh.Trimesh]:
         part.apply_translation(2.0 * rng.normal(size=3))
         found.append(part)
     return found
+
+
+@pytest.mark.parametrize(("nodes", "edges"), [(1, 0), (40, 15), (40, 60), (3000, 2000)])
+def test_components_are_numbered_in_the_order_of_their_first_nodes(nodes: int, edges: int) -> None:
+    graph = np.random.default_rng(edges).integers(nodes, size=(2, edges))
+    pairs = coo_array((np.ones(edges), tuple(graph)), shape=(nodes, nodes))
+    assert np.array_equal(mesh._components(nodes, *graph), connected_components(pairs, directed=False)[1])
 
 
 def convex(points: Array) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ from oracles.closest_point import OracleIndex
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import Surface
 from avsreplay.register import RegisterParams
-from avsreplay.register.surface_index import IcpParams, SurfaceIndex
+from avsreplay.register.surface_index import IcpParams, SurfaceIndex, kernel_module
 
 kernel = pytest.importorskip("avsreplay.register._kernel", reason="the C++ kernel is not built")
 scipy_spatial = pytest.importorskip("scipy.spatial")
@@ -113,6 +113,43 @@ def test_nearest_point_is_that_of_a_kd_tree(name: str) -> None:
     near = found.id >= 0
     assert np.allclose(np.sqrt(found.d2[near]), d[near], rtol=1e-14, atol=0)
     assert np.array_equal(found.foot[near], points[found.id[near]])
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 700])
+def test_the_tree_of_points_has_the_distances_of_another_kd_tree(count: int) -> None:
+    points = rng(6).standard_normal((count, 3)) * [1.0, 1.0, 0.01]
+    points[: count // 3] = points[:1]  # more equal points than a leaf holds
+    q = np.concatenate([rng(7).standard_normal((300, 3)), points])
+    for k in (1, 2, 9):
+        distance, number = kernel_module().PointTree(points).query(q, k)
+        assert np.array_equal(distance, scipy_spatial.cKDTree(points).query(q, k=range(1, k + 1))[0])
+        known = number < count
+        assert np.array_equal(known, np.isfinite(distance))
+        between = np.linalg.norm(q[:, None, :] - np.append(points, np.zeros((1, 3)), axis=0)[number], axis=2)
+        assert np.allclose(between[known], distance[known], rtol=1e-14, atol=0)
+        assert all(len(set(row[row < count])) == np.sum(row < count) for row in number)
+
+
+@pytest.mark.parametrize("count", [0, 1, 40, 700])
+def test_groups_of_points_are_numbered_in_the_order_of_their_first_points(count: int) -> None:
+    points = rng(8).uniform(0.0, 1.0, (count, 3)) * [1.0, 1.0, 0.01]
+    for most in (0.001, 0.03, 0.05, 0.2):
+        near = scipy_spatial.distance.cdist(points, points) <= most
+        own, expected = np.full(count, -1), 0
+        for k in range(count):
+            if own[k] < 0:
+                reached = np.arange(count) == k
+                while (more := near[reached].any(axis=0)).sum() > reached.sum():
+                    reached = more
+                own[reached], expected = expected, expected + 1
+        assert np.array_equal(kernel_module().PointTree(points).groups(most), own)
+
+
+def test_the_tree_of_points_refuses_other_shapes() -> None:
+    with pytest.raises(ValueError, match="points must be"):
+        kernel_module().PointTree(np.zeros((3, 2)))
+    with pytest.raises(ValueError, match="k from 1"):
+        kernel_module().PointTree(np.zeros((3, 3))).query(np.zeros((3, 3)), 0)
 
 
 def test_the_lower_index_wins_a_tie() -> None:

@@ -47,6 +47,16 @@ def test_help_loads_no_heavy_library():
     assert "HEAVY []" in done.stdout, done.stdout + done.stderr
 
 
+def test_a_run_loads_no_scipy():
+    code = (
+        "import sys\nfrom avsreplay.cli import group\n"
+        f"group.main(['run', {str(ROOT / 'fixtures' / 'tumble.mcap')!r}, '--n-scans', '3'], standalone_mode=False)\n"
+        "print('SCIPY', 'scipy' in sys.modules)"
+    )
+    done = run(sys.executable, "-c", code)
+    assert "SCIPY False" in done.stdout, done.stdout + done.stderr
+
+
 def test_no_module_exceeds_the_line_limit():
     long = {p: n for p in ROOT.glob("avsreplay/**/*.py") if (n := p.read_text(encoding="utf-8").count("\n")) > 350}
     assert not long, long

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -102,7 +103,7 @@ class TargetGeometry:
 
     Attributes:
         axis_c: (3,) outward axis of the fixture in {C}, unit.
-        hull_c: (n, 3) vertices of the convex hull in {C} [m].
+        hull_c: (n, 3) points in {C} with the same convex hull as the surface [m].
         surface: Closest points of the surface, see ``Scene``; None where no clearance is required.
     """
 
@@ -120,18 +121,17 @@ class TargetGeometry:
 
 
 def hull_vertices(vertices: Array) -> Array:
-    """Return the vertices (m, 3) of the convex hull of points, or the points themselves where it has none.
+    """Return the vertices (m, 3) of the convex hull of points, or the points if they are few or have no hull.
 
     Args:
         vertices: (n, 3) points in any frame.
     """
-    from scipy.spatial import ConvexHull, QhullError
+    if len(vertices) > 5_000:
+        from scipy.spatial import ConvexHull, QhullError  # takes 0.3 s to import
 
-    points = np.asarray(vertices, dtype=np.float64)
-    try:
-        return np.ascontiguousarray(points[np.sort(ConvexHull(points).vertices)])
-    except QhullError:
-        return points
+        with suppress(QhullError):
+            return np.asarray(vertices[np.sort(ConvexHull(vertices).vertices)])
+    return vertices
 
 
 @dataclass(frozen=True, slots=True, eq=False)

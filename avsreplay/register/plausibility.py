@@ -37,7 +37,7 @@ from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.quality import Visibility, not_measured
 from avsreplay.register.sampling import sample
 from avsreplay.register.size import normal_jacobian
-from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
 SURFACE_POINTS = 1500
 LEVELS = np.array([0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9])  # quantiles of |distance|
@@ -186,17 +186,15 @@ class PlausibilityTest:
 
         None with too few to compare.
         """
-        from scipy.spatial import cKDTree
-
         T_ac, points = T_ca.inverse(), rays.points
         surface, normals = T_ac.apply(self._points), self._normals @ T_ac.R.T
         expected = self._expected(_Image(points), surface, normals)
         if not len(expected):
             return None
-        tree = cKDTree(points)
-        spacing = float(np.median(np.asarray(tree.query(points[:: max(1, len(points) // 500)], k=2)[0])[:, -1]))
+        tree = kernel_module().PointTree(points)
+        spacing = float(np.median(tree.query(points[:: max(1, len(points) // 500)].copy(), k=2)[0][:, -1]))
         near = max(self._gate, 3.0 * noise, 3.0 * spacing)
-        supported = np.asarray(tree.query(surface[expected])[0]) < near
+        supported = tree.query(surface[expected])[0][:, 0] < near
         missing = expected[~supported]
         passed, empty = rays.through(surface[missing], 2.0 * near)
         held = int(np.count_nonzero(supported))
@@ -212,7 +210,7 @@ class PlausibilityTest:
         off = Rays(points[~on])
         if seen.tree is None or not len(off.points):
             return bool(on.all())
-        angle, k = (np.asarray(each) for each in seen.tree.query(off.points / off.ranges[:, None]))
+        angle, k = (each[:, 0] for each in seen.tree.query(off.points / off.ranges[:, None]))
         hiding = (angle < EMPTY * seen.spacing) & (off.ranges < seen.ranges[k] - BEFORE_OF_EXTENT * self._extent)
         return int(np.count_nonzero(on)) >= LEAST_ALONE * (len(points) - int(np.count_nonzero(hiding)))
 
@@ -286,8 +284,6 @@ class Rays:
 
     def __init__(self, points: Array) -> None:
         """Find the directions and their spacing."""
-        from scipy.spatial import cKDTree
-
         ranges = np.linalg.norm(points, axis=1)
         known = np.isfinite(ranges) & (ranges > 0.0)
         self.points, self.ranges = points[known], ranges[known]
@@ -295,9 +291,9 @@ class Rays:
         if len(self.points) <= NEIGHBOUR:
             return
         directions = self.points / self.ranges[:, None]
-        self.tree = cKDTree(directions)
-        few = directions[:: max(1, len(directions) // SPACED)]
-        apart = np.asarray(self.tree.query(few, k=NEIGHBOUR + 1)[0])[:, -1]
+        self.tree = kernel_module().PointTree(directions)
+        few = directions[:: max(1, len(directions) // SPACED)].copy()
+        apart = self.tree.query(few, k=NEIGHBOUR + 1)[0][:, -1]
         self.spacing = float(np.median(apart)) * np.sqrt(np.pi / NEIGHBOUR)
 
     def through(self, points: Array, behind_m: float) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -310,7 +306,7 @@ class Rays:
         far = np.linalg.norm(points, axis=1)
         if self.tree is None or not len(points):
             return np.zeros(len(points), dtype=bool), np.zeros(len(points), dtype=bool)
-        angle, k = (np.asarray(each) for each in self.tree.query(points / far[:, None], k=AMONG))
+        angle, k = self.tree.query(points / far[:, None], k=AMONG)
         empty = angle[:, 0] > EMPTY * self.spacing
         near = angle[:, -1] < SURROUNDED * self.spacing
         return near & (self.ranges[k] > (far + behind_m)[:, None]).all(axis=1), empty

@@ -101,10 +101,8 @@ class NearSymmetry:
         share, area = float(moved.mean()), surface_area(surface)
         if not moved.any() or share >= MOST_MARKED:
             return none, np.array([share, 0.0])
-        from scipy.spatial import cKDTree
-
         dense, normals = sample(surface, DENSE)
-        apart = np.asarray(cKDTree(points[moved]).query(dense)[0])
+        apart = kernel_module().PointTree(points[moved]).query(dense)[0][:, 0]
         around = np.flatnonzero(apart < AROUND * np.sqrt(area / SAMPLES))
         marks = around[self._carried_off(dense[around], 1.0)]
         stride = max(1, -(-len(marks) // MOST_MARKS))
@@ -255,7 +253,7 @@ class NearSymmetry:
         far = np.linalg.norm(marks, axis=1)
         cosine = -np.einsum("ij,ij->i", self._normals[seen] @ T_ca.R, marks) / far
         expected = self._area * cosine / (far * rays.spacing) ** 2
-        angle, nearest = (np.asarray(each) for each in rays.tree.query(marks / far[:, None]))
+        angle, nearest = (each[:, 0] for each in rays.tree.query(marks / far[:, None]))
         empty = angle > EMPTY * rays.spacing
         passed = ~empty & (rays.ranges[nearest] > far + OFF * self._gate)
         return float(expected[passed].sum()), float(expected[empty].sum())

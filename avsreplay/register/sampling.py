@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, bounding_diagonal
 from avsreplay.records import Surface
+from avsreplay.register.surface_index import kernel_module
 
 CLOUD_POINTS = 20  # factor: the points of a cloud are first thinned evenly to this many times the number needed
 EVEN_ROUNDS, EVEN_WITHIN = 10, (0.85, 1.2)
@@ -127,11 +128,10 @@ def without_scattered_points(points: Array) -> Array:
 
     The distance to the eighth neighbour is small on a surface and large among outliers spread over a volume.
     """
-    from scipy.spatial import cKDTree
-
     if len(points) < 10 * NEIGHBOUR:
         return points
-    distance = np.asarray(cKDTree(points).query(points, k=NEIGHBOUR + 1)[0])[:, -1]
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    distance: Array = kernel_module().PointTree(points).query(points, k=NEIGHBOUR + 1)[0][:, -1]
     low, high = np.quantile(distance, [0.25, 0.75])
     if high < BIMODAL * low:
         return points
@@ -184,18 +184,12 @@ def _small_parts(points: Array, extent_m: float, least: int, planes: int) -> Ite
 
 def _connected(points: Array, voxel_m: float) -> Iterator[Array]:
     """Parts whose occupied voxels touch each other, at a corner at least."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
     if not len(points):
         return
     cells, voxel = np.unique(np.floor(points / voxel_m).astype(np.int64), axis=0, return_inverse=True)
-    pairs = cKDTree(cells.astype(np.float64)).query_pairs(1.8, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cells), len(cells)))
-    count, label = connected_components(graph, directed=False)
+    label = kernel_module().PointTree(cells.astype(np.float64)).groups(1.8)
     part = label[voxel.reshape(-1)]
-    for k in range(count):
+    for k in range(int(label.max()) + 1):
         yield points[part == k]
 
 

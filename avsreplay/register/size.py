@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
 LEAST_RESIDUALS = 50
 GROUPED = 3000  # points of a scan in which connected groups are looked for
@@ -287,14 +287,8 @@ def part_of_size(points: NDArray[Any], size_m: float, share: tuple[float, float]
     Returns:
         The points (k, 3) [m]; None if no group of at least ten points, and of 1 % of them, has the size.
     """
-    from scipy.sparse import csr_matrix
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
-
-    few = np.asarray(points[:: max(len(points) // GROUPED, 1)], dtype=np.float64)
-    edges = cKDTree(few).query_pairs(gap * size_m, output_type="ndarray")
-    graph = csr_matrix((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(few), len(few)))
-    _, member = connected_components(graph, directed=False)
+    few = np.array(points[:: max(len(points) // GROUPED, 1)], dtype=np.float64, order="C")
+    member = kernel_module().PointTree(few).groups(gap * size_m)
     groups = [few[member == k] for k in np.flatnonzero(np.bincount(member) >= max(10, len(few) // 100))]
     fitting = [group for group in groups if share[0] <= diameter(group, trimmed=False) / size_m <= share[1]]
     return max(fitting, key=len, default=None)

@@ -78,9 +78,12 @@ def bodies(rng):
 
 
 def near_start(truth, rng):
-    """A first belief that is off as its covariance says."""
+    """A first belief that is off as its covariance says, with inertia ratios that a body can have."""
     one = [0.01] * 3 + [0.01] * 3 + [0.02] * 3 + [0.005] * 3 + [0.1] * 2 + [0.1] * 3 + [np.radians(1.0)] * 3
-    return Belief(0, boxplus(truth, np.array(one) * rng.standard_normal(20)), np.diag(np.square(one)))
+    start = boxplus(truth, np.array(one) * rng.standard_normal(20))
+    while np.abs(start.sigma).max() >= 1.0:
+        start = boxplus(truth, np.array(one) * rng.standard_normal(20))
+    return Belief(0, start, np.diag(np.square(one)))
 
 
 def measured(x, rng):

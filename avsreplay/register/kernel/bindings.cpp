@@ -16,6 +16,7 @@
 #include "evidence.hpp"
 #include "grade.hpp"
 #include "loop.hpp"
+#include "point_tree.hpp"
 #include "save.hpp"
 
 namespace nb = nanobind;
@@ -427,6 +428,24 @@ nb::tuple refine(const Field& field, const Doubles& points, const Poses& T_ca, i
   return nb::make_tuple(poses, costs);
 }
 
+nb::tuple nearest(const PointTree& tree, const Doubles& points, int64_t k) {
+  require(points.ndim() == 2 && points.shape(1) == 3 && k > 0 && k < 100, "points must be (n, 3), and k from 1 to 99");
+  const size_t n = points.shape(0);
+  double* distance;
+  int64_t* number;
+  auto distances = array<double>({n, (size_t)k}, &distance);
+  auto numbers = array<int64_t>({n, (size_t)k}, &number);
+  {
+    nb::gil_scoped_release release;
+    std::vector<std::pair<double, int64_t>> best(k);
+    for (size_t i = 0; i < n; ++i) {
+      tree.query(points.data() + 3 * i, k, best.data());
+      for (int64_t j = 0; j < k; ++j) distance[i * k + j] = std::sqrt(best[j].first), number[i * k + j] = best[j].second;
+    }
+  }
+  return nb::make_tuple(distances, numbers);
+}
+
 }  // namespace
 
 NB_MODULE(_kernel, m) {
@@ -444,6 +463,19 @@ NB_MODULE(_kernel, m) {
       .def("size_error", [](const Table& t) { return size_error(t.table); })
       .def("covariance", &covariance_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"))
       .def("split", &split_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"), nb::arg("across"));
+  nb::class_<PointTree>(m, "PointTree")
+      .def("__init__", [](PointTree* tree, const Doubles& points) {
+        require(points.ndim() == 2 && points.shape(1) == 3, "points must be (n, 3)");
+        nb::gil_scoped_release release;
+        new (tree) PointTree(points.data(), (int64_t)points.shape(0)); }, nb::arg("points"))
+      .def("query", &nearest, nb::arg("points"), nb::arg("k") = 1)
+      .def("groups", [](const PointTree& tree, double most) {
+        int64_t* of;
+        auto numbers = array<int64_t>({(size_t)tree.size()}, &of);
+        nb::gil_scoped_release release;
+        const auto found = tree.groups(most);
+        std::copy(found.begin(), found.end(), of);
+        return numbers; }, nb::arg("most_m"));
   nb::class_<Field>(m, "Field")
       .def("__init__", [](Field* f, const Doubles& points, const Doubles& normals, int across) {
         new (f) Field(field_of(points, normals, across)); }, nb::arg("points"), nb::arg("normals"), nb::arg("across"))
