@@ -108,6 +108,31 @@ def test_an_invalid_option(flags, word, cli, log):
     check_one_line(cli("run", log, *flags), 2, word)
 
 
+@pytest.mark.parametrize(
+    ("scale", "word"), [("1e-320", "the model spans"), ("1e300", "a vertex is at"), ("1.7e308", "not finite")]
+)
+@pytest.mark.parametrize("command", ["run", "info"])
+def test_a_model_of_an_extreme_scale_is_one_line(command, scale, word, cli, log):
+    check_one_line(cli(command, log, "--model-scale", scale), 3, word)
+
+
+def test_a_seed_beyond_64_bits_is_one_line(cli, log, tmp_path):
+    check_one_line(cli("record", "-o", tmp_path / "a.mcap", "--seed", 2**63), 2, "--seed")
+    assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize("option", ["--end", "--duration"])
+def test_a_selection_without_a_scan_is_shown_and_not_replayed(option, cli, log):
+    done = cli("info", log, option, "0")
+    assert done.code == 0, done.err
+    check_one_line(cli("run", log, option, "0"), 3, "no scan to replay")
+
+
+@pytest.mark.parametrize("size", ["nan", "inf", "0", "-1", "1e-7", "1e7", "1e-320"])
+def test_a_size_that_no_target_has_is_one_line(size, cli, log, tmp_path):
+    check_one_line(cli("odometry", log, "-o", tmp_path / "a.tum", "--n-scans", 2, "--size", size), 2, "--size")
+
+
 def test_a_config_file_with_a_wrong_key(cli, log, tmp_path):
     config = tmp_path / "c.toml"
     config.write_text("[plan]\n\nhorizon = 3\n")

@@ -175,6 +175,7 @@ def _table(regions: list[dict[str, Any]]) -> list[str]:
 
 
 LEAST_POINTS = 50  # a scan with fewer is left out
+LEAST_M, MOST_M = 1e-6, 1e6  # size of a target
 
 ODOMETRY_EPILOG = """\b
 Examples:
@@ -186,7 +187,7 @@ Examples:
 @click.argument("log", type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, help="The trajectory to write (TUM).")
 @click.option(
-    "--size", type=click.FloatRange(min=0.0, min_open=True), help="Size of the target [m]; default: of the first scan."
+    "--size", type=click.FloatRange(LEAST_M, MOST_M), help="Size of the target [m]; default: of the first scan."
 )
 @click.option("--no-deskew", is_flag=True, help="Ignore the times of the points.")
 @click.option("--overwrite", is_flag=True, help="Replace an existing output.")
@@ -220,7 +221,11 @@ def odometry_command(
             if len(scan.points) < LEAST_POINTS:
                 continue
             if odometry is None:
-                odometry = KissOdometry(size or bounding_diagonal(scan.points), not no_deskew)
+                extent = bounding_diagonal(scan.points) if size is None else size
+                if not LEAST_M <= extent <= MOST_M:  # also nan
+                    what = f"the size of the target would be {extent:g} m"
+                    raise UsageError(what, where="--size", hint=f"give {LEAST_M:g} to {MOST_M:g} m")
+                odometry = KissOdometry(extent, not no_deskew)
             pose, after_s = odometry.add(scan.points, scan.times_s)
             poses.append((scan.t_ns + round(1e9 * after_s), pose))
     if not poses:

@@ -62,7 +62,7 @@ class _Fault(click.ParamType["RecordedFault"]):
 @click.command("record", epilog=EPILOG)
 @click.argument("source", required=False, type=PATH)
 @click.option("-o", "--output", required=True, type=PATH, help="Write this log (.mcap); - is standard output.")
-@click.option("--seed", type=click.IntRange(0), help="Seed of a simulation or of the faults.")
+@click.option("--seed", type=click.IntRange(0, 2**63 - 1), help="Seed of a simulation or of the faults.")
 @click.option(
     "--fault", "faults", type=_Fault(), multiple=True, help="Inject a fault [s after the first scan]; repeatable."
 )

@@ -50,7 +50,7 @@ Exit codes: 0 ok, 2 usage, 3 unreadable input, 4 finished, but runs failed or da
     show_default=True,
     help="Address of the Dask dashboard of --workers; port 0: any free port.",
 )
-@click.option("--limit", type=click.IntRange(0), help="Make at most this number of runs now.")
+@click.option("--limit", type=click.IntRange(0, 2**63 - 1), help="Make at most this number of runs now.")
 @click.option("--retry-failed", is_flag=True, help="Repeat failed and crashed runs.")
 @click.option("--plan", "only_plan", is_flag=True, help="List the runs without starting them.")
 @click.option(

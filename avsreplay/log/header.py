@@ -195,6 +195,25 @@ def scaled(surface: Surface, scale: float) -> Surface:
     return replace(bare, data=data, sha256=hashlib.sha256(data).hexdigest())
 
 
+def in_metres(surface: Surface, factor: float) -> Surface:
+    """Return the model with its coordinates multiplied by the factor of the reading options.
+
+    Args:
+        surface: the model as in its file.
+        factor: metres per unit of the file, times the scale that the user gives.
+
+    Returns:
+        The scaled model.
+
+    Raises:
+        UnreadableInput: the scaled model is too large or too small.
+    """
+    found = scaled(surface, factor)
+    if found is not surface:
+        _check(found.vertices, found.faces, shown(surface.name), cloud_ok=True)
+    return found
+
+
 def surface_bytes(surface: Surface) -> bytes:
     """Return the bytes of the model's file; if it was not read from one, a binary PLY with float64 vertices."""
     if surface.data:

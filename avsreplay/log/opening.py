@@ -14,7 +14,7 @@ from avsreplay.geometry import Pose
 from avsreplay.log import streams
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.db3_file import SQLITE_MAGIC, Db3File
-from avsreplay.log.header import HEADER_RECORD, decode_header, octahedron, parse_surface, read_surface, scaled
+from avsreplay.log.header import HEADER_RECORD, decode_header, in_metres, octahedron, parse_surface, read_surface
 from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import MAGIC
@@ -153,7 +153,7 @@ def _header(recording: Recording, options: SourceOptions) -> tuple[LogHeader, tu
     if surface is None:
         surface, trouble = _carried(recording)
         lost += trouble
-    return replace(header, surface=surface and scaled(surface, options.model_factor)), tuple(lost)
+    return replace(header, surface=surface and in_metres(surface, options.model_factor)), tuple(lost)
 
 
 def _carried(recording: Recording) -> tuple[Surface | None, list[Loss]]:
@@ -205,7 +205,7 @@ def _open_pose_file(path: Path, options: SourceOptions) -> Source:
     poses = streams.PoseFile(path, options.scan_rate_hz)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
     header = LogHeader(
-        surface=surface and scaled(surface, options.model_factor),
+        surface=surface and in_metres(surface, options.model_factor),
         notes={"source": "pose file", "times": options.times_note(poses.timed)},
     )
     truth = streams.GroundTruth()
@@ -307,7 +307,7 @@ def _open_folder(path: Path, options: SourceOptions) -> Source:
     times = _times(path, files, found)
     clouds = streams.FolderClouds(files, options.scan_rate_hz, options.max_message_mib << 20, times)
     surface = None if options.model is None else read_surface(options.model, options.cloud_model)
-    surface = surface and scaled(surface, options.model_factor)
+    surface = surface and in_metres(surface, options.model_factor)
     ground_truth = _ground_truth(files, clouds.header_ns, by_name, found, options)
     besides = [p for p in (pose_file, path / _TIME_FILE) if p is not None and p.is_file() and p.is_relative_to(path)]
     header = LogHeader(surface=surface, notes={"source": "folder", "times": options.times_note(times is not None)})

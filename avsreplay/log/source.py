@@ -173,7 +173,7 @@ class Source:
         """
         track, options = self._ground_truth.track, self.options
         if all(self.truth_of(scan).pose is None for scan in scans):
-            why, gap = ("", False) if track is None else track.uncovered([scan.t_ns for scan in scans])
+            why, gap = ("", False) if track is None or not scans else track.uncovered([scan.t_ns for scan in scans])
             stamps = why and not gap and options.truth_file is None and options.clock is ClockChoice.HEADER
             option = "--truth-gap SECONDS" if gap else "--clock log" if stamps else ""
             return (f"none of the {len(scans)} examined scans has a true pose{why}", option) if scans else None

@@ -92,11 +92,14 @@ class InjectedFault(Settings):
             raise ValueError(f"strength = {self.strength} is out of range for '{self.kind.value}'")
 
 
+MOST_STRENGTH = 1e9  # a jump by more seconds leaves the 31 bits of a ROS time
+
+
 def fits(kind: Kind, value: float) -> bool:
     """Return whether a strength is in the range of its kind."""
     if kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
         return 0.0 < value <= 1.0
-    return math.isfinite(value) and (value > 0.0 or kind in (Kind.RANGE_BIAS, Kind.STAMP_JUMP))
+    return abs(value) <= MOST_STRENGTH and (value > 0.0 or kind in (Kind.RANGE_BIAS, Kind.STAMP_JUMP))
 
 
 def strength(fault: InjectedFault) -> float:

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from avsreplay.geometry import Array
 from avsreplay.records import Label, Scan, ScanStatus
-from avsreplay.simulate.faults import DEFAULTS, NS, Kind, clutter, fits, occlude
+from avsreplay.simulate.faults import DEFAULTS, MOST_STRENGTH, NS, Kind, clutter, fits, occlude
 from avsreplay.simulate.scanner import Returns
 
 OUTLIER_RANGES = 0.5, 1.5  # limits of the range of an outlier, over the median range of the scan
@@ -66,6 +66,8 @@ class RecordedFault:
             numbers = []
         if len(numbers) not in (2, 3) or not all(map(math.isfinite, numbers)):
             raise ValueError(f"'{text}' is not kind:start:duration[:strength] with times in seconds")
+        if max(numbers[:2]) > MOST_STRENGTH:
+            raise ValueError(f"'{text}': times of more than {MOST_STRENGTH:g} s")
         default = RECORDED_KINDS[kind][0]
         if numbers[0] < 0.0 or numbers[1] <= 0.0:
             raise ValueError(f"'{text}': the start must be at least 0 s and the duration positive")
