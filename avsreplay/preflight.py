@@ -139,7 +139,9 @@ def _clock(info: LogInfo) -> list[Advice]:
         text = f"the files hold no time stamps: {ASSUMED_HZ:g} Hz is assumed, on which all velocities depend"
         return [Advice("check", "time stamps", text, "--rate HZ")]
     problems = [
-        f"{getattr(clock, name)} {name}" for name in ("unset", "jumps", "back", "equal") if getattr(clock, name)
+        f"{count} {'jump' if (count, name) == (1, 'jumps') else name}"
+        for name in ("unset", "jumps", "back", "equal")
+        if (count := getattr(clock, name))
     ]
     if not problems:
         text = f"median period {clock.period_s:.4g} s" if clock.period_s else "no period: a single scan"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import shutil
 from pathlib import Path
@@ -13,7 +14,7 @@ from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.export import write_tum
-from avsreplay.report.jsonl import write_rows
+from avsreplay.report.jsonl import read_rows, write_rows
 from avsreplay.report.result import facts_record, load_result, motion_samples
 from avsreplay.report.summary import Summary
 from avsreplay.report.view import PathView, View, read_view, thin_cloud, thin_surface, write_view
@@ -67,6 +68,18 @@ def test_the_summary_is_read_back_unchanged(folder):
     assert result.header["seed"] == 7
     assert [t for t, _ in result.poses] == [r.t_ns for r in result.rows]
     np.testing.assert_allclose(result.poses[3][1].q, exp([0, 0, 0.3]), atol=1e-15)
+
+
+def test_the_garbage_collector_rests_while_rows_are_read(folder, monkeypatch):
+    states = []
+    monkeypatch.setattr(
+        "avsreplay.report.result.read_rows", lambda path: states.append(gc.isenabled()) or read_rows(path)
+    )
+    load_result(folder[0])
+    (folder[0] / "rows.jsonl").write_text("{}\n")
+    with pytest.raises(UnreadableInput):
+        load_result(folder[0])
+    assert (states, gc.isenabled()) == ([False, False], True)
 
 
 def test_a_single_file_of_rows_is_a_result(folder):

@@ -7,11 +7,12 @@ the same bytes here.
 from __future__ import annotations
 
 import dataclasses
+import gc
 import json
 import math
 import typing
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from itertools import pairwise
 from operator import attrgetter
@@ -26,7 +27,7 @@ from avsreplay.rows import Row
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
 _MAX_LINE, _MAX_FILE, _MAX_NAME, _MAX_TEXT = 1 << 20, 2 << 30, 100, 10_000
-_BLOCK = 4 << 20
+_BLOCK = 1 << 20
 _MAX_JSON = 64 << 20
 _LARGEST = 1e100  # sums of squares of larger values are not finite
 
@@ -190,6 +191,18 @@ def read_rows(path: str | Path) -> list[Row]:
         else:
             rows += found
     return rows
+
+
+@contextmanager
+def without_garbage_collection() -> Iterator[None]:
+    """Pause the collector, which would visit all rows again and again while they are read. They have no cycles."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _add_cell_by_cell(rows: list[Row], block: bytes, path: str | Path, first: int) -> None:

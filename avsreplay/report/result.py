@@ -21,7 +21,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose, bounding_diagonal
 from avsreplay.records import Label, State, Surface
 from avsreplay.report.export import StampedPose
-from avsreplay.report.jsonl import read_json, read_rows
+from avsreplay.report.jsonl import read_json, read_rows, without_garbage_collection
 from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, read_view
 from avsreplay.rows import Row
@@ -143,12 +143,13 @@ def load_result(path: str | Path) -> Result:
     header, unverified = _header(whole / "run.json") if whole else {}, "it is a single file of rows without run.json"
     if whole:
         unverified = _verify(whole, header, None if folder else ("rows.jsonl",))
-    rows = read_rows(rows_path)
-    if not unverified and len(rows) != header.get("rows"):
-        what = f"{len(rows)} rows, run.json states {header.get('rows')}"
-        raise UnreadableInput(what, where=str(rows_path), hint=_RUN_AGAIN)
-    labels, truth, counts = _facts(header.get("facts") or {}, str(path))
-    summary = Summary.fold(rows, labels=labels, truth=truth, counts=counts)
+    with without_garbage_collection():
+        rows = read_rows(rows_path)
+        if not unverified and len(rows) != header.get("rows"):
+            what = f"{len(rows)} rows, run.json states {header.get('rows')}"
+            raise UnreadableInput(what, where=str(rows_path), hint=_RUN_AGAIN)
+        labels, truth, counts = _facts(header.get("facts") or {}, str(path))
+        summary = Summary.fold(rows, labels=labels, truth=truth, counts=counts)
     poses = read_tum(folder / "truth.tum") if folder and (folder / "truth.tum").is_file() else []
     view = read_view(folder / "view.npz") if folder and (folder / "view.npz").is_file() else None
     name = path.resolve().name if folder else path.name.removesuffix(".jsonl").removesuffix(".rows")
