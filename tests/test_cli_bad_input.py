@@ -116,6 +116,11 @@ def test_a_model_of_an_extreme_scale_is_one_line(command, scale, word, cli, log)
     check_one_line(cli(command, log, "--model-scale", scale), 3, word)
 
 
+@pytest.mark.parametrize("extent", ["nan", "inf", "0", "1e308", "1e-320"])
+def test_an_extent_that_no_target_has_is_one_line(extent, cli):
+    check_one_line(cli("plan", "nothing", "--extent", extent), 2, "--extent")
+
+
 def test_a_seed_beyond_64_bits_is_one_line(cli, log, tmp_path):
     check_one_line(cli("record", "-o", tmp_path / "a.mcap", "--seed", 2**63), 2, "--seed")
     assert not (tmp_path / "a.mcap").exists()

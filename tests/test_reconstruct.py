@@ -19,7 +19,7 @@ from avsreplay.reconstruct import at_grasp, deviations, reconstruct, surface_of,
 from avsreplay.reconstruct.fusion import continues, contradicting, refuted
 from avsreplay.reconstruct.registration import between
 from avsreplay.reconstruct.tracking import ReconstructionParams, free_motion
-from avsreplay.reconstruct.views import SAMPLE, Twist, extent_of, full_cloud, surveyed, thinned_view
+from avsreplay.reconstruct.views import SAMPLE, Survey, Twist, extent_of, full_cloud, surveyed, thinned_view
 from avsreplay.records import AlignStatus, Scan, Surface
 from avsreplay.register import Registrar
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
@@ -533,3 +533,15 @@ def test_scans_of_a_plate_in_front_of_the_target_are_not_used():
     used = {t_ns // 500_000_000 for t_ns, _ in made.poses}
     assert used == set(range(12)) - {6, 7, 8}
     assert errors(made, truth)[:, 0].max() < 1.0
+
+
+def test_a_point_at_the_sensor_is_left_out_of_a_view():
+    """It has no direction; a damaged log may contain one."""
+    grid = np.stack(np.meshgrid(np.linspace(-0.2, 0.2, 20), np.linspace(-0.2, 0.2, 20)), axis=-1).reshape(-1, 2)
+    points = np.vstack([np.column_stack([grid, np.zeros(len(grid))]), np.zeros((1, 3))]).astype(np.float32)
+    camera = points[7].astype(np.float64)
+    view = thinned_view(Scan(0, 0, points), Survey((0,), 1, 0.5, camera, False), 0.01)
+    assert len(view.points) > 300
+    assert np.isfinite(view.normals).all()
+    assert np.isfinite(view.weight).all()
+    assert np.linalg.norm(view.points - camera, axis=1).min() > 0.0

@@ -150,6 +150,7 @@ def test_times_of_points_stay_with_their_points():
         ("occlusion:1:2:1.5", "out of range"),
         ("frame_rate:1:2:1.5", "out of range"),
         ("stamp_jump:0:1:-1e300", "out of range"),
+        ("clutter:0:1:101", "out of range"),
         ("occlusion:0:1e308", "times of more than"),
         ("dropped:1e300:1", "times of more than"),
         ("noise_burst:0:1:1e10", "out of range"),

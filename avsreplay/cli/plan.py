@@ -134,8 +134,8 @@ def plan_command(
     from avsreplay.saved_result import load_saved, with_settings
 
     for name, value in (("--every", every_s), ("--extent", extent_m)):
-        if value is not None and not 0.0 < value < float("inf"):
-            raise UsageError(f"{value} is not above 0", where=name, hint="give a finite number above 0")
+        if value is not None and not 1e-6 <= value <= 1e6:
+            raise UsageError(f"{value:g} is not in the range 1e-6 to 1e6", where=name, hint="correct the option")
     check_outputs("export", "animate", overwrite=overwrite)
     of_robot = () if robot_file is None else robot_settings(robot_file)
     saved = with_settings(load_saved(result, extent_m), (*of_robot, *assignments))

@@ -122,6 +122,7 @@ def thinned_view(scan: Scan, survey: Survey, size_m: float, twist: Twist | None 
     """
     full = full_cloud(scan, twist)
     points = central_points(full, size_m)
+    points = points[np.linalg.norm(survey.camera - points, axis=1) > 0.0]  # the sensor itself has no direction
     normals, lines = normals_of(points, full, survey.camera), survey.camera - points
     weight = np.einsum("ni,ni->n", normals, lines) / np.linalg.norm(lines, axis=1)
     rays = -lines / np.linalg.norm(lines, axis=1, keepdims=True)
@@ -246,7 +247,7 @@ def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float, tre
         return np.zeros(0)
     rays, own = measured - camera, p - camera
     far, r = np.linalg.norm(rays, axis=1), np.linalg.norm(own, axis=1)
-    tree = tree or cKDTree(rays / far[:, None])
+    tree = tree or cKDTree(rays / np.maximum(far, 1e-300)[:, None])  # a point at the camera has no direction
     distances, nearest = tree.query(own / r[:, None], k=3, distance_upper_bound=spacing_m / r.min())
     d, index = np.asarray(distances), np.asarray(nearest)
     hit = d[:, 2] < spacing_m / r

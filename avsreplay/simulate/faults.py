@@ -92,6 +92,7 @@ class InjectedFault(Settings):
             raise ValueError(f"strength = {self.strength} is out of range for '{self.kind.value}'")
 
 
+MOST_CLUTTER = 100.0  # points added for each point of the scan
 MOST_STRENGTH = 1e9  # a jump by more seconds leaves the 31 bits of a ROS time
 
 
@@ -99,6 +100,8 @@ def fits(kind: Kind, value: float) -> bool:
     """Return whether a strength is in the range of its kind."""
     if kind in (Kind.OCCLUSION, Kind.PARTIAL_OCCLUSION):
         return 0.0 < value <= 1.0
+    if kind is Kind.CLUTTER:
+        return 0.0 < value <= MOST_CLUTTER
     return abs(value) <= MOST_STRENGTH and (value > 0.0 or kind in (Kind.RANGE_BIAS, Kind.STAMP_JUMP))
 
 
