@@ -231,7 +231,7 @@ def test_there_is_no_page_without_a_plan(result, tmp_path):
         (("--cone-deg", 120), "cone_deg is 120"),
         (("--horizon", 0), "horizon_s is 0"),
         (("--at", 500), "outside the result"),
-        (("--every", 0), "not above 0"),
+        (("--every", 0), "not in the range"),
         (("--keepout", 3.0), "keepout_m is 3.0"),
         (("--clearance", 0.1), "contains no model"),
         (("--set", "robot.mass_kg=3"), "must be given together"),
