@@ -91,6 +91,15 @@ def test_a_push_is_reported_and_followed(seed: int) -> None:
     assert not any(claimed and ratio > 4.0 for claimed, ratio in zip(result.converged, result.ratio, strict=True))
 
 
+def test_a_push_that_random_forces_explain_hardly_better_is_a_manoeuvre() -> None:
+    """Taken for random forces, it is contradicted by the quiet poses before it as soon as all poses are fitted."""
+    result = surprises.run(surprises.Case("push", velocity=0.01, seconds=60.0), 719)
+    assert result.track is not None
+    assert len(result.track.manoeuvres) == 1
+    assert result.violations == []
+    assert max(result.ratio[result.t.index(45.5) + 10 :]) < 4.0
+
+
 @pytest.mark.slow
 def test_a_bias_of_the_sensor_is_no_manoeuvre() -> None:
     """5 cm along the line of sight from 60 to 70 s: flagged from the first scan, and the estimate is not moved."""

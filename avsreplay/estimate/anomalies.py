@@ -102,6 +102,7 @@ class AnomalyTest:
             return self._accepted(track, epoch, update), verdict
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
         window, ranked = explain(window, first, self._priors, *self.batch.noise_levels(track), self.batch.orbit)
+        ranked = _ranked(ranked)
         best = ranked[0].hypothesis
         changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= _OVER_FREE
         free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
@@ -323,6 +324,18 @@ class AnomalyTest:
         old = replace(track, recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None
         out = replace(with_history(out, track), drift=track.drift, previous=old)
         return replace(out, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
+
+
+def _ranked(found: list[Explanation]) -> list[Explanation]:
+    """The explanations, most likely first, a manoeuvre before random disturbances that are hardly more likely.
+
+    Disturbances as strong as the change would also have acted on the poses before the window, which were quiet.
+    """
+    if found[0].hypothesis is not Hypothesis.DISTURBED:
+        return found
+    least = found[0].log_evidence - _OVER_NEXT
+    close = [e for e in found if e.hypothesis is Hypothesis.MANOEUVRE and e.log_evidence > least and _explains(e)]
+    return close + [e for e in found if e not in close]
 
 
 def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
