@@ -20,7 +20,7 @@ from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import VEL, W, definite_product
-from avsreplay.estimate.hypotheses import explain, linear, odds_over_free
+from avsreplay.estimate.hypotheses import OVER_NEXT, explain, linear, odds_over_free
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.mixture import moments
@@ -28,6 +28,7 @@ from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.scan_window import (
+    EXPLAINED,
     MOST_DISTURBED,
     ChangePriors,
     Explanation,
@@ -54,8 +55,7 @@ from avsreplay.records import Belief, Manoeuvre, Reason, Verdict
 from avsreplay.settings import given
 
 _FEWEST, _MOST, _RECENT = 3, 5, 12  # least and most doubtful scans at a decision; accepted scans kept
-_OVER_FREE, _OVER_NEXT = 3.0, 2.0  # log odds over free motion, and over the next hypothesis, of an early decision
-_EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
+_OVER_FREE = 3.0  # log odds over free motion of an early decision
 _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its spread, that shows which poses are biased
 _SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
@@ -102,12 +102,11 @@ class AnomalyTest:
             return self._accepted(track, epoch, update), verdict
         window, first = (*track.recent, *doubtful.doubtful), len(track.recent)
         window, ranked = explain(window, first, self._priors, *self.batch.noise_levels(track), self.batch.orbit)
-        ranked = _ranked(ranked)
         best = ranked[0].hypothesis
         changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= _OVER_FREE
         free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
         changed = changed and (bool(track.doubtful) or linear(free, window))
-        disturbed = best is Hypothesis.DISTURBED and odds_over_free(ranked) >= _OVER_FREE and _explains(ranked[0])
+        disturbed = best is Hypothesis.DISTURBED and odds_over_free(ranked) >= _OVER_FREE and ranked[0].explains
         if (large or track.doubtful) and disturbed:
             track, doubtful = self._disturbed(track, ranked[0]), self._disturbed(doubtful, ranked[0])
         if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
@@ -139,8 +138,8 @@ class AnomalyTest:
     def _decided(self, track: Track, window: tuple[Epoch, ...], ranked: list[Explanation]) -> tuple[Track, Verdict]:
         """The track after a decision, or still in doubt."""
         doubtful, in_doubt = len(track.doubtful), (track, Verdict(0, Reason.DOUBTFUL))
-        best, explained = ranked[0], _explains(ranked[0])
-        certain = explained and best.log_evidence - ranked[1].log_evidence >= _OVER_NEXT
+        best, explained = ranked[0], ranked[0].explains
+        certain = explained and best.log_evidence - ranked[1].log_evidence >= OVER_NEXT
         certain = certain and (odds_over_free(ranked) >= _OVER_FREE or best.hypothesis is Hypothesis.FREE_MOTION)
         if doubtful < _MOST and not certain:
             return in_doubt
@@ -313,7 +312,7 @@ class AnomalyTest:
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in epochs)
         poses = poses_of(fixes)
         fitted = fit(poses, to_chart(rough_state(fixes)), weak_prior(poses, self.params), FitParams(rescale=False))
-        agree = 2.0 * fitted.half_chi2 <= _EXPLAINED * (6 * len(fixes) - 12)
+        agree = 2.0 * fitted.half_chi2 <= EXPLAINED * (6 * len(fixes) - 12)
         return self._started(track, epochs, levels) if agree else None
 
     def _started(self, track: Track, epochs: tuple[Epoch, ...], levels: NoiseLevels) -> Track:
@@ -324,18 +323,6 @@ class AnomalyTest:
         old = replace(track, recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None
         out = replace(with_history(out, track), drift=track.drift, previous=old)
         return replace(out, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
-
-
-def _ranked(found: list[Explanation]) -> list[Explanation]:
-    """The explanations, most likely first, a manoeuvre before random disturbances that are hardly more likely.
-
-    Disturbances as strong as the change would also have acted on the poses before the window, which were quiet.
-    """
-    if found[0].hypothesis is not Hypothesis.DISTURBED:
-        return found
-    least = found[0].log_evidence - _OVER_NEXT
-    close = [e for e in found if e.hypothesis is Hypothesis.MANOEUVRE and e.log_evidence > least and _explains(e)]
-    return close + [e for e in found if e not in close]
 
 
 def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
@@ -353,10 +340,6 @@ def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:
     still, ended = _chi2(change, P), _chi2(change + bias.offset, P + bias.P)
     gain = float(np.linalg.slogdet(P + bias.P)[1] - np.linalg.slogdet(P)[1])
     return replace(bias, last=epoch) if still < min(GATE, ended + gain) else None
-
-
-def _explains(found: Explanation) -> bool:
-    return found.chi2 < _EXPLAINED * found.dof
 
 
 def _chi2(y: Array, C: Array) -> float:

@@ -33,6 +33,7 @@ from avsreplay.estimate.track import Epoch
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief
 
+OVER_NEXT = 2.0  # log odds over the next hypothesis of an early decision
 _NONLINEAR = 2.0  # chi-square of free motion over the sum of the NIS from which the linearisation does not hold
 _DENSITIES = np.logspace(-6.0, -1.0, 21)  # root densities of random impulses that are compared
 _PER_BAD_SCAN = math.log(1e-2)
@@ -86,7 +87,19 @@ def explain(
         _bad_scans(window, priors, first_doubtful, n),
         _frozen(window, first_doubtful, n),
     ]
-    return tuple(epochs), sorted(found, key=lambda e: -e.log_evidence)
+    return tuple(epochs), _ranked(sorted(found, key=lambda e: -e.log_evidence))
+
+
+def _ranked(found: list[Explanation]) -> list[Explanation]:
+    """The explanations, most likely first, a manoeuvre before random disturbances that are hardly more likely.
+
+    Disturbances as strong as the change would also have acted on the poses before the window, which were quiet.
+    """
+    if found[0].hypothesis is not Hypothesis.DISTURBED:
+        return found
+    least = found[0].log_evidence - OVER_NEXT
+    close = [e for e in found if e.hypothesis is Hypothesis.MANOEUVRE and e.log_evidence > least and e.explains]
+    return close + [e for e in found if e not in close]
 
 
 def linear(chi2: float, epochs: Sequence[Epoch]) -> bool:

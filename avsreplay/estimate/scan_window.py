@@ -29,6 +29,7 @@ from avsreplay.estimate.track import NO_CHANGE, Epoch
 from avsreplay.geometry import Array, Pose, conjugate, frozen, log, multiply
 from avsreplay.records import Belief
 
+EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _SUSPECTED, _PRIOR_CHANGE = 3, 0.02  # last scans in which a change may have begun, and its prior probability
 _SCALES = (1.0, 0.1)  # factors on the prior standard deviations: a large or a small change
@@ -84,6 +85,11 @@ class Explanation:
     size: Array = field(default_factory=lambda: _ZERO)
     P: Array = field(default_factory=lambda: _NO_COVARIANCE)
     changes_s: tuple[float, ...] = ()
+
+    @property
+    def explains(self) -> bool:
+        """Whether the residuals are not much larger than the noise."""
+        return self.chi2 < EXPLAINED * self.dof
 
 
 @dataclass(frozen=True, slots=True, eq=False)
