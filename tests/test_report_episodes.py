@@ -26,6 +26,15 @@ def test_a_window_within_the_replayed_time_counts_although_it_left_no_scan():
     assert (found.injected, found.detected, found.missed) == (2, 1, 1)
 
 
+@pytest.mark.parametrize(("gamma", "detected"), [(0, 2), (1, 0)])
+def test_a_window_whose_scans_all_carry_another_fault_is_judged_by_them(gamma, detected):
+    labels = [Label("clutter", 3 * NS, 7 * NS), Label("bias", 4 * NS, 5 * NS)]
+    marks = [Mark(k * NS, gamma if 3 <= k <= 7 else 1, "clutter" if 3 <= k <= 7 else None) for k in range(12)]
+    found = account(marks, labels)
+    assert (found.injected, found.detected, found.missed) == (2, detected, 2 - detected)
+    assert [episode.scans for episode in found.episodes] == [5, 0]
+
+
 @pytest.mark.parametrize("longest", [2, 15])  # windows that are apart, and windows that overlap
 def test_a_scan_belongs_to_the_nearest_window_of_its_kind(longest):
     rng = random.Random(longest)

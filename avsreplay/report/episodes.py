@@ -1,8 +1,9 @@
 """Injected faults against the detector's verdicts, and the time to recover.
 
 A label is *harmful* (the scan must be flagged) or not (either verdict is right). A harmful label is *detected* where at
-least one of its scans has gamma 0 or, where no scan came at all, where a gap covers it. A flagged scan without a
-label is a *false alarm*. A *gap* is an interval between scans longer than 1.5 times the median interval.
+least one of its scans has gamma 0 or, where no scan came at all, where a gap covers it. Where all scans in its window
+carry the label of another fault, these scans decide. A flagged scan without a label is a *false alarm*. A *gap* is an
+interval between scans longer than 1.5 times the median interval.
 
 Recovery is assessed by gamma alone: an estimate that followed wrong poses agrees with the next ones and counts as
 healthy. The effect of a fault is seen in the errors of the estimate over its flagged scans, its used scans and the
@@ -223,6 +224,7 @@ def _episode(
     own = [marks[k] for k in rows]
     flagged = [m for m in own if m.gamma == 0]
     missing = not rows and any(a <= label.end_ns and label.start_ns <= b for a, b in holes)
+    shared = [] if rows else [m for m in marks if label.start_ns <= m.t_ns <= label.end_ns and m.fault is not None]
     behind = rows[-1] + 1 if rows else bisect_right(marks, label.end_ns, key=lambda m: m.t_ns)
 
     def after() -> Iterator[Mark]:
@@ -240,7 +242,7 @@ def _episode(
         end_s=(label.end_ns - t0) * 1e-9,
         scans=len(rows),
         flagged=len(flagged),
-        detected=bool(flagged) or missing,
+        detected=missing or any(m.gamma == 0 for m in flagged or shared),
         recover_scans=recover_scans,
         recover_s=recover_s,
         strength=label.strength,
