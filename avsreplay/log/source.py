@@ -185,7 +185,11 @@ class Source:
         return f"the true poses are in '{shown(at)}', the clouds in '{shown(clouds)}'", f"--fixed-frame {shown(at)}"
 
     def in_own_frame(self, scan: Scan) -> NDArray[Any]:
-        """Return the points (n, 3) of a scan in the frame of its cloud, to which crops refer [m]."""
+        """Return the points (n, 3) of a scan in the frame of its cloud, to which crops refer [m].
+
+        Args:
+            scan: of this source.
+        """
         moved = len(scan.points) and self._ground_truth.sensor is not None
         return self._sensor(scan.t_ns, scan.frame).inverse().apply(scan.points) if moved else scan.points
 
