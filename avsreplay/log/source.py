@@ -252,8 +252,7 @@ class Source:
         """Return the positions of the selected scans: the window first, then every n-th, then at most ``n_scans``."""
         if not self._placed:
             return []
-        start, end = self.options.window_s
-        first = self._placed[0].t_ns
+        (start, end), first = self.options.window_s, self._placed[0].t_ns
         inside = [i for i, p in enumerate(self._placed) if start <= (p.t_ns - first) * 1e-9 < end]
         return inside[:: self.options.every][: self.options.n_scans]
 
@@ -297,8 +296,7 @@ class Source:
         cloud = _cropped(cloud, self.options)
         if self._ground_truth.sensor is None:
             return cloud
-        pose = self._sensor(t_ns, cloud.frame)
-        return replace(cloud, points=pose.apply(cloud.points))
+        return replace(cloud, points=self._sensor(t_ns, cloud.frame).apply(cloud.points))
 
     def _sensor(self, t_ns: int, frame: str) -> Pose:
         """Return the pose of the sensor in the fixed frame. Raises BadMessage if it is unknown."""
@@ -341,14 +339,12 @@ def _cropped(cloud: Cloud, options: SourceOptions) -> Cloud:
     if options.crop_range is not None:
         distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
         keep &= (distance >= options.crop_range[0]) & (distance <= options.crop_range[1])
-    times = None if cloud.times_s is None else cloud.times_s[keep]
-    seen = None if cloud.intensities is None else cloud.intensities[keep]
+    times, seen = (None if each is None else each[keep] for each in (cloud.times_s, cloud.intensities))
     return replace(cloud, points=cloud.points[keep], times_s=times, intensities=seen)
 
 
 def refuse_losses(source: Source) -> None:
     """Raise UnreadableInput if any part was lost (``--strict``)."""
     if source.losses:
-        first = source.losses[0]
-        what = f"{len(source.losses)} losses, the first: {first.what} (byte {first.offset})"
+        what = f"{len(source.losses)} losses, the first: {source.losses[0].what} (byte {source.losses[0].offset})"
         raise UnreadableInput(what, where=shown(source.path), hint="leave out --strict to use the intact part")
