@@ -38,7 +38,7 @@ def test_an_unknown_choice_is_one_line(cli):
 
 SCRIPT = """
 import os, sys
-print("start")
+print("start", flush=True)
 {before}
 from avsreplay import arithmetic
 arithmetic.pin()

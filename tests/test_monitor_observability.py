@@ -171,9 +171,11 @@ def test_rows_of_a_body_at_rest_do_not_claim_more_than_pose_and_velocity(tmp_pat
 def test_rows_of_a_cold_start_do_not_claim_more_than_the_motion_allows(fixtures_folder) -> None:
     """Between two fits the mean of a mixture is no trajectory; along it the rank was 20 where it is 16.
 
-    The fit of the row and that of the whole log weight the poses differently. At the last scan the ratio of information
-    to prior of one direction is 1.007 in one and 0.93 in the other, so that it counts in the row only.
+    A direction counts where its information exceeds that of the prior. After the gap at 7 s the fit of a row has fewer
+    poses and other noise levels than that of the whole log. Along these two motions the ratios of the three weakest
+    directions differ by factors of up to 2.6 about one, so that the rank differs by up to two.
     """
     pairs = _compared(fixtures_folder / "tumble.mcap", "estimator.start=cold")
-    assert all(abs(row.ogm_rank - line["rank_fitted_motion"]) <= 1 for row, line in pairs)
-    assert all(row.ogm_rank == line["rank_fitted_motion"] for row, line in pairs[:-1] if row.t_s > 3.0)
+    assert all(row.ogm_rank == line["rank_fitted_motion"] for row, line in pairs if 3.0 < row.t_s < 8.5)
+    assert all(abs(row.ogm_rank - line["rank_fitted_motion"]) <= 2 for row, line in pairs)
+    assert max(row.ogm_rank for row, _ in pairs) < 20
