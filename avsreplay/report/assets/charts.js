@@ -324,8 +324,8 @@ const Charts = (() => {
       all[0].u.setScale("x", { min: t[0] - half, max: t[t.length - 1] + half });
     }
     function choose(k) { chosen = k; pins(); readouts(); }
-    function resize() {
-      const width = Math.max(host.clientWidth - 14, 240);
+    function resize(wide = host.clientWidth) {
+      const width = Math.max(wide - 14, 240);
       for (const c of all) if (c.u.width !== width) c.u.setSize({ width, height: c.u.height });
       requestAnimationFrame(pins);
     }

@@ -67,6 +67,8 @@
     if (jump) { choose(Number(jump.dataset.scan)); by("charts").scrollIntoView(); slider.focus({ preventScroll: true }); }
   });
   new ResizeObserver(() => { charts.resize(); view.resize(); }).observe(by("charts"));
+  addEventListener("beforeprint", () => charts.resize(660));  // CSS pixels between the margins of A4 and of US letter
+  addEventListener("afterprint", () => charts.resize());
   choose(0);
   recall();
   ready = true;
