@@ -6,6 +6,7 @@ import base64
 import json
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
 from operator import attrgetter
 from typing import Any
 
@@ -317,8 +318,10 @@ def most_telling(rows: Sequence[Row], most: int, always: Iterable[int] = ()) -> 
     """
     if len(rows) <= most:
         return list(range(len(rows)))
-    states = [(row.gamma, row.reason, row.fault, row.action) for row in rows]
-    turns = [k for k in range(1, len(rows)) if states[k] != states[k - 1]]
+    turns: set[int] = set()
+    for name in ("gamma", "reason", "fault", "action"):
+        column = list(map(attrgetter(name), rows))
+        turns.update(k for k, (before, now) in enumerate(pairwise(column), 1) if now != before)
     kept = {0, len(rows) - 1, *always, *(turns if len(turns) <= most // 4 else ())}
     step = -(-len(rows) * 5 // (most - len(kept)))
     peaks = [np.nan_to_num(values(rows, name), nan=-1.0) for name in ("pos_err_m", "rot_err_deg", "nis", "rms_m")]
