@@ -20,9 +20,9 @@ from avsreplay.log.header import scaled
 from avsreplay.log.options import Unit
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import RegisterParams, Registrar
-from avsreplay.register.size import diameter, part_of_size
+from avsreplay.register.size import MOST_OF_MODEL, diameter, part_of_size
 
-_LEAST, _MOST = 0.25, 1.3  # diameter of a scan over that of the model outside which something is wrong
+_LEAST = 0.25  # diameter of a scan over that of the model below which something is wrong, as above MOST_OF_MODEL
 _WHOLE = 1.1  # no scan of the target alone is larger than this
 _FEW = 0.02  # share of background below which it does not explain too large a scan
 _MOST_BACKGROUND = 0.5  # share of background from which on scans are rejected for too few inliers
@@ -30,7 +30,7 @@ _LEFT_OVER = 2.0  # below this ratio, background explains too large a scan bette
 _FEET = 0.36  # below this ratio, a model in feet explains the sizes as well as a view from a narrow side
 _LARGEST_TARGET_M = 500.0
 _ONE_SIDE = (0.4, 1.15)  # the same for a scan of the target alone
-SEARCHED, SEARCHED_SCANS = 20_000, 3  # points of a scan in which the model is searched, and scans
+_SEARCHED, _SEARCHED_SCANS = 20_000, 3  # points of a scan in which the model is searched, and scans
 _SCENE = 0.11  # factor of a unit from which on a scan that seems to show the target only may show its surroundings
 _LARGEST_SCENE = 300.0  # largest scan over the target in it, where the unit of the model is unknown
 _GAPS = 0.2, 0.3  # gaps within and around a target of unknown unit, over its diameter
@@ -102,26 +102,26 @@ def compare_sizes(
         return other or [_agreeing(said, scan_m, ratio)]
     whole = _units(ratio, unit)
     left = ratio < _LEFT_OVER or not whole  # background, not a wrong unit, explains the size
-    if ratio > _MOST and left and (found := _located(clouds, surface, registrar)):
+    if ratio > MOST_OF_MODEL and left and (found := _located(clouds, surface, registrar)):
         why = f"the model was found in {len(found)} of {len(clouds)} examined scans"
         among = Advice("ok", "size", f"{said}; {why}, among other points")
         return [_crop_advice(clouds, found, why) or among]
-    targets = [part_of_size(cloud, model_m, _ONE_SIDE) for cloud in clouds] if ratio > _MOST else []
+    targets = [part_of_size(cloud, model_m, _ONE_SIDE) for cloud in clouds] if ratio > MOST_OF_MODEL else []
     inside = [points for points in targets if points is not None]
     if ratio > _LEFT_OVER and len(inside) * 2 <= len(clouds):
         inside = _groups(clouds, model_m)
     grouped = len(inside) * 2 > len(clouds)
     if grouped and (crop := _crop_advice(clouds, inside, _of_size(model_m))):
         return [crop]
-    if grouped or _WHOLE < ratio <= _MOST:
+    if grouped or _WHOLE < ratio <= MOST_OF_MODEL:
         text = f"{said}: the model is too small (then --model-scale {ratio:.2f} or more), or background is left"
         return [Advice("check", "size", text)]
-    if _MOST < ratio < _LEFT_OVER:
+    if MOST_OF_MODEL < ratio < _LEFT_OVER:
         text = f"{said}: points around the target seem to be left; a narrower --crop-box or --crop-range removes them"
         return [Advice("check", "background", text)]
     units = {**dict.fromkeys(whole, ()), **_grouped_units(clouds, model_m, ratio, unit)}
     if not units:
-        hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (ratio > _MOST)
+        hint = ": if other objects are in view, keep the target by --crop-box or --crop-range" * (ratio > MOST_OF_MODEL)
         return [Advice("fail", "size", f"{said}; no common unit explains the difference{hint}")]
     return _unit_advice(units, clouds, surface, unit, said)
 
@@ -144,7 +144,7 @@ def find_model(
     scale = Unit(named[0]).metres if named and " " not in named[0] else options.model_unit.metres
     model = scaled(surface, scale / options.model_unit.metres)
     few = _few(clouds)
-    one, any_pose = _fitting(few, model)
+    one, any_pose = _fitting(few, Registrar(model))
     text = f"the model is found in {any_pose} of {len(few)} searched scans"
     if not any_pose:
         return [Advice("check", "pose", f"{text}: is it the right model, and does the topic show the target?")]
@@ -153,8 +153,12 @@ def find_model(
 
 def _few(clouds: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
     """Points of scans in which the model is searched."""
-    chosen = np.unique(np.linspace(0, len(clouds) - 1, SEARCHED_SCANS).astype(int)).tolist()
-    return [clouds[k][:: max(len(clouds[k]) // SEARCHED, 1)] for k in chosen]
+    chosen = np.unique(np.linspace(0, len(clouds) - 1, _SEARCHED_SCANS).astype(int)).tolist()
+    return [_thinned(clouds[k]) for k in chosen]
+
+
+def _thinned(cloud: NDArray[Any]) -> NDArray[Any]:
+    return cloud[:: max(len(cloud) // _SEARCHED, 1)]
 
 
 def _agreeing(said: str, scan_m: float, ratio: float) -> Advice:
@@ -187,7 +191,7 @@ def _grouped_units(
     units = dict[float, Sequence[Array]]()
     for scale in _UNITS:
         factor = scale / given
-        if scale == given or factor > most or not _MOST < ratio / factor < _LARGEST_SCENE:
+        if scale == given or factor > most or not MOST_OF_MODEL < ratio / factor < _LARGEST_SCENE:
             continue
         if len(groups := _groups(clouds, factor * model_m)) * 2 > len(clouds):
             units[scale] = groups
@@ -210,7 +214,8 @@ def _unit_advice(
     scale, groups = next(iter(units.items()))
     if len(units) > 1:
         few = _few(clouds)
-        fits = {each: _fitting(few, scaled(surface, each / given))[0] for each in units}
+        once = RegisterParams(index_cache=False)  # most of the units are wrong
+        fits = {each: _fitting(few, Registrar(scaled(surface, each / given), once))[0] for each in units}
         scale, groups = max(units.items(), key=lambda item: fits[item[0]])
     if scale == given:
         return []
@@ -220,9 +225,8 @@ def _unit_advice(
     return [unit, crop] if crop else [unit]
 
 
-def _fitting(clouds: Sequence[NDArray[Any]], surface: Surface) -> tuple[int, int]:
+def _fitting(clouds: Sequence[NDArray[Any]], registrar: Registrar) -> tuple[int, int]:
     """The numbers of scans in which a search finds one pose of the model, and one pose or more."""
-    registrar = Registrar(surface, RegisterParams(index_cache=False))
     found = [registrar.acquire(cloud) for cloud in clouds]
     return sum(each.status is AlignStatus.ALIGNED for each in found), sum(each.measured for each in found)
 
@@ -239,7 +243,7 @@ def _located(clouds: Sequence[NDArray[Any]], surface: Surface, registrar: Regist
     """
     registrar, found = registrar or Registrar(surface), []
     for k, cloud in enumerate(clouds):
-        pose = registrar.acquire(cloud[:: max(len(cloud) // SEARCHED, 1)])
+        pose = registrar.acquire(_thinned(cloud))
         if pose.measured:
             found.append(pose.T_ac.apply(surface.vertices))
         if 2 * (k + 1 - len(found)) > len(clouds):

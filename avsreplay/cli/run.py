@@ -142,9 +142,10 @@ class Wanted:
         if self.resume and self.output is None:
             raise UsageError("--resume needs the result directory of the interrupted run", hint="add -o DIR")
         check_outputs("update_golden")
-        for golden in (self.golden, self.update_golden):
-            if golden and (golden == self.golden or golden.is_file()):
-                read_golden(golden)
+        if self.golden:
+            read_golden(self.golden)
+        if self.update_golden and self.update_golden.is_file():
+            read_golden(self.update_golden)
 
 
 def _job(log: Path, flags: dict[str, Any]) -> Job:

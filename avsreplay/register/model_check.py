@@ -22,7 +22,7 @@ from avsreplay.geometry import Array
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import without_scattered_points
-from avsreplay.register.size import SIGMAS, diameter, fitted_size, noise_bias
+from avsreplay.register.size import MOST_OF_MODEL, SIGMAS, diameter, fitted_size, noise_bias
 
 POINTS = 1500  # points used of each scan
 _LEAST_RUN_ERROR = 0.002  # least error of size that is reported; a single scan cannot show so small a one
@@ -139,8 +139,7 @@ class ModelCheck:
             return "the scans fit the mirror image of the model: is an axis of the model or of the scans inverted?"
         own, seen = diameter(self._surface.vertices, trimmed=False), diameter(scan)
         sizes = f"the first of them measures {seen:.3g} m, the model {own:.3g} m"
-        # the limit of `preflight` beyond which a scan is too large for the target alone
-        cause = "is background left around the target, and is it" if seen > 1.3 * own else "is it"
+        cause = "is background left around the target, and is it" if seen > MOST_OF_MODEL * own else "is it"
         return f"no pose of the model explains the scans ({sizes}): {cause} the right model, in metres?"
 
     def _fits(self, surface: Surface, scan: Array) -> bool:

@@ -30,6 +30,7 @@ from avsreplay.geometry import Array, Pose
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
 LEAST_RESIDUALS = 50
+MOST_OF_MODEL = 1.3  # diameter of a scan over that of the model above which more than the target is in view
 GROUPED = 3000  # points of a scan in which connected groups are looked for
 NORMAL_QUANTILE = 0.67449  # median |e| over standard deviation for a normal e
 LEAST_ERROR, SIGMAS = 0.005, 4.0  # least |delta| that is reported, by itself and in standard errors

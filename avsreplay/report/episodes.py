@@ -224,8 +224,9 @@ def _episode(
     own = [marks[k] for k in rows]
     flagged = [m for m in own if m.gamma == 0]
     missing = not rows and any(a <= label.end_ns and label.start_ns <= b for a, b in holes)
-    shared = [] if rows else [m for m in marks if label.start_ns <= m.t_ns <= label.end_ns and m.fault is not None]
     behind = rows[-1] + 1 if rows else bisect_right(marks, label.end_ns, key=lambda m: m.t_ns)
+    begin = behind if rows else bisect_left(marks, label.start_ns, key=lambda m: m.t_ns)
+    shared = (m for m in marks[begin:behind] if m.fault is not None)
 
     def after() -> Iterator[Mark]:
         return (marks[k] for k in range(behind, len(marks)))
