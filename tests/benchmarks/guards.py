@@ -94,7 +94,7 @@ GUARDS: tuple[tuple[str, str, str, str], ...] = (
      "test_cli_results.py::test_a_result_that_is_replaced_keeps_the_files_of_others"),
     ("files.py", "        if _exchange(part, place):", "        if False:",
      "test_files.py::test_a_folder_is_replaced_in_one_step"),
-    ("cli/run.py", "                read_golden(golden)\n", "                pass\n",
+    ("cli/run.py", "            read_golden(self.golden)\n", "            pass\n",
      "test_cli_results.py::test_an_unusable_golden_file_is_refused_before_the_replay"),
     ("log/writer.py", "        except ValueError:\n            self._discard()",
      "        except ZeroDivisionError:\n            self._discard()",
