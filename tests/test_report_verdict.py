@@ -156,6 +156,19 @@ def test_a_moment_states_what_is_usual_and_its_cause(make_rows):
     assert found[40][1] == "the estimate is not converged"
 
 
+def test_a_manoeuvre_is_the_cause_of_the_scans_that_were_rejected_before_it_was_decided(make_rows):
+    rows = _good(make_rows, n=40, gamma=1, reason="ok", fault=None, nis=6.0, converged=True, manoeuvres=0)
+    late = {"manoeuvres": 1, "manoeuvre_s": 50.24}
+    changed = {k: {"gamma": 0, "reason": "doubtful", "nis": 300.0} for k in (20, 21)}
+    changed[22] = {"nis": 208.0}
+    rows = [dataclasses.replace(r, **(late if r.seq > 20 else {}), **changed.get(r.seq, {})) for r in rows]
+    found = [m.cause for m in sorted(worst_moments(rows), key=lambda m: m.start_s)]
+    manoeuvre = "manoeuvre of the target at 50.2 s"
+    assert found == [f"rejected: doubtful; {manoeuvre}", manoeuvre]
+    rejected = [dataclasses.replace(r, manoeuvres=0) for r in rows]
+    assert {m.cause for m in worst_moments(rejected)} == {"rejected: doubtful", "first used scan after rejected scans"}
+
+
 def test_harmful_scans_that_were_used_are_judged_by_the_error(make_rows):
     """Some scans of the fault were flagged, so that it counts as detected, but others moved the estimate."""
     rows = _good(make_rows)

@@ -251,8 +251,7 @@ def _plain(name: str) -> str:
 
 
 def _median(figures: Array) -> float | None:
-    known = np.sort(figures[np.isfinite(figures)])
-    return float(known[len(known) // 2]) if len(known) else None
+    return float(known[len(known) // 2]) if len(known := np.sort(figures[np.isfinite(figures)])) else None
 
 
 def first_pose(rows: Sequence[Row], header: Mapping[str, Any]) -> str:
@@ -326,23 +325,23 @@ def _flagged_moment(rows: Sequence[Row], places: Sequence[int]) -> tuple[float, 
     error = "" if largest is None else f", position error up to {length_text(largest)}"
     count = "1 scan" if len(places) == 1 else f"{len(places)} scans"
     span = rows[places[0]].t_s, rows[places[-1]].t_s
-    return 3.0 * len(places), Moment(worst, *span, f"{count} not used{error}", _cause(rows, places[0]))
+    return 3.0 * len(places), Moment(worst, *span, f"{count} not used{error}", _cause(rows, places[0], places[-1]))
 
 
-def _cause(rows: Sequence[Row], k: int) -> str:
-    """The cause, by the rows, of a moment that begins at row k."""
-    row, before = rows[k], rows[k - 1] if k else None
+def _cause(rows: Sequence[Row], k: int, last: int | None = None) -> str:
+    """The cause, by the rows, of a moment that begins at row k and ends at row ``last``, or at k."""
+    row, end = rows[k], rows[k if last is None else last]
+    before = next((rows[j] for j in range(k - 1, -1, -1) if rows[j].gamma != 0), None)
     if row.fault:
         return f"injected: {_plain(row.fault)}"
+    moved = before is not None and (end.manoeuvres or 0) > (before.manoeuvres or 0)
+    manoeuvre = "manoeuvre of the target" + ("" if end.manoeuvre_s is None else f" at {end.manoeuvre_s:.1f} s")
     if row.gamma == 0:
-        return f"rejected: {_plain(row.reason)}"
-    if before is not None:
-        if (row.reinitialised or 0) > (before.reinitialised or 0):
-            return "the estimate was reinitialised"
-        if (row.manoeuvres or 0) > (before.manoeuvres or 0):
-            return "manoeuvre of the target"
-        if before.gamma == 0:
-            return "first scan used after a time without"
+        return f"rejected: {_plain(row.reason)}" + (f"; {manoeuvre}" if moved else "")
+    if moved or (before is not None and (row.reinitialised or 0) > (before.reinitialised or 0)):
+        return manoeuvre if moved else "the estimate was reinitialised"
+    if k and rows[k - 1].gamma == 0:
+        return "first used scan after rejected scans"
     if row.guess == "acquired":
         return "pose found by a search"
     if not row.converged:
