@@ -9,11 +9,13 @@ import subprocess
 import sys
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from avsreplay.records import Label
 from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import print_tables
-from avsreplay.report.table import choose_rows, decimals, head, make_console, state_cell
+from avsreplay.report.table import Table, choose_rows, decimals, head, make_console, print_table, state_cell
 from avsreplay.rows import columns
 
 
@@ -50,7 +52,7 @@ def test_no_escape_codes_off_a_terminal(make_rows):
     assert "\x1b" not in _printed(make_rows(30))
 
 
-@pytest.mark.parametrize("width", [40, 80, 100, 160, 250])
+@pytest.mark.parametrize("width", [70, 80, 100, 160, 250])
 def test_every_width_is_kept_and_what_is_left_out_is_named(make_rows, width):
     text = _printed(make_rows(30), width=width)
     assert max(len(line.rstrip()) for line in text.splitlines()) <= width
@@ -165,3 +167,17 @@ def test_importing_the_report_loads_no_heavy_library():
     code = "import avsreplay.report, sys; print([m for m in ('rich', 'plotly', 'pyarrow') if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("tight", [False, True])
+@given(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=6), st.integers(20, 90))
+def test_no_number_and_no_name_is_cut_at_any_width(tight: bool, values: list[float], width: int) -> None:
+    stream = io.StringIO()
+    texts = [f"{value:.5g}" for value in values]
+    rows = tuple((f"name_of_a_long_metric_{k}", "some words that can wrap", t, t) for k, t in enumerate(texts))
+    table = Table("title", ("metric", "meaning", "baseline", "this"), rows, align="nlr")
+    print_table(make_console(stream, width=width), table, tight=tight)
+    lines = stream.getvalue().splitlines()
+    for k, text in enumerate(texts):
+        line = next(line for line in lines if f"name_of_a_long_metric_{k} " in line)
+        assert line.split()[-2:] == [text, text]

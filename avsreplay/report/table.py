@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import IO, Any, Literal
 
 from rich import box
+from rich.cells import cell_len
 from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
@@ -20,6 +21,7 @@ from rich.text import Text
 from avsreplay.rows import Column, Row, columns
 
 PLAIN_WIDTH = 80
+_WRAPPED = 12  # least width of a column of wrapped text, with its margin
 _SIGNS = {"good": ("●", "o"), "bad": ("✗", "x"), "warn": ("~", "~"), "faint": ("", "")}
 _COLOURS = {"good": "#009E73", "bad": "bold #D55E00", "warn": "#E69F00", "faint": "dim"}
 
@@ -99,10 +101,24 @@ def ascii_only(console: Console) -> bool:
 
 
 def print_table(console: Console, table: Table, *, tight: bool = False) -> None:
-    """Print a table and an empty line; nothing for a table without rows. ``tight``: one blank between columns."""
+    """Print a table and an empty line; nothing for a table without rows. ``tight``: one blank between columns.
+
+    Lines are longer than the console is wide where numbers and names, which are never cut, require it.
+    """
     if table.rows:
+        width, console.width = console.width, max(console.width, _least_width(table, 1 if tight else 2))
         console.print(_rich(console, table, tight))
+        console.width = width
         console.print()
+
+
+def _least_width(table: Table, gap: int) -> int:
+    """Width at which no column of one line is cut; all columns have one where the gap between them is 1."""
+    columns_of_text = zip(table.heads, *([as_cell(c).signed() for c in row] for row in table.rows), strict=True)
+    return sum(
+        _WRAPPED if gap > 1 and table.letter(k) == "l" else gap + max(map(cell_len, "\n".join(texts).split("\n")))
+        for k, texts in enumerate(columns_of_text)
+    )
 
 
 def print_line(console: Console, text: str) -> None:
@@ -167,9 +183,7 @@ def number(value: float | None, spec: str = ".5g", none: str = "-") -> str:
 def decimals(values: Iterable[float], least: int, *, figures: int = 3) -> int:
     """Number of decimals, ``least`` to 8, that show ``figures`` significant figures of the middle value."""
     sizes: Sequence[float] = sorted(abs(v) for v in values if v)
-    if not sizes:
-        return least
-    wanted = figures - 1 - math.floor(math.log10(sizes[len(sizes) // 2]))
+    wanted = figures - 1 - math.floor(math.log10(sizes[len(sizes) // 2])) if sizes else least
     return min(max(least, wanted), 8)
 
 
@@ -284,9 +298,7 @@ def _cells(column: Column, rows: Sequence[Row]) -> list[TableCell]:
 def _cell(value: Any, fmt: str) -> TableCell:
     if value is None:
         return TableCell("-", "faint")
-    if isinstance(value, bool):
-        return TableCell("yes" if value else "no")
-    return TableCell(format(value, fmt))
+    return TableCell(("no", "yes")[value] if isinstance(value, bool) else format(value, fmt))
 
 
 def state_cell(gamma: int, reason: str) -> TableCell:
@@ -299,11 +311,9 @@ def state_cell(gamma: int, reason: str) -> TableCell:
 def _fit(widths: dict[str, int], width: int) -> list[str]:
     """Column names in row order: as many as fit, chosen in the order of preference."""
     kept: list[str] = []
-    used = 0
     for name in dict.fromkeys(n for n in (*_ORDER, *widths) if n in widths):
-        if used + widths[name] <= width:
+        if sum(widths[other] for other in (*kept, name)) <= width:
             kept.append(name)
-            used += widths[name]
     return [name for name in widths if name in kept]
 
 
@@ -316,7 +326,7 @@ def spark(values: Sequence[float | None], width: int) -> str:
     """At most ``width`` blocks from 0 to the largest value, each the largest of its part; a blank for none."""
     parts = [[v for v in values[a:b] if v is not None] for a, b in _parts(len(values), width)]
     top = max((max(part) for part in parts if part), default=0.0)
-    return "".join(_block(max(part), top) if part else " " for part in parts)
+    return "".join(_BLOCKS[min(int(max(p) / top * 8.0), 7) if top > 0 else 0] if p else " " for p in parts)
 
 
 def _parts(count: int, width: int) -> list[tuple[int, int]]:
@@ -324,20 +334,15 @@ def _parts(count: int, width: int) -> list[tuple[int, int]]:
     return [(count * k // cells, count * (k + 1) // cells) for k in range(cells)]
 
 
-def _block(value: float, top: float) -> str:
-    return _BLOCKS[min(int(value / top * len(_BLOCKS)), len(_BLOCKS) - 1)] if top > 0 else _BLOCKS[0]
-
-
 def print_sparks(console: Console, rows: Sequence[Row]) -> None:
     """Print pose errors and flagged scans over time; only on a wide terminal with Unicode."""
     if not console.is_terminal or console.width < LEAST_WIDTH or ascii_only(console):
         return
     width = console.width - _LABEL
-    for name, unit, column in (("position error", "mm", "pos_err_m"), ("attitude error", "deg", "rot_err_deg")):
-        found = [getattr(row, column) for row in rows]
-        values = [1000.0 * v if v is not None and unit == "mm" else v for v in found]
-        known = [v for v in values if v is not None]
-        if known:
+    shown = (("position error", "mm", "pos_err_m", 1000.0), ("attitude error", "deg", "rot_err_deg", 1.0))
+    for name, unit, column, scale in shown:
+        values = [None if (v := getattr(row, column)) is None else scale * v for row in rows]
+        if known := [v for v in values if v is not None]:
             label = f"{name} to {max(known):.3g} {unit}"
             console.print(Text(f"{label:{_LABEL}}").append(spark(values, width), style="#0072B2"))
     flags = "".join("✗" if any(row.gamma == 0 for row in rows[a:b]) else "·" for a, b in _parts(len(rows), width))
