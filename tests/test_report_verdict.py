@@ -91,7 +91,7 @@ PUSH = {
         ({"rms_m": 0.3}, Grade.CHECK, "check unit, scale and model"),
         ({"nees": 100.0}, Grade.CHECK, "the covariance is too small (overconfident): only 0 % of NEES inside"),
         ({"nees": 1.0}, Grade.CHECK, "the covariance is too large"),
-        ({"nis": 40.0}, Grade.CHECK, "only 0 % of NIS inside the 95 % band"),
+        ({"nis": 40.0}, Grade.CHECK, "only 0 % of NIS inside the 95 % band, 100 % above it"),
         ({"consistent": False}, Grade.CHECK, "the innovations are inconsistent in 100 of 100 scans, first at 0.0 s"),
         ({"reinitialised": 2}, Grade.CHECK, "the estimate was reinitialised 2 times, first at 0.0 s"),
         (PUSH, Grade.CHECK, "the target's velocity changed at 4.0 s by 10 +- 0.2 mm/s"),

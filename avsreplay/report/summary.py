@@ -50,11 +50,12 @@ class Errors:
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """A chi-square statistic: its median and the share of scans inside the two-sided 95 % band."""
+    """A chi-square statistic: its median and the shares of scans inside and above the two-sided 95 % band."""
 
     count: int
     median: float
     inside: float
+    above: float
     low: float
     high: float
 
@@ -280,5 +281,6 @@ def _blocks(figures: Mapping[str, Array]) -> dict[str, Share]:
 def _share(values: Array, band: tuple[float, float]) -> Share | None:
     if not len(values):
         return None
+    above = int(np.count_nonzero(values > band[1])) / len(values)
     inside = int(np.count_nonzero((band[0] <= values) & (values <= band[1]))) / len(values)
-    return Share(len(values), median(values), inside, *band)
+    return Share(len(values), median(values), inside, above, *band)

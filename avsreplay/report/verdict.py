@@ -205,7 +205,8 @@ def _filter(rows: Sequence[Row], summary: Summary) -> Iterator[Concern]:
         if share is not None and share.count >= 10 and share.inside < INSIDE_LEAST:
             low = "too small (overconfident)" if share.median > share.high else "too large (conservative)"
             where = f"the covariance is {low}: " if not share.low <= share.median <= share.high else ""
-            yield Concern(Grade.CHECK, f"{where}only {100 * share.inside:.0f} % of {name} inside the 95 % band")
+            shares = f"{100 * share.inside:.0f} % of {name} inside the 95 % band, {100 * share.above:.0f} % above it"
+            yield Concern(Grade.CHECK, f"{where}only {shares}")
     if len(inconsistent := [row.t_s for row in rows if row.consistent is False]) > 0.1 * len(rows):
         begin = inconsistent[0]
         text = f"the innovations are inconsistent in {len(inconsistent)} of {len(rows)} scans, first at {begin:.1f} s"
