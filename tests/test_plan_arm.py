@@ -164,6 +164,15 @@ def test_a_capture_out_of_reach_is_replaced_by_a_later_one(arm: Arm) -> None:
     assert (turn.inv() * Rotation.from_quat(scene.attitude(end)[0])).magnitude() < 1e-6
 
 
+def test_the_later_capture_is_not_one_of_a_coarse_grid(arm: Arm) -> None:
+    scene, limits = _turning(phase=3.6, rate=-0.05), replace(NEAR, reach_max_m=arm.reach_m)
+    free, made, _ = _fitted(arm, scene)
+    params, zero = PlanParams(a_max_mps2=0.05, horizon_s=90.0), np.zeros(3)
+    for capture_s in np.arange(free.t_go_s, made.t_go_s - 0.1, 0.1)[::-1][:8]:  # the joints miss those shortly before
+        earlier = constrained(scene, START, zero, params, limits, extent_m=2.0, earliest_s=capture_s)
+        assert not arm.last_metres(path_of(earlier, START, zero), scene, limits).possible
+
+
 def test_a_weak_arm_flies_slower(arm: Arm, tmp_path: Path) -> None:
     scene = _turning(phase=0.0, rate=0.01)
     free, _, joints = _fitted(arm, scene)

@@ -326,6 +326,14 @@ def test_plans_with_a_clearance_are_near_the_best_known(number, known_s):
     assert plan.violation_m == 0.0
 
 
+def test_the_number_of_intervals_costs_less_than_a_tenth_of_a_second():
+    """Time of IPOPT with 200 nodes: plan_limits.py --kind cone --first 37 --count 1 --seed 71 --ipopt 38."""
+    problem = problems(38, 71)[37]
+    params = PlanParams(a_max_mps2=problem.a_max)
+    plan = constrained(problem.scene, problem.r0, ORIGIN, params, Limits(cone_deg=35.0))
+    assert plan.t_go_s <= 31.888 + 0.05
+
+
 @pytest.mark.parametrize(("number", "earliest_s"), [(0, 24.016442393), (3, 21.57), (3, 15.0)])
 def test_an_earliest_capture_before_that_of_the_plan_does_not_change_the_plan(number, earliest_s):
     """Acceleration bounded per axis of a turned base, which makes drafts hard to refine."""

@@ -20,7 +20,7 @@ from avsreplay import geometry
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import Plan, PlanStatus
-from avsreplay.plan.joint_path import JointPath, share_of
+from avsreplay.plan.joint_path import JointPath, last_metres_s, share_of, shoulder_and_wrist, sum_of_links
 from avsreplay.plan.limits import Scene
 from avsreplay.plan.path import MOTION_FACTOR, RobotPath
 from avsreplay.plan.rendezvous import no_plan
@@ -34,11 +34,12 @@ POSE_ERROR = 1e-8  # largest error of the inverse kinematics [m, rad]
 DAMPING = 1e-3
 CAPTURES = 16  # plans that are tried until the joints can fly one
 GRID_S = 0.25  # spacing of the instants at which the reach is bounded
-EXACT_M = 1e-9  # an offset within this distance is on an axis [m]
+CLOSE_S = 0.1  # interval between a capture that the joints miss and one that they follow at which the search ends
 STEP_S = 1.0  # spacing of the capture instants
 APPROACH = 9  # poses on the axis of the corridor at which a capture instant is tried
 QUICK = 8  # joint configurations from which the inverse kinematics of a capture instant begins
 SLOWEST = 0.1  # smallest share of the largest acceleration
+SAME_RAD = 1e-4  # joints of the capture that differ by less belong to one branch
 JUMP_RAD = 0.5  # a larger change of a joint between two instants is another branch
 
 
@@ -79,46 +80,12 @@ class Arm:
             raise UsageError(f"there is no frame '{frame}'", where=str(urdf), hint=f"frames: {names}")
         model.gravity = self._pin.Motion.Zero()
         self._data, self._frame = model.createData(), model.getFrameId(frame)
-        self._reach = self._wrist()
+        self._reach = shoulder_and_wrist(self._pin, model, self._data, self._frame)
 
     @property
     def reach_m(self) -> float:
         """Upper bound of the distance from the base to the gripper: the sum of the lengths of all links [m]."""
-        model = self._model
-        total = float(np.linalg.norm(model.frames[self._frame].placement.translation))
-        joint = int(model.frames[self._frame].parentJoint)
-        while joint > 0:
-            total += float(np.linalg.norm(model.jointPlacements[joint].translation))
-            if model.joints[joint].shortname().startswith("JointModelP"):  # a prismatic joint
-                k = model.joints[joint].idx_q
-                total += max(abs(model.lowerPositionLimit[k]), abs(model.upperPositionLimit[k]))
-            joint = int(model.parents[joint])
-        return total
-
-    def _wrist(self) -> tuple[Array, Array, float]:
-        """Return shoulder (3,), wrist (3,) and the largest distance between them [m], the same for all joint positions.
-
-        The shoulder is given in the frame of the base, the wrist in that of the gripper. They are the origins of the
-        first and the last joint, or of the ones next to them where the offset lies on the axis of rotation.
-        """
-        pin, model, data = self._pin, self._model, self._data
-        tip, chain = model.frames[self._frame].placement.inverse(), [int(model.frames[self._frame].parentJoint)]
-        while model.parents[chain[0]] > 0:
-            chain.insert(0, int(model.parents[chain[0]]))
-        pin.computeJointJacobians(model, data, pin.neutral(model))
-        axes = [pin.getJointJacobian(model, data, j, pin.LOCAL)[:, model.joints[j].idx_v] for j in chain]
-        if len(chain) < 4 or any(np.linalg.norm(axis[3:]) < 0.5 for axis in axes):  # a prismatic joint
-            return np.zeros(3), np.zeros(3), self.reach_m
-        place = model.jointPlacements
-        shoulder, wrist, inner = place[chain[0]].translation.copy(), tip.translation.copy(), chain[1:]
-        if float(np.linalg.norm(np.cross(axes[0][3:], place[chain[1]].translation))) < EXACT_M:
-            shoulder += place[chain[0]].rotation @ place[chain[1]].translation
-            inner = inner[1:]
-        offset = place[chain[-1]].rotation.T @ place[chain[-1]].translation
-        if float(np.linalg.norm(np.cross(axes[-1][3:], offset))) < EXACT_M:
-            wrist -= tip.rotation @ offset
-            inner = inner[:-1]
-        return shoulder, wrist, float(sum(np.linalg.norm(place[j].translation) for j in inner))
+        return sum_of_links(self._model, self._frame)
 
     def missing_m(self, target: Pose) -> float:
         """Return by how much a pose is certainly out of reach [m]; at most 0 where it may be in reach.
@@ -169,7 +136,7 @@ class Arm:
             q = np.clip(q + step, model.lowerPositionLimit, model.upperPositionLimit)
         return None
 
-    def last_metres(self, path: RobotPath, scene: Scene, limits: Limits) -> JointPath:
+    def last_metres(self, path: RobotPath, scene: Scene, limits: Limits, starts: Array | None = None) -> JointPath:
         """Return the joints along the end of a plan; of several branches at the capture the one that reaches farthest.
 
         The gripper has the attitude of the fixture.
@@ -178,28 +145,15 @@ class Arm:
             path: Path of the end-effector in {A}.
             scene: The target after the instant of planning, with its attitude.
             limits: Resolved limits: the pose of the base, and the length of the final approach.
+            starts: (m, k) joints from which the inverse kinematics of the capture begins; None: over their whole range.
 
         Raises:
             ValueError: The scene has no attitude.
         """
-        all_times = np.linspace(0.0, path.t_go_s, 1001)
-        far = np.flatnonzero(
-            np.linalg.norm(path.at(all_times)[0] - scene.goal(all_times)[0], axis=1) > (limits.final_range_m or 0.0)
-        )
-        begin_s = float(all_times[far[-1]]) if len(far) else 0.0
-        times = np.linspace(begin_s, path.t_go_s, INSTANTS)
+        times = np.linspace(last_metres_s(path, scene, limits), path.t_go_s, INSTANTS)
         r = path.at(times)[0]
         poses = self._poses(scene, limits, times, r)
-        best: list[Array] = []
-        for start in self._starts():
-            end = self.inverse(poses[-1], start)
-            if end is None:
-                continue
-            traced = self._traced(poses, end)
-            if len(traced) > len(best):
-                best = traced
-            if len(best) == len(times):
-                break
+        best = self._farthest(poses, self._starts() if starts is None else starts)
         return self._graded(times[len(times) - len(best) :], best, r[len(times) - len(best) :], len(best) == len(times))
 
     def fitted(
@@ -224,7 +178,7 @@ class Arm:
             limits: Resolved limits: the pose of the base, and the length of the final approach.
             first_s: Earliest capture [s after the instant of planning].
             horizon_s: Latest capture.
-            hint_s: Capture of an earlier plan that the joints delayed; it is tried first, a little earlier.
+            hint_s: Capture of an earlier plan that the joints delayed; it is tried first.
 
         Returns:
             The plan and its joints. Without one a plan with the status ``none_found`` and the joints of the first plan,
@@ -233,23 +187,29 @@ class Arm:
         if self.never_reaches(scene, limits, horizon_s):
             made = make(first_s, 1.0)
             return no_plan(made.t_ns, PlanStatus.INFEASIBLE, made.a_max, horizon_s), None
-        if hint_s - 0.5 * STEP_S > first_s:
-            made = make(hint_s - 0.5 * STEP_S, 1.0)
+        if hint_s > first_s:
+            made = make(hint_s, 1.0)
             joints = self.last_metres(path(made), scene, limits) if made.found else None
             if joints is not None and joints.possible:
                 return _later(made, make(first_s, 1.0).lower_bound_s), joints
-        earliest_s, share, first = first_s, 1.0, None
+        earliest_s, missed_s, share, lead_s, first = first_s, first_s, 1.0, 0.0, None
         for _ in range(CAPTURES):
             made = make(earliest_s, share)
             joints = self.last_metres(path(made), scene, limits) if made.found else None
             if joints is not None and joints.possible:
-                return (made if first is None else _later(made, first[0].lower_bound_s)), joints
+                if first is None:
+                    return made, joints
+                made, joints = self._earlier(make, path, scene, limits, (missed_s, share), (made, joints))
+                return _later(made, first[0].lower_bound_s), joints
             first = first or (made, joints)
             least = 1.0 if joints is None else joints.slower
             if joints is not None and least * share >= SLOWEST and least < 1.0:
                 share *= least
                 continue
-            after_s = self._next_capture(scene, limits, max(made.t_go_s if made.found else 0.0, earliest_s), horizon_s)
+            if made.found:
+                lead_s = made.t_go_s - last_metres_s(path(made), scene, limits)
+                earliest_s = missed_s = max(made.t_go_s, earliest_s)
+            after_s = self._next_capture(scene, limits, earliest_s, horizon_s, lead_s)
             if after_s is None or (not made.found and share == 1.0):
                 break
             earliest_s, share = after_s, 1.0
@@ -258,25 +218,49 @@ class Arm:
         none = replace(no_plan(made.t_ns, PlanStatus.NOT_FOUND, made.a_max, made.lower_bound_s), delayed_by="arm")
         return (none if made.found else made), joints
 
-    def _next_capture(self, scene: Scene, limits: Limits, after_s: float, horizon_s: float) -> float | None:
-        """Return the first instant later than ``after_s`` by STEP_S or more at which the arm reaches the fixture.
+    def _earlier(
+        self,
+        make: Callable[[float, float], Plan],
+        path: Callable[[Plan], RobotPath],
+        scene: Scene,
+        limits: Limits,
+        missed: tuple[float, float],
+        best: tuple[Plan, JointPath],
+    ) -> tuple[Plan, JointPath]:
+        """Return an earlier capture with the same branch of the joints; ``missed``: a capture that they miss, share."""
+        missed_s, share = missed
+        while best[0].t_go_s - missed_s > CLOSE_S:
+            middle_s = 0.5 * (missed_s + best[0].t_go_s)
+            made = make(middle_s, share)
+            if made.found and made.t_go_s >= best[0].t_go_s:  # no capture is earlier
+                break
+            joints = self.last_metres(path(made), scene, limits, best[1].joints[-1:]) if made.found else None
+            if joints is not None and joints.possible:
+                best = made, joints
+            else:
+                missed_s = middle_s
+        return best
 
-        It reaches the pose of the capture and, with the same branch of the joints, the corridor ahead of it.
+    def _next_capture(
+        self, scene: Scene, limits: Limits, after_s: float, horizon_s: float, lead_s: float
+    ) -> float | None:
+        """Return the first instant later than ``after_s``, in steps of STEP_S, at which the arm reaches the fixture.
+
+        It reaches the pose of the capture and, with the same branch of the joints, the axis of the corridor ahead of
+        it during the time ``lead_s`` before, with a distance that decreases with the square of the time to the capture.
         """
         times = np.arange(after_s + STEP_S, horizon_s, STEP_S)
         goal = scene.goal(times)[0]
         near = [self.missing_m(pose) <= 0.0 for pose in self._poses(scene, limits, times, goal)]
         axis = np.array([1.0, 0.0, 0.0]) if scene.axis_c is None else scene.axis_c
         for k in np.flatnonzero(near):
-            instants = np.full(APPROACH, times[k])
-            ahead = np.linspace(limits.final_range_m or 0.0, 0.0, APPROACH)[:, None]
+            left = np.linspace(1.0, 0.0, APPROACH)
+            instants = np.maximum(times[k] - lead_s * left, 0.0)
             assert scene.attitude is not None
-            r = goal[k] + ahead * (geometry.matrix(scene.attitude(instants[:1])[0]) @ axis)
-            line = self._poses(scene, limits, instants, r)
-            for start in self._starts()[:QUICK]:
-                end = self.inverse(line[-1], start)
-                if end is not None and len(self._traced(line, end)) == APPROACH:
-                    return float(times[k])
+            ahead = ((limits.final_range_m or 0.0) * left**2)[:, None]
+            r = scene.goal(instants)[0] + ahead * (geometry.matrix(scene.attitude(instants)) @ axis)
+            if len(self._farthest(self._poses(scene, limits, instants, r), self._starts()[:QUICK])) == APPROACH:
+                return float(times[k])
         return None
 
     def _poses(self, scene: Scene, limits: Limits, times: Array, r: Array) -> list[Pose]:
@@ -295,6 +279,21 @@ class Arm:
         low, high = self._model.lowerPositionLimit, self._model.upperPositionLimit
         rng = np.random.Generator(np.random.PCG64(0))
         return np.concatenate([0.5 * (low + high)[None], low + (high - low) * rng.random((STARTS - 1, len(low)))])
+
+    def _farthest(self, poses: list[Pose], starts: Array) -> list[Array]:
+        """Return the joints at the last poses, of the branch at the last pose that reaches farthest back."""
+        best, ends = list[Array](), list[Array]()
+        for start in starts:
+            end = self.inverse(poses[-1], start)
+            if end is None or any(float(np.abs(end - other).max()) < SAME_RAD for other in ends):
+                continue
+            ends.append(end)
+            traced = self._traced(poses, end)
+            if len(traced) > len(best):
+                best = traced
+            if len(best) == len(poses):
+                break
+        return best
 
     def _traced(self, poses: list[Pose], end: Array) -> list[Array]:
         """Return the joints at the last poses, in their order, as far back as the branch exists."""

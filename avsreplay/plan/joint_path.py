@@ -1,13 +1,19 @@
-"""The joints of a manipulator during the last metres of a plan, and how much of their limits they use."""
+"""The joints of a manipulator during the last metres of a plan, the use of their limits, and the reach of its links."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from avsreplay.geometry import Array
+from avsreplay.plan.limits import Scene
+from avsreplay.plan.path import RobotPath
+from avsreplay.plan.robot import Limits
+
+EXACT_M = 1e-9  # an offset within this distance is on an axis [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,3 +80,66 @@ def share_of(values: Array, limits: Array) -> float:
     """
     on = np.isfinite(limits) & (limits > 0.0)
     return float((np.abs(values[:, on]) / limits[on]).max()) if on.any() else math.nan
+
+
+def last_metres_s(path: RobotPath, scene: Scene, limits: Limits) -> float:
+    """Return the instant at which the last metres of a plan begin, the length of the corridor before the capture [s].
+
+    Args:
+        path: Path of the end-effector in {A}.
+        scene: The target after the instant of planning.
+        limits: Resolved limits.
+    """
+    times = np.linspace(0.0, path.t_go_s, 1001)
+    away = np.linalg.norm(path.at(times)[0] - scene.goal(times)[0], axis=1)
+    far = np.flatnonzero(away > (limits.final_range_m or 0.0))
+    return float(times[far[-1]]) if len(far) else 0.0
+
+
+def sum_of_links(model: Any, frame: int) -> float:
+    """Return an upper bound of the distance from the base to the gripper: the sum of the lengths of all links [m].
+
+    Args:
+        model: Model of the manipulator.
+        frame: Number of the frame of the gripper.
+    """
+    total = float(np.linalg.norm(model.frames[frame].placement.translation))
+    joint = int(model.frames[frame].parentJoint)
+    while joint > 0:
+        total += float(np.linalg.norm(model.jointPlacements[joint].translation))
+        if model.joints[joint].shortname().startswith("JointModelP"):  # a prismatic joint
+            k = model.joints[joint].idx_q
+            total += max(abs(model.lowerPositionLimit[k]), abs(model.upperPositionLimit[k]))
+        joint = int(model.parents[joint])
+    return total
+
+
+def shoulder_and_wrist(pin: Any, model: Any, data: Any, frame: int) -> tuple[Array, Array, float]:
+    """Return shoulder (3,), wrist (3,) and the largest distance between them [m], the same for all joint positions.
+
+    The shoulder is given in the frame of the base, the wrist in that of the gripper. They are the origins of the
+    first and the last joint, or of the ones next to them where the offset lies on the axis of rotation.
+
+    Args:
+        pin: The module pinocchio.
+        model: Model of the manipulator.
+        data: Its data.
+        frame: Number of the frame of the gripper.
+    """
+    tip, chain = model.frames[frame].placement.inverse(), [int(model.frames[frame].parentJoint)]
+    while model.parents[chain[0]] > 0:
+        chain.insert(0, int(model.parents[chain[0]]))
+    pin.computeJointJacobians(model, data, pin.neutral(model))
+    axes = [pin.getJointJacobian(model, data, j, pin.LOCAL)[:, model.joints[j].idx_v] for j in chain]
+    if len(chain) < 4 or any(np.linalg.norm(axis[3:]) < 0.5 for axis in axes):  # a prismatic joint
+        return np.zeros(3), np.zeros(3), sum_of_links(model, frame)
+    place = model.jointPlacements
+    shoulder, wrist, inner = place[chain[0]].translation.copy(), tip.translation.copy(), chain[1:]
+    if float(np.linalg.norm(np.cross(axes[0][3:], place[chain[1]].translation))) < EXACT_M:
+        shoulder += place[chain[0]].rotation @ place[chain[1]].translation
+        inner = inner[1:]
+    offset = place[chain[-1]].rotation.T @ place[chain[-1]].translation
+    if float(np.linalg.norm(np.cross(axes[-1][3:], offset))) < EXACT_M:
+        wrist -= tip.rotation @ offset
+        inner = inner[:-1]
+    return shoulder, wrist, float(sum(np.linalg.norm(place[j].translation) for j in inner))

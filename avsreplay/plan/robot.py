@@ -80,7 +80,7 @@ class Limits(Settings):
         (0.0, 0.0, 0.0, 1.0), "Quaternion that takes coordinates of the robot's base to {A}."
     )
     nodes: int = setting(
-        40,
+        60,
         "Number of thrust intervals of a constrained plan. A larger value gives an earlier capture, in more time.",
         low=8,
     )
