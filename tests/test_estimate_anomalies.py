@@ -47,22 +47,26 @@ def test_the_covariance_contains_a_change_that_two_scans_make_possible() -> None
     Phi, H, A = rng.normal(size=(2, 20, 20)), rng.normal(size=(2, 6, 20)), 0.3 * rng.normal(size=(2, 20, 20))
     P, R = A @ A.swapaxes(1, 2), np.array([np.diag(rng.uniform(1.0, 2.0, size=6)) for _ in range(2)])
     S, alpha, one_sigma = H @ P @ H.swapaxes(1, 2) + R, 3.0 * rng.normal(size=(2, 6)), (0.2, 0.3)
-    ratio, moments = _motion.change(Phi, P, H, alpha, S, R, np.ones((2, 2)), one_sigma, 1.0)
+    share, none, y = 0.2, np.zeros(12), alpha.reshape(-1)
+    ratio, moments = _motion.change(Phi, P, H, alpha, S, R, np.ones((2, 2)), one_sigma, 1.0, share)
     left = [np.eye(20) - P[k] @ H[k].T @ np.linalg.inv(S[k]) @ H[k] for k in range(2)]
-    C = np.block([[S[0], np.zeros((6, 6))], [np.zeros((6, 6)), S[1]]])
-    y, want, weighted = alpha.reshape(-1), [], []
-    for first, part, kind, size in itertools.product((0, 1), (0.125, 0.875), (0, 1), (1.0, 0.1)):
+    ratios, weighted = [], []
+    for first, part, kind, size in itertools.product((0, 1), (0.125, 0.875), (0, 1), (0.3, 0.1)):
+        C = np.kron(np.diag([1.0, 0.0]), S[0]) + np.kron(np.diag([0.0, 1.0]), S[1])
+        C *= 1.0 + share if first == 0 else 1.0  # errors that both scans have in common
         F = Phi[first][:, [3, 4, 5] if kind == 0 else [9, 10, 11]]
         F = F * np.where(np.isin(np.arange(20), [0, 1, 2, 6, 7, 8]), part, 1.0)[:, None]
         M = np.vstack([H[0] @ F, H[1] @ Phi[1] @ left[0] @ F] if first == 0 else [np.zeros((6, 3)), H[1] @ F])
         error = left[1] @ (Phi[1] @ left[0] @ F if first == 0 else F)
         with_change = C + (size * one_sigma[kind]) ** 2 * M @ M.T
-        want.append(multivariate_normal.pdf(y, np.zeros(12), with_change))
+        ratios.append(multivariate_normal.pdf(y, none, with_change) / multivariate_normal.pdf(y, none, C))
         u = (size * one_sigma[kind]) ** 2 * M.T @ np.linalg.solve(with_change, y)
         P_u = np.linalg.inv(np.eye(3) / (size * one_sigma[kind]) ** 2 + M.T @ np.linalg.solve(C, M))
-        weighted.append(want[-1] * error @ (np.outer(u, u) + P_u) @ error.T)
-    assert ratio == pytest.approx(np.mean(want) / multivariate_normal.pdf(y, np.zeros(12), C), rel=1e-9)
-    assert moments == pytest.approx(np.sum(weighted, axis=0) / np.sum(want), rel=5e-3, abs=5e-3 * np.abs(moments).max())
+        weighted.append(max(ratios[-1] - 1.0, 0.0) * error @ (np.outer(u, u) + P_u) @ error.T)
+    assert min(ratios) < 1.0 < max(ratios)
+    assert ratio == pytest.approx(np.mean(ratios), rel=1e-9)
+    want = np.sum(weighted, axis=0) / np.sum(ratios)
+    assert moments == pytest.approx(want, rel=1e-8, abs=1e-8 * np.abs(want).max())
 
 
 def test_nothing_is_found_on_a_clean_log() -> None:

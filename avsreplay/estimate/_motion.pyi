@@ -36,6 +36,7 @@ def change(
     colour: Array,
     one_sigma: tuple[float, float],
     scale: float,
+    share: float,
 ) -> tuple[float, Array]: ...
 def forecast(
     q_ab: Array,

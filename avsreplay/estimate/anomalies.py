@@ -116,7 +116,7 @@ class AnomalyTest:
     def with_possible_change(self, track: Track) -> Track:
         """The track with the possible change of the velocities within its accepted scans."""
         recent = track.recent if self.enabled and ready(track) else ()
-        probability, P = possible_change(recent, nis_scale(track), self._priors)
+        probability, P = possible_change(recent, nis_scale(track), self._priors, self.params.change_probability)
         return replace(track, change_probability=probability, change_P=P)
 
     def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:

@@ -171,6 +171,13 @@ class EstimatorParams(Settings):
         unit="s",
         low=0.0,
     )
+    change_probability: float = setting(
+        0.02,
+        "Prior probability that rate or velocity of the target changed within the last five intervals between scans."
+        " With a larger value the published covariance is larger where the last scans make a change possible.",
+        low=0.0,
+        below=1.0,
+    )
     start_pos_1s_m: float | None = setting(
         None, "1 sigma of the position of the initial pose.", unit="m", above=0.0, of_extent=0.05
     )

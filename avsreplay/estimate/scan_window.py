@@ -31,7 +31,7 @@ from avsreplay.records import Belief
 
 EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
-_SUSPECTED, _PRIOR_CHANGE = 3, 0.02  # last scans in which a change may have begun, and its prior probability
+_SUSPECTED = 5  # last scans in which a change may have begun
 _SCALES = (1.0, 0.1)  # factors on the prior standard deviations: a large or a small change
 FEWEST_DISTURBED, MOST_DISTURBED = 5, 8  # poses from which disturbances are estimated without a model of the motion
 _DENSITIES, _ERRORS = np.logspace(-6.0, 2.0, 81), np.logspace(0.0, 4.0, 41)  # compared; errors over the claimed ones
@@ -140,22 +140,27 @@ def window_of(
     return Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, tuple(R_ba))
 
 
-def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors) -> tuple[float, Array]:
+def possible_change(
+    epochs: Sequence[Epoch], scale: float, priors: ChangePriors, prior: float
+) -> tuple[float, Array]:
     """The probability of a change of rate or velocity within the last accepted scans, and what it adds to the variance.
 
     The estimate is wrong before a change can be detected. By the law of total covariance, the second moments of the
     error that the change would cause are added to the covariance, times its probability. This is done where the
-    likelihood ratio of a change in one of the last three intervals is above 1: in 1.6 % of the scans without a change.
+    likelihood ratio of a change in one of the last five intervals is above 1. Of the changes that are compared, which
+    differ in instant, size and kind, only those count that the scans have made more likely: a change just before the
+    last scan is as likely as at any other time, and its effect on the velocity could be large.
 
     Args:
         epochs: accepted scans in the order of time.
         scale: factor on the covariance of their innovations (``nis_scale``).
         priors: 1 sigma of the size of a change.
+        prior: probability of a change in these intervals before the scans are seen.
 
     Returns:
         The probability, and (20, 20); both 0 where the ratio is 1 or less, or without scans.
     """
-    if not epochs:
+    if not epochs or prior == 0.0:
         return 0.0, NO_CHANGE
     last = epochs[-_SUSPECTED:]
     seen = [e.innovation for e in last]
@@ -169,11 +174,12 @@ def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors)
         np.array([i.R for i in seen]),
         np.array([c / i.weight for c, i in zip(inflation, seen, strict=True)]),
         (priors.rate_radps, priors.velocity_mps),
-        scale * (1.0 + (len(last) - 1) * seen[-1].share),
+        scale,
+        seen[-1].share,
     )
     if not ratio > 1.0:
         return 0.0, NO_CHANGE
-    probability = _PRIOR_CHANGE * ratio / (1.0 - _PRIOR_CHANGE + _PRIOR_CHANGE * ratio)
+    probability = prior * ratio / (1.0 - prior + prior * ratio)
     return probability, frozen(probability * P)
 
 

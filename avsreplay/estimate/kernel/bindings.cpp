@@ -183,7 +183,7 @@ nb::tuple correct_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>&
 // The likelihood ratio of a change in the last scans, and the second moments (20, 20) of the error it would cause.
 nb::tuple change_of(const Matrix<-1, DIM, DIM>& Phi, const Matrix<-1, DIM, DIM>& P, const Matrix<-1, SEEN, DIM>& H,
                     const Matrix<-1, SEEN>& alpha, const Matrix<-1, SEEN, SEEN>& S, const Matrix<-1, SEEN, SEEN>& R,
-                    const Matrix<-1, 2>& colour, const Two& one_sigma, double scale) {
+                    const Matrix<-1, 2>& colour, const Two& one_sigma, double scale, double share) {
   const size_t n = Phi.shape(0);
   if (!n || P.shape(0) != n || H.shape(0) != n || alpha.shape(0) != n || S.shape(0) != n || R.shape(0) != n ||
       colour.shape(0) != n)
@@ -199,7 +199,7 @@ nb::tuple change_of(const Matrix<-1, DIM, DIM>& Phi, const Matrix<-1, DIM, DIM>&
     std::memcpy(scans[k].Phi, Phi.data() + DIM * DIM * k, sizeof scans[k].Phi);
   }
   Square moments;
-  const double ratio = change_ratio(scans.data(), (int)n, one_sigma.data(), scale, moments);
+  const double ratio = change_ratio(scans.data(), (int)n, one_sigma.data(), scale, share, moments);
   return nb::make_tuple(ratio, made(moments));
 }
 
@@ -369,7 +369,7 @@ NB_MODULE(_motion, m) {
   m.def("forecast", &forecast_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("torque"), nb::arg("force"), nb::arg("times"));
   m.def("change", &change_of, nb::arg("Phi"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
-        nb::arg("colour"), nb::arg("one_sigma"), nb::arg("scale"));
+        nb::arg("colour"), nb::arg("one_sigma"), nb::arg("scale"), nb::arg("share"));
   m.def("chart", &chart_from, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"));
   m.def("moved", &moved_by, nb::arg("chart"), nb::arg("y"));

@@ -10,8 +10,9 @@ namespace avs {
 namespace {
 
 constexpr int SIZES = 2;  // prior standard deviations of a change that are compared: a large and a small one
-constexpr double SIZE[SIZES] = {1, 0.1}, PART[2] = {0.875, 0.125};  // parts of an interval that the change has acted for
-constexpr double NO_WEIGHT = 1e-3;  // share of the evidence of a change whose covariance is left out
+constexpr double SIZE[SIZES] = {0.3, 0.1}, PART[2] = {0.875, 0.125};  // parts of an interval that the change has acted for
+
+constexpr double MOST = 600;  // log of a likelihood ratio, larger ones are cut
 
 // One change: the log of its likelihood ratio, and its effect F u on the estimate's error, E uu' = moment.
 struct Candidate {
@@ -49,9 +50,11 @@ void evidence(const double A[SEEN][SEEN], const double b[SEEN], int first, doubl
 
 }  // namespace
 
-double change_ratio(const Used* scans, int count, const double one_sigma[2], double scale, double P[DIM][DIM]) {
+double change_ratio(const Used* scans, int count, const double one_sigma[2], double scale, double share,
+                    double P[DIM][DIM]) {
   std::vector<Candidate> found;
-  for (int k = 0; k < count; ++k)
+  for (int k = 0; k < count; ++k) {
+    const double wider = scale * (1 + (count - 1 - k) * share);  // errors that the scans from k on have in common
     for (const double part : PART) {
       double F[DIM][SEEN], A[SEEN][SEEN] = {}, b[SEEN] = {};
       for (int r = 0; r < DIM; ++r)
@@ -76,8 +79,8 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], dou
             for (int c = 0; c < SEEN; ++c) SM[r][c] += scan.info[r][i] * M[i][c];
         for (int r = 0; r < SEEN; ++r)
           for (int i = 0; i < SEEN; ++i) {
-            b[r] += SM[i][r] * scan.alpha[i] / scale;
-            for (int c = 0; c < SEEN; ++c) A[r][c] += M[i][r] * SM[i][c] / scale;
+            b[r] += SM[i][r] * scan.alpha[i] / wider;
+            for (int c = 0; c < SEEN; ++c) A[r][c] += M[i][r] * SM[i][c] / wider;
           }
         for (int r = 0; r < DIM; ++r)  // what the update leaves of the error
           for (int i = 0; i < SEEN; ++i)
@@ -92,13 +95,16 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], dou
           found.push_back(one);
         }
     }
+  }
   double top = found[0].log_ratio, total = 0;
   for (const Candidate& one : found) top = std::max(top, one.log_ratio);
-  for (Candidate& one : found) total += one.log_ratio = exp_of(one.log_ratio - top);
+  top = std::min(top, MOST);
+  const double none = exp_of(-top);
+  for (Candidate& one : found) total += one.log_ratio = exp_of(std::min(one.log_ratio - top, 0.0));
   std::memset(P, 0, DIM * DIM * sizeof(double));
   for (const Candidate& one : found) {
-    const double weight = one.log_ratio / total;
-    if (!(weight > NO_WEIGHT)) continue;
+    const double weight = (one.log_ratio - none) / total;  // a change as likely as before the scans adds nothing
+    if (!(weight > 0)) continue;
     double FM[DIM][3] = {};
     for (int r = 0; r < DIM; ++r)
       for (int i = 0; i < 3; ++i)
@@ -109,7 +115,7 @@ double change_ratio(const Used* scans, int count, const double one_sigma[2], dou
   }
   for (int r = 0; r < DIM; ++r)
     for (int c = 0; c < r; ++c) P[r][c] = P[c][r] = 0.5 * (P[r][c] + P[c][r]);
-  return exp_of(std::min(top, 600.0)) * total / (double)found.size();
+  return exp_of(top) * total / (double)found.size();
 }
 
 }  // namespace avs

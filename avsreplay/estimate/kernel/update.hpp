@@ -42,9 +42,11 @@ struct Used {
 void seen_at(const double P[DIM][DIM], const Pose& pose, const double colour[2], Used& out);
 
 // Likelihood ratio of a change of rate or velocity within one of the intervals before the last scans, to none, and the
-// second moments P of the estimate's error after the last of them if there was one. `one_sigma` is that of the rate and
-// of the velocity; `scale` is the factor on the covariance of the innovations.
-double change_ratio(const Used* scans, int count, const double one_sigma[2], double scale, double P[DIM][DIM]);
+// second moments P of the estimate's error after the last of them if there was one, from the changes that the scans have
+// made more likely. `one_sigma` is that of the rate and of the velocity; `scale` is the factor on the covariance of the
+// innovations, and `share` the part of it that scans have in common.
+double change_ratio(const Used* scans, int count, const double one_sigma[2], double scale, double share,
+                    double P[DIM][DIM]);
 
 // y and P once rows e + H y of unit variance have been seen, P of the motion having grown by Q before.
 void pass(double y[DIM], double P[DIM][DIM], const double e[SEEN], const double H[SEEN][DIM],
