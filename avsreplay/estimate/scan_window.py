@@ -140,9 +140,7 @@ def window_of(
     return Window(times, y.reshape(-1), flat, whiten, rows, tuple(poses), R, tuple(R_ba))
 
 
-def possible_change(
-    epochs: Sequence[Epoch], scale: float, priors: ChangePriors, prior: float
-) -> tuple[float, Array]:
+def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors, prior: float) -> tuple[float, Array]:
     """The probability of a change of rate or velocity within the last accepted scans, and what it adds to the variance.
 
     The estimate is wrong before a change can be detected. By the law of total covariance, the second moments of the
