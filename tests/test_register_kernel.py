@@ -506,6 +506,49 @@ def test_looks_counts_the_points_on_faces_that_face_the_camera(target: Surface) 
     assert model.looks(scan, T, 3) == (np.count_nonzero(near), np.count_nonzero(facing))
 
 
+@pytest.mark.parametrize("count", [150, 1000, 1700])
+@pytest.mark.parametrize("eye", [(0.0, 0.0, 4.0), (0.0, 0.0, -4.0)])
+def test_distances_are_those_of_the_closest_points(count: int, eye: tuple[float, float, float]) -> None:
+    """A plate whose upper side alone is there: from below no face faces the camera, and both sides count."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
+    plate = SurfaceIndex.build(surface(corners, [[0, 1, 2], [0, 2, 3]]), 0.5)
+    points = rng(count).uniform(-1, 1, (count, 3)) * [1.2, 1.2, 0.7]
+    points[::50] = np.nan
+    T_ca = Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array(eye))
+    found, work = plate.distances(points - eye, T_ca, 0.3, True, 200, 0.4)
+    expected = np.sqrt(np.minimum(plate.closest(points).d2, 0.3**2))
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    assert work > count / 3
+
+
+def test_distances_to_the_faces_towards_the_camera(target: Surface) -> None:
+    index, scan = SurfaceIndex.build(target, 0.4), scan_of(soup(600, seed=14), 1003, 18)
+    T_ca = Pose(np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.1, 0.2, 5.0]))
+    found, _ = index.distances(scan - T_ca.t, T_ca, np.inf, True, 200, 0.0)
+    expected = np.sqrt(np.minimum(index.closest(scan, camera_c=T_ca.t).d2, 0.4**2))
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_voxels_are_numbered_by_their_first_points() -> None:
+    points = rng(5).uniform(-3, 3, (500, 3))
+    first, voxel, counts = kernel.voxels(points, 0.7)
+    cells = np.floor(points / 0.7)
+    assert (np.diff(first) > 0).all()
+    np.testing.assert_array_equal(cells[first[voxel]], cells)
+    assert len(first) == len(np.unique(cells, axis=0))
+    np.testing.assert_array_equal(counts, np.bincount(voxel))
+
+
+def test_of_equal_poses_the_first_is_different() -> None:
+    poses = [
+        Pose(exp(np.radians([0.0, 0.0, d])), np.array([x, 0.0, 0.0])) for d, x in ((0, 0), (4, 0), (30, 0), (0, 1))
+    ]
+    T = np.stack([pose.matrix for pose in poses])
+    trace = 1.0 + 2.0 * np.cos(np.radians(10.0))
+    np.testing.assert_array_equal(kernel.different(T, np.zeros(3), 9, trace, 0.5), [0, 2, 3])
+    np.testing.assert_array_equal(kernel.different(T, np.zeros(3), 2, trace, 0.5), [0, 2])
+
+
 def test_any_instruction_set_gives_the_same_bits(target: Surface) -> None:
     scan = scan_of(soup(600, seed=14), 5003, 18)
     fast, plain = SurfaceIndex.build(target, 0.4), SurfaceIndex.build(target, 0.4, portable=True)

@@ -10,7 +10,7 @@ from avsreplay import geometry, mesh
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar, allowed_scans
-from avsreplay.register.backend import FIXED_WORK, HEALTHY_PASSES
+from avsreplay.register.backend import healthy_work
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.plausibility import PlausibilityTest, robust_noise
 from avsreplay.register.quality import Visibility
@@ -119,9 +119,7 @@ def test_what_is_called_aligned_is_right(registrar: Registrar, surface: Surface,
 
 def test_the_budget_counts_work() -> None:
     budget = Budget(3000)
-    budget.spend(HEALTHY_PASSES * 3000)
-    left = (HEALTHY_SCANS - 1) * HEALTHY_PASSES * 3000 + HEALTHY_SCANS * FIXED_WORK
-    budget.spend(left - 500)
+    budget.spend(HEALTHY_SCANS * healthy_work(3000) - 500)
     assert not budget.allows(300, kept=300)  # as the rest is kept for a later step
     assert budget.allows(500)
     assert not budget.exhausted

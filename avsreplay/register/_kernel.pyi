@@ -13,6 +13,13 @@ def sandwich(normals: NDArray[np.float64], gradients: NDArray[np.float64]) -> ND
 
 class Matches: ...
 
+def voxels(
+    points: NDArray[np.float64], size_m: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]: ...
+def different(
+    T_ca: NDArray[np.float64], middle: NDArray[np.float64], most: int, trace: float, near_m: float
+) -> NDArray[np.int64]: ...
+
 class PointTree:
     def __init__(self, points: NDArray[np.float64]) -> None: ...
     def query(self, points: NDArray[np.float64], k: int = 1) -> tuple[NDArray[np.float64], NDArray[np.int64]]: ...
@@ -141,6 +148,15 @@ class Index:
         threads: int = 1,
         matches: Matches | None = None,
     ) -> tuple[Any, ...]: ...
+    def distances(
+        self,
+        points: NDArray[Any],
+        T_ca: NDArray[np.float64],
+        most_m: float,
+        camera: bool,
+        tested: int,
+        least_facing: float,
+    ) -> tuple[NDArray[np.float64], int]: ...
     def looks(self, points: NDArray[Any], T_ca: NDArray[np.float64], stride: int) -> tuple[int, int]: ...
     @property
     def primitives(self) -> int: ...

@@ -37,10 +37,10 @@ TIGHTEN = 3.0  # rejection distance over the rms distance of the last pass
 LEAST_GATE_OF_EXTENT = 0.004  # the rejection distance follows the rms down to this
 MOST_WITHIN = 60  # passes of an alignment that begins near its result
 FEW_POINTS = 600  # points for the first passes on a scan that has many more
-HEALTHY_PASSES = 7  # searches per point of an ordinary registration and its quality
 LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
-FIXED_WORK = 15_000  # fixed cost of a registration: quality, covariance
-ALIGN_SCANS, WITHIN_SCANS = 4, 2  # most work of an alignment, and of one with a fixed gate, in ordinary registrations
+HEALTHY_WORK, HEALTHY_PASSES = 22_000, 3.5  # an ordinary registration: point searches in all, and besides per point
+FIXED_WORK = 11_000  # fixed cost of the quality of a pose, in point searches
+ALIGN_PASSES, WITHIN_PASSES = 40, 35  # most searches per point of an alignment, and of one with a fixed gate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,11 +141,11 @@ class HornBackend:
         rule = self._rules[facing]
         plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, MOST_WITHIN)
         within = replace(rule, n_max=most, n_plane=plane, few=few, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
-        return self._with(points, guess, within, WITHIN_SCANS * healthy_work(len(points)))
+        return self._with(points, guess, within, WITHIN_PASSES * max(len(points), LEAST_POINTS))
 
     def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams]) -> Fit:
         rule = rules[self._visibility.camera_c(self._index, points, guess) is not None]
-        return self._with(points, guess, rule, ALIGN_SCANS * healthy_work(len(points)))
+        return self._with(points, guess, rule, ALIGN_PASSES * max(len(points), LEAST_POINTS))
 
     def _with(self, points: NDArray[Any], guess: Pose, rule: IcpParams, most_work: int) -> Fit:
         found = self._index.icp(points, guess, rule, most_work)
@@ -154,7 +154,7 @@ class HornBackend:
 
 def healthy_work(points: int) -> int:
     """Return the work of an ordinary registration of a scan of so many points, in point searches."""
-    return HEALTHY_PASSES * max(points, LEAST_POINTS) + FIXED_WORK
+    return HEALTHY_WORK + int(HEALTHY_PASSES * max(points, LEAST_POINTS))
 
 
 def measured_alignment(found: MeasuredPose) -> Alignment:

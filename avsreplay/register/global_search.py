@@ -32,6 +32,7 @@ COARSE_PASSES, MIDDLE_PASSES = 8, 12  # point-to-plane iterations for each attit
 MIDDLE_STARTS, FINE_STARTS = 50, 10  # attitudes kept for the second selection, and poses registered on the model
 CELLS = 40  # cells of the grid along the diagonal of the model
 COARSE_OF_EXTENT, MIDDLE_OF_EXTENT = 0.03, 0.02  # distances beyond which a point counts as unexplained
+MOST_OF_EXTENT = 0.05  # distances from the model are limited to this; those of a pose that is accepted are less
 START_OF_EXTENT, FALL = 0.3, 0.7  # rejection distance of the first pass, and its factor from pass to pass
 FIRST_PASSES, KEPT_AFTER_FIRST = 2, 3  # after two passes with part of the points one start in three is kept
 SECOND_PASSES, KEPT_AFTER_SECOND = 2, 8  # after two more passes with all of them one start in eight is kept
@@ -41,14 +42,13 @@ SYMMETRIC, SYMMETRIES = 0.3, 6  # largest unexplained share of the surface turne
 TURNED_PASSES, TURNED_RIVALS = 6, 2
 RIVALS, RIVAL_WITHIN = 6, 0.15  # poses that are registered to the end: share of unexplained points over the least
 SAME_RAD, SAME_OF_EXTENT = np.radians(10.0), 0.05  # poses that differ by less are the same
-SIGMAS = 5.0
-FAVOURED = 5.0  # noise, in units of the extent, lowers the cost of a wrong pose with more surface nearby by up to this
+SIGMAS = FAVOURED = 5.0  # noise over the extent lowers the cost of a wrong pose near more surface by up to this factor
 REFINED_POINTS = 500  # fine points with which the last poses are registered
+STOP_RAD, STOP_OF_EXTENT = 1e-4, 1e-4  # a pass that moves the pose by less ends a registration, as poses are compared
 FIRST_FINE, FINE_PASSES = 5, 15  # passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
 RIVAL_AFTER, MOST_RIVALS = 0.05, 4  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
-LOOK_UPS = 3  # look-ups in the grid that cost as much as a search on the model
-ROUND_WORK = 30_000  # fixed cost of a round [searches]: thinning, interpreter
-MEASURED_WORK = 4  # cost of measuring a point at a pose, in point searches
+LOOK_UPS = 4  # look-ups in the grid that cost as much as a search on the model
+ROUND_WORK = 35_000  # fixed cost of a round [searches]: thinning, interpreter
 APART = 0.6  # usual share of the starts of the second selection that are different poses
 REGISTERED_WORK = 100  # usual cost of registering the last poses, for each point with which they are measured
 CELL_OF_EXTENT = 0.02
@@ -113,8 +113,9 @@ class GlobalSearch:
             kept["symmetries"] = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
         self.symmetries = kept["symmetries"]
         self._spent = 0  # work of the round so far
+        coarse = replace(target.limits, eps_rad=STOP_RAD, eps_m=STOP_OF_EXTENT * self._extent)
         self._brief, self._refine = (
-            HornBackend(replace(target, limits=replace(target.limits, n_max=min(passes, target.limits.n_max))))
+            HornBackend(replace(target, limits=replace(coarse, n_max=min(passes, coarse.n_max))))
             for passes in (FIRST_FINE, FINE_PASSES)
         )
 
@@ -198,53 +199,55 @@ class GlobalSearch:
         poses, costs = self._field.refine(few, poses, SECOND_PASSES, narrow * L, *coarse)
         poses, narrow = _best(poses, costs, max(1, p.starts // KEPT_AFTER_SECOND)), narrow * FALL**SECOND_PASSES
         poses, costs = self._field.refine(few, poses, COARSE_PASSES - SECOND_PASSES, narrow * L, *coarse)
-        apart = self._different(_best(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
-        poses = np.stack([pose.matrix for pose in apart])
+        poses = self._different(_best(poses, costs, 2 * MIDDLE_STARTS), MIDDLE_STARTS, 0.3)
         narrow = START_OF_EXTENT * FALL**FIRST_PASSES
         poses, costs = self._field.refine(some[::MIDDLE_STRIDE].copy(), poses, MIDDLE_FIRST, narrow * L, *middle)
         poses, narrow = _best(poses, costs, KEPT_IN_MIDDLE), narrow * FALL**MIDDLE_FIRST
         poses, costs = self._field.refine(some, poses, MIDDLE_PASSES - MIDDLE_FIRST, narrow * L, *middle)
-        return self._different(_best(poses, costs, MIDDLE_STARTS), FINE_STARTS, 0.5)
+        found = self._different(_best(poses, costs, MIDDLE_STARTS), FINE_STARTS, 0.5)
+        return [Pose.from_matrix(T) for T in found]
 
-    def _different(self, poses: Array, most: int, scale: float) -> list[Pose]:
+    def _different(self, poses: Array, most: int, scale: float) -> Array:
         """The first few of (k, 4, 4) that are different poses."""
-        R = poses[:, :3, :3]
-        middles = (R.transpose(0, 2, 1) @ (self._middle - poses[:, :3, 3])[:, :, None])[:, :, 0]
-        turned = np.einsum("aij,bij->ab", R, R) > 1.0 + 2.0 * np.cos(scale * SAME_RAD)
-        near = np.linalg.norm(middles[:, None] - middles, axis=2) < scale * SAME_OF_EXTENT * self._extent
-        left = np.ones(len(poses), dtype=bool)
-        kept: list[int] = []
-        while left.any() and len(kept) < most:
-            kept.append(int(np.argmax(left)))
-            left &= ~(turned & near)[kept[-1]]
-            left[kept[-1]] = False
-        return [Pose.from_matrix(poses[k]) for k in kept]
+        trace, near = 1.0 + 2.0 * np.cos(scale * SAME_RAD), scale * SAME_OF_EXTENT * self._extent
+        return np.ascontiguousarray(poses[kernel_module().different(poses, self._middle, most, trace, near)])
 
     def _refined(self, some: Array, fine: Array, poses: list[Pose], facing: bool) -> list[Candidate]:
         """The poses measured on the model; the best, and the very best by a near-symmetry, are registered to it."""
         width = MIDDLE_OF_EXTENT * self._extent
-        found = [self._measured(some, T_ca) for T_ca in poses]
+        found = [self._measured(some, T_ca, width) for T_ca in poses]
         ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         most = float(ranked[0].unexplained(width).mean()) + RIVAL_WITHIN
         best = [each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most]
-        found = self._to_the_end(fine, best, width)
+        found, least = self._to_the_end(fine, best, width)
         first = min(found, key=lambda each: float(each.unexplained(width).mean())).T_ca
         if not len(self.symmetries):
             return found
         rule = (FALL, 0.01 * self._extent, width, facing, self._target.limits.threads)
-        turned, costs = self._field.refine(some, self.symmetries @ first.matrix, TURNED_PASSES, 4.0 * width, *rule)
-        rivals = [Pose.from_matrix(T) for T in _best(turned, costs, TURNED_RIVALS)]
-        return [*found, *self._to_the_end(fine, rivals, width)]
+        starts = np.concatenate([first.matrix[None], self.symmetries @ first.matrix])
+        turned, costs = self._field.refine(some, starts, TURNED_PASSES, 4.0 * width, *rule)
+        near = costs < costs[0] + RIVAL_WITHIN
+        near[0] = False
+        rivals = [Pose.from_matrix(T) for T in _best(turned[near], costs[near], TURNED_RIVALS)]
+        return [*found, *self._to_the_end(fine, rivals, width, least)[0]]
 
-    def _to_the_end(self, fine: Array, poses: list[Pose], width_m: float) -> list[Candidate]:
-        """The poses registered to the model by a few passes, and to the end those that may be as good as the best."""
+    def _to_the_end(
+        self, fine: Array, poses: list[Pose], width_m: float, least: float = np.inf
+    ) -> tuple[list[Candidate], float]:
+        """The poses registered to the model by a few passes, and to the end those that may be as good as the best.
+
+        Also returned: the least cost after the few passes, also of other poses if it is given (``least``).
+        """
         part = np.ascontiguousarray(fine[:: max(1, len(fine) // REFINED_POINTS)])
-        found = [self._measured(part, self._counted(self._brief.align_within(part, T_ca, width_m))) for T_ca in poses]
+        brief = [self._counted(self._brief.align_within(part, T_ca, width_m)) for T_ca in poses]
+        found = [self._measured(part, T_ca, width_m) for T_ca in brief]
         costs = np.array([each.unexplained(width_m).mean() for each in found])
-        order = [k for k in np.argsort(costs, kind="stable") if costs[k] < costs.min() + 2.0 * RIVAL_AFTER]
-        last = [k for k in order[:MOST_RIVALS] if costs[k] < costs.min() + RIVAL_AFTER]
+        least = min(least, float(costs.min(initial=np.inf)))
+        order = [k for k in np.argsort(costs, kind="stable") if costs[k] < least + 2.0 * RIVAL_AFTER]
+        last = [k for k in order[:MOST_RIVALS] if costs[k] < least + RIVAL_AFTER]
         ended = [self._counted(self._refine.align_within(part, found[k].T_ca, width_m, near=True)) for k in last]
-        return [self._measured(fine, T_ca) for T_ca in (*ended, *(found[k].T_ca for k in order if k not in last))]
+        others = [found[k].T_ca for k in order if k not in last]
+        return [self._measured(fine, T_ca) for T_ca in (*ended, *others)], least
 
     def _near_symmetries(self, points: Array) -> Array:
         """Motions (k, 4, 4) in {C} that carry most of the surface onto itself, without the identity: the best few."""
@@ -256,12 +259,11 @@ class GlobalSearch:
         apart = [not self.same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
         return np.ascontiguousarray(poses[apart & (costs < SYMMETRIC)][:SYMMETRIES])
 
-    def _measured(self, points: Array, T_ca: Pose) -> Candidate:
-        target = self._target
-        camera_c = target.visibility.camera_c(target.index, points, T_ca)
-        d2 = target.index.closest(T_ca.apply(points), camera_c=camera_c).d2
-        self._spent += MEASURED_WORK * len(points)
-        return Candidate(T_ca, np.sqrt(np.minimum(d2, target.index.reach_m**2)))
+    def _measured(self, points: Array, T_ca: Pose, most_m: float | None = None) -> Candidate:
+        most_m = MOST_OF_EXTENT * self._extent if most_m is None else most_m
+        distance, work = self._target.visibility.distances(self._target.index, points, T_ca, most_m)
+        self._spent += work
+        return Candidate(T_ca, distance)
 
     def _counted(self, fit: Fit) -> Pose:
         self._spent += fit.work

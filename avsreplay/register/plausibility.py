@@ -111,12 +111,11 @@ class PlausibilityTest:
         text = f"the scan measures {size:.3g} m, the model {self._extent:.3g} m: is --model-unit right?"
         return replace(not_measured(points, AlignStatus.IMPLAUSIBLE, guess), message=text)
 
-    def noise(self, points: NDArray[Any], T_ca: Pose, guess: Pose | None) -> float:
-        """Return the robust noise [m] of ``points`` (n, 3) in {A}; of those near the model where most are not.
+    def noise(self, distance: Array, T_ca: Pose, guess: Pose | None) -> float:
+        """Return the robust noise [m] of distances (n,) [m] at a pose; of the smaller ones where most are not near.
 
         The latter only at the predicted pose ``guess``: elsewhere the points near the model may be so by chance.
         """
-        distance = self.measure(points, T_ca)
         near = distance[distance < NEAR_OF_EXTENT * self._extent]
         few = LEAST_COMPARED <= len(near) < MOST_HIDDEN * len(distance)
         return robust_noise(near if few and self.predicted(T_ca, guess) else distance)
@@ -145,7 +144,7 @@ class PlausibilityTest:
             The score and the reason of a rejection.
         """
         camera_c = self._visibility.camera_c(self._index, points, T_ca)
-        noise = self.noise(points, T_ca, guess)
+        noise = self.noise(self.measure(points, T_ca), T_ca, guess)
         rays = np.asarray(points if scene is None else scene, dtype=np.float64)
         width = max(self._gate, 3.0 * noise)
         p = T_ca.apply(rays)
@@ -177,9 +176,7 @@ class PlausibilityTest:
 
     def measure(self, points: NDArray[Any], T_ca: Pose) -> Array:
         """Return the distances (n,) [m] of points (n, 3) in {A} to the visible faces, at most the reach."""
-        camera_c = self._visibility.camera_c(self._index, points, T_ca)
-        d2 = self._index.closest(T_ca.apply(points), camera_c=camera_c).d2
-        return np.asarray(np.sqrt(np.minimum(d2, self._index.reach_m**2)))
+        return self._visibility.distances(self._index, points, T_ca, np.inf)[0]
 
     def _compared(self, rays: Rays, T_ca: Pose, noise: float) -> tuple[int, NDArray[np.intp], NDArray[np.intp]] | None:
         """How many of the visible surface points the scan has, those in free space, and those where it has no point.

@@ -82,6 +82,10 @@ class Visibility:
         matched, facing = index.looks(points, T_ca, max(1, len(points) // TESTED_POINTS))
         return T_ca.t if facing >= LEAST_FACING * matched else None
 
+    def distances(self, index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, most_m: float) -> tuple[Array, int]:
+        """Return the distances (n,) [m] of a scan to the faces that the camera sees, at most ``most_m``; the work."""
+        return index.distances(points, T_ca, most_m, self.may_be_camera(T_ca), TESTED_POINTS, LEAST_FACING)
+
     def may_be_camera(self, T_ca: Pose) -> bool:
         """Return whether the test can apply: the outer sides are known, and the origin of {A} is clear of the model."""
         return self.sided and self._clear(T_ca.t)

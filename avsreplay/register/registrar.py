@@ -15,7 +15,7 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Surface
 from avsreplay.register import index_cache, quality, restarts
-from avsreplay.register.backend import WITHIN_SCANS, Target, aligned, create_backend, healthy_work, load_backend
+from avsreplay.register.backend import Target, aligned, create_backend, healthy_work, load_backend
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
 from avsreplay.register.params import RegisterParams
@@ -27,6 +27,7 @@ from avsreplay.register.surface_index import SurfaceIndex
 
 FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
 TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
+LAST_SCANS = 2  # work that is kept for a last registration, in ordinary registrations
 LEAST_TO_TURN, SURE_RATIO = 0.2, 0.9  # with fewer inliers no rotated starts are tried; another search follows
 NO_MOTION: Array = np.zeros((6, 0))
 PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
@@ -134,11 +135,10 @@ class Registrar:
         few, results = self._restarter.part(target), list[Alignment]()
         whole: SearchResult | None = None
         for part, number in islice(attempts(target, self._index.extent_m, lambda: results[0].measured), rounds):
-            work = self._symmetry.search.work(len(part), number)
-            if results and not budget.allows(work):
+            if results and not budget.allows(self._symmetry.search.work(len(part), number)):
                 break
             search = self._symmetry.search.search(part, number, whole if part is target else None, known)
-            budget.spend(search.work + restarts.TEST_WORK)
+            budget.spend(search.work + restarts.TEST_WORK + restarts.COMPARED_WORK)
             whole = search if part is target else whole
             found, alone = self._acquired(scan, part, search, budget, carried)
             results.append(found)
@@ -207,9 +207,7 @@ class Registrar:
             T_ac: pose of the model.
             most_m: larger distances are limited to this value [m]; it is at most the reach of the index.
         """
-        most_m = min(most_m, self._index.reach_m)
-        d2 = self._index.closest(T_ac.inverse().apply(points), most_m=most_m).d2
-        return np.asarray(np.sqrt(np.minimum(d2, most_m**2)))
+        return self._index.distances(points, T_ac.inverse(), most_m, False, 1, 0.0)[0]
 
     @cached_property
     def _symmetry(self) -> NearSymmetry:
@@ -269,6 +267,7 @@ class Registrar:
     ) -> tuple[Alignment, bool]:
         """Register again within a distance that follows the noise; restart if implausible. Whether it was searched."""
         few = self._restarter.part(scan)
+        budget.spend(restarts.COMPARED_WORK)
         starts = self._restarter.starts(few, first, guess)
         hopeful = first.measured and starts[0].noise_m <= NOISE_OF_EXTENT * self._index.extent_m
         tried = [self._regraded(scan, few, at, budget, halves, carried) for at in starts] if hopeful else [first]
@@ -279,8 +278,9 @@ class Registrar:
         before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without it, perhaps another object
         restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
-        last = WITHIN_SCANS * healthy_work(len(scan))  # the best pose is registered once more
-        work = self._symmetry.search.work(len(scan), 0) + restarts.SCATTER_WORK * len(scan) if overlap else 0
+        last = LAST_SCANS * healthy_work(len(scan))  # the best pose is registered once more
+        after = restarts.TEST_WORK + restarts.COMPARED_WORK + restarts.SCATTER_WORK * len(scan)
+        work = self._symmetry.search.work(len(scan), 0) + after + last // LAST_SCANS if overlap else 0
         for step in () if budget.brief else steps:
             if step == "search":
                 if overlap:

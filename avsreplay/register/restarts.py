@@ -29,19 +29,18 @@ POINTS = 1000  # points of the scan used by restarts
 START_OF_EXTENT, STOP_OF_EXTENT = 0.05, 0.004
 FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes per stage
 TURN_RAD = np.radians(4.0)
-PATCH_OF_EXTENT, CELLS = 0.05, 64  # neighbouring points: those in a cube of this side; cubes along the extent, at least
+PATCH_OF_EXTENT, CELLS = 0.05, 64  # side of a cube of neighbouring points; cubes along the extent, at least
 SHARED = 0.5  # of the rms distance; a correct pose of a correct model has less than 0.4 in common to neighbours
 VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
 BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
-PASS_WORK = 1000  # fixed cost of a pass of a restart, in point searches
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
 FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
 SCATTER_WORK = 10  # cost per point of leaving out scattered points
-TEST_WORK = 20_000  # cost of a test of a pose
-VALLEY_WORK = 5 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
-SIZE_WORK = 20_000  # cost of fitting the size, which is done where many points are off the model
-MEASURED_WORK = 4  # cost of measuring a point at a pose, in point searches
+TEST_WORK = SIZE_WORK = 23_000  # cost of a test of a pose, and of fitting the size where many points are off the model
+VALLEY_WORK = 7 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
+PASS_WORK, MEASURED_WORK = 1500, 4  # cost of a stage of a restart, and of a point measured at a pose [searches]
+COMPARED_WORK = 4 * MEASURED_WORK * POINTS  # cost of comparing the results of a step, measured about four times
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
 
 
@@ -134,7 +133,7 @@ class Restarter:
 
     def measure(self, points: NDArray[Any], T_ca: Pose, guess: Pose | None = None) -> Restart:
         """Return the distances of ``points`` (n, 3) in {A} at a pose; ``guess``: as of ``PlausibilityTest.noise``."""
-        return Restart(T_ca, self._test.measure(points, T_ca), self._test.noise(points, T_ca, guess))
+        return Restart(T_ca, at := self._test.measure(points, T_ca), self._test.noise(at, T_ca, guess))
 
     def starts(self, points: NDArray[Any], first: Alignment, guess: Pose) -> list[Restart]:
         """Return a registered pose, and its guess T_ac if part of ``points`` (n, 3) in {A} is off and it is as near.
@@ -262,13 +261,14 @@ class Restarter:
         info, radius = scaled_information(sums.info, sums.inliers, centre)
         floor = np.linalg.eigh(info)[1][:, :2].T
         steps = 0.5 * gate * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
-        tried = [T_ca]
-        for step in np.multiply.outer(steps, floor).reshape(-1, 6):
-            turn = geometry.exp(step[:3] / radius)
-            tried.append(Pose(turn, centre + step[3:] - geometry.matrix(turn) @ centre) @ T_ca)
-        moved = np.concatenate([each.apply(few) for each in tried])
-        d2 = index.closest(moved, camera_c=camera_c, most_m=width).d2.reshape(len(tried), -1)
-        return tried[int(np.argmin(np.minimum(d2, width**2).mean(axis=1)))]
+        tried = np.concatenate([np.zeros((1, 6)), np.multiply.outer(steps, floor).reshape(-1, 6)])
+        turns = geometry.exp(tried[:, :3] / radius)
+        moved = np.einsum("kij,nj->kni", geometry.matrix(turns), T_ca.apply(few) - centre)
+        moved += (centre + tried[:, 3:])[:, None]
+        d2 = index.closest(moved.reshape(-1, 3), camera_c=camera_c, most_m=width).d2.reshape(len(tried), -1)
+        best = int(np.argmin(np.minimum(d2, width**2).mean(axis=1)))
+        shift = centre + tried[best, 3:] - geometry.matrix(turns[best]) @ centre
+        return Pose(turns[best], shift) @ T_ca if best else T_ca
 
     def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
         """Return the pose after passes with a falling rejection distance, from ``start_m`` [m] on."""

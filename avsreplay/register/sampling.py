@@ -94,7 +94,7 @@ def thin_to(points: Array, count: int) -> Array:
         if EVEN_WITHIN[0] * count <= len(first) <= EVEN_WITHIN[1] * count:
             break
         voxel *= float(np.clip(np.sqrt(len(first) / count), 0.5, 2.0))
-    return points[np.sort(first)]
+    return points[first]
 
 
 def without_sparse_points(points: Array) -> Array:
@@ -116,11 +116,10 @@ def _spread(points: Array) -> float:
 
 def _voxels(points: Array, voxel_m: float) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
     """First point of every occupied voxel, the voxel of every point, and the number of points in each voxel."""
-    cells = np.floor((points - points.min(axis=0)) / max(voxel_m, np.finfo(float).tiny)).astype(np.int64)
-    shape = cells.max(axis=0) + 1
-    keys = (cells[:, 0] * shape[1] + cells[:, 1]) * shape[2] + cells[:, 2]
-    _, first, voxel, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
-    return first, voxel.reshape(-1), counts
+    found: tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]] = kernel_module().voxels(
+        np.subtract(points, points.min(axis=0), dtype=np.float64), max(voxel_m, np.finfo(float).tiny)
+    )
+    return found
 
 
 def without_scattered_points(points: Array) -> Array:

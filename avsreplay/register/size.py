@@ -176,8 +176,8 @@ def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> _Rows | No
     delta, moved, rows = 0.0, Pose.identity(), None
     for _ in range(ROUNDS):
         q = moved.apply(p) / (1.0 + delta)
-        found = index.closest(q, camera_c=camera_c)
-        near = found.d2 < (WIDTH_OF_EXTENT * index.extent_m) ** 2
+        found = index.closest(q, camera_c=camera_c, most_m=WIDTH_OF_EXTENT * index.extent_m)
+        near = np.isfinite(found.d2)
         if np.count_nonzero(near) < LEAST_RESIDUALS:
             return None
         n, q, foot = found.normal[near], q[near], found.foot[near]

@@ -7,13 +7,11 @@ Closest point
     The nearest point of the surface to a query point: on a face, an edge or a vertex. A query at ``reach_m`` or farther
     from the surface has none: id -1, d2 inf, foot and normal NaN.
 Ties
-    Among faces at the same distance (to 1e-10; this happens on edges and vertices) the face with the largest distance
-    between the query point and the plane of the face is chosen, then the lower index. Among points of a cloud the lower
-    index is chosen.
+    Among faces at the same distance (to 1e-10, on edges and vertices) the face whose plane is farthest from the query
+    point is chosen, then the lower index. Among points of a cloud the lower index is chosen.
 Normal
-    The face normal by the right-hand rule of the chosen triangle, also where the closest point lies on an edge or a
-    vertex. For a point cloud: the eigenvector of the smallest eigenvalue of the scatter of the 10 nearest points; its
-    sign is arbitrary.
+    The face normal by the right-hand rule of the chosen triangle, also on an edge or a vertex. For a point cloud: the
+    eigenvector of the smallest eigenvalue of the scatter of the 10 nearest points, with any sign.
 """
 
 from __future__ import annotations
@@ -129,14 +127,10 @@ class PatchSums:
     """Sums over the inliers at a pose by patches of the model, with J and e as in :class:`NormalEquations`, e negated.
 
     Attributes:
-        points: points of the scan, also those that are not finite.
-        inliers: points nearer than the gate.
-        sum_d2: sum of the squared distances to the closest points [m^2].
-        median_m: median of |e| [m].
-        centre: (3,) centroid of the inliers in {C} [m].
-        counts: (m,) inliers of each patch.
-        normals: (m, 6, 6) sums of J'J.
-        gradients: (m, 6) sums of e J with e = n . (p_c - foot).
+        points: of the scan, also those that are not finite.  inliers: points nearer than the gate.
+        sum_d2: sum of the squared distances to the closest points [m^2].  median_m: median of |e| [m].
+        centre: (3,) centroid of the inliers in {C} [m].  counts: (m,) inliers of each patch.
+        normals: (m, 6, 6) sums of J'J.  gradients: (m, 6) sums of e J with e = n . (p_c - foot).
         offsets, errors, places: sums of J (m, 6) and of e (m,), and the centroid (m, 3) of each patch.
     """
 
@@ -160,8 +154,7 @@ class SurfaceIndex:
     Attributes:
         reach_m: no closest point is searched at this distance or farther.
         extent_m: diagonal of the bounding box of the surface.
-        primitives: triangles or points in the index.  dropped: triangles without area.
-        restored: the index was read from the cache instead of built.
+        primitives: triangles or points in the index.  dropped: triangles without area.  restored: read from the cache.
     """
 
     reach_m: float
@@ -232,8 +225,7 @@ class SurfaceIndex:
 
         Point-to-plane passes, then Newton's method to the fixed point of Horn's point-to-point iteration (eq:ICP), a
         stationary point of the sum of squared distances. A Newton step that raises the sum is replaced by Horn's. The
-        last pass is Horn's over all points and verifies the fixed point.
-        The guess is re-orthonormalised. With fewer than 6 inliers, or after ``most_work``, it ends, not converged.
+        last pass is Horn's over all points. With fewer than 6 inliers, or after ``most_work``, it ends, not converged.
         """
         params = params or IcpParams()
         gate = min(self.reach_m, self.reach_m if params.gate_m is None else params.gate_m)
@@ -280,6 +272,12 @@ class SurfaceIndex:
     def grade(self, points: NDArray[Any], T_ca: Pose, *rule: Any) -> tuple[Any, ...]:
         """Grade the pose of ``points`` (n, 3) in {A}, see ``quality.Grade``; ``rule``: as in ``kernel/grade.hpp``."""
         found: tuple[Any, ...] = self._index.grade(_points(points), T_ca.matrix, *rule)
+        return found
+
+    def distances(self, points: NDArray[Any], T_ca: Pose, most_m: float, *sight: Any) -> tuple[Array, int]:
+        """Distances (n,) [m] of ``points`` in {A}, at most ``most_m``; the work. ``sight``: ``kernel/evidence.hpp``."""
+        most_m = min(most_m, self.reach_m)
+        found: tuple[Array, int] = self._index.distances(_points(points), T_ca.matrix, most_m, *sight)
         return found
 
     def looks(self, points: NDArray[Any], T_ca: ArrayLike | Pose, stride: int) -> tuple[int, int]:

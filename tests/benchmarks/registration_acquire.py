@@ -63,7 +63,7 @@ def off_deg(truth: Pose, found: Pose) -> float:
 
 
 def acquired(name: str, registrar: Registrar, cases: list[Case]) -> None:
-    registrar.search(cases[0][0])  # builds the search once
+    registrar.acquire(cases[0][0])  # prepares the search
     seconds, right, statuses = [], 0, Counter[str]()
     for points, truth in cases:
         begun = time.process_time()

@@ -13,6 +13,7 @@
 #include "build.hpp"
 #include "coarse.hpp"
 #include "covariance.hpp"
+#include "cubes.hpp"
 #include "evidence.hpp"
 #include "grade.hpp"
 #include "loop.hpp"
@@ -140,6 +141,7 @@ class Index {
     const View v = cloud.view();
     const Vec3 eye = camera ? Vec3{(*camera)[0], (*camera)[1], (*camera)[2]} : Vec3{0, 0, 0};
     const bool sided = camera.has_value();
+    const double still[12] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0};
     Feet out;
     auto foot = array<double>({(size_t)v.n, 3}, &out.foot), normal = array<double>({(size_t)v.n, 3}, &out.normal);
     auto d2 = array<double>({(size_t)v.n}, &out.d2);
@@ -151,7 +153,7 @@ class Index {
       Facing facing;
       code.face(store_, sided ? &eye : nullptr, 0, facing);
       team.each((v.n + CHUNK - 1) / CHUNK, [&](int64_t k) {
-        code.closest(store_, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), facing, sided, std::min(most, store_.reach), out);
+        code.closest(store_, v, k * CHUNK, std::min(v.n, (k + 1) * CHUNK), still, facing, sided, std::min(most, store_.reach), out);
       });
     }
     return nb::make_tuple(foot, d2, id, normal);
@@ -252,6 +254,21 @@ class Index {
     return nb::make_tuple(g.points, g.inliers, g.used, g.rms, g.noise, centre, array66(g.total), g.statistic, g.overlap,
                           g.observable, g.bounded, g.beyond, array66(g.covariance.P), g.covariance.dof, g.split,
                           g.size[0], g.size[1]);
+  }
+
+  nb::tuple distances(nb::handle points, const Doubles& T_ca, double most, bool known, int64_t tested, double least_facing) const {
+    require(most > 0 && tested > 0, "the largest distance and the number of tested points must be positive");
+    const Cloud cloud(points);
+    const View v = cloud.view();
+    const Rows T = rows(T_ca);
+    double* out;
+    auto found = array<double>({(size_t)v.n}, &out);
+    int64_t work;
+    {
+      nb::gil_scoped_release release;
+      work = avs::distances(store_, code(), v, T.v, {known, tested, least_facing}, most, out);
+    }
+    return nb::make_tuple(found, work);
   }
 
   nb::tuple looks(nb::handle points, const Doubles& T_ca, int64_t stride) const {
@@ -423,7 +440,7 @@ nb::tuple refine(const Field& field, const Doubles& points, const Poses& T_ca, i
   {
     nb::gil_scoped_release release;
     Team team(threads);
-    team.each((int64_t)n, [&](int64_t k) { cost[k] = field.refine(points.data(), (int64_t)points.shape(0), rule, T + 16 * k); });
+    team.each((int64_t)n, [&](int64_t k) { cost[k] = field.refine(code(false), points.data(), (int64_t)points.shape(0), rule, T + 16 * k); });
   }
   return nb::make_tuple(poses, costs);
 }
@@ -444,6 +461,37 @@ nb::tuple nearest(const PointTree& tree, const Doubles& points, int64_t k) {
     }
   }
   return nb::make_tuple(distances, numbers);
+}
+
+nb::tuple voxels(const Doubles& points, double size) {
+  require(points.ndim() == 2 && points.shape(1) == 3, "points must be (n, 3)");
+  require(size > 0, "the size of a voxel must be positive");
+  const size_t n = points.shape(0);
+  int64_t *of, *first, *count;
+  auto numbers = array<int64_t>({n}, &of);
+  std::vector<int64_t> begin, many;
+  {
+    nb::gil_scoped_release release;
+    Numbers cubes;
+    for (size_t k = 0; k < n; ++k) {
+      of[k] = cubes.of(cube_of(points.data() + 3 * k, 1 / size));
+      if (cubes.size() > begin.size()) begin.push_back((int64_t)k), many.push_back(0);
+      ++many[(size_t)of[k]];
+    }
+  }
+  auto firsts = array<int64_t>({begin.size()}, &first), counts = array<int64_t>({begin.size()}, &count);
+  std::copy(begin.begin(), begin.end(), first), std::copy(many.begin(), many.end(), count);
+  return nb::make_tuple(firsts, numbers, counts);
+}
+
+nb::ndarray<nb::numpy, int64_t> different_of(const Poses& T, const std::array<double, 3>& middle, int64_t most, double trace,
+                                             double near) {
+  require(T.shape(1) == 4 && T.shape(2) == 4, "poses must be (k, 4, 4)");
+  const std::vector<int64_t> kept = different(T.data(), (int64_t)T.shape(0), middle.data(), most, trace, near);
+  int64_t* out;
+  auto numbers = array<int64_t>({kept.size()}, &out);
+  std::copy(kept.begin(), kept.end(), out);
+  return numbers;
 }
 
 }  // namespace
@@ -476,6 +524,8 @@ NB_MODULE(_kernel, m) {
         const auto found = tree.groups(most);
         std::copy(found.begin(), found.end(), of);
         return numbers; }, nb::arg("most_m"));
+  m.def("voxels", &voxels, nb::arg("points"), nb::arg("size_m"));
+  m.def("different", &different_of, nb::arg("T_ca"), nb::arg("middle"), nb::arg("most"), nb::arg("trace"), nb::arg("near_m"));
   nb::class_<Field>(m, "Field")
       .def("__init__", [](Field* f, const Doubles& points, const Doubles& normals, int across) {
         new (f) Field(field_of(points, normals, across)); }, nb::arg("points"), nb::arg("normals"), nb::arg("across"))
@@ -503,6 +553,8 @@ NB_MODULE(_kernel, m) {
            nb::arg("noise_m"), nb::arg("noise_floor_m"), nb::arg("least_inliers"), nb::arg("least_ratio"),
            nb::arg("least_information"), nb::arg("systematic"), nb::arg("turn_rad"), nb::arg("move_m"), nb::arg("across"),
            nb::arg("threads") = 1, nb::arg("matches").none() = nb::none())
+      .def("distances", &Index::distances, nb::arg("points"), nb::arg("T_ca"), nb::arg("most_m"), nb::arg("camera"),
+           nb::arg("tested"), nb::arg("least_facing"))
       .def("looks", &Index::looks, nb::arg("points"), nb::arg("T_ca"), nb::arg("stride"))
       .def_prop_ro("primitives", &Index::primitives)
       .def_prop_ro("nbytes", &Index::bytes)

@@ -86,7 +86,7 @@ double Field::squared(int16_t id, const Vec3& p) const {
   return (q[0] - p.x) * (q[0] - p.x) + (q[1] - p.y) * (q[1] - p.y) + (q[2] - p.z) * (q[2] - p.z);
 }
 
-void Field::offer(Near& near, int16_t id, const Vec3& p) const {
+void Field::offer(FieldCell& near, int16_t id, const Vec3& p) const {
   if (id < 0 || id == near.front || id == near.back) return;
   const auto opposite = [&](int16_t i, int16_t j) {
     const float *a = samples_[(size_t)i].n, *b = samples_[(size_t)j].n;
@@ -116,66 +116,30 @@ void Field::sweep(int sx, int sy, int sz) {
         const Vec3 p = middle(c[0], c[1], c[2]);
         for (int a = 0; a < 3; ++a) {
           if (c[a] - s[a] < 0 || c[a] - s[a] >= size_[a]) continue;
-          const Near from = cells_[(size_t)(here - s[a] * stride[a])];
+          const FieldCell from = cells_[(size_t)(here - s[a] * stride[a])];
           offer(cells_[(size_t)here], from.front, p);
           offer(cells_[(size_t)here], from.back, p);
         }
       }
 }
 
-const Field::Near& Field::at(const double* p) const {
-  int64_t c[3];
-  for (int a = 0; a < 3; ++a) {
-    const double x = (p[a] - low_[a]) / cell_;
-    c[a] = x > 0 ? (x < (double)size_[a] ? (int64_t)x : size_[a] - 1) : 0;
-  }
-  return cells_[(size_t)((c[0] * size_[1] + c[1]) * size_[2] + c[2])];
-}
-
-// The distance is to the piece of the plane, about a cell wide, that the sampled point stands for.
-bool Field::match(const double* p, const double* eye, bool facing, Match& m) const {
-  const Near& near = at(p);
-  for (const int16_t id : {near.front, near.back}) {
-    if (id < 0) break;
-    const Sample& s = samples_[(size_t)id];
-    const double n[3] = {s.n[0], s.n[1], s.n[2]}, d[3] = {s.p[0] - p[0], s.p[1] - p[1], s.p[2] - p[2]};
-    if (facing && n[0] * (eye[0] - s.p[0]) + n[1] * (eye[1] - s.p[1]) + n[2] * (eye[2] - s.p[2]) <= 0) continue;
-    const double e = dot(n, d), all = dot(d, d), beside = std::max(0.0, all - e * e - cell_ * cell_);
-    m = {&s, e, e * e + beside};
-    return true;
-  }
-  return false;
-}
-
-double Field::refine(const double* points, int64_t m, const CoarseRule& rule, double* T) const {
+double Field::refine(const Code& code, const double* points, int64_t m, const CoarseRule& rule, double* T) const {
+  FieldTable table{samples_.data(), cells_.data(), {low_[0], low_[1], low_[2]}, {}, cell_, {size_[0], size_[1], size_[2]}};
+  for (int a = 0; a < 3; ++a) table.middle[a] = 0.5 * (low_[a] + low_[a] + (double)size_[a] * cell_);
+  const double* c = table.middle;
+  const int64_t padded = (m + 3) / 4 * 4;
+  std::vector<double> scan((size_t)(3 * padded));
+  for (int64_t k = 0; k < 3 * m; ++k) scan[(size_t)(k % 3 * padded + k / 3)] = points[k];
   double gate = rule.gate, cost = 1;
   for (int pass = 0; pass <= rule.passes; ++pass) {
-    double H[6][6] = {}, b[6] = {}, unexplained = 0, c[3] = {};
-    int64_t matched = 0;
-    const double eye[3] = {T[3], T[7], T[11]};
-    for (int a = 0; a < 3; ++a) c[a] = 0.5 * (low_[a] + low_[a] + (double)size_[a] * cell_);
-    for (int64_t k = 0; k < m; ++k) {
-      const double* x = points + 3 * k;
-      double p[3];
-      for (int a = 0; a < 3; ++a) p[a] = T[4 * a] * x[0] + T[4 * a + 1] * x[1] + T[4 * a + 2] * x[2] + T[4 * a + 3];
-      Match found;
-      if (!match(p, eye, rule.facing, found)) {
-        unexplained += 1;
-        continue;
-      }
-      unexplained += std::min(1.0, found.d2 / (rule.beyond * rule.beyond));
-      if (pass == rule.passes || found.d2 > gate * gate) continue;  // the last pass gives the cost only
-      const float* n = found.sample->n;
-      const double r[3] = {p[0] - c[0], p[1] - c[1], p[2] - c[2]};
-      const double J[6] = {r[1] * n[2] - r[2] * n[1], r[2] * n[0] - r[0] * n[2], r[0] * n[1] - r[1] * n[0], n[0], n[1], n[2]};
-      for (int i = 0; i < 6; ++i) {
-        for (int j = 0; j <= i; ++j) H[i][j] += J[i] * J[j];
-        b[i] += J[i] * found.e;
-      }
-      ++matched;
-    }
-    cost = unexplained / (double)std::max<int64_t>(m, 1);
-    if (pass == rule.passes || matched < LEAST_MATCHED) break;
+    const bool last = pass == rule.passes;  // gives the cost only
+    FieldSums sums;
+    code.field_pass(table, {scan.data(), m, padded, T, gate, rule.beyond, rule.facing, last}, sums);
+    cost = sums.unexplained / (double)std::max<int64_t>(m, 1);
+    if (last || sums.matched < (double)LEAST_MATCHED) break;
+    double H[6][6], *b = sums.gradient;
+    for (int i = 0, t = 0; i < 6; ++i)
+      for (int j = 0; j <= i; ++j, ++t) H[i][j] = sums.info[t];
     const double turns = (H[0][0] + H[1][1] + H[2][2]) / 3, shifts = (H[3][3] + H[4][4] + H[5][5]) / 3;
     for (int i = 0; i < 6; ++i) H[i][i] += DAMPING * (i < 3 ? turns : shifts);
     if (!solve(H, b)) break;
@@ -187,6 +151,23 @@ double Field::refine(const double* points, int64_t m, const CoarseRule& rule, do
     gate = std::max(rule.floor, rule.fall * gate);
   }
   return cost;
+}
+
+std::vector<int64_t> different(const double* T, int64_t n, const double* middle, int64_t most, double trace, double near) {
+  std::vector<int64_t> kept;
+  std::vector<double> at((size_t)(3 * n));  // R' (middle - t)
+  for (int64_t k = 0; k < n; ++k)
+    for (int64_t i = 0; i < 3; ++i)
+      for (int64_t j = 0; j < 3; ++j) at[(size_t)(3 * k + i)] += T[16 * k + 4 * j + i] * (middle[j] - T[16 * k + 4 * j + 3]);
+  for (int64_t k = 0; k < n && (int64_t)kept.size() < most; ++k) {
+    const bool same = std::any_of(kept.begin(), kept.end(), [&](int64_t other) {
+      const double *a = T + 16 * k, *b = T + 16 * other, *p = at.data() + 3 * k, *q = at.data() + 3 * other;
+      const double d[3] = {p[0] - q[0], p[1] - q[1], p[2] - q[2]};
+      return dot(a, b) + dot(a + 4, b + 4) + dot(a + 8, b + 8) > trace && dot(d, d) < near * near;
+    });
+    if (!same) kept.push_back(k);
+  }
+  return kept;
 }
 
 }  // namespace avs

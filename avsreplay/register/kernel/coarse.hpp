@@ -4,7 +4,7 @@
 #include <cstdint>
 #include <vector>
 
-#include "layout.hpp"
+#include "hot.hpp"
 
 namespace avs {
 
@@ -26,31 +26,22 @@ class Field {
   Field(const double* points, const double* normals, int64_t n, int across);
 
   // Refines `T` (rows of [R t]) by point-to-plane passes over m points; returns the mean of min(1, d^2 / beyond^2).
-  double refine(const double* points, int64_t m, const CoarseRule& rule, double* T) const;
+  double refine(const Code& code, const double* points, int64_t m, const CoarseRule& rule, double* T) const;
 
  private:
-  struct Near {
-    int16_t front = -1, back = -1;
-  };
-  struct Sample {
-    float p[3], n[3];
-  };
-  struct Match {
-    const Sample* sample;
-    double e, d2;
-  };
-
   Vec3 middle(int64_t x, int64_t y, int64_t z) const;
   double squared(int16_t id, const Vec3& p) const;
-  void offer(Near& near, int16_t id, const Vec3& p) const;
+  void offer(FieldCell& near, int16_t id, const Vec3& p) const;
   void sweep(int sx, int sy, int sz);
-  const Near& at(const double* p) const;
-  bool match(const double* p, const double* eye, bool facing, Match& m) const;
 
-  std::vector<Sample> samples_;
-  std::vector<Near> cells_;
+  std::vector<FieldSample> samples_;
+  std::vector<FieldCell> cells_;
   double low_[3], cell_;
   int64_t size_[3];
 };
+
+// Which of n poses (4, 4) are different, at most `most`, the first of each kind. The same are two whose rotations R have a
+// trace of R'R above `trace`, and whose points of the scan at the middle of the model are nearer than `near`.
+std::vector<int64_t> different(const double* T, int64_t n, const double* middle, int64_t most, double trace, double near);
 
 }  // namespace avs

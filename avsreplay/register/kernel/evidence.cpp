@@ -2,15 +2,13 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <memory>
+
+#include "cubes.hpp"
 
 namespace avs {
 namespace {
-
-struct Cube {
-  int64_t x, y, z;
-  bool operator==(const Cube& o) const { return x == o.x && y == o.y && z == o.z; }
-};
 
 constexpr double NEARER = 0.999;  // of the gate of an alignment: neighbours this near are the nearest whatever the gate
 
@@ -47,52 +45,6 @@ class Matcher {
   const Kept* kept_ = nullptr;
 };
 
-Cube cube_of(const Match& m, double per_m) {
-  const auto cell = [&](double x) {
-    const double y = std::min(std::max(x * per_m, -1e15), 1e15);
-    const int64_t k = (int64_t)y;
-    return k - (y < (double)k);
-  };
-  return {cell(m.p[0]), cell(m.p[1]), cell(m.p[2])};
-}
-
-// Numbers cubes in the order in which they first come.
-class Numbers {
- public:
-  uint32_t of(const Cube& cube) {
-    if (!cubes_.empty() && cube == cubes_[last_]) return last_;
-    size_t at = hash(cube) & (slots_.size() - 1);
-    while (slots_[at] != EMPTY && !(cubes_[slots_[at]] == cube)) at = (at + 1) & (slots_.size() - 1);
-    if (slots_[at] != EMPTY) return last_ = slots_[at];
-    slots_[at] = last_ = (uint32_t)cubes_.size();
-    cubes_.push_back(cube);
-    if (2 * cubes_.size() > slots_.size()) grow();
-    return last_;
-  }
-  size_t size() const { return cubes_.size(); }
-
- private:
-  static constexpr uint32_t EMPTY = UINT32_MAX;
-
-  static size_t hash(const Cube& c) {
-    const uint64_t h = ((uint64_t)c.x * 73856093u ^ (uint64_t)c.y * 19349663u ^ (uint64_t)c.z * 83492791u) * 0x9e3779b97f4a7c15u;
-    return (size_t)(h >> 32);
-  }
-
-  void grow() {
-    slots_.assign(2 * slots_.size(), EMPTY);
-    for (uint32_t k = 0; k < (uint32_t)cubes_.size(); ++k) {
-      size_t at = hash(cubes_[k]) & (slots_.size() - 1);
-      while (slots_[at] != EMPTY) at = (at + 1) & (slots_.size() - 1);
-      slots_[at] = k;
-    }
-  }
-
-  std::vector<Cube> cubes_;
-  std::vector<uint32_t> slots_ = std::vector<uint32_t>(1024, EMPTY);
-  uint32_t last_ = 0;
-};
-
 // What one chunk adds.
 struct Part {
   int inliers = 0;
@@ -114,7 +66,7 @@ class Sorted {
     begin_.assign(numbers.size() + 1, 0);
     for (int64_t k = 0; k < chunks; ++k)
       for (int64_t i = k * CHUNK; i < k * CHUNK + parts[k].inliers; ++i) {
-        const uint32_t p = patch_[(size_t)i] = numbers.of(cube_of(matches_[(size_t)i], per_m));
+        const uint32_t p = patch_[(size_t)i] = numbers.of(cube_of(matches_[(size_t)i].p, per_m));
         if (begin_.size() < p + 2) begin_.resize(p + 2, 0);
         ++begin_[p + 1];
       }
@@ -199,6 +151,71 @@ Looks looks(const Store& s, const Code& code, const View& v, const double* T, in
     }
   }
   return found;
+}
+
+namespace {
+
+// Copies point k of a view to three numbers.
+void copy_point(const View& v, int64_t k, double* p) {
+  for (int a = 0; a < 3; ++a) {
+    const char* at = v.data + k * v.row + a * v.column;
+    float x;
+    v.single ? (void)std::memcpy(&x, at, sizeof x) : (void)std::memcpy(p + a, at, sizeof(double));
+    if (v.single) p[a] = (double)x;
+  }
+}
+
+// Squared distances, feet and normals of some points of a scan, with the work that finding them took.
+struct Found {
+  std::vector<double> foot, d2, normal;
+  std::vector<int32_t> id;
+  int64_t work;
+
+  Found(const Store& s, const Code& code, const View& v, const double* T, bool sided, double bound)
+      : foot((size_t)(3 * v.n)), d2((size_t)v.n), normal((size_t)(3 * v.n)), id((size_t)v.n) {
+    const Vec3 eye{T[3], T[7], T[11]};
+    Facing facing;
+    code.face(s, sided ? &eye : nullptr, 0, facing);
+    const int64_t compared = code.closest(s, v, 0, v.n, T, facing, sided, bound, {foot.data(), d2.data(), id.data(), normal.data()});
+    work = work_of(v.n, v.n, compared);
+  }
+
+  // Whether the closest face of a point is there and faces the eye.
+  bool faces(int64_t k, const double* T) const {
+    double height = 0;
+    for (int64_t a = 0; a < 3; ++a) height += normal[(size_t)(3 * k + a)] * (T[4 * a + 3] - foot[(size_t)(3 * k + a)]);
+    return id[(size_t)k] >= 0 && height > 0;
+  }
+};
+
+}  // namespace
+
+int64_t distances(const Store& s, const Code& code, const View& v, const double* T, const Sight& sight, double most, double* out) {
+  const int64_t stride = std::max<int64_t>(1, v.n / sight.tested);
+  std::vector<int64_t> left;
+  int64_t work = 0;
+  bool sided = false;
+  if (sight.known && s.mesh) {
+    const View few{v.data, (v.n + stride - 1) / stride, v.row * stride, v.column, v.single};
+    const Found tested(s, code, few, T, false, s.reach);
+    int64_t matched = 0, facing = 0;
+    for (int64_t k = 0; k < few.n; ++k) matched += tested.id[(size_t)k] >= 0, facing += tested.faces(k, T);
+    sided = (double)facing >= sight.least_facing * (double)matched;
+    work += tested.work;
+    for (int64_t k = 0; k < v.n; ++k) {
+      const bool settled = k % stride == 0 && (!sided || tested.faces(k / stride, T));
+      if (settled) out[k] = std::min(std::sqrt(tested.d2[(size_t)(k / stride)]), most);
+      if (!settled) left.push_back(k);
+    }
+  } else {
+    for (int64_t k = 0; k < v.n; ++k) left.push_back(k);
+  }
+  std::vector<double> points(3 * left.size());
+  for (size_t k = 0; k < left.size(); ++k) copy_point(v, left[k], points.data() + 3 * k);
+  const View rest{reinterpret_cast<const char*>(points.data()), (int64_t)left.size(), 3 * (int64_t)sizeof(double), sizeof(double), false};
+  const Found found(s, code, rest, T, sided, std::min(most, s.reach));
+  for (size_t k = 0; k < left.size(); ++k) out[left[k]] = std::min(std::sqrt(found.d2[k]), most);
+  return work + found.work;
 }
 
 }  // namespace avs

@@ -28,4 +28,15 @@ struct Looks {
 };
 Looks looks(const Store& store, const Code& code, const View& points, const double* T, int64_t stride);
 
+// Whether only faces that face the camera count: where t of T may be it (`known`), and of about `tested` points that have a
+// closest point at least this share has it on a face that faces t.
+struct Sight {
+  bool known;
+  int64_t tested;
+  double least_facing;
+};
+// The distances of the points of a scan to the model at T, at most `most`; returns the work in ordinary searches.
+int64_t distances(const Store& store, const Code& code, const View& points, const double* T, const Sight& sight, double most,
+                  double* out);
+
 }  // namespace avs

@@ -73,6 +73,34 @@ struct Near {
   uint32_t block, steps;
 };
 
+// The points sampled from a model and the grid around it, see `Field`.
+struct FieldSample {
+  float p[3], n[3];
+};
+struct FieldCell {
+  int16_t front = -1, back = -1;
+};
+struct FieldTable {
+  const FieldSample* samples;
+  const FieldCell* cells;
+  double low[3], middle[3], cell;
+  int64_t size[3];
+};
+
+// One pass over m points of a scan, (3, m) with m a multiple of four; those from `points` on are padding.
+struct FieldLook {
+  const double* scan;
+  int64_t points, m;
+  const double* T;
+  double gate, beyond;
+  bool facing, cost_only;
+};
+
+// Sum of min(1, d^2 / beyond^2); matched points, lower triangle of J'J and J'e with J = [r x n, n], r from the middle.
+struct FieldSums {
+  double unexplained, matched, info[21], gradient[6];
+};
+
 constexpr int NEIGHBOURS = 10;  // of a cloud's point, itself among them, that give its normal
 
 struct Code {
@@ -80,7 +108,9 @@ struct Code {
   // Appends the cells nearer than `band` to a block; false once there are more than `most`.
   bool (*cells)(const Store&, uint32_t block, float band, size_t most, std::vector<Near>&);
   void (*face)(const Store&, const Vec3* eye, double margin, Facing&);
-  void (*closest)(const Store&, const View&, int64_t first, int64_t last, const Facing&, bool sided, double bound, const Feet&);
+  // The closest points of a scan moved by T; returns how many blocks and nodes of the tree the searches compared.
+  int64_t (*closest)(const Store&, const View&, int64_t first, int64_t last, const double* T, const Facing&, bool sided,
+                     double bound, const Feet&);
   void (*normals)(const Store&, int64_t first, int64_t last, Vec3* out);  // of lanes
   void (*pass)(const Store&, const View&, int64_t first, int64_t last, const Look&, Kept*, Sums&);
   // The inliers among a chunk's points, in their order; returns how many. `kept`: where the searches begin, or null; what
@@ -88,6 +118,7 @@ struct Code {
   int (*match)(const Store&, const View&, int64_t first, int64_t last, const Look&, const Kept* kept, Match* out);
   // Adds the n matches that `order` names, ascending; partial sums of those of a chunk are added in the order of chunks.
   void (*add)(const Match*, const uint32_t* order, int64_t n, PatchSums&);
+  void (*field_pass)(const FieldTable&, const FieldLook&, FieldSums&);
 };
 
 const Code& code_base();

@@ -24,10 +24,12 @@ namespace AVS_ISA {
 
 #include "pass.hpp"
 
-static void closest(const Store& s, const View& v, int64_t first, int64_t last, const Facing& facing, bool sided,
-                    double bound, const Feet& out) {
-  s.mesh ? closest_kind<Triangles>(s, v, first, last, facing, sided, bound, out)
-         : closest_kind<Points>(s, v, first, last, facing, sided, bound, out);
+#include "field_pass.hpp"
+
+static int64_t closest(const Store& s, const View& v, int64_t first, int64_t last, const double* T, const Facing& facing,
+                       bool sided, double bound, const Feet& out) {
+  return s.mesh ? closest_kind<Triangles>(s, v, first, last, T, facing, sided, bound, out)
+                : closest_kind<Points>(s, v, first, last, T, facing, sided, bound, out);
 }
 
 static bool cells(const Store& s, uint32_t block, float band, size_t most, std::vector<Near>& out) {
@@ -51,7 +53,7 @@ static int match(const Store& s, const View& v, int64_t first, int64_t last, con
 
 const Code& AVS_CODE() {
   static const Code code{AVS_NAME, AVS_ISA::cells, AVS_ISA::face, AVS_ISA::closest, AVS_ISA::normals, AVS_ISA::pass, AVS_ISA::match,
-                         AVS_ISA::add};
+                         AVS_ISA::add, AVS_ISA::field_pass};
   return code;
 }
 }  // namespace avs

@@ -15,6 +15,9 @@ struct Rule {
   int64_t most_work;  // after the pass that reaches it the loop ends, not converged
 };
 
+// In point searches. An ordinary one moves a point and compares about two blocks, which is 4/3 of this unit.
+inline int64_t work_of(int64_t moved, int64_t searched, int64_t compared) { return (moved + searched + compared) / 3; }
+
 struct Outcome {
   double T[12];  // rows of [R t]
   int passes;      // over all points and over a part of them
@@ -24,8 +27,7 @@ struct Outcome {
   int64_t compared;  // blocks and nodes of the tree, by all searches
   int64_t moved;     // points, over all passes
 
-  // In ordinary searches, each of which moves one point and compares about two blocks.
-  int64_t work() const { return (moved + searched + compared) / 4; }
+  int64_t work() const { return work_of(moved, searched, compared); }
   double rms, gate, turn, move;
 };
 

@@ -303,16 +303,17 @@ static void add(const Match* matches, const uint32_t* order, int64_t n, PatchSum
 }
 
 template <class Kind>
-static void closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const Facing& facing, bool sided,
-                         double bound, const Feet& out) {
-  const double nan = std::numeric_limits<double>::quiet_NaN(), here[12] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0};
+static int64_t closest_kind(const Store& s, const View& v, int64_t first, int64_t last, const double* T, const Facing& facing,
+                            bool sided, double bound, const Feet& out) {
+  const double nan = std::numeric_limits<double>::quiet_NaN();
   const Scope o = scope_of(s, facing, sided, bound, 0.f);
   Chunk c;
   Sums counts{};
+  int64_t compared = 0;
   for (int64_t at = first; at < last; at += CHUNK) {
     const int n = (int)std::min<int64_t>(CHUNK, last - at);
-    gather(s, v, at, n, here, nullptr, c, counts);
-    search<Kind>(o, at, n, nullptr, nullptr, c);
+    gather(s, v, at, n, T, nullptr, c, counts);
+    compared += search<Kind>(o, at, n, nullptr, nullptr, c).compared;
     each_four<Kind>(o, n, Ask::NORMAL, c, [&](int i, const D4 (&)[3], const Four& four, D4::Mask in) {
       const D4 none = d4(nan);
       double d2[4], v[6][4];
@@ -325,4 +326,5 @@ static void closest_kind(const Store& s, const View& v, int64_t first, int64_t l
       }
     });
   }
+  return compared;
 }
