@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.geometry import Array, MeasuredPose, Pose, frozen
+from avsreplay.geometry import Array, MeasuredPose, Pose, frozen, matrix, rotate
 
 BLOCKS: Mapping[str, slice] = {
     "attitude": slice(0, 3),  # dq_v, half angle, {B}
@@ -115,13 +115,12 @@ class State:
     @property
     def T_ac(self) -> Pose:
         """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho."""
-        position = self.r_a + geometry.rotate(geometry.matrix(self.q_ab), self.c_b)
-        return Pose(geometry.multiply(self.q_ab, self.q_bc), position)
+        return Pose(geometry.multiply(self.q_ab, self.q_bc), self.r_a + rotate(matrix(self.q_ab), self.c_b))
 
     @property
     def fixture_velocity(self) -> Array:
         """Return the (3,) velocity of the origin of {C} in {A} [m/s] (section 8)."""
-        return self.v_a + geometry.rotate(geometry.matrix(self.q_ab), np.cross(self.w_b, self.c_b))
+        return self.v_a + rotate(matrix(self.q_ab), np.cross(self.w_b, self.c_b))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -142,7 +141,7 @@ class Scan:
     Attributes:
         seq: index in the replay, from 0.  t_ns: instant on the selected clock.  log_ns: time of reception.
         points: (n, 3) finite, float32 or float64, possibly strided, in {A} [m].
-        times_s, intensities: (n,) instant relative to ``t_ns`` [s] and intensity of each point, or None.
+        times_s, intensities, places: (n,) instant after ``t_ns`` [s], intensity, share of the message before; or None.
         dropped_points: non-finite ones.  frame: of the message, or "".  note: what was wrong.  pose: in place of them.
     """
 
@@ -157,6 +156,7 @@ class Scan:
     frame: str = ""
     pose: MeasuredPose | None = None
     intensities: NDArray[Any] | None = None
+    places: NDArray[Any] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -192,7 +192,7 @@ class Run:
             truth = self._truth_of(outcome.scan)
             if self.job.growing:
                 self.job.growing.take(outcome.scan, self._true(outcome.scan))
-            self.model_check.add(outcome.scan.points, outcome.alignment)
+            self.model_check.add(outcome.scan, outcome.alignment)
             row = Row.of(outcome, self._scored.score(state, outcome, truth))
             self._fold.add(row)
             if truth.state is not None:

@@ -12,7 +12,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import point_cloud2
-from avsreplay.log.point_cloud2 import decode_cloud, read_layout
+from avsreplay.log.options import SourceOptions
+from avsreplay.log.point_cloud2 import decode_cloud, read_layout, selected
 
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 ROS2, ROS1 = get_typestore(Stores.ROS2_HUMBLE), get_typestore(Stores.ROS1_NOETIC)
@@ -88,6 +89,29 @@ def test_points_that_are_not_finite_are_left_out_and_counted() -> None:
     assert cloud.dropped == 3
     np.testing.assert_array_equal(cloud.points, points[kept])
     np.testing.assert_array_equal(cloud.times_s, kept)
+
+
+def test_the_order_of_points_without_times_counts_those_that_are_left_out() -> None:
+    points = np.arange(30, dtype=np.float32).reshape(10, 3)
+    points[3, 1], points[5, 2] = np.nan, np.inf
+    cloud = decode_cloud(point_cloud2(5, "c", points, None))
+    assert cloud.places is not None
+    np.testing.assert_allclose(cloud.places, [0.0, 0.1, 0.2, 0.4, 0.6, 0.7, 0.8, 0.9], atol=1e-7)
+    assert decode_cloud(point_cloud2(5, "c", points, np.arange(10, dtype=np.float32))).places is None
+
+
+@pytest.mark.parametrize("duration_s", [0.5, -0.5])
+def test_the_duration_of_a_scan_gives_times_by_the_order_of_the_points(duration_s: float) -> None:
+    points = np.arange(30, dtype=np.float32).reshape(10, 3)
+    points[3, 1] = np.nan
+    options = SourceOptions(scan_duration_s=duration_s, crop_range=(8.0, 1e3))
+    found = selected(decode_cloud(point_cloud2(5, "c", points, None)), options)
+    np.testing.assert_array_equal(found.points, points[[2, 4, 5, 6, 7, 8, 9]])
+    np.testing.assert_allclose(found.times_s, duration_s * np.array([0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]), atol=1e-7)
+    assert found.places is None
+    given = np.arange(10, dtype=np.float32)
+    own = selected(decode_cloud(point_cloud2(5, "c", points, given)), options)
+    np.testing.assert_array_equal(own.times_s, given[[2, 4, 5, 6, 7, 8, 9]])  # times of the message are kept
 
 
 @pytest.mark.parametrize("kind", ["float32", "float64"])

@@ -403,7 +403,8 @@ def test_a_model_in_millimetres_is_said_before_any_table(cli, fixtures_folder, m
     done = cli("run", log, "--model", model_in_mm, "--n-scans", 5)
     assert "--model-unit mm" in done.err.splitlines()[0]
     assert "--model-unit mm" in done.out.split("Scans:")[0]
-    assert "avsreplay: model:" not in done.err  # the shape is not judged in a wrong unit
+    assert "model explains" not in done.err  # the shape is not judged in a wrong unit
+    assert "mirror" not in done.err
     right = cli("run", log, "--model", model_in_mm, "--model-unit", "mm", "--n-scans", 5)
     assert "model-unit" not in right.err.splitlines()[0]
     assert "5 healthy" in right.out

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import AlignStatus, Surface
+from avsreplay.records import AlignStatus, Scan, Surface
 from avsreplay.register import ModelCheck, Registrar
 from avsreplay.register.contract import boxes, view
 from avsreplay.register.params import RegisterParams
@@ -31,7 +32,7 @@ def checked(model: Surface, measured: Surface, count: int = 30) -> ModelCheck:
     registrar = Registrar(model)
     check = ModelCheck(registrar, model)
     for points, T_ac in scans(measured, count):
-        check.add(points, registrar.register(points, T_ac))
+        check.add(Scan(0, 0, points), registrar.register(points, T_ac))
     return check
 
 
@@ -61,6 +62,48 @@ def test_the_size_is_measured_until_an_error_is_excluded(factor: float, used: in
     assert bool(check.notes()) == (factor != 1.0)
 
 
+def moving_scans(surface: Surface, duration_s: float, count: int, sigma: float = 0.001) -> list[tuple[Scan, Pose]]:
+    """Scans of a moving target every 0.5 s, point after point from left to right; the poses are those in the middle."""
+    rng, found = np.random.default_rng(SEED), []
+    rate, velocity = np.array([0.05, 0.08, -0.04]), np.array([0.004, -0.003, 0.002])
+    for k in range(count):
+        t = 0.5 * k
+        T_ac = Pose(geometry.exp(rate * t), np.array([0.0, 0.0, 3.0 * surface.extent]) + velocity * t)
+        points = T_ac.apply(view(surface, 2000, T_ac.inverse().t))
+        points = points[np.argsort(points[:, 0])]
+        places = np.arange(len(points)) / len(points)
+        moved = np.cross(rate, points - T_ac.t) + velocity
+        points = points + duration_s * (places - 0.5)[:, None] * moved + sigma * rng.standard_normal(points.shape)
+        found.append((Scan(k, round(t * 1e9), points, places=places.astype(np.float32)), T_ac))
+    return found
+
+
+@pytest.mark.parametrize("duration_s", [0.3, -0.2])
+def test_points_that_are_measured_one_after_the_other_are_noticed(duration_s: float) -> None:
+    model = boxes()
+    registrar = Registrar(model)
+    check, timed = ModelCheck(registrar, model), ModelCheck(registrar, model)
+    for scan, T_ac in moving_scans(model, duration_s, 34):
+        found = registrar.register(scan.points, T_ac)
+        check.add(scan, found)
+        timed.add(replace(scan, places=None, times_s=scan.places), found)
+    mean, sigma, period = check._duration()
+    assert mean == pytest.approx(duration_s, abs=max(4.0 * sigma, 0.01))
+    assert period == pytest.approx(0.5)
+    assert f"--scan-duration {mean:.3g}" in " ".join(check.notes())
+    assert "--scan-duration" not in " ".join(timed.notes())
+
+
+def test_points_of_one_instant_raise_no_note_though_the_target_moves() -> None:
+    model = boxes()
+    registrar = Registrar(model)
+    check = ModelCheck(registrar, model)
+    for scan, T_ac in moving_scans(model, 0.0, 20):
+        check.add(scan, registrar.register(scan.points, T_ac))
+    assert len(check._durations) >= 8
+    assert check.notes() == ()
+
+
 def test_few_scans_say_nothing_of_the_size() -> None:
     check = checked(boxes(), boxes(), count=4)
     assert check.scale() is None
@@ -74,7 +117,7 @@ def test_poses_that_did_not_converge_on_the_model_say_nothing_of_its_shape() -> 
     check = ModelCheck(registrar, model)
     for points, T_ac in scans(model, 3):
         start = Pose(T_ac.q, T_ac.t + 0.003 * model.extent)
-        check.add(points, registrar.register(points, start))
+        check.add(Scan(0, 0, points), registrar.register(points, start))
     assert check.notes() == ()
 
 
@@ -87,7 +130,7 @@ def test_a_mirrored_model_and_another_object_are_told_apart() -> None:
     for points, word in ((scans(mirrored, 1)[0][0], "mirror image"), (sphere, "right model")):
         registrar = Registrar(model)
         check = ModelCheck(registrar, model)
-        check.add(points, registrar.acquire(points))
+        check.add(Scan(0, 0, points), registrar.acquire(points))
         assert word in check.notes()[0]
 
 
@@ -99,7 +142,7 @@ def test_a_model_of_another_size_is_not_called_mirrored(factor: float) -> None:
     registrar = Registrar(wrong)
     check = ModelCheck(registrar, wrong)
     for points, _ in scans(model, 3):
-        check.add(points, registrar.acquire(points))
+        check.add(Scan(0, 0, points), registrar.acquire(points))
     note = check.notes()[0]
     assert "mirror" not in note
     corners = wrong.vertices - wrong.vertices[:, None]

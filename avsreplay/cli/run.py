@@ -247,7 +247,7 @@ def _model_notes(run: Run, advice: list[Advice]) -> tuple[str, ...]:
         return ()
     notes = run.model_check.notes()
     for note in notes:
-        click.echo(f"avsreplay: model: {note}", err=True)
+        click.echo(f"avsreplay: {note}", err=True)
     return notes
 
 

@@ -95,7 +95,7 @@ class GrowingLog:
             scan: the scan; its points are not kept.
             truth: its ground truth.
         """
-        self._used.append((replace(scan, points=_NO_POINTS, times_s=None), truth))
+        self._used.append((replace(scan, points=_NO_POINTS, times_s=None, places=None), truth))
 
     def outdated(self) -> bool:
         """Return whether the finished log gives another time, note or truth for a scan than was used."""

@@ -100,6 +100,15 @@ class SourceOptions(Settings):
         low=0.0,
         infinite=True,
     )
+    scan_duration_s: float | None = setting(
+        None,
+        "Time in which the points of a cloud are measured, in their order and from the stamp on, where they have no "
+        "times; negative if the last one is measured first.",
+        unit="s",
+        low=-1e3,
+        high=1e3,
+        unset="the points of a cloud belong to one instant",
+    )
     fixed_frame: str | None = setting(
         None, "Frame of the /tf tree into which each cloud is transformed at its own time."
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from avsreplay.geometry import MeasuredPose
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import Cursor
+from avsreplay.log.options import SourceOptions
 
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _MAX_FIELDS = 256
@@ -66,7 +67,8 @@ class Layout:
 class Cloud:
     """A decoded cloud: finite points (n, 3) [m] in ``frame``, their times [s] after the stamp and intensities, or None.
 
-    ``pose`` is set instead of the points where the source holds measured poses.
+    ``places`` (n,) is the share of the message that stands before each point, for points without times. ``pose`` is set
+    instead of the points where the source holds measured poses.
     """
 
     stamp_ns: int
@@ -76,6 +78,33 @@ class Cloud:
     dropped: int
     pose: MeasuredPose | None = None
     intensities: NDArray[np.float32] | None = None
+    places: NDArray[np.float32] | None = None
+
+    def keep(self, kept: NDArray[np.bool_]) -> Cloud:
+        """Return the cloud with some of its points."""
+        each = (self.times_s, self.intensities, self.places)
+        times, seen, places = (None if column is None else column[kept] for column in each)
+        return replace(self, points=self.points[kept], times_s=times, intensities=seen, places=places)
+
+
+def selected(cloud: Cloud, options: SourceOptions) -> Cloud:
+    """Return a cloud after the crop, with the times of its points if their order and the duration of a scan give them.
+
+    Args:
+        cloud: as decoded.
+        options: how the log is read.
+    """
+    keep = np.ones(len(cloud.points), dtype=bool)
+    if options.crop_box is not None:
+        low, high = np.array(options.crop_box[:3]), np.array(options.crop_box[3:])
+        keep &= ((cloud.points >= low) & (cloud.points <= high)).all(axis=1)
+    if options.crop_range is not None:
+        distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
+        keep &= (distance >= options.crop_range[0]) & (distance <= options.crop_range[1])
+    cloud = cloud if keep.all() else cloud.keep(keep)
+    if options.scan_duration_s is None or cloud.places is None:
+        return cloud
+    return replace(cloud, times_s=np.float32(options.scan_duration_s) * cloud.places, places=None)
 
 
 def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
@@ -92,12 +121,11 @@ def decode_cloud(payload: bytes | memoryview, encoding: str = "cdr") -> Cloud:
     if 0 in layout.shape:
         return Cloud(layout.stamp_ns, layout.frame, np.zeros((0, 3), np.float32), None, 0)
     points, times, intensities = _points(layout), _times(layout), _intensities(layout)
+    places = np.arange(len(points), dtype=np.float32) / np.float32(len(points)) if times is None else None
+    cloud = Cloud(layout.stamp_ns, layout.frame, points, times, 0, intensities=intensities, places=places)
     kept = usable(points)
     dropped = 0 if kept is None else len(points) - int(np.count_nonzero(kept))
-    if kept is not None and dropped:
-        points, times = points[kept], None if times is None else times[kept]
-        intensities = None if intensities is None else intensities[kept]
-    return Cloud(layout.stamp_ns, layout.frame, points, times, dropped, intensities=intensities)
+    return cloud if kept is None or not dropped else replace(cloud.keep(kept), dropped=dropped)
 
 
 def usable(points: NDArray[Any]) -> NDArray[np.bool_] | None:

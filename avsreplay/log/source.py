@@ -20,7 +20,7 @@ from avsreplay.geometry import MeasuredPose, Pose
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.clock import Placed, place
 from avsreplay.log.options import ClockChoice, ClockSummary, LogInfo, Loss, SourceOptions
-from avsreplay.log.point_cloud2 import Cloud
+from avsreplay.log.point_cloud2 import Cloud, selected
 from avsreplay.log.streams import CloudStream, GroundTruth, ahead
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Truth
 
@@ -278,6 +278,7 @@ class Source:
             frame="" if cloud is None else cloud.frame,
             pose=None if cloud is None else cloud.pose,
             intensities=None if cloud is None else cloud.intensities,
+            places=None if cloud is None else cloud.places,
         )
 
     def _body_at(self, t_ns: int) -> State | None:
@@ -290,10 +291,10 @@ class Source:
         return max(inside, key=lambda label: label.start_ns).kind if inside else None
 
     def _taken(self, cloud: Cloud, t_ns: int) -> Cloud:
-        """Crop a cloud and transform it to the fixed frame. Raises BadMessage if the pose of the sensor is unknown."""
+        """Select points and transform them to the fixed frame. Raises BadMessage if the sensor's pose is unknown."""
         if cloud.pose is not None:
             return replace(cloud, pose=self._measured(cloud.pose, t_ns, cloud.frame))
-        cloud = _cropped(cloud, self.options)
+        cloud = selected(cloud, self.options)
         if self._ground_truth.sensor is None:
             return cloud
         return replace(cloud, points=self._sensor(t_ns, cloud.frame).apply(cloud.points))
@@ -327,20 +328,6 @@ def _status(cloud: Cloud | None, placed: Placed) -> ScanStatus:
     if not len(cloud.points) and cloud.pose is None:
         return ScanStatus.EMPTY
     return ScanStatus.CLOCK if placed.note else ScanStatus.OK
-
-
-def _cropped(cloud: Cloud, options: SourceOptions) -> Cloud:
-    if options.crop_box is None and options.crop_range is None:
-        return cloud
-    keep = np.ones(len(cloud.points), dtype=bool)
-    if options.crop_box is not None:
-        low, high = np.array(options.crop_box[:3]), np.array(options.crop_box[3:])
-        keep &= ((cloud.points >= low) & (cloud.points <= high)).all(axis=1)
-    if options.crop_range is not None:
-        distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
-        keep &= (distance >= options.crop_range[0]) & (distance <= options.crop_range[1])
-    times, seen = (None if each is None else each[keep] for each in (cloud.times_s, cloud.intensities))
-    return replace(cloud, points=cloud.points[keep], times_s=times, intensities=seen)
 
 
 def refuse_losses(source: Source) -> None:

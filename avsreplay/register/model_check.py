@@ -1,10 +1,13 @@
-"""Errors of the model that the scans of a run show: a wrong size, a mirrored or a wrong shape.
+"""Errors that the scans of a run show: a wrong size of the model, a mirrored or wrong shape, unknown times of points.
 
 Size: along a run, the factor between target and model is estimated from the residuals of registered scans. With
 T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
 n . (p - c) = J d + delta n . p. Least squares per scan give delta after the pose is eliminated (``size``); scans are
 weighted by the inverse of its variance, and their spread gives the standard error (jackknife over scans). The bias that
 noise causes is found on a few of the scans and subtracted; half of it counts as a standard error.
+
+Times: points without times are taken as measured at one instant. The motion between two scans and the order of the
+points give the duration of a scan by least squares; a significant one is reported.
 
 Shape: if no scan was registered, the global search is repeated with the mirrored model. The unit of the model is
 checked before a run (``preflight``).
@@ -18,11 +21,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.geometry import Array
-from avsreplay.records import Alignment, AlignStatus, Surface
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Alignment, AlignStatus, Scan, Surface
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.sampling import without_scattered_points
-from avsreplay.register.size import MOST_OF_MODEL, SIGMAS, diameter, fitted_size, noise_bias
+from avsreplay.register.size import MOST_OF_MODEL, SIGMAS, diameter, fitted_duration, fitted_size, noise_bias
 
 POINTS = 1500  # points used of each scan
 _LEAST_RUN_ERROR = 0.002  # least error of size that is reported; a single scan cannot show so small a one
@@ -31,6 +35,10 @@ ENOUGH_SCANS = 16  # with which the check ends where they exclude an error of si
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
 MOST_WEIGHT = 4.0  # largest weight of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
+_DURATION_EVERY, _MOST_DURATIONS, _LEAST_DURATIONS = 2, 24, 8  # aligned scans, and durations measured in a run
+_DURATION_POINTS = 800
+_LEAST_OF_PERIOD = 0.02  # least duration of a scan that is reported, over the period of the scans
+_MOST_TURN_RAD = 0.5  # between two scans; the motion is taken as uniform
 LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged
 
 
@@ -50,14 +58,17 @@ class ModelCheck:
         self._weights: list[float] = []
         self._points: list[tuple[Array, Array | None]] = []  # points of each measured scan, and the camera, in {C}
         self._unmatched: NDArray[Any] | None = None
+        self._last: tuple[int, Pose] | None = None  # instant and pose of the last aligned scan
+        self._durations: list[tuple[float, float, float]] = []  # duration, its standard error, period [s]
 
-    def add(self, points: NDArray[Any], found: Alignment | None) -> None:
+    def add(self, scan: Scan, found: Alignment | None) -> None:
         """Use one scan.
 
         Args:
-            points: (n, 3) in {A} [m]; points that are not finite are left out.
+            scan: points in {A} [m]; points that are not finite are left out.
             found: its alignment; None, or a scan without points, is ignored.
         """
+        points = scan.points
         if found is None or not len(points):
             return
         if found.measured and found.inlier_ratio >= LEAST_ON_MODEL:
@@ -70,6 +81,9 @@ class ModelCheck:
         self._aligned += 1
         if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and not self._settled():
             self._measure(points, found)
+        if scan.places is not None and self._aligned % _DURATION_EVERY == 0 and self._duration_open():
+            self._measure_duration(scan, scan.places, found.T_ac)
+        self._last = scan.t_ns, found.T_ac
 
     def scale(self) -> tuple[float, float] | None:
         """Return the size of the target over that of the model and its standard error; None with too few scans."""
@@ -83,12 +97,9 @@ class ModelCheck:
 
     def _mean(self) -> tuple[float, float, Array]:
         """The weighted mean of the errors of size, its standard error (jackknife), and the weights of the scans."""
-        delta, weight = np.array(self._deltas), np.array(self._weights)
+        weight = np.array(self._weights)
         weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
-        without = (weight @ delta - weight * delta) / (weight.sum() - weight)
-        n = len(delta)
-        spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
-        return float(weight @ delta / weight.sum()), spread, weight
+        return *_jackknife(np.array(self._deltas), weight), weight
 
     def _settled(self) -> bool:
         """Whether the scans so far exclude an error of size that would be reported."""
@@ -104,7 +115,7 @@ class ModelCheck:
         if not self._aligned:
             several = f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init"
             return (several,) if self._ambiguous else ()
-        return self._size()
+        return *self._size(), *self._duration_note()
 
     def _size(self) -> tuple[str, ...]:
         found = self.scale()
@@ -130,6 +141,46 @@ class ModelCheck:
             self._weights.append(1.0 / measured.sigma**2)
             self._points.append((p, camera_c))
 
+    def _measure_duration(self, scan: Scan, places: NDArray[Any], T_ac: Pose) -> None:
+        if self._last is None or (period := 1e-9 * (scan.t_ns - self._last[0])) <= 0.0:
+            return
+        before, T_ca = self._last[1], T_ac.inverse()
+        turn = geometry.log((T_ac @ before.inverse()).q)
+        if np.linalg.norm(turn) > _MOST_TURN_RAD:
+            return
+        kept = np.flatnonzero(np.isfinite(scan.points).all(axis=1))
+        kept = kept[:: max(1, len(kept) // _DURATION_POINTS)]
+        p = T_ca.apply(np.asarray(scan.points[kept], dtype=np.float64))
+        rate, velocity = (geometry.rotate(T_ca.R, each / period) for each in (turn, T_ac.t - before.t))
+        motion = (places[kept].astype(np.float64) - 0.5)[:, None] * (np.cross(rate, p) + velocity)
+        measured = fitted_duration(self._registrar.index, p, T_ca.t if self._registrar.sided else None, motion)
+        if measured is not None and measured[1] > 0.0:
+            self._durations.append((*measured, period))
+
+    def _duration(self) -> tuple[float, float, float]:
+        """The mean duration of a scan weighted by its variance, its standard error (jackknife), the period [s]."""
+        duration, sigma, period = np.array(self._durations).T
+        return *_jackknife(duration, 1.0 / sigma**2), float(np.median(period))
+
+    def _duration_open(self) -> bool:
+        """Whether the scans so far do not exclude a duration that would be reported."""
+        if len(self._durations) < _LEAST_DURATIONS:
+            return True
+        mean, spread, period = self._duration()
+        return len(self._durations) < _MOST_DURATIONS and abs(mean) + SIGMAS * spread > _LEAST_OF_PERIOD * period
+
+    def _duration_note(self) -> tuple[str, ...]:
+        if len(self._durations) < _LEAST_DURATIONS:
+            return ()
+        mean, spread, period = self._duration()
+        if abs(mean) < max(_LEAST_OF_PERIOD * period, SIGMAS * spread):
+            return ()
+        return (
+            f"the points of a scan have no times, but they fit a moving target that is measured point after point in "
+            f"{abs(mean):.3g} +- {spread:.1g} s: record the time of each point (field 't'); less exactly, "
+            f"--scan-duration {mean:.3g} gives times by the order of the points",
+        )
+
     def _diagnosis(self, points: NDArray[Any]) -> str:
         """Try the mirrored model on a scan that was not registered, and compare the sizes."""
         finite = np.isfinite(points).all(axis=1)
@@ -147,3 +198,12 @@ class ModelCheck:
         params = replace(self._registrar.params, reach_m=None, gate_m=None, eps_m=None, noise_m=None)
         found = Registrar(surface, params).acquire(scan)
         return found.status is AlignStatus.ALIGNED and found.inlier_ratio >= LEAST_OF_MIRRORED and not found.message
+
+
+def _jackknife(values: Array, weight: Array) -> tuple[float, float]:
+    """Weighted mean of values, and its standard error; no weight counts more than ``MOST_WEIGHT`` times the median."""
+    weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
+    without = (weight @ values - weight * values) / (weight.sum() - weight)
+    n = len(values)
+    spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+    return float(weight @ values / weight.sum()), spread

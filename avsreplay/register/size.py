@@ -1,4 +1,4 @@
-"""Size of the target over that of the model, from the residuals of a registered scan.
+"""Size of the target over that of the model, and duration of a scan, from the residuals of a registered scan.
 
 With T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
 n . (p - c) = J d + delta n . p. Robust least squares give pose and delta; the points are matched again a few times,
@@ -9,6 +9,9 @@ Standard error: one part is that of the weighted residuals, which are correlated
 offset of the surface. Their amplitudes are fitted to what pose and size leave, and their variances enter with the
 change of delta that they cause.
 
+Duration: a target that moves while its points are measured one after the other is deformed. If k is the share of the
+scan before a point, and u the velocity of the target there, the residual is n . (p - c) = J d + T k n . u.
+
 Bias: the closest point is a nonlinear function of the measured one, so that noise makes curved and thin parts appear
 larger. The same fit to the closest points with artificial noise of the same size along the rays, with both signs, gives
 this bias; it is subtracted, and half of it counts as a standard error (indirect inference: Gourieroux, Monfort and
@@ -17,7 +20,7 @@ Renault, J. Applied Econometrics 8, 1993).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from statistics import NormalDist
 from typing import Any
@@ -175,31 +178,70 @@ def normal_jacobian(p: Array, n: Array) -> Array:
 def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> _Rows | None:
     delta, moved, rows = 0.0, Pose.identity(), None
     for _ in range(ROUNDS):
-        q = moved.apply(p) / (1.0 + delta)
-        found = index.closest(q, camera_c=camera_c, most_m=WIDTH_OF_EXTENT * index.extent_m)
-        near = np.isfinite(found.d2)
-        if np.count_nonzero(near) < LEAST_RESIDUALS:
+        found = _step(index, moved.apply(p) / (1.0 + delta), camera_c)
+        if found is None:
             return None
-        n, q, foot = found.normal[near], q[near], found.foot[near]
-        centre = q.mean(axis=0)
-        e = np.einsum("ij,ij->i", n, q - foot)
-        weight, noise = _weights(e)
-        J, a = weight[:, None] * normal_jacobian(q - centre, n), weight * np.einsum("ij,ij->i", n, q - centre)
-        of_a, of_e = np.linalg.lstsq(J, np.column_stack([a, weight * e]), rcond=1e-6)[0].T
-        free = a - J @ of_a
-        if free @ free < LEAST_INFORMATION * (a @ a):
-            return None
-        step = float(free @ (weight * e)) / max(float(free @ free), np.finfo(float).tiny)
-        d = of_e - step * of_a
+        rows, d, centre = found
         turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
-        about = centre - turn.R @ centre - d[3:] + step * centre
+        about = centre - turn.R @ centre - d[3:] + rows.delta * centre
         moved = Pose(turn.q, (1.0 + delta) * about) @ moved
-        delta = (1.0 + delta) * (1.0 + step) - 1.0
+        delta = (1.0 + delta) * (1.0 + rows.delta) - 1.0
         if abs(delta) > LARGEST_ERROR:
             return None
-        left = weight * e - J @ of_e - step * free
-        rows = _Rows(q, foot, n, J, free, left, weight, noise, delta, moved)
+        rows = replace(rows, delta=delta, moved=moved)
     return rows
+
+
+def fitted_duration(index: SurfaceIndex, p: Array, camera_c: Array | None, motion: Array) -> tuple[float, float] | None:
+    """Fit pose and duration of a scan whose points were measured one after the other while the target moved.
+
+    Args:
+        index: of the model.
+        p: (n, 3) points in {C} [m], at the registered pose.
+        camera_c: (3,) camera position in {C} [m], or None: both sides of a face are matched.
+        motion: (n, 3) velocity of the target at each point [m/s], in {C}, times the share of the scan before the point.
+
+    Returns:
+        Duration and standard error [s]; negative if the last point is measured first. None as for ``fitted_size``.
+    """
+    duration, moved, rows = 0.0, Pose.identity(), None
+    for _ in range(ROUNDS):
+        found = _step(index, moved.apply(p - duration * motion), camera_c, motion)
+        if found is None:
+            return None
+        rows, d, centre = found
+        turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
+        moved = Pose(turn.q, centre - turn.R @ centre - d[3:]) @ moved
+        duration += rows.delta
+    if rows is None:
+        return None
+    return duration, max(_clustered(rows, side * index.extent_m) for side in PATCHES_OF_EXTENT)
+
+
+def _step(
+    index: SurfaceIndex, q: Array, camera_c: Array | None, motion: Array | None = None
+) -> tuple[_Rows, Array, Array] | None:
+    """One least-squares step: the rows with the step of the parameter, the pose (6,), and the centre it refers to.
+
+    ``motion``: (n, 3) displacement of the points by a unit of the parameter; None: the parameter is the size.
+    """
+    found = index.closest(q, camera_c=camera_c, most_m=WIDTH_OF_EXTENT * index.extent_m)
+    near = np.isfinite(found.d2)
+    if np.count_nonzero(near) < LEAST_RESIDUALS:
+        return None
+    n, q, foot = found.normal[near], q[near], found.foot[near]
+    centre = q.mean(axis=0)
+    e = np.einsum("ij,ij->i", n, q - foot)
+    weight, noise = _weights(e)
+    moving = q - centre if motion is None else motion[near]
+    J, a = weight[:, None] * normal_jacobian(q - centre, n), weight * np.einsum("ij,ij->i", n, moving)
+    of_a, of_e = np.linalg.lstsq(J, np.column_stack([a, weight * e]), rcond=1e-6)[0].T
+    free = a - J @ of_a
+    if free @ free <= LEAST_INFORMATION * (a @ a):
+        return None
+    step = float(free @ (weight * e)) / max(float(free @ free), np.finfo(float).tiny)
+    left = weight * e - J @ of_e - step * free
+    return _Rows(q, foot, n, J, free, left, weight, noise, step, Pose.identity()), of_e - step * of_a, centre
 
 
 def _weights(e: Array) -> tuple[Array, float]:
