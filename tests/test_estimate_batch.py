@@ -89,7 +89,7 @@ def test_every_parameter_vector_is_a_valid_inertia() -> None:
 
 def test_equal_moments_are_not_singular() -> None:
     """A sphere's chart moves smoothly through M = 0, where sigma and mu jump."""
-    sphere = Chart(
+    sphere = Chart.of(
         np.array([0, 0, 0, 1.0]), np.array([0.1, 0, 0]), *[np.zeros(3)] * 2, np.zeros((3, 3)), *[np.ones(3)], np.eye(3)
     )
     y = np.zeros(20)

@@ -235,7 +235,7 @@ class Problem:
     @property
     def chart(self) -> Chart:
         """Where the cost is linearised."""
-        return Chart.of(self.core.chart)
+        return Chart(self.core.chart)
 
     @property
     def covariance(self) -> Array:

@@ -320,7 +320,7 @@ def _accepted_share(base: Chart, move: Array, latest: Problem) -> float:
 def propagate_chart(chart: Chart, h: float, arc: OrbitArc | None = None) -> tuple[Chart, Array]:
     """The motion h seconds later, and the transition matrix (20, 20) of steps of the chart."""
     there, step = _motion.transition(chart.flat, h, translation(h, arc))
-    return Chart.of(there), step
+    return Chart(there), step
 
 
 def memory_s(torque: float, pose_rad: float = _LINEAR_RAD**2) -> float:

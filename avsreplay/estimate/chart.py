@@ -22,6 +22,7 @@ fit uses as well.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from itertools import permutations, product
 
@@ -83,41 +84,49 @@ _PERMS = np.array([p.perm[:2] for p in AXIS_PERMUTATIONS])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Chart:
-    """A state in chart coordinates.
+    """A state in chart coordinates, as the extension's 34 numbers ``flat``."""
 
-    Attributes:
-        q_ac: (4,) attitude of the fixture.  w_c: (3,) rate in {C} [rad/s].  t_a, u_a: (3,) its position and velocity.
-        M: (3, 3) logarithm of the second mass moments.  arm_c: (3,) from the centre of mass to the fixture [m].
-        R_cb: (3, 3) eigenvectors of M, in the order and with the signs that define the principal axes.
-    """
-
-    q_ac: Array
-    w_c: Array
-    t_a: Array
-    u_a: Array
-    M: Array
-    arm_c: Array
-    R_cb: Array
+    flat: Array
 
     @classmethod
-    def of(cls, flat: Array) -> Chart:
-        """The chart of the extension's 34 numbers."""
-        return cls(
-            flat[:4],
-            flat[4:7],
-            flat[7:10],
-            flat[10:13],
-            flat[13:22].reshape(3, 3),
-            flat[22:25],
-            flat[25:].reshape(3, 3),
-        )
+    def of(cls, q_ac: Array, w_c: Array, t_a: Array, u_a: Array, M: Array, arm_c: Array, R_cb: Array) -> Chart:
+        """The chart of its parts, which the properties describe."""
+        return cls(np.concatenate((q_ac, w_c, t_a, u_a, M.reshape(-1), arm_c, R_cb.reshape(-1))))
 
     @property
-    def flat(self) -> Array:
-        """(34,) all numbers, in the extension's order."""
-        return np.concatenate(
-            (self.q_ac, self.w_c, self.t_a, self.u_a, self.M.reshape(-1), self.arm_c, self.R_cb.reshape(-1))
-        )
+    def q_ac(self) -> Array:
+        """(4,) attitude of the fixture."""
+        return self.flat[:4]
+
+    @property
+    def w_c(self) -> Array:
+        """(3,) rate in {C} [rad/s]."""
+        return self.flat[4:7]
+
+    @property
+    def t_a(self) -> Array:
+        """(3,) position of the fixture in {A} [m]."""
+        return self.flat[7:10]
+
+    @property
+    def u_a(self) -> Array:
+        """(3,) velocity of the fixture in {A} [m/s]."""
+        return self.flat[10:13]
+
+    @property
+    def M(self) -> Array:
+        """(3, 3) logarithm of the second mass moments."""
+        return self.flat[13:22].reshape(3, 3)
+
+    @property
+    def arm_c(self) -> Array:
+        """(3,) vector from the centre of mass to the fixture in {C} [m]."""
+        return self.flat[22:25]
+
+    @property
+    def R_cb(self) -> Array:
+        """(3, 3) eigenvectors of M, in the order and with the signs that define the principal axes."""
+        return self.flat[25:].reshape(3, 3)
 
     def moved(self, y: Array) -> Chart:
         """Displaced by a step y (20,); a half-angle vector longer than 1 is cut to a half turn.
@@ -125,7 +134,7 @@ class Chart:
         A logarithm M of the mass moments longer than 12 is cut to this length, so that |sigma| stays below 1. The
         columns of R_cb are the eigenvectors in the order and with the signs nearest to those before.
         """
-        return Chart.of(_motion.moved(self.flat, np.ascontiguousarray(y, dtype=np.float64)))
+        return Chart(_motion.moved(self.flat, np.ascontiguousarray(y, dtype=np.float64)))
 
     def minus(self, other: Chart) -> Array:
         """The step y (20,) with ``other.moved(y)`` equal to this."""
@@ -139,7 +148,7 @@ def inertia_matrices(y: Array) -> Array:
 
 def to_chart(x: State) -> Chart:
     """Chart coordinates of a state; |sigma| must be below 1."""
-    return Chart.of(_motion.chart(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc))
+    return Chart(_motion.chart(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc))
 
 
 def to_state(c: Chart) -> State:
@@ -163,11 +172,12 @@ def separated(c: Chart, P: Array) -> Chart:
         c: mean.
         P: (20, 20) covariance of the chart.
     """
-    S, values = P[INERTIA, INERTIA], np.diagonal(c.R_cb.T @ c.M @ c.R_cb)
+    S = P[INERTIA, INERTIA]
+    if _motion.least_gap(c.flat) >= _LEAST_GAP * math.sqrt(S.trace()):
+        return c
+    values = np.diagonal(c.R_cb.T @ c.M @ c.R_cb)
     order = np.argsort(values, kind="stable")
     gaps = np.diff(values[order])
-    if float(gaps.min()) >= _LEAST_GAP * float(np.sqrt(np.trace(S))):
-        return c
     axes = c.R_cb[:, order].T
     first, second = axes[:-1], axes[1:]
     across = np.sqrt(2.0) * np.einsum("nij,ki,kj->kn", _BASIS, first, second)

@@ -181,7 +181,7 @@ def weak_prior(poses: Poses, params: EstimatorParams) -> Prior:
 
     The centre of the sphere is at the fixture.
     """
-    mean = Chart(poses.q[0], np.zeros(3), poses.t[0], np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.eye(3))
+    mean = Chart.of(poses.q[0], np.zeros(3), poses.t[0], np.zeros(3), np.zeros((3, 3)), np.zeros(3), np.eye(3))
     arm = given(params.start_varrho_1s_m)
     speed = given(params.start_vel_1s_mps) + params.start_rate_1s_radps * arm
     widths = [2.0, params.start_rate_1s_radps, 4.0 * arm, speed, params.start_log_inertia_1s, arm]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -55,6 +56,7 @@ class Component:
         return Belief(self.t_ns, to_state(chart), 0.5 * (P + P.T))
 
 
+@lru_cache(maxsize=4)
 def moments(components: tuple[Component, ...]) -> Belief:
     """Mean and second moments about it: the mean of the first component, and what the weights have moved it since."""
     return _joined(components).belief
@@ -103,17 +105,20 @@ def carried(
     """
     pair, found = (float(factors[0]), float(factors[1])), []
     for c in components:
-        density = torque_density(to_state(c.chart).sigma, noise[0])
+        density = torque_density(_motion.state(c.chart.flat)[4], noise[0])
         h = (t_ns - c.t_ns) * 1e-9
         path = translation(h, None if orbit is None else orbit.at(c.t_ns))
         chart, P, chi2, log_det = _motion.carry(
             c.chart.flat, c.P, h, path, density, noise[1] ** 2, pose.q, pose.t, root, pair, weight
         )
-        found.append((replace(c, t_ns=t_ns, chart=Chart.of(chart), P=P), -0.5 * (chi2 + log_det)))
-    best = max(value for _, value in found)
-    weights = [c.weight * math.exp(value - best) for c, value in found]
+        found.append((chart, P, -0.5 * (chi2 + log_det)))
+    best = max(value for _, _, value in found)
+    weights = [c.weight * math.exp(value - best) for c, (_, _, value) in zip(components, found, strict=True)]
     total = sum(weights)
-    return tuple(replace(c, weight=w / total) for (c, _), w in zip(found, weights, strict=True))
+    return tuple(
+        Component(weight / total, c.quadrature, t_ns, Chart(chart), P, c.share)
+        for c, weight, (chart, P, _) in zip(components, weights, found, strict=True)
+    )
 
 
 def not_worse(

@@ -231,6 +231,8 @@ nb::tuple state(const Flat& from) {
   return nb::make_tuple(made(x.q_ab), made(x.w_b), made(x.r_a), made(x.v_a), made(x.sigma), made(x.c_b), made(x.q_bc));
 }
 
+double least_gap_of(const Flat& from) { return least_gap(chart(from)); }
+
 Numpy errors(const Flat& from) {
   Square T;
   errors_of(chart(from), T);
@@ -372,6 +374,7 @@ NB_MODULE(_motion, m) {
         nb::arg("colour"), nb::arg("one_sigma"), nb::arg("scale"), nb::arg("share"));
   m.def("chart", &chart_from, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"));
+  m.def("least_gap", &least_gap_of, nb::arg("chart"));
   m.def("moved", &moved_by, nb::arg("chart"), nb::arg("y"));
   m.def("minus", &minus_of, nb::arg("chart"), nb::arg("other"));
   m.def("state", &state, nb::arg("chart"));

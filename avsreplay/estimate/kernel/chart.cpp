@@ -1,5 +1,7 @@
 #include "chart.hpp"
 
+#include <algorithm>
+#include <cmath>
 #include <cstring>
 
 namespace avs {
@@ -90,6 +92,13 @@ State state_of(const Chart& c) {
   std::memcpy(x.c_b, arm.x, sizeof x.c_b);
   std::memcpy(x.q_bc, &q_bc, sizeof x.q_bc);
   return x;
+}
+
+double least_gap(const Chart& c) {
+  const M3 D = seen_by(transposed(c.R_cb), c.M);
+  double least = INFINITY;
+  for (int i = 0; i < 3; ++i) least = std::min(least, std::fabs(D.x[i][i] - D.x[NEXT[i]][NEXT[i]]));
+  return least;
 }
 
 void errors_of(const Chart& c, double T[DIM][DIM]) {

@@ -29,6 +29,9 @@ Chart chart_of(const State& x);
 // The state of a chart.
 State state_of(const Chart& c);
 
+// The least difference of two principal values of M.
+double least_gap(const Chart& c);
+
 // Jacobian T of state_of: error states d = T y of a small step y.
 void errors_of(const Chart& c, double T[DIM][DIM]);
 
