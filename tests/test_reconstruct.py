@@ -17,9 +17,9 @@ from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.reconstruct import at_grasp, deviations, reconstruct, surface_of, true_frame
 from avsreplay.reconstruct.fusion import continues, contradicting, refuted
-from avsreplay.reconstruct.registration import between
+from avsreplay.reconstruct.registration import Pairing, between
 from avsreplay.reconstruct.tracking import ReconstructionParams, free_motion
-from avsreplay.reconstruct.views import SAMPLE, Survey, Twist, extent_of, full_cloud, surveyed, thinned_view
+from avsreplay.reconstruct.views import SAMPLE, Survey, Twist, extent_of, full_cloud, point_tree, surveyed, thinned_view
 from avsreplay.records import AlignStatus, Scan, Surface
 from avsreplay.register import Registrar
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
@@ -502,6 +502,45 @@ def test_a_survey_keeps_few_scans_of_a_long_log():
 
 
 @pytest.mark.slow
+def test_the_plane_of_the_nearest_points_uses_those_of_the_same_side_only():
+    rng = np.random.default_rng(5)
+    flat = np.column_stack([rng.uniform(-1.0, 1.0, (400, 2)), 0.002 * rng.normal(size=400)])
+    p = np.vstack([flat, flat + [0.0, 0.0, 0.01]])  # a thin plate
+    n = np.repeat([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]], 400, axis=0)
+    normals, squares, count = point_tree(p).planes(p, n, p, n, 30, 0.5, 0.5)
+    distances = np.linalg.norm(p[:, None] - p, axis=2)
+    for k in range(0, 800, 97):
+        near = np.argsort(distances[k], kind="stable")[:30]
+        near = near[n[near] @ n[k] > 0.5]
+        values, vectors = np.linalg.eigh(np.cov(p[near].T, bias=True) * len(near))
+        assert count[k] == len(near) < 30
+        assert squares[k] == pytest.approx(values[0], rel=1e-9)
+        assert abs(normals[k] @ vectors[:, 0]) == pytest.approx(1.0, abs=1e-12)
+    alone = point_tree(p[:1]).planes(p[:1], n[:1], p[1:2], n[1:2], 5, 1e-9, 0.5)
+    assert alone[2][0] == 0 and not alone[0].any()
+
+
+def test_the_equations_of_pairs_are_the_derivatives_of_the_distances_and_pairs_are_kept_while_they_stand_still():
+    scans, truth = turning(4, 20.0)
+    survey = Survey(tuple(range(4)), 4, 1.5, np.zeros(3), False)
+    views = [thinned_view(scan, survey, 0.03) for scan in scans]
+    poses, gate = [T.inverse() for T in truth], 0.05
+    pairing = Pairing(views, poses, 300, 0.003)
+    _, g, e, rms = pairing.equations(poses, gate)
+    slopes = np.zeros(24)
+    for k in range(24):
+        step = np.zeros(24)
+        step[k] = 1e-6
+        moved = [Pose(geometry.exp(s[:3]), s[3:]) @ T for s, T in zip(step.reshape(4, 6), poses, strict=True)]
+        slopes[k] = (pairing.equations(moved, gate)[3] ** 2 - rms**2) / 1e-6
+    weights = np.concatenate([view.weight for view in views])
+    assert np.abs(slopes).max() > 0.0 and len(e) > 500 and weights.min() > 0.0
+    assert slopes @ g / np.linalg.norm(slopes) / np.linalg.norm(g) == pytest.approx(-1.0, abs=0.02)
+    far = [poses[0]] + [Pose(T.q, T.t + [0.0, 0.0, 0.02]) for T in poses[1:]]
+    fresh = Pairing(views, poses, 300, 0.003).equations(far, gate)
+    assert np.array_equal(pairing.equations(far, gate)[2], fresh[2])  # a large step searches again
+
+
 def test_a_displaced_guess_does_not_end_at_a_false_minimum_between_the_points_of_a_model(fixtures_folder):
     """A scan that shows one flat side mainly: from guesses 4 cm beside it, every pose that is accepted is right."""
     with open_source(fixtures_folder / "tumble.mcap") as source:

@@ -134,7 +134,8 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
     if motion is None:
         _refuse_unconfirmed(found.views, replace(tracked, poses=poses), p, survey.extent)
     else:
-        motion = joint_motion(found.views, sorted(found.keys), motion, found.gate, survey.extent)
+        fine = _fine_views(scans, survey, found, motion, p)
+        motion = joint_motion(found.views, fine, motion, found.gate, p.thin * survey.extent, survey.extent)
         poses = _on_motion(found, motion)
     chosen = dict(sorted(poses.items())[:: max(1, -(-len(poses) // MOST_FUSED))])
     twist = twists([view.t_ns for view in views], poses, motion if survey.timed else None)
@@ -198,6 +199,15 @@ def _tracked(scans: Scans, survey: Survey, p: ReconstructionParams) -> tuple[lis
         tracked = track(views, p, survey.extent)
     _refuse_few(tracked, views)
     return views, tracked
+
+
+def _fine_views(
+    scans: Scans, survey: Survey, found: Assembly, motion: FreeMotion, p: ReconstructionParams
+) -> dict[int, ScanView]:
+    """The key views with more points."""
+    size_m, timed = p.fine * survey.extent, survey.timed
+    each = ((k, scan) for k, scan in enumerate(selected(scans, survey)) if k in found.keys)
+    return {k: thinned_view(scan, survey, size_m, motion.twist_at(scan.t_ns) if timed else None) for k, scan in each}
 
 
 def _refuse_few(tracked: Tracked, views: Sequence[ScanView]) -> None:

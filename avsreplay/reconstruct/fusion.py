@@ -8,11 +8,10 @@ from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from avsreplay.estimate.chart import to_chart, to_state
 from avsreplay.geometry import Array, Pose
-from avsreplay.reconstruct.registration import SAME_SIDE, moved, overlapping, pair_equations, registered
+from avsreplay.reconstruct.registration import PAIR_POINTS, SAME_SIDE, Pairing, moved, registered
 from avsreplay.reconstruct.tracking import KEEP_RATIO, FreeMotion, ReconstructionParams, Tracked, patchwork
 from avsreplay.reconstruct.views import (
     NEIGHBOURS,
@@ -24,6 +23,7 @@ from avsreplay.reconstruct.views import (
     depth_behind,
     full_cloud,
     normals_of,
+    point_tree,
     sight_lines,
     turn,
 )
@@ -32,6 +32,7 @@ from avsreplay.register import sampling
 
 MOTION_POINTS = 1500  # points of a scan in one comparison for the fit of the motion
 FEWEST_KEYS = 40  # in a log with fewer key scans, every scan is a key scan in the refinement
+STILL = 0.1  # share of the spacing of the points up to which a moved pair of views keeps its corresponding points
 MERGED = 30  # nearest points of all key scans from which a normal is estimated
 MERGED_REACH = 0.03  # their largest distance as a share of the extent
 LEAST_VARIANCE = 0.1  # least variance of a point along its normal, in units of the median
@@ -81,10 +82,10 @@ def _adjusted(
     """Gauss-Newton iterations of the poses of all key views; the gate [m] follows the distances."""
     keys = sorted(start)
     poses, rms = [start[k].inverse() for k in keys], 0.0
-    pairs = overlapping([views[k] for k in keys], poses)
+    pairing = Pairing([views[k] for k in keys], poses, PAIR_POINTS, STILL * p.thin * extent)
     scale = np.tile(np.array([1.0 / extent] * 3 + [1.0] * 3), len(keys))
     for _ in range(p.refinements):
-        N, g, every, _ = pair_equations(views, keys, poses, gate, pairs)
+        N, g, every, _ = pairing.equations(poses, gate)
         N[:6, :6] += np.eye(6) * max(np.trace(N), 1.0)  # the first view defines the frame
         N = N * np.outer(scale, scale)
         N[np.diag_indices_from(N)] += 1e-6 * np.trace(N) / len(N)
@@ -100,7 +101,7 @@ def _adjusted(
 
 
 def _with_merged_normals(
-    views: Sequence[ScanView], poses: dict[int, Pose], extent: float, weighted: bool
+    views: Sequence[ScanView] | dict[int, ScanView], poses: dict[int, Pose], extent: float, weighted: bool
 ) -> dict[int, ScanView]:
     """The key views with normals from the nearest points of all of them that lie on the same side of the target.
 
@@ -110,18 +111,13 @@ def _with_merged_normals(
     keys = sorted(poses)
     p = np.vstack([poses[k].inverse().apply(views[k].points) for k in keys])
     n = np.vstack([views[k].normals @ poses[k].R for k in keys])
-    d, index = cKDTree(p).query(p, k=min(MERGED, len(p)))
-    near = (np.einsum("ni,nki->nk", n, n[index]) > SAME_SIDE) & (d < MERGED_REACH * extent)
-    count = near.sum(axis=1)
-    off = np.where(near[:, :, None], p[index], 0.0)
-    off = np.where(near[:, :, None], off - off.sum(axis=1, keepdims=True) / count[:, None, None], 0.0)
-    squares, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", off, off))
-    normals, good = vectors[:, :, 0], count >= NEIGHBOURS
+    normals, squares, count = point_tree(p).planes(p, n, p, n, MERGED, MERGED_REACH * extent, SAME_SIDE)
+    good = count >= NEIGHBOURS
     normals *= np.where(np.einsum("ni,ni->n", normals, n) < 0.0, -1.0, 1.0)[:, None]
     normals = np.where(good[:, None], normals, n)
     weight = np.concatenate([views[k].weight for k in keys])
     if weighted and good.any():
-        variance = np.maximum(squares[:, 0], 0.0) / np.maximum(count - 3, 1)
+        variance = squares / np.maximum(count - 3, 1)
         typical = float(np.median(variance[good]))
         weight = np.where(good, typical / np.maximum(variance, LEAST_VARIANCE * typical), LONELY)
     ends = np.cumsum([len(views[k].points) for k in keys])[:-1]
@@ -130,32 +126,42 @@ def _with_merged_normals(
 
 
 def joint_motion(
-    views: Sequence[ScanView], keys: Sequence[int], start: FreeMotion, gate: float, extent: float
+    views: Sequence[ScanView], fine: dict[int, ScanView], start: FreeMotion, gate: float, thin_m: float, extent: float
 ) -> FreeMotion:
     """The free motion that minimises the distances between overlapping pairs of key views.
 
     The distances determine some directions of a pose much better than others: the turn of a cylinder about its axis is
     hardly seen. A motion that is fitted to the poses with equal weights spreads the errors of the bad directions over
-    the good ones; fitted to the distances it uses the information of all scans about each direction.
+    the good ones; fitted to the distances it uses the information of all scans about each direction. Normals and
+    weights depend on the poses and are estimated again from the first result, for more points of each scan.
 
     Args:
-        views: with the normals of all key views together.
-        keys: numbers of the key views, ascending.
+        views: of the log, with the normals of all key views together.
+        fine: the key views with more points.
         start: the motion fitted to the poses, whose covariance is kept.
         gate: largest distance that counts [m].
+        thin_m: spacing of the points of a view [m].
         extent: of the target [m].
 
     Returns:
         The motion after Levenberg-Marquardt steps in the 20 initial values.
     """
-    instants, chart, damping = [views[k].t_ns for k in keys], to_chart(start.state), LEAST_DAMPING
-    pairs = overlapping([views[k] for k in keys], [start.at(t_ns).inverse() for t_ns in instants])
+    motion = _least_distances([views[k] for k in fine], start, gate, thin_m, extent)
+    better = _with_merged_normals(fine, {k: motion.at(view.t_ns) for k, view in fine.items()}, extent, True)
+    return _least_distances([better[k] for k in fine], motion, gate, thin_m, extent)
+
+
+def _least_distances(
+    views: Sequence[ScanView], start: FreeMotion, gate: float, thin_m: float, extent: float
+) -> FreeMotion:
+    instants, chart, damping = [view.t_ns for view in views], to_chart(start.state), LEAST_DAMPING
+    pairing = Pairing(views, [start.at(t_ns).inverse() for t_ns in instants], MOTION_POINTS, STILL * thin_m)
     best, best_rms = start, np.inf
     for _ in range(MOST_STEPS):
         tried = replace(start, state=to_state(chart))
         poses = [tried.at(t_ns) for t_ns in instants]
         T_ca = [T.inverse() for T in poses]
-        N, g, _, rms = pair_equations(views, keys, T_ca, gate, pairs, MOTION_POINTS)
+        N, g, _, rms = pairing.equations(T_ca, gate)
         if rms < best_rms:
             small = rms > (1.0 - LEAST_GAIN) * best_rms
             best, best_rms, damping = tried, rms, max(0.1 * damping, LEAST_DAMPING)
@@ -217,8 +223,8 @@ def contradicting(
         far = np.linalg.norm(lines, axis=1)
         facing = np.einsum("ni,ni->n", n, lines) > 0.5 * far
         off, nearest = views[k].rays.query(-lines[facing] / far[facing, None])
-        behind = measured[nearest] - far[facing]
-        hit = np.asarray(off) * far[facing] <= reach
+        behind = measured[nearest[:, 0]] - far[facing]
+        hit = off[:, 0] * far[facing] <= reach
         hidden, there, seen = (
             int((hit & where).sum()) for where in (behind < -reach, abs(behind) <= reach, behind > reach)
         )
@@ -263,10 +269,10 @@ class Sight:
         """
         p, rays = self.T_ac.apply(p_c) - self.camera, self.points - self.camera
         far = np.linalg.norm(p, axis=1)
-        tree = cKDTree(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-        spacing = float(np.median(np.asarray(cKDTree(self.points).query(self.points, k=5)[0])[:, 4]))
+        tree = point_tree(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        spacing = float(np.median(point_tree(self.points).query(self.points, k=5)[0][:, 4]))
         facing = np.abs(np.einsum("ni,ni->n", normals @ self.T_ac.R.T, p)) > 0.5 * far
-        return np.asarray(facing & (np.asarray(tree.query(p / far[:, None])[0]) * far > max(reach_m, 3.0 * spacing)))
+        return np.asarray(facing & (tree.query(p / far[:, None])[0][:, 0] * far > max(reach_m, 3.0 * spacing)))
 
 
 def fused(
@@ -306,9 +312,9 @@ def fused(
 
 def continues(p: Array, n: Array, size_m: float) -> NDArray[np.bool_]:
     """Whether at least SUPPORT of the ten points nearest to each (n, 3) have a similar normal and lie in its plane."""
-    distances, nearest = cKDTree(p).query(p, k=2 * SUPPORT + 1, distance_upper_bound=3.0 * size_m)
-    d = np.asarray(distances)[:, 1:]
-    index = np.where(np.isfinite(d), np.asarray(nearest)[:, 1:], 0)
+    distances, nearest = point_tree(p).query(p, k=2 * SUPPORT + 1, most_m=3.0 * size_m)
+    d = distances[:, 1:]
+    index = np.where(np.isfinite(d), nearest[:, 1:], 0)
     near = np.isfinite(d) & (np.einsum("ni,nki->nk", n, n[index]) > SAME_SIDE)
     near &= np.abs(np.einsum("ni,nki->nk", n, p[index] - p[:, None])) < size_m
     return np.asarray(near.sum(axis=1) >= SUPPORT)

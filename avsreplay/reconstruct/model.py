@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from avsreplay import geometry
@@ -18,7 +16,7 @@ from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.reconstruct.fusion import Sight
 from avsreplay.reconstruct.tracking import FreeMotion
-from avsreplay.reconstruct.views import averaged
+from avsreplay.reconstruct.views import averaged, point_tree
 from avsreplay.records import BLOCKS, Surface
 
 PATCH = 0.04  # radius of a grasp patch as a share of the extent
@@ -303,9 +301,7 @@ def _regions(kind: str, points: Array, deviation: Array, voxel_m: float) -> list
     """Groups of points closer together than three voxels."""
     if len(points) < FEWEST_IN_REGION:
         return []
-    pairs = cKDTree(points).query_pairs(3.0 * voxel_m, output_type="ndarray")
-    n = len(points)
-    _, group = connected_components(coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n)))
+    group = point_tree(points).groups(3.0 * voxel_m)
     found = []
     for k in np.flatnonzero(np.bincount(group) >= FEWEST_IN_REGION):
         p, known = points[group == k], deviation[group == k]

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.views import ScanView, sight_lines
 from avsreplay.register.size import normal_jacobian
+from avsreplay.register.surface_index import kernel_module
 
 SAME_SIDE = 0.5  # least cosine between the normals of two corresponding points
 MOST_POINTS = 1500  # points of a scan in one registration
@@ -30,7 +32,7 @@ class Patchwork:
 
     points: Array
     normals: Array
-    tree: cKDTree
+    tree: Any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,9 +76,9 @@ def _normal_equations(view: ScanView, model: Patchwork, T_ca: Pose, gate: float)
     """Sums J'WJ (6, 6) and J'We (6,) over corresponding points, their distances to the planes [m], and their share."""
     every = max(1, len(view.points) // MOST_POINTS)
     p, n_view = T_ca.apply(view.points[::every]), view.normals[::every] @ T_ca.R.T
-    d, index = model.tree.query(p, distance_upper_bound=gate)
-    near = np.isfinite(d)
-    index = np.where(near, index, 0)
+    distance, nearest = model.tree.query(p, most_m=gate)
+    near = np.isfinite(distance[:, 0])
+    index = np.where(near, nearest[:, 0], 0)
     near &= np.einsum("ni,ni->n", n_view, model.normals[index]) > SAME_SIDE
     p, q, n = p[near], model.points[index[near]], between(n_view[near], model.normals[index[near]])
     e = np.einsum("ni,ni->n", n, q - p)
@@ -129,7 +131,7 @@ def best_starts(view: ScanView, model: Patchwork, attitudes: Array, gate_m: floa
     gate, scale = np.full(len(R), gate_m), np.array([1.0 / extent] * 3 + [1.0] * 3)
     for number in range(COARSE_PASSES):
         p, n = points @ R.transpose(0, 2, 1) + t[:, None], normals @ R.transpose(0, 2, 1)
-        d, index = model.tree.query(p, distance_upper_bound=gate_m)
+        d, index = (found.reshape(p.shape[:2]) for found in model.tree.query(p.reshape(-1, 3), most_m=gate_m))
         near = np.isfinite(d) & (d < gate[:, None])
         index = np.where(near, index, 0)
         other = model.normals[index]
@@ -180,63 +182,81 @@ def pair_rms(views: Sequence[ScanView], poses: dict[int, Pose], gate: float) -> 
     """Weighted rms of the distances between all overlapping pairs of views at poses T_ac [m]."""
     keys = sorted(poses)
     T_ca = [poses[k].inverse() for k in keys]
-    return pair_equations(views, keys, T_ca, gate, overlapping([views[k] for k in keys], T_ca))[3]
+    return Pairing([views[k] for k in keys], T_ca, PAIR_POINTS, 0.0).equations(T_ca, gate)[3]
 
 
-def pair_equations(
-    views: Sequence[ScanView],
-    keys: Sequence[int],
-    poses: Sequence[Pose],
-    gate: float,
-    pairs: NDArray[np.int64],
-    most: int = PAIR_POINTS,
-) -> tuple[Array, Array, Array, float]:
-    """Normal equations of the distances between pairs of views.
+class Pairing:
+    """Corresponding points of overlapping pairs of views: of a point of view i the nearest point of view j.
 
-    A distance is that of a point of view i to the nearest point of view j, along the mean of the two normals.
+    The points of a pair are searched again where the relative pose has changed by more than ``still_m`` at a corner of
+    the box of view i: within a small share of the spacing of the points the distance along the normals does not depend
+    on which of the neighbouring points corresponds. Each pair of a view takes every n-th point from another first one.
 
     Args:
-        views: of the log.
-        keys: numbers of the n views that are compared.
-        poses: their poses T_ca.
-        gate: largest distance that counts [m].
-        pairs: (m, 2) places in ``keys``, as given by ``overlapping``.
+        views: the n views that are compared.
+        poses: their poses T_ca, which decide on the pairs.
         most: points of a view in one comparison.
-
-    Returns:
-        Normal matrix (6n, 6n) and right side (6n,) of steps [theta; v] in {C} of all poses, the distances [m], and
-        their weighted rms [m] by Tukey's function, whose square the steps minimise.
+        still_m: change of a relative pose that does not require a new search [m].
     """
-    count, first = len(keys), np.cumsum([0] + [len(views[k].points) for k in keys])
-    p = np.vstack([T.apply(views[k].points) for k, T in zip(keys, poses, strict=True)])
-    n = np.vstack([views[k].normals @ T.R.T for k, T in zip(keys, poses, strict=True)])
-    weight = np.concatenate([views[k].weight for k in keys])
-    found = [np.zeros((3, 0), dtype=np.int64)]
-    for number, (i, j) in enumerate(pairs):
-        own = np.arange(first[i], first[i + 1], max(1, (first[i + 1] - first[i]) // most))
-        d, index = views[keys[j]].tree.query((p[own] - poses[j].t) @ poses[j].R, distance_upper_bound=gate)
-        near = np.isfinite(d)
-        near[near] = np.einsum("ni,ni->n", n[own[near]], n[first[j] + index[near]]) > SAME_SIDE
-        if near.sum() >= FEWEST_COMMON:
-            found.append(np.stack([own[near], first[j] + index[near], np.full(int(near.sum()), number)]))
-    a, b, pair = np.hstack(found)
-    if not len(a):
-        return np.eye(6 * count), np.zeros(6 * count), np.zeros(1), 0.0
-    along = between(n[a], n[b])
-    e = np.einsum("ni,ni->n", along, p[b] - p[a])
-    inside, own = np.maximum(1.0 - (e / gate) ** 2, 0.0), weight[a] * weight[b]
-    w, square = inside**2 * own, float(np.sum(own * (1.0 - inside**3)) / np.sum(own)) * gate**2 / 3.0
-    J = normal_jacobian(p[a], along)
-    begin = np.flatnonzero(np.diff(pair, prepend=-1))
-    M = np.add.reduceat((J * w[:, None])[:, :, None] * J[:, None, :], begin, axis=0)
-    r = np.add.reduceat(J * (w * e)[:, None], begin, axis=0)
-    i, j = pairs[pair[begin]].T
-    N, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
-    for u, v, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
-        np.add.at(N, (u, v), sign * M)
-    np.add.at(g, i, r)
-    np.add.at(g, j, -r)
-    return N.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.ravel(), np.asarray(e), float(np.sqrt(square))
+
+    def __init__(self, views: Sequence[ScanView], poses: Sequence[Pose], most: int, still_m: float) -> None:
+        self._views, self._most, self._still_m, self._gate = views, most, still_m, 0.0
+        self._pairs = overlapping(views, poses)
+        self._corners = np.array(
+            [list(product(*zip(v.points.min(axis=0), v.points.max(axis=0), strict=True))) for v in views]
+        )
+        self._at = np.full((len(self._pairs), 8, 3), np.inf)
+        self._found = [(np.zeros(0, np.int64), np.zeros(0, np.int64))] * len(self._pairs)
+
+    def equations(self, poses: Sequence[Pose], gate: float) -> tuple[Array, Array, Array, float]:
+        """Normal equations of the distances, along the mean of the two normals.
+
+        Args:
+            poses: T_ca of the views.
+            gate: largest distance that counts [m].
+
+        Returns:
+            Normal matrix (6n, 6n) and right side (6n,) of steps [theta; v] in {C} of all poses, the distances [m], and
+            their weighted rms [m] by Tukey's function, whose square the steps minimise.
+        """
+        views, count = self._views, len(self._views)
+        first = np.cumsum([0] + [len(view.points) for view in views])
+        p = np.vstack([T.apply(view.points) for view, T in zip(views, poses, strict=True)])
+        n = np.vstack([view.normals @ T.R.T for view, T in zip(views, poses, strict=True)])
+        self._search(p, n, first, poses, gate)
+        used = np.array([len(own) >= FEWEST_COMMON for own, _ in self._found], dtype=bool)
+        if not used.any():
+            return np.eye(6 * count), np.zeros(6 * count), np.zeros(1), 0.0
+        found = [pair for pair, good in zip(self._found, used, strict=True) if good]
+        a, b = (np.concatenate([pair[k] for pair in found]) for k in (0, 1))
+        begin = np.cumsum([0] + [len(own) for own, _ in found])
+        weight = np.concatenate([view.weight for view in views])
+        M, r, e, totals = kernel_module().pair_sums(p, n, weight, a, b, begin, gate)
+        i, j = self._pairs[used].T
+        N, g = np.zeros((count, count, 6, 6)), np.zeros((count, 6))
+        for u, v, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
+            np.add.at(N, (u, v), sign * M)
+        np.add.at(g, i, r)
+        np.add.at(g, j, -r)
+        rms = float(gate * np.sqrt(totals[0] / totals[1] / 3.0))
+        return N.transpose(0, 2, 1, 3).reshape(6 * count, 6 * count), g.ravel(), e, rms
+
+    def _search(self, p: Array, n: Array, first: NDArray[np.int64], poses: Sequence[Pose], gate: float) -> None:
+        """Search the corresponding points of the pairs whose relative poses have changed; of all if the gate has."""
+        if gate != self._gate:
+            self._gate, self._at[:] = gate, np.inf
+        for number, (i, j) in enumerate(self._pairs):
+            to_j = poses[j].inverse()
+            at = to_j.apply(poses[i].apply(self._corners[i]))
+            if np.abs(at - self._at[number]).max() < self._still_m:
+                continue
+            every = max(1, (first[i + 1] - first[i]) // self._most)
+            own = np.arange(first[i] + number % every, first[i + 1], every)
+            d, index = self._views[j].tree.query(to_j.apply(p[own]), most_m=gate)
+            near = np.isfinite(d[:, 0])
+            own, other = own[near], first[j] + index[near, 0]
+            same = np.einsum("ni,ni->n", n[own], n[other]) > SAME_SIDE
+            self._at[number], self._found[number] = at, (own[same], other[same])
 
 
 def overlapping(views: Sequence[ScanView], poses: Sequence[Pose]) -> NDArray[np.int64]:

@@ -8,7 +8,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from avsreplay import geometry
 from avsreplay.estimate.batch import Problem
@@ -19,7 +18,7 @@ from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.reference import reference_fit
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.registration import Match, Patchwork, best_starts, near_attitudes, registered
-from avsreplay.reconstruct.views import ScanView, Twist, averaged, depth_behind, turn
+from avsreplay.reconstruct.views import ScanView, Twist, averaged, depth_behind, point_tree, turn
 from avsreplay.records import BLOCKS, State
 from avsreplay.register import sampling
 
@@ -149,6 +148,7 @@ class ReconstructionParams:
     Attributes:
         voxel: edge of the voxels of the fused model.
         thin: edge of the voxels to which scans are thinned for registration.
+        fine: edge of the voxels to which they are thinned for the fit of the motion to all scans.
         reach: largest distance of corresponding points at the first iteration.
         fewest_points: scans with fewer points are not used.
         n_scans: most scans that are used; a longer log is thinned evenly.
@@ -157,6 +157,7 @@ class ReconstructionParams:
 
     voxel: float = 1.0 / 300.0
     thin: float = 1.0 / 120.0
+    fine: float = 1.0 / 240.0
     reach: float = 0.06
     fewest_points: int = 100
     n_scans: int = 400
@@ -242,7 +243,7 @@ def _explained(view: ScanView, model: Patchwork, T_ac: Pose, extent: float) -> f
     facing = np.einsum("ni,ni->n", n, lines) > GRAZING * np.linalg.norm(lines, axis=1)
     if not facing.any():
         return 0.0
-    near, _ = view.tree.query(p[facing], distance_upper_bound=0.03 * extent)
+    near, _ = view.tree.query(p[facing], most_m=0.03 * extent)
     return float(np.isfinite(near).mean())
 
 
@@ -321,13 +322,10 @@ def _new_side(keys: Sequence[Pose], T_ac: Pose) -> bool:
 
 def patchwork(views: Sequence[ScanView], found: Tracked, size_m: float) -> Patchwork:
     """The model that the key views give, averaged over voxels of the given size."""
-    points, normals = [], []
-    for k in found.keys:
-        T_ca = found.poses[k].inverse()
-        points.append(T_ca.apply(views[k].points))
-        normals.append(views[k].normals @ T_ca.R.T)
+    each = [(found.poses[k].inverse(), views[k]) for k in found.keys]
+    points, normals = [T.apply(view.points) for T, view in each], [view.normals @ T.R.T for T, view in each]
     mean, normal, _ = averaged(np.vstack(points), np.vstack(normals), size_m)
-    return Patchwork(mean, normal, cKDTree(mean))
+    return Patchwork(mean, normal, point_tree(mean))
 
 
 def _predicted(views: Sequence[ScanView], found: Tracked, k: int, extent: float) -> Pose:

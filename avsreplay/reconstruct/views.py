@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Scan
+from avsreplay.register.surface_index import kernel_module
 
 SAMPLE = 24  # most scans from which extent and position of the camera are determined
 NEIGHBOURS = 12  # nearest points from which a normal is estimated
@@ -33,7 +31,7 @@ class ScanView:
         t_ns: instant.  camera: (3,) position of the camera in {A} [m].
         points: (n, 3) thinned points in {A} [m].  normals: (n, 3) unit normals toward the camera.
         weight: (n,) cosine of the inclination to the line of sight: grazing points are the least accurate.
-        tree: over the points.  rays: over the directions from the camera to the points.
+        tree: ``PointTree`` over the points.  rays: over the directions from the camera to the points.
     """
 
     t_ns: int
@@ -41,8 +39,8 @@ class ScanView:
     points: Array
     normals: Array
     weight: Array
-    tree: cKDTree
-    rays: cKDTree
+    tree: Any
+    rays: Any
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,7 +124,12 @@ def thinned_view(scan: Scan, survey: Survey, size_m: float, twist: Twist | None 
     normals, lines = normals_of(points, full, survey.camera), survey.camera - points
     weight = np.einsum("ni,ni->n", normals, lines) / np.linalg.norm(lines, axis=1)
     rays = -lines / np.linalg.norm(lines, axis=1, keepdims=True)
-    return ScanView(scan.t_ns, survey.camera, points, normals, weight, cKDTree(points), cKDTree(rays))
+    return ScanView(scan.t_ns, survey.camera, points, normals, weight, point_tree(points), point_tree(rays))
+
+
+def point_tree(points: Array) -> Any:
+    """The search tree ``PointTree`` of the extension over points (n, 3)."""
+    return kernel_module().PointTree(np.ascontiguousarray(points, dtype=np.float64))
 
 
 def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
@@ -139,7 +142,7 @@ def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
 
 def _connected(points: Array) -> Array:
     """The points without isolated ones: the fourth neighbour is farther away than ISOLATED times the median."""
-    distance = np.asarray(cKDTree(points).query(points, k=5)[0])[:, 4]
+    distance = point_tree(points).query(points, k=5)[0][:, 4]
     return np.asarray(points[distance < ISOLATED * np.median(distance)])
 
 
@@ -149,11 +152,9 @@ def extent_of(points: Array) -> float:
     Points are grouped where they lie closer together than LINK times the typical spacing; groups of less than
     SMALL_GROUP of all points are left out. A box around all points would grow to the range limits of the scanner.
     """
-    spacing = float(np.median(np.asarray(cKDTree(points).query(points, k=5)[0])[:, 4]))
-    pairs = cKDTree(points).query_pairs(LINK * max(spacing, 1e-9), output_type="ndarray")
-    n = len(points)
-    _, group = connected_components(coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n)))
-    large = np.bincount(group)[group] >= SMALL_GROUP * n
+    tree = point_tree(points)
+    group = tree.groups(LINK * max(float(np.median(tree.query(points, k=5)[0][:, 4])), 1e-9))
+    large = np.bincount(group)[group] >= SMALL_GROUP * len(points)
     return geometry.bounding_diagonal(points[large] if large.any() else points)
 
 
@@ -218,10 +219,8 @@ def averaged(points: Array, normals: Array, size_m: float) -> tuple[Array, Array
 
 def normals_of(points: Array, full: Array, camera: Array) -> Array:
     """Unit normals (n, 3) toward the camera: smallest principal direction of the nearest points of the whole scan."""
-    _, index = cKDTree(full).query(points, k=min(NEIGHBOURS, len(full)))
-    near = full[index] - full[index].mean(axis=1, keepdims=True)
-    _, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", near, near))
-    normals = vectors[:, :, 0]
+    full, points = np.ascontiguousarray(full), np.ascontiguousarray(points)
+    normals = point_tree(full).planes(full, full, points, points, NEIGHBOURS)[0]
     away = np.einsum("ni,ni->n", normals, points - camera) > 0.0
     normals[away] *= -1.0
     return np.asarray(normals)
@@ -238,7 +237,7 @@ def turn(a: Pose, b: Pose) -> float:
     return float(geometry.angle(geometry.multiply(geometry.conjugate(a.q), b.q)))
 
 
-def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float, tree: cKDTree | None = None) -> Array:
+def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float, tree: Any = None) -> Array:
     """How far the surface that was measured in the direction of each point p lies behind it [m]; 0 where none was.
 
     ``tree`` is that over the directions of the measured points, if it is known.
@@ -247,8 +246,7 @@ def depth_behind(p: Array, measured: Array, camera: Array, spacing_m: float, tre
         return np.zeros(0)
     rays, own = measured - camera, p - camera
     far, r = np.linalg.norm(rays, axis=1), np.linalg.norm(own, axis=1)
-    tree = tree or cKDTree(rays / np.maximum(far, 1e-300)[:, None])  # a point at the camera has no direction
-    distances, nearest = tree.query(own / r[:, None], k=3, distance_upper_bound=spacing_m / r.min())
-    d, index = np.asarray(distances), np.asarray(nearest)
+    tree = tree or point_tree(rays / np.maximum(far, 1e-300)[:, None])  # a point at the camera has no direction
+    d, index = tree.query(own / r[:, None], k=3, most_m=spacing_m / r.min())
     hit = d[:, 2] < spacing_m / r
     return np.where(hit, far[np.where(hit[:, None], index, 0)].min(axis=1) - r, 0.0)

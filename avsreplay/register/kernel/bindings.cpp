@@ -17,6 +17,7 @@
 #include "evidence.hpp"
 #include "grade.hpp"
 #include "loop.hpp"
+#include "pairs.hpp"
 #include "point_tree.hpp"
 #include "save.hpp"
 
@@ -445,7 +446,7 @@ nb::tuple refine(const Field& field, const Doubles& points, const Poses& T_ca, i
   return nb::make_tuple(poses, costs);
 }
 
-nb::tuple nearest(const PointTree& tree, const Doubles& points, int64_t k) {
+nb::tuple nearest(const PointTree& tree, const Doubles& points, int64_t k, double most) {
   require(points.ndim() == 2 && points.shape(1) == 3 && k > 0 && k < 100, "points must be (n, 3), and k from 1 to 99");
   const size_t n = points.shape(0);
   double* distance;
@@ -456,8 +457,11 @@ nb::tuple nearest(const PointTree& tree, const Doubles& points, int64_t k) {
     nb::gil_scoped_release release;
     std::vector<std::pair<double, int64_t>> best(k);
     for (size_t i = 0; i < n; ++i) {
-      tree.query(points.data() + 3 * i, k, best.data());
-      for (int64_t j = 0; j < k; ++j) distance[i * k + j] = std::sqrt(best[j].first), number[i * k + j] = best[j].second;
+      tree.query(points.data() + 3 * i, k, best.data(), most);
+      for (int64_t j = 0; j < k; ++j) {
+        number[i * k + j] = best[j].second;
+        distance[i * k + j] = best[j].second < tree.size() ? std::sqrt(best[j].first) : HUGE_VAL;
+      }
     }
   }
   return nb::make_tuple(distances, numbers);
@@ -494,6 +498,57 @@ nb::ndarray<nb::numpy, int64_t> different_of(const Poses& T, const std::array<do
   return numbers;
 }
 
+using Indices = nb::ndarray<const int64_t, nb::c_contig, nb::device::cpu>;
+
+bool are_vectors(const Doubles& a, size_t n) { return a.ndim() == 2 && a.shape(0) == n && a.shape(1) == 3; }
+
+nb::tuple planes(const PointTree& tree, const Doubles& all, const Doubles& sides, const Doubles& points,
+                 const Doubles& normals, int64_t k, double most, double least_cosine) {
+  const size_t n = points.shape(0);
+  require(are_vectors(all, (size_t)tree.size()) && are_vectors(sides, (size_t)tree.size()) && are_vectors(points, n) &&
+          are_vectors(normals, n) && k > 0 && k < 100, "points and normals must be (n, 3), and k from 1 to 99");
+  double *direction, *square;
+  int64_t* count;
+  auto directions = array<double>({n, 3}, &direction);
+  auto squares = array<double>({n}, &square);
+  auto counts = array<int64_t>({n}, &count);
+  {
+    nb::gil_scoped_release release;
+    std::vector<std::pair<double, int64_t>> best(k);
+    for (size_t i = 0; i < n; ++i) {
+      tree.query(points.data() + 3 * i, k, best.data(), most);
+      const Plane plane = plane_of(best, all.data(), sides.data(), normals.data() + 3 * i, least_cosine, tree.size());
+      std::copy(plane.normal, plane.normal + 3, direction + 3 * i);
+      square[i] = plane.square, count[i] = plane.count;
+    }
+  }
+  return nb::make_tuple(directions, squares, counts);
+}
+
+nb::tuple pair_sums(const Doubles& points, const Doubles& normals, const Doubles& weights, const Indices& from,
+                    const Indices& to, const Indices& begin, double gate) {
+  const size_t n = points.shape(0), count = begin.size() > 0 ? begin.size() - 1 : 0;
+  require(are_vectors(points, n) && are_vectors(normals, n) && weights.size() == n && from.size() == to.size() &&
+          begin.size() > 0 && begin.data()[0] == 0 && (size_t)begin.data()[count] == from.size(), "arrays of pairs do not fit");
+  for (size_t i = 0; i < from.size(); ++i)
+    require(from.data()[i] >= 0 && (size_t)from.data()[i] < n && to.data()[i] >= 0 && (size_t)to.data()[i] < n,
+            "a number of a point is out of range");
+  for (size_t i = 0; i < count; ++i) require(begin.data()[i] <= begin.data()[i + 1], "pairs must be in order");
+  double *normal, *right, *distance, *total;
+  auto matrices = array<double>({count, 6, 6}, &normal);
+  auto sides = array<double>({count, 6}, &right);
+  auto distances = array<double>({from.size()}, &distance);
+  auto totals = array<double>({2}, &total);
+  {
+    nb::gil_scoped_release release;
+    total[0] = total[1] = 0;
+    for (size_t i = 0; i < count; ++i)
+      add_pairs(points.data(), normals.data(), weights.data(), from.data(), to.data(), begin.data()[i], begin.data()[i + 1],
+                gate, normal + 36 * i, right + 6 * i, distance, total);
+  }
+  return nb::make_tuple(matrices, sides, distances, totals);
+}
+
 }  // namespace
 
 NB_MODULE(_kernel, m) {
@@ -511,12 +566,16 @@ NB_MODULE(_kernel, m) {
       .def("size_error", [](const Table& t) { return size_error(t.table); })
       .def("covariance", &covariance_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"))
       .def("split", &split_of, nb::arg("block"), nb::arg("smooth"), nb::arg("amplitudes"), nb::arg("fit"), nb::arg("across"));
+  m.def("pair_sums", &pair_sums, nb::arg("points"), nb::arg("normals"), nb::arg("weights"), nb::arg("from_points"),
+        nb::arg("to_points"), nb::arg("begin"), nb::arg("gate_m"));
   nb::class_<PointTree>(m, "PointTree")
       .def("__init__", [](PointTree* tree, const Doubles& points) {
         require(points.ndim() == 2 && points.shape(1) == 3, "points must be (n, 3)");
         nb::gil_scoped_release release;
         new (tree) PointTree(points.data(), (int64_t)points.shape(0)); }, nb::arg("points"))
-      .def("query", &nearest, nb::arg("points"), nb::arg("k") = 1)
+      .def("query", &nearest, nb::arg("points"), nb::arg("k") = 1, nb::arg("most_m") = HUGE_VAL)
+      .def("planes", &planes, nb::arg("all_points"), nb::arg("all_normals"), nb::arg("points"), nb::arg("normals"), nb::arg("k"),
+           nb::arg("most_m") = HUGE_VAL, nb::arg("least_cosine") = -2.0)
       .def("groups", [](const PointTree& tree, double most) {
         int64_t* of;
         auto numbers = array<int64_t>({(size_t)tree.size()}, &of);

@@ -20,9 +20,9 @@ class PointTree {
 
   int64_t size() const { return (int64_t)points_.size(); }
 
-  // The squared distances and numbers of the k nearest points in ascending order.
-  void query(const double* p, int64_t k, std::pair<double, int64_t>* best) const {
-    std::fill(best, best + k, std::make_pair(HUGE_VAL, size()));
+  // The squared distances and numbers of the k nearest points in ascending order; size() where fewer are within `most`.
+  void query(const double* p, int64_t k, std::pair<double, int64_t>* best, double most = HUGE_VAL) const {
+    std::fill(best, best + k, std::make_pair(most * most, size()));
     if (size() > 0) visit(0, p, k, best);
   }
 
