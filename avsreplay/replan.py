@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -21,6 +22,7 @@ from avsreplay.pipeline import Forecaster, planner_input, target_scene
 from avsreplay.plan import Limits, PlannerInput, PlanParams, Scene, SupervisorParams
 from avsreplay.plan.arm import Arm
 from avsreplay.plan.joint_path import JointPath
+from avsreplay.plan.limits import margin
 from avsreplay.plan.robot import slowed
 from avsreplay.records import Alignment, AlignStatus, Belief, State
 from avsreplay.report.page import Flight
@@ -86,6 +88,14 @@ class Replanning:
         belief = self.saved.beliefs[index]
         return self._planned(self._scene(belief), belief.t_ns)
 
+    def start_margin(self, index: int) -> float:
+        """Return the margin of the limits at the start [m or m/s]: negative where one is violated, infinite without.
+
+        Args:
+            index: index of the scan from which is planned.
+        """
+        return margin(self._scene(self.saved.beliefs[index]), self.limits, *self.start)
+
     def _forecast(self, belief: Belief) -> Forecaster:
         return partial(self.saved.estimator.forecast, belief)
 
@@ -94,6 +104,11 @@ class Replanning:
 
     def _planned(self, scene: Scene, t_ns: int, warm: plan.RobotPath | None = None) -> Plan:
         turn_s = plan.turn_time(scene.attitude, self.robot.gripper, self.params, t_ns)
+        if turn_s is not None and math.isinf(turn_s):
+            assert scene.attitude is not None
+            assert self.robot.gripper is not None
+            rest = plan.Turn(t_ns, self.robot.gripper[0])
+            return plan.without_turn(rest, scene.attitude, self.robot.gripper[1], self.params, t_ns)
         begin, extent_m = None if warm is None else (warm, 0.0), self.saved.extent_m
 
         def make(earliest_s: float, share: float) -> Plan:
@@ -145,9 +160,9 @@ class Replanning:
             "speed_mps": np.linalg.norm(v - rate, axis=1),
             **{f"u{axis}_mps2": u for axis, u in zip("xyz", path.thrust(times).T, strict=True)},
         }
-        for name, margin in zip(plan.CONSTRAINTS, plan.margins(scene, self.limits, y, r).values.T, strict=True):
-            if np.isfinite(margin).all():
-                figures[f"margin_{name}_m"] = margin
+        for name, least in zip(plan.CONSTRAINTS, plan.margins(scene, self.limits, y, r).values.T, strict=True):
+            if np.isfinite(least).all():
+                figures[f"margin_{name}_m"] = least
         limits, surface = self.limits, self.saved.surface
         return Flight(times, y, figures, np.array(self.saved.axis_c), limits.cones, limits.mouth_m or 0.0, surface)
 

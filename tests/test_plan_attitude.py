@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan import Limits, PlanParams, Scene, constrained, path_of, rendezvous, turn_to
-from avsreplay.plan.attitude import angular_acceleration
+from avsreplay.plan.attitude import Turn, angular_acceleration, without_turn
 
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 PARAMS = PlanParams(horizon_s=60.0)
@@ -59,6 +59,18 @@ def test_the_shorter_way_round_is_taken():
     )
     assert turn.ready_s(0.0) == pytest.approx(min(onward.t_go_s, other.t_go_s), rel=2e-3)
     assert back.ready_s(0.0) < turn.ready_s(0.0)
+
+
+@pytest.mark.parametrize(("accel", "status"), [(0.0016, PlanStatus.INFEASIBLE), (0.0017, PlanStatus.NOT_FOUND)])
+def test_a_rate_out_of_reach_is_proven_impossible_and_no_other(accel, status):
+    """In 60 s the gripper reaches 60 s times its angular acceleration, the fixture has 0.1 rad/s."""
+    target = spinning([0, 0, 1], 3.0, 0.1)
+    assert turn_to(target, IDENTITY, REST, accel, PARAMS, 0) is None
+    answer = without_turn(Turn(0, IDENTITY), target, accel, PARAMS, 0)
+    assert answer.status is status
+    assert answer.delayed_by == "attitude"
+    moving = Turn(0, IDENTITY, turn_to(target, IDENTITY, REST, 0.02, PARAMS, 0).path, target)
+    assert without_turn(moving, target, accel, PARAMS, round(30e9)).status is PlanStatus.NOT_FOUND
 
 
 @pytest.mark.parametrize("seed", range(6))

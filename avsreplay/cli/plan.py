@@ -21,8 +21,10 @@ if TYPE_CHECKING:
 PLAN, LIMITS = "avsreplay.plan:PlanParams", "avsreplay.plan:Limits"
 # settings changed one at a time where no plan is found, with the factors of their values, and later instants [s]
 CHANGES = (
+    ("robot.angular_accel_radps2", (2.0, 8.0, 64.0)),
     ("limits.clearance_sigmas", (2.0 / 3.0, 1.0 / 3.0, 0.0)),
-    ("limits.clearance_m", (0.5, 0.25)),
+    ("limits.clearance_m", (0.5, 0.25, 0.02)),
+    ("robot.radius_m", (0.5,)),
     ("limits.final_range_m", (1.5, 2.0, 3.0)),
     ("limits.final_deg", (1.5,)),
     ("limits.cone_deg", (1.5,)),
@@ -31,9 +33,12 @@ CHANGES = (
     ("limits.keepout_release_m", (1.5,)),
     ("robot.reach_max_m", (1.5, 2.0, 3.0)),
     ("limits.reach_max_m", (1.5, 2.0, 3.0)),
-    ("limits.speed_max_mps", (2.0,)),
+    ("limits.speed_max_mps", (2.0, 8.0, 64.0, 1000.0)),
     ("limits.contact_accel_mps2", (2.0,)),
     ("robot.accel_max_mps2", (2.0, 4.0)),
+    ("robot.accel_axes_mps2", (2.0, 4.0)),
+    ("robot.thrust_max_n", (2.0, 4.0)),
+    ("robot.thrust_axes_n", (2.0, 4.0)),
     ("plan.a_max_mps2", (2.0, 4.0)),
     ("plan.horizon_s", (2.0, 4.0)),
 )
@@ -209,9 +214,9 @@ def _changes(planning: Replanning, saved: Saved, flags: dict[str, Any], index: i
     for key, factors in CHANGES:
         table, name = key.split(".")
         before = getattr(tables[table], name)
-        for factor in factors if before is not None and len(out) < MOST_CHANGES else ():
-            value = f"{factor * before:.2g}"
-            given: dict[str, Any] = {name: float(value)} if table == "robot" else {}
+        for factor in factors if before and len(out) < MOST_CHANGES else ():
+            value, number = _scaled(before, factor)
+            given: dict[str, Any] = {name: number} if table == "robot" else {}
             robot = replace(planning.robot, **given)
             changed = replace(with_settings(saved, () if table == "robot" else (f"{key}={value}",)), robot=robot)
             others = {k: v for k, v in flags.items() if k != name}
@@ -230,6 +235,14 @@ def _changes(planning: Replanning, saved: Saved, flags: dict[str, Any], index: i
             if made.found:
                 return [*out, PossibleChange("--at", f"--at {saved.rows[later].t_s:.2f}", saved.rows[later].t_s, made)]
     return out
+
+
+def _scaled(value: Any, factor: float) -> tuple[str, Any]:
+    """Return a number, or each number of a tuple, times a factor with two digits, as a text and as a value."""
+    if isinstance(value, tuple):
+        texts = [f"{factor * x:.2g}" for x in value]
+        return f"[{','.join(texts)}]", tuple(float(text) for text in texts)
+    return f"{factor * value:.2g}", float(f"{factor * value:.2g}")
 
 
 def _export(planning: Replanning, made: Plan, path: Path) -> None:

@@ -135,6 +135,10 @@ def print_answer(answer: Answer) -> None:
     for found in (answer.joints, answer.spread, answer.flown):
         facts += found.described() if found else []
     if not answer.made.found:
+        if (start := answer.planning.start_margin(answer.planning.saved.index_at(answer.at_s))) < 0.0:
+            facts.append(
+                ("start", f"violates a limit by {-start:.2f}: inside the target or its clearance, or too fast")
+            )
         facts.append(("what prevents it", prevented(answer.changes)))
         facts.append(("spread over belief", "not computed, because there is no plan"))
     print_table(console, facts_table(f"Plan made at {answer.at_s:.2f} s", facts))
@@ -148,7 +152,7 @@ def print_answer(answer: Answer) -> None:
 def prevented(changes: list[PossibleChange]) -> str:
     """Return in one sentence which settings prevent a plan and with which changes one is found."""
     if not changes:
-        return "more than one limit: no single change of a limit or of --at gives a plan"
+        return "not found: no change of a single limit, of the robot or of --at that was tried gives a plan"
     names = [c.setting for c in changes if c.setting != "--at"] or ["the estimate at this instant"]
     together = f"{' and '.join(names)} together" if len(names) > 1 else names[0]
     found = " or ".join(f"{c.option} (at {c.capture_s:.2f} s)" for c in changes)
@@ -183,8 +187,16 @@ _DELAYED = {
 }
 
 
+_TURN = {
+    "none_found": "none found: no turn of the gripper to the fixture; a capture may exist",
+    "infeasible_within_horizon": "proven impossible: the gripper cannot reach the fixture's angular rate in time",
+}
+
+
 def _status(made: Plan) -> str:
     """Return what is known about the plan, in words."""
+    if made.delayed_by == "attitude" and not made.found:
+        return _TURN[made.status.value]
     gap = f"; no capture is earlier by more than {made.gap_s:.0e} s" if made.gap_s > 0.0 else ""
     words = {
         "optimal": f"optimal{gap}",

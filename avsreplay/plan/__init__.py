@@ -1,6 +1,6 @@
 """Time-optimal rendezvous with the grasp point under constraints, the supervisor, and their evaluation."""
 
-from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn
+from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn, without_turn
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.evaluation import (
     Execution,
@@ -64,4 +64,5 @@ __all__ = [
     "turn_time",
     "turn_to",
     "with_turn",
+    "without_turn",
 ]

@@ -15,10 +15,10 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.geometry import Array
-from avsreplay.outcome import Plan
+from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan import _cone
-from avsreplay.plan.path import CostatePath
-from avsreplay.plan.rendezvous import PlanParams, rendezvous
+from avsreplay.plan.path import MOTION_FACTOR, CostatePath
+from avsreplay.plan.rendezvous import PlanParams, no_plan, rendezvous
 from avsreplay.records import Trajectory
 
 GRID_S = 0.1  # spacing of the samples of the relative attitude
@@ -155,8 +155,8 @@ def _relative(target: Attitude, q0: Array, horizon_s: float, winding: int) -> tu
     return (lambda t: (_cone.values(pieces, nodes, t, 0), _cone.values(pieces, nodes, t, 1))), float(times[last])
 
 
-def next_turn(before: Turn, target: Attitude, accel_radps2: float, params: PlanParams, t_ns: int) -> Turn:
-    """Return the turn to the fixture that begins after the latency; the attitude is kept where none was found.
+def next_turn(before: Turn, target: Attitude, accel_radps2: float, params: PlanParams, t_ns: int) -> Turn | None:
+    """Return the turn to the fixture that begins after the latency; None where none was found.
 
     Args:
         before: The turn until then.
@@ -170,13 +170,13 @@ def next_turn(before: Turn, target: Attitude, accel_radps2: float, params: PlanP
     since_s = (begin_ns - before.t_ns) * 1e-9
     q0, rate0 = before.at(np.array([since_s]))[0], before.rate(since_s)
     late = replace(params, latency_s=0.0)
-    return turn_to(lambda t: target(t + wait_s), q0, rate0, accel_radps2, late, begin_ns) or Turn(begin_ns, q0)
+    return turn_to(lambda t: target(t + wait_s), q0, rate0, accel_radps2, late, begin_ns)
 
 
 def turn_time(
     target: Attitude | None, gripper: tuple[Array, float] | None, params: PlanParams, t_ns: int
 ) -> float | None:
-    """Return the time that a gripper at rest needs to attitude and rate of the fixture [s], at most the horizon.
+    """Return the time that a gripper at rest needs to attitude and rate of the fixture [s].
 
     Args:
         target: Attitude of the fixture, in seconds after t_ns; None where it is not known.
@@ -185,12 +185,33 @@ def turn_time(
         t_ns: Instant of planning.
 
     Returns:
-        The time, or None where the attitude is not planned.
+        The time, or None where the attitude is not planned; infinite where no turn was found.
     """
     if target is None or gripper is None:
         return None
     turn = turn_to(target, gripper[0], np.zeros(3), gripper[1], params, t_ns)
-    return params.horizon_s if turn is None else turn.ready_s(params.horizon_s)
+    return math.inf if turn is None else turn.ready_s(math.inf)
+
+
+def without_turn(before: Turn, target: Attitude, accel_radps2: float, params: PlanParams, t_ns: int) -> Plan:
+    """Return the answer where no turn was found: impossible if the rate of the fixture is out of reach at all times.
+
+    Between two instants the rate changes by at most half the spacing times its largest derivative, times 1.5.
+
+    Args:
+        before: The turn until the end of the latency.
+        target: Attitude of the fixture, in seconds after t_ns.
+        accel_radps2: Largest angular acceleration [rad/s2].
+        params: Largest acceleration of the end-effector, latency and horizon.
+        t_ns: Instant of planning.
+    """
+    times = np.arange(STEP_S, params.horizon_s + GRID_S, GRID_S)
+    rates = np.linalg.norm(_rates(target, times), axis=1)
+    begun = float(np.linalg.norm(before.rate((t_ns - before.t_ns) * 1e-9 + params.latency_s)))
+    missing = rates - begun - accel_radps2 * np.maximum(times - params.latency_s, 0.0)
+    never = float(missing.min()) > 0.5 * MOTION_FACTOR * float(np.abs(np.diff(missing)).max())
+    status, bound_s = (PlanStatus.INFEASIBLE, params.horizon_s) if never else (PlanStatus.NOT_FOUND, params.latency_s)
+    return replace(no_plan(t_ns, status, params.a_max_mps2, bound_s), delayed_by="attitude")
 
 
 def with_turn(plan: Plan, turn_s: float | None) -> Plan:

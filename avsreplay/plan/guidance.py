@@ -16,7 +16,7 @@ import numpy as np
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.arm import Arm
-from avsreplay.plan.attitude import Turn, next_turn, with_turn
+from avsreplay.plan.attitude import Turn, next_turn, with_turn, without_turn
 from avsreplay.plan.constrained import constrained
 from avsreplay.plan.limits import Scene, margin
 from avsreplay.plan.path import RobotPath, path_of
@@ -156,13 +156,10 @@ class Guidance:
         return GuidanceState(Segment(t_ns, r0, v0, turn=Turn(t_ns, self.gripper[0]) if self.gripper else None))
 
     def fly(self, inputs: Iterable[PlannerInput]) -> Iterator[tuple[PlannerInput, GuidanceState]]:
-        """Apply ``step`` to one input after the other.
+        """Apply ``step`` to one input after the other; yields each input and the state after it.
 
         Args:
             inputs: What was known after each scan, in the order of the scans.
-
-        Yields:
-            Each input and the state after it.
         """
         state: GuidanceState | None = None
         for known in inputs:
@@ -236,6 +233,8 @@ class Guidance:
         All initial paths are searched where there is none, or where the time to go exceeds that of the latest search.
         """
         segment, draft, turn = state.segment, state.draft, self._turn(state.segment, known)
+        if isinstance(turn, Plan):
+            return turn, None
         earliest_s = 0.0 if turn is None else turn.ready_s(self.params.horizon_s)
         searched_s = math.inf if draft is None else draft.searched_s
 
@@ -268,11 +267,12 @@ class Guidance:
         made = replace(made, capture=True, turn=turn or made.turn, searched_s=searched_s)
         return (plan if turn is None else with_turn(plan, earliest_s + self.params.latency_s)), made
 
-    def _turn(self, segment: Segment, known: PlannerInput) -> Turn | None:
-        """Return the next turn of the gripper; None where its attitude is not planned."""
+    def _turn(self, segment: Segment, known: PlannerInput) -> Turn | Plan | None:
+        """Return the next turn of the gripper, the answer where none was found, or None where it is not planned."""
         if self.gripper is None or segment.turn is None or known.scene.attitude is None:
             return None
-        return next_turn(segment.turn, known.scene.attitude, self.gripper[1], self.params, known.t_ns)
+        problem = (segment.turn, known.scene.attitude, self.gripper[1], self.params, known.t_ns)
+        return next_turn(*problem) or without_turn(*problem)
 
     def _plan(self, segment: Segment, scene: Scene, t_ns: int, planner: _Planner) -> tuple[Plan, Segment | None]:
         """Plan from the state that the current segment reaches when the latency is over."""
