@@ -142,10 +142,11 @@ def _relative(target: Attitude, q0: Array, horizon_s: float, winding: int) -> tu
     psi = np.array(geometry.log(geometry.multiply(geometry.conjugate(q0), target(times))))
     size = np.maximum(np.linalg.norm(psi, axis=1, keepdims=True), 1e-12)
     branches = psi[:, None] + 2.0 * math.pi * np.array([-2, -1, 0, 1, 2])[None, :, None] * (psi / size)[:, None]
-    taken = np.empty_like(psi)
-    taken[0] = branches[0, 2 + winding]
-    for k in range(1, len(times)):
-        taken[k] = branches[k, int(np.argmin(np.sum((branches[k] - taken[k - 1]) ** 2, axis=1)))]
+    nearest = np.argmin(np.sum((branches[1:, :, None] - branches[:-1, None]) ** 2, axis=3), axis=1).tolist()
+    branch = [2 + winding]
+    for following in nearest:  # of each branch the nearest one at the next instant
+        branch.append(following[branch[-1]])
+    taken = branches[np.arange(len(times)), branch]
     jumps = np.flatnonzero(np.linalg.norm(np.diff(taken, axis=0), axis=1) > 1.0)
     last = int(jumps[0]) if len(jumps) else len(times) - 1
     if last < 4:

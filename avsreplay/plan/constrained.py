@@ -53,6 +53,7 @@ HOPELESS = 1.2  # an iteration this much later than the best path ends its initi
 SAME_TIME_S = 1e-3  # a plan this close to the lower bound is optimal
 IMPROVED = 2  # drafts whose entry is moved
 MOVES = 6  # largest number of moves of the entry in one direction
+RETRIED = 3  # initial paths nearest to the earliest draft, tried on the fine grid where no draft can be refined
 TRUST = 0.25  # largest relative change of the end time between two iterations
 CAREFUL = 0.03  # the same from a draft whose first refinement ended later or without a path
 STUCK = 4  # from this iteration on an initial path without a plan ends where the slack does not shrink
@@ -217,8 +218,10 @@ def _best_path(case: Case, free: Plan, unbound: Plan, warm: tuple[RobotPath, flo
         if other is not None and other.t_go_s >= case.earliest_s:
             return other
     best = _improved(case, coarse, drafts, best)
-    for reference in initial_references(case, free) if drafts and best is None else ():
-        best = best or _converged(case, reference)
+    if drafts and best is None:
+        near = sorted(initial_references(case, free), key=lambda reference: abs(reference.t - drafts[0].t_go_s))
+        for reference in near[:RETRIED]:
+            best = best or _converged(case, reference)
     return best if best is None else _moved(case, best)
 
 

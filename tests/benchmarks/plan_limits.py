@@ -105,7 +105,7 @@ def main():
     parser.add_argument("--first", type=int, default=0, help="number of the first problem")
     parser.add_argument("--ipopt", type=int, default=0, help="compare the first problems with IPOPT")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--nodes", type=int, default=40)
+    parser.add_argument("--nodes", type=int, default=Limits().nodes)
     args = parser.parse_args()
     limits, done = replace(LIMITS[args.kind], nodes=args.nodes), []
     for k, problem in enumerate(problems(args.first + args.count, args.seed)):
