@@ -52,6 +52,17 @@ def test_points_with_times_are_carried_to_one_instant(cli, fixtures_folder):
     assert [row["seq"] for row in with_it if row["gamma"] == 0] == [22]  # the scan with the injected clock fault
 
 
+def test_a_cold_start_from_scans_that_last_is_consistent(cli, tmp_path):
+    """The points are moved to the stamp by a motion that is hardly known; the pose has this error too."""
+    scenario, log = tmp_path / "raster.toml", tmp_path / "raster.mcap"
+    text = "duration_s = 8.0\nrate_hz = 2.0\n[scanner]\npattern = 'raster'\nscan_s = 0.3\nrays = [60, 60]\n"
+    scenario.write_text(text, encoding="utf-8")
+    assert cli("record", scenario, "-o", log).code == 0
+    found = rows(cli, log, "--start", "cold")
+    assert {"fit"} <= {row["estimator"] for row in found}
+    assert found[-1]["violations"] == 0
+
+
 def test_a_reference_is_called_a_fit_and_never_truth(cli, fixtures_folder):
     log = fixtures_folder / "tumble.mcap"
     fitted, true = rows(cli, log, "--reference", "fit"), rows(cli, log)

@@ -225,9 +225,7 @@ class Estimator:
     ) -> tuple[Array, Array, Array, float] | None:
         """Residual (6,) of the measured pose after the update, its noise R (6, 6) by now, inflation (2,) and gate.
 
-        The gate is the 99.99 % point of the residual's square in the metric of R plus the covariance of the pose.
-
-        None before the first fit.
+        The gate is the 99.99 % point of the residual squared by R plus the covariance of the pose. None before a fit.
 
         Args:
             track: after a healthy scan.
@@ -237,7 +235,9 @@ class Estimator:
         if track.mode not in ("fit", "filter"):
             return None
         left = residual(track.belief.x, prediction.belief.x, innovation.alpha)
-        R = self.noise.rescaled(innovation.R, prediction.window, track.window)
+        R, x = self.noise.rescaled(innovation.R, prediction.window, track.window), prediction.belief.x
+        if prediction.blur is not None:  # the points were moved to one instant with the error of the prior's motion
+            R = R + in_camera(prediction.blur, x.T_ac.q, x.q_bc)
         gate = gate_of(innovation.dof, R, R + self.pose_covariance(track.belief))
         return left, R, NO_INFLATION if track.inflation is None else track.inflation, gate
 
