@@ -40,7 +40,7 @@ FEW_POINTS = 600  # points for the first passes on a scan that has many more
 LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
 HEALTHY_WORK, HEALTHY_PASSES = 22_000, 3.5  # an ordinary registration: point searches in all, and besides per point
 FIXED_WORK = 11_000  # fixed cost of the quality of a pose, in point searches
-ALIGN_PASSES, WITHIN_PASSES = 40, 35  # most searches per point of an alignment, and of one with a fixed gate
+ALIGN_PASSES, WITHIN_PASSES = 55, 35  # most searches per point of an alignment, and of one with a fixed gate
 
 
 @dataclass(frozen=True, slots=True, eq=False)

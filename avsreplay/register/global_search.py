@@ -26,11 +26,10 @@ from avsreplay.register.plausibility import NOISE_OF_EXTENT, robust_noise
 from avsreplay.register.sampling import attitudes, directions, sample_evenly, thin_to, without_sparse_points
 from avsreplay.register.surface_index import kernel_module
 
-MODEL_POINTS = 3000
 COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS = 100, 300, 1500  # points: first and second selection, final ranking
 COARSE_PASSES, MIDDLE_PASSES = 8, 12  # point-to-plane iterations for each attitude in the two selections
 MIDDLE_STARTS, FINE_STARTS = 50, 10  # attitudes kept for the second selection, and poses registered on the model
-CELLS = 40  # cells of the grid along the diagonal of the model
+MODEL_POINTS, CELLS = 3000, 40  # sampled from the model; cells of the grid along its diagonal
 COARSE_OF_EXTENT, MIDDLE_OF_EXTENT = 0.03, 0.02  # distances beyond which a point counts as unexplained
 MOST_OF_EXTENT = 0.05  # distances from the model are limited to this; those of a pose that is accepted are less
 START_OF_EXTENT, FALL = 0.3, 0.7  # rejection distance of the first pass, and its factor from pass to pass
@@ -47,12 +46,11 @@ REFINED_POINTS = 500  # fine points with which the last poses are registered
 STOP_RAD, STOP_OF_EXTENT = 1e-4, 1e-4  # a pass that moves the pose by less ends a registration, as poses are compared
 FIRST_FINE, FINE_PASSES = 5, 15  # passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
 RIVAL_AFTER, MOST_RIVALS = 0.05, 4  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
-LOOK_UPS = 4  # look-ups in the grid that cost as much as a search on the model
-ROUND_WORK = 35_000  # fixed cost of a round [searches]: thinning, interpreter
+LOOK_UPS, ROUND_WORK = 4, 35_000  # look-ups in the grid that cost as much as a search on the model; cost of a round
+SHORT = 1.5  # with less work left than so many usual rounds, the last poses are registered with half of the points
 APART = 0.6  # usual share of the starts of the second selection that are different poses
 REGISTERED_WORK = 100  # usual cost of registering the last poses, for each point with which they are measured
-CELL_OF_EXTENT = 0.02
-LEAST_COSINE = 0.05
+CELL_OF_EXTENT, LEAST_COSINE = 0.02, 0.05
 SHIFTS, SHIFT_OF_EXTENT = 6, 0.3  # number and size of the shifts of the starts across the direction to the camera
 
 
@@ -99,9 +97,8 @@ class GlobalSearch:
 
     def __init__(self, target: Target, params: AcquireParams, kept: dict[str, Array]) -> None:
         """Sample the model and find its near-symmetries, or take both from ``kept``; what is missing is added to it."""
-        self._target, self._params = target, params
+        self._target, self._params, self._sided = target, params, target.visibility.sided
         self._extent = target.surface.extent
-        self._sided = target.visibility.sided
         if "sampled" not in kept:
             kept["sampled"] = np.stack(sample_evenly(target.surface, MODEL_POINTS))
         points, normals = kept["sampled"]
@@ -112,7 +109,7 @@ class GlobalSearch:
         if "symmetries" not in kept:
             kept["symmetries"] = self._near_symmetries(thin_to(points, MIDDLE_POINTS))
         self.symmetries = kept["symmetries"]
-        self._spent = 0  # work of the round so far
+        self._spent, self._registered = 0, REFINED_POINTS  # work of the round so far; points for the last poses
         coarse = replace(target.limits, eps_rad=STOP_RAD, eps_m=STOP_OF_EXTENT * self._extent)
         self._brief, self._refine = (
             HornBackend(replace(target, limits=replace(coarse, n_max=min(passes, coarse.n_max))))
@@ -137,7 +134,12 @@ class GlobalSearch:
         return ROUND_WORK + looked // LOOK_UPS
 
     def search(
-        self, points: NDArray[Any], number: int = 0, before: SearchResult | None = None, known: Pose | None = None
+        self,
+        points: NDArray[Any],
+        number: int = 0,
+        before: SearchResult | None = None,
+        known: Pose | None = None,
+        left: int = 2**62,
     ) -> SearchResult:
         """Return the best poses for a scan by one round of the search.
 
@@ -147,16 +149,15 @@ class GlobalSearch:
                 partly outside the scan or hidden; 2 does not assume the position of the camera.
             before: result of another round for the same points, whose poses are compared as well.
             known: a pose T_ca that is compared as well: another one is unique only if it explains the scan better.
+            left: work that is left, in point searches.
         """
         self._spent = self._looked(len(points), number)
+        self._registered = REFINED_POINTS // (2 if left < SHORT * self.work(len(points), number) else 1)
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
-        few, some, fine = (
-            np.ascontiguousarray(thin_to(scan, count)) for count in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS)
-        )
+        few, some, fine = (np.ascontiguousarray(thin_to(scan, n)) for n in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS))
         sight = self._target.visibility.direction_to_camera(scan)
         sights, shifts, facing = self._rounds(few, sight)[number]
         starts = self._starts(few.mean(axis=0), sights, shifts, THINNED[number])
-        facing = facing and self._sided
         selected = self._selected(few, some, starts, facing, FIRST_STRIDES[number])
         found = self._refined(some, fine, selected, facing)
         found = found if known is None else [*found, self._measured(fine, known)]
@@ -168,7 +169,7 @@ class GlobalSearch:
         axes = np.linalg.svd((few - few.mean(axis=0)) if sight is None else sight[None])[2]
         turn = 2.0 * np.pi * np.arange(SHIFTS)[:, None] / SHIFTS
         u, v = SHIFT_OF_EXTENT * self._extent * (axes[:2] if sight is None else axes[1:])
-        known = sight is not None
+        known = self._sided and sight is not None
         return [
             ([sight], none, known),
             ([sight], np.cos(turn) * u + np.sin(turn) * v, known),
@@ -215,7 +216,7 @@ class GlobalSearch:
     def _refined(self, some: Array, fine: Array, poses: list[Pose], facing: bool) -> list[Candidate]:
         """The poses measured on the model; the best, and the very best by a near-symmetry, are registered to it."""
         width = MIDDLE_OF_EXTENT * self._extent
-        found = [self._measured(some, T_ca, width) for T_ca in poses]
+        found = [self._measured(some, T_ca, MIDDLE_OF_EXTENT) for T_ca in poses]
         ranked = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
         most = float(ranked[0].unexplained(width).mean()) + RIVAL_WITHIN
         best = [each.T_ca for each in ranked[:RIVALS] if float(each.unexplained(width).mean()) < most]
@@ -238,9 +239,9 @@ class GlobalSearch:
 
         Also returned: the least cost after the few passes, also of other poses if it is given (``least``).
         """
-        part = np.ascontiguousarray(fine[:: max(1, len(fine) // REFINED_POINTS)])
+        part = np.ascontiguousarray(fine[:: max(1, len(fine) // self._registered)])
         brief = [self._counted(self._brief.align_within(part, T_ca, width_m)) for T_ca in poses]
-        found = [self._measured(part, T_ca, width_m) for T_ca in brief]
+        found = [self._measured(part, T_ca, MIDDLE_OF_EXTENT) for T_ca in brief]
         costs = np.array([each.unexplained(width_m).mean() for each in found])
         least = min(least, float(costs.min(initial=np.inf)))
         order = [k for k in np.argsort(costs, kind="stable") if costs[k] < least + 2.0 * RIVAL_AFTER]
@@ -259,9 +260,8 @@ class GlobalSearch:
         apart = [not self.same(Pose.identity(), Pose.from_matrix(T)) for T in poses]
         return np.ascontiguousarray(poses[apart & (costs < SYMMETRIC)][:SYMMETRIES])
 
-    def _measured(self, points: Array, T_ca: Pose, most_m: float | None = None) -> Candidate:
-        most_m = MOST_OF_EXTENT * self._extent if most_m is None else most_m
-        distance, work = self._target.visibility.distances(self._target.index, points, T_ca, most_m)
+    def _measured(self, points: Array, T_ca: Pose, most: float = MOST_OF_EXTENT) -> Candidate:
+        distance, work = self._target.visibility.distances(self._target.index, points, T_ca, most * self._extent)
         self._spent += work
         return Candidate(T_ca, distance)
 
@@ -273,9 +273,9 @@ class GlobalSearch:
         noise = self.noise_of(found)
         width = max(self._target.limits.gate_m, min(3.0 * noise, 3.0 * NOISE_OF_EXTENT * self._extent))
         best, *rest = sorted(found, key=lambda each: float(each.unexplained(width).mean()))
-        margin = self.margin(noise)
         others = (other for other in rest if not self.same(best.T_ca, other.T_ca))
-        rivals = tuple(other.T_ca for other in takewhile(lambda other: as_good(best, other, width, margin), others))
+        good = takewhile(lambda other: as_good(best, other, width, self.margin(noise)), others)
+        rivals = tuple(other.T_ca for other in good)
         return SearchResult(best.T_ca, rivals, width, float(np.mean(best.distance < width)), tuple(found), self._spent)
 
     def noise_of(self, found: Sequence[Candidate]) -> float:

@@ -137,7 +137,7 @@ class Registrar:
         for part, number in islice(attempts(target, self._index.extent_m, lambda: results[0].measured), rounds):
             if results and not budget.allows(self._symmetry.search.work(len(part), number)):
                 break
-            search = self._symmetry.search.search(part, number, whole if part is target else None, known)
+            search = self._symmetry.search.search(part, number, whole if part is target else None, known, budget.left)
             budget.spend(search.work + restarts.TEST_WORK + restarts.COMPARED_WORK)
             whole = search if part is target else whole
             found, alone = self._acquired(scan, part, search, budget, carried)

@@ -69,12 +69,12 @@ class Budget:
 
     def __init__(self, points: int, scans: int = HEALTHY_SCANS) -> None:
         self.brief = scans <= 1
-        self._left = scans * healthy_work(points)
+        self.left = scans * healthy_work(points)
         self.exhausted = False
 
     def spend(self, searches: int) -> None:
         """Subtract work that was done."""
-        self._left -= searches
+        self.left -= searches
 
     def registered(self, fit: Fit, found: Alignment) -> None:
         """Subtract the work of an alignment and of its quality; that of back ends that do not count is estimated."""
@@ -84,8 +84,8 @@ class Budget:
 
     def allows(self, searches: int, kept: int = 0) -> bool:
         """Return whether this much work is left besides ``kept`` for a later step; without any, it is exhausted."""
-        self.exhausted = self.exhausted or searches > self._left
-        return not self.exhausted and searches + kept <= self._left
+        self.exhausted = self.exhausted or searches > self.left
+        return not self.exhausted and searches + kept <= self.left
 
 
 @dataclass(frozen=True, slots=True, eq=False)
