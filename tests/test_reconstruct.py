@@ -16,7 +16,7 @@ from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log import SourceOptions, open_source
 from avsreplay.reconstruct import at_grasp, deviations, reconstruct, surface_of, true_frame
-from avsreplay.reconstruct.fusion import continues, contradicting, refuted
+from avsreplay.reconstruct.fusion import continues, contradicting, fused, refuted
 from avsreplay.reconstruct.registration import Pairing, between
 from avsreplay.reconstruct.tracking import ReconstructionParams, free_motion
 from avsreplay.reconstruct.views import SAMPLE, Survey, Twist, extent_of, full_cloud, point_tree, surveyed, thinned_view
@@ -218,6 +218,23 @@ def test_points_that_one_scan_only_has_seen_are_kept_where_they_continue_a_surfa
     kept = continues(np.vstack([plane, stray]), normals, 0.05)
     assert kept[:2000].mean() > 0.99
     assert kept[2000:].mean() < 0.05
+
+
+def test_an_arm_beside_the_target_is_left_out_because_other_scans_have_no_return_there():
+    scans, truth = turning(12, 15.0)
+    scans = [replace(scan, points=scan.points[::5]) for scan in scans]
+    rng = np.random.default_rng(8)
+    arm = np.column_stack([rng.uniform(0.9, 1.1, 300), rng.uniform(-0.5, 0.5, 300), np.full(300, 3.8)])
+    mixed = [replace(s, points=np.vstack([s.points, arm])) if s.seq in (4, 5) else s for s in scans]
+    survey = Survey(tuple(range(12)), 12, 1.5, np.zeros(3), False)
+    twist = {k: Twist(T, np.zeros(3), np.zeros(3)) for k, T in enumerate(truth)}
+    with_arm, without_arm = (fused(log, survey, twist, 0.02, 0.001) for log in (mixed, scans))
+    height = [
+        (made[0] @ HULL.equations[:, :3].T + HULL.equations[:, 3]).max(axis=1) for made in (with_arm, without_arm)
+    ]
+    assert height[0].max() < 0.1
+    assert len(height[0]) > 0.98 * len(height[1])
+    assert np.count_nonzero(without_arm[3] == 1) > 0  # points of the body that one scan has seen are kept
 
 
 def test_the_standard_error_of_points_that_few_scans_have_seen_is_that_of_their_noise():

@@ -38,6 +38,8 @@ MERGED_REACH = 0.03  # their largest distance as a share of the extent
 LEAST_VARIANCE = 0.1  # least variance of a point along its normal, in units of the median
 LONELY = 0.25  # weight of a point with too few neighbours for a variance
 MOST_SIGHTS = 60  # scans that are tested for rays through a point
+MOST_EMPTY = 3  # scans that face a point without a return there; with more, a point from one scan is left out
+OFTEN = 6  # points that so many scans have measured are compared with a third of the scans at first
 MOST_ASKED = 3000  # points of the model that are compared with one view
 LEAST_SHOWN = 0.8  # share of the model's visible points that a view must show, in units of the median of all views
 MISSED = 0.05  # share of the surface in its direction that a view of a right model seldom contradicts
@@ -281,7 +283,8 @@ def fused(
     """Surface points, normals, standard errors along the normal, numbers of scans, and sights; one scan at a time.
 
     Points are left out if the scans whose rays pass through them are more than a third of those that have measured
-    them. Points that only one scan has measured are left out if they do not continue the surface of their neighbours.
+    them. Points that only one scan has measured are left out if they do not continue the surface of their neighbours,
+    or if more than MOST_EMPTY scans that face them have no return from their direction: they belong to something else.
     Where voxels hold few points, their scatter is joined with one square of the noise of a point: half the mean square
     ``rms_m`` of the distances between two scans.
     """
@@ -303,11 +306,23 @@ def fused(
     seen = np.bincount(np.unique(cell * (who.max() + 1) + who) // (who.max() + 1), minlength=len(count))
     height = np.einsum("ni,ni->n", p - mean[cell], normal[cell])
     wide = 1.5 * size_m  # rays of one scan are farther apart than points of all scans
-    through = sum((s.seen_through(mean, 1.5 * wide) > 6.0 * wide).astype(np.float64) for s in sights)
-    keep = np.asarray(through) * (len(twist) / len(sights)) <= 0.34 * seen
+    keep = _seen_through(mean, seen, sights, wide) * (len(twist) / len(sights)) <= 0.34 * seen
     keep &= (seen >= 2) | (len(twist) < 12) | continues(mean, normal, size_m)
+    once = np.flatnonzero(keep & (seen == 1))
+    empty = sum(s.without_return(mean[once], normal[once], 2.0 * wide).astype(np.float64) for s in sights)
+    keep[once] = np.asarray(empty) * (len(twist) / len(sights)) <= MOST_EMPTY
     sigma = np.sqrt(np.bincount(cell, height**2) + 0.5 * rms_m**2) / count
     return mean[keep], normal[keep], np.maximum(sigma, 1e-3 * size_m)[keep], seen[keep], sights
+
+
+def _seen_through(p: Array, seen: NDArray[np.int64], sights: Sequence[Sight], wide: float) -> Array:
+    """Number of sights (n,) that have measured something behind each point; a point seen OFTEN needs several."""
+    through, tested = np.zeros(len(p)), np.arange(len(p))
+    for part in (sights[::3], sights[1::3], sights[2::3]):
+        for sight in part:
+            through[tested] += sight.seen_through(p[tested], 1.5 * wide) > 6.0 * wide
+        tested = np.flatnonzero((seen < OFTEN) | (through > 0.0))
+    return through
 
 
 def continues(p: Array, n: Array, size_m: float) -> NDArray[np.bool_]:
