@@ -301,7 +301,7 @@ def test_an_explanation_without_degrees_of_freedom_does_not_scale_the_odds() -> 
     """Its residuals say nothing about the noise."""
     found = scan_window.Explanation(scan_window.Hypothesis.MANOEUVRE, 10.0, 0.0, 0, 0)
     free = scan_window.Explanation(scan_window.Hypothesis.FREE_MOTION, 1.0, 300.0, 12, 0)
-    assert hypotheses.odds_over_free([found, free]) == pytest.approx(9.0)
+    assert scan_window.odds_over_free([found, free]) == pytest.approx(9.0)
 
 
 def test_the_evidence_of_changes_at_several_instants_is_that_of_the_gaussian_they_make() -> None:
@@ -374,17 +374,22 @@ def test_random_disturbances_are_no_manoeuvre(monkeypatch: pytest.MonkeyPatch) -
 
 @pytest.mark.parametrize(("density", "kind"), [(3e-3, 0), (3e-2, 3)])
 def test_changes_in_every_interval_and_a_single_change_are_told_apart(density: float, kind: int) -> None:
-    """Innovations drawn from one hypothesis: it is the more likely one, and the density is found."""
+    """Innovations drawn from one hypothesis: it is the more likely one, and the density is found.
+
+    A constant acceleration is more likely than either where it acts.
+    """
     rng, n = np.random.Generator(np.random.PCG64(8)), 12
     world = tumbling.draw(2, seconds=0.5 * n, hz=2.0)
     start = Belief(0, world.states[0], np.eye(20) * 1e-12)
     R = np.eye(6) * 1e-8
-    for single in (False, True):
+    for single in (False, True, None):
         x, epochs, drawn = world.states[0], [], []
         free = world.states[0]
         for k in range(n):
             push = np.zeros(6)
-            if not single or k == n // 2:
+            if single is None:
+                push[kind : kind + 3] = density * np.array([0.1, 0.2, -0.1])
+            elif not single or k == n // 2:
                 push[kind : kind + 3] = (
                     density * np.sqrt(0.5) * (rng.normal(size=3) if not single else 3.0 * np.ones(3))
                 )
@@ -401,8 +406,14 @@ def test_changes_in_every_interval_and_a_single_change_are_told_apart(density: f
         _, ranked = hypotheses.explain(epochs, n - 1, priors, 0.0, 0.0)
         found = {e.hypothesis: e for e in ranked}
         disturbed, change = found[scan_window.Hypothesis.DISTURBED], found[scan_window.Hypothesis.MANOEUVRE]
-        if single:
-            assert change.log_evidence > disturbed.log_evidence + 3.0
+        constant = found[scan_window.Hypothesis.ACCELERATED]
+        if single is None:
+            assert ranked[0] is constant
+            assert constant.log_evidence > change.log_evidence + 3.0
+            assert constant.explains
+            assert not constant.size[3 - kind : 6 - kind].any()
+        elif single:
+            assert change.log_evidence > max(disturbed.log_evidence, constant.log_evidence) + 3.0
         else:
             assert disturbed.log_evidence > change.log_evidence + 3.0
             assert disturbed.size[kind] == pytest.approx(density, rel=0.8)

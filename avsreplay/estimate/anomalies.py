@@ -20,7 +20,7 @@ from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import VEL, W, definite_product
-from avsreplay.estimate.hypotheses import OVER_NEXT, explain, linear, odds_over_free
+from avsreplay.estimate.hypotheses import OVER_NEXT, explain, linear
 from avsreplay.estimate.initialise import BatchResult, PoseFix, poses_of, rough_state, weak_prior
 from avsreplay.estimate.measurement import GATE, gate_of, innovation_vector, measured_pose, measurement_jacobian
 from avsreplay.estimate.mixture import moments
@@ -35,6 +35,7 @@ from avsreplay.estimate.scan_window import (
     Hypothesis,
     disturbance_levels,
     last_change_ns,
+    odds_over_free,
     possible_change,
     scans_after,
 )
@@ -60,6 +61,7 @@ _RMS_STEP, _LEAST_SPREAD = 4.0, 0.02  # step of the log rms residual, over its s
 _SIGNIFICANT = 12.6  # 95 % point of chi-square with 6 degrees: the end of a smaller offset cannot be recognised
 _KEPT_S = 60.0  # time for which the estimate before a new start is kept
 _TESTED = (Reason.OK, Reason.POSE_JUMP)
+_DISTURBANCES = (Hypothesis.DISTURBED, Hypothesis.ACCELERATED)
 
 Replay = Callable[[Track, Epoch], tuple[Track, Epoch]]
 
@@ -106,7 +108,7 @@ class AnomalyTest:
         changed = best is Hypothesis.MANOEUVRE and odds_over_free(ranked) >= _OVER_FREE
         free = next(e.chi2 for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
         changed = changed and (bool(track.doubtful) or linear(free, window))
-        disturbed = best is Hypothesis.DISTURBED and odds_over_free(ranked) >= _OVER_FREE and ranked[0].explains
+        disturbed = best in _DISTURBANCES and odds_over_free(ranked) >= _OVER_FREE and ranked[0].explains
         if (large or track.doubtful) and disturbed:
             track, doubtful = self._disturbed(track, ranked[0]), self._disturbed(doubtful, ranked[0])
         if not (large or changed or (track.doubtful and best is Hypothesis.SENSOR_BIAS)):
@@ -151,7 +153,7 @@ class AnomalyTest:
                 return reported, Verdict(0, Reason.DOUBTFUL)
         if doubtful < _FEWEST:
             return in_doubt
-        if best.hypothesis is Hypothesis.FREE_MOTION or (best.hypothesis is Hypothesis.DISTURBED and explained):
+        if best.hypothesis is Hypothesis.FREE_MOTION or (best.hypothesis in _DISTURBANCES and explained):
             before = replace(with_history(track.doubtful[0].track, track), recent=track.recent, levels=track.levels)
             return self._used(before, track.doubtful), Verdict(1, Reason.OK)
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):

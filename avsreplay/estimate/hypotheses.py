@@ -1,4 +1,4 @@
-"""Which hypothesis explains a run of large innovations: manoeuvre, sensor error, bad scans, or none of these.
+"""Which hypothesis explains a run of large innovations: manoeuvre, torque, sensor error, bad scans, or none of these.
 
 The pose of a free body is continuous and its velocity constant but for small disturbances. A step in the velocity with
 a continuous pose is therefore a manoeuvre; a step in the pose that the velocity does not explain is an error of the
@@ -16,21 +16,23 @@ from numpy.typing import NDArray
 
 from avsreplay.estimate.dynamics import rotation_history
 from avsreplay.estimate.error_state import RHO, VEL
-from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.scan_window import (
     PRIOR_ODDS,
+    SCALES,
     ChangePriors,
     Explanation,
     Hypothesis,
     Window,
+    log_density,
     log_evidence,
     log_mean,
     mixed,
+    pose_difference,
     window_of,
 )
 from avsreplay.estimate.track import Epoch
-from avsreplay.geometry import Array, Pose
+from avsreplay.geometry import Array
 from avsreplay.records import Belief
 
 OVER_NEXT = 2.0  # log odds over the next hypothesis of an early decision
@@ -45,6 +47,7 @@ _NOT_BY_CHANCE = 16.3  # 99.9 % point of chi-square with 3 degrees of freedom
 _A_CHANGE = 22.5  # 99.9 % point with 6 degrees of freedom
 _CHANGES = (slice(0, 3), slice(3, 6), slice(0, 6))  # rate, velocity, both
 _SPREAD = (0.7, 0.1, 0.1, 0.1)  # prior share of manoeuvres at one instant, and over one, two and three intervals
+_PER_S = 0.02  # prior 1 sigma of a constant acceleration over that of a change of the velocity [1/s]
 _OFFSETS = (slice(6, 7), slice(0, 3), slice(0, 6))  # range, position, pose
 
 
@@ -83,6 +86,7 @@ def explain(
         Explanation(Hypothesis.FREE_MOTION, free, float(white @ white), 6 * n, n),
         _manoeuvre(window, start, white, free, priors, n),
         _disturbed(window, start, white, free, n),
+        _accelerated(window, start, white, free, priors, n),
         _sensor_bias(window, white, free, priors, n),
         _bad_scans(window, priors, first_doubtful, n),
         _frozen(window, first_doubtful, n),
@@ -170,6 +174,22 @@ def _disturbed(window: Window, start: Belief, white: Array, free: float, n: int)
         value = free + log_mean(odds.tolist()) + PRIOR_ODDS
         found.append(Explanation(Hypothesis.DISTURBED, value, float(left[k]), 6 * n, n, size=size))
     return max(found, key=lambda f: f.log_evidence)
+
+
+def _accelerated(window: Window, start: Belief, white: Array, free: float, priors: ChangePriors, n: int) -> Explanation:
+    """A constant torque or force: the same change of the velocity per second in every interval.
+
+    ``size`` holds the root densities of random disturbances that cause changes as large over the window.
+    """
+    edges = np.concatenate([[0.0], window.times_s])
+    columns = _after_changes(window, start, 0.5 * (edges[1:] + edges[:-1])) * np.diff(edges)[:, None, None]
+    M, scale = columns.sum(axis=0), _PER_S * np.repeat([priors.rate_radps, priors.velocity_mps], 3)
+    found = [(kind, *log_evidence(white, free, M[:, kind], f * scale[kind])[:2]) for kind in _CHANGES for f in SCALES]
+    kind, _, u = max(found, key=lambda f: f[1])
+    left, size = white - M[:, kind] @ u, np.zeros(6)
+    size[kind] = math.sqrt(edges[-1] / 3.0) * np.repeat(np.linalg.norm(u.reshape(-1, 3), axis=1), 3)
+    value = log_mean([value for _, value, _ in found]) + PRIOR_ODDS
+    return Explanation(Hypothesis.ACCELERATED, value, float(left @ left), 6 * n - len(u), n, size=size)
 
 
 def _located(
@@ -309,42 +329,16 @@ def _bad_scans(window: Window, priors: ChangePriors, first: int, n: int) -> Expl
     extra = np.repeat([priors.position_m, priors.half_angle], 3) ** 2
     for k in range(first, n):
         C[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] += np.diag(extra)
-    value, chi2 = _gaussian(window.y, C)
+    value, chi2 = log_density(window.y, C)
     value += PRIOR_ODDS + _PER_BAD_SCAN * (n - first)
     return Explanation(Hypothesis.BAD_SCANS, value, chi2, 6 * n, first)
 
 
 def _frozen(window: Window, first: int, n: int) -> Explanation:
     """The doubtful scans repeat the last accepted one: their poses equal its pose."""
-    value, chi2 = _gaussian(window.y[: 6 * first], window.C[: 6 * first, : 6 * first])
+    value, chi2 = log_density(window.y[: 6 * first], window.C[: 6 * first, : 6 * first])
     for k in range(first, n):
-        away = _difference(window.poses[k], window.poses[first - 1], window.R_ba[k])
-        part, size = _gaussian(away, 2.0 * window.R[k])
+        away = pose_difference(window.poses[k], window.poses[first - 1], window.R_ba[k])
+        part, size = log_density(away, 2.0 * window.R[k])
         value, chi2 = value + part, chi2 + size
     return Explanation(Hypothesis.FROZEN, value + PRIOR_ODDS, chi2, 6 * n, first)
-
-
-def _difference(a: Pose, b: Pose, R_ba: Array) -> Array:
-    """(6,) difference of two poses: metres in {A} and half angle in {B}."""
-    turn = (a @ b.inverse()).q
-    half = turn[:3] if turn[3] >= 0.0 else -turn[:3]
-    return np.concatenate([a.t - b.t, R_ba @ half])
-
-
-def _gaussian(y: Array, C: Array) -> tuple[float, float]:
-    """Log density of N(0, C) at y without its constant, and the squared whitened norm."""
-    root = cholesky_root(C)
-    white = np.linalg.solve(root, y)
-    chi2 = float(white @ white)
-    return -0.5 * chi2 - float(np.log(np.diagonal(root)).sum()), chi2
-
-
-def odds_over_free(ranked: Sequence[Explanation]) -> float:
-    """Log odds of the best hypothesis over free motion, with the noise that its own residuals show if that is larger.
-
-    Errors of the registration that are larger than claimed, or correlated, resemble small changes of the motion.
-    """
-    best = ranked[0]
-    free = next(e.log_evidence for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
-    scale = max(1.0, best.chi2 / best.dof) if best.dof > 0 else 1.0
-    return (best.log_evidence - free - PRIOR_ODDS) / scale + PRIOR_ODDS

@@ -32,7 +32,7 @@ from avsreplay.records import Belief
 EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _SUSPECTED = 5  # last scans in which a change may have begun
-_SCALES = (1.0, 0.1)  # factors on the prior standard deviations: a large or a small change
+SCALES = (1.0, 0.1)  # factors on the prior standard deviations: a large or a small change
 FEWEST_DISTURBED, MOST_DISTURBED = 5, 8  # poses from which disturbances are estimated without a model of the motion
 _DENSITIES, _ERRORS = np.logspace(-6.0, 2.0, 81), np.logspace(0.0, 4.0, 41)  # compared; errors over the claimed ones
 _LONGEST = 3.0  # interval between two of them over the median
@@ -46,6 +46,7 @@ class Hypothesis(Enum):
     FREE_MOTION = "free_motion"
     MANOEUVRE = "manoeuvre"
     DISTURBED = "disturbed"  # the velocity changes all the time
+    ACCELERATED = "accelerated"  # a constant torque or force
     SENSOR_BIAS = "sensor_bias"
     FROZEN = "frozen"  # the sensor repeats an old scan
     BAD_SCANS = "bad_scans"
@@ -190,6 +191,21 @@ def log_evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[flo
     return value, scale * v, np.outer(scale, scale) * (0.5 * (inverse + inverse.T))
 
 
+def pose_difference(a: Pose, b: Pose, R_ba: Array) -> Array:
+    """(6,) difference of two poses: metres in {A} and half angle in {B}."""
+    turn = (a @ b.inverse()).q
+    half = turn[:3] if turn[3] >= 0.0 else -turn[:3]
+    return np.concatenate([a.t - b.t, R_ba @ half])
+
+
+def log_density(y: Array, C: Array) -> tuple[float, float]:
+    """Log density of N(0, C) at y without its constant, and the squared whitened norm."""
+    root = cholesky_root(C)
+    white = np.linalg.solve(root, y)
+    chi2 = float(white @ white)
+    return -0.5 * chi2 - float(np.log(np.diagonal(root)).sum()), chi2
+
+
 def mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice]) -> Array:
     """(k,) log evidence over free motion of unknowns with columns M (k, m, n), the mean over kinds and prior widths.
 
@@ -199,7 +215,7 @@ def mixed(M: Array, white: Array, scale: Array, kinds: Sequence[slice]) -> Array
     G, g = Mt @ M, Mt @ white
     found = []
     for kind in kinds:
-        for factor in _SCALES:
+        for factor in SCALES:
             s = factor * scale[kind]
             A = G[:, kind, kind] * np.outer(s, s) + np.eye(len(s))
             b = g[:, kind] * s
@@ -273,6 +289,17 @@ def scans_after(window: tuple[Epoch, ...], found: Explanation) -> int:
 def last_change_ns(window: tuple[Epoch, ...], found: Explanation) -> int:
     """Instant at which a manoeuvre ends [ns]."""
     return window[0].track.belief.t_ns + round(found.changes_s[-1] * 1e9)
+
+
+def odds_over_free(ranked: Sequence[Explanation]) -> float:
+    """Log odds of the best hypothesis over free motion, with the noise that its own residuals show if that is larger.
+
+    Errors of the registration that are larger than claimed, or correlated, resemble small changes of the motion.
+    """
+    best = ranked[0]
+    free = next(e.log_evidence for e in ranked if e.hypothesis is Hypothesis.FREE_MOTION)
+    scale = max(1.0, best.chi2 / best.dof) if best.dof > 0 else 1.0
+    return (best.log_evidence - free - PRIOR_ODDS) / scale + PRIOR_ODDS
 
 
 def log_mean(values: Sequence[float]) -> float:
