@@ -40,7 +40,7 @@ FEW_POINTS = 600  # points for the first passes on a scan that has many more
 LEAST_POINTS = 2000  # a scan of fewer points has the budget of this many, because its target may be mostly hidden
 HEALTHY_WORK, HEALTHY_PASSES = 22_000, 3.5  # an ordinary registration: point searches in all, and besides per point
 FIXED_WORK = 11_000  # fixed cost of the quality of a pose, in point searches
-ALIGN_PASSES, WITHIN_PASSES = 55, 35  # most searches per point of an alignment, and of one with a fixed gate
+ALIGN_WORK, WITHIN_WORK = (60_000, 25), (40_000, 18)  # most of an alignment and per point, also with a fixed gate
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -141,11 +141,11 @@ class HornBackend:
         rule = self._rules[facing]
         plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, MOST_WITHIN)
         within = replace(rule, n_max=most, n_plane=plane, few=few, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
-        return self._with(points, guess, within, WITHIN_PASSES * max(len(points), LEAST_POINTS))
+        return self._with(points, guess, within, _most(WITHIN_WORK, len(points)))
 
     def _run(self, points: NDArray[Any], guess: Pose, rules: dict[bool, IcpParams]) -> Fit:
         rule = rules[self._visibility.camera_c(self._index, points, guess) is not None]
-        return self._with(points, guess, rule, ALIGN_PASSES * max(len(points), LEAST_POINTS))
+        return self._with(points, guess, rule, _most(ALIGN_WORK, len(points)))
 
     def _with(self, points: NDArray[Any], guess: Pose, rule: IcpParams, most_work: int) -> Fit:
         found = self._index.icp(points, guess, rule, most_work)
@@ -155,6 +155,11 @@ class HornBackend:
 def healthy_work(points: int) -> int:
     """Return the work of an ordinary registration of a scan of so many points, in point searches."""
     return HEALTHY_WORK + int(HEALTHY_PASSES * max(points, LEAST_POINTS))
+
+
+def _most(work: tuple[int, int], points: int) -> int:
+    """The most point searches of an alignment."""
+    return work[0] + work[1] * max(points, LEAST_POINTS)
 
 
 def measured_alignment(found: MeasuredPose) -> Alignment:
