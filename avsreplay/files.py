@@ -88,6 +88,8 @@ def _check_place(path: Path, overwrite: bool, folder: bool) -> None:
             raise UsageError("a folder cannot be written to standard output", where="-", hint="name a folder")
         return
     place = path.resolve()
+    if place.is_symlink():  # from Python 3.13 on, ``resolve`` returns a loop of links as it is
+        raise RuntimeError("a loop of symbolic links")
     there = place.stat().st_mode if place.exists() else None
     if there is not None and not folder and is_stream(place):
         return
