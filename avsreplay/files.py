@@ -62,6 +62,8 @@ def check_output(path: Path, *, overwrite: bool = True, folder: bool = False, in
         where = f"{path.name[:40]}..."
         raise UsageError(f"the name is longer than {_NAME_BYTES} bytes", where=where, hint="name another output")
     try:
+        if path.resolve().is_symlink():  # from Python 3.13 on, ``resolve`` returns a loop of links as it is
+            raise RuntimeError("a loop of symbolic links")
         _check_place(path, overwrite, folder)
         if not is_stream(path) and any(_replaces(path.resolve(), each.resolve()) for each in inputs):
             raise UsageError(
@@ -88,8 +90,6 @@ def _check_place(path: Path, overwrite: bool, folder: bool) -> None:
             raise UsageError("a folder cannot be written to standard output", where="-", hint="name a folder")
         return
     place = path.resolve()
-    if place.is_symlink():  # from Python 3.13 on, ``resolve`` returns a loop of links as it is
-        raise RuntimeError("a loop of symbolic links")
     there = place.stat().st_mode if place.exists() else None
     if there is not None and not folder and is_stream(place):
         return
