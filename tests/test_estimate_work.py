@@ -95,7 +95,7 @@ def test_the_drift_that_is_found_does_not_depend_on_the_budget(monkeypatch: pyte
         return after
 
     monkeypatch.setattr(DisturbanceSchedule, "advanced", counting)
-    result = surprises.run(replace(surprises.Case("torque"), torque=1e-4, seconds=50.0), 3)
+    result = surprises.run(replace(surprises.Case("torque"), torque=1e-4, seconds=55.0), 2)
     assert result.track is not None
     drift = result.track.drift
     assert drift is not None
