@@ -49,6 +49,7 @@ def test_a_closed_pipe_is_not_a_failed_check(args: tuple[object, ...], fixtures_
 
 @posix
 def test_a_closed_pipe_loses_no_output(fixtures_folder: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")  # for the campaign
     log, result = fixtures_folder / "tumble.mcap", tmp_path / "result"
     whole, campaign = tmp_path / "whole", tmp_path / "campaign.toml"
     campaign.write_text('[set]\n"scenario.duration_s" = 1.0\n', encoding="utf-8")
