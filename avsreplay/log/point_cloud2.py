@@ -94,14 +94,12 @@ def selected(cloud: Cloud, options: SourceOptions) -> Cloud:
         cloud: as decoded.
         options: how the log is read.
     """
-    keep = np.ones(len(cloud.points), dtype=bool)
     if options.crop_box is not None:
         low, high = np.array(options.crop_box[:3]), np.array(options.crop_box[3:])
-        keep &= ((cloud.points >= low) & (cloud.points <= high)).all(axis=1)
+        cloud = cloud.keep(np.all((cloud.points >= low) & (cloud.points <= high), axis=1))
     if options.crop_range is not None:
-        distance = np.linalg.norm(cloud.points.astype(np.float64), axis=1)
-        keep &= (distance >= options.crop_range[0]) & (distance <= options.crop_range[1])
-    cloud = cloud if keep.all() else cloud.keep(keep)
+        distance, (least, most) = np.linalg.norm(cloud.points.astype(np.float64), axis=1), options.crop_range
+        cloud = cloud.keep((distance >= least) & (distance <= most))
     if options.scan_duration_s is None or cloud.places is None:
         return cloud
     return replace(cloud, times_s=np.float32(options.scan_duration_s) * cloud.places, places=None)
