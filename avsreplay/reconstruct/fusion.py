@@ -25,6 +25,7 @@ from avsreplay.reconstruct.views import (
     normals_of,
     point_tree,
     sight_lines,
+    spacings,
     turn,
 )
 from avsreplay.records import Scan
@@ -272,7 +273,7 @@ class Sight:
         p, rays = self.T_ac.apply(p_c) - self.camera, self.points - self.camera
         far = np.linalg.norm(p, axis=1)
         tree = point_tree(rays / np.linalg.norm(rays, axis=1, keepdims=True))
-        spacing = float(np.median(point_tree(self.points).query(self.points, k=5)[0][:, 4]))
+        spacing = float(np.median(spacings(point_tree(self.points), self.points)))
         facing = np.abs(np.einsum("ni,ni->n", normals @ self.T_ac.R.T, p)) > 0.5 * far
         return np.asarray(facing & (tree.query(p / far[:, None])[0][:, 0] * far > max(reach_m, 3.0 * spacing)))
 

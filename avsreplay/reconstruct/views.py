@@ -132,6 +132,11 @@ def point_tree(points: Array) -> Any:
     return kernel_module().PointTree(np.ascontiguousarray(points, dtype=np.float64))
 
 
+def spacings(tree: Any, points: Array) -> Array:
+    """Distance of each point (n, 3) of a tree to its fourth neighbour (n,) [m]."""
+    return np.asarray(tree.query(points, k=5)[0][:, 4])
+
+
 def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
     """Points (n, 3) in {A} moved to the stamp: p(0) = T_ac(0) T_ac(t)^-1 p(t), with constant rate and velocity."""
     times = np.asarray(times_s, dtype=np.float64)[:, None]
@@ -142,7 +147,7 @@ def _deskewed(points: Array, times_s: NDArray[Any], twist: Twist) -> Array:
 
 def _connected(points: Array) -> Array:
     """The points without isolated ones: the fourth neighbour is farther away than ISOLATED times the median."""
-    distance = point_tree(points).query(points, k=5)[0][:, 4]
+    distance = spacings(point_tree(points), points)
     return np.asarray(points[distance < ISOLATED * np.median(distance)])
 
 
@@ -153,7 +158,7 @@ def extent_of(points: Array) -> float:
     SMALL_GROUP of all points are left out. A box around all points would grow to the range limits of the scanner.
     """
     tree = point_tree(points)
-    group = tree.groups(LINK * max(float(np.median(tree.query(points, k=5)[0][:, 4])), 1e-9))
+    group = tree.groups(LINK * max(float(np.median(spacings(tree, points))), 1e-9))
     large = np.bincount(group)[group] >= SMALL_GROUP * len(points)
     return geometry.bounding_diagonal(points[large] if large.any() else points)
 
