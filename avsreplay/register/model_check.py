@@ -97,9 +97,7 @@ class ModelCheck:
 
     def _mean(self) -> tuple[float, float, Array]:
         """The weighted mean of the errors of size, its standard error (jackknife), and the weights of the scans."""
-        weight = np.array(self._weights)
-        weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
-        return *_jackknife(np.array(self._deltas), weight), weight
+        return _jackknife(np.array(self._deltas), np.array(self._weights))
 
     def _settled(self) -> bool:
         """Whether the scans so far exclude an error of size that would be reported."""
@@ -131,9 +129,8 @@ class ModelCheck:
         )
 
     def _measure(self, points: NDArray[Any], alignment: Alignment) -> None:
-        finite = np.asarray(points[np.isfinite(points).all(axis=1)], dtype=np.float64)
         T_ca = alignment.T_ac.inverse()
-        p = T_ca.apply(finite[:: max(1, len(finite) // POINTS)])
+        p = T_ca.apply(np.asarray(points[_some(points, POINTS)], dtype=np.float64))
         camera_c = T_ca.t if self._registrar.sided else None
         measured = fitted_size(self._registrar.index, p, camera_c)
         if measured is not None and measured.sigma > 0.0:
@@ -148,8 +145,7 @@ class ModelCheck:
         turn = geometry.log((T_ac @ before.inverse()).q)
         if np.linalg.norm(turn) > _MOST_TURN_RAD:
             return
-        kept = np.flatnonzero(np.isfinite(scan.points).all(axis=1))
-        kept = kept[:: max(1, len(kept) // _DURATION_POINTS)]
+        kept = _some(scan.points, _DURATION_POINTS)
         p = T_ca.apply(np.asarray(scan.points[kept], dtype=np.float64))
         rate, velocity = (geometry.rotate(T_ca.R, each / period) for each in (turn, T_ac.t - before.t))
         motion = (places[kept].astype(np.float64) - 0.5)[:, None] * (np.cross(rate, p) + velocity)
@@ -160,7 +156,8 @@ class ModelCheck:
     def _duration(self) -> tuple[float, float, float]:
         """The mean duration of a scan weighted by its variance, its standard error (jackknife), the period [s]."""
         duration, sigma, period = np.array(self._durations).T
-        return *_jackknife(duration, 1.0 / sigma**2), float(np.median(period))
+        mean, spread, _ = _jackknife(duration, 1.0 / sigma**2)
+        return mean, spread, float(np.median(period))
 
     def _duration_open(self) -> bool:
         """Whether the scans so far do not exclude a duration that would be reported."""
@@ -200,10 +197,16 @@ class ModelCheck:
         return found.status is AlignStatus.ALIGNED and found.inlier_ratio >= LEAST_OF_MIRRORED and not found.message
 
 
-def _jackknife(values: Array, weight: Array) -> tuple[float, float]:
-    """Weighted mean of values, and its standard error; no weight counts more than ``MOST_WEIGHT`` times the median."""
+def _some(points: NDArray[Any], count: int) -> NDArray[np.intp]:
+    """Numbers of about ``count`` finite points (n, 3), in their order."""
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    return finite[:: max(1, len(finite) // count)]
+
+
+def _jackknife(values: Array, weight: Array) -> tuple[float, float, Array]:
+    """Weighted mean of values, its standard error, and the weights, at most ``MOST_WEIGHT`` times their median."""
     weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
     without = (weight @ values - weight * values) / (weight.sum() - weight)
     n = len(values)
     spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
-    return float(weight @ values / weight.sum()), spread
+    return float(weight @ values / weight.sum()), spread, weight

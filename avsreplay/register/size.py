@@ -182,9 +182,8 @@ def _fitted(index: SurfaceIndex, p: Array, camera_c: Array | None) -> _Rows | No
         if found is None:
             return None
         rows, d, centre = found
-        turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
-        about = centre - turn.R @ centre - d[3:] + rows.delta * centre
-        moved = Pose(turn.q, (1.0 + delta) * about) @ moved
+        back = _undone(d, centre)
+        moved = Pose(back.q, (1.0 + delta) * (back.t + rows.delta * centre)) @ moved
         delta = (1.0 + delta) * (1.0 + rows.delta) - 1.0
         if abs(delta) > LARGEST_ERROR:
             return None
@@ -210,12 +209,17 @@ def fitted_duration(index: SurfaceIndex, p: Array, camera_c: Array | None, motio
         if found is None:
             return None
         rows, d, centre = found
-        turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
-        moved = Pose(turn.q, centre - turn.R @ centre - d[3:]) @ moved
+        moved = _undone(d, centre) @ moved
         duration += rows.delta
     if rows is None:
         return None
     return duration, max(_clustered(rows, side * index.extent_m) for side in PATCHES_OF_EXTENT)
+
+
+def _undone(d: Array, centre: Array) -> Pose:
+    """The motion that undoes a pose error d (6,) about a centre (3,)."""
+    turn = Pose(geometry.exp(-d[:3]), np.zeros(3))
+    return Pose(turn.q, centre - turn.R @ centre - d[3:])
 
 
 def _step(
