@@ -71,6 +71,30 @@ def carry(
     factors: tuple[float, float],
     weight: float,
 ) -> tuple[Array, Array, float, float]: ...
+def roots(C: Array) -> tuple[Array, Array]: ...
+def above(P: Array, least: float) -> bool: ...
+def impulses(
+    q: Array,
+    w: Array,
+    sigma: tuple[float, float, float],
+    times: NDArray[np.float64],
+    drive: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Array: ...
+def join(charts: Array, P: Array, weights: Array, quadrature: Array) -> tuple[Array, Array]: ...
+def propagate(
+    q_ab: Array,
+    w_b: Array,
+    r_a: Array,
+    v_a: Array,
+    sigma: Array,
+    c_b: Array,
+    q_bc: Array,
+    P: Array,
+    h: float,
+    path: Array,
+    torque: tuple[float, float, float],
+    force: float,
+) -> tuple[Array, Array, Array, Array, Array, Array]: ...
 
 class Problem:
     def __init__(

@@ -81,8 +81,9 @@ class Poses:
     info: Array = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "root", _inverse(np.linalg.cholesky(self.C)))
-        object.__setattr__(self, "info", _inverse(np.stack([self.C[:, :3, :3], self.C[:, 3:, 3:]], axis=1)))
+        root, info = _motion.roots(self.C)
+        object.__setattr__(self, "root", root)
+        object.__setattr__(self, "info", info)
 
     def __len__(self) -> int:
         return len(self.times_s)
@@ -107,10 +108,18 @@ class Poses:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prior:
-    """A Gaussian prior of the initial values: mean and covariance P (20, 20) of the chart coordinates."""
+    """A Gaussian prior of the initial values: mean and covariance P (20, 20) of the chart coordinates.
+
+    Attributes:
+        info: (20, 20) inverse of P.
+    """
 
     mean: Chart
     P: Array
+    info: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "info", _inverse(self.P))
 
     @property
     def one_sigma(self) -> Array:
@@ -195,9 +204,7 @@ class Problem:
         self, poses: Poses, prior: Prior, factors: Array, start: Chart | None = None, slack: float = 1.0
     ) -> None:
         self.poses, self.prior, self.factors, self._slack = poses, prior, factors, slack
-        core = _motion.Problem(
-            poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, _inverse(prior.P)
-        )
+        core = _motion.Problem(poses.times_s, poses.q, poses.t, poses.root, poses.info, prior.mean.flat, prior.info)
         self.core = core
         if poses.arc is not None:
             moved = poses.arc.transitions(poses.times_s)

@@ -25,7 +25,7 @@ from avsreplay.estimate.batch import BatchFit, FitParams, Pin, Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import drift_equivalents
 from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, torque_density, translation
-from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite, least_eigenvalue
+from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite
 from avsreplay.estimate.mixture import Component
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
 from avsreplay.estimate.relative_orbit import OrbitArc
@@ -171,7 +171,7 @@ def sandwich(problem: Problem, points: Poses, levels: NoiseLevels) -> tuple[Arra
     told, basis = np.linalg.eigh(problem.core.normal()[0] * np.outer(scale, scale))
     told = np.sqrt(np.maximum(told, 1e-15 * told[-1]))
     L, inverse = scale[:, None] * basis / told, told[:, None] * basis.T / scale  # P = L L'
-    P, total = L @ L.T, np.linalg.inv(problem.prior.P)
+    P, total = L @ L.T, problem.prior.info
     plain = levels.factors(mean_share(points))
     V, inflation = pose_error_covariance(points, levels, problem.factors), np.ones(BLOCKS)
     for b in range(BLOCKS):
@@ -264,7 +264,7 @@ def final_mixture(
             if pin is None:
                 P, added = _fixed(P, rows), step @ added @ step.T  # added is valid about free motion only
             P = step @ P @ step.T + added + beyond
-            lost = not least_eigenvalue(P) >= -ROUNDING  # about an unstable spin, by rounding at the epoch
+            lost = not _motion.above(P, -ROUNDING)  # about an unstable spin, by rounding at the epoch
         if pin is not None and lost:
             left = _without(found, pin)
             return (yield from final_mixture(left, problem, latest, noise, t_ns, after_s, spread, unseen))
@@ -288,7 +288,7 @@ def _moved_on(
     """
     base, step = propagate_chart(chart, after_s, problem.poses.arc)
     move, share = step @ y, 1.0
-    if least_eigenvalue(P) < ROUNDING or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
+    if not _motion.above(P, ROUNDING) or float(y @ np.linalg.solve(P, y)) > _NEGLIGIBLE**2:
         share = _accepted_share(base, move, recent)
     return base.moved(share * move), share, step, (1.0 - share) ** 2 * np.outer(move, move)
 

@@ -15,6 +15,7 @@ from operator import attrgetter
 
 import numpy as np
 
+from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_chart
 from avsreplay.estimate.chart import Chart, to_chart, to_errors
@@ -100,7 +101,7 @@ class BatchSchedule:
             belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
             return replace(track, belief=belief)
         fix, factors, noise = track.fixes[-1], last.factors * np.sqrt(last.inflation), self.noise_levels(track)
-        root = np.linalg.inv(np.linalg.cholesky(fix.C))
+        root = _motion.roots(fix.C[None])[0][0]
         mixture = carried(last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit)
         C = fix.C * np.outer(np.repeat(factors, 3), np.repeat(factors, 3))  # the components may lie further apart
         mixture = not_worse(mixture, fix.t_ns, fix.T_ac, C, innovation.weight, noise, self.orbit)
@@ -338,7 +339,7 @@ def with_later_poses(result: BatchResult, fixes: Sequence[PoseFix], noise: tuple
         return result
     mixture, factors = result.components, result.factors * np.sqrt(result.inflation)
     for fix in fixes:
-        root = np.linalg.inv(np.linalg.cholesky(fix.C))
+        root = _motion.roots(fix.C[None])[0][0]
         mixture = carried(mixture, fix.t_ns, fix.T_ac, root, factors, fix.weight, noise, fix.orbit)
     belief, _ = propagated(moments(mixture), fixes[-1].scan_ns, *noise, fixes[-1].orbit)
     return replace(result, belief=belief, components=mixture)

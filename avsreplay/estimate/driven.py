@@ -32,7 +32,6 @@ from avsreplay.estimate.dynamics import (
     process_noise,
     propagate,
     ratios,
-    rotation_history,
     seconds_to,
     transition,
 )
@@ -208,6 +207,18 @@ def driven_forecast(belief: Belief, times_s: Array, torque: float, force: float)
     return forecast_of(times_s, variances.reshape(-1, 3, 3).sum(axis=2))
 
 
+def impulses(x: State, times_s: Array) -> Array:
+    """Errors (n, 6, 3) of (dq_v, w) at 0 that equal a unit of rate in {B} at each of ``times_s`` (n,) [s].
+
+    Raises:
+        LinAlgError: an unstable spin over so long a time that its motion cannot be inverted.
+    """
+    found = _motion.impulses(x.q_ab, x.w_b, ratios(x.sigma), times_s)
+    if not np.isfinite(found).all():
+        raise np.linalg.LinAlgError("the motion cannot be inverted")
+    return found
+
+
 def drift_equivalents(x: State, times_s: Array) -> Array:
     """Errors of attitude to velocity at the epoch that equal a constant unit acceleration since.
 
@@ -221,8 +232,7 @@ def drift_equivalents(x: State, times_s: Array) -> Array:
     last = float(times_s.max())
     count = max(100, math.ceil(float(np.linalg.norm(x.w_b)) * last / _STEP_RAD))
     grid = np.linspace(0.0, last, count + 1)
-    S = rotation_history(x, grid).S[:, :, :6]
-    rate = np.linalg.inv(S)[:, :, 3:]
+    rate = impulses(x, grid)
     total = np.zeros((count + 1, 6, 3))
     np.cumsum(0.5 * (rate[1:] + rate[:-1]) * (last / count), axis=0, out=total[1:])
     B = np.zeros((len(times_s), 12, 6))

@@ -88,7 +88,7 @@ def fit_driven(poses: Poses, start: Chart, prior: Prior, factors: Array, onset_s
     G = H[:, :, :_REACHED]
     if u.any():
         e = e - drift_columns(G, points.times_s, chart, onset_s) @ u
-    info = np.asarray(np.linalg.inv(prior.P), dtype=np.float64)
+    info = prior.info
     off, J = info @ chart.minus(prior.mean), (H @ to_errors(chart)).reshape(e.size, -1)
     return DrivenFit(poses, points, start, chart, problem, fitted.half_chi2, onset_s, u, e.reshape(-1), J, G, info, off)
 

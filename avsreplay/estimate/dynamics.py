@@ -175,13 +175,12 @@ def propagate(
         UsageError: the step turns the target by more than ``MOST_RAD``.
     """
     h, x = seconds_to(belief, t_ns), belief.x
-    step = flow(x.w_b, x.sigma, h, torque)
-    arc = None if orbit is None else orbit.at(belief.t_ns)
-    Phi = transition(step, x.sigma, h, arc)
-    P = Phi @ belief.P @ Phi.T
-    if h > 0.0:
-        P += process_noise(step, h, force)
-    return Belief(t_ns, advance(x, step, h, arc), 0.5 * (P + P.T)), Phi
+    path = translation(h, None if orbit is None else orbit.at(belief.t_ns))
+    density = torque_density(x.sigma, torque)
+    q_ab, w_b, r_a, v_a, Phi, P = _motion.propagate(
+        x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, belief.P, h, path, density, force**2
+    )
+    return Belief(t_ns, State(q_ab, w_b, r_a, v_a, x.sigma, x.c_b, x.q_bc), P), Phi
 
 
 def seconds_to(belief: Belief, t_ns: int) -> float:

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from avsreplay.estimate import _motion
 from avsreplay.geometry import Array
 from avsreplay.records import BLOCKS, State
 
@@ -94,21 +95,12 @@ def _unit(q: Quad) -> Array:
     return np.array((x * n, y * n, z * n, w * n))
 
 
-def least_eigenvalue(P: Array) -> float:
-    """The least eigenvalue of P in units of its variances; minus infinity where a variance is not positive."""
-    variances = np.diagonal(P)
-    if not (np.all(variances > 0.0) and np.all(np.isfinite(P))):
-        return -np.inf
-    scale = np.sqrt(variances)
-    return float(np.linalg.eigvalsh(P / np.outer(scale, scale))[0])
-
-
 def definite(P: Array) -> Array:
     """P with its eigenvalues, in units of its variances, raised to ``ROUNDING`` where rounding made one negative.
 
     Standard deviations are limited to ``LARGEST_MOVE``: about an unstable spin they grow without bound.
     """
-    if least_eigenvalue(P) >= 0.0 and float(np.diagonal(P).max()) <= LARGEST_MOVE**2:
+    if _motion.above(P, 0.0) and float(np.diagonal(P).max()) <= LARGEST_MOVE**2:
         return P
     scale = np.sqrt(np.maximum(np.abs(np.diagonal(P)), np.finfo(float).tiny))
     values, axes = np.linalg.eigh(0.5 * (P + P.T) / np.outer(scale, scale))

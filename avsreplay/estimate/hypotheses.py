@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.estimate.dynamics import rotation_history
+from avsreplay.estimate.driven import impulses
 from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.scan_window import (
@@ -235,7 +235,7 @@ def _located(
 
 def _after_changes(window: Window, start: Belief, instants: Array) -> Array:
     """Derivatives (k, 6n, 6) of the whitened innovations by a change of (rate, velocity) at each instant (k,) [s]."""
-    back = np.linalg.inv(rotation_history(start.x, instants).S[:, :, :6])[:, :, 3:]
+    back = impulses(start.x, instants)
     tau, n = instants[:, None, None, None], len(window.times_s)
     M = np.empty((len(instants), n, 6, 6))
     M[..., :3] = window.rows[:, :, :6] @ back[:, None]

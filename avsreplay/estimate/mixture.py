@@ -7,7 +7,7 @@ weight by the likelihood of the pose. No new fit is needed while the weights are
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -16,7 +16,6 @@ from avsreplay import geometry
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, separated, to_errors, to_state
 from avsreplay.estimate.dynamics import forecast_of, grasp_prediction, torque_density, translation
-from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import measurement_jacobian, to_fixture
 from avsreplay.estimate.noise import cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
@@ -67,12 +66,13 @@ def _joined(components: tuple[Component, ...]) -> Component:
     first = components[0]
     if len(components) == 1:
         return first
-    off = np.array([c.chart.minus(first.chart) for c in components])
-    shift = np.array([c.weight - c.quadrature for c in components]) @ off
-    P = np.zeros((DIM, DIM))
-    for component, y in zip(components, off - shift, strict=True):
-        P += component.weight * (np.outer(y, y) + component.P)
-    return replace(first, chart=first.chart.moved(shift), P=P, weight=1.0, quadrature=1.0)
+    chart, P = _motion.join(
+        np.array([c.chart.flat for c in components]),
+        np.array([c.P for c in components]),
+        np.array([c.weight for c in components]),
+        np.array([c.quadrature for c in components]),
+    )
+    return Component(1.0, 1.0, first.t_ns, Chart(chart), P, first.share)
 
 
 def worn(components: tuple[Component, ...]) -> bool:

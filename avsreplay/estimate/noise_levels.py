@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.estimate.batch import Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
-from avsreplay.estimate.dynamics import rotation_history, torque_density
+from avsreplay.estimate.driven import impulses
+from avsreplay.estimate.dynamics import torque_density
 from avsreplay.estimate.error_state import RHO, VEL
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
@@ -234,8 +235,7 @@ def _linearised(
     """Residuals about the chart of ``problem``, and the covariances of the six components."""
     e, H = problem.core.rows()
     J = np.ascontiguousarray((H @ to_errors(problem.chart)).transpose(1, 0, 2)).reshape(6 * len(points), -1)
-    info: Array = np.asarray(np.linalg.inv(problem.prior.P), dtype=np.float64)
-    off = problem.chart.minus(problem.prior.mean)
+    info, off = problem.prior.info, problem.chart.minus(problem.prior.mean)
     if others is not None:
         m = others[0].shape[2]
         J = np.hstack([J, np.ascontiguousarray(others[0].transpose(1, 0, 2)).reshape(-1, m)])
@@ -280,7 +280,7 @@ def _disturbances(times_s: Array, chart: Chart, H: Array) -> tuple[Array, Array]
     x, n = to_state(chart), len(times_s)
     middle, root = 0.5 * (times_s[1:] + times_s[:-1]), np.sqrt(np.diff(times_s))
     later = times_s[:, None] > middle
-    back = np.linalg.inv(rotation_history(x, middle).S[:, :, :6])[:, :, 3:] * np.sqrt(torque_density(x.sigma, 1.0))
+    back = impulses(x, middle) * np.sqrt(torque_density(x.sigma, 1.0))
     turn = (H[:, :, :6].reshape(-1, 6) @ back.transpose(1, 0, 2).reshape(6, -1)).reshape(n, 6, -1, 3)
     push = H[:, :, None, VEL] - middle[:, None] * H[:, :, None, RHO]
     weight = (later * root)[:, None, :, None]

@@ -16,12 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.dynamics import propagate_state, rotation_path
 from avsreplay.estimate.error_state import DMU, VARRHO
 from avsreplay.estimate.initialise import BatchResult, PoseFix
 from avsreplay.estimate.measurement import measurement_jacobian, to_camera, to_fixture
-from avsreplay.estimate.noise import NoiseWindow, cholesky_root, line_of_sight_1s
+from avsreplay.estimate.noise import NoiseWindow, line_of_sight_1s
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.work import Computation
 from avsreplay.geometry import Array, Pose, frozen
@@ -267,10 +268,9 @@ def ready(track: Track) -> bool:
 def long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
     """Return whether the sum of the last whitened innovations is large, over one of several runs of scans."""
     last = [e.innovation for e in epochs[: -_RUNS[-1] - 1 : -1]]
-    roots = cholesky_root(np.array([one.S for one in last]))
-    white = np.linalg.solve(roots, np.array([one.alpha for one in last])[:, :, None])[:, :, 0]
-    sums = np.cumsum(white, axis=0)
-    share, lengths = epochs[-1].innovation.share, [n for n in _RUNS if n <= len(white)]
+    roots, _ = _motion.roots(np.array([one.S for one in last]))
+    sums = np.cumsum((roots @ np.array([one.alpha for one in last])[:, :, None])[:, :, 0], axis=0)
+    share, lengths = epochs[-1].innovation.share, [n for n in _RUNS if n <= len(sums)]
     return any(sums[n - 1] @ sums[n - 1] > _RUN_GATE * scale * n * (1.0 + (n - 1) * share) for n in lengths)
 
 

@@ -7,7 +7,7 @@
 #include <cstring>
 #include <stdexcept>
 
-#include "fit.hpp"
+#include "covariance.hpp"
 
 namespace nb = nanobind;
 using namespace avs;
@@ -360,6 +360,66 @@ nb::tuple carry_of(const Flat& from, const Matrix<DIM, DIM>& P0, double h, const
   return nb::make_tuple(flat(c), made(P), told[0], told[1]);
 }
 
+// Of covariances C (n, 6, 6): roots (n, 6, 6) with root C root' = 1, and the inverses (n, 2, 3, 3) of the diagonal blocks.
+nb::tuple roots_of(const Matrix<-1, SEEN, SEEN>& C) {
+  const size_t n = C.shape(0);
+  double *root, *info;
+  Numpy first = array({n, SEEN, SEEN}, &root), second = array({n, 2, 3, 3}, &info);
+  for (size_t k = 0; k < n; ++k) {
+    const auto& one = as<double[SEEN][SEEN]>(C.data() + SEEN * SEEN * k);
+    if (!inverse_root(one, *reinterpret_cast<double(*)[SEEN][SEEN]>(root + SEEN * SEEN * k)))
+      throw std::invalid_argument("a covariance is not positive definite");
+    for (int block = 0; block < 2; ++block) {
+      double A[3][3];
+      for (int r = 0; r < 3; ++r) std::memcpy(A[r], &one[3 * block + r][3 * block], sizeof A[r]);
+      const M3 found = inverse(A);
+      std::memcpy(info + 18 * k + 9 * block, &found, sizeof found);
+    }
+  }
+  return nb::make_tuple(first, second);
+}
+
+bool above_of(const Matrix<DIM, DIM>& P, double least) { return above(as<Square>(P.data()), least); }
+
+// (n, 6, 3) errors (dq_v, w) at the start that equal a unit of rate at each instant.
+Numpy impulses(const Vector<4>& q0, const Vector<3>& w0, const Three& sigma, const Times& times, const Three& drive) {
+  const size_t n = times.shape(0);
+  double* out;
+  Numpy found = array({n, 6, 3}, &out);
+  const Body b = body(sigma, {0, 0, 0}, drive);
+  Flow flow = begin(turn(q0, w0));
+  double t = 0;
+  for (size_t k = 0; k < n; ++k) {
+    advance(flow, b, times(k) - t);
+    t = times(k);
+    impulse(flow, *reinterpret_cast<double(*)[6][3]>(out + 18 * k));
+  }
+  return found;
+}
+
+nb::tuple join_of(const Matrix<-1, CHART>& charts, const Matrix<-1, DIM, DIM>& P, const Vector<-1>& weights,
+                  const Vector<-1>& quadrature) {
+  const size_t n = charts.shape(0);
+  if (!n || P.shape(0) != n || weights.shape(0) != n || quadrature.shape(0) != n)
+    throw std::invalid_argument("charts, covariances and weights must be equally many, one at least");
+  Chart mean;
+  Square moments;
+  join(reinterpret_cast<const Chart*>(charts.data()), reinterpret_cast<const Square*>(P.data()), weights.data(),
+       quadrature.data(), (int)n, mean, moments);
+  return nb::make_tuple(flat(mean), made(moments));
+}
+
+// Attitude, rate, position and velocity h seconds later, the transition and the covariance.
+nb::tuple propagate_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
+                       const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Matrix<DIM, DIM>& P0,
+                       double h, const Matrix<6, 6>& path, const Three& torque, double force) {
+  State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
+  Square P, Phi;
+  std::memcpy(P, P0.data(), sizeof P);
+  propagate(x, P, h, as<double[6][6]>(path.data()), torque.data(), force, Phi);
+  return nb::make_tuple(made(x.q_ab), made(x.w_b), made(x.r_a), made(x.v_a), made(Phi), made(P));
+}
+
 }  // namespace
 
 NB_MODULE(_motion, m) {
@@ -382,6 +442,14 @@ NB_MODULE(_motion, m) {
   m.def("transition", &transition_of, nb::arg("chart"), nb::arg("h"), nb::arg("path"));
   m.def("carry", &carry_of, nb::arg("chart"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
         nb::arg("force"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("factors"), nb::arg("weight"));
+  m.def("roots", &roots_of, nb::arg("C"));
+  m.def("above", &above_of, nb::arg("P"), nb::arg("least"));
+  m.def("impulses", &impulses, nb::arg("q"), nb::arg("w"), nb::arg("sigma"), nb::arg("times"),
+        nb::arg("drive") = Three{0, 0, 0});
+  m.def("join", &join_of, nb::arg("charts"), nb::arg("P"), nb::arg("weights"), nb::arg("quadrature"));
+  m.def("propagate", &propagate_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
+        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
+        nb::arg("force"));
   nb::class_<Problem>(m, "Problem")
       .def("__init__", &create, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),
            nb::arg("mean"), nb::arg("prior_info"))

@@ -65,17 +65,6 @@ void congruent(const Square T, const Square A, Square out) {
       for (int c = 0; c < DIM; ++c) out[r][c] += T[i][r] * AT[i][c];
 }
 
-M3 inverse(const double A[3][3]) {
-  M3 out;
-  for (int r = 0; r < 3; ++r)
-    for (int c = 0; c < 3; ++c)
-      out.x[c][r] = A[NEXT[r]][NEXT[c]] * A[LAST[r]][LAST[c]] - A[NEXT[r]][LAST[c]] * A[LAST[r]][NEXT[c]];
-  const double det = A[0][0] * out.x[0][0] + A[0][1] * out.x[1][0] + A[0][2] * out.x[2][0];
-  for (auto& row : out.x)
-    for (double& v : row) v /= det;
-  return out;
-}
-
 // S^-1 Q S^-T of a flow: its noise propagated back to the start. S = [A B; 0 D] with A orthogonal.
 void at_start(const Flow& flow, double out[6][6]) {
   double D[3][3], back[6][6] = {};
@@ -103,6 +92,17 @@ void at_start(const Flow& flow, double out[6][6]) {
 }
 
 }  // namespace
+
+M3 inverse(const double A[3][3]) {
+  M3 out;
+  for (int r = 0; r < 3; ++r)
+    for (int c = 0; c < 3; ++c)
+      out.x[c][r] = A[NEXT[r]][NEXT[c]] * A[LAST[r]][LAST[c]] - A[NEXT[r]][LAST[c]] * A[LAST[r]][NEXT[c]];
+  const double det = A[0][0] * out.x[0][0] + A[0][1] * out.x[1][0] + A[0][2] * out.x[2][0];
+  for (auto& row : out.x)
+    for (double& v : row) v /= det;
+  return out;
+}
 
 Turn turn_of(const State& x) {
   Turn turn;

@@ -72,6 +72,15 @@ class Problem {
   double penalty(const Chart& chart) const;
 };
 
+// The inverse of A (3, 3).
+M3 inverse(const double A[3][3]);
+
+// The transition Phi of the error states over a flow; `path` takes position and velocity of the centre of mass there.
+void errors_transition(const Flow& flow, const double join[3][2], const double path[6][6], Square Phi);
+
+// Position and velocity of the centre of mass, moved by `path`.
+void translate(State& x, const double path[6][6]);
+
 // A chart h seconds later, the transition F of its steps, and the noise Q that disturbances of these densities add to
 // them. `path` takes position and velocity of the centre of mass there. Without densities and Q it is the motion alone.
 void transition(Chart& chart, double h, const double path[6][6], const double* torque_density, double force_density,

@@ -78,6 +78,25 @@ void evidence(const double off[SEEN], const double H[SEEN][DIM], const Square P,
 
 }  // namespace
 
+void errors_transition(const Flow& flow, const double join[3][2], const double path[6][6], Square Phi) {
+  std::memset(Phi, 0, sizeof(Square));
+  for (int r = 0; r < DIM; ++r) Phi[r][r] = 1;
+  for (int r = 0; r < 6; ++r) {
+    std::memcpy(Phi[r], flow.S[r], 6 * sizeof(double));
+    for (int c = 0; c < 2; ++c)
+      Phi[r][12 + c] = flow.S[r][6] * join[0][c] + flow.S[r][7] * join[1][c] + flow.S[r][8] * join[2][c];
+    std::memcpy(&Phi[6 + r][6], path[r], sizeof path[r]);
+  }
+}
+
+void translate(State& x, const double path[6][6]) {
+  double centre[6] = {};
+  for (int r = 0; r < 6; ++r)
+    for (int c = 0; c < 3; ++c) centre[r] += path[r][c] * x.r_a[c] + path[r][3 + c] * x.v_a[c];
+  std::memcpy(x.r_a, centre, sizeof x.r_a);
+  std::memcpy(x.v_a, centre + 3, sizeof x.v_a);
+}
+
 void transition(Chart& chart, double h, const double path[6][6], const double* torque_density, double force_density,
                 Square F, double (*Q)[MOTION]) {
   State x = state_of(chart);
@@ -87,22 +106,10 @@ void transition(Chart& chart, double h, const double path[6][6], const double* t
   if (torque_density) std::memcpy(body.push, torque_density, sizeof body.push);
   Flow flow = begin(turn_of(x));
   avs::advance(flow, body, h);
-  Square T, Phi = {};
+  Square T, Phi;
   errors_of(chart, T);
-  for (int r = 0; r < DIM; ++r) Phi[r][r] = 1;
-  for (int r = 0; r < 6; ++r) {
-    std::memcpy(Phi[r], flow.S[r], 6 * sizeof(double));
-    for (int c = 0; c < 2; ++c)
-      Phi[r][12 + c] = flow.S[r][6] * join[0][c] + flow.S[r][7] * join[1][c] + flow.S[r][8] * join[2][c];
-  }
-  double centre[6];
-  for (int r = 0; r < 6; ++r) {
-    std::memcpy(&Phi[6 + r][6], path[r], sizeof path[r]);
-    centre[r] = 0;
-    for (int c = 0; c < 3; ++c) centre[r] += path[r][c] * x.r_a[c] + path[r][3 + c] * x.v_a[c];
-  }
-  std::memcpy(x.r_a, centre, sizeof x.r_a);
-  std::memcpy(x.v_a, centre + 3, sizeof x.v_a);
+  errors_transition(flow, join, path, Phi);
+  translate(x, path);
   std::memcpy(x.q_ab, flow.at.q, sizeof x.q_ab);
   std::memcpy(x.w_b, flow.at.w, sizeof x.w_b);
   chart = chart_of(x);
