@@ -8,17 +8,18 @@ stays. Each numeric column has a topic ``/rows/NAME``.
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, transform
+from avsreplay.log.mcap_writer import McapWriter
 from avsreplay.records import Surface
 
 CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
@@ -40,7 +41,6 @@ _TOPICS = {
     "/rosout": "rcl_interfaces/msg/Log",
 }
 _ROWS = "/rows/"
-_FLOAT64 = struct.Struct("<xBxxd")  # encapsulation of little-endian CDR, then the value
 _INFO, _WARN = 20, 30  # levels of rcl_interfaces/msg/Log
 
 
@@ -95,7 +95,6 @@ class ResultLog:
         Raises:
             UnreadableInput: the file cannot be written.
         """
-        from mcap.writer import CompressionType, Writer
         from rosbags.typesys import Stores, get_typestore
 
         self._definitions: Any = get_typestore(Stores.ROS2_HUMBLE)
@@ -104,10 +103,9 @@ class ResultLog:
         except OSError as error:
             what = error.strerror or "cannot be written"
             raise UnreadableInput(what, where=str(path), hint="check the folder and its rights") from None
-        self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
-        self._writer.start(profile="ros2", library=LIBRARY)
+        self._writer = McapWriter(self._stream, LIBRARY, chunk_bytes=CHUNK_BYTES)
         if metadata:
-            self._writer.add_metadata("avsreplay", dict(metadata))
+            self._writer.metadata("avsreplay", metadata)
         self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -117,7 +115,7 @@ class ResultLog:
         if self._stream.closed:
             return
         try:
-            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._writer.finish()
         finally:
             self._stream.close()
 
@@ -184,18 +182,23 @@ class ResultLog:
                     self._append_columns(columns, message.log_time)
 
     def _append_columns(self, columns: Mapping[str, float], t_ns: int) -> None:
-        for name, value in columns.items():
-            self._append(_ROWS + name, t_ns, _FLOAT64.pack(1, value))
+        channels = [self._channel(_ROWS + name) for name in columns]
+        self._writer.scalars(channels, t_ns, np.array(list(columns.values()), np.float64), self._count)
 
     def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
+        self._writer.message(self._channel(topic), t_ns, payload, self._count)
+
+    def _channel(self, topic: str) -> int:
+        """The number of a topic's channel, which is defined with its first message."""
         if topic not in self._channels:
             kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
             if kind not in self._schemas:
                 text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
-                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", text.encode())
-            qos = {"offered_qos_profiles": ""}
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
-        self._writer.add_message(self._channels[topic], t_ns, payload, t_ns, self._count)
+                self._schemas[kind] = self._writer.schema(kind, "ros2msg", text.encode())
+            self._channels[topic] = self._writer.channel(
+                topic, "cdr", self._schemas[kind], {"offered_qos_profiles": ""}
+            )
+        return self._channels[topic]
 
 
 def _path(t_ns: int, times_s: Array, positions: Array) -> bytes:
