@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, Pose
-from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, transform
+from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.mcap_writer import McapWriter
 from avsreplay.records import Surface
 
@@ -95,9 +95,6 @@ class ResultLog:
         Raises:
             UnreadableInput: the file cannot be written.
         """
-        from rosbags.typesys import Stores, get_typestore
-
-        self._definitions: Any = get_typestore(Stores.ROS2_HUMBLE)
         try:
             self._stream = path.open("wb")
         except OSError as error:
@@ -193,8 +190,7 @@ class ResultLog:
         if topic not in self._channels:
             kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
             if kind not in self._schemas:
-                text, _ = self._definitions.generate_msgdef(kind, ros_version=2)
-                self._schemas[kind] = self._writer.schema(kind, "ros2msg", text.encode())
+                self._schemas[kind] = self._writer.schema(kind, "ros2msg", schema_text(kind))
             self._channels[topic] = self._writer.channel(
                 topic, "cdr", self._schemas[kind], {"offered_qos_profiles": ""}
             )

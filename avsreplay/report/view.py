@@ -125,7 +125,7 @@ def write_view(path: str | Path, view: View) -> None:
         "path_miss": np.array([np.nan if p.miss_m is None else p.miss_m for p in view.paths], dtype=np.float64),
     }
     with output_path(path) as part, part.open("wb") as stream:
-        np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+        np.savez(stream, **arrays)  # type: ignore[arg-type]
 
 
 def _joined(parts: Sequence[Floats]) -> Floats:
