@@ -12,18 +12,18 @@ namespace avs {
 template <class T>
 struct Pages {
   using value_type = T;
-  static constexpr std::size_t LINE = 64, HUGE = std::size_t{1} << 21, LARGE = 2 * HUGE;
+  static constexpr std::size_t CACHE_LINE = 64, HUGE_PAGE = std::size_t{1} << 21, LARGE_ARRAY = 2 * HUGE_PAGE;
 
   Pages() = default;
   template <class U>
   Pages(const Pages<U>&) {}
 
-  static std::size_t alignment(std::size_t n) { return n * sizeof(T) < LARGE ? LINE : HUGE; }
+  static std::size_t alignment(std::size_t n) { return n * sizeof(T) < LARGE_ARRAY ? CACHE_LINE : HUGE_PAGE; }
 
   T* allocate(std::size_t n) {
     void* p = ::operator new(n * sizeof(T), std::align_val_t(alignment(n)));
 #if defined(__linux__) && defined(MADV_HUGEPAGE)
-    if (alignment(n) == HUGE) ::madvise(p, n * sizeof(T), MADV_HUGEPAGE);
+    if (alignment(n) == HUGE_PAGE) ::madvise(p, n * sizeof(T), MADV_HUGEPAGE);
 #endif
     return static_cast<T*>(p);
   }
