@@ -54,7 +54,8 @@ struct NodeSides {
 
 // The grid near the surface. A cell's word is 0 (not near, or nothing there) or where its list starts: a header with
 // the number of entries and a distance, then the blocks by their distance from the cell's centre. All blocks within the
-// header's distance of the centre are listed. Distances are in units of `Store::step`, rounded down.
+// header's distance of the centre are listed that are within the band of some place of the cell. Distances are in units
+// of `Store::step`, rounded down.
 constexpr int BRICK = 4, WORDS = BRICK * BRICK * BRICK;  // cells along a brick's side, and in a brick
 constexpr int DISTANCE_BITS = 10, LONGEST_LIST = 24;
 constexpr uint32_t STEPS = (1u << DISTANCE_BITS) - 1;

@@ -42,6 +42,17 @@ static inline const uint32_t* list_of(const Store& s, const uint32_t* word) {
   return word && *word ? s.lists.data() + *word : nullptr;
 }
 
+// Distance of a place in the grid from the centre of its cell, rounded up.
+static inline float off_centre(const Store& s, const Query& q) {
+  const double inv = 1.0 / s.cell, f[3] = {(q.x - s.low.x) * inv, (q.y - s.low.y) * inv, (q.z - s.low.z) * inv};
+  double sum = 0;
+  for (const double x : f) {
+    const double d = x - (double)(int32_t)x - 0.5;
+    sum += d * d;
+  }
+  return (float)(1.000001 * s.cell * std::sqrt(sum)) + s.slack;
+}
+
 constexpr int STACK = 96;  // at most 10 levels of 8 children
 
 // One search.
@@ -110,14 +121,15 @@ class Search {
   bool in_list(const uint32_t* list, uint32_t seed) {
     constexpr int shift = 32 - DISTANCE_BITS;
     const uint32_t n = *list & (MOST_BLOCKS - 1);
-    const float radius = cell_radius(s_);
+    const float radius = off_centre(s_, q_);
     for (uint32_t k = 1; k <= n; ++k) {
       const float d = (float)(list[k] >> shift) * s_.step - radius;
       if (d > 0.f && !(d * d < limit_)) break;
       const uint32_t block = list[k] & (MOST_BLOCKS - 1);
       if (block != seed && o_.facing.may[block] && to_box2(s_.boxes[block]) < limit_) visit(block);
     }
-    const float known = (float)(*list >> shift) * s_.step - radius;
+    // A block farther from every place of the cell than the band of the grid is in no list.
+    const float band = (float)STEPS * s_.step - cell_radius(s_), known = std::min((float)(*list >> shift) * s_.step - radius, band);
     return known > 0.f && limit_ <= known * known;
   }
 
