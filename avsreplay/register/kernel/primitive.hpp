@@ -60,10 +60,6 @@ struct Points {
 };
 
 struct Triangles {
-  struct Local {
-    F8 x, y, z, fx, fy;  // the query and its foot in the triangles' own planes
-  };
-
   struct Normals {
     F8 x, y, z;
   };
@@ -74,38 +70,27 @@ struct Triangles {
     return {uy * wz - uz * wy, uz * wx - ux * wz, ux * wy - uy * wx};
   }
 
-  static Local local(const TriangleBlock& b, const Query& q) {
-    const F8 dx = q.qx - load8(b.a[0]), dy = q.qy - load8(b.a[1]), dz = q.qz - load8(b.a[2]);
-    Local r;
-    r.x = dx * load8(b.u[0]) + dy * load8(b.u[1]) + dz * load8(b.u[2]);
-    r.y = dx * load8(b.w[0]) + dy * load8(b.w[1]) + dz * load8(b.w[2]);
-    const Normals n = normals(b);
-    r.z = dx * n.x + dy * n.y + dz * n.z;
-    place(b, r);
-    return r;
-  }
-
-  // The foot in the plane: the place itself inside, else the nearest of the feet on the three sides.
-  static void place(const TriangleBlock& b, Local& r) {
-    const F8 zero = f8(0.f), one = f8(1.f), length = load8(b.length), cx = load8(b.cx), cy = load8(b.cy);
-    const F8 bx = length - cx, rx = length - r.x;
-    const F8 t = clamp8((r.x * cx + r.y * cy) / squared(cx, cy), zero, one);
-    const F8 s = clamp8((rx * bx + r.y * cy) / squared(bx, cy), zero, one);
-    const F8 x1 = clamp8(r.x, zero, length), x2 = t * cx, y2 = t * cy, x3 = length - s * bx, y3 = s * cy;
-    const F8 e1 = squared(r.x - x1, r.y), e2 = squared(r.x - x2, r.y - y2), e3 = squared(r.x - x3, r.y - y3);
-    const F8::Mask out = either(either(r.y < zero, r.x * cy - r.y * cx < zero), rx * cy - r.y * bx < zero);
-    const F8::Mask second = e2 < e1;
-    const F8 e12 = select(second, e2, e1), x12 = select(second, x2, x1), y12 = select(second, y2, zero);
-    const F8::Mask third = e3 < e12;
-    r.fx = select(out, select(third, x3, x12), r.x);
-    r.fy = select(out, select(third, y3, y12), r.y);
-  }
-
   static F8 squared(F8 x, F8 y) { return x * x + y * y; }
 
   static F8 distance2(const Store& s, uint32_t block, const Query& q) {
-    const Local r = local(s.triangle_blocks[block], q);
-    return squared(r.x - r.fx, r.y - r.fy) + r.z * r.z;
+    const TriangleBlock& b = s.triangle_blocks[block];
+    const F8 dx = q.qx - load8(b.a[0]), dy = q.qy - load8(b.a[1]), dz = q.qz - load8(b.a[2]);
+    const Normals n = normals(b);
+    const F8 z = dx * n.x + dy * n.y + dz * n.z;
+    return beside(b, dx * load8(b.u[0]) + dy * load8(b.u[1]) + dz * load8(b.u[2]),
+                  dx * load8(b.w[0]) + dy * load8(b.w[1]) + dz * load8(b.w[2])) + z * z;
+  }
+
+  // Squared distances of the places (x, y) of the planes from the triangles: zero inside, else to the nearest side.
+  static F8 beside(const TriangleBlock& b, F8 x, F8 y) {
+    const F8 zero = f8(0.f), one = f8(1.f), length = load8(b.length), cx = load8(b.cx), cy = load8(b.cy);
+    const F8 bx = length - cx, rx = length - x;
+    const F8 t = clamp8((x * cx + y * cy) / squared(cx, cy), zero, one);
+    const F8 s = clamp8((rx * bx + y * cy) / squared(bx, cy), zero, one);
+    const F8 e1 = squared(x - clamp8(x, zero, length), y), e2 = squared(x - t * cx, y - t * cy);
+    const F8 e3 = squared(rx - s * bx, y - s * cy);
+    const F8::Mask out = either(either(y < zero, x * cy - y * cx < zero), rx * cy - y * bx < zero);
+    return select(out, min8(min8(e1, e2), e3), zero);
   }
 
   static Four feet(const Store& s, const uint32_t (&lane)[4], const D4 (&p)[3], Ask ask) {
