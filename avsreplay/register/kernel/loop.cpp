@@ -81,8 +81,15 @@ void apply(const Store& s, const Step& step, double* T) {
 // over the scan falls; else it is undone, Horn's step, which cannot raise the sum, is made in its place, and the next
 // Newton steps are limited to a quarter of the one that failed (a trust region). Once that is below `eps_m`, only Horn's
 // steps are made.
+//
+// Where feet pass from one primitive to another, the sum curves less than on each of them, so that a Newton step is a
+// fixed share of the way and the next ones have its direction. Broyden's update of the inverse of the derivative, from the
+// last step alone, makes up for it. Where such a step fails, the Newton step is made in its place.
 class Newton {
  public:
+  // `extends`: to the fixed point of all points; that of a part of them need not be exact.
+  explicit Newton(bool extends) : extends_(extends) {}
+
   struct Choice {
     Step step;
     bool undo;     // go back to the pose before the last step first
@@ -93,24 +100,59 @@ class Newton {
     const Step horn = horn_step(sums);
     const double cost = sums.v[1] + outside * gate * gate;
     const bool comparable = used_ && gate == gate_;
-    if (comparable && !(cost < cost_)) {
-      used_ = false, longest_ = SHORTER * length_;
-      return {horn_, true, false};
-    }
+    if (comparable && !(cost < cost_)) return instead();
     if (used_) longest_ *= LONGER;
-    used_ = false, gate_ = gate, cost_ = cost, horn_ = horn;
-    Step step;
-    if (longest_ <= eps_m || !newton_step(sums, std::min(longest, longest_), step)) return {horn, false, true};
-    if (step.turn < eps_rad && step.move < eps_m && step.length < longest_) return {horn, false, true};
-    used_ = true, length_ = step.length;
+    const bool second = used_;
+    used_ = extended_ = false, gate_ = gate, cost_ = cost, horn_ = horn;
+    Motion motion;
+    const double most = std::min(longest, longest_);
+    if (longest_ <= eps_m || !newton_motion(sums, motion) || !to_step(motion, most, plain_)) return {horn, false, true};
+    if (plain_.turn < eps_rad && plain_.move < eps_m && plain_.length < longest_) return {horn, false, true};
+    Step step = plain_;
+    used_ = true, extended_ = extend(motion, second) && to_step(motion, most, step);
+    length_ = step.length;
     return {step, false, false};
   }
 
  private:
   static constexpr double SHORTER = 0.25, LONGER = 2.0;
+  static constexpr double LEAST_SHARE = 0.35;  // of the way that a Newton step is taken to be
+  static constexpr double LEAST_COSINE = 0.7;  // between a Newton step and the last step
+
+  // What is done in place of a step that raised the sum.
+  Choice instead() {
+    if (extended_) {
+      extended_ = false, length_ = plain_.length;
+      std::copy(newton_, newton_ + 6, made_);
+      return {plain_, true, false};
+    }
+    used_ = false, longest_ = SHORTER * length_;
+    return {horn_, true, false};
+  }
+
+  // Broyden's step from the Newton step and the last step, where both have about the same direction and it is not longer
+  // than the last one. Returns whether it was taken.
+  bool extend(Motion& motion, bool second) {
+    double now[6], step[6], along = 0, share = 0, made = 0, newton = 0, length = 0;
+    for (int i = 0; i < 6; ++i) {
+      now[i] = motion.d[i] * (i < 3 ? motion.radius : 1);
+      along += made_[i] * now[i], share += made_[i] * (newton_[i] - now[i]);
+      made += made_[i] * made_[i], newton += now[i] * now[i];
+    }
+    const double factor = along / std::max(share, LEAST_SHARE * made);
+    for (int i = 0; i < 6; ++i) step[i] = now[i] + factor * (made_[i] - newton_[i] + now[i]), length += step[i] * step[i];
+    const bool taken = extends_ && second && along > LEAST_COSINE * std::sqrt(made * newton) && share < made && !(length > made);
+    std::copy(now, now + 6, newton_);
+    std::copy(taken ? step : now, (taken ? step : now) + 6, made_);
+    for (int i = 0; i < 6; ++i) motion.d[i] = made_[i] / (i < 3 ? motion.radius : 1);
+    return taken;
+  }
+
   double cost_ = 0, gate_ = 0, length_ = 0, longest_ = worst();
-  Step horn_{};
-  bool used_ = false;
+  double newton_[6] = {}, made_[6] = {};  // the last Newton step and the step made, turns in units of length
+  Step horn_{}, plain_{};
+  bool used_ = false, extended_ = false;
+  const bool extends_;
 };
 
 // Every n / m-th point of a scan, at a place within its n / m points that follows no pattern of rows and columns.
@@ -139,7 +181,7 @@ class Passes {
 
   // `few`: the points are a part of the scan. Returns whether there were inliers to the end.
   bool run(const View& v, Memory& memory, bool plane, bool few) {
-    Newton newton;
+    Newton newton(!few);
     double before[12];
     const int most = few ? rule_.n_max / 2 : rule_.n_max, last_plane = o_.passes + rule_.n_plane;
     while (o_.passes < most && o_.work() < most_work() && !o_.converged) {

@@ -60,21 +60,6 @@ bool solve6(double (&H)[6][6], double* b, double& radius) {
   return most > 0;
 }
 
-// The step d = [turn; shift] about c, shortened to `longest`.
-bool to_step(double* d, const double* c, double radius, double longest, Step& s) {
-  const double length = radius * norm3(d) + norm3(d + 3);
-  if (length > longest)
-    for (int i = 0; i < 6; ++i) d[i] *= longest / length;
-  const double angle = norm3(d), f = angle > 1e-9 ? std::sin(angle / 2) / angle : 0.5;
-  const double q[4] = {std::cos(angle / 2), f * d[0], f * d[1], f * d[2]}, to[3] = {c[0] + d[3], c[1] + d[4], c[2] + d[5]};
-  rotation(q, s.D);
-  place(s.D, c, to);
-  s.turn = angle;
-  s.move = norm3(d + 3);
-  s.length = length < longest ? length : longest;
-  return std::isfinite(s.turn) && std::isfinite(s.move);
-}
-
 // The normal equations about c instead of the origin: p x n - c x n, that is J S with S = [I 0; [c x] I] in rows.
 void shift(double (&H)[6][6], double* b, const double* c) {
   const double C[3][3] = {{0, -c[2], c[1]}, {c[2], 0, -c[0]}, {-c[1], c[0], 0}};
@@ -122,20 +107,23 @@ Step horn_step(const Sums& sums) {
 bool plane_step(const Sums& sums, double longest, Step& s) {
   const double* a = sums.v;
   const double c[3] = {a[4] / a[0], a[5] / a[0], a[6] / a[0]};
-  double H[6][6], b[6], radius = 0;
+  Motion m{{}, {c[0], c[1], c[2]}, 0};
+  double H[6][6];
   int k = 7;
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j <= i; ++j) H[i][j] = a[k++];
-  for (int i = 0; i < 6; ++i) b[i] = a[k++];
-  shift(H, b, c);
-  return solve6(H, b, radius) && to_step(b, c, radius, longest, s);
+  for (int i = 0; i < 6; ++i) m.d[i] = a[k++];
+  shift(H, m.d, c);
+  return solve6(H, m.d, m.radius) && to_step(m, longest, s);
 }
 
-bool newton_step(const Sums& sums, double longest, Step& s) {
+bool newton_motion(const Sums& sums, Motion& m) {
   const double* a = sums.v;
-  const double c[3] = {a[4] / a[0], a[5] / a[0], a[6] / a[0]};
   // - gradient = [sum p x foot; sum foot - p].
-  double H[6][6], b[6] = {a[15] - a[17], a[16] - a[12], a[11] - a[13], a[7] - a[4], a[8] - a[5], a[9] - a[6]}, radius = 0;
+  m = {{a[15] - a[17], a[16] - a[12], a[11] - a[13], a[7] - a[4], a[8] - a[5], a[9] - a[6]},
+       {a[4] / a[0], a[5] / a[0], a[6] / a[0]},
+       0};
+  double H[6][6];
   int k = 19;
   for (int i = 0; i < 6; ++i)
     for (int j = 0; j <= i; ++j) H[i][j] = a[k++];
@@ -146,8 +134,23 @@ bool newton_step(const Sums& sums, double longest, Step& s) {
     for (int j = 0; j <= i; ++j) H[i][j] += (i == j ? trace : 0) - pp[k++];
   for (int i = 0; i < 3; ++i) H[3 + i][3 + i] += w;
   H[3][1] += p[2], H[3][2] -= p[1], H[4][0] -= p[2], H[4][2] += p[0], H[5][0] += p[1], H[5][1] -= p[0];
-  shift(H, b, c);
-  return solve6(H, b, radius) && to_step(b, c, radius, longest, s);
+  shift(H, m.d, m.centre);
+  return solve6(H, m.d, m.radius);
+}
+
+bool to_step(Motion m, double longest, Step& s) {
+  double *d = m.d, *c = m.centre;
+  const double length = m.radius * norm3(d) + norm3(d + 3);
+  if (length > longest)
+    for (int i = 0; i < 6; ++i) d[i] *= longest / length;
+  const double angle = norm3(d), f = angle > 1e-9 ? std::sin(angle / 2) / angle : 0.5;
+  const double q[4] = {std::cos(angle / 2), f * d[0], f * d[1], f * d[2]}, to[3] = {c[0] + d[3], c[1] + d[4], c[2] + d[5]};
+  rotation(q, s.D);
+  place(s.D, c, to);
+  s.turn = angle;
+  s.move = norm3(d + 3);
+  s.length = length < longest ? length : longest;
+  return std::isfinite(s.turn) && std::isfinite(s.move);
 }
 
 void compose(const double* D, double* T) {

@@ -16,9 +16,17 @@ Step horn_step(const Sums& sums);
 // Directions whose information is below 1e-6 of the largest are left as they are. `longest`: the step is shortened so that
 // no inlier is expected to move farther [m].
 bool plane_step(const Sums& sums, double longest, Step& step);
+
+// d = [turn; shift] about `centre`; a turn times `radius` is a length.
+struct Motion {
+  double d[6], centre[3], radius;
+};
 // One Newton step of the sum of squared distances of the inliers, whose stationary points are the fixed points of Horn's
-// iteration: the gradient from Horn's moments, the second derivative from each foot's face, edge or vertex.
-bool newton_step(const Sums& sums, double longest, Step& step);
+// iteration: the gradient from Horn's moments, the second derivative from each foot's face, edge or vertex. False where
+// nothing is observable.
+bool newton_motion(const Sums& sums, Motion& motion);
+// The motion as a step, shortened to `longest`; false where it is not finite.
+bool to_step(Motion motion, double longest, Step& step);
 void compose(const double* D, double* T);  // T = D T, both rows of [R t]
 
 }  // namespace avs
