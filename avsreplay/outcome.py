@@ -7,12 +7,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TypeVar
-
-import numpy as np
 
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import (
@@ -24,7 +21,6 @@ from avsreplay.records import (
     Innovation,
     Manoeuvre,
     Scan,
-    ScanStatus,
     Verdict,
 )
 
@@ -206,137 +202,3 @@ class Score:
     nees_blocks: Mapping[str, float] = field(default_factory=dict)
     planned: CaptureError | None = None
     captured: CaptureError | None = None
-
-
-T = TypeVar("T")
-Value = Callable[[Outcome, Score], T]
-"""Takes the value of a column from an outcome and its score."""
-
-
-def finite(value: float | None) -> float | None:
-    """Return a value, or None where it is None, NaN or infinite.
-
-    Args:
-        value: the value.
-    """
-    return float(value) if value is not None and np.isfinite(value) else None
-
-
-def if_innovation(get: Callable[[Innovation], float | None]) -> Value[float | None]:
-    """Return a column value taken from the innovation, None where nothing was measured.
-
-    Args:
-        get: takes the value from the innovation.
-    """
-    return lambda o, s: None if o.innovation is None else get(o.innovation)
-
-
-def if_planned(get: Callable[[Outcome, Plan], T]) -> Value[T | None]:
-    """Return a column value taken from the capture plan in force, None where there is none.
-
-    Args:
-        get: takes the value from the outcome and its plan.
-    """
-    return lambda o, s: get(o, o.plan) if o.plan is not None and o.plan.found else None
-
-
-def change_values(get: Callable[[Outcome], Manoeuvre | None]) -> tuple[Value[float | None], ...]:
-    """Return the column values of a manoeuvre or a drift, None where there is none.
-
-    Args:
-        get: takes it from the outcome.
-
-    Returns:
-        Instant [s], size of the linear part, size of the angular part, each followed by its standard deviation.
-    """
-
-    def of(value: Callable[[Outcome, Manoeuvre], float]) -> Value[float | None]:
-        return lambda o, s: None if (change := get(o)) is None else float(value(o, change))
-
-    return (
-        of(lambda o, m: since_start_s(o, m.t_ns)),
-        of(lambda o, m: m.t_1s_s),
-        of(lambda o, m: float(np.linalg.norm(m.velocity))),
-        of(lambda o, m: math.sqrt(np.trace(m.P[3:, 3:]))),
-        of(lambda o, m: float(np.linalg.norm(m.rate))),
-        of(lambda o, m: math.sqrt(np.trace(m.P[:3, :3]))),
-    )
-
-
-def if_measured(get: Callable[[Pose], float]) -> Value[float | None]:
-    """Return a column value that ``get`` takes from the registered pose, None where nothing was measured."""
-    return lambda o, s: float(get(o.alignment.T_ac)) if o.alignment.measured else None
-
-
-def if_points(get: Callable[[Outcome], T]) -> Value[T | None]:
-    """Return a column value of the registration, None where the scan holds no point.
-
-    Args:
-        get: takes the value from the outcome.
-    """
-    return lambda o, s: get(o) if len(o.scan.points) else None
-
-
-def pose_error_values(get: Callable[[Score], PoseError | None]) -> tuple[Value[float | None], Value[float | None]]:
-    """Return the column values of a pose error: distance [m] and angle [deg], None without truth.
-
-    Args:
-        get: takes the pose error from the score.
-    """
-    return (
-        lambda o, s: None if (error := get(s)) is None else error.distance_m,
-        lambda o, s: None if (error := get(s)) is None else error.angle_deg,
-    )
-
-
-def capture_error_values(
-    get: Callable[[Score], CaptureError | None],
-) -> tuple[Value[float | None], Value[float | None], Value[float | None]]:
-    """Return the column values of a capture error: distance [m], speed [m/s] and angle [deg], None where there is none.
-
-    Args:
-        get: takes the capture error from the score.
-    """
-    return (
-        lambda o, s: None if (error := get(s)) is None else finite(error.distance_m),
-        lambda o, s: None if (error := get(s)) is None else finite(error.speed_mps),
-        lambda o, s: None if (error := get(s)) is None else finite(error.angle_deg),
-    )
-
-
-def full_angle_deg(variance: float) -> float:
-    """Return the standard deviation of a full angle [deg].
-
-    Args:
-        variance: variance of the half angle [rad^2]; negative values count as 0.
-    """
-    return float(np.degrees(2.0 * np.sqrt(max(float(variance), 0.0))))
-
-
-def position_1s_m(covariance: Array) -> float:
-    """Return the root of the trace of the position block [m].
-
-    Args:
-        covariance: (6, 6) covariance of a pose, position first [m2].
-    """
-    return float(np.sqrt(max(np.diag(covariance)[:3].sum(), 0.0)))
-
-
-def since_start_s(outcome: Outcome, t_ns: int) -> float:
-    """Return the seconds from the first scan of the replay to an instant.
-
-    Args:
-        outcome: any outcome of the replay.
-        t_ns: the instant [ns].
-    """
-    return (t_ns - outcome.start_ns) * 1e-9
-
-
-def status(outcome: Outcome) -> str:
-    """Return the status of the alignment, or of the scan where that is not ok.
-
-    Args:
-        outcome: outcome of the scan.
-    """
-    scan = outcome.scan.status
-    return outcome.alignment.status.value if scan is ScanStatus.OK else scan.value

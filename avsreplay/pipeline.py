@@ -338,7 +338,7 @@ def target_scene(estimator: Estimator, belief: Belief, target: TargetGeometry, f
         centre_c=centre_c,
         surface=target.surface,
         sigma=sigma,
-        radius_m=target.radius(centre_c),
+        hull_c=target.hull_c,
     )
 
 

@@ -7,30 +7,20 @@ files. A row holds results only, no wall clock, host, version or path: the same 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from avsreplay.outcome import (
-    Outcome,
-    Score,
-    Value,
-    capture_error_values,
-    change_values,
-    finite,
-    full_angle_deg,
-    if_innovation,
-    if_measured,
-    if_planned,
-    if_points,
-    pose_error_values,
-    position_1s_m,
-    since_start_s,
-    status,
-)
+from avsreplay.geometry import Pose
+from avsreplay.outcome import CaptureError, Outcome, Plan, PoseError, Score
+from avsreplay.records import Innovation, Manoeuvre, ScanStatus
 
 T = TypeVar("T")
+Value = Callable[[Outcome, Score], T]
+"""Takes the value of a column from an outcome and its score."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,9 +89,63 @@ def _exact(value: Value[T], table: bool = False) -> T:
     return column(value, table=table)
 
 
-_ESTIMATE, _REGISTRATION = pose_error_values(lambda s: s.estimate), pose_error_values(lambda s: s.registration)
-_PUSH, _DRIFT = change_values(lambda o: o.manoeuvres[-1] if o.manoeuvres else None), change_values(lambda o: o.drift)
-_PLANNED, _CAPTURED = capture_error_values(lambda s: s.planned), capture_error_values(lambda s: s.captured)
+def finite(value: float | None) -> float | None:
+    """Return a value, or None where it is None, NaN or infinite."""
+    return float(value) if value is not None and np.isfinite(value) else None
+
+
+def _if_innovation(get: Callable[[Innovation], float | None]) -> Value[float | None]:
+    return lambda o, s: None if o.innovation is None else get(o.innovation)
+
+
+def _if_planned(get: Callable[[Outcome, Plan], T]) -> Value[T | None]:
+    return lambda o, s: get(o, o.plan) if o.plan is not None and o.plan.found else None
+
+
+def _if_measured(get: Callable[[Pose], float]) -> Value[float | None]:
+    return lambda o, s: float(get(o.alignment.T_ac)) if o.alignment.measured else None
+
+
+def _if_points(get: Callable[[Outcome], T]) -> Value[T | None]:
+    return lambda o, s: get(o) if len(o.scan.points) else None
+
+
+def _change(get: Callable[[Outcome], Manoeuvre | None]) -> tuple[Value[float | None], ...]:
+    """Instant [s] and sizes of the linear and the angular part of a change, each followed by its standard deviation."""
+
+    def of(value: Callable[[Outcome, Manoeuvre], float]) -> Value[float | None]:
+        return lambda o, s: None if (change := get(o)) is None else float(value(o, change))
+
+    return (
+        of(lambda o, m: _since_start_s(o, m.t_ns)),
+        of(lambda o, m: m.t_1s_s),
+        of(lambda o, m: float(np.linalg.norm(m.velocity))),
+        of(lambda o, m: math.sqrt(np.trace(m.P[3:, 3:]))),
+        of(lambda o, m: float(np.linalg.norm(m.rate))),
+        of(lambda o, m: math.sqrt(np.trace(m.P[:3, :3]))),
+    )
+
+
+def _of_error(get: Callable[[Score], PoseError | CaptureError | None], name: str) -> Value[float | None]:
+    return lambda o, s: None if (error := get(s)) is None else finite(getattr(error, name))
+
+
+def _full_angle_deg(variance: float) -> float:
+    """Standard deviation of a full angle [deg] from the variance of the half angle [rad2], at least 0."""
+    return float(np.degrees(2.0 * np.sqrt(max(float(variance), 0.0))))
+
+
+def _since_start_s(outcome: Outcome, t_ns: int) -> float:
+    return (t_ns - outcome.start_ns) * 1e-9
+
+
+def _status(outcome: Outcome) -> str:
+    """The status of the alignment, or of the scan where that is not ok."""
+    scan = outcome.scan.status
+    return outcome.alignment.status.value if scan is ScanStatus.OK else scan.value
+
+
+_PUSH, _DRIFT = _change(lambda o: o.manoeuvres[-1] if o.manoeuvres else None), _change(lambda o: o.drift)
 
 
 def _nees(block: str) -> float | None:
@@ -115,35 +159,35 @@ class Row:
 
     seq: int = _exact(lambda o, s: o.scan.seq, table=True)
     t_ns: int = _exact(lambda o, s: o.scan.t_ns)
-    t_s: float = column(lambda o, s: since_start_s(o, o.scan.t_ns), "s", ".2f", 0.0, 1e-09, table=True)
-    status: str = _exact(lambda o, s: status(o), table=True)
+    t_s: float = column(lambda o, s: _since_start_s(o, o.scan.t_ns), "s", ".2f", 0.0, 1e-09, table=True)
+    status: str = _exact(lambda o, s: _status(o), table=True)
     gamma: int = _exact(lambda o, s: o.verdict.gamma, table=True)
     reason: str = _exact(lambda o, s: o.verdict.reason.value, table=True)
     guess: str = _exact(lambda o, s: o.guess)
     fault: str | None = _exact(lambda o, s: s.fault, table=True)
     message: str | None = _exact(lambda o, s: o.alignment.message or o.scan.note or None)
     points: int | None = _exact(lambda o, s: None if o.scan.pose else len(o.scan.points))
-    iterations: int | None = _exact(if_points(lambda o: o.alignment.iterations), table=True)
-    inliers: int | None = column(if_points(lambda o: o.alignment.inliers), "", "d", 0.001, 3)
+    iterations: int | None = _exact(_if_points(lambda o: o.alignment.iterations), table=True)
+    inliers: int | None = column(_if_points(lambda o: o.alignment.inliers), "", "d", 0.001, 3)
     inlier_ratio: float | None = column(
-        if_points(lambda o: o.alignment.inlier_ratio), "", ".3f", 0.001, 0.001, table=True
+        _if_points(lambda o: o.alignment.inlier_ratio), "", ".3f", 0.001, 0.001, table=True
     )
-    rms_m: float | None = column(if_points(lambda o: finite(o.alignment.rms_m)), "m", ".5f", 0.0001, 1e-07, table=True)
+    rms_m: float | None = column(_if_points(lambda o: finite(o.alignment.rms_m)), "m", ".5f", 0.0001, 1e-07, table=True)
     free_directions: str | None = _exact(lambda o, s: o.alignment.free_directions or None)
-    split_nis: float | None = _number(if_points(lambda o: finite(o.alignment.split_nis)), fmt=".1f")
-    reg_dof: float | None = _number(if_points(lambda o: finite(o.alignment.dof)), fmt=".0f")
-    reg_x_m: float | None = _metres(if_measured(lambda T: T.t[0]))
-    reg_y_m: float | None = _metres(if_measured(lambda T: T.t[1]))
-    reg_z_m: float | None = _metres(if_measured(lambda T: T.t[2]))
-    reg_qx: float | None = _number(if_measured(lambda T: T.q[0]))
-    reg_qy: float | None = _number(if_measured(lambda T: T.q[1]))
-    reg_qz: float | None = _number(if_measured(lambda T: T.q[2]))
-    reg_qw: float | None = _number(if_measured(lambda T: T.q[3]))
-    nis: float | None = column(if_innovation(lambda i: finite(i.chi2)), "", ".2f", 0.001, 0.0001, table=True)
-    cauchy_weight: float | None = _number(if_innovation(lambda i: i.weight), atol=0.0001)
-    innov_m: float | None = _metres(if_innovation(lambda i: finite(i.distance_m)))
+    split_nis: float | None = _number(_if_points(lambda o: finite(o.alignment.split_nis)), fmt=".1f")
+    reg_dof: float | None = _number(_if_points(lambda o: finite(o.alignment.dof)), fmt=".0f")
+    reg_x_m: float | None = _metres(_if_measured(lambda T: T.t[0]))
+    reg_y_m: float | None = _metres(_if_measured(lambda T: T.t[1]))
+    reg_z_m: float | None = _metres(_if_measured(lambda T: T.t[2]))
+    reg_qx: float | None = _number(_if_measured(lambda T: T.q[0]))
+    reg_qy: float | None = _number(_if_measured(lambda T: T.q[1]))
+    reg_qz: float | None = _number(_if_measured(lambda T: T.q[2]))
+    reg_qw: float | None = _number(_if_measured(lambda T: T.q[3]))
+    nis: float | None = column(_if_innovation(lambda i: finite(i.chi2)), "", ".2f", 0.001, 0.0001, table=True)
+    cauchy_weight: float | None = _number(_if_innovation(lambda i: i.weight), atol=0.0001)
+    innov_m: float | None = _metres(_if_innovation(lambda i: finite(i.distance_m)))
     innov_deg: float | None = column(
-        if_innovation(lambda i: finite(np.degrees(i.angle_rad))), "deg", ".3f", 0.0001, 0.0001
+        _if_innovation(lambda i: finite(np.degrees(i.angle_rad))), "deg", ".3f", 0.0001, 0.0001
     )
     estimator: str = _exact(lambda o, s: o.estimator)
     x_m: float | None = _metres(lambda o, s: float(o.pose.t[0]))
@@ -153,8 +197,8 @@ class Row:
     qy: float | None = _number(lambda o, s: float(o.pose.q[1]))
     qz: float | None = _number(lambda o, s: float(o.pose.q[2]))
     qw: float | None = _number(lambda o, s: float(o.pose.q[3]))
-    pos_1s_m: float | None = _number(lambda o, s: position_1s_m(o.pose_covariance), "m")
-    rot_1s_deg: float | None = _number(lambda o, s: full_angle_deg(np.diag(o.pose_covariance)[3:].sum()), "deg")
+    pos_1s_m: float | None = _number(lambda o, s: float(np.sqrt(max(np.diag(o.pose_covariance)[:3].sum(), 0.0))), "m")
+    rot_1s_deg: float | None = _number(lambda o, s: _full_angle_deg(np.diag(o.pose_covariance)[3:].sum()), "deg")
     wx_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[0]), "rad/s")
     wy_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[1]), "rad/s")
     wz_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[2]), "rad/s")
@@ -176,7 +220,7 @@ class Row:
     muy: float | None = _number(lambda o, s: float(o.belief.x.q_bc[1]))
     muz: float | None = _number(lambda o, s: float(o.belief.x.q_bc[2]))
     muw: float | None = _number(lambda o, s: float(o.belief.x.q_bc[3]))
-    mu_1s_deg: float | None = _number(lambda o, s: full_angle_deg(o.body.limited_1s[3] ** 2), "deg")
+    mu_1s_deg: float | None = _number(lambda o, s: _full_angle_deg(o.body.limited_1s[3] ** 2), "deg")
     com_x_m: float | None = _metres(lambda o, s: float(o.body.centre_c[0]))
     com_y_m: float | None = _metres(lambda o, s: float(o.body.centre_c[1]))
     com_z_m: float | None = _metres(lambda o, s: float(o.body.centre_c[2]))
@@ -196,10 +240,10 @@ class Row:
     moment_middle: float | None = _number(lambda o, s: float(o.body.moments[1]))
     moment_large: float | None = _number(lambda o, s: float(o.body.moments[2]))
     moments_1s: float | None = _number(lambda o, s: float(o.body.moments_1s.max()))
-    pos_err_m: float | None = _error_m(_ESTIMATE[0], table=True)
-    rot_err_deg: float | None = _error_deg(_ESTIMATE[1], table=True)
-    reg_pos_err_m: float | None = _error_m(_REGISTRATION[0])
-    reg_rot_err_deg: float | None = _error_deg(_REGISTRATION[1])
+    pos_err_m: float | None = _error_m(_of_error(lambda s: s.estimate, "distance_m"), table=True)
+    rot_err_deg: float | None = _error_deg(_of_error(lambda s: s.estimate, "angle_deg"), table=True)
+    reg_pos_err_m: float | None = _error_m(_of_error(lambda s: s.registration, "distance_m"))
+    reg_rot_err_deg: float | None = _error_deg(_of_error(lambda s: s.registration, "angle_deg"))
     reference: str | None = _exact(lambda o, s: s.reference)
     nees: float | None = column(lambda o, s: finite(s.nees), "", ".2f", 0.01, 0.001)
     nees_attitude: float | None = _nees("attitude")
@@ -209,8 +253,8 @@ class Row:
     nees_sigma: float | None = _nees("sigma")
     nees_varrho: float | None = _nees("varrho")
     nees_mu: float | None = _nees("mu")
-    r_pos_m: float | None = _number(if_innovation(lambda i: float(np.sqrt(np.diag(i.R)[:3].mean()))), "m")
-    r_rot_deg: float | None = _number(if_innovation(lambda i: full_angle_deg(np.diag(i.R)[3:].mean())), "deg")
+    r_pos_m: float | None = _number(_if_innovation(lambda i: float(np.sqrt(np.diag(i.R)[:3].mean()))), "m")
+    r_rot_deg: float | None = _number(_if_innovation(lambda i: _full_angle_deg(np.diag(i.R)[3:].mean())), "deg")
     sigma_hits: int | None = _exact(lambda o, s: o.sigma_hits)
     r_floors: int | None = _exact(lambda o, s: o.r_floors)
     reinitialised: int | None = _exact(lambda o, s: o.reinitialised)
@@ -244,10 +288,10 @@ class Row:
         lambda o, s: float(np.degrees(o.monitors.forecast.rot_1s_rad.max())), "deg"
     )
     plan_status: str | None = _exact(lambda o, s: None if o.plan is None else o.plan.status.value)
-    capture_time_s: float | None = _seconds(if_planned(lambda o, p: since_start_s(o, p.t_ns) + p.t_go_s), table=True)
-    t_go_s: float | None = _seconds(if_planned(lambda o, p: p.t_go_s - (o.scan.t_ns - p.t_ns) * 1e-09))
+    capture_time_s: float | None = _seconds(_if_planned(lambda o, p: _since_start_s(o, p.t_ns) + p.t_go_s), table=True)
+    t_go_s: float | None = _seconds(_if_planned(lambda o, p: p.t_go_s - (o.scan.t_ns - p.t_ns) * 1e-09))
     earliest_capture_s: float | None = _seconds(
-        lambda o, s: None if o.plan is None else since_start_s(o, o.plan.t_ns) + o.plan.lower_bound_s
+        lambda o, s: None if o.plan is None else _since_start_s(o, o.plan.t_ns) + o.plan.lower_bound_s
     )
     plan_margin_m: float | None = column(
         lambda o, s: None if o.plan is None else finite(o.plan.margin_m), "m", ".4f", 0.0, 0.01
@@ -256,16 +300,16 @@ class Row:
     abort_margin_m: float | None = column(
         lambda o, s: None if o.plan is None else finite(o.plan.abort_margin_m), "m", ".4f", 0.0, 0.01
     )
-    gripper_ready_s: float | None = _seconds(if_planned(lambda o, p: finite(since_start_s(o, p.t_ns) + p.attitude_s)))
-    plan_delay: str | None = _exact(if_planned(lambda o, p: p.delayed_by or None))
-    plan_miss_m: float | None = _error_m(_PLANNED[0])
-    plan_miss_mps: float | None = _error_m(_PLANNED[1], "m/s")
-    plan_miss_deg: float | None = _error_deg(_PLANNED[2])
+    gripper_ready_s: float | None = _seconds(_if_planned(lambda o, p: finite(_since_start_s(o, p.t_ns) + p.attitude_s)))
+    plan_delay: str | None = _exact(_if_planned(lambda o, p: p.delayed_by or None))
+    plan_miss_m: float | None = _error_m(_of_error(lambda s: s.planned, "distance_m"))
+    plan_miss_mps: float | None = _error_m(_of_error(lambda s: s.planned, "speed_mps"), "m/s")
+    plan_miss_deg: float | None = _error_deg(_of_error(lambda s: s.planned, "angle_deg"))
     action: str = _exact(lambda o, s: o.action, table=True)
     supervisor_rule: str = _exact(lambda o, s: o.supervisor_rule)
-    capture_miss_m: float | None = _error_m(_CAPTURED[0])
-    capture_miss_mps: float | None = _error_m(_CAPTURED[1], "m/s")
-    capture_miss_deg: float | None = _error_deg(_CAPTURED[2])
+    capture_miss_m: float | None = _error_m(_of_error(lambda s: s.captured, "distance_m"))
+    capture_miss_mps: float | None = _error_m(_of_error(lambda s: s.captured, "speed_mps"), "m/s")
+    capture_miss_deg: float | None = _error_deg(_of_error(lambda s: s.captured, "angle_deg"))
 
     @classmethod
     def of(cls, outcome: Outcome, score: Score) -> Row:

@@ -48,7 +48,7 @@ def scene(rng):
         c = Rotation.from_quat(attitude(t)).apply(arm)
         return CENTRE + np.outer(t, DRIFT) + c, DRIFT + np.cross(w, c)
 
-    return Scene(goal, attitude, x, -arm, radius_m=RADIUS)
+    return Scene(goal, attitude, x, -arm, hull_c=RADIUS * x[None] - arm)
 
 
 def inputs(rng, end_s=160.0, step_s=0.5):

@@ -50,7 +50,8 @@ def test_signed_distance_of_the_built_in_target():
     assert target.surface(inside)[1][0] < 0.0
     foot, distance = target.surface(outside)
     assert distance[0] == pytest.approx(np.linalg.norm(outside - foot))
-    assert target.radius(np.zeros(3)) == pytest.approx(np.linalg.norm(surface.vertices, axis=1).max())
+    furthest = np.linalg.norm(surface.vertices + X, axis=1).max()  # from the centre of mass of ``still``
+    assert still(hull_c=target.hull_c).radius_m == pytest.approx(furthest)
 
 
 def test_the_workspace_is_a_shell_about_the_base():

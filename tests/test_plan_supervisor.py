@@ -144,7 +144,7 @@ def inputs(truth, error=0.0, blind=(), sigma=(0.001, 0.0003, 0.001), growth=0.0,
             return Forecast(dt, sigma[0] * grown, sigma[1] * grown, sigma[2] * grown)
 
         x = np.array([0.0, 0.0, -1.0])
-        scene = Scene(goal, lambda dt, t=t: truth(t + dt)[2], x, np.array([0.0, 0.0, 1.0]), radius_m=1.5)
+        scene = Scene(goal, lambda dt, t=t: truth(t + dt)[2], x, -x, hull_c=1.5 * x[None] - x)
         yield PlannerInput(round(t * 1e9), gamma, t >= from_s, scene, forecast)
 
 

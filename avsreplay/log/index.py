@@ -1,4 +1,4 @@
-"""The index of a log: its topics, chunks, the places of its messages, and the base class of the log readers."""
+"""The index of a log: its topics, chunks and the places of its messages; base class of the log readers; its clouds."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from avsreplay.log.bytes_io import BadMessage, ByteFile, inflate
 from avsreplay.log.cdr import Cursor
 from avsreplay.log.mcap_format import ChunkHead
 from avsreplay.log.options import Loss, TopicInfo
+from avsreplay.log.point_cloud2 import Cloud, decode_cloud
 
 MAX_NS = (2**31 - 2) * 1_000_000_000  # a ROS 2 time has 31 bits of seconds; a later one is cut to this
 CLOUD_TYPES = ("sensor_msgs/msg/PointCloud2",)
@@ -115,7 +116,7 @@ class MessageTable:
 
     def clouds(self, topic: str) -> CloudIndex:
         """Return the index of a cloud topic."""
-        return self._clouds.get(topic, CloudIndex())
+        return self._clouds.get(topic) or CloudIndex()
 
 
 def _stamp(payload: memoryview, encoding: str) -> int:
@@ -215,6 +216,46 @@ class Recording:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+class MessageClouds:
+    """The clouds of one topic of a recording, ordered by log time, then by file order.
+
+    Attributes:
+        kind: the format in words.
+        topic: the cloud topic, None if there is none to read.
+        log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header [ns], one per cloud.
+    """
+
+    def __init__(self, recording: Recording, topic: str | None) -> None:
+        self.kind, self.topic, self._recording = recording.kind, topic, recording
+        index = recording.clouds(topic or "")
+        self._places = index.order()
+        self._encoding = next((t.encoding for t in recording.topics() if t.name == topic), "cdr")
+        self.log_ns = [index.log_ns[i] for i in self._places]
+        self.publish_ns = [index.publish_ns[i] for i in self._places]
+        self.header_ns = [index.header_ns[i] for i in self._places]
+
+    @property
+    def losses(self) -> Sequence[Loss]:
+        """Parts of the log that could not be read."""
+        return self._recording.losses
+
+    def load(self, place: int) -> Cloud:
+        """Return the decoded cloud. Raises BadMessage if it cannot be decoded."""
+        return decode_cloud(*self.payload(place))
+
+    def payload(self, place: int) -> tuple[bytes | memoryview, str]:
+        """Return the serialised message and its encoding. Raises BadMessage if it cannot be read."""
+        return self._recording.read(self.topic or "", self._places[place]), self._encoding
+
+    def topics(self) -> list[TopicInfo]:
+        """Return all topics of the recording, sorted by name."""
+        return self._recording.topics()
+
+    def close(self) -> None:
+        """Close the recording."""
+        self._recording.close()
 
 
 class Merged(Recording):

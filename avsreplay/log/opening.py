@@ -15,7 +15,7 @@ from avsreplay.log import streams
 from avsreplay.log.bytes_io import BadMessage, shown
 from avsreplay.log.db3_file import SQLITE_MAGIC, Db3File
 from avsreplay.log.header import HEADER_RECORD, decode_header, in_metres, octahedron, parse_surface, read_surface
-from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, Recording, Sink
+from avsreplay.log.index import CLOUD_TYPES, POSE_NAMES, Merged, MessageClouds, Recording, Sink
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import MAGIC
 from avsreplay.log.options import Loss, SourceOptions, TopicInfo
@@ -83,12 +83,12 @@ def _messages(path: Path, options: SourceOptions, inspect: bool, upto: int | Non
         header, lost = _header(recording, options)
         ground_truth = collector.ground_truth()
         if options.poses:
-            clouds: streams.MessageClouds = streams.PoseMessages(recording, topic)
+            clouds: MessageClouds = streams.PoseMessages(recording, topic)
             header = _pose_header(header, options)
             if topic == (options.truth_topic or TRUTH_TOPIC):  # a measurement is not its own truth
                 ground_truth = replace(ground_truth, truth=None, track=None)
         else:
-            clouds = streams.MessageClouds(recording, topic)
+            clouds = MessageClouds(recording, topic)
     except BaseException:
         recording.close()
         raise

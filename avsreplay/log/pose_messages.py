@@ -193,6 +193,10 @@ class PoseTrack:
         row = self._at(t_ns)
         return None if row is None else Pose(row[3:7], row[:3])
 
+    def at_scan(self, t_ns: int, _place: int, _frame: str) -> Pose | None:
+        """Return the pose at the instant of a scan, whatever its number and frame."""
+        return self.pose(t_ns)
+
     def body(self, t_ns: int, constants: State) -> State | None:
         """Return the full state from poses of {B} in {A} and twists in {B}; ``constants`` gives sigma, c_b and q_bc."""
         row = self._at(t_ns)

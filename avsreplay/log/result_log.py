@@ -8,6 +8,7 @@ stays. Each numeric column has a topic ``/rows/NAME``.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -169,14 +170,24 @@ class ResultLog:
     def _copy(self, written: Path, changed: Mapping[int, Mapping[str, float]]) -> None:
         from mcap.reader import NonSeekingReader
 
+        pending: dict[str, float] = {}
+        last_ns = 0
+
+        def end_row() -> None:
+            if pending:
+                self._append_columns(changed.get(self._count - 1, pending), last_ns)
+                pending.clear()
+
         with written.open("rb") as stream:
             for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
-                columns = changed.get(message.sequence - 1) if channel.topic.startswith(_ROWS) else None
-                if columns is None:
-                    self._count = message.sequence
-                    self._append(channel.topic, message.log_time, message.data)
-                elif channel.topic == _ROWS + next(iter(columns)):  # the first of the row stands for all
-                    self._append_columns(columns, message.log_time)
+                if channel.topic.startswith(_ROWS):  # the columns of a scan are written together
+                    pending[channel.topic.removeprefix(_ROWS)] = struct.unpack_from("<d", message.data, 4)[0]
+                    last_ns = message.log_time
+                    continue
+                end_row()
+                self._count = message.sequence
+                self._append(channel.topic, message.log_time, message.data)
+        end_row()
 
     def _append_columns(self, columns: Mapping[str, float], t_ns: int) -> None:
         channels = [self._channel(_ROWS + name) for name in columns]

@@ -18,9 +18,9 @@ from avsreplay.binary_files import BadFile
 from avsreplay.errors import UsageError
 from avsreplay.geometry import Pose
 from avsreplay.log.bytes_io import BadMessage, shown
-from avsreplay.log.index import Recording, Sink
+from avsreplay.log.index import MessageClouds, Recording, Sink
 from avsreplay.log.options import ClockChoice, Loss, SourceOptions, TopicInfo
-from avsreplay.log.point_cloud2 import Cloud, decode_cloud, usable
+from avsreplay.log.point_cloud2 import Cloud, usable
 from avsreplay.log.pose_files import TimedPoses, read_measured, read_poses
 from avsreplay.log.pose_messages import POSE_TYPES, TF_TYPE, PoseTrack, TfBuffer, decode_measured
 from avsreplay.log.scan_files import read_points
@@ -30,46 +30,6 @@ T = TypeVar("T")
 _WAIT_S = 0.1
 _NO_POINTS = np.zeros((0, 3), np.float32)
 EPOCH_NS = 1_000_000_000  # stamp of the first scan of a folder: a stamp of zero means "unset"
-
-
-class MessageClouds:
-    """The clouds of one topic of a recording, ordered by log time, then by file order.
-
-    Attributes:
-        kind: the format in words.
-        topic: the cloud topic, None if there is none to read.
-        log_ns, publish_ns, header_ns: time of reception, of sending, and in the message header [ns], one per cloud.
-    """
-
-    def __init__(self, recording: Recording, topic: str | None) -> None:
-        self.kind, self.topic, self._recording = recording.kind, topic, recording
-        index = recording.clouds(topic or "")
-        self._places = index.order()
-        self._encoding = next((t.encoding for t in recording.topics() if t.name == topic), "cdr")
-        self.log_ns = [index.log_ns[i] for i in self._places]
-        self.publish_ns = [index.publish_ns[i] for i in self._places]
-        self.header_ns = [index.header_ns[i] for i in self._places]
-
-    @property
-    def losses(self) -> Sequence[Loss]:
-        """Parts of the log that could not be read."""
-        return self._recording.losses
-
-    def load(self, place: int) -> Cloud:
-        """Return the decoded cloud. Raises BadMessage if it cannot be decoded."""
-        return decode_cloud(*self.payload(place))
-
-    def payload(self, place: int) -> tuple[bytes | memoryview, str]:
-        """Return the serialised message and its encoding. Raises BadMessage if it cannot be read."""
-        return self._recording.read(self.topic or "", self._places[place]), self._encoding
-
-    def topics(self) -> list[TopicInfo]:
-        """Return all topics of the recording, sorted by name."""
-        return self._recording.topics()
-
-    def close(self) -> None:
-        """Close the recording."""
-        self._recording.close()
 
 
 class PoseMessages(MessageClouds):
@@ -89,8 +49,25 @@ class PoseMessages(MessageClouds):
         return Cloud(stamp_ns, frame, _NO_POINTS, None, 0, pose)
 
 
-class PoseFile:
-    """The measured poses of a file; same interface as MessageClouds.
+class _Files:
+    """What clouds and poses from files have in common; same interface as MessageClouds."""
+
+    topic: str | None = None
+    losses: Sequence[Loss] = ()
+
+    def payload(self, place: int) -> None:
+        """Return None: files hold no messages."""
+
+    def topics(self) -> list[TopicInfo]:
+        """Return no topics."""
+        return []
+
+    def close(self) -> None:
+        """Do nothing: no file is held open."""
+
+
+class PoseFile(_Files):
+    """The measured poses of a file.
 
     Args:
         path: the file.
@@ -98,8 +75,6 @@ class PoseFile:
     """
 
     kind = "pose file"
-    topic: str | None = None
-    losses: Sequence[Loss] = ()
 
     def __init__(self, path: Path, rate_hz: float) -> None:
         found = read_measured(path)
@@ -115,19 +90,9 @@ class PoseFile:
             raise BadMessage(pose)
         return Cloud(self.header_ns[place], "", _NO_POINTS, None, 0, pose)
 
-    def payload(self, place: int) -> None:
-        """Return None: the file has lines, not messages."""
 
-    def topics(self) -> list[TopicInfo]:
-        """Return no topics: it is a single file."""
-        return []
-
-    def close(self) -> None:
-        """Do nothing: the file is not held open."""
-
-
-class FolderClouds:
-    """The scan files of a folder as clouds; same interface as MessageClouds.
+class FolderClouds(_Files):
+    """The scan files of a folder as clouds.
 
     Args:
         files: the files, in order.
@@ -137,8 +102,6 @@ class FolderClouds:
     """
 
     kind = "folder"
-    topic: str | None = None
-    losses: Sequence[Loss] = ()
 
     def __init__(self, files: list[Path], rate_hz: float, limit: int, times_ns: list[int] | None = None) -> None:
         self._files, self._limit = files, limit
@@ -160,16 +123,6 @@ class FolderClouds:
         chosen = usable(points)
         kept = points if chosen is None else points[chosen]
         return Cloud(self.header_ns[place], "", kept, None, len(points) - len(kept))
-
-    def payload(self, place: int) -> None:
-        """Return None: a folder has files, not messages."""
-
-    def topics(self) -> list[TopicInfo]:
-        """Return no topics: a folder has files."""
-        return []
-
-    def close(self) -> None:
-        """Do nothing: no file is held open."""
 
 
 CloudStream = MessageClouds | FolderClouds | PoseFile
@@ -305,7 +258,7 @@ class TruthCollector:
             return file_truth(read_poses(self.options.truth_file), self.options.truth_gap_s)
         if child is not None:
             return (lambda t_ns, _place, frame: self._tf.pose(fixed or frame, child, t_ns)), None
-        return _by_time(self._truth) if len(self._truth) else (None, None)
+        return (self._truth.at_scan, self._truth) if len(self._truth) else (None, None)
 
     def _sensor_lookup(self) -> Callable[[int, str], Pose | None] | None:
         fixed = self.options.fixed_frame
@@ -324,11 +277,7 @@ def file_truth(found: TimedPoses, gap_s: float) -> tuple[TruthLookup, PoseTrack 
     track = PoseTrack(gap_s)
     for t_ns, pose in zip(found.t_ns, found.poses, strict=True):
         track.add(t_ns, (*pose.t.tolist(), *pose.q.tolist()))
-    return _by_time(track)
-
-
-def _by_time(track: PoseTrack) -> tuple[TruthLookup, PoseTrack]:
-    return (lambda t_ns, _place, _frame: track.pose(t_ns)), track
+    return track.at_scan, track
 
 
 def _poses_of(topics: Sequence[TopicInfo]) -> str:

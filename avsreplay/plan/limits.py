@@ -36,7 +36,7 @@ class Scene:
         centre_c: (3,) centre of mass in {C} [m], the centre of the sphere; None where unknown.
         surface: Points (n, 3) in {C} -> closest points (n, 3), signed distances (n,) (see ``Margins``); None: unknown.
         sigma: Times (n,) ascending [s] -> predicted 1 sigma of the position [m] and attitude [rad] of {C}, each (n,).
-        radius_m: Radius of the sphere about the centre of mass that contains the target in every attitude.
+        hull_c: (n, 3) points in {C} with the same convex hull as the target's surface [m]; None: unknown.
     """
 
     goal: Trajectory
@@ -45,7 +45,14 @@ class Scene:
     centre_c: Array | None = None
     surface: Callable[[Array], tuple[Array, Array]] | None = None
     sigma: Callable[[Array], tuple[Array, Array]] | None = None
-    radius_m: float = 0.0
+    hull_c: Array | None = None
+
+    @property
+    def radius_m(self) -> float:
+        """Radius of the sphere about the centre of mass that contains the target in every attitude [m]; 0: unknown."""
+        if self.hull_c is None or self.centre_c is None:
+            return 0.0
+        return float(np.sqrt(np.max(np.sum((self.hull_c - self.centre_c) ** 2, axis=1))))
 
     def centre(self, times: Array) -> Array:
         """Return the centre of mass (n, 3) in {A} [m], or the grasp point where it is unknown.
@@ -110,14 +117,6 @@ class TargetGeometry:
     axis_c: Array
     hull_c: Array
     surface: Callable[[Array], tuple[Array, Array]] | None = None
-
-    def radius(self, centre_c: Array) -> float:
-        """Return the radius of the sphere about a centre that contains the target [m].
-
-        Args:
-            centre_c: (3,) the centre in {C} [m].
-        """
-        return float(np.sqrt(np.max(np.sum((self.hull_c - centre_c) ** 2, axis=1))))
 
 
 def hull_vertices(vertices: Array) -> Array:

@@ -180,7 +180,9 @@ class SummaryFold:
 
     def add(self, row: Row) -> None:
         """Take the next row."""
-        self.extend((row,))
+        for name, column in self._taken.items():
+            column.append(getattr(row, name))
+        self._last = row
 
     def extend(self, rows: Sequence[Row]) -> None:
         """Take the next rows."""
