@@ -14,8 +14,8 @@ The order and the signs of the principal axes are arbitrary: (q, mu, sigma) are 
 permutations, proper rotations R_bn (columns: new axes in the old {B}). sigma follows the permutation and changes its
 sign if the permutation is odd: s'_i = parity * s_perm(i). The truth is therefore compared modulo these.
 
-Displacement, difference, state and Jacobian of a chart are computed by the extension (``kernel/chart.cpp``), which the
-fit uses as well.
+Displacement, difference, state, Jacobian and inertia of a chart are computed by the extension (``kernel/chart.cpp``),
+which the fit uses as well.
 
 ``body_parameters`` gives inertia, mass centre and rate in {C}, which do not depend on order and signs of the axes.
 """
@@ -141,11 +141,6 @@ class Chart:
         return _motion.minus(self.flat, other.flat)
 
 
-def inertia_matrices(y: Array) -> Array:
-    """Traceless symmetric matrices (n, 3, 3) of the chart's inertia steps (n, 5)."""
-    return np.asarray(np.tensordot(y, _BASIS, 1))
-
-
 def to_chart(x: State) -> Chart:
     """Chart coordinates of a state; |sigma| must be below 1."""
     return Chart(_motion.chart(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc))
@@ -257,24 +252,18 @@ def body_parameters(belief: Belief) -> BodyParameters:
     (unscented transform). The tensor is divided by its trace, so that they stay in the physical range.
     """
     chart = to_chart(belief.x)
-    T = to_errors(chart)
-    P = np.linalg.solve(T, np.linalg.solve(T, belief.P).T)
-    values, vectors = np.linalg.eigh(0.5 * (P + P.T)[INERTIA, INERTIA])
-    n = len(values)
-    steps = vectors * np.minimum(np.sqrt(np.maximum(values, 0.0)), _LARGEST_1S) * np.sqrt(n)
-    tensors = _inertia(chart.M + inertia_matrices(np.concatenate([np.zeros((1, n)), steps.T, -steps.T])))
-    moments = np.linalg.eigvalsh(tensors)
-    spread = [np.sqrt(np.mean((found[1:] - found[0]) ** 2, axis=0)) for found in (tensors, moments)]
+    found = _motion.body(chart.flat, belief.P, _LARGEST_1S)
+    arm_variance, rate_variance = found[24:].tolist()
     return BodyParameters(
-        inertia=tensors[0],
-        inertia_1s=spread[0],
-        moments=moments[0],
-        moments_1s=spread[1],
+        inertia=found[:9].reshape(3, 3),
+        inertia_1s=found[9:18].reshape(3, 3),
+        moments=found[18:21],
+        moments_1s=found[21:24],
         centre_c=-chart.arm_c,
-        centre_1s_m=float(np.sqrt(np.trace(P[ARM, ARM]))),
+        centre_1s_m=math.sqrt(arm_variance),
         rate_c=chart.w_c,
-        rate_1s_radps=float(np.sqrt(np.trace(P[RATE, RATE]))),
-        limited_1s=_limited_1s(belief, float(np.trace(P[ARM, ARM]))),
+        rate_1s_radps=math.sqrt(rate_variance),
+        limited_1s=_limited_1s(belief, arm_variance),
     )
 
 
@@ -287,17 +276,9 @@ def _limited_1s(belief: Belief, arm_variance: float) -> tuple[float, float, floa
     x, variance = belief.x, np.maximum(np.diagonal(belief.P), 0.0)
     sigma = np.sqrt(np.minimum(variance[SIGMA], 1.0 / 3.0 + x.sigma**2))
     varrho = min(float(variance[VARRHO].sum()), arm_variance + 2.0 * float(x.c_b @ x.c_b))
-    return float(sigma[0]), float(sigma[1]), float(np.sqrt(varrho)), min(_root(variance[DMU]), ANY_HALF_RAD)
-
-
-def _root(variances: Array) -> float:
-    return float(np.sqrt(variances.sum()))
-
-
-def _inertia(M: Array) -> Array:
-    """Inertia tensors (n, 3, 3) over their trace, from the logarithms M (n, 3, 3) of the second mass moments."""
-    values, vectors = np.linalg.eigh(M)
-    mass = np.exp(values - values.max(axis=1, keepdims=True))
-    mass /= 2.0 * mass.sum(axis=1, keepdims=True)  # the trace of the inertia is twice that of the mass moments
-    moments = mass.sum(axis=1, keepdims=True) - mass
-    return np.asarray((vectors * moments[:, None, :]) @ np.swapaxes(vectors, 1, 2))
+    return (
+        float(sigma[0]),
+        float(sigma[1]),
+        float(np.sqrt(varrho)),
+        min(float(np.sqrt(variance[DMU].sum())), ANY_HALF_RAD),
+    )

@@ -239,6 +239,14 @@ Numpy errors(const Flat& from) {
   return made(T);
 }
 
+Numpy body_numbers(const Flat& from, const Matrix<DIM, DIM>& P, double largest) {
+  double* to;
+  Numpy out = array({sizeof(BodyNumbers) / sizeof(double)}, &to);
+  const BodyNumbers found = numbers_of(chart(from), as<Square>(P.data()), largest);
+  std::memcpy(to, &found, sizeof found);
+  return out;
+}
+
 void create(Problem* self, const Times& t, const Matrix<-1, 4>& q, const Matrix<-1, 3>& p,
             const Matrix<-1, SEEN, SEEN>& root, const Matrix<-1, 2, 3, 3>& info, const Flat& mean,
             const Matrix<DIM, DIM>& prior_info) {
@@ -439,6 +447,7 @@ NB_MODULE(_motion, m) {
   m.def("minus", &minus_of, nb::arg("chart"), nb::arg("other"));
   m.def("state", &state, nb::arg("chart"));
   m.def("errors", &errors, nb::arg("chart"));
+  m.def("body", &body_numbers, nb::arg("chart"), nb::arg("P"), nb::arg("largest"));
   m.def("transition", &transition_of, nb::arg("chart"), nb::arg("h"), nb::arg("path"));
   m.def("carry", &carry_of, nb::arg("chart"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
         nb::arg("force"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("factors"), nb::arg("weight"));

@@ -28,7 +28,125 @@ void put(const M3& A, double f, int row, int column, double T[DIM][DIM]) {
     for (int c = 0; c < 3; ++c) T[row + r][column + c] = f * A.x[r][c];
 }
 
+// Inertia tensor over its trace and its ascending eigenvalues, from the logarithm M of the mass moments.
+void inertia(const M3& M, double tensor[3][3], double moments[3]) {
+  const M3 V = matrix(eigenvectors(M)), D = seen_by(transposed(V), M);
+  const double largest = std::max({D.x[0][0], D.x[1][1], D.x[2][2]});
+  double mass[3], sum = 0;
+  for (int k = 0; k < 3; ++k) sum += mass[k] = exp_of(D.x[k][k] - largest);
+  for (int k = 0; k < 3; ++k) moments[k] = 0.5 * (sum - mass[k]) / sum;  // the trace of the inertia is twice that of the mass
+  for (int i = 0; i < 3; ++i)
+    for (int j = 0; j < 3; ++j) {
+      tensor[i][j] = 0;
+      for (int k = 0; k < 3; ++k) tensor[i][j] += V.x[i][k] * moments[k] * V.x[j][k];
+    }
+  std::sort(moments, moments + 3);
+}
+
+// Rows of the inverse of T, which is overwritten: Gauss-Jordan elimination with row pivots. False if T is singular.
+bool invert(double T[DIM][DIM], double out[DIM][DIM]) {
+  std::memset(out, 0, sizeof(double) * DIM * DIM);
+  for (int k = 0; k < DIM; ++k) out[k][k] = 1;
+  for (int k = 0; k < DIM; ++k) {
+    int pivot = k;
+    for (int r = k + 1; r < DIM; ++r)
+      if (std::fabs(T[r][k]) > std::fabs(T[pivot][k])) pivot = r;
+    if (!(std::fabs(T[pivot][k]) > 0)) return false;
+    for (int c = 0; c < DIM; ++c) std::swap(T[k][c], T[pivot][c]), std::swap(out[k][c], out[pivot][c]);
+    const double one = 1 / T[k][k];
+    for (int c = 0; c < DIM; ++c) T[k][c] *= one, out[k][c] *= one;
+    for (int r = 0; r < DIM; ++r) {
+      const double f = T[r][k];
+      if (r == k || f == 0) continue;
+      for (int c = 0; c < DIM; ++c) T[r][c] -= f * T[k][c], out[r][c] -= f * out[k][c];
+    }
+  }
+  return true;
+}
+
+// Eigenvalues, on the diagonal of a symmetric S, and eigenvectors, the columns of V: cyclic Jacobi rotations.
+template <int N>
+void eigen(double S[N][N], double V[N][N]) {
+  for (int r = 0; r < N; ++r)
+    for (int c = 0; c < N; ++c) V[r][c] = r == c;
+  for (int sweep = 0; sweep < 30; ++sweep) {
+    double off = 0, size = 0;
+    for (int r = 0; r < N; ++r)
+      for (int c = 0; c < N; ++c) (r == c ? size : off) += S[r][c] * S[r][c];
+    if (!(off > 1e-32 * size)) return;
+    for (int i = 0; i < N; ++i)
+      for (int j = i + 1; j < N; ++j) {
+        if (S[i][j] == 0) continue;
+        const double ratio = (S[j][j] - S[i][i]) / (2 * S[i][j]);
+        const double tan = std::copysign(1 / (std::fabs(ratio) + std::sqrt(ratio * ratio + 1)), ratio);
+        const double cos = 1 / std::sqrt(tan * tan + 1), sin = tan * cos;
+        for (int k = 0; k < N; ++k) {
+          const double a = S[k][i], b = S[k][j];
+          S[k][i] = cos * a - sin * b, S[k][j] = sin * a + cos * b;
+        }
+        for (int k = 0; k < N; ++k) {
+          const double a = S[i][k], b = S[j][k], u = V[k][i], w = V[k][j];
+          S[i][k] = cos * a - sin * b, S[j][k] = sin * a + cos * b;
+          V[k][i] = cos * u - sin * w, V[k][j] = sin * u + cos * w;
+        }
+        S[i][j] = S[j][i] = 0;
+      }
+  }
+}
+
+// out := variances and covariances of chart coordinates `first` to `first + N`, where `inverse` is that of errors_of.
+template <int N>
+void block(const double inverse[DIM][DIM], const double P[DIM][DIM], int first, double out[N][N]) {
+  double XP[N][DIM];
+  product<N, DIM>(*reinterpret_cast<const double(*)[N][DIM]>(inverse[first]), P, XP);
+  for (int r = 0; r < N; ++r)
+    for (int c = 0; c < N; ++c) {
+      out[r][c] = 0;
+      for (int i = 0; i < DIM; ++i) out[r][c] += XP[r][i] * inverse[first + c][i];
+    }
+}
+
+double trace(const double A[3][3]) { return A[0][0] + A[1][1] + A[2][2]; }
+
 }  // namespace
+
+BodyNumbers numbers_of(const Chart& c, const double P[DIM][DIM], double largest) {
+  BodyNumbers out;
+  double T[DIM][DIM], inverse[DIM][DIM], small[3][3], S[5][5], V[5][5];
+  errors_of(c, T);
+  if (!invert(T, inverse)) std::fill(&inverse[0][0], &inverse[0][0] + DIM * DIM, NAN);
+  block<3>(inverse, P, ARM, small);
+  out.arm_variance = trace(small);
+  block<3>(inverse, P, RATE, small);
+  out.rate_variance = trace(small);
+  block<5>(inverse, P, INERTIA, S);
+  for (int r = 0; r < 5; ++r)
+    for (int k = 0; k < r; ++k) S[r][k] = S[k][r] = 0.5 * (S[r][k] + S[k][r]);
+  eigen<5>(S, V);
+  inertia(c.M, out.inertia, out.moments);
+  std::memset(out.inertia_1s, 0, sizeof out.inertia_1s);
+  std::memset(out.moments_1s, 0, sizeof out.moments_1s);
+  for (int k = 0; k < 5; ++k)
+    for (int side = -1; side <= 1; side += 2) {
+      const double length = side * std::sqrt(5.0) * std::min(std::sqrt(std::max(S[k][k], 0.0)), largest);
+      double tensor[3][3], moments[3];
+      M3 M = c.M;
+      for (int n = 0; n < 5; ++n)
+        for (int i = 0; i < 3; ++i)
+          for (int j = 0; j < 3; ++j) M.x[i][j] += length * V[n][k] * BASIS[n].x[i][j];
+      inertia(M, tensor, moments);
+      for (int i = 0; i < 3; ++i) {
+        out.moments_1s[i] += (moments[i] - out.moments[i]) * (moments[i] - out.moments[i]) / 10;
+        for (int j = 0; j < 3; ++j)
+          out.inertia_1s[i][j] += (tensor[i][j] - out.inertia[i][j]) * (tensor[i][j] - out.inertia[i][j]) / 10;
+      }
+    }
+  for (int i = 0; i < 3; ++i) {
+    out.moments_1s[i] = std::sqrt(out.moments_1s[i]);
+    for (double& one : out.inertia_1s[i]) one = std::sqrt(one);
+  }
+  return out;
+}
 
 Chart moved(const Chart& c, const double y[DIM]) {
   Chart out = c;

@@ -35,4 +35,14 @@ double least_gap(const Chart& c);
 // Jacobian T of state_of: error states d = T y of a small step y.
 void errors_of(const Chart& c, double T[DIM][DIM]);
 
+// Inertia over its trace and principal moments (ascending) of a body, with their standard deviations, and the sums of the
+// variances of arm and rate. An array of 26 numbers in Python.
+struct BodyNumbers {
+  double inertia[3][3], inertia_1s[3][3], moments[3], moments_1s[3], arm_variance, rate_variance;
+};
+
+// The numbers of a chart with the covariance P of its error states. The inertia is a nonlinear function of M: its
+// deviations are those of ten sigma points, at most `largest` standard deviations of M away.
+BodyNumbers numbers_of(const Chart& c, const double P[DIM][DIM], double largest);
+
 }  // namespace avs
