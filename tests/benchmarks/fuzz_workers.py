@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
-import resource
 import signal
 import sys
 import tempfile
@@ -19,6 +18,9 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from command_server import exit_code
+
+if sys.platform != "win32":  # a campaign needs the forks, alarms and limits of POSIX; its inputs do not
+    import resource
 
 WALL = 20  # limit of wall time per limit of processor time, because machines are shared
 
