@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -20,7 +20,6 @@ from avsreplay.log.header import HEADER_RECORD, MODEL_ENDINGS, decode_header, pa
 from avsreplay.log.index import CLOUD_TYPES, MAX_NS
 from avsreplay.log.mcap_file import McapFile
 from avsreplay.log.mcap_format import Channel, is_mcap
-from avsreplay.log.mcap_writer import McapWriter
 from avsreplay.log.opening import open_source
 from avsreplay.log.options import ClockSummary, LogInfo, Loss, SourceOptions
 from avsreplay.log.point_cloud2 import decode_cloud, read_layout
@@ -254,8 +253,11 @@ class _Copier:
     """A RecordSink that writes the records to a new file."""
 
     def __init__(self, stream: BinaryIO, profile: str) -> None:
+        from mcap.writer import Writer
+
         self.done = Repaired()
-        self._writer = McapWriter(stream, LIBRARY, chunk_bytes=_CHUNK_BYTES, profile=profile)
+        self._writer: Any = Writer(stream, _CHUNK_BYTES, enable_data_crcs=True)
+        self._writer.start(profile=profile, library=LIBRARY)
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._channels: dict[int, int] = {}
 
@@ -271,7 +273,7 @@ class _Copier:
             self.done.dropped.append(f"a message on {shown(channel.topic)} of an impossible time")
             return
         number = self._channel(channel)
-        self._writer.message(number, times[0], bytes(payload), sequence, min(times[1], MAX_NS))
+        self._writer.add_message(number, times[0], bytes(payload), min(times[1], MAX_NS), sequence)
         self.done.messages += 1
 
     def attachment(self, name: str, media: str, times: tuple[int, int], data: memoryview) -> None:
@@ -282,7 +284,7 @@ class _Copier:
             except UnreadableInput as error:
                 self.done.dropped.append(f"the model inside: {shown(error)}")
                 return
-        self._writer.attachment(name, media, bytes(data), times)
+        self._writer.add_attachment(times[1], times[0], name, media, bytes(data))
         self.done.attachments += 1
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
@@ -293,7 +295,7 @@ class _Copier:
             except ValueError as error:
                 self.done.dropped.append(f"the header record: {shown(error)}")
                 return
-        self._writer.metadata(name, values)
+        self._writer.add_metadata(name, values)
         self.done.records += 1
 
     def finish(self) -> None:
@@ -304,8 +306,8 @@ class _Copier:
         if channel.id not in self._channels:
             key = (channel.type, channel.schema_encoding, channel.schema)
             if key not in self._schemas:
-                self._schemas[key] = self._writer.schema(*key)
-            new = self._writer.channel(channel.topic, channel.encoding, self._schemas[key], channel.metadata)
+                self._schemas[key] = self._writer.register_schema(*key)
+            new = self._writer.register_channel(channel.topic, channel.encoding, self._schemas[key], channel.metadata)
             self._channels[channel.id] = new
         return self._channels[channel.id]
 

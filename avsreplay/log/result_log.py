@@ -14,13 +14,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, schema_text, transform
-from avsreplay.log.mcap_writer import McapWriter
 from avsreplay.records import Surface
 
 CAMERA, TARGET, TRUE, ROOT = "camera", "target", "target_true", "map"
@@ -42,6 +40,7 @@ _TOPICS = {
     "/rosout": "rcl_interfaces/msg/Log",
 }
 _ROWS = "/rows/"
+_FLOAT64 = struct.Struct("<xBxxd")  # encapsulation of little-endian CDR, then the value
 _INFO, _WARN = 20, 30  # levels of rcl_interfaces/msg/Log
 
 
@@ -96,14 +95,17 @@ class ResultLog:
         Raises:
             UnreadableInput: the file cannot be written.
         """
+        from mcap.writer import CompressionType, Writer
+
         try:
             self._stream = path.open("wb")
         except OSError as error:
             what = error.strerror or "cannot be written"
             raise UnreadableInput(what, where=str(path), hint="check the folder and its rights") from None
-        self._writer = McapWriter(self._stream, LIBRARY, chunk_bytes=CHUNK_BYTES)
+        self._writer = Writer(self._stream, CHUNK_BYTES, CompressionType.ZSTD, enable_data_crcs=True)
+        self._writer.start(profile="ros2", library=LIBRARY)
         if metadata:
-            self._writer.metadata("avsreplay", metadata)
+            self._writer.add_metadata("avsreplay", dict(metadata))
         self._surface, self._cone, self._count, self._state = surface, cone, 0, ""
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
@@ -113,7 +115,7 @@ class ResultLog:
         if self._stream.closed:
             return
         try:
-            self._writer.finish()
+            self._writer.finish()  # type: ignore[no-untyped-call]
         finally:
             self._stream.close()
 
@@ -170,42 +172,27 @@ class ResultLog:
     def _copy(self, written: Path, changed: Mapping[int, Mapping[str, float]]) -> None:
         from mcap.reader import NonSeekingReader
 
-        pending: dict[str, float] = {}
-        last_ns = 0
-
-        def end_row() -> None:
-            if pending:
-                self._append_columns(changed.get(self._count - 1, pending), last_ns)
-                pending.clear()
-
         with written.open("rb") as stream:
             for _, channel, message in NonSeekingReader(stream).iter_messages(log_time_order=False):
-                if channel.topic.startswith(_ROWS):  # the columns of a scan are written together
-                    pending[channel.topic.removeprefix(_ROWS)] = struct.unpack_from("<d", message.data, 4)[0]
-                    last_ns = message.log_time
-                    continue
-                end_row()
-                self._count = message.sequence
-                self._append(channel.topic, message.log_time, message.data)
-        end_row()
+                columns = changed.get(message.sequence - 1) if channel.topic.startswith(_ROWS) else None
+                if columns is None:
+                    self._count = message.sequence
+                    self._append(channel.topic, message.log_time, message.data)
+                elif channel.topic == _ROWS + next(iter(columns)):  # the first of the row stands for all
+                    self._append_columns(columns, message.log_time)
 
     def _append_columns(self, columns: Mapping[str, float], t_ns: int) -> None:
-        channels = [self._channel(_ROWS + name) for name in columns]
-        self._writer.scalars(channels, t_ns, np.array(list(columns.values()), np.float64), self._count)
+        for name, value in columns.items():
+            self._append(_ROWS + name, t_ns, _FLOAT64.pack(1, value))
 
     def _append(self, topic: str, t_ns: int, payload: bytes) -> None:
-        self._writer.message(self._channel(topic), t_ns, payload, self._count)
-
-    def _channel(self, topic: str) -> int:
-        """The number of a topic's channel, which is defined with its first message."""
         if topic not in self._channels:
             kind = "std_msgs/msg/Float64" if topic.startswith(_ROWS) else _TOPICS[topic]
             if kind not in self._schemas:
-                self._schemas[kind] = self._writer.schema(kind, "ros2msg", schema_text(kind))
-            self._channels[topic] = self._writer.channel(
-                topic, "cdr", self._schemas[kind], {"offered_qos_profiles": ""}
-            )
-        return self._channels[topic]
+                self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", schema_text(kind))
+            qos = {"offered_qos_profiles": ""}
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[kind], qos)
+        self._writer.add_message(self._channels[topic], t_ns, payload, t_ns, self._count)
 
 
 def _path(t_ns: int, times_s: Array, positions: Array) -> bytes:

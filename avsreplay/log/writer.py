@@ -20,7 +20,6 @@ from avsreplay.geometry import Pose
 from avsreplay.log.cdr import diagnostic, odometry, point_cloud2, pose_stamped, schema_text, transform
 from avsreplay.log.header import HEADER_RECORD, encode_header, surface_bytes
 from avsreplay.log.index import MAX_NS
-from avsreplay.log.mcap_writer import McapWriter
 from avsreplay.records import Label, LogHeader, Scan, State
 
 CLOUD_TOPIC, TRUTH_TOPIC, BODY_TOPIC, FAULT_TOPIC = "/points", "/truth/pose", "/truth/body", "/faults"
@@ -217,6 +216,12 @@ class LogWriter:
             ) from None
 
     def _begin(self, header: LogHeader, compression: str) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        kinds = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
+        # The library closes a chunk only after it exceeds its size; sizes and spans are therefore checked here.
+        self._writer: Any = Writer(self._stream, 1 << 62, kinds[compression], enable_data_crcs=True)
+
         try:
             record = encode_header(header)
         except ValueError:
@@ -225,11 +230,11 @@ class LogWriter:
             raise UsageError("a state of the scenario is not finite", where=str(self._path), hint=hint) from None
 
         def begin() -> None:
-            self._writer = McapWriter(self._stream, LIBRARY, "" if compression == "none" else compression)
-            self._writer.metadata(HEADER_RECORD, record)
+            self._writer.start(profile="ros2", library=LIBRARY)
+            self._writer.add_metadata(HEADER_RECORD, record)
             if header.surface is not None:
                 data = surface_bytes(header.surface)
-                self._writer.attachment(header.surface.name, "application/octet-stream", data)
+                self._writer.add_attachment(0, 0, header.surface.name, "application/octet-stream", data)
             self._stream.flush()
 
         self._guarded(begin)
@@ -269,7 +274,7 @@ class LogWriter:
             self._flush()
         self._chunk_start_ns = log_ns if self._chunk_start_ns is None else self._chunk_start_ns
         sequence = self._counts.get(topic, 0)
-        self._writer.message(self._channel(topic), log_ns, payload, sequence)
+        self._writer.add_message(self._channel(topic), log_ns, payload, log_ns, sequence)
         self._counts[topic] = sequence + 1
         self._pending_bytes += len(payload)
         self._last_ns = max(self._last_ns, log_ns)
@@ -284,9 +289,9 @@ class LogWriter:
     def _channel(self, topic: str) -> int:
         if topic not in self._channels:
             kind = _TYPES[topic]
-            schema = self._writer.schema(kind, "ros2msg", schema_text(kind))
+            schema = self._writer.register_schema(kind, "ros2msg", schema_text(kind))
             qos = {"offered_qos_profiles": _LATCHED if topic == "/tf_static" else ""}
-            self._channels[topic] = self._writer.channel(topic, "cdr", schema, qos)
+            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, qos)
         return self._channels[topic]
 
     def _finish(self) -> None:
