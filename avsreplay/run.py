@@ -25,7 +25,7 @@ from avsreplay.pipeline import PipelineState, Stages
 from avsreplay.plan import Motion
 from avsreplay.records import Belief, LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.register import POSES, ModelCheck, Registrar
-from avsreplay.report.summary import Summary, SummaryFold
+from avsreplay.report import Summary, SummaryFold
 from avsreplay.rows import Row
 from avsreplay.score import HealthyPoses, Scorer, matched_truth, reference_motion
 

@@ -18,13 +18,13 @@ from avsreplay.errors import AvsError, CheckFailed, UnreadableInput, UsageError
 from avsreplay.log import SourceOptions
 from avsreplay.log.options import ClockChoice, Unit
 from avsreplay.records import Label
+from avsreplay.report import Summary
 from avsreplay.report.compare import METRICS, changed_settings, metrics
 from avsreplay.report.gate import GateRule, RuleOutcome, check_gate, github_lines, judge, junit, load_rules
 from avsreplay.report.golden import compare_rows
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import build_comparison
 from avsreplay.report.result import load_result, write_manifest
-from avsreplay.report.summary import Summary
 from avsreplay.report.table import print_sparks, spark
 
 

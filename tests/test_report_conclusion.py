@@ -13,10 +13,10 @@ from click.testing import CliRunner
 
 from avsreplay.cli.compare import compare_command
 from avsreplay.errors import UsageError
+from avsreplay.report import Summary
 from avsreplay.report.compare import METRICS
 from avsreplay.report.conclusion import HEADLINES, changes_table, conclude
 from avsreplay.report.jsonl import write_rows
-from avsreplay.report.summary import Summary
 from avsreplay.report.table import make_console, print_table
 
 

@@ -20,7 +20,7 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan.supervisor import Action
 from avsreplay.records import AlignStatus, Reason, ScanStatus
-from avsreplay.report import jsonl
+from avsreplay.report import Summary, jsonl
 from avsreplay.report.export import (
     columns_page,
     descriptions,
@@ -37,7 +37,6 @@ from avsreplay.report.export import (
     write_tum,
 )
 from avsreplay.report.jsonl import dump_row, field_types, parse_row, read_rows, write_rows
-from avsreplay.report.summary import Summary
 from avsreplay.rows import Row, columns
 
 ROOT = Path(__file__).parent.parent

@@ -20,11 +20,11 @@ from avsreplay.cli.record import report_command
 from avsreplay.errors import AvsError
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
+from avsreplay.report import Summary
 from avsreplay.report.charts import charts, derived, embed, most_telling, spans
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.page import Flight, build_flight_page, build_page, render
 from avsreplay.report.result import load_result
-from avsreplay.report.summary import Summary
 from avsreplay.report.view import PathView, View, cone_lines, scene, thin_cloud
 
 ROOT = Path(__file__).resolve().parents[1]

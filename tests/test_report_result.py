@@ -13,10 +13,10 @@ import pytest
 from avsreplay.errors import UnreadableInput
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Label, State, Surface
+from avsreplay.report import Summary
 from avsreplay.report.export import write_tum
 from avsreplay.report.jsonl import read_rows, write_rows
 from avsreplay.report.result import facts_record, load_result, motion_samples
-from avsreplay.report.summary import Summary
 from avsreplay.report.view import PathView, View, read_view, thin_cloud, thin_surface, write_view
 
 TRUTH = State([0, 0, 0, 1], [0.1, 0, 0], [0, 0, 5], [0, 0, 0], [0.25, -0.4], [0.5, 0.6, -0.4], exp([0, 0, 0.1]))

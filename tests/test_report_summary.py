@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from avsreplay.geometry import exp
 from avsreplay.records import Label, State
-from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary, SummaryFold
+from avsreplay.report import NEES_BAND, NIS_BAND, Summary, SummaryFold
 from avsreplay.report.summary_parts import Statistics, events
 from avsreplay.report.summary_tables import fact_lines, in_one_line, manoeuvre_table
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from avsreplay.records import Label
-from avsreplay.report.summary import Summary
+from avsreplay.report import Summary
 from avsreplay.report.summary_tables import print_tables
 from avsreplay.report.table import Table, choose_rows, decimals, head, make_console, print_table, state_cell
 from avsreplay.rows import columns

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from avsreplay.records import Label
+from avsreplay.report import Summary
 from avsreplay.report.export import dump_document
 from avsreplay.report.page import build_page
-from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import Grade, first_pose, verdict_of, worst_moments
 
 HEADER = {"model": {"extent_m": 8.0}, "config": {"init": "log", "estimator": {"start": "auto"}, "plan": {}}}

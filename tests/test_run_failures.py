@@ -14,7 +14,7 @@ from avsreplay.log import SourceOptions
 from avsreplay.records import Fit
 from avsreplay.register import Registrar
 from avsreplay.register.registrar import POSTPONED
-from avsreplay.report.summary import Summary
+from avsreplay.report import Summary
 from avsreplay.report.verdict import Grade, verdict_of
 from avsreplay.run import Job, Run
 

@@ -24,7 +24,7 @@ from avsreplay.register.surface_index import IcpParams
 from avsreplay.report.gate import GateRules
 from avsreplay.settings import Settings, setting
 from avsreplay.simulate.scenario import ScenarioParams
-from avsreplay.sweep.campaign import Campaign
+from avsreplay.sweep import Campaign
 
 
 class Policy(Enum):

@@ -10,7 +10,8 @@ from scipy import stats
 
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.simulate import load_scenario
-from avsreplay.sweep import expand, load_campaign
+from avsreplay.sweep import load_campaign
+from avsreplay.sweep.expansion import expand
 
 BASE = """
 name = "test"

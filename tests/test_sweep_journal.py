@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from avsreplay.errors import UnreadableInput, UsageError
-from avsreplay.sweep import Journal
-from avsreplay.sweep.execute import SCAN_COLUMNS, RunResult
-from avsreplay.sweep.journal import RESULTS
+from avsreplay.sweep import SCAN_COLUMNS, RunResult
+from avsreplay.sweep.journal import RESULTS, Journal
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed")
 SCAN = (0, None, True, 1, 0.5, 0.1, 0.9, None, 20.0, 0.01, 1.0)
@@ -170,7 +169,7 @@ def test_two_campaigns_cannot_use_one_directory(tmp_path):
 
 @pytest.mark.slow
 def test_the_lock_of_a_killed_process_is_free(tmp_path):
-    code = "import os\nfrom pathlib import Path\nfrom avsreplay.sweep import Journal\n"
+    code = "import os\nfrom pathlib import Path\nfrom avsreplay.sweep.journal import Journal\n"
     code += f"Journal(Path({str(tmp_path)!r})).__enter__()\nos.kill(os.getpid(), 9)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == -9
     with Journal(tmp_path) as journal:

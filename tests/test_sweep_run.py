@@ -13,9 +13,10 @@ from click.testing import CliRunner
 
 from avsreplay.cli.sweep import sweep_command
 from avsreplay.errors import DataLost, MissingBackend, UnreadableInput, UsageError
-from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
-from avsreplay.sweep.execute import _crashed
-from avsreplay.sweep.expansion import Task
+from avsreplay.sweep import load_campaign
+from avsreplay.sweep.execute import _crashed, run_tasks, write_results
+from avsreplay.sweep.expansion import Task, expand
+from avsreplay.sweep.journal import Journal
 
 pytest.importorskip("pyarrow", reason="pyarrow is not installed")
 pytest.importorskip("distributed", reason="Dask is not installed")
@@ -316,8 +317,8 @@ def test_results_hold_a_few_runs_in_memory(campaign, reference, tmp_path, monkey
     """Batches of 2 runs and of 1 scan give the same values."""
     import pyarrow.parquet as pq
 
-    monkeypatch.setattr(sys.modules["avsreplay.sweep"], "BATCH", 2)
-    monkeypatch.setattr(sys.modules["avsreplay.sweep"], "SCAN_BATCH", 1)
+    monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "BATCH", 2)
+    monkeypatch.setattr(sys.modules["avsreplay.sweep.execute"], "SCAN_BATCH", 1)
     assert sweep(campaign, tmp_path / "out", "--workers", "0").exit_code == 0
     for name in ("results.parquet", "scans.parquet"):
         (tmp_path / name).write_bytes(reference[name])

@@ -17,8 +17,9 @@ from avsreplay import settings, toml_document
 from avsreplay.report.episodes import Episode, Peak
 from avsreplay.simulate import load_scenario
 from avsreplay.simulate.faults import Kind
-from avsreplay.sweep import Journal, expand, load_campaign
-from avsreplay.sweep.execute import RunResult
+from avsreplay.sweep import RunResult, load_campaign
+from avsreplay.sweep.expansion import expand
+from avsreplay.sweep.journal import Journal
 from avsreplay.sweep.statistics import (
     EPISODE_COLUMNS,
     FaultKinds,

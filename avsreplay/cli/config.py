@@ -185,7 +185,7 @@ SECTIONS = (
     ("Reading a log", "Options of `avsreplay run`, `info` and `record`.", "avsreplay.log:SourceOptions"),
     ("Constraints of a plan", "Options of `avsreplay plan`.", "avsreplay.plan:Limits"),
     ("Scenario", "A scenario file, see [Scenarios](scenario.md).", "avsreplay.simulate.scenario:ScenarioParams"),
-    ("Campaign", "A campaign file, see [Campaigns](sweep.md).", "avsreplay.sweep.campaign:Campaign"),
+    ("Campaign", "A campaign file, see [Campaigns](sweep.md).", "avsreplay.sweep:Campaign"),
     ("Gate", "A file of rules for `avsreplay compare --gate`, see [CI](ci.md).", "avsreplay.report.gate:GateRules"),
 )
 

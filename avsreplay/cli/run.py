@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 
     from avsreplay.log import GrowingLog
     from avsreplay.model_size import Advice
+    from avsreplay.report import Summary
     from avsreplay.report.golden import GoldenResult
-    from avsreplay.report.summary import Summary
     from avsreplay.report.verdict import RunVerdict
     from avsreplay.result_dir import ResultDirectory, ResultWriter
     from avsreplay.rows import Row

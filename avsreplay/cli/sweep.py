@@ -15,9 +15,9 @@ from avsreplay.errors import DataLost, UsageError
 from avsreplay.files import check_output
 
 if TYPE_CHECKING:
-    from avsreplay.sweep import Expansion, Journal
-    from avsreplay.sweep.execute import RunResult
-    from avsreplay.sweep.expansion import Task
+    from avsreplay.sweep import RunResult
+    from avsreplay.sweep.expansion import Expansion, Task
+    from avsreplay.sweep.journal import Journal
     from avsreplay.sweep.summary import SweepSummary
 
 EPILOG = """\b
@@ -87,8 +87,10 @@ def sweep_command(
         MissingBackend: pyarrow is not installed.
         DataLost: a run failed, crashed or lost data.
     """  # noqa: D301
-    from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
-    from avsreplay.sweep.journal import arrow
+    from avsreplay.sweep import load_campaign
+    from avsreplay.sweep.execute import run_tasks, write_results
+    from avsreplay.sweep.expansion import expand
+    from avsreplay.sweep.journal import Journal, arrow
 
     plan = expand(load_campaign(campaign))
     if only_plan:

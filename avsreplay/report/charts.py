@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from avsreplay import geometry
 from avsreplay.records import State
+from avsreplay.report import NEES_BAND, NIS_BAND
 from avsreplay.report.episodes import Episode
-from avsreplay.report.summary import NEES_BAND, NIS_BAND
 from avsreplay.report.summary_parts import add_rows
 from avsreplay.rows import Row
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from avsreplay.report.summary import Errors, Summary
+from avsreplay.report import Errors, Summary
 from avsreplay.report.summary_parts import Statistics
 from avsreplay.report.table import Table, number
 from avsreplay.settings import dump, entries

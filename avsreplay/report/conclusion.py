@@ -20,10 +20,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from avsreplay.geometry import Array
+from avsreplay.report import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.charts import values
 from avsreplay.report.compare import METRICS, different_inputs, metrics
 from avsreplay.report.golden import GoldenResult, compare_rows
-from avsreplay.report.summary import NEES_BAND, NIS_BAND, Summary
 from avsreplay.report.table import Table, TableCell, facts_table, number
 from avsreplay.rows import Row
 

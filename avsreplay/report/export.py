@@ -21,8 +21,8 @@ from typing import Any, Literal
 from avsreplay.errors import MissingBackend
 from avsreplay.files import output_path, output_text
 from avsreplay.geometry import Pose
+from avsreplay.report import Summary
 from avsreplay.report.jsonl import field_types, plain
-from avsreplay.report.summary import Summary
 from avsreplay.report.verdict import verdict_of
 from avsreplay.rows import Column, Row, columns
 from avsreplay.settings import dump

@@ -19,12 +19,11 @@ from markupsafe import Markup
 
 from avsreplay.geometry import Array
 from avsreplay.records import State, Surface
-from avsreplay.report import charts
+from avsreplay.report import Summary, charts
 from avsreplay.report.approach import approach_picture
 from avsreplay.report.conclusion import ComparedRun, Conclusion, changes_table, settings_table
 from avsreplay.report.export import StampedPose
 from avsreplay.report.gate import RuleOutcome, gate_table
-from avsreplay.report.summary import Summary
 from avsreplay.report.summary_tables import fact_lines, in_one_line, moments_table, summary_tables, verdict_table
 from avsreplay.report.table import Table, as_cell, facts_table
 from avsreplay.report.verdict import verdict_of

@@ -20,9 +20,9 @@ from avsreplay.binary_files import read_limited
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Array, Pose, bounding_diagonal
 from avsreplay.records import Label, State, Surface
+from avsreplay.report import Summary
 from avsreplay.report.export import StampedPose
 from avsreplay.report.jsonl import read_json, read_rows, without_garbage_collection
-from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, read_view
 from avsreplay.rows import Row
 from avsreplay.settings import dump

@@ -9,8 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from rich.console import Console
 
 from avsreplay.records import BLOCKS
+from avsreplay.report import Errors, Summary
 from avsreplay.report.episodes import Episode
-from avsreplay.report.summary import Errors, Summary
 from avsreplay.report.summary_parts import Capture, Parameter, Statistics, length_text, times
 from avsreplay.report.table import (
     Table,

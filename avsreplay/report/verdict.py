@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.geometry import Array
+from avsreplay.report import NIS_LIMIT, Summary
 from avsreplay.report.charts import values
-from avsreplay.report.summary import NIS_LIMIT, Summary
 from avsreplay.report.summary_parts import events, length_text, times
 from avsreplay.rows import Row
 

@@ -1,121 +1,203 @@
 """Campaigns: many runs from one file, on one machine or a Dask cluster; they resume and give the same results.
 
-The result files are made from the journal in the order of the plan. No clock, host, path or order of completion reaches
-them: any number of workers, interrupted or not, gives the same bytes. Runs are read one by one, so that the memory
-needed hardly depends on their number.
+A campaign file states what is varied, how often, and what counts as a success. The result files are made from the
+journal in the order of the plan. No clock, host, path or order of completion reaches them: any number of workers,
+interrupted or not, gives the same bytes. Runs are read one by one, so that the memory needed hardly depends on their
+number.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
-from itertools import islice
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from avsreplay import __version__
-from avsreplay.files import output_text
-from avsreplay.sweep.campaign import Campaign, load_campaign
-from avsreplay.sweep.execute import RunResult, run_tasks
-from avsreplay.sweep.expansion import Expansion, Point, expand
-from avsreplay.sweep.journal import Journal, arrow, scan_schema, write_batches
-from avsreplay.sweep.page import build_sweep_page
-from avsreplay.sweep.summary import CampaignFold, DetectorFold, SweepSummary
+from avsreplay import toml_document
+from avsreplay.settings import Settings, setting
 
-__all__ = ["Campaign", "Expansion", "Journal", "Point", "expand", "load_campaign", "run_tasks", "write_results"]
+MAX_REPEATS = 10_000_000
+SCORES = ("rms_m", "alpha_m", "inlier_ratio", "nis", "nees", "pos_err_m", "rot_err_deg")
+SCAN_COLUMNS = ("seq", "fault", "harmful", "gamma", *SCORES)
+PREFIXES = ("scenario.", "run.")
 
 
-BATCH = 5_000  # runs held in memory while results.parquet is written
-SCAN_BATCH = 200_000  # scans held in memory while scans.parquet is written
-_FIXED = ("index", "cell", "repeat", "seed", "id", "status", "error")
+class DrawKind(Enum):
+    """How a random value is drawn."""
+
+    UNIFORM = "uniform"  # a number in [low, high)
+    LOG_UNIFORM = "log_uniform"  # a number whose logarithm is uniform
+    NORMAL = "normal"  # a number of mean ``low`` and standard deviation ``high``
+    INTEGER = "integer"  # a whole number in [low, high]
+    CHOICE = "choice"  # one of ``values``
+    DIRECTION = "direction"  # three numbers: any direction, length uniform in [low, high]
+    ATTITUDE = "attitude"  # four numbers: a unit quaternion, uniform over all attitudes
 
 
-def write_results(plan: Expansion, journal: Journal, folder: Path) -> SweepSummary:
-    """Write ``results.parquet``, ``scans.parquet`` (where scans are kept), ``summary.json`` and ``report.html``.
+@dataclass(frozen=True, slots=True)
+class Axis(Settings):
+    """One table [[grid]]: every value is combined with every value of the other tables."""
+
+    key: str = setting(doc="scenario.<key> or run.<key>; a number selects an entry, as in scenario.fault.0.strength.")
+    values: Any = setting(doc="The list of its values.")
+
+    def check(self) -> None:
+        """Raise ValueError for a wrong key or an empty list."""
+        _check_key(self.key)
+        if not isinstance(self.values, list) or not self.values:
+            raise ValueError(f"values of '{self.key}' must be a list that is not empty")
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignCase(Settings):
+    """One table [[case]]: settings that go together; cases are alternatives, each combined with the grid."""
+
+    name: str = setting(doc="Name of the case in tables.")
+    set: Any = setting(dict, "Settings of the case, by key.")
+
+    def check(self) -> None:
+        """Raise ValueError for a wrong key."""
+        _check_set(self.set)
+
+
+@dataclass(frozen=True, slots=True)
+class Draw(Settings):
+    """One table [[draw]]: a value drawn anew for every repeat, the same for all combinations of that repeat."""
+
+    key: str = setting(doc="scenario.<key> or run.<key>.")
+    kind: DrawKind = setting(doc="Distribution of the value.")
+    low: float = setting(0.0, "Smallest value; the mean of a normal distribution.")
+    high: float = setting(1.0, "Largest value; the standard deviation of a normal distribution.")
+    values: Any = setting(list, "The values of a choice.")
+
+    def check(self) -> None:
+        """Raise ValueError where the bounds do not fit the distribution."""
+        _check_key(self.key)
+        if self.kind is DrawKind.CHOICE and not (isinstance(self.values, list) and self.values):
+            raise ValueError(f"a choice for '{self.key}' needs values")
+        if self.kind is DrawKind.NORMAL and not self.high >= 0.0:
+            raise ValueError(f"standard deviation (high) of '{self.key}' must not be negative")
+        if self.kind is not DrawKind.NORMAL and self.low > self.high:
+            raise ValueError(f"low = {self.low} of '{self.key}' must not exceed high = {self.high}")
+        if self.kind is DrawKind.LOG_UNIFORM and not self.low > 0.0:
+            raise ValueError(f"low = {self.low} of '{self.key}' must be positive")
+
+
+@dataclass(frozen=True, slots=True)
+class SuccessCriterion(Settings):
+    """One table [[success]]: a run succeeds where the metric has a value and is within the limits."""
+
+    name: str = setting(doc="Name of the criterion in tables.")
+    metric: str = setting(doc="A column of the results.")
+    min: float = setting(-math.inf, "Smallest value that counts as success.", infinite=True)
+    max: float = setting(math.inf, "Largest value that counts as success.", infinite=True)
+
+
+@dataclass(frozen=True, slots=True)
+class Campaign(Settings):
+    """A campaign file."""
+
+    name: str = setting("campaign", "Name of the campaign.")
+    seed: int = setting(0, "Seed of every draw, and through it of every run's own seed.", low=0, below=2**63)
+    repeats: int = setting(1, "Runs of every combination.", low=1, high=MAX_REPEATS)
+    scenario: str = setting("", "Scenario file, relative to this one; empty for the built-in scenario.")
+    scenarios: tuple[str, ...] = setting((), "Several scenario files, each one a value of the axis 'scenario'.")
+    model: str = setting("", "Model of the target in place of the scenario's or the logs' own.")
+    logs: tuple[str, ...] = setting((), "Recorded logs in place of a scenario, each one a value of the axis 'log'.")
+    config: str = setting("", "File with settings of the replay, as for 'avsreplay run --config'.")
+    scans: bool = setting(True, "Keep one line per scan (scans.parquet), from which the ROC curves are made.")
+    flights: int = setting(
+        0,
+        "Number of simulated flights after each run, to targets drawn from its belief, as with 'avsreplay plan"
+        " --flights'.",
+        low=0,
+    )
+    set: Any = setting(dict, "Settings of every run.")
+    grid: tuple[Axis, ...] = setting((), "What is varied.")
+    case: tuple[CampaignCase, ...] = setting((), "Alternatives.")
+    draw: tuple[Draw, ...] = setting((), "What is drawn.")
+    success: tuple[SuccessCriterion, ...] = setting((), "What counts as a success.")
+
+    def check(self) -> None:
+        """Raise ValueError where entries exclude each other or a name occurs twice."""
+        if sum(map(bool, (self.logs, self.scenario, self.scenarios))) > 1:
+            raise ValueError("scenario, scenarios and logs exclude each other")
+        _check_set(self.set)
+        self._check_names()
+
+    def _check_names(self) -> None:
+        names = [axis.key for axis in self.grid] + [draw.key for draw in self.draw]
+        for kind, entries in (("key", names), ("case", [c.name for c in self.case])):
+            double = next((n for n in entries if entries.count(n) > 1), None)
+            if double is not None:
+                raise ValueError(f"{kind} '{double}' occurs twice")
+        wrong = next((n for n in self._keys() if self.logs and n.startswith("scenario.")), None)
+        if wrong is not None:
+            raise ValueError(f"'{wrong}' cannot be set where logs are given")
+
+    def _keys(self) -> list[str]:
+        cases = [key for case in self.case for key in case.set]
+        return [*self.set, *cases, *(a.key for a in self.grid), *(d.key for d in self.draw)]
+
+
+@dataclass(frozen=True, slots=True)
+class LoadedCampaign:
+    """A campaign, the folder to which its file names are relative, and its own name."""
+
+    campaign: Campaign
+    folder: Path
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """The result of one run.
+
+    Attributes:
+        id: Id of its task.
+        status: ``ok``; ``lossy``: part of the log could not be read; ``failed``: an error of the input; ``crashed``.
+        error: One line of text, None where the status is ``ok``.
+        metrics: Numbers, truth values and words by name.
+        scans: One tuple per scan, in the order of SCAN_COLUMNS.
+        episodes: One tuple per fault window, in the order of EPISODE_COLUMNS.
+        scan_count: Number of scans that are kept.
+    """
+
+    id: str
+    status: str
+    error: str | None = None
+    metrics: Mapping[str, Any] | None = None
+    scans: tuple[tuple[Any, ...], ...] = ()
+    episodes: tuple[tuple[Any, ...], ...] = ()
+    scan_count: int = 0
+
+
+def load_campaign(path: Path) -> LoadedCampaign:
+    """Read a campaign file.
 
     Args:
-        plan: The runs of the campaign.
-        journal: Journal of the finished runs; runs that are not finished are left out.
-        folder: Folder to write to.
-
-    Returns:
-        The summary that ``summary.json`` and ``report.html`` show.
+        path: the TOML file; file names in it are relative to its folder.
 
     Raises:
-        MissingBackend: pyarrow is not installed.
-        UnreadableInput: A file cannot be read or written.
+        UnreadableInput: the file cannot be read.
+        UsageError: the file is not TOML, or a key or value is invalid; the message gives file and line.
     """
-    arrow()
-    fold, kinds, ids = CampaignFold(plan), dict[str, set[str]](), set[str]()
-    for point, result in _finished(plan, journal):
-        fold.add(point, result)
-        ids.add(result.id)
-        for name, value in _values(point, result).items():
-            kinds.setdefault(name, set()).add(_kind(value))
-    _write_runs(plan, journal, kinds, folder / "results.parquet")
-    detector = None
-    if plan.loaded.campaign.scans:
-        detector = DetectorFold()
-        write_batches(folder / "scans.parquet", scan_schema(), _scan_batches(sorted(ids), journal, detector))
-    summary = fold.result(detector.result() if detector else None)
-    text = json.dumps({"version": __version__, **summary.document()}, indent=1, allow_nan=False)
-    for name, content in (("summary.json", text + "\n"), ("report.html", build_sweep_page(summary))):
-        with output_text(folder / name) as stream:
-            stream.write(content)
-    return summary
+    document = toml_document.load(path)
+    return LoadedCampaign(toml_document.build(Campaign, document), Path(path).parent, str(path))
 
 
-def _finished(plan: Expansion, journal: Journal) -> Iterator[tuple[Point, RunResult]]:
-    return ((point, journal.result(point.task.id)) for point in plan.points() if point.task.id in journal)
+def _check_key(key: str) -> None:
+    if not key.startswith(PREFIXES) or not all(key.split(".")):
+        raise ValueError(f"key '{key}' must begin with 'scenario.' or 'run.'")
 
 
-def _values(point: Point, result: RunResult) -> dict[str, Any]:
-    """The columns of a run that depend on the campaign: what was set, and its metrics."""
-    return {**{f"set:{key}": value for key, value in point.values.items()}, **(result.metrics or {})}
-
-
-def _kind(value: Any) -> str:
-    if value is None:
-        return "none"
-    if isinstance(value, bool):
-        return "bool"
-    return "number" if isinstance(value, (int, float)) else "text" if isinstance(value, str) else "mixed"
-
-
-def _write_runs(plan: Expansion, journal: Journal, kinds: Mapping[str, set[str]], path: Path) -> None:
-    """One row per run; a column is of truth values, float64 or text, anything mixed or nested as JSON text."""
-    pa, _ = arrow()
-    types = {"bool": pa.bool_(), "number": pa.float64(), "text": pa.string()}
-    columns = [*sorted(name for name in kinds if name.startswith("set:"))]
-    columns += sorted(name for name in kinds if not name.startswith("set:"))
-    only = {name: "".join(kinds[name] - {"none"}) for name in columns}
-    integers = {"index", "cell", "repeat", "seed"}
-    fixed = [(name, pa.int64() if name in integers else pa.string()) for name in _FIXED]
-    schema = pa.schema([*fixed, *((name, types.get(only[name] or "number", pa.string())) for name in columns)])
-
-    def row(point: Point, result: RunResult) -> tuple[Any, ...]:
-        found = _values(point, result)
-        place = (point.index, point.cell, point.repeat, point.seed, result.id, result.status, result.error)
-        return (*place, *(_plain(found.get(name), only[name]) for name in columns))
-
-    runs = (row(*found) for found in _finished(plan, journal))
-    write_batches(path, schema, iter(lambda: list(islice(runs, BATCH)), []))
-
-
-def _plain(value: Any, kind: str) -> Any:
-    if value is None or kind in ("bool", "text"):
-        return value
-    return float(value) if kind == "number" else json.dumps(value)
-
-
-def _scan_batches(ids: list[str], journal: Journal, detector: DetectorFold) -> Iterator[list[tuple[Any, ...]]]:
-    """The scans in the order of the runs' ids; each run counts once for the fault tests."""
-    batch: list[tuple[Any, ...]] = []
-    for run_id in ids:
-        scans = journal.scans(run_id)
-        detector.add(scans)
-        batch += [(run_id, *line) for line in scans]
-        if len(batch) >= SCAN_BATCH:
-            yield batch
-            batch = []
-    yield batch
+def _check_set(table: Any) -> None:
+    if not isinstance(table, dict):
+        raise ValueError("set must be a table of key = value")
+    for key in table:
+        try:
+            _check_key(key)
+        except ValueError as error:
+            raise ValueError(f'{error}, in quotes, as in "run.init" = "truth"') from None

@@ -1,4 +1,4 @@
-"""Runs tasks in this process, on worker processes of this machine, or on a Dask cluster.
+"""Runs tasks in this process, on worker processes of this machine, or on a Dask cluster; writes the result files.
 
 A task records its scenario, replays the log as ``avsreplay run`` does, and summarises it. An error of the input is the
 result of the run; it does not end the campaign.
@@ -7,56 +7,41 @@ result of the run; it does not end the campaign.
 from __future__ import annotations
 
 import importlib
+import json
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from avsreplay import settings, toml_document
+from avsreplay import __version__, settings, toml_document
 from avsreplay.errors import AvsError, MissingBackend, UnreadableInput
+from avsreplay.files import output_text
 from avsreplay.log import SourceOptions
 from avsreplay.plan.arm import with_arm
 from avsreplay.record import RecordOptions, record_scenario
 from avsreplay.records import Belief, Label, Scan
 from avsreplay.replan import Replanning
-from avsreplay.report.summary import Summary
+from avsreplay.report import Summary
 from avsreplay.rows import Row
 from avsreplay.run import Job, Listener, ReplayedScan, Run
 from avsreplay.saved_result import of_run
 from avsreplay.simulate import scenario_of
-from avsreplay.sweep.expansion import Task
+from avsreplay.sweep import SCORES, RunResult
+from avsreplay.sweep.expansion import Expansion, Point, Task
+from avsreplay.sweep.journal import Journal, arrow, scan_schema, write_batches
+from avsreplay.sweep.page import build_sweep_page
 from avsreplay.sweep.statistics import episode_lines
+from avsreplay.sweep.summary import CampaignFold, DetectorFold, SweepSummary
 
-_SCORES = ("rms_m", "alpha_m", "inlier_ratio", "nis", "nees", "pos_err_m", "rot_err_deg")
-SCAN_COLUMNS = ("seq", "fault", "harmful", "gamma", *_SCORES)
-
-
-@dataclass(frozen=True, slots=True)
-class RunResult:
-    """The result of one run.
-
-    Attributes:
-        id: Id of its task.
-        status: ``ok``; ``lossy``: part of the log could not be read; ``failed``: an error of the input; ``crashed``.
-        error: One line of text, None where the status is ``ok``.
-        metrics: Numbers, truth values and words by name.
-        scans: One tuple per scan, in the order of SCAN_COLUMNS.
-        episodes: One tuple per fault window, in the order of EPISODE_COLUMNS.
-        scan_count: Number of scans that are kept.
-    """
-
-    id: str
-    status: str
-    error: str | None = None
-    metrics: Mapping[str, Any] | None = None
-    scans: tuple[tuple[Any, ...], ...] = ()
-    episodes: tuple[tuple[Any, ...], ...] = ()
-    scan_count: int = 0
+BATCH = 5_000  # runs held in memory while results.parquet is written
+SCAN_BATCH = 200_000  # scans held in memory while scans.parquet is written
+_FIXED = ("index", "cell", "repeat", "seed", "id", "status", "error")
 
 
 def run_task(task: Task) -> RunResult:
@@ -122,7 +107,7 @@ def _line(row: Row, scan: Scan, labels: tuple[Label, ...], length_m: float) -> t
     alpha = None
     if row.innov_m is not None and row.innov_deg is not None:
         alpha = float(np.hypot(row.innov_m, length_m * np.radians(row.innov_deg)))
-    scores = (alpha if name == "alpha_m" else getattr(row, name) for name in _SCORES)
+    scores = (alpha if name == "alpha_m" else getattr(row, name) for name in SCORES)
     return (row.seq, row.fault, harmful, row.gamma, *scores)
 
 
@@ -245,3 +230,94 @@ def _crashed(task_id: str, error: BaseException | None) -> RunResult:
         return RunResult(task_id, "crashed", "the worker process died repeatedly")
     first = (str(error).splitlines() or [""])[0]
     return RunResult(task_id, "crashed", f"{type(error).__name__}: {first}")
+
+
+def write_results(plan: Expansion, journal: Journal, folder: Path) -> SweepSummary:
+    """Write ``results.parquet``, ``scans.parquet`` (where scans are kept), ``summary.json`` and ``report.html``.
+
+    Args:
+        plan: The runs of the campaign.
+        journal: Journal of the finished runs; runs that are not finished are left out.
+        folder: Folder to write to.
+
+    Returns:
+        The summary that ``summary.json`` and ``report.html`` show.
+
+    Raises:
+        MissingBackend: pyarrow is not installed.
+        UnreadableInput: A file cannot be read or written.
+    """
+    arrow()
+    fold, kinds, ids = CampaignFold(plan), dict[str, set[str]](), set[str]()
+    for point, result in _finished(plan, journal):
+        fold.add(point, result)
+        ids.add(result.id)
+        for name, value in _values(point, result).items():
+            kinds.setdefault(name, set()).add(_kind(value))
+    _write_runs(plan, journal, kinds, folder / "results.parquet")
+    detector = None
+    if plan.loaded.campaign.scans:
+        detector = DetectorFold()
+        write_batches(folder / "scans.parquet", scan_schema(), _scan_batches(sorted(ids), journal, detector))
+    summary = fold.result(detector.result() if detector else None)
+    text = json.dumps({"version": __version__, **summary.document()}, indent=1, allow_nan=False)
+    for name, content in (("summary.json", text + "\n"), ("report.html", build_sweep_page(summary))):
+        with output_text(folder / name) as stream:
+            stream.write(content)
+    return summary
+
+
+def _finished(plan: Expansion, journal: Journal) -> Iterator[tuple[Point, RunResult]]:
+    return ((point, journal.result(point.task.id)) for point in plan.points() if point.task.id in journal)
+
+
+def _values(point: Point, result: RunResult) -> dict[str, Any]:
+    """The columns of a run that depend on the campaign: what was set, and its metrics."""
+    return {**{f"set:{key}": value for key, value in point.values.items()}, **(result.metrics or {})}
+
+
+def _kind(value: Any) -> str:
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "bool"
+    return "number" if isinstance(value, (int, float)) else "text" if isinstance(value, str) else "mixed"
+
+
+def _write_runs(plan: Expansion, journal: Journal, kinds: Mapping[str, set[str]], path: Path) -> None:
+    """One row per run; a column is of truth values, float64 or text, anything mixed or nested as JSON text."""
+    pa, _ = arrow()
+    types = {"bool": pa.bool_(), "number": pa.float64(), "text": pa.string()}
+    columns = [*sorted(name for name in kinds if name.startswith("set:"))]
+    columns += sorted(name for name in kinds if not name.startswith("set:"))
+    only = {name: "".join(kinds[name] - {"none"}) for name in columns}
+    integers = {"index", "cell", "repeat", "seed"}
+    fixed = [(name, pa.int64() if name in integers else pa.string()) for name in _FIXED]
+    schema = pa.schema([*fixed, *((name, types.get(only[name] or "number", pa.string())) for name in columns)])
+
+    def row(point: Point, result: RunResult) -> tuple[Any, ...]:
+        found = _values(point, result)
+        place = (point.index, point.cell, point.repeat, point.seed, result.id, result.status, result.error)
+        return (*place, *(_plain(found.get(name), only[name]) for name in columns))
+
+    runs = (row(*found) for found in _finished(plan, journal))
+    write_batches(path, schema, iter(lambda: list(islice(runs, BATCH)), []))
+
+
+def _plain(value: Any, kind: str) -> Any:
+    if value is None or kind in ("bool", "text"):
+        return value
+    return float(value) if kind == "number" else json.dumps(value)
+
+
+def _scan_batches(ids: list[str], journal: Journal, detector: DetectorFold) -> Iterator[list[tuple[Any, ...]]]:
+    """The scans in the order of the runs' ids; each run counts once for the fault tests."""
+    batch: list[tuple[Any, ...]] = []
+    for run_id in ids:
+        scans = journal.scans(run_id)
+        detector.add(scans)
+        batch += [(run_id, *line) for line in scans]
+        if len(batch) >= SCAN_BATCH:
+            yield batch
+            batch = []
+    yield batch

@@ -25,7 +25,7 @@ from avsreplay import geometry, toml_document
 from avsreplay.config import RunConfig
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.simulate import load_scenario, scenario_of
-from avsreplay.sweep.campaign import Campaign, Draw, DrawKind, LoadedCampaign
+from avsreplay.sweep import Campaign, Draw, DrawKind, LoadedCampaign
 
 FORMAT = 4  # format of a run's result; a result with another format is computed again
 _NAMED = ("scenario", "log", "case")  # axes that select a file or a case, not a key

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, TypeVar
 
 from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
 from avsreplay.files import output_path
-from avsreplay.sweep.execute import SCAN_COLUMNS, RunResult
+from avsreplay.sweep import SCAN_COLUMNS, RunResult
 
 
 def arrow() -> tuple[Any, Any]:

@@ -10,9 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from avsreplay import settings
-from avsreplay.sweep import statistics
-from avsreplay.sweep.campaign import SuccessCriterion
-from avsreplay.sweep.execute import SCAN_COLUMNS, RunResult
+from avsreplay.sweep import SCAN_COLUMNS, RunResult, SuccessCriterion, statistics
 from avsreplay.sweep.expansion import Expansion, Point
 
 HEADLINES = {

@@ -17,9 +17,9 @@ import numpy as np
 
 from avsreplay.geometry import Pose, exp
 from avsreplay.records import Surface
+from avsreplay.report import Summary
 from avsreplay.report.jsonl import field_types
 from avsreplay.report.page import build_page
-from avsreplay.report.summary import Summary
 from avsreplay.report.view import View, thin_cloud, thin_surface
 from avsreplay.rows import Row
 from avsreplay.simulate import builtin_surface

@@ -24,8 +24,10 @@ from pathlib import Path
 
 from sweep_speed import CAMPAIGN
 
-from avsreplay.sweep import Journal, expand, load_campaign
+from avsreplay.sweep import load_campaign
 from avsreplay.sweep.execute import IN_FLIGHT, RunResult, run_task
+from avsreplay.sweep.expansion import expand
+from avsreplay.sweep.journal import Journal
 
 SCANS = 600
 

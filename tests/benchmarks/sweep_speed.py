@@ -14,8 +14,10 @@ import tempfile
 import time
 from pathlib import Path
 
-from avsreplay.sweep import Journal, expand, load_campaign, run_tasks, write_results
-from avsreplay.sweep.execute import RunResult, run_task
+from avsreplay.sweep import RunResult, load_campaign
+from avsreplay.sweep.execute import run_task, run_tasks, write_results
+from avsreplay.sweep.expansion import expand
+from avsreplay.sweep.journal import Journal
 
 CAMPAIGN = """
 name = "speed"
