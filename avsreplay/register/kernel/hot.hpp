@@ -44,7 +44,9 @@ struct Kept {
   double x, y, z;
   float radius2;   // the neighbour is the same nearer than this to (x, y, z); negative: nowhere
   float block2;    // the same of its block, at least radius2
+  float pair2;     // the same of that block and `other`
   int32_t lane;    // 8 block + lane, -1: none
+  uint32_t other;  // a block, or NO_CHILD
 };
 
 struct Feet {

@@ -15,7 +15,7 @@ namespace {
 class Memory {
  public:
   Memory(const Store& s, int64_t n, bool allowed)
-      : extent_(s.extent), grain_(s.grain), longest_(allowed ? MOST_OF_GRAIN * s.grain : 0), kept_((size_t)n, Kept{0, 0, 0, -1.f, -1.f, -1}) {}
+      : extent_(s.extent), grain_(s.grain), longest_(allowed ? MOST_OF_GRAIN * s.grain : 0), kept_((size_t)n, Kept{0, 0, 0, -1.f, -1.f, -1.f, -1, NO_CHILD}) {}
 
   Kept* data() { return kept_.data(); }
   std::vector<Kept> take() { return std::move(kept_); }
@@ -30,11 +30,11 @@ class Memory {
   }
 
   void forget_radii() {
-    for (Kept& k : kept_) k.radius2 = k.block2 = -1.f;
+    for (Kept& k : kept_) k.radius2 = k.block2 = k.pair2 = -1.f;
   }
 
  private:
-  static constexpr double MOST_OF_GRAIN = 0.2, LEAST_OF_GRAIN = 0.02, STEPS = 4.0;
+  static constexpr double MOST_OF_GRAIN = 0.2, LEAST_OF_GRAIN = 0.005, STEPS = 4.0;
   double extent_, grain_, longest_, last_ = 0;
   std::vector<Kept> kept_;
 };

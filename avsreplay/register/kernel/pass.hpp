@@ -4,7 +4,8 @@
 // the lists, then the blocks a few points ahead of the search.
 static_assert(CHUNK % 4 == 0, "sums run over four points at a time");
 
-enum Treat : uint8_t { IGNORED, SEARCHED, IN_BLOCK, KEPT };  // only the kept neighbour's block, or only the neighbour
+// What is searched: everything, two blocks, the block of the kept neighbour, or nothing but this neighbour.
+enum Treat : uint8_t { IGNORED, SEARCHED, IN_PAIR, IN_BLOCK, KEPT };
 
 struct Chunk {
   alignas(32) double p[3][CHUNK];   // moved, relative to the model's centre
@@ -38,7 +39,8 @@ static inline void move(const double* T, const double* p, double* q) {
 
 static inline Treat treat(const Kept& k, const double* q) {
   const double x = q[0] - k.x, y = q[1] - k.y, z = q[2] - k.z, moved2 = x * x + y * y + z * z;
-  return moved2 < (double)k.radius2 ? KEPT : moved2 < (double)k.block2 ? IN_BLOCK : SEARCHED;
+  if (moved2 < (double)k.radius2) return KEPT;
+  return moved2 < (double)k.block2 ? IN_BLOCK : moved2 < (double)k.pair2 ? IN_PAIR : SEARCHED;
 }
 
 static void gather(const Store& s, const View& v, int64_t first, int n, const double* T, const Kept* kept, Chunk& c,
@@ -68,15 +70,27 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
   }
 }
 
-template <class Kind>
-static inline int32_t keep_one(const Scope& o, const Query& q, uint32_t block) {
-  Search<Kind> search(o, q);
-  search.run_block(block);
-  return search.lane();
-}
-
 // Square of a length, with room for rounding; negative where it is not positive.
 static inline float squared(float room) { return room > 0.f ? room * room * 0.9999f : -1.f; }
+
+static inline Kept kept_at(const Query& q, float lane, float block, float pair, int32_t nearest, uint32_t other) {
+  return {q.x, q.y, q.z, squared(lane), squared(block), squared(pair), nearest, other};
+}
+
+// The nearest lane of the kept neighbour's block, and of the other block where `pair`. `remember`: where what is left of
+// the room is written for later passes, or null.
+template <class Kind>
+static inline int32_t keep_one(const Scope& o, const Query& q, bool pair, const Kept& was, Kept* remember) {
+  Search<Kind> search(o, q);
+  search.run_blocks((uint32_t)was.lane / LANES, pair ? was.other : NO_CHILD);
+  if (!remember || search.lane() < 0) return search.lane();
+  const double x = q.x - was.x, y = q.y - was.y, z = q.z - was.z;
+  const float moved = 1.0001f * (float)std::sqrt(x * x + y * y + z * z);
+  const auto left = [moved](float room2) { return room2 > 0.f ? std::sqrt(room2) - moved : 0.f; };
+  const auto room = search.room_left({0.f, left(was.block2), left(was.pair2), was.other});
+  *remember = kept_at(q, room.lane, room.block, room.pair, search.lane(), room.other);
+  return search.lane();
+}
 
 template <class Kind>
 static inline int32_t search_one(const Scope& o, const Query& q, const uint32_t* list, int32_t seed, Kept* kept,
@@ -85,9 +99,9 @@ static inline int32_t search_one(const Scope& o, const Query& q, const uint32_t*
   search.run(list, seed);
   compared += search.compared();
   if (kept) {
-    typename Search<Kind>::Room room{0.f, 0.f};
+    typename Search<Kind>::Room room{0.f, 0.f, 0.f, NO_CHILD};
     if (o.lead > 0.f) room = search.room();
-    *kept = {q.x, q.y, q.z, squared(room.lane), squared(room.block), search.lane()};
+    *kept = kept_at(q, room.lane, room.block, room.pair, search.lane(), room.other);
   }
   return search.lane();
 }
@@ -95,7 +109,7 @@ static inline int32_t search_one(const Scope& o, const Query& q, const uint32_t*
 // A kept neighbour that no longer faces the eye is searched for again.
 template <class Kind>
 static inline bool is_kept(const Scope& o, Treat treat, int32_t lane) {
-  if (treat < IN_BLOCK) return false;
+  if (treat <= SEARCHED) return false;
   if (!o.eye || lane < 0 || o.facing.sure[lane / LANES] >> lane % LANES & 1) return true;
   return Kind::faces(o.s, (uint32_t)lane, *o.eye);
 }
@@ -104,8 +118,9 @@ constexpr int AHEAD = 4, FAR_AHEAD = 16;  // points ahead of the search, and of 
 
 // What the search of a point will read first.
 template <class Kind>
-static inline void fetch_ahead(const Store& s, Treat treat, const uint32_t* list, int32_t lane) {
-  if (treat == IN_BLOCK && lane >= 0) Kind::prefetch_block(s, (uint32_t)lane / LANES);
+static inline void fetch_ahead(const Store& s, Treat treat, const uint32_t* list, int32_t lane, uint32_t other) {
+  if ((treat == IN_BLOCK || treat == IN_PAIR) && lane >= 0) Kind::prefetch_block(s, (uint32_t)lane / LANES);
+  if (treat == IN_PAIR && other != NO_CHILD) Kind::prefetch_block(s, other);
   if (!list) return;
   if (lane >= 0) Kind::prefetch_block(s, (uint32_t)lane / LANES);
   const uint32_t n = *list & (MOST_BLOCKS - 1);
@@ -123,15 +138,17 @@ static Effort search(const Scope& o, int64_t first, int n, const Kept* kept, Kep
   int32_t last = -1;
   Effort effort;
   const auto own = [&](int i) { return kept ? kept[first + i].lane : -1; };
+  const auto other = [&](int i) { return kept && c.search[i] == IN_PAIR ? kept[first + i].other : NO_CHILD; };
   for (int i = 0; i < n; ++i) {
-    if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.search[i + AHEAD], c.list[i + AHEAD], own(i + AHEAD));
+    if (i + AHEAD < n) fetch_ahead<Kind>(o.s, c.search[i + AHEAD], c.list[i + AHEAD], own(i + AHEAD), other(i + AHEAD));
     c.lane[i] = -1;
     if (c.search[i] == IGNORED) continue;
     const int32_t lane = own(i);
     if (is_kept<Kind>(o, c.search[i], lane)) {
       c.lane[i] = lane;
       if (c.search[i] == KEPT || lane < 0) continue;
-      c.lane[i] = keep_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), (uint32_t)lane / LANES);
+      Kept* memory = remember ? remember + first + i : nullptr;
+      c.lane[i] = keep_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), c.search[i] == IN_PAIR, kept[first + i], memory);
     } else {
       const int32_t seed = lane < 0 && !c.list[i] ? last : lane;
       Kept* memory = remember ? remember + first + i : nullptr;
@@ -254,7 +271,7 @@ static bool search_beyond(const Scope& o, int n, double known, Chunk& c) {
   bool any = false;
   int64_t compared = 0;
   for (int i = 0; i < n; ++i) {
-    if (c.search[i] < IN_BLOCK || (c.take[i] > 0 && c.d2[i] < known * known)) continue;
+    if (c.search[i] <= SEARCHED || (c.take[i] > 0 && c.d2[i] < known * known)) continue;
     const Query q = query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]);
     c.lane[i] = search_one<Kind>(o, q, list_of(o.s, word_at(o.s, q.x, q.y, q.z)), c.lane[i], nullptr, compared);
     any = true;

@@ -71,15 +71,16 @@ class Search {
     const uint32_t first = seed < 0 ? NO_CHILD : (uint32_t)seed / LANES;
     if (seed >= 0) visit(first);
     if (!list || !in_list(list, first)) {
-      first_ = other_ = 3e38f, waiting_ = 0;  // the tree comes to the same blocks again
+      first_ = other_ = third_ = FAR, waiting_ = 0;  // the tree comes to the same blocks again
       in_tree();
     }
     resolve(true);
   }
 
-  // Only this block. Where it holds the nearest lane, this finds it.
-  void run_block(uint32_t block) {
+  // Only these blocks; `other` may be NO_CHILD. Where one holds the nearest lane, this finds it.
+  void run_blocks(uint32_t block, uint32_t other) {
     visit(block);
+    if (other != NO_CHILD) visit(other);
     resolve(true);
   }
 
@@ -89,24 +90,44 @@ class Search {
   // Blocks and nodes of the tree that were compared with the query: a measure of the work, the same on every machine.
   int64_t compared() const { return compared_; }
 
-  // How far the query may move before another primitive (`lane`), or one of another block (`block`), can be the nearest,
-  // or one come within the bound. An eye that stays within the margin of `Facing` makes no difference.
+  // How far the query may move before another primitive (`lane`), one of another block (`block`), or one that is neither in
+  // the lane's block nor in `other` (`pair`) can be the nearest, or one come within the bound. An eye that stays within the
+  // margin of `Facing` makes no difference.
   struct Room {
-    float lane, block;
+    float lane, block, pair;
+    uint32_t other;
   };
   Room room() const {
     const float first = std::sqrt(first_), known = std::sqrt(limit_);
     if (lane_ < 0) {
       const float gap = (first < known ? first : known) - o_.bound - 3.f * s_.slack;
-      return {gap, gap};
+      return {gap, gap, gap, NO_CHILD};
     }
-    if (first_ < least_ || (uint32_t)lane_ / LANES != first_block_) return {0.f, 0.f};
-    const float other = std::sqrt(other_), block = half(first, other < known ? other : known);
-    float lanes[LANES], second = 3e38f;
-    store8(lanes, first_lanes_);
-    for (int k = 0; k < LANES; ++k)
-      if (k != lane_ % LANES && lanes[k] < second) second = lanes[k];
-    return {second < first_ ? 0.f : std::min(block, half(first, std::sqrt(second))), block};
+    Room room{0.f, 0.f, 0.f, NO_CHILD};
+    const uint32_t own = (uint32_t)lane_ / LANES;
+    if (own == first_block_ || own == other_block_) {
+      room.pair = half(std::sqrt(least_), std::min(std::sqrt(third_), known));
+      room.other = own == first_block_ ? other_block_ : first_block_;
+    }
+    if (first_ < least_ || own != first_block_) return room;
+    room.block = half(first, std::min(std::sqrt(other_), known));
+    room.lane = in_block(room.block);
+    return room;
+  }
+
+  // The same after `run_blocks` of the lane's block and `was.other`, or of the former alone. `was`: what is left of the room
+  // that was known; there must be a lane.
+  Room room_left(const Room& was) const {
+    Room room = was;
+    room.lane = 0.f;
+    const uint32_t own = (uint32_t)lane_ / LANES;
+    const bool nearest = !(first_ < least_) && own == first_block_;
+    if (other_block_ != NO_CHILD) {
+      room.block = nearest ? std::min(was.pair, half(std::sqrt(first_), std::sqrt(other_))) : 0.f;
+      room.other = own == first_block_ ? other_block_ : first_block_;
+    }
+    if (nearest) room.lane = in_block(room.block);
+    return room;
   }
 
  private:
@@ -182,10 +203,14 @@ class Search {
     const unsigned may = o_.facing.may[block], sure = o_.facing.sure[block];
     if (may != 0xffu) d = select(expand(may), d, f8(FAR));
     const float nearest = least(d);
-    if (nearest < first_)
-      other_ = first_, first_ = nearest, first_block_ = block, first_lanes_ = d;
-    else
-      other_ = nearest < other_ ? nearest : other_;
+    if (nearest < first_) {
+      third_ = other_, other_ = first_, other_block_ = first_block_;
+      first_ = nearest, first_block_ = block, first_lanes_ = d;
+    } else if (nearest < other_) {
+      third_ = other_, other_ = nearest, other_block_ = block;
+    } else {
+      third_ = nearest < third_ ? nearest : third_;
+    }
     if (!(nearest < exact_)) return;
     if (sure == may)
       tighten(nearest);
@@ -250,6 +275,15 @@ class Search {
     exact_ = exact < exact_ ? exact : exact_, limit_ = limit < limit_ ? limit : limit_;
   }
 
+  // The room of the lane in its block, which has this room.
+  float in_block(float block) const {
+    float lanes[LANES], second = FAR;
+    store8(lanes, first_lanes_);
+    for (int k = 0; k < LANES; ++k)
+      if (k != lane_ % LANES && lanes[k] < second) second = lanes[k];
+    return second < first_ ? 0.f : std::min(block, half(std::sqrt(first_), std::sqrt(second)));
+  }
+
   float half(float nearest, float next) const { return 0.5f * (next - nearest) - 3.f * s_.slack; }
 
   static constexpr float FAR = 3e38f;
@@ -262,8 +296,8 @@ class Search {
   float p_[3];  // the query relative to the model's centre
   float exact_, limit_;  // squared distances under which lanes are measured exactly, and looked at
   float least_ = FAR;   // least squared distance of a lane that counts
-  float first_ = FAR, other_ = FAR;  // least of the lanes that may count, and the least in any other block
-  uint32_t first_block_ = 0;
+  float first_ = FAR, other_ = FAR, third_ = FAR;  // least of the lanes that may count, by blocks
+  uint32_t first_block_ = NO_CHILD, other_block_ = NO_CHILD;
   F8 first_lanes_{};    // squared distances in that block
   int waiting_ = 0;
   int64_t compared_ = 0;
