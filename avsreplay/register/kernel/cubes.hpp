@@ -1,6 +1,7 @@
 // Cubes of a lattice, numbered in the order in which they first come.
 #pragma once
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <vector>
@@ -15,7 +16,8 @@ struct Cube {
 // The cube of a point, with `per_m` cubes along a metre.
 inline Cube cube_of(const double* p, double per_m) {
   const auto cell = [per_m](double x) {
-    const double y = std::min(std::max(x * per_m, -1e15), 1e15);
+    double y = x * per_m;
+    if (!(std::fabs(y) < 1e15)) y = y > 0 ? 1e15 : -1e15;
     const int64_t k = (int64_t)y;
     return k - (y < (double)k);
   };

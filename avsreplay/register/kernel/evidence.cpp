@@ -84,11 +84,35 @@ class Sorted {
   std::vector<uint32_t> patch_, order_, begin_, next_;
 };
 
+constexpr size_t BINS = 2048;
+
+// Leaves the values of the bins of the given rank and of the one before it; returns the rank among them. Values are >= 0.
+size_t narrow(std::vector<double>& x, size_t rank) {
+  double most = 0;
+  for (const double value : x) most = std::max(most, value);
+  const double per_value = (double)BINS / most;
+  if (x.size() < BINS || rank == 0 || !(per_value > 0 && std::isfinite(per_value))) return rank;
+  const auto bin = [per_value](double value) { return std::min((size_t)(int64_t)(value * per_value), BINS - 1); };
+  std::vector<uint32_t> count(BINS, 0);
+  for (const double value : x) ++count[bin(value)];
+  size_t first = 0, below = 0, kept = 0;
+  while (below + count[first] < rank) below += count[first++];
+  size_t last = first;
+  for (size_t to = below + count[first]; to <= rank;) to += count[++last];
+  for (const double value : x) {
+    const size_t k = bin(value);
+    x[kept] = value, kept += first <= k && k <= last;
+  }
+  x.resize(kept);
+  return rank - below;
+}
+
 double median(std::vector<double>& x) {
   if (x.empty()) return 0;
-  const auto middle = x.begin() + (int64_t)(x.size() / 2);
-  std::nth_element(x.begin(), middle, x.end());
-  return x.size() % 2 ? *middle : 0.5 * (*middle + *std::max_element(x.begin(), middle));
+  const bool odd = x.size() % 2;
+  const auto middle = (int64_t)narrow(x, x.size() / 2);
+  std::nth_element(x.begin(), x.begin() + middle, x.end());
+  return odd ? x[(size_t)middle] : 0.5 * (x[(size_t)middle] + *std::max_element(x.begin(), x.begin() + middle));
 }
 
 }  // namespace

@@ -20,24 +20,24 @@ constexpr int JOINED = 6 + AMPLITUDES;     // pose and amplitudes
 using Joined = Square<JOINED>;
 using Row = std::array<double, JOINED>;
 
-// The normal equations of pose and amplitudes, a patch at a time: N (n, n) and g (n).
+// The normal equations of pose and amplitudes, a patch at a time: N (13, 13) and g (13).
 struct Equations {
-  int n = 6, strains = 0;  // of them the amplitudes of the strain
-  double basis[AMPLITUDES][AMPLITUDES] = {};  // columns: the observable amplitudes
+  int n = 6, strains = 0;  // dimensions of the observable part, and of them the amplitudes of the strain
+  Joined basis;            // columns: the pose and the observable amplitudes
   std::vector<Joined> N;
   std::vector<Row> g;
 };
 
-// The observable combinations of the amplitudes, from the sums F (7, 7) and A (6, 7) over all patches.
-void observable(const PatchTable& t, const Square<AMPLITUDES>& F, const Coupling& A, Equations& out) {
+// The observable combinations of the amplitudes, from the sum of N over all patches.
+void observable(const PatchTable& t, const Joined& all, Equations& out) {
   const Six inverse = pseudo_inverse(total(t.normals, t.m));
   double points = 0, free[AMPLITUDES][AMPLITUDES];
   for (int64_t p = 0; p < t.m; ++p) points += (double)t.counts[p];
   for (int r = 0; r < AMPLITUDES; ++r)
     for (int c = 0; c < AMPLITUDES; ++c) {
-      free[r][c] = F.v[r][c];
+      free[r][c] = all.v[6 + r][6 + c];
       for (int i = 0; i < 6; ++i)
-        for (int j = 0; j < 6; ++j) free[r][c] -= A[i][r] * inverse.v[i][j] * A[j][c];
+        for (int j = 0; j < 6; ++j) free[r][c] -= all.v[i][6 + r] * inverse.v[i][j] * all.v[j][6 + c];
     }
   const double least = OBSERVABLE * points, offset = free[6][6];
   Six alone, V;
@@ -45,88 +45,78 @@ void observable(const PatchTable& t, const Square<AMPLITUDES>& F, const Coupling
     for (int c = 0; c < 6; ++c)
       alone.v[r][c] = 0.5 * (free[r][c] + free[c][r]) - 0.5 * (free[r][6] * free[6][c] + free[c][6] * free[6][r]) / std::max(offset, least);
   eigen(alone.v, V.v, 6, 1e-32);
+  for (int k = 0; k < 6; ++k) out.basis.v[k][k] = 1;
   for (int k = 0; k < 6; ++k) {
     if (!(alone.v[k][k] > least)) continue;
-    for (int i = 0; i < 6; ++i) out.basis[i][out.strains] = V.v[i][k];
+    for (int i = 0; i < 6; ++i) out.basis.v[6 + i][6 + out.strains] = V.v[i][k];
     ++out.strains;
   }
   out.n = 6 + out.strains;
-  if (offset > least) out.basis[6][out.n++ - 6] = 1;
+  if (offset > least) out.basis.v[12][out.n++] = 1;
 }
 
-Equations joined(const PatchTable& t) {
+void add(const Joined& A, Joined& to) {
+  for (int i = 0; i < JOINED; ++i)
+    for (int j = 0; j < JOINED; ++j) to.v[i][j] += A.v[i][j];
+}
+
+Equations joined(const PatchTable& t, Joined& all) {
   Equations out;
-  std::vector<Square<AMPLITUDES>> F((size_t)t.m);
-  std::vector<Coupling> A((size_t)t.m);
-  std::vector<std::array<double, AMPLITUDES>> e((size_t)t.m);
-  Square<AMPLITUDES> all;
-  Coupling coupling{};
+  out.N.resize((size_t)t.m), out.g.resize((size_t)t.m);
   for (int64_t p = 0; p < t.m; ++p) {
     double T[3][6];
+    Coupling A;
     strains(t, p, T);
-    couple(t, p, T, A[p]);
-    for (int r = 0; r < 6; ++r) {
-      for (int c = 0; c < AMPLITUDES; ++c) F[p].v[r][c] = T[0][r] * A[p][3][c] + T[1][r] * A[p][4][c] + T[2][r] * A[p][5][c];
-      F[p].v[6][r] = F[p].v[r][6];
-      const double* g = t.gradients + 6 * p + 3;
-      e[p][r] = T[0][r] * g[0] + T[1][r] * g[1] + T[2][r] * g[2];
-    }
-    F[p].v[6][6] = (double)t.counts[p], e[p][6] = t.errors[p];
-    for (int r = 0; r < AMPLITUDES; ++r)
-      for (int c = 0; c < AMPLITUDES; ++c) all.v[r][c] += F[p].v[r][c];
-    for (int i = 0; i < 6; ++i)
-      for (int c = 0; c < AMPLITUDES; ++c) coupling[i][c] += A[p][i][c];
-  }
-  observable(t, all, coupling, out);
-  out.N.resize((size_t)t.m), out.g.resize((size_t)t.m);
-  const int k = out.n - 6;
-  for (int64_t p = 0; p < t.m; ++p) {
+    couple(t, p, T, A);
     Joined& N = out.N[p];
-    double FB[AMPLITUDES][AMPLITUDES];
+    Row& g = out.g[p];
     for (int i = 0; i < 6; ++i) {
-      out.g[p][i] = t.gradients[6 * p + i];
+      g[i] = t.gradients[6 * p + i];
       for (int j = 0; j < 6; ++j) N.v[i][j] = t.normals[36 * p + 6 * i + j];
-      for (int c = 0; c < k; ++c) {
-        double sum = 0;
-        for (int r = 0; r < AMPLITUDES; ++r) sum += A[p][i][r] * out.basis[r][c];
-        N.v[i][6 + c] = N.v[6 + c][i] = sum;
-      }
+      for (int c = 0; c < AMPLITUDES; ++c) N.v[i][6 + c] = N.v[6 + c][i] = A[i][c];
     }
-    for (int r = 0; r < AMPLITUDES; ++r)
-      for (int c = 0; c < k; ++c) {
-        FB[r][c] = 0;
-        for (int i = 0; i < AMPLITUDES; ++i) FB[r][c] += F[p].v[r][i] * out.basis[i][c];
-      }
-    for (int r = 0; r < k; ++r) {
-      out.g[p][6 + r] = 0;
-      for (int i = 0; i < AMPLITUDES; ++i) out.g[p][6 + r] += e[p][i] * out.basis[i][r];
-      for (int c = 0; c <= r; ++c) {
-        double sum = 0;
-        for (int i = 0; i < AMPLITUDES; ++i) sum += out.basis[i][r] * FB[i][c];
-        N.v[6 + r][6 + c] = N.v[6 + c][6 + r] = sum;
-      }
+    for (int r = 0; r < 6; ++r) {
+      for (int c = 0; c < AMPLITUDES; ++c) N.v[6 + r][6 + c] = T[0][r] * A[3][c] + T[1][r] * A[4][c] + T[2][r] * A[5][c];
+      N.v[12][6 + r] = N.v[6 + r][12];
+      g[6 + r] = T[0][r] * g[3] + T[1][r] * g[4] + T[2][r] * g[5];
     }
+    N.v[12][12] = (double)t.counts[p], g[12] = t.errors[p];
+    add(N, all);
   }
+  observable(t, all, out);
   return out;
 }
 
-// What follows runs over all JOINED rows and columns; those from n on are zero.
-
-// out += the covariance of the gradients of a patch: g g' enlarged by its leverage; `first` to `last`: rows.
-void add_spread(const Row& g, double enlarge, int first, int last, Joined& out) {
-  for (int i = first; i < last; ++i)
-    for (int j = 0; j < JOINED; ++j) out.v[i][j] += g[i] * g[j] * enlarge;
+Joined product(const Joined& A, const Joined& B) {
+  Joined out;
+  for (int i = 0; i < JOINED; ++i)
+    for (int k = 0; k < JOINED; ++k)
+      for (int j = 0; j < JOINED; ++j) out.v[i][j] += A.v[i][k] * B.v[k][j];
+  return out;
 }
 
-// What the fit of pose and amplitudes adds to the sum of squares of independent gradients: K Q K' - 2 K S' of the three
-// displacements, with K their rows of N N^+ and S the same rows of the covariance of the gradients. `squares`: K' K.
-double fitted(const Joined& K, const Joined& S, const Joined& squares, const Joined& Q) {
+Joined transposed(const Joined& A) {
+  Joined out;
+  for (int i = 0; i < JOINED; ++i)
+    for (int j = 0; j < JOINED; ++j) out.v[i][j] = A.v[j][i];
+  return out;
+}
+
+// A B A'.
+Joined about(const Joined& A, const Joined& B) { return product(product(A, B), transposed(A)); }
+
+// Sum of the products of the entries.
+double inner(const Joined& A, const Joined& B) {
   double sum = 0;
   for (int i = 0; i < JOINED; ++i)
-    for (int j = 0; j < JOINED; ++j) sum += squares.v[i][j] * Q.v[i][j];
-  for (int i = 3; i < 6; ++i)
-    for (int j = 0; j < JOINED; ++j) sum -= 2 * S.v[i][j] * K.v[i][j];
+    for (int j = 0; j < JOINED; ++j) sum += A.v[i][j] * B.v[i][j];
   return sum;
+}
+
+// out += the covariance of the gradients of a patch: g g' enlarged by its leverage.
+void add_spread(const Row& g, double enlarge, Joined& out) {
+  for (int i = 0; i < JOINED; ++i)
+    for (int j = 0; j < JOINED; ++j) out.v[i][j] += g[i] * g[j] * enlarge;
 }
 
 double squares(const Joined& N) {
@@ -136,36 +126,43 @@ double squares(const Joined& N) {
   return sum;
 }
 
-// out += A B' with the displacements' columns of A and B; `first` to `last`: rows.
-void add_outer(const Joined& A, const Joined& B, int first, int last, Joined& out) {
-  for (int i = first; i < last; ++i)
-    for (int j = 0; j < JOINED; ++j)
-      out.v[i][j] += A.v[i][3] * B.v[j][3] + A.v[i][4] * B.v[j][4] + A.v[i][5] * B.v[j][5];
-}
+// Rows of the displacements, or three columns.
+using Three = std::array<Row, 3>;
 
-// The displacements' rows of A B.
-Joined rows_of_product(const Joined& A, const Joined& B) {
-  Joined out;
-  for (int i = 3; i < 6; ++i)
-    for (int k = 0; k < JOINED; ++k)
-      for (int j = 0; j < JOINED; ++j) out.v[i][j] += A.v[i][k] * B.v[k][j];
-  return out;
-}
-
-// What the gradients of one scan say of displacements common to the patches of a block.
+// What the gradients of one scan say of displacements common to the patches of a block: sums over blocks, less those over
+// patches, of the squared displacements' gradients (`found`), of their expectation for a unit variance (`expected`), and of
+// what the fit of pose and amplitudes changes in both. With N the normal equations of a patch, n its displacements' rows,
+// S = g g' the covariance of independent gradients and Q that of all, the fit adds K Q K' - 2 K S' to the covariance of the
+// displacements' gradients, K = n N^+. The sums of n' n, n' S and n' n n_block are kept, so that the products with N^+ are
+// made once.
 struct Moments {
-  double found = 0, expected = 0, moved = 0;  // sums of squares, and what they are for a unit variance
+  double found = 0, expected = 0;
+  Joined square, spread, moved;
+
+  // `spread`: rows of the covariance; `own`: columns of the block's normal equations.
+  void add(double weight, const Joined& N, const Row& g, const Three& rows, const Three& own) {
+    found += weight * (g[3] * g[3] + g[4] * g[4] + g[5] * g[5]), expected += weight * squares(N);
+    Three n = {}, through = {};  // n' n_own, as columns
+    for (int i = 0; i < 3; ++i)
+      for (int k = 0; k < JOINED; ++k) n[i][k] = weight * N.v[3 + i][k];
+    for (int i = 0; i < 3; ++i)
+      for (int k = 0; k < JOINED; ++k)
+        for (int a = 0; a < 3; ++a) through[a][k] += n[i][k] * N.v[3 + i][3 + a];
+    for (int k = 0; k < JOINED; ++k)
+      for (int j = 0; j < JOINED; ++j) {
+        square.v[k][j] += n[0][k] * N.v[3][j] + n[1][k] * N.v[4][j] + n[2][k] * N.v[5][j];
+        spread.v[k][j] += n[0][k] * rows[0][j] + n[1][k] * rows[1][j] + n[2][k] * rows[2][j];
+        moved.v[k][j] += through[0][k] * own[0][j] + through[1][k] * own[1][j] + through[2][k] * own[2][j];
+      }
+  }
 };
 
-void add_moments(double weight, const Joined& N, const Row& g, const Joined& S, const Joined& M, const Joined& all,
-                 const Joined& of_blocks, const Joined& inverse, Moments& to) {
-  const Joined K = rows_of_product(N, inverse);
-  Joined both;
-  for (int i = 0; i < JOINED; ++i)
-    for (int j = 0; j < JOINED; ++j) both.v[i][j] = K.v[3][i] * K.v[3][j] + K.v[4][i] * K.v[4][j] + K.v[5][i] * K.v[5][j];
-  const double own = g[3] * g[3] + g[4] * g[4] + g[5] * g[5];
-  to.found += weight * (own - fitted(K, S, both, all));
-  to.expected += weight * (squares(N) + fitted(K, M, both, of_blocks));
+// The displacements' columns of N.
+Three columns(const Joined& N) {
+  Three out;
+  for (int a = 0; a < 3; ++a)
+    for (int k = 0; k < JOINED; ++k) out[a][k] = N.v[k][3 + a];
+  return out;
 }
 
 // Variance of the displacements of blocks by the method of moments, and its effect M on the gradients. The products of
@@ -173,38 +170,43 @@ void add_moments(double weight, const Joined& N, const Row& g, const Joined& S, 
 // add_spread; the fit correlates the gradients. `all`: the covariances of all patches, summed.
 double block_variance(const PatchTable& t, const Equations& q, const std::vector<double>& enlarge, const Joined& all,
                       const Joined& inverse, Joined& M) {
+  struct Block {
+    Joined whole;
+    Three rows{}, columns{};
+    Row g{};
+    double points = 0;
+  };
   std::vector<int64_t> block;
-  const int64_t blocks = number_blocks(t, block);
-  std::vector<Joined> whole((size_t)blocks), spread((size_t)blocks);
-  std::vector<Row> g((size_t)blocks, Row{});
-  std::vector<double> points((size_t)blocks, 0);
+  std::vector<Block> blocks((size_t)number_blocks(t, block));
   for (int64_t p = 0; p < t.m; ++p) {
-    const int64_t b = block[p];
-    points[b] += (double)t.counts[p];
-    for (int i = 0; i < JOINED; ++i) {
-      g[b][i] += q.g[p][i];
-      for (int j = 0; j < JOINED; ++j) whole[b].v[i][j] += q.N[p].v[i][j];
-    }
-    add_spread(q.g[p], enlarge[p], 3, 6, spread[b]);
+    Block& b = blocks[(size_t)block[p]];
+    b.points += (double)t.counts[p];
+    add(q.N[p], b.whole);
+    for (int i = 0; i < JOINED; ++i) b.g[i] += q.g[p][i];
+    for (int a = 0; a < 3; ++a)
+      for (int k = 0; k < JOINED; ++k) b.rows[a][k] += enlarge[p] * q.g[p][3 + a] * q.g[p][k];
   }
-  for (int64_t b = 0; b < blocks; ++b) add_outer(whole[b], whole[b], 0, JOINED, M);
-  Moments of_blocks, of_patches;
+  Moments sums;
   double moved = 0;
-  for (int64_t b = 0; b < blocks; ++b) {
-    Joined own;
-    add_outer(whole[b], whole[b], 3, 6, own);
-    add_moments(1 / points[b], whole[b], g[b], spread[b], own, all, M, inverse, of_blocks);
-    moved += squares(whole[b]) / points[b];
+  for (Block& b : blocks) {
+    b.columns = columns(b.whole);
+    for (int i = 0; i < JOINED; ++i)
+      for (int j = 0; j < JOINED; ++j)
+        M.v[i][j] += b.columns[0][i] * b.columns[0][j] + b.columns[1][i] * b.columns[1][j] + b.columns[2][i] * b.columns[2][j];
+    sums.add(1 / b.points, b.whole, b.g, b.rows, b.columns);
+    moved += squares(b.whole) / b.points;
   }
   for (int64_t p = 0; p < t.m; ++p) {
-    Joined own, of_patch;
-    add_outer(q.N[p], whole[block[p]], 3, 6, own);
-    add_spread(q.g[p], enlarge[p], 3, 6, of_patch);
-    add_moments(1 / points[block[p]], q.N[p], q.g[p], of_patch, own, all, M, inverse, of_patches);
+    const Block& b = blocks[(size_t)block[p]];
+    Three rows;
+    for (int a = 0; a < 3; ++a)
+      for (int k = 0; k < JOINED; ++k) rows[a][k] = enlarge[p] * q.g[p][3 + a] * q.g[p][k];
+    sums.add(-1 / b.points, q.N[p], q.g[p], rows, b.columns);
   }
-  const double expected = of_blocks.expected - of_patches.expected;
+  const Joined square = about(inverse, sums.square);
+  const double expected = sums.expected + inner(square, M) - 2 * inner(sums.moved, inverse);
   if (!(expected > LEAST_DETERMINED * moved)) return 0;
-  return std::max(0.0, (of_blocks.found - of_patches.found) / expected);
+  return std::max(0.0, (sums.found - inner(square, all) + 2 * inner(sums.spread, inverse)) / expected);
 }
 
 // Variance t of the `size` values from `first` on, ~ N(0, t I + P), of greatest likelihood, by weighted moments; 0 where it
@@ -298,33 +300,26 @@ Systematic systematic_errors(const PatchTable& t) {
   int64_t most = 0;
   for (int64_t p = 0; p < t.m; ++p) most = std::max(most, t.counts[p]);
   if (t.m < LEAST_PATCHES || most == 1) return out;
-  Equations q = joined(t);
+  Joined N, M, spread;
+  Equations q = joined(t, N);
   const int n = q.n;
-  Joined N, M, spread, P;
-  double g[JOINED] = {}, fit[JOINED] = {};
+  Row g{};
   for (int64_t p = 0; p < t.m; ++p)
-    for (int i = 0; i < n; ++i) {
-      g[i] += q.g[p][i];
-      for (int j = 0; j < n; ++j) N.v[i][j] += q.N[p].v[i][j];
-    }
-  const Joined inverse = pseudo_inverse(N, n);
-  for (int i = 0; i < n; ++i)
-    for (int j = 0; j < n; ++j) fit[i] += inverse.v[i][j] * g[j];
-  const std::vector<double> enlarge = take_fit(q, inverse, fit);
-  for (int64_t p = 0; p < t.m; ++p) add_spread(q.g[p], enlarge[p], 0, JOINED, spread);
+    for (int i = 0; i < JOINED; ++i) g[i] += q.g[p][i];
+  const Joined back = transposed(q.basis), reduced = product(pseudo_inverse(about(back, N), n), back), inverse = product(q.basis, reduced);
+  double fit[JOINED] = {}, all[JOINED] = {};  // of the observable part, and of pose and amplitudes
+  for (int i = 0; i < JOINED; ++i)
+    for (int j = 0; j < JOINED; ++j) fit[i] += reduced.v[i][j] * g[j], all[i] += inverse.v[i][j] * g[j];
+  const std::vector<double> enlarge = take_fit(q, inverse, all);
+  for (int64_t p = 0; p < t.m; ++p) add_spread(q.g[p], enlarge[p], spread);
   out.block = block_variance(t, q, enlarge, spread, inverse, M);
-  Joined half;
-  for (int i = 0; i < n; ++i)
-    for (int k = 0; k < n; ++k)
-      for (int j = 0; j < n; ++j) half.v[i][j] += inverse.v[i][k] * (spread.v[k][j] + out.block * M.v[k][j]);
-  for (int i = 0; i < n; ++i)
-    for (int k = 0; k < n; ++k)
-      for (int j = 0; j < n; ++j) P.v[i][j] += half.v[i][k] * inverse.v[k][j];
+  for (int i = 0; i < JOINED; ++i)
+    for (int j = 0; j < JOINED; ++j) spread.v[i][j] += out.block * M.v[i][j];
+  const Joined P = about(reduced, spread);
   const double strain = common_variance(fit, P, 6, q.strains);
   for (int k = 0; k < 6; ++k) out.smooth[k] = strain, out.fit[k] = fit[k];
   out.smooth[6] = common_variance(fit, P, 6 + q.strains, n - 6 - q.strains);
-  for (int r = 0; r < AMPLITUDES; ++r)
-    for (int c = 0; c < n - 6; ++c) out.amplitudes[r] += q.basis[r][c] * fit[6 + c];
+  for (int r = 0; r < AMPLITUDES; ++r) out.amplitudes[r] = all[6 + r];
   return out;
 }
 
