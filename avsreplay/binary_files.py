@@ -175,7 +175,7 @@ _LIBRARY = {
 }
 _ACCUMULATORS = {  # classes that collect values scan by scan and are no dataclasses
     ("avsreplay.estimate.work", "Work"),
-    ("avsreplay.register.model_check", "ModelCheck"),
+    ("avsreplay.register", "ModelCheck"),
     ("avsreplay.report", "SummaryFold"),
     ("avsreplay.result_dir", "Beliefs"),
     ("avsreplay.viewers", "NewPaths"),

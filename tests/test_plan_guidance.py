@@ -19,9 +19,10 @@ from avsreplay.plan import (
     SupervisorParams,
     Tolerance,
     closed_loop,
+    pushed,
     rendezvous,
+    with_thrust_error,
 )
-from avsreplay.plan.evaluation import pushed, with_thrust_error
 from avsreplay.plan.limits import margin
 from avsreplay.records import Forecast
 

@@ -1,23 +1,222 @@
-"""Registration of scans against a fixed model: back ends behind one protocol, one quality measure for all of them."""
+"""Registration of scans against a fixed model: back ends behind one protocol, one quality measure for all of them.
+
+Here: errors that the scans of a run show, such as a wrong size or shape of the model, or unknown times of points.
+
+Size: along a run, the factor between target and model is estimated from the residuals of registered scans. With
+T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
+n . (p - c) = J d + delta n . p. Least squares per scan give delta after the pose is eliminated (``size``); scans are
+weighted by the inverse of its variance, and their spread gives the standard error (jackknife over scans). The bias that
+noise causes is found on a few of the scans and subtracted; half of it counts as a standard error.
+
+Times: points without times are taken as measured at one instant. The motion between two scans and the order of the
+points give the duration of a scan by least squares; a significant one is reported.
+
+Shape: if no scan was registered, the global search is repeated with the mirrored model. The unit of the model is
+checked before a run (``preflight``).
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Alignment, AlignStatus, Scan, Surface
 from avsreplay.register.backend import POSES, Availability, Backend, Target, available, measured_alignment
-from avsreplay.register.model_check import ModelCheck
 from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.restarts import allowed_scans
+from avsreplay.register.sampling import without_scattered_points
+from avsreplay.register.size import MOST_OF_MODEL, SIGMAS, diameter, fitted_duration, fitted_size, noise_bias
 
 __all__ = [
-    "POSES",
-    "Availability",
-    "Backend",
-    "ModelCheck",
-    "RegisterParams",
-    "Registrar",
-    "RegistrationLimits",
-    "Target",
-    "allowed_scans",
-    "available",
-    "measured_alignment",
-]
+    "POSES", "Availability", "Backend", "ModelCheck", "RegisterParams", "Registrar", "RegistrationLimits", "Target",
+    "allowed_scans", "available", "measured_alignment",
+]  # fmt: skip
+
+POINTS = 1500  # points used of each scan
+_LEAST_RUN_ERROR = 0.002  # least error of size that is reported; a single scan cannot show so small a one
+EVERY, MOST_SCANS, LEAST_SCANS = 3, 60, 8
+ENOUGH_SCANS = 16  # with which the check ends where they exclude an error of size that would be reported
+BIAS_SCANS = 4  # scans on which the bias of the noise is found
+MOST_WEIGHT = 4.0  # largest weight of a scan, in units of the median weight
+LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
+_DURATION_EVERY, _MOST_DURATIONS, _LEAST_DURATIONS = 2, 24, 8  # aligned scans, and durations measured in a run
+_DURATION_POINTS = 800
+_LEAST_OF_PERIOD = 0.02  # least duration of a scan that is reported, over the period of the scans
+_MOST_TURN_RAD = 0.5  # between two scans; the motion is taken as uniform
+LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged
+
+
+class ModelCheck:
+    """Collects scans of one run and reports errors of the model."""
+
+    def __init__(self, registrar: Registrar, surface: Surface) -> None:
+        """Create the check of one run.
+
+        Args:
+            registrar: of the run.
+            surface: its model, vertices in {C} [m].
+        """
+        self._registrar, self._surface = registrar, surface
+        self._aligned, self._matched, self._ambiguous = 0, False, ""
+        self._deltas: list[float] = []
+        self._weights: list[float] = []
+        self._points: list[tuple[Array, Array | None]] = []  # points of each measured scan, and the camera, in {C}
+        self._unmatched: NDArray[Any] | None = None
+        self._last: tuple[int, Pose] | None = None  # instant and pose of the last aligned scan
+        self._durations: list[tuple[float, float, float]] = []  # duration, its standard error, period [s]
+
+    def add(self, scan: Scan, found: Alignment | None) -> None:
+        """Use one scan.
+
+        Args:
+            scan: points in {A} [m]; points that are not finite are left out.
+            found: its alignment; None, or a scan without points, is ignored.
+        """
+        points = scan.points
+        if found is None or not len(points):
+            return
+        if found.measured and found.inlier_ratio >= LEAST_ON_MODEL:
+            self._matched = True  # the scan is on the model, although the pose is not accepted
+        if found.status is AlignStatus.AMBIGUOUS:
+            self._ambiguous = self._ambiguous or found.free_directions
+        if found.status is not AlignStatus.ALIGNED:
+            self._unmatched = points if self._unmatched is None else self._unmatched
+            return
+        self._aligned += 1
+        if self._aligned % EVERY == 1 and len(self._deltas) < MOST_SCANS and not self._settled():
+            self._measure(points, found)
+        if scan.places is not None and self._aligned % _DURATION_EVERY == 0 and self._duration_open():
+            self._measure_duration(scan, scan.places, found.T_ac)
+        self._last = scan.t_ns, found.T_ac
+
+    def scale(self) -> tuple[float, float] | None:
+        """Return the size of the target over that of the model and its standard error; None with too few scans."""
+        if len(self._deltas) < LEAST_SCANS:
+            return None
+        mean, spread, weight = self._mean()
+        tried = np.linspace(0, len(weight) - 1, BIAS_SCANS).astype(np.intp)
+        bias = [noise_bias(self._registrar.index, *self._points[k]) for k in tried]
+        mean_bias = float(weight[tried] @ np.array(bias) / weight[tried].sum())
+        return 1.0 + mean - mean_bias, float(np.hypot(spread, 0.5 * mean_bias))
+
+    def _mean(self) -> tuple[float, float, Array]:
+        """The weighted mean of the errors of size, its standard error (jackknife), and the weights of the scans."""
+        return _jackknife(np.array(self._deltas), np.array(self._weights))
+
+    def _settled(self) -> bool:
+        """Whether the scans so far exclude an error of size that would be reported."""
+        if len(self._deltas) < ENOUGH_SCANS:
+            return False
+        mean, spread, _ = self._mean()
+        return abs(mean) + SIGMAS * spread < _LEAST_RUN_ERROR
+
+    def notes(self) -> tuple[str, ...]:
+        """Return the errors of the model that the run shows, one line each; empty if there are none."""
+        if not self._matched:
+            return () if self._unmatched is None else (self._diagnosis(self._unmatched),)
+        if not self._aligned:
+            several = f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init"
+            return (several,) if self._ambiguous else ()
+        return *self._size(), *self._duration_note()
+
+    def _size(self) -> tuple[str, ...]:
+        found = self.scale()
+        if found is None:
+            return ()
+        if abs(found[0] - 1.0) < max(_LEAST_RUN_ERROR, SIGMAS * found[1]):
+            return ()
+        small, long = ("small", "long") if found[0] > 1.0 else ("large", "short")
+        percent = 100.0 * abs(found[0] - 1.0)
+        return (
+            f"the model is {percent:.1f} % too {small} (1 sigma {100.0 * found[1]:.2g} %): "
+            f"multiply --model-scale by {found[0]:.4f}, or the ranges of the sensor are too {long} by as much",
+        )
+
+    def _measure(self, points: NDArray[Any], alignment: Alignment) -> None:
+        T_ca = alignment.T_ac.inverse()
+        p = T_ca.apply(np.asarray(points[_some(points, POINTS)], dtype=np.float64))
+        camera_c = T_ca.t if self._registrar.sided else None
+        measured = fitted_size(self._registrar.index, p, camera_c)
+        if measured is not None and measured.sigma > 0.0:
+            self._deltas.append(measured.delta)
+            self._weights.append(1.0 / measured.sigma**2)
+            self._points.append((p, camera_c))
+
+    def _measure_duration(self, scan: Scan, places: NDArray[Any], T_ac: Pose) -> None:
+        if self._last is None or (period := 1e-9 * (scan.t_ns - self._last[0])) <= 0.0:
+            return
+        before, T_ca = self._last[1], T_ac.inverse()
+        turn = geometry.log((T_ac @ before.inverse()).q)
+        if np.linalg.norm(turn) > _MOST_TURN_RAD:
+            return
+        kept = _some(scan.points, _DURATION_POINTS)
+        p = T_ca.apply(np.asarray(scan.points[kept], dtype=np.float64))
+        rate, velocity = (geometry.rotate(T_ca.R, each / period) for each in (turn, T_ac.t - before.t))
+        motion = (places[kept].astype(np.float64) - 0.5)[:, None] * (np.cross(rate, p) + velocity)
+        measured = fitted_duration(self._registrar.index, p, T_ca.t if self._registrar.sided else None, motion)
+        if measured is not None and measured[1] > 0.0:
+            self._durations.append((*measured, period))
+
+    def _duration(self) -> tuple[float, float, float]:
+        """The mean duration of a scan weighted by its variance, its standard error (jackknife), the period [s]."""
+        duration, sigma, period = np.array(self._durations).T
+        mean, spread, _ = _jackknife(duration, 1.0 / sigma**2)
+        return mean, spread, float(np.median(period))
+
+    def _duration_open(self) -> bool:
+        """Whether the scans so far do not exclude a duration that would be reported."""
+        if len(self._durations) < _LEAST_DURATIONS:
+            return True
+        mean, spread, period = self._duration()
+        return len(self._durations) < _MOST_DURATIONS and abs(mean) + SIGMAS * spread > _LEAST_OF_PERIOD * period
+
+    def _duration_note(self) -> tuple[str, ...]:
+        if len(self._durations) < _LEAST_DURATIONS:
+            return ()
+        mean, spread, period = self._duration()
+        if abs(mean) < max(_LEAST_OF_PERIOD * period, SIGMAS * spread):
+            return ()
+        return (
+            f"the points of a scan have no times, but they fit a moving target that is measured point after point in "
+            f"{abs(mean):.3g} +- {spread:.1g} s: record the time of each point (field 't'); less exactly, "
+            f"--scan-duration {mean:.3g} gives times by the order of the points",
+        )
+
+    def _diagnosis(self, points: NDArray[Any]) -> str:
+        """Try the mirrored model on a scan that was not registered, and compare the sizes."""
+        finite = np.isfinite(points).all(axis=1)
+        scan = without_scattered_points(np.asarray(points[finite], dtype=np.float64))
+        mirrored = replace(self._surface, vertices=self._surface.vertices * [-1.0, 1.0, 1.0])
+        if len(scan) and self._fits(replace(mirrored, faces=mirrored.faces[:, ::-1]), scan):
+            return "the scans fit the mirror image of the model: is an axis of the model or of the scans inverted?"
+        own, seen = diameter(self._surface.vertices, trimmed=False), diameter(scan)
+        sizes = f"the first of them measures {seen:.3g} m, the model {own:.3g} m"
+        cause = "is background left around the target, and is it" if seen > MOST_OF_MODEL * own else "is it"
+        return f"no pose of the model explains the scans ({sizes}): {cause} the right model, in metres?"
+
+    def _fits(self, surface: Surface, scan: Array) -> bool:
+        """Whether nearly all of a scan is on a model, in one pose only and with its size."""
+        params = replace(self._registrar.params, reach_m=None, gate_m=None, eps_m=None, noise_m=None)
+        found = Registrar(surface, params).acquire(scan)
+        return found.status is AlignStatus.ALIGNED and found.inlier_ratio >= LEAST_OF_MIRRORED and not found.message
+
+
+def _some(points: NDArray[Any], count: int) -> NDArray[np.intp]:
+    """Numbers of about ``count`` finite points (n, 3), in their order."""
+    finite = np.flatnonzero(np.isfinite(points).all(axis=1))
+    return finite[:: max(1, len(finite) // count)]
+
+
+def _jackknife(values: Array, weight: Array) -> tuple[float, float, Array]:
+    """Weighted mean of values, its standard error, and the weights, at most ``MOST_WEIGHT`` times their median."""
+    weight = np.minimum(weight, MOST_WEIGHT * np.median(weight))
+    without = (weight @ values - weight * values) / (weight.sum() - weight)
+    n = len(values)
+    spread = float(np.sqrt((n - 1) / n * np.sum((without - without.mean()) ** 2)))
+    return float(weight @ values / weight.sum()), spread, weight

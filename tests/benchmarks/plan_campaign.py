@@ -37,9 +37,10 @@ from avsreplay.plan import (
     SupervisorParams,
     TargetGeometry,
     Tolerance,
+    closed_miss,
     miss,
+    with_thrust_error,
 )
-from avsreplay.plan.evaluation import closed_miss, with_thrust_error
 from avsreplay.records import Alignment, AlignStatus, Belief, State
 
 EXTENT_M, RATE_HZ, SPAN_S = 8.0, 5.0, 120.0
