@@ -12,6 +12,7 @@ from avsreplay.records import AlignStatus, Surface
 from avsreplay.register import Registrar
 from avsreplay.register.contract import boxes, example_pose, view
 from avsreplay.register.global_search import GlobalSearch
+from avsreplay.register.neighbourhood import Neighbourhood
 from avsreplay.register.restarts import Restarter
 from avsreplay.simulate import builtin_surface, scenario_of, simulate
 
@@ -190,11 +191,37 @@ def test_a_pose_beside_the_truth_is_left_along_the_valley():
         np.vstack([*ends, corners]), np.vstack([*sides, *caps, faces + 98]).astype(np.int32), "stage with a fin", ""
     )
     T_ac = Pose(geometry.exp([0.0, -np.pi / 3, 0.0]), np.array([0.0, 0.0, 12.0]))
-    restarter = Registrar(surface)._restarter
+    neighbourhood = Registrar(surface)._neighbourhood
     scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))
     turned = T_ac @ Pose(geometry.exp([0.0, 0.0, np.radians(3.0)]), np.zeros(3))
-    moved = restarter.along_valley(scan, turned.inverse())
+    moved = neighbourhood.along_valley(scan, turned.inverse())
     assert np.degrees(geometry.angle((T_ac.inverse() @ moved.inverse()).q)) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("seed", "error"), [(13, "a minimum 2.7 deg off"), (15, "the other side of a panel, 0.2 deg and 0.01 extents off")]
+)
+def test_a_scan_of_a_part_of_the_target_is_registered_to_the_best_minimum(scans, monkeypatch, seed, error):
+    """Three tenths of a scan, from a guess 3 deg off: nearly all of its points are near the model at a wrong pose."""
+    registrar, rng, scan = Registrar(builtin_surface()), np.random.default_rng(seed), scans[0]
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    across = (scan.points[:, :2] / scan.points[:, 2:]) @ np.array([np.cos(angle), np.sin(angle)])
+    part = scan.points[across <= np.quantile(across, 0.3)]
+    axis, shift = rng.standard_normal((2, 3))
+    extent = registrar.index.extent_m
+    turn = geometry.exp(np.radians(3.0) * axis / np.linalg.norm(axis))
+    guess = scan.truth @ Pose(turn, 0.01 * extent * shift / np.linalg.norm(shift))
+
+    def off(T_ac: Pose) -> float:
+        return float(np.linalg.norm((scan.truth.inverse() @ T_ac).t)) / extent
+
+    found = registrar.register(part, guess)
+    assert found.status is AlignStatus.ALIGNED
+    assert off(found.T_ac) < 0.003
+    monkeypatch.setattr(registrar._neighbourhood, "best", lambda points, guess, at, budget: (None, at.status, ""))
+    alone = registrar.register(part, guess)
+    assert alone.inlier_ratio > 0.95, error
+    assert off(alone.T_ac) > 0.009, error
 
 
 def test_a_pose_with_one_point_on_the_model_has_no_valley():
@@ -202,7 +229,7 @@ def test_a_pose_with_one_point_on_the_model_has_no_valley():
     surface, T_ac = boxes(), example_pose()
     scan = seen(surface, T_ac, 0.001, np.random.default_rng(5))[:40]
     scan[1:] += [0.0, 0.0, 50.0]
-    kept = Registrar(surface)._restarter.along_valley(scan, T_ac.inverse())
+    kept = Registrar(surface)._neighbourhood.along_valley(scan, T_ac.inverse())
     assert kept.t.tobytes() == T_ac.inverse().t.tobytes()
 
 
@@ -254,7 +281,7 @@ def test_a_scan_with_the_work_of_one_registration_is_not_searched(monkeypatch: p
     sphere = rng.standard_normal((600, 3))
     scan = 2.0 * sphere / np.linalg.norm(sphere, axis=1, keepdims=True) + np.array([0.0, 0.0, 8.0])
     made: list[str] = []
-    for kind, name in ((Restarter, "along_valley"), (Restarter, "graduated"), (GlobalSearch, "search")):
+    for kind, name in ((Neighbourhood, "along_valley"), (Restarter, "graduated"), (GlobalSearch, "search")):
         original = getattr(kind, name)
 
         def counted(self: object, *given: object, _name: str = name, _original: object = original) -> object:

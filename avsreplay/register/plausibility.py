@@ -54,6 +54,8 @@ LEAST_ALONE = 0.9  # share on the model of the points that do not hide it: missi
 BEFORE_OF_EXTENT = 0.25  # a point that hides the model is this much nearer; a part of the model is less, as a rule
 PREDICTED = 1.0  # a pose whose surface is in the mean within so many gates of the predicted one agrees with it
 NEAR_OF_EXTENT, MOST_HIDDEN = 0.05, 0.5  # where fewer points are nearer, the noise at a predicted pose is theirs
+PARTIAL = 0.8  # a scan narrower than so much of the model, along one of the directions ``ACROSS``, shows a part of it
+ACROSS = np.array([[1.0, 0.0, 1.0, 1.0], [0.0, 1.0, 1.0, -1.0]])  # directions in the image
 LEAST_COMPARED = 30  # with fewer surface points the test has no power
 LEAST_COSINE = 0.25  # a surface point is expected in the scan if the cosine of its incidence is larger
 HIDDEN_OF_EXTENT = 0.05  # a surface point this much behind the nearest of its cell is hidden
@@ -126,6 +128,21 @@ class PlausibilityTest:
             return False
         moved = T_ca.inverse().apply(self._points) - guess.apply(self._points)
         return float(np.linalg.norm(moved, axis=1).mean()) < PREDICTED * self._gate
+
+    def partial(self, points: NDArray[Any], T_ca: Pose) -> bool:
+        """Return whether the scan (n, 3) in {A} shows only a part of the target: it is narrower in some direction.
+
+        Compared in the image, with the whole surface at the pose T_ca; False where the camera is not known.
+        """
+        if not self._visibility.may_be_camera(T_ca):
+            return False
+        image = _Image(points)
+        spans = [np.ptp(image.plane(each) @ ACROSS, axis=0) for each in (points, T_ca.inverse().apply(self._points))]
+        return bool((spans[0] < PARTIAL * spans[1]).any())
+
+    def turned_away(self, points: NDArray[Any], T_ca: Pose) -> bool:
+        """Return whether most points (n, 3) in {A} are on faces that face away from a camera at the origin."""
+        return self._visibility.may_be_camera(T_ca) and self._visibility.camera_c(self._index, points, T_ca) is None
 
     def check(
         self, points: NDArray[Any], T_ca: Pose, scene: NDArray[Any] | None = None, guess: Pose | None = None
@@ -257,10 +274,14 @@ class _Image:
         """Return which points are within 70 deg of the viewing direction."""
         return np.asarray(points @ self._axes[2] > 0.34 * np.linalg.norm(points, axis=1))
 
+    def plane(self, points: Array) -> Array:
+        """Return the coordinates (n, 2) of points (n, 3) in {A} in the tangent plane."""
+        turned = points @ self._axes.T
+        return np.asarray(turned[:, :2] / turned[:, 2:])
+
     def cells(self, points: Array) -> NDArray[np.int64]:
         """Return the number of the cell of each point (n, 3); a cell has about ``POINTS_PER_CELL`` of them."""
-        turned = points @ self._axes.T
-        plane = turned[:, :2] / turned[:, 2:]
+        plane = self.plane(points)
         if not len(plane):
             return np.zeros(0, dtype=np.int64)
         area = float(np.prod(np.maximum(np.ptp(plane, axis=0), 1e-9)))

@@ -18,6 +18,7 @@ from avsreplay.register import index_cache, quality, restarts
 from avsreplay.register.backend import Target, aligned, create_backend, healthy_work, load_backend
 from avsreplay.register.degenerate import motions_outside, turn_words
 from avsreplay.register.global_search import SearchResult
+from avsreplay.register.neighbourhood import VALLEY_WORK, Neighbourhood
 from avsreplay.register.params import RegisterParams
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.restarts import Budget, Restart, Restarter
@@ -31,6 +32,7 @@ LAST_SCANS = 2  # work that is kept for a last registration, in ordinary registr
 LEAST_TO_TURN, SURE_RATIO = 0.2, 0.9  # with fewer inliers no rotated starts are tried; another search follows
 NO_MOTION: Array = np.zeros((6, 0))
 PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
+NOT_VERIFIED = "rotated by more than 30 deg from the guess, and no work left for a global search"
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
 
 
@@ -65,6 +67,7 @@ class Registrar:
         self._backend = create_backend(self.params.backend, factory, self._target)
         self._test = PlausibilityTest(surface, self._index, self._visibility, self.limits.gate_m)
         self._restarter = Restarter(self._target, self._test)
+        self._neighbourhood = Neighbourhood(self._target, self._test, self._restarter)
 
     def register(
         self,
@@ -104,8 +107,8 @@ class Registrar:
         found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried, budget)
         if self._far(guess, found) and not searched:
             return self._searched(scan, found, carried, budget)
-        free = NO_MOTION if unknown is None else unknown
-        return found if searched or effort <= 1 else self._settled(scan, found, budget, halves, carried, free)
+        found = found if searched else self._unique(scan, guess, found, budget, halves, carried)
+        return found if searched or effort <= 1 else self._settled(scan, found, budget, halves, carried, unknown)
 
     def acquire(self, points: NDArray[Any], effort: int = restarts.HEALTHY_SCANS) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
@@ -230,13 +233,13 @@ class Registrar:
         return thin(scan, self.params.subsample_m) if self.params.subsample_m > 0.0 else scan
 
     def _settled(
-        self, scan: NDArray[Any], found: Alignment, budget: Budget, halves: bool, carried: bool, unknown: Array
+        self, scan: NDArray[Any], found: Alignment, budget: Budget, halves: bool, carried: bool, unknown: Array | None
     ) -> Alignment:
         """The pose turned by a near-symmetry of the model, if the points off the model decide for it.
 
         DEGENERATE in the motions that the guess leaves unknown, if other poses explain the scan as well.
         """
-        unknown = motions_outside(unknown, found.free, self._index.extent_m)
+        unknown = motions_outside(NO_MOTION if unknown is None else unknown, found.free, self._index.extent_m)
         unsure, accepted = unknown.size > 0, found.status in (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
         if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.near:
             return found
@@ -247,20 +250,27 @@ class Registrar:
         found = turned if unsure or turned.status is AlignStatus.ALIGNED else found
         return quality.left_undetermined(found, unknown) if unsure and rivals else found
 
+    def _unique(
+        self, scan: NDArray[Any], guess: Pose, found: Alignment, budget: Budget, halves: bool, carried: bool
+    ) -> Alignment:
+        """The best of the minima around a pose of a part of the target; not accepted if another is as good."""
+        few = self._restarter.part(scan)
+        best, status, doubt = self._neighbourhood.best(few, guess, found, budget)
+        found = found if best is None else self._regraded(scan, few, best, budget, halves, carried)
+        return replace(found, status=status, covariance=None, message=doubt) if doubt else found
+
     def _far(self, guess: Pose, found: Alignment) -> bool:
         """A measured pose so far from the guess that another local minimum may be better."""
-        angle = float(geometry.angle((guess.inverse() @ found.T_ac).q))
-        if not found.measured or angle <= TURNED_RAD:
+        if not found.measured or (angle := float(geometry.angle((guess.inverse() @ found.T_ac).q))) <= TURNED_RAD:
             return False
-        known = found.status is not AlignStatus.DEGENERATE
-        return angle > FAR_RAD or (known and len(self._symmetry.search.symmetries) > 0)
+        free = found.status is AlignStatus.DEGENERATE
+        return angle > FAR_RAD or (not free and len(self._symmetry.search.symmetries) > 0)
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
         if not budget.brief:
             return self._acquire(scan, budget, carried, known=found.T_ac.inverse())
-        far = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a global search"
-        return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=far)
+        return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_VERIFIED)
 
     def _recovered(
         self, scan: NDArray[Any], guess: Pose, first: Alignment, halves: bool, carried: bool, budget: Budget
@@ -271,8 +281,8 @@ class Registrar:
         starts = self._restarter.starts(few, first, guess)
         hopeful = first.measured and starts[0].noise_m <= NOISE_OF_EXTENT * self._index.extent_m
         tried = [self._regraded(scan, few, at, budget, halves, carried) for at in starts] if hopeful else [first]
-        final = tried[0] if len(tried) == 1 else self._nearest(few, tried, self.limits.gate_m)
-        reason = self._reason(few, final, budget, guess)
+        final = tried[0] if len(tried) == 1 else self._restarter.nearest(few, tried, self.limits.gate_m)
+        reason = self._restarter.reason(few, final, budget, guess)
         if not (reason or self._restarter.doubtful(few, guess, final)):
             return self._restarter.consistent(few, guess, final), False
         before, overlap = None, first.status is not AlignStatus.NO_OVERLAP  # without it, perhaps another object
@@ -283,10 +293,9 @@ class Registrar:
         work = self._symmetry.search.work(len(scan), 0) + after + last // LAST_SCANS if overlap else 0
         for step in () if budget.brief else steps:
             if step == "search":
-                if overlap:
-                    found = self._acquire(scan, budget, carried, 1, final.T_ac.inverse() if final.measured else None)
-                    if found.status is AlignStatus.ALIGNED:
-                        return found, True
+                known = final.T_ac.inverse() if final.measured else None
+                if overlap and (found := self._acquire(scan, budget, carried, 1, known)).status is AlignStatus.ALIGNED:
+                    return found, True
                 continue
             if before and np.mean(before.distance < self.limits.gate_m) < LEAST_TO_TURN:
                 break
@@ -294,18 +303,13 @@ class Registrar:
             before = self._restarter.best(few, guess.inverse(), final.T_ac.inverse(), budget, before, kept)
             if before.T_ca.matrix.tobytes() != final.T_ac.inverse().matrix.tobytes():
                 final = self._regraded(scan, few, before, budget, halves, carried)
-                reason = self._reason(few, final, budget, guess)
+                reason = self._restarter.reason(few, final, budget, guess)
             if final.measured and not reason:
                 return self._restarter.consistent(few, guess, final), False
         if not reason:
             return final, False
         status = AlignStatus.BUDGET_EXHAUSTED if budget.exhausted or budget.brief else AlignStatus.IMPLAUSIBLE
         return replace(final, status=status, covariance=None, free_directions="", message=reason), False
-
-    def _reason(self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose) -> str:
-        """Why a pose is not plausible; "" if it is, or nothing was measured."""
-        budget.spend(restarts.TEST_WORK)
-        return self._test.check(few, found.T_ac.inverse(), None, guess).reason if found.measured else ""
 
     def _regraded(
         self, scan: NDArray[Any], few: NDArray[Any], kept: Restart, budget: Budget, halves: bool, carried: bool
@@ -315,16 +319,12 @@ class Registrar:
         found = self._graded(scan, kept.T_ca.inverse(), budget, width, halves, carried)
         if found.status is not AlignStatus.ALIGNED or found.inlier_ratio >= restarts.LEAST_RATIO or budget.brief:
             return found
-        budget.spend(restarts.VALLEY_WORK)
-        moved = self._restarter.along_valley(few, found.T_ac.inverse())
+        budget.spend(VALLEY_WORK)
+        moved = self._neighbourhood.along_valley(few, found.T_ac.inverse())
         if moved.t.tobytes() == found.T_ac.inverse().t.tobytes():
             return found
-        return self._nearest(few, [found, self._graded(scan, moved.inverse(), budget, width, halves, carried)], width)
-
-    def _nearest(self, few: NDArray[Any], found: list[Alignment], width_m: float) -> Alignment:
-        """The second alignment if the points, none farther than ``width_m``, are nearer to the model there."""
-        cost = [self._restarter.measure(few, each.T_ac.inverse()).cost(width_m) for each in found]
-        return found[cost[1] < restarts.NEARER * cost[0]]
+        again = self._graded(scan, moved.inverse(), budget, width, halves, carried)
+        return self._restarter.nearest(few, [found, again], width)
 
     def _graded(
         self,

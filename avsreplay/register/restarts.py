@@ -19,7 +19,6 @@ from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.backend import FIXED_WORK, Target, healthy_work
-from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.plausibility import NOISE_OF_EXTENT, PlausibilityTest
 from avsreplay.register.size import LEAST_RESIDUALS
 from avsreplay.register.surface_index import IcpParams
@@ -31,14 +30,12 @@ FALL, PASSES = 0.6, 4  # factor on the rejection distance per stage, and passes 
 TURN_RAD = np.radians(4.0)
 PATCH_OF_EXTENT, CELLS = 0.05, 64  # side of a cube of neighbouring points; cubes along the extent, at least
 SHARED = 0.5  # of the rms distance; a correct pose of a correct model has less than 0.4 in common to neighbours
-VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
 BETTER_THAN, NEARER = 0.9, 0.999  # a restart, or a second alignment, replaces the first with a cost below this share
 SAME_POSE = 1e-9  # two poses with entries nearer than this (lengths: times the extent) are one
 NEAR, MOSTLY = 5.0, 0.9  # a rest is another object if this share of points nearer than so many widths is on the model
 FAR_WORK, LEAST_NEAR = 2, 0.5  # searches per point of a pass while less than this share of the points is on the model
 SCATTER_WORK = 10  # cost per point of leaving out scattered points
 TEST_WORK = SIZE_WORK = 23_000  # cost of a test of a pose, and of fitting the size where many points are off the model
-VALLEY_WORK = 7 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
 PASS_WORK, MEASURED_WORK = 1500, 4  # cost of a stage of a restart, and of a point measured at a pose [searches]
 COMPARED_WORK = 4 * MEASURED_WORK * POINTS  # cost of comparing the results of a step, measured about four times
 HEALTHY_SCANS = 20  # most work for one scan in units of an ordinary registration
@@ -96,9 +93,13 @@ class Restart:
     distance: Array
     noise_m: float
 
+    def costs(self, width_m: float) -> Array:
+        """Return min(1, squared distance in units of the width) of each point."""
+        return np.asarray(np.minimum(self.distance / width_m, 1.0) ** 2)
+
     def cost(self, width_m: float) -> float:
-        """Return the mean of min(1, squared distance in units of the width)."""
-        return float(np.mean(np.minimum(self.distance / width_m, 1.0) ** 2))
+        """Return the mean of :meth:`costs`."""
+        return float(np.mean(self.costs(width_m)))
 
     def separate(self, width_m: float) -> bool:
         """Return whether the points off the model are well away from it, as those of another object are."""
@@ -115,8 +116,8 @@ class Restarter:
         vertices = target.surface.vertices
         self._middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         narrow, wide = START_OF_EXTENT * self._extent, target.limits.reach_m
-        self._narrow, self._wide = narrow, max(wide, narrow)
-        self._stages = {start: self._stages_from(start) for start in (self._narrow, self._wide)}
+        self.narrow_m, self._wide = narrow, max(wide, narrow)
+        self._stages = {start: self._stages_from(start) for start in (self.narrow_m, self._wide)}
 
     def _stages_from(self, start_m: float) -> list[dict[bool, IcpParams]]:
         """The rules of the stages with falling rejection distance, without and with the facing test."""
@@ -177,6 +178,16 @@ class Restarter:
         """
         noise = min(at.noise_m, NOISE_OF_EXTENT * self._extent)
         return max(min(self._target.limits.gate_m, STOP_OF_EXTENT * self._extent), 3.0 * noise)
+
+    def nearest(self, few: NDArray[Any], found: list[Alignment], width_m: float) -> Alignment:
+        """Return the second alignment if the points, none farther than ``width_m``, are nearer to the model there."""
+        cost = [self.measure(few, each.T_ac.inverse()).cost(width_m) for each in found]
+        return found[cost[1] < NEARER * cost[0]]
+
+    def reason(self, few: NDArray[Any], found: Alignment, budget: Budget, guess: Pose) -> str:
+        """Return why a pose is not plausible; "" if it is, or nothing was measured."""
+        budget.spend(TEST_WORK)
+        return self._test.check(few, found.T_ac.inverse(), None, guess).reason if found.measured else ""
 
     def misfit(self, points: NDArray[Any], T_ca: Pose) -> bool:
         """Return whether neighbouring points on the model share most of their distances from it, (n, 3) in {A}.
@@ -239,37 +250,6 @@ class Restarter:
         far = float(np.linalg.norm(moved, axis=1).mean()) > gate
         return far and self.structure(points, T_ca) > max(poor, np.sqrt(0.5) * found.rms_m)
 
-    def along_valley(self, points: NDArray[Any], T_ca: Pose) -> Pose:
-        """Return the best pose along the two directions in which the scan determines it least, or the pose itself.
-
-        Points of another object next to the surface can hold a pose away from the minimum that the surface alone has,
-        and such a false minimum lies along the floor of the valley.
-
-        Args:
-            points: (n, 3) in {A} [m].
-            T_ca: registered pose.
-        """
-        index, target = self._target.index, self._target
-        few = points[:: max(1, len(points) // VALLEY_POINTS)]
-        here = self.measure(few, T_ca)
-        gate, width = target.limits.gate_m, self.width(here)
-        on, camera_c = here.distance < gate, target.visibility.camera_c(index, few, T_ca)
-        sums = index.normal_equations(few, T_ca, gate, facing=camera_c is not None)
-        if min(sums.inliers, int(on.sum())) < 6:  # fewer do not determine a pose
-            return T_ca
-        centre = T_ca.apply(few[on]).mean(axis=0)
-        info, radius = scaled_information(sums.info, sums.inliers, centre)
-        floor = np.linalg.eigh(info)[1][:, :2].T
-        steps = 0.5 * gate * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
-        tried = np.concatenate([np.zeros((1, 6)), np.multiply.outer(steps, floor).reshape(-1, 6)])
-        turns = geometry.exp(tried[:, :3] / radius)
-        moved = np.einsum("kij,nj->kni", geometry.matrix(turns), T_ca.apply(few) - centre)
-        moved += (centre + tried[:, 3:])[:, None]
-        d2 = index.closest(moved.reshape(-1, 3), camera_c=camera_c, most_m=width).d2.reshape(len(tried), -1)
-        best = int(np.argmin(np.minimum(d2, width**2).mean(axis=1)))
-        shift = centre + tried[best, 3:] - geometry.matrix(turns[best]) @ centre
-        return Pose(turns[best], shift) @ T_ca if best else T_ca
-
     def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
         """Return the pose after passes with a falling rejection distance, from ``start_m`` [m] on."""
         index = self._target.index
@@ -306,14 +286,14 @@ class Restarter:
             if not budget.allows(self.work(start) * FAR_WORK * len(points), kept):
                 break
             found.append(self.graduated(points, T_ca, start, budget))
-            best = self._least(found)
+            best = self.least(found)
             if best is tested or not self._confirmed(best, found):
                 continue
             budget.spend(TEST_WORK)
             if not self._test.check(points, best.T_ca).reason:
                 break
             tested = best
-        return self._least(found)
+        return self.least(found)
 
     def work(self, start_m: float) -> int:
         """Return the largest number of passes of one graduated registration."""
@@ -321,22 +301,28 @@ class Restarter:
 
     def _confirmed(self, best: Restart, found: list[Restart]) -> bool:
         """Whether two starts led to the best pose."""
-        return any(self._same(best.T_ca, other.T_ca) for other in found if other is not best)
+        return any(self.same(best.T_ca, other.T_ca) for other in found if other is not best)
 
-    def _least(self, found: list[Restart]) -> Restart:
+    def least(self, found: list[Restart]) -> Restart:
+        """Return the pose of least cost, but the first one if none has a clearly lower cost."""
         width = max(self._target.limits.gate_m, 3.0 * min(each.noise_m for each in found))
         least = min(found, key=lambda each: each.cost(width))
         return least if least.cost(width) < BETTER_THAN * found[0].cost(width) else found[0]
 
-    def _same(self, T_a: Pose, T_b: Pose) -> bool:
+    def same(self, T_a: Pose, T_b: Pose) -> bool:
+        """Return whether two poses T_ca differ by less than 1 deg and 0.01 of the extent."""
         step = T_a @ T_b.inverse()  # in {C}
         if float(geometry.angle(step.q)) >= np.radians(1.0):
             return False
-        return float(np.linalg.norm(step.apply(self._middle) - self._middle)) < 0.01 * self._extent
+        return self.shift(step) < 0.01 * self._extent
+
+    def shift(self, step: Pose) -> float:
+        """Return by how much a motion in {C} moves the middle of the model [m]."""
+        return float(np.linalg.norm(step.apply(self._middle) - self._middle))
 
     def _starts(self, guess: Pose, result: Pose, centre_a: Array, turned: bool) -> Iterator[tuple[Pose, float]]:
         """Guess and result with a narrow and a wide start, or both rotated by TURN_RAD about each axis of {C}."""
-        narrow = self._narrow
+        narrow = self.narrow_m
         apart = np.abs(guess.matrix - result.matrix) / np.array([1.0, 1.0, 1.0, self._extent])
         bases = (guess, result) if apart.max() > SAME_POSE else (guess,)
         if not turned:

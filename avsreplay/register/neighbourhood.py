@@ -1,0 +1,142 @@
+"""Other local minima near a registered pose, along the directions of motion that the scan determines least.
+
+Three cases lead to a wrong minimum near the true pose. Points of another object next to the surface can hold a pose
+away from the minimum that the surface alone has; the cost is then lower along the floor of the valley. A scan that
+shows a small part of the target has several minima, and nearly all points can be near the model at a wrong one; the
+scan is then registered again from poses displaced along these directions. A scan of a panel can be matched to its other
+side; it is registered again from a pose that is displaced towards the camera.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from avsreplay import geometry
+from avsreplay.geometry import Array, Pose
+from avsreplay.records import Alignment, AlignStatus
+from avsreplay.register.backend import Target
+from avsreplay.register.degenerate import scaled_information
+from avsreplay.register.plausibility import PlausibilityTest
+from avsreplay.register.restarts import FAR_WORK, MEASURED_WORK, STOP_OF_EXTENT, Budget, Restart, Restarter
+
+VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
+VALLEY_WORK = 7 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
+POINTS, DIRECTIONS = 300, 3  # points that are registered from displaced poses; directions, each both ways
+DISPLACED_OF_EXTENT = 0.03  # rms displacement of the points of the scan
+UNMOVED, RADIUS_OF_EXTENT = 0.25, 0.25  # a pose nearer to its guess, in gates, is not compared; usual rms radius
+SEVERAL = "the scan shows a part of the target, and another pose near this one explains it as well"
+NOT_COMPARED = "the scan shows a part of the target, and no work is left to compare the poses near this one"
+SIGMAS = 4.0  # a minimum whose excess cost is below so many standard errors of it explains the scan as well
+
+
+class Neighbourhood:
+    """Local minima near registered poses of one target."""
+
+    def __init__(self, target: Target, test: PlausibilityTest, restarter: Restarter) -> None:
+        self._target, self._test, self._restarter = target, test, restarter
+        self._extent = target.surface.extent
+
+    def best(
+        self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget
+    ) -> tuple[Restart | None, AlignStatus, str]:
+        """Return a better minimum around a pose; the status of the better of both, and why it is not accepted.
+
+        Nothing is compared at the predicted pose, and where the scan shows all of the target on faces that face the
+        camera.
+
+        Args:
+            points: (n, 3) in {A} [m], part of the scan.
+            guess: predicted T_ac.
+            found: the alignment.
+            budget: work that is left.
+
+        Returns:
+            None if no minimum is clearly better; "" if no other one explains the scan as well.
+        """
+        T_ca, aligned = found.T_ac.inverse(), found.status is AlignStatus.ALIGNED
+        if not (aligned or found.status is AlignStatus.DEGENERATE) or not self._moved(T_ca, guess):
+            return None, found.status, ""
+        if not (self._test.turned_away(points, T_ca) or (aligned and self._test.partial(points, T_ca))):
+            return None, found.status, ""
+        if not budget.allows((1 + 2 * DIRECTIONS) * FAR_WORK * self._restarter.work(self._restarter.narrow_m) * POINTS):
+            return None, AlignStatus.BUDGET_EXHAUSTED, NOT_COMPARED
+        minima = self._minima(points, T_ca, DIRECTIONS if aligned else 0, budget)
+        best, width = self._restarter.least(minima), 3.0 * min(each.noise_m for each in minima)
+        width = max(STOP_OF_EXTENT * self._extent, width)
+        others = (each for each in minima if not self._restarter.same(best.T_ca, each.T_ca))
+        doubt = SEVERAL if aligned and any(_as_good(best, other, width) for other in others) else ""
+        return None if best is minima[0] else best, AlignStatus.AMBIGUOUS, doubt
+
+    def _moved(self, T_ca: Pose, guess: Pose) -> bool:
+        """Whether a pose differs from the predicted T_ac ``guess``."""
+        step = T_ca @ guess  # in {C}
+        turned = float(geometry.angle(step.q)) * RADIUS_OF_EXTENT * self._extent
+        return turned + self._restarter.shift(step) > UNMOVED * self._target.limits.gate_m
+
+    def _minima(self, points: NDArray[Any], T_ca: Pose, count: int, budget: Budget) -> list[Restart]:
+        """The pose, and those registered from poses displaced towards the camera and along ``count`` directions."""
+        few = points[:: max(1, len(points) // POINTS)]
+        found, weak = [self._restarter.measure(points, T_ca)], self._weak(few, T_ca, count)
+        if weak is None:
+            return found
+        centre, radius, directions = weak
+        nearer = np.concatenate([np.zeros(3), T_ca.t - centre])[None] / np.linalg.norm(T_ca.t - centre)
+        for x in DISPLACED_OF_EXTENT * self._extent * np.concatenate([nearer, directions, -directions]):
+            start = _displaced(T_ca, centre, radius, x)
+            ended = self._restarter.graduated(few, start, self._restarter.narrow_m, budget)
+            found.append(self._restarter.measure(points, ended.T_ca))
+            budget.spend(MEASURED_WORK * len(points))
+        return found
+
+    def along_valley(self, points: NDArray[Any], T_ca: Pose) -> Pose:
+        """Return the best pose along the two directions in which the scan determines it least, or the pose itself.
+
+        Args:
+            points: (n, 3) in {A} [m].
+            T_ca: registered pose.
+        """
+        few, target = points[:: max(1, len(points) // VALLEY_POINTS)], self._target
+        weak = self._weak(few, T_ca, 2)
+        if weak is None:
+            return T_ca
+        centre, radius, floor = weak
+        width = self._restarter.width(self._restarter.measure(few, T_ca))
+        steps = 0.5 * target.limits.gate_m * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
+        tried = np.concatenate([np.zeros((1, 6)), np.multiply.outer(steps, floor).reshape(-1, 6)])
+        turns = geometry.exp(tried[:, :3] / radius)
+        moved = np.einsum("kij,nj->kni", geometry.matrix(turns), T_ca.apply(few) - centre)
+        moved += (centre + tried[:, 3:])[:, None]
+        camera_c = target.visibility.camera_c(target.index, few, T_ca)
+        d2 = target.index.closest(moved.reshape(-1, 3), camera_c=camera_c, most_m=width).d2.reshape(len(tried), -1)
+        best = int(np.argmin(np.minimum(d2, width**2).mean(axis=1)))
+        return _displaced(T_ca, centre, radius, tried[best]) if best else T_ca
+
+    def _weak(self, few: NDArray[Any], T_ca: Pose, count: int) -> tuple[Array, float, Array] | None:
+        """Centroid and rms radius of the inliers, and the motions x (count, 6) that they determine least.
+
+        None with fewer than six inliers, which do not determine a pose.
+        """
+        target, gate = self._target, self._target.limits.gate_m
+        on = self._restarter.measure(few, T_ca).distance < gate
+        facing = target.visibility.camera_c(target.index, few, T_ca) is not None
+        sums = target.index.normal_equations(few, T_ca, gate, facing=facing)
+        if min(sums.inliers, int(on.sum())) < 6:
+            return None
+        centre = T_ca.apply(few[on]).mean(axis=0)
+        info, radius = scaled_information(sums.info, sums.inliers, centre)
+        return centre, radius, np.linalg.eigh(info)[1][:, :count].T
+
+
+def _displaced(T_ca: Pose, centre: Array, radius_m: float, x: Array) -> Pose:
+    """The pose moved by x = [L theta; u] (6,) about a centre (3,) in {C} [m], with the rms radius L."""
+    turn = geometry.exp(x[:3] / radius_m)
+    return Pose(turn, centre + x[3:] - geometry.matrix(turn) @ centre) @ T_ca
+
+
+def _as_good(best: Restart, other: Restart, width_m: float) -> bool:
+    """Whether the excess cost of the other pose, point by point, is below ``SIGMAS`` standard errors of its mean."""
+    excess = other.costs(width_m) - best.costs(width_m)
+    return bool(excess.mean() < SIGMAS * excess.std() / np.sqrt(len(excess)))
