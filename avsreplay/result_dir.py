@@ -17,7 +17,6 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from avsreplay.binary_files import read_npz
 from avsreplay.errors import UnreadableInput, UsageError
@@ -25,7 +24,6 @@ from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.files import check_output, output_folder
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, State, Surface
-from avsreplay.register import Registrar
 from avsreplay.report.export import row_poses, write_layout, write_tum
 from avsreplay.report.jsonl import write_rows
 from avsreplay.report.result import load_result, write_manifest
@@ -33,13 +31,12 @@ from avsreplay.report.view import CloudView, PathView, View, thin_cloud, thin_su
 from avsreplay.rows import Row
 from avsreplay.run import Listener, ReplayedScan, Run
 from avsreplay.settings import dump
-from avsreplay.viewers import NewPaths, ResultLogWriter
+from avsreplay.viewers import NewPaths, ResultLogWriter, residuals_of
 
 CHECKPOINT = "resume.bin"  # checkpoint of an interrupted run
 OWN = frozenset({"rows.jsonl", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz", "view.npz", "run.json",
                  "result.mcap", "result.layout.json", "report.html", CHECKPOINT})  # fmt: skip
 _MOST_BELIEF_BYTES, _LARGEST = 1 << 30, 1e15
-VIEW_REACH = 0.05  # largest residual in the view, over the model's extent
 _BLOCKS = (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4))
 MEAN_COLUMNS = tuple(f"{name}[{k}]" for name, size in _BLOCKS for k in range(size))
 _DRIVEN = ("driven", "u", "P_u", "cross")  # arrays of beliefs.npz about beliefs with a constant acceleration
@@ -146,20 +143,17 @@ class Beliefs:
 
 
 class ViewWriter:
-    """A listener that keeps a thinned model, thinned clouds and planned paths for the report page."""
+    """Keeps a thinned model, thinned clouds and planned paths for the report page."""
 
-    def __init__(self, surface: Surface, registrar: Registrar) -> None:
-        self._surface, self._registrar, self._paths = surface, registrar, NewPaths()
-        self._reach_m = VIEW_REACH * surface.extent
+    def __init__(self, surface: Surface) -> None:
+        self._surface = surface
         self._clouds: list[CloudView] = []
         self._plans: list[PathView] = []
 
-    def __call__(self, scan: ReplayedScan) -> None:
-        """Take one scan of a run."""
+    def take(self, scan: ReplayedScan, residuals: Array, path: tuple[Array, Array] | None) -> None:
+        """Take one scan: distances (n,) of its points to the model [m]; times and positions of a new flight, if any."""
         source = scan.outcome.scan
-        thin = thin_cloud(source.seq, source.points, intensity=source.intensities)
-        self._clouds.append(replace(thin, residual_m=self._residual(thin.points, scan.outcome.pose)))
-        path = self._paths.of(scan.state)
+        self._clouds.append(thin_cloud(source.seq, source.points, residuals, source.intensities))
         if path is not None:
             self._plans.append(PathView(scan.row.t_ns, np.asarray(path[1], np.float32), scan.row.plan_miss_m))
 
@@ -167,10 +161,6 @@ class ViewWriter:
         """Take the errors of the plans from corrected rows."""
         misses = {row.t_ns: row.plan_miss_m for row in rows}
         self._plans = [replace(plan, miss_m=misses[plan.t_ns]) for plan in self._plans]
-
-    def _residual(self, points: NDArray[np.float32], T_ac: Pose) -> NDArray[np.float32]:
-        """Distance (n,) [m] of points (n, 3) in {A} to the model at the estimated pose."""
-        return self._registrar.distance(points, T_ac, self._reach_m).astype(np.float32)
 
     def view(self) -> View:
         """Return everything kept so far."""
@@ -248,7 +238,7 @@ class ResultWriter:
             run: the open run.
         """
         self._directory, self._run = directory, run
-        self._beliefs, self._view = Beliefs(), ViewWriter(run.surface, run.registrar)
+        self._beliefs, self._view, self._paths = Beliefs(), ViewWriter(run.surface), NewPaths()
 
     def __enter__(self) -> ResultWriter:
         self._directory.__enter__()
@@ -265,7 +255,12 @@ class ResultWriter:
     @property
     def listeners(self) -> tuple[Listener, ...]:
         """The listeners that must take every scan."""
-        return self._beliefs, self._view, self._log
+        return self._beliefs, self._take
+
+    def _take(self, scan: ReplayedScan) -> None:
+        shown = residuals_of(self._run, scan), self._paths.of(scan.state)
+        self._view.take(scan, *shown)
+        self._log.take(scan, *shown)
 
     def resume(self, facts: Mapping[str, Any]) -> list[Row]:
         """Continue the interrupted run whose result the directory holds; return its rows.
@@ -287,9 +282,9 @@ class ResultWriter:
             hint = "give the same options as at first, or start anew with --overwrite"
             what = f"the interrupted run differs in: {', '.join(different)}"
             raise UsageError(what, where=f"--resume {folder}", hint=hint)
-        more: Any = ([], self._beliefs, self._view, self._log.paths)
-        rows, self._beliefs, self._view, known = self._run.restore(folder / CHECKPOINT, more)
-        self._log.resume(folder / "result.mcap", known, rows[-1])
+        more: Any = ([], self._beliefs, self._view, self._paths)
+        rows, self._beliefs, self._view, self._paths = self._run.restore(folder / CHECKPOINT, more)
+        self._log.take_over(folder / "result.mcap", rows)
         return list(rows)
 
     def correct(self, rows: Sequence[Row], changed: Sequence[int]) -> None:
@@ -319,6 +314,6 @@ class ResultWriter:
         write_view(self._directory.file("view.npz"), self._view.view())
         write_layout(self._directory.file("result.layout.json"))
         if resumable:
-            more = (list(rows), self._beliefs, self._view, self._log.paths)
+            more = (list(rows), self._beliefs, self._view, self._paths)
             self._directory.file(CHECKPOINT).write_bytes(self._run.checkpoint(more))
         write_manifest(self._directory.file("run.json").parent, record, len(rows))

@@ -28,7 +28,7 @@ from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump
 
 PATH_POINTS = 41
-RESIDUAL_REACH = 0.05  # largest residual in the viewer log, over the model's extent
+RESIDUAL_REACH = 0.05  # largest residual that is shown, over the model's extent
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
 _COLUMNS = tuple(column.name for column in columns())
 RERUN_PORT = 9876  # port of a Rerun viewer
@@ -45,6 +45,16 @@ def message_covariance(belief: Belief) -> Array:
     to_a[:3, :3] = np.eye(3)
     to_a[3:, 3:] = 2.0 * geometry.matrix(belief.x.q_ab)  # half angle in {B} -> full angle in {A}
     return np.asarray(to_a @ H @ belief.P @ H.T @ to_a.T)
+
+
+def residuals_of(run: Run, scan: ReplayedScan) -> Array:
+    """Return the distances (n,) of the points of a scan to the model at the estimate [m], at most 5 % of its extent.
+
+    Args:
+        run: the open run.
+        scan: one of its scans.
+    """
+    return run.registrar.distance(scan.outcome.scan.points, scan.outcome.pose, RESIDUAL_REACH * run.surface.extent)
 
 
 class NewPaths:
@@ -64,30 +74,24 @@ class NewPaths:
 
 
 class ResultLogWriter:
-    """A listener that writes each scan's outcome to ``result.mcap``; ``close`` completes the file."""
+    """Writes each scan's outcome to ``result.mcap``; ``close`` completes the file."""
 
     def __init__(self, path: Path, run: Run) -> None:
         settings = dump(run.config)
         del settings["register"]["threads"]  # the file is the same for any number of threads
         facts = {"configuration": json.dumps(settings, sort_keys=True), "version": __version__}
-        self._log, self.paths = ResultLog(path, run.surface, facts, approach_cones(run)), NewPaths()
-        self._registrar, self._reach_m = run.registrar, RESIDUAL_REACH * run.surface.extent
+        self._log = ResultLog(path, run.surface, facts, approach_cones(run))
 
-    def resume(self, written: Path, paths: NewPaths, last: Row) -> None:
-        """Take over the messages of the log of an interrupted run, the plans that it has seen and its last row."""
-        self._log.copy(written, last.reason)
-        self.paths = paths
-
-    def take_over(self, written: Path, rows: Sequence[Row], changed: Iterable[int]) -> None:
-        """Take over the messages of a complete log of the same run, with the columns of the rows that have changed."""
+    def take_over(self, written: Path, rows: Sequence[Row], changed: Iterable[int] = ()) -> None:
+        """Take over the messages of an earlier log of the same run, with the columns of the rows that have changed."""
         self._log.copy(written, rows[-1].reason, {k: _numbers(rows[k]) for k in changed})
 
     def close(self) -> None:
         """Complete the file."""
         self._log.close()
 
-    def __call__(self, scan: ReplayedScan) -> None:
-        """Take one scan of a run."""
+    def take(self, scan: ReplayedScan, residuals: Array, path: tuple[Array, Array] | None) -> None:
+        """Take one scan: distances (n,) of its points to the model [m]; times and positions of a new flight, if any."""
         row, outcome = scan.row, scan.outcome
         values = {name: value for name in _LOGGED_COLUMNS if (value := getattr(row, name)) is not None}
         self._log.write(
@@ -98,11 +102,11 @@ class ResultLogWriter:
                 covariance=message_covariance(outcome.belief),
                 registration=next((pose for _, pose in row_poses([row], "registration")), None),
                 truth=scan.truth.pose,
-                path=self.paths.of(scan.state),
+                path=path,
                 healthy=row.gamma == 1,
                 message=row.reason,
                 values=values,
-                residuals=self._registrar.distance(outcome.scan.points, outcome.pose, self._reach_m),
+                residuals=residuals,
                 intensities=outcome.scan.intensities,
                 columns=_numbers(row),
             )
@@ -148,8 +152,7 @@ class RerunStream:
             hint = "install it with: pip install 'avsreplay[rerun]'"
             raise MissingBackend("rerun-sdk is not installed", where="--rerun", hint=hint) from None
         self._rr: Any = rerun
-        self._registrar, self._reach_m = run.registrar, RESIDUAL_REACH * run.surface.extent
-        self._paths = NewPaths()
+        self._run, self._paths = run, NewPaths()
         rerun.init("avsreplay", spawn=target == "view")
         if target == "connect":
             rerun.connect_grpc()
@@ -172,8 +175,8 @@ class RerunStream:
         rr, row, outcome = self._rr, scan.row, scan.outcome
         rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
         points = np.array(outcome.scan.points, np.float32, order="C")
-        residuals = self._registrar.distance(outcome.scan.points, outcome.pose, self._reach_m)
-        rr.log("camera/scan", rr.Points3D(points, colors=_colours(residuals / self._reach_m)))
+        share = residuals_of(self._run, scan) / (RESIDUAL_REACH * self._run.surface.extent)
+        rr.log("camera/scan", rr.Points3D(points, colors=_colours(share)))
         self._place("camera/estimate", outcome.pose)
         if scan.truth.pose is not None:
             self._place("camera/truth", scan.truth.pose)

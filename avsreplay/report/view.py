@@ -77,7 +77,8 @@ def thin_cloud(
 ) -> CloudView:
     """At most ``most`` points at an even stride. points (n, 3) in {A} [m], residual_m (n,) [m], intensity (n,)."""
     points = np.asarray(points)
-    chosen = np.unique(np.linspace(0, max(len(points) - 1, 0), min(most, len(points))).astype(np.intp))
+    count = min(most, len(points))
+    chosen = np.arange(count) * (len(points) - 1) // max(count - 1, 1)
     residual, seen = (
         None if of_point is None else np.asarray(of_point, dtype=np.float32)[chosen]
         for of_point in (residual_m, intensity)
