@@ -57,10 +57,12 @@ def read_limited(path: Path, limit: int, hint: str, *, pipe: bool = False) -> by
     """
     try:
         found = path.stat()
-        if not stat.S_ISREG(found.st_mode) and not (pipe and stat.S_ISFIFO(found.st_mode)):
+        regular = stat.S_ISREG(found.st_mode)
+        if not regular and not (pipe and stat.S_ISFIFO(found.st_mode)):
             raise UnreadableInput("is not a regular file", where=str(path), hint=hint)
         with path.open("rb") as stream:
-            data = stream.read(limit + 1) if found.st_size <= limit else b""
+            # read(n) allocates n bytes, which is 16 GiB for a checkpoint
+            data = b"" if found.st_size > limit else stream.read() if regular else stream.read(limit + 1)
         if max(found.st_size, len(data)) > limit:
             raise UnreadableInput(f"larger than {limit >> 20} MiB", where=str(path), hint=hint)
         return data

@@ -10,7 +10,7 @@ from itertools import islice
 import numpy as np
 import pytest
 
-from avsreplay.binary_files import pack_state, unpack
+from avsreplay.binary_files import pack_state, read_limited, unpack
 from avsreplay.cli.run import _collect
 from avsreplay.errors import UnreadableInput, UsageError
 from avsreplay.geometry import Pose
@@ -162,3 +162,12 @@ def test_a_damaged_checkpoint_is_one_line(tmp_path, cut):
     path.write_bytes(data[:cut])
     with pytest.raises(UnreadableInput):
         unpack(path, {})
+
+
+def test_reading_a_file_allocates_its_size_and_not_the_limit(tmp_path):
+    """``read(n)`` allocates n bytes; Windows refuses 16 GiB, the limit of a checkpoint."""
+    path = tmp_path / "file"
+    path.write_bytes(b"seven")
+    assert read_limited(path, 1 << 62, "") == b"seven"
+    with pytest.raises(UnreadableInput, match="larger than 0 MiB"):
+        read_limited(path, 4, "")
