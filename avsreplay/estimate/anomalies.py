@@ -35,6 +35,7 @@ from avsreplay.estimate.scan_window import (
     Hypothesis,
     disturbance_levels,
     last_change_ns,
+    long_run,
     odds_over_free,
     possible_change,
     scans_after,
@@ -44,7 +45,6 @@ from avsreplay.estimate.track import (
     SensorBias,
     Track,
     confirmed,
-    long_run,
     nis_scale,
     ready,
     with_history,
@@ -92,9 +92,9 @@ class AnomalyTest:
         if track.bias is not None:
             bias = _continued(track.bias, epoch)
             if bias is not None:
-                return replace(track, belief=epoch.prediction.belief, bias=bias), Verdict(0, Reason.SENSOR_BIAS)
-            track = replace(track, bias=None)
-        doubtful = replace(track, belief=epoch.prediction.belief, doubtful=(*track.doubtful, epoch))
+                return track.changed(belief=epoch.prediction.belief, bias=bias), Verdict(0, Reason.SENSOR_BIAS)
+            track = track.changed(bias=None)
+        doubtful = track.changed(belief=epoch.prediction.belief, doubtful=(*track.doubtful, epoch))
         large = verdict.reason is Reason.POSE_JUMP
         if not (ready(track) and track.recent):
             large = large or (ready(track) and epoch.innovation.chi2 > GATE * nis_scale(track))
@@ -119,7 +119,7 @@ class AnomalyTest:
         """The track with the possible change of the velocities within its accepted scans."""
         recent = track.recent if self.enabled and ready(track) else ()
         probability, P = possible_change(recent, nis_scale(track), self._priors, self.params.change_probability)
-        return replace(track, change_probability=probability, change_P=P)
+        return track.changed(change_probability=probability, change_P=P)
 
     def _accepted(self, track: Track, epoch: Epoch, update: Callable[[Track], Track]) -> Track:
         """A scan that agrees with the prediction: the doubtful scans before it were bad.
@@ -127,9 +127,9 @@ class AnomalyTest:
         The hypotheses are linear about the prediction from the first recent scan. This one must be from an estimate
         that is based on enough poses: before, its errors are too large for the linearisation.
         """
-        after = update(replace(track, doubtful=(), rejected=(), manoeuvres=confirmed(track), pending=False))
+        after = update(track.changed(doubtful=(), rejected=(), manoeuvres=confirmed(track), pending=False))
         after = with_nis(after, track, epoch.innovation.chi2)
-        return replace(after, recent=(*track.recent, epoch)[-_RECENT:]) if ready(track) else after
+        return after.changed(recent=(*track.recent, epoch)[-_RECENT:]) if ready(track) else after
 
     def _undecidable(self, track: Track) -> tuple[Track, Verdict]:
         """Too few scans were accepted for the hypotheses to be compared: the doubtful ones may agree by themselves."""
@@ -154,7 +154,7 @@ class AnomalyTest:
         if doubtful < _FEWEST:
             return in_doubt
         if best.hypothesis is Hypothesis.FREE_MOTION or (best.hypothesis in _DISTURBANCES and explained):
-            before = replace(with_history(track.doubtful[0].track, track), recent=track.recent, levels=track.levels)
+            before = with_history(track.doubtful[0].track, track).changed(recent=track.recent, levels=track.levels)
             return self._used(before, track.doubtful), Verdict(1, Reason.OK)
         if best.hypothesis is Hypothesis.SENSOR_BIAS and explained and self._bias_began(track):
             return self._biased(track, window, best), Verdict(0, Reason.SENSOR_BIAS)
@@ -167,7 +167,7 @@ class AnomalyTest:
         rate, velocity = float(found.size[0]), float(found.size[3])
         torque, force = self.batch.noise_levels(track)
         levels = replace(track.levels, torque=max(torque, rate / SPHERE), force=max(force, velocity))
-        return replace(track, levels=replace(levels, count=max(levels.count, 1)))
+        return track.changed(levels=replace(levels, count=max(levels.count, 1)))
 
     def _bias_began(self, track: Track) -> bool:
         """Return whether a step in the pose is the beginning of a sensor error; it may as well be the end of one.
@@ -195,10 +195,10 @@ class AnomalyTest:
         first, last = len(window) - len(track.doubtful), window[-1]
         bias = SensorBias(best.size, best.P, last)
         if best.onset >= first:
-            return replace(with_history(track, track), bias=bias)
+            return with_history(track, track).changed(bias=bias)
         then = window[best.onset].track
         belief, _ = self.batch.propagated(track, then.belief, last.prediction.belief.t_ns)
-        return replace(with_history(then, track), belief=belief, recent=window[: best.onset], bias=bias)
+        return with_history(then, track).changed(belief=belief, recent=window[: best.onset], bias=bias)
 
     def _by_agreement(self, track: Track) -> tuple[Track, Verdict]:
         """The track initialised anew from the doubtful poses if they agree with one another; else they are bad."""
@@ -212,15 +212,15 @@ class AnomalyTest:
             if anew is None and levels.count:
                 anew = self._started(track, track.doubtful[-_FEWEST:], levels)
         if anew is not None:
-            return replace(anew, reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
-        return replace(with_history(track, track), doubtful=track.doubtful[1 - _FEWEST :]), Verdict(0, Reason.POSE_JUMP)
+            return anew.changed(reinitialised=track.reinitialised + 1), Verdict(1, Reason.OK)
+        return with_history(track, track).changed(doubtful=track.doubtful[1 - _FEWEST :]), Verdict(0, Reason.POSE_JUMP)
 
     def _with_rejected(self, track: Track) -> Track:
         """The track with the doubtful poses in its list of rejected ones."""
         last_ns = track.rejected[-1].scan_ns if track.rejected else -1
         later = (e for e in track.doubtful if e.prediction.belief.t_ns > last_ns)
         fixes = (self.batch.fix(e.prediction, e.innovation) for e in later)
-        return replace(track, rejected=(*track.rejected, *fixes)[-MOST_DISTURBED:])
+        return track.changed(rejected=(*track.rejected, *fixes)[-MOST_DISTURBED:])
 
     def _disturbances(self, track: Track) -> NoiseLevels:
         """Levels of disturbances that the last poses show, such as those of a part on a cable, used or not."""
@@ -252,14 +252,14 @@ class AnomalyTest:
         for epoch in epochs:
             out, again = self._replay(out, epoch)
             used.append(again)
-        return replace(out, recent=(*track.recent, *used)[-_RECENT:])
+        return out.changed(recent=(*track.recent, *used)[-_RECENT:])
 
     def _reported(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
         """The track with the manoeuvre in its list; a later report of the same one replaces the first."""
         at_ns = window[0].track.belief.t_ns + round(best.after_s * 1e9)
         now_ns = track.manoeuvres[-1].detected_ns if track.pending else window[-1].prediction.belief.t_ns
         found = Manoeuvre(at_ns, best.after_1s_s, best.size[3:], best.size[:3], best.P, now_ns)
-        return replace(track, manoeuvres=(*confirmed(track), found), pending=True)
+        return track.changed(manoeuvres=(*confirmed(track), found), pending=True)
 
     def _manoeuvred(self, track: Track, window: tuple[Epoch, ...], best: Explanation) -> Track:
         """Rate and velocity fitted anew from the manoeuvre on; everything else is continuous."""
@@ -273,9 +273,9 @@ class AnomalyTest:
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
             at = replace(at, P=P)
         after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
-        anew = replace(track, since=0, recent=(), doubtful=(), pending=False, fitting=None, testing=None)
+        anew = track.changed(since=0, recent=(), doubtful=(), pending=False, fitting=None, testing=None)
         if isinstance(at, DrivenBelief):  # the filter continues, with rate and velocity free
-            return self._used(replace(anew, belief=at, mode="filter", fixes=()), after)
+            return self._used(anew.changed(belief=at, mode="filter", fixes=()), after)
         chart = to_chart(at.x)
         prior = Prior(
             chart,
@@ -284,7 +284,7 @@ class AnomalyTest:
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
         mode = "filter" if track.mode == "filter" else "fit"
-        return replace(anew, belief=result.belief, mode=mode, fixes=fixes, batch=result, prior=prior, prior_ns=t_ns)
+        return anew.changed(belief=result.belief, mode=mode, fixes=fixes, batch=result, prior=prior, prior_ns=t_ns)
 
     def _fitted(self, track: Track, fixes: tuple[PoseFix, ...], prior: Prior, t_ns: int) -> BatchResult:
         """Fit of the poses after a manoeuvre with the prior at its instant."""
@@ -322,9 +322,9 @@ class AnomalyTest:
         prior = epochs[0].prediction.belief
         begin = Belief(prior.t_ns, prior.x, prior.P)
         out = self._used(Track(begin, "start", started_ns=prior.t_ns, levels=levels), epochs)
-        old = replace(track, recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None
-        out = replace(with_history(out, track), drift=track.drift, previous=old)
-        return replace(out, sigma_hits=track.sigma_hits, r_floors=track.r_floors)
+        old = track.changed(recent=(), doubtful=(), previous=None, bias=None) if ready(track) else None
+        out = with_history(out, track).changed(drift=track.drift, previous=old)
+        return out.changed(sigma_hits=track.sigma_hits, r_floors=track.r_floors)
 
 
 def _continued(bias: SensorBias, epoch: Epoch) -> SensorBias | None:

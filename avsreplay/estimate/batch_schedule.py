@@ -50,6 +50,7 @@ FEWEST_TO_FIT = 3
 MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does not grow with the log
 FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
 FEWEST_TO_SPREAD = 48  # poses from which a fit is spread over scans
+_LEAST_GROWTH = 0.25  # part of the growth until the next fit after which worn weights make it due
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
 _RECENT = 0.1  # largest age of a given start over the fit's memory; until then disturbances change it little
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
@@ -86,27 +87,29 @@ class BatchSchedule:
         Between fits the filter's update is applied if the likelihood is Gaussian; otherwise every component of the
         mixture is updated by itself. ``spread``: a fit to many poses is left to ``advanced``.
         """
-        track = replace(track, fixes=self._with(track, prediction, innovation), R=innovation.R, since=track.since + 1)
+        track = track.changed(fixes=self._with(track, prediction, innovation), R=innovation.R, since=track.since + 1)
         if len(track.fixes) < FEWEST_TO_FIT:
-            return replace(track, belief=self._first(track, prediction, innovation))
+            return track.changed(belief=self._first(track, prediction, innovation))
         last = track.batch
-        if last is None or track.since >= max(1.0, self._growth(last) * last.count) or worn(last.components):
+        most = 1.0 if last is None else self._growth(last) * last.count
+        if last is None or track.since >= max(1.0, _LEAST_GROWTH * most if worn(last.components) else most):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
             if last is None or not spread or len(track.fixes) < FEWEST_TO_SPREAD:
                 return self.fitted(forgot, converged, track, whole(self.fit(track, prediction.belief, forgot)))
             if not track.fitting:
                 job = Computation(ComputationKind.FIT, (track, prediction.belief, forgot), (forgot, converged))
-                track = replace(track, fitting=job)
+                track = track.changed(fitting=job)
         if last.gaussian:
             belief = chart_update(prediction.belief, prediction.H, innovation, last.inflation)
-            return replace(track, belief=belief)
+            return track.changed(belief=belief)
         fix, factors, noise = track.fixes[-1], last.factors * np.sqrt(last.inflation), self.noise_levels(track)
         root = _motion.roots(fix.C[None])[0][0]
         mixture = carried(last.components, fix.t_ns, fix.T_ac, root, factors, innovation.weight, noise, self.orbit)
         C = fix.C * np.outer(np.repeat(factors, 3), np.repeat(factors, 3))  # the components may lie further apart
         mixture = not_worse(mixture, fix.t_ns, fix.T_ac, C, innovation.weight, noise, self.orbit)
-        belief, _ = self.propagated(track, moments(mixture), prediction.belief.t_ns)
-        return replace(track, belief=belief, batch=replace(last, components=mixture))
+        belief, t_ns = moments(mixture), prediction.belief.t_ns
+        belief = belief if belief.t_ns == t_ns else self.propagated(track, belief, t_ns)[0]
+        return track.changed(belief=belief, batch=replace(last, components=mixture))
 
     def fit(self, track: Track, belief: Belief, forgot: bool) -> Parts[BatchResult]:
         """The fit to all poses of a track, in parts. ``forgot``: the last fit began with an earlier pose."""
@@ -119,7 +122,7 @@ class BatchSchedule:
         last, noise = track.batch, self.noise_levels(track)
         result = with_last_pose(self._at_present(track, result), track.fixes[-1], noise)
         rejected = result.prior_rejected and not (last is not None and last.prior_rejected)
-        track = replace(track, reinitialised=track.reinitialised + rejected)
+        track = track.changed(reinitialised=track.reinitialised + rejected)
         remembers = forgot and track.levels.slack > 1.0  # the filter keeps information that later fits cannot use
         return self.adopted(track, result, result.gaussian and (converged or remembers))
 
@@ -145,8 +148,7 @@ class BatchSchedule:
         drift = track.drift
         if drift is not None and isinstance(belief, DrivenBelief):
             drift = replace(drift, rate=belief.u[:3], velocity=belief.u[3:], P=belief.P_u)
-        return replace(
-            track,
+        return track.changed(
             belief=belief,
             drift=drift,
             mode="filter",
@@ -178,7 +180,7 @@ class BatchSchedule:
         poses = track.fixes, self.params, self._rules, self._levels(track), last, begin, given
         finish = (last is not None,)
         if spread:
-            return replace(track, fitting=Computation(ComputationKind.CHECK, poses, finish))
+            return track.changed(fitting=Computation(ComputationKind.CHECK, poses, finish))
         return self.checked(*finish, track, whole(batch_estimate(*poses)))
 
     def checked(self, whole_memory: bool, track: Track, result: BatchResult) -> Track:
@@ -192,11 +194,11 @@ class BatchSchedule:
         result = self._at_present(track, result)
         sound = result.gaussian and _better_than_measured(result.belief, track.R)
         if (sound or many_outliers) and contradicted(track.belief, result.belief):
-            adopted = replace(self.adopted(track, result, result.gaussian), reinitialised=track.reinitialised + 1)
-            return adopted if many_outliers else replace(adopted, window=track.window)
+            adopted = self.adopted(track, result, result.gaussian).changed(reinitialised=track.reinitialised + 1)
+            return adopted if many_outliers else adopted.changed(window=track.window)
         if sound and whole_memory and linear:
-            return replace(self.adopted(track, result, to_filter=True), window=track.window)
-        return replace(track, since=0)
+            return self.adopted(track, result, to_filter=True).changed(window=track.window)
+        return track.changed(since=0)
 
     def noise_levels(self, track: Track) -> tuple[float, float]:
         """Root densities of torque [rad/s^1.5] and force [m/s^1.5], given or estimated.
@@ -242,8 +244,8 @@ class BatchSchedule:
     def adopted(self, track: Track, result: BatchResult, to_filter: bool) -> Track:
         """The track with the estimate of a fit; ``to_filter``: the filter continues from it."""
         window = filled(self.noise.base(track.R, track.window), result.factors, self.params.window)
-        track = replace(track, mode="filter" if to_filter else "fit", window=window, since=0)
-        return replace(track, belief=result.belief, batch=result, inflation=result.inflation)
+        track = track.changed(mode="filter" if to_filter else "fit", window=window, since=0)
+        return track.changed(belief=result.belief, batch=result, inflation=result.inflation)
 
     def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
         """The poses within the fit's memory, including this one; of many poses the older half is joined in pairs."""

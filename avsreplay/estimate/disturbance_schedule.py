@@ -36,6 +36,7 @@ FEWEST_WITH_DRIFT, FEWEST_TO_TEST, DRIFT_GROWTH = 40, 10, 0.1  # poses for a tes
 LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the noise levels
 _DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
 _LEAST_EXCESS = 1e-6  # of the variance of a belief over that of a pose, in whose direction it is used
+_LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
 
 
@@ -66,21 +67,25 @@ class DisturbanceSchedule:
         self._drift_scale = (1e-3, _DRIFT_OF_SPEED * given(batch.params.start_vel_1s_mps))
 
     def advanced(self, track: Track, tested: bool) -> Track:
-        """The track after a healthy scan with the work of one scan: a part of a fit, else of a test.
+        """The track after a healthy scan with the work of one scan: noise levels, or a fit and a test in turn.
+
+        Where the levels are too small, every pose makes another fit due: they are estimated before.
 
         Args:
             track: after the scan.
             tested: a test may begin.
         """
         if tested:
-            track = self._begun(replace(track, untested=track.untested + 1, unlevelled=track.unlevelled + 1))
-        job = track.fitting or track.testing
+            track = self._begun(track.changed(untested=track.untested + 1, unlevelled=track.unlevelled + 1))
+        job, other = track.fitting, track.testing
+        if other is not None and (job is None or other.kind is ComputationKind.LEVELS or track.unlevelled % 2):
+            job = other
         if job is None:
             return track
         begin, finish = self._jobs[job.kind]
         work = job.work.continued(partial(begin, *job.begin))
         after = None if work.done else replace(job, work=work)
-        track = replace(track, testing=after) if track.fitting is None else replace(track, fitting=after)
+        track = track.changed(testing=after) if job is track.testing else track.changed(fitting=after)
         return finish(*job.finish, track, work.result) if work.done else track
 
     def _begun(self, track: Track) -> Track:
@@ -90,32 +95,33 @@ class DisturbanceSchedule:
         motion that the filter predicts, and the filter improves its value; fits to all poses replace that estimate.
         """
         count, last, known = pose_count(track.fixes), track.batch, track.drift
-        if not self.batch.checked_poses or last is None or track.testing is not None or track.since == 0:
+        if not self.batch.checked_poses or last is None or track.testing is not None:
             return track
         epoch_ns = track.fixes[0].t_ns
         start = last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
-        if count >= FEWEST and known is None and track.unlevelled > max(FEWEST_TO_TEST, LEVEL_GROWTH * count):
+        late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
+        if count >= FEWEST and known is None and late > (0 if track.since else _LATEST):
             poses = track.fixes, last, start, self.params, track.levels
             if len(track.fixes) < FEWEST_TO_SPREAD:
-                return replace(self._levelled(track, whole(improved_levels(*poses))), unlevelled=0)
-            return replace(track, testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
+                return self._levelled(track, whole(improved_levels(*poses))).changed(unlevelled=0)
+            return track.changed(testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
         due = max(FEWEST_TO_TEST, (DRIFT_GROWTH if known is None else CHECK_GROWTH) * count)
-        if count < FEWEST_WITH_DRIFT or track.untested <= due:
+        if count < FEWEST_WITH_DRIFT or track.untested <= due or track.since == 0:
             return track
         begun = None
         if known is not None:
             if last.epoch_ns != epoch_ns or not isinstance(track.belief, DrivenBelief):
-                return replace(track, untested=0)
+                return track.changed(untested=0)
             begun = max(0.0, (known.t_ns - epoch_ns) * 1e-9), track.belief.u
         job = Computation(ComputationKind.DRIFT, (track, start, begun), (epoch_ns, track.fixes[-1].t_ns))
-        return replace(track, testing=job, untested=0)
+        return track.changed(testing=job, untested=0)
 
     def _levelled(self, track: Track, levels: NoiseLevels) -> Track:
         """The track with new noise levels."""
         used, found = (track.levels.torque, track.levels.force), (levels.torque, levels.force)
         more = any(new > _MORE * old for new, old in zip(found, used, strict=True))
         since = pose_count(track.fixes) if more else track.since  # the estimate does not allow for these: fit again
-        return replace(track, levels=levels, since=since)
+        return track.changed(levels=levels, since=since)
 
     def _tested(self, track: Track, start: Chart, begun: tuple[float, Array] | None) -> Parts[_Driven | None]:
         """The test for a drift, in parts. ``begun``: onset and size of one that is known."""
@@ -162,7 +168,7 @@ class DisturbanceSchedule:
         drift = Drift(onset_ns, spread, moved.u[3:], moved.u[:3], moved.P_u, detected_ns)
         result = BatchResult(epoch_ns, best.fitted.chart, count, plain, inflation, moved, last.gaussian)
         result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
-        track = replace(track, drift=drift, levels=replace(driven.levels, count=count), fitting=None)
+        track = track.changed(drift=drift, levels=replace(driven.levels, count=count), fitting=None)
         return self.batch.adopted(track, result, to_filter=True)
 
 

@@ -156,11 +156,11 @@ class Estimator:
         """
         if innovation is None:
             return self.update(track, prediction, None, 0), verdict
-        epoch = Epoch(replace(track, recent=(), doubtful=(), previous=None), prediction, innovation, converged)
+        epoch = Epoch(track.changed(recent=(), doubtful=(), previous=None), prediction, innovation, converged)
         after, verdict = self.anomalies.step(
             track, epoch, verdict, lambda t: self.update(t, prediction, innovation, verdict.gamma, converged, True)
         )
-        after = replace(after, undetermined=undetermined(track, innovation, verdict.gamma, self._length_m))
+        after = after.changed(undetermined=undetermined(track, innovation, verdict.gamma, self._length_m))
         after = self.anomalies.with_possible_change(after) if verdict.gamma else after
         due = verdict.gamma == 1 and after.mode in ("fit", "filter")
         return self.disturbances.advanced(after, self._robust) if due else after, verdict
@@ -250,7 +250,7 @@ class Estimator:
         seen, P = epoch.innovation, prediction.belief.P
         innovation = innovation_of(P, prediction.H, alpha, R, self._robust, seen.share, seen.dof)
         innovation = replace(innovation, rms_m=seen.rms_m)
-        used = Epoch(replace(track, recent=(), doubtful=(), previous=None), prediction, innovation, epoch.converged)
+        used = Epoch(track.changed(recent=(), doubtful=(), previous=None), prediction, innovation, epoch.converged)
         return self.update(track, prediction, innovation, 1, epoch.converged), used
 
     def update(
@@ -273,7 +273,7 @@ class Estimator:
             spread: a fit to many poses is left to the next scans (``step``).
         """
         if innovation is None or gamma == 0:
-            return replace(track, belief=prediction.belief, change_P=prediction.Phi @ track.change_P @ prediction.Phi.T)
+            return track.changed(belief=prediction.belief, change_P=prediction.Phi @ track.change_P @ prediction.Phi.T)
         if track.mode in ("start", "fit") or (track.mode == "near" and not self.params.by_gain):
             return self.batch.initialised(track, prediction, innovation, converged, spread)
         return self.batch.check_against_batch(self.batch.filtered(track, prediction, innovation), spread)

@@ -16,13 +16,13 @@ from avsreplay import geometry
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, separated, to_errors, to_state
 from avsreplay.estimate.dynamics import forecast_of, grasp_prediction, torque_density, translation
-from avsreplay.estimate.measurement import measurement_jacobian, to_fixture
-from avsreplay.estimate.noise import cholesky_root
+from avsreplay.estimate.error_state import rotation
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, Forecast
 
 _SMALL_EXCESS = 1.1  # largest ratio of the corrected covariance to that of the last pose
+_POSE = np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])  # half angle in {C} and position in {A} of the chart's steps
 _MOVED = 0.5  # sum of the changes of the weights above which the mixture is not a quadrature
 
 
@@ -55,12 +55,17 @@ class Component:
         return Belief(self.t_ns, to_state(chart), 0.5 * (P + P.T))
 
 
-@lru_cache(maxsize=4)
 def moments(components: tuple[Component, ...]) -> Belief:
     """Mean and second moments about it: the mean of the first component, and what the weights have moved it since."""
-    return _joined(components).belief
+    return _belief(_joined(components))
 
 
+@lru_cache(maxsize=4)
+def _belief(joined: Component) -> Belief:
+    return joined.belief
+
+
+@lru_cache(maxsize=4)
 def _joined(components: tuple[Component, ...]) -> Component:
     """One Gaussian with the moments of the mixture."""
     first = components[0]
@@ -146,7 +151,7 @@ def not_worse(
         noise: root densities of torque [rad/s^1.5] and force [m/s^1.5].
         orbit: the relative orbit that the target is on; None for free motion.
     """
-    whiten = np.asarray(np.linalg.inv(cholesky_root(C)), dtype=np.float64)
+    whiten = _motion.roots(C[None])[0][0]
     values, axes = _excess(components, whiten)
     if values[-1] <= 1.0:
         return components
@@ -160,9 +165,10 @@ def not_worse(
 
 def _excess(components: tuple[Component, ...], whiten: Array) -> tuple[Array, Array]:
     """Ascending eigenvalues of S in units of C, and their directions in columns; ``whiten`` C whiten' = 1."""
-    belief = moments(components)
-    J = whiten @ to_fixture(belief.x.T_ac.q, belief.x.q_bc) @ measurement_jacobian(belief.x)
-    values, axes = np.linalg.eigh(J @ belief.P @ J.T)
+    joined = _joined(components)
+    R_ac = rotation(joined.chart.q_ac)
+    J = np.hstack([2.0 * whiten[:, :3], whiten[:, 3:] @ R_ac.T])
+    values, axes = np.linalg.eigh(J @ joined.P[_POSE] @ J.T)
     return values, axes
 
 

@@ -32,6 +32,7 @@ from avsreplay.records import Belief
 EXPLAINED = 2.5  # chi-square per degree of freedom up to which a hypothesis explains the scans
 PRIOR_ODDS = math.log(1e-3)  # prior log odds of every hypothesis relative to free motion with good scans
 _SUSPECTED = 5  # last scans in which a change may have begun
+_RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 SCALES = (1.0, 0.1)  # factors on the prior standard deviations: a large or a small change
 FEWEST_DISTURBED, MOST_DISTURBED = 5, 8  # poses from which disturbances are estimated without a model of the motion
 _DENSITIES, _ERRORS = np.logspace(-6.0, 2.0, 81), np.logspace(0.0, 4.0, 41)  # compared; errors over the claimed ones
@@ -180,6 +181,15 @@ def possible_change(epochs: Sequence[Epoch], scale: float, priors: ChangePriors,
         return 0.0, NO_CHANGE
     probability = prior * ratio / (1.0 - prior + prior * ratio)
     return probability, frozen(probability * P)
+
+
+def long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
+    """Return whether the sum of the last whitened innovations is large, over one of several runs of scans."""
+    last = [e.innovation for e in epochs[: -_RUNS[-1] - 1 : -1]]
+    roots, _ = _motion.roots(np.array([one.S for one in last]))
+    sums = np.cumsum((roots @ np.array([one.alpha for one in last])[:, :, None])[:, :, 0], axis=0)
+    share, lengths = epochs[-1].innovation.share, [n for n in _RUNS if n <= len(sums)]
+    return any(sums[n - 1] @ sums[n - 1] > _RUN_GATE * scale * n * (1.0 + (n - 1) * share) for n in lengths)
 
 
 def log_evidence(white: Array, free: float, M: Array, scale: Array) -> tuple[float, Array, Array]:

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.dynamics import propagate_state, rotation_path
 from avsreplay.estimate.error_state import DMU, VARRHO
@@ -30,7 +29,6 @@ from avsreplay.records import Alignment, AlignStatus, Belief, Drift, Innovation,
 
 _FEWEST_NIS, _MOST_NIS, _MEDIAN_CHI2 = 5, 61, 5.348  # NIS values for the scale; median of chi-square with 6 degrees
 _READY, _READY_AFTER_MANOEUVRE = 8, 3  # least number of poses of an estimate whose prediction can be tested
-_RUNS, _RUN_GATE = (1, 2, 4, 8), 18.5  # lengths of the runs of innovations that are summed; 99.5 % point, 6 degrees
 _NO_NOISE = frozen(np.zeros((6, 6)))
 _NO_MOTION = frozen(np.zeros((6, 0)))
 NO_CHANGE = frozen(np.zeros((20, 20)))
@@ -63,7 +61,7 @@ class Epoch:
     converged: bool
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Track:
     """The state of the estimator between two scans.
 
@@ -125,6 +123,14 @@ class Track:
     change_probability: float = 0.0
     change_P: Array = field(default_factory=lambda: NO_CHANGE)
 
+    def changed(self, **values: Any) -> Track:
+        """Return a copy with other values: ``dataclasses.replace``, faster for so many fields."""
+        new = object.__new__(Track)
+        new.__dict__.update(self.__dict__, **values)
+        if len(new.__dict__) != len(self.__dict__):
+            raise TypeError(f"no fields of a track: {values.keys() - self.__dict__.keys()}")
+        return new
+
 
 def common_motions(first: Array, other: Array | None, length_m: float) -> Array:
     """Return the motions of the model that two sets contain, as columns d = [theta; v] in {C} (6, k).
@@ -178,8 +184,8 @@ def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Tr
     x = replace(x, q_bc=geometry.multiply(x.q_bc, G.q), c_b=x.c_b + geometry.matrix(x.q_bc) @ G.t)
     fixes = tuple(replace(fix, T_ac=fix.T_ac @ G, C=adjoint @ fix.C @ adjoint.T) for fix in track.fixes)
     belief = replace(track.belief, x=x)
-    anew = replace(track, belief=belief, fixes=fixes, mode="start", batch=None, fitting=None, testing=None)
-    return replace(anew, recent=(), doubtful=(), bias=None)
+    anew = track.changed(belief=belief, fixes=fixes, mode="start", batch=None, fitting=None, testing=None)
+    return anew.changed(recent=(), doubtful=(), bias=None)
 
 
 def common_1s(track: Track, r_a: Array) -> Array:
@@ -229,8 +235,7 @@ def in_doubt(track: Track) -> bool:
 
 def with_history(then: Track, now: Track) -> Track:
     """An earlier track, with the events that were found since; no scan is in doubt."""
-    return replace(
-        then,
+    return then.changed(
         manoeuvres=confirmed(now),
         pending=False,
         drift=then.drift or now.drift,
@@ -253,7 +258,7 @@ def nis_scale(track: Track) -> float:
 
 def with_nis(after: Track, before: Track, nis: float) -> Track:
     """The track with the NIS of one more accepted scan."""
-    return replace(after, nis=(*before.nis, nis)[-_MOST_NIS:])
+    return after.changed(nis=(*before.nis, nis)[-_MOST_NIS:])
 
 
 def ready(track: Track) -> bool:
@@ -263,15 +268,6 @@ def ready(track: Track) -> bool:
     """
     least = _READY_AFTER_MANOEUVRE if track.manoeuvres else _READY
     return track.mode == "filter" or (track.mode == "fit" and track.batch is not None and track.batch.count >= least)
-
-
-def long_run(epochs: tuple[Epoch, ...], scale: float) -> bool:
-    """Return whether the sum of the last whitened innovations is large, over one of several runs of scans."""
-    last = [e.innovation for e in epochs[: -_RUNS[-1] - 1 : -1]]
-    roots, _ = _motion.roots(np.array([one.S for one in last]))
-    sums = np.cumsum((roots @ np.array([one.alpha for one in last])[:, :, None])[:, :, 0], axis=0)
-    share, lengths = epochs[-1].innovation.share, [n for n in _RUNS if n <= len(sums)]
-    return any(sums[n - 1] @ sums[n - 1] > _RUN_GATE * scale * n * (1.0 + (n - 1) * share) for n in lengths)
 
 
 _KNOTS = 65  # instants at which the motion is computed; in between, rotation and position are interpolated linearly

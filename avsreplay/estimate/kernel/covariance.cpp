@@ -20,6 +20,33 @@ bool cholesky(const double C[N][N], double L[N][N]) {
   return true;
 }
 
+// The columns in which a row of Phi may differ from 0: Phi is 1 beside the turn and the translation.
+struct Columns {
+  int count, at[8];
+};
+
+Columns columns_of(int row) {
+  if (row < 6) return {8, {0, 1, 2, 3, 4, 5, 12, 13}};
+  if (row < MOTION) return {6, {6, 7, 8, 9, 10, 11}};
+  return {1, {row}};
+}
+
+// P := Phi P Phi' for the transition Phi of error states.
+void congruent(const Square Phi, Square P) {
+  Square half = {};
+  for (int r = 0; r < DIM; ++r) {
+    const Columns from = columns_of(r);
+    for (int k = 0; k < from.count; ++k)
+      for (int c = 0; c < DIM; ++c) half[c][r] += Phi[r][from.at[k]] * P[from.at[k]][c];
+  }
+  for (int c = 0; c < DIM; ++c) {
+    const Columns from = columns_of(c);
+    for (int r = 0; r < DIM; ++r) P[c][r] = 0;
+    for (int k = 0; k < from.count; ++k)
+      for (int r = 0; r < DIM; ++r) P[c][r] += Phi[c][from.at[k]] * half[from.at[k]][r];
+  }
+}
+
 }  // namespace
 
 bool inverse_root(const double C[SEEN][SEEN], double root[SEEN][SEEN]) {
@@ -89,11 +116,7 @@ void propagate(State& x, Square P, double h, const double path[6][6], const doub
   Flow flow = begin(turn_of(x));
   advance(flow, body, h);
   errors_transition(flow, join, path, Phi);
-  Square half, on;
-  product<DIM, DIM>(Phi, P, half);
-  for (int r = 0; r < DIM; ++r)
-    for (int c = 0; c < DIM; ++c) on[c][r] = Phi[r][c];
-  product<DIM, DIM>(half, on, P);
+  congruent(Phi, P);
   if (h > 0) {
     for (int r = 0; r < 6; ++r)
       for (int c = 0; c < 6; ++c) P[r][c] += flow.Q[r][c];
