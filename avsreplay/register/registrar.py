@@ -180,8 +180,8 @@ class Registrar:
             return replace(found, status=AlignStatus.IMPLAUSIBLE, covariance=None, message=at.reason), False
         best, rivals = found.T_ac.inverse(), list(search.rivals)
         if self._symmetry.marked:
+            budget.spend(self._symmetry.work(len(part), len(rivals)))
             best, rivals = self._symmetry.decided(part, best, rivals, at.covered)
-            budget.spend(self._symmetry.work(len(part)))
             if not self._symmetry.search.same(best, found.T_ac.inverse()):
                 found = self._regraded(scan, few, self._restarter.measure(few, best), budget, True, carried)
         rivals = self._symmetry.distinct(scan, found, rivals)

@@ -48,7 +48,7 @@ CONTRADICTING = 0.1  # share of the rays that contradict the true pose, at least
 LEAST_LIKELIHOOD = 20.0  # log likelihood ratio that decides
 LEAST_RAYS = 8  # fewer points off the model decide nothing
 MOST_AGAINST = 0.25  # rays against the better pose over those for it, at most
-STEPS = 24  # steps from a mark towards the camera
+STEPS, LONGEST_STEP = 24, 0.05  # steps from a mark towards the camera; the longest, over the extent
 MOST_POINTS, SCREENED = 6000, 150  # points of the scan; those on and off the model with which all motions are compared
 FINALISTS = 2  # poses of each kind of motion that are refined
 
@@ -129,12 +129,12 @@ class NearSymmetry:
         """Whether a mark distinguishes the turned copies of the model, and nothing else does."""
         return self.near and self._share > 0.0
 
-    def work(self, points: int) -> int:
-        """Return the usual cost of a decision in point searches."""
-        n = min(points, MOST_POINTS)
-        motions = sum(len(motions) for motions in self._kinds)
-        finalists = FINALISTS * len(self._kinds)
-        return 2 * SCREENED * motions + finalists * (FINE_PASSES * 2 * SCREENED + n + STEPS * len(self._marks) // 2)
+    def work(self, points: int, others: int = 0) -> int:
+        """Return the usual cost of a decision between so many other poses and the turned ones in point searches."""
+        motions, finalists = sum(len(motions) for motions in self._kinds), FINALISTS * len(self._kinds)
+        rays = STEPS * len(self._marks)
+        measured = (1 + others + finalists) * (min(points, MOST_POINTS) + rays)
+        return 2 * SCREENED * motions + finalists * (FINE_PASSES * 2 * SCREENED + rays) + measured
 
     def decided(
         self, scan: NDArray[np.floating], T_ca: Pose, others: list[Pose] | None, complete: bool
@@ -266,12 +266,13 @@ class NearSymmetry:
         towards /= np.linalg.norm(towards, axis=1)[:, None]
         seen = np.flatnonzero(np.einsum("ij,ij->i", towards, self._normals) > LEAST_COSINE)
         at, hidden = np.full(len(seen), OFF * self._gate), np.zeros(len(seen), dtype=bool)
+        most = LONGEST_STEP * self._target.index.extent_m
         for _ in range(STEPS):
             p = self._marks[seen] + at[:, None] * towards[seen]
             inside = ((p > self._low) & (p < self._high)).all(axis=1) & ~hidden
             if not inside.any():
                 break
-            distance = self._distances(p[inside], np.eye(4)[None])[0]
+            distance = self._target.index.distances(p[inside], Pose.identity(), most, False, 1, 0.0)[0]
             hidden[inside] |= distance < 0.25 * self._gate
             at[inside] += np.maximum(distance, 0.5 * self._gate)
         return seen[~hidden]
