@@ -14,6 +14,7 @@ import re
 import shutil
 import stat
 import sys
+import time
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +24,6 @@ from avsreplay.errors import UnreadableInput, UsageError
 
 STDOUT = Path("-")
 _NAME_BYTES = 255
-_MOST_MANIFEST = 64 << 20
 _PART = re.compile(r"\..+\.\d+\.\d+\.part", re.DOTALL)
 _CLEANED: set[Path] = set()
 _COUNTER = itertools.count()
@@ -66,9 +66,8 @@ def check_output(path: Path, *, overwrite: bool = True, folder: bool = False, in
             raise RuntimeError("a loop of symbolic links")
         _check_place(path, overwrite, folder)
         if not is_stream(path) and any(_replaces(path.resolve(), each.resolve()) for each in inputs):
-            raise UsageError(
-                "is an input, a part of one, or another output", where=str(path), hint="name another output"
-            )
+            what = "is an input, a part of one, or another output"
+            raise UsageError(what, where=str(path), hint="name another output")
     except (OSError, RuntimeError) as error:  # RuntimeError: a loop of symbolic links
         what = f"cannot be written: {getattr(error, 'strerror', None) or 'a loop of symbolic links'}"
         raise UsageError(what, where=str(path)[:200], hint="name another output") from None
@@ -80,7 +79,7 @@ def _replaces(place: Path, source: Path) -> bool:
         return place == source
     manifest = source / "run.json"
     if manifest.is_file() and place != manifest:
-        return manifest.stat().st_size > _MOST_MANIFEST or os.fsencode(f'"{place.name}"') in manifest.read_bytes()
+        return manifest.stat().st_size > 64 << 20 or os.fsencode(f'"{place.name}"') in manifest.read_bytes()
     return place.suffix != ".html"
 
 
@@ -229,15 +228,22 @@ def _link(source: str | Path, target: str | Path) -> None:
 def _publish(part: Path, place: Path, overwrite: bool) -> None:
     with contextlib.suppress(OSError):
         shutil.copymode(place, part)
-    if overwrite:
-        part.replace(place)
-        return
-    try:
-        os.link(part, place)  # fails if another process has created the file meanwhile
-    except FileExistsError:
-        raise UsageError("appeared while it was written", where=str(place), hint="add --overwrite") from None
-    except OSError:  # a file system without hard links
-        part.replace(place)
+    if not overwrite:
+        try:
+            os.link(part, place)  # fails if another process has created the file meanwhile
+            return
+        except FileExistsError:
+            raise UsageError("appeared while it was written", where=str(place), hint="add --overwrite") from None
+        except OSError:  # a file system without hard links
+            pass
+    for left in range(40 if os.name == "nt" else 1, 0, -1):
+        try:
+            part.replace(place)
+            return
+        except PermissionError:  # Windows replaces no file that a program has open
+            if left == 1:
+                raise
+        time.sleep(0.05)
 
 
 def _unwritable(path: Path, error: OSError) -> UnreadableInput:
@@ -247,8 +253,7 @@ def _unwritable(path: Path, error: OSError) -> UnreadableInput:
 
 def _beside(place: Path) -> Path:
     """Return a name beside ``place`` that no other process or thread uses."""
-    stem = os.fsdecode(os.fsencode(place.name)[:200])
-    return place.with_name(f".{stem}.{os.getpid()}.{next(_COUNTER)}.part")
+    return place.with_name(f".{os.fsdecode(os.fsencode(place.name)[:200])}.{os.getpid()}.{next(_COUNTER)}.part")
 
 
 @contextmanager
@@ -277,12 +282,7 @@ def _part(place: Path, *, folder: bool = False) -> Iterator[Path]:
 
 
 def _lock(part: Path, *, wait: bool = False) -> int | None:
-    """Lock a temporary file until this process ends; None if the system or file system cannot lock files.
-
-    Args:
-        part: the file or folder.
-        wait: whether to wait for a process that holds the lock.
-    """
+    """Lock a temporary file or folder until this process ends; None if the system cannot. ``wait`` for another lock."""
     if os.name == "nt":  # an open file cannot be removed there
         return None
     handle = os.open(part, os.O_RDONLY)

@@ -250,5 +250,6 @@ def dump(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [dump(v) for v in value]
     if isinstance(value, (str, Path)):  # a name of a file may contain bytes that are not UTF-8
-        return str(value).encode("utf-8", "backslashreplace").decode("utf-8")
+        text = value.as_posix() if isinstance(value, Path) else value
+        return text.encode("utf-8", "backslashreplace").decode("utf-8")
     return value

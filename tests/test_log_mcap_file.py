@@ -267,8 +267,10 @@ def test_a_file_of_another_format_gives_one_error_line(tmp_path: Path, content: 
 def test_no_such_file(tmp_path: Path) -> None:
     with pytest.raises(UnreadableInput, match="no such file"):
         open_source(tmp_path / "no.mcap")
-    with pytest.raises(UnreadableInput, match="too long"):
+    with pytest.raises(UnreadableInput, match="too long" if os.name == "posix" else "no such file"):
         open_source(tmp_path / ("n" * 5000))
+    if os.name != "posix":
+        return
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UnreadableInput, match="neither a file nor a folder"):
         open_source(tmp_path / "pipe")

@@ -122,7 +122,8 @@ def test_the_users_cache_folder_follows_the_platform(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr("sys.platform", "linux")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert index_cache.user_folder() == tmp_path / "avsreplay"
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for home in ("HOME", "USERPROFILE"):
+        monkeypatch.setenv(home, str(tmp_path / "home"))
     for relative in ("", "cache"):
         monkeypatch.setenv("XDG_CACHE_HOME", relative)
         assert index_cache.user_folder() == tmp_path / "home" / ".cache" / "avsreplay"
