@@ -224,8 +224,9 @@ class SurfaceIndex:
         """Align the scan ``points`` (n, 3) [m] in {A} to the model from the guess ``T_ca`` (4, 4).
 
         Point-to-plane passes, then Newton's method to the fixed point of Horn's point-to-point iteration (eq:ICP), a
-        stationary point of the sum of squared distances. A Newton step that raises the sum is replaced by Horn's. The
-        last pass is Horn's over all points. With fewer than 6 inliers, or after ``most_work``, it ends, not converged.
+        stationary point of the sum of squared distances. A Newton step that raises the sum is replaced by Horn's. At
+        the last pass, over all points, the steps of Horn and of Newton are both within the stopping rule, and Newton's
+        is made. With fewer than 6 inliers, or after ``most_work``, it ends, not converged.
         """
         params = params or IcpParams()
         gate = min(self.reach_m, self.reach_m if params.gate_m is None else params.gate_m)

@@ -38,6 +38,7 @@ from registration_cases import (
     table,
 )
 
+from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Fit, Surface
 from avsreplay.register import quality
@@ -47,6 +48,7 @@ from avsreplay.register.surface_index import IcpParams, SurfaceIndex
 from avsreplay.simulate import builtin_surface
 
 EPS_RAD, EPS_M = 1e-5, 1e-5
+STARTS = ((0.0, 0.5, 0.01), (0.05, 3.0, 0.05), (0.0, 10.0, 0.15))  # outliers, deg, m
 
 
 def fixed(n_max: int, n_plane: int = 0, **more: Any) -> IcpParams:
@@ -177,6 +179,12 @@ def views(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
 
 def meshes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
     """Six meshes: index, one searched pass, and the whole of Registrar.register against the peers' registration."""
+    for mesh in [*real_meshes(surface, args), stage()]:
+        one_mesh(mesh, args)
+
+
+def real_meshes(surface: Surface, args: argparse.Namespace) -> list[Surface]:
+    """The built-in target, and the meshes of the shared data in its size."""
     files = [
         ("spacecraft-meshes", "HST.obj"),
         ("spacecraft-meshes", "Kepler.obj"),
@@ -184,8 +192,28 @@ def meshes(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
         ("stanford-dragon", "dragon_vrip_res3.ply"),
     ]
     found = [shared(*file) for file in (files[:1] if args.quick else files)]
-    for mesh in [surface, *(scaled(each) for each in found if each is not None), stage()]:
-        one_mesh(mesh, args)
+    return [surface, *(scaled(each) for each in found if each is not None)]
+
+
+def fixed_point(cloud: Surface, surface: Surface, args: argparse.Namespace) -> None:
+    """Passes of an alignment over sides and starts, and the distance of its result from the fixed point."""
+    print("\npasses over all points: least, median, most; alignments with more than 12; distance to the fixed point")
+    for mesh in real_meshes(surface, args):
+        registrar = Registrar(mesh, RegisterParams(index_cache=False))
+        rule = registrar._backend._rules[True]
+        exact = replace(rule, n_plane=0, few=0, tighten=0.0, eps_rad=1e-10, eps_m=1e-10)
+        for outliers, deg, metres in STARTS:
+            passes, far = [], []
+            for side in range(2 if args.quick else 8):
+                scan, truth = look(mesh, args.scan, outliers, side)
+                fit = registrar.index.icp(scan, off(truth, deg, metres, 100 + side), rule)
+                end = registrar.index.icp(scan, fit.T_ca, replace(exact, gate_m=fit.gate_m))
+                passes.append(fit.iterations)
+                apart = Pose.from_matrix(fit.T_ca).inverse() @ Pose.from_matrix(end.T_ca)
+                far.append(np.degrees(geometry.angle(apart.q)))
+            most = sum(n > 12 for n in passes)
+            counts = f"{min(passes):2} {statistics.median(passes):4} {max(passes):3}, {most} of {len(passes)}"
+            print(f"{mesh.name:24} {deg:4} deg {outliers:3.0%}: {counts}; {np.median(far):.0e} to {max(far):.0e} deg")
 
 
 def one_mesh(mesh: Surface, args: argparse.Namespace) -> None:
@@ -201,7 +229,7 @@ def one_mesh(mesh: Surface, args: argparse.Namespace) -> None:
     registrar, two = (Registrar(mesh, RegisterParams(threads=t, index_cache=False)) for t in (1, 2))
     points = sample(mesh, args.model, 1).vertices
     normals = SurfaceIndex.build(sample(mesh, args.model, 1), reach).closest(points).normal
-    for outliers, deg, metres in ((0.0, 0.5, 0.01), (0.05, 3.0, 0.05), (0.0, 10.0, 0.15)):
+    for outliers, deg, metres in STARTS:
         scan, truth = look(mesh, args.scan, outliers, 3)
         guess = off(truth, deg, metres, 4)
         cases = {
@@ -310,6 +338,7 @@ def _graded(one: Registrar, scan: Array, fit: Fit, rest: tuple[Any, ...]) -> tup
 PARTS = {
     "grading": grading,
     "meshes": meshes,
+    "fixed_point": fixed_point,
     "sizes": sizes,
     "index": index,
     "speed": speed,

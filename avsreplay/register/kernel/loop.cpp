@@ -94,6 +94,7 @@ class Newton {
     Step step;
     bool undo;     // go back to the pose before the last step first
     bool settled;  // the pose is stationary as far as Newton's step can tell
+    Step last;     // what is made where Horn's step is small as well
   };
 
   Choice choose(const Sums& sums, double outside, double gate, double longest, double eps_rad, double eps_m) {
@@ -106,12 +107,12 @@ class Newton {
     used_ = extended_ = false, gate_ = gate, cost_ = cost, horn_ = horn;
     Motion motion;
     const double most = std::min(longest, longest_);
-    if (longest_ <= eps_m || !newton_motion(sums, motion) || !to_step(motion, most, plain_)) return {horn, false, true};
-    if (plain_.turn < eps_rad && plain_.move < eps_m && plain_.length < longest_) return {horn, false, true};
+    if (longest_ <= eps_m || !newton_motion(sums, motion) || !to_step(motion, most, plain_)) return {horn, false, true, horn};
+    if (plain_.turn < eps_rad && plain_.move < eps_m && plain_.length < longest_) return {horn, false, true, plain_};
     Step step = plain_;
     used_ = true, extended_ = extend(motion, second) && to_step(motion, most, step);
     length_ = step.length;
-    return {step, false, false};
+    return {step, false, false, step};
   }
 
  private:
@@ -124,10 +125,10 @@ class Newton {
     if (extended_) {
       extended_ = false, length_ = plain_.length;
       std::copy(newton_, newton_ + 6, made_);
-      return {plain_, true, false};
+      return {plain_, true, false, plain_};
     }
     used_ = false, longest_ = SHORTER * length_;
-    return {horn_, true, false};
+    return {horn_, true, false, horn_};
   }
 
   // Broyden's step from the Newton step and the last step, where both have about the same direction and it is not longer
@@ -203,7 +204,7 @@ class Passes {
         const Newton::Choice c = newton.choose(sums, outside, o_.gate, rule_.gate, rule_.eps_rad, rule_.eps_m);
         settled = c.settled;
         if (c.undo) std::memcpy(o_.T, before, sizeof before);
-        if (!(small && settled)) step = c.step;
+        step = small && settled ? c.last : c.step;
       }
       o_.converged = small && settled && !few;
       std::memcpy(before, o_.T, sizeof before);
