@@ -52,7 +52,7 @@ from avsreplay.reconstruct.tracking import (
     twists,
     without,
 )
-from avsreplay.reconstruct.views import ScanView, Survey, selected, surveyed, thinned_view
+from avsreplay.reconstruct.views import ScanView, Survey, surveyed, surveyed_scans, thinned_view
 from avsreplay.records import Scan
 
 __all__ = [
@@ -140,7 +140,7 @@ def reconstruct(scans: Scans, params: ReconstructionParams | None = None) -> Rec
     chosen = dict(sorted(poses.items())[:: max(1, -(-len(poses) // MOST_FUSED))])
     twist = twists([view.t_ns for view in views], poses, motion if survey.timed else None)
     points, normals, one_sigma_m, seen, sights = fused(
-        selected(scans, survey), survey, {k: twist[k] for k in chosen}, p.voxel * survey.extent, rms
+        surveyed_scans(scans, survey), survey, {k: twist[k] for k in chosen}, p.voxel * survey.extent, rms
     )
     each = tuple((views[k].t_ns, T) for k, T in sorted(poses.items()))
     return Reconstruction(
@@ -188,14 +188,16 @@ def true_frame(made: Reconstruction, truth: Iterable[tuple[int, Pose]]) -> Pose 
 def _tracked(scans: Scans, survey: Survey, p: ReconstructionParams) -> tuple[list[ScanView], Tracked]:
     """The thinned views and their poses; scans with times of their own are deskewed and tracked twice."""
     size_m = p.thin * survey.extent
-    views = [thinned_view(scan, survey, size_m) for scan in selected(scans, survey)]
+    views = [thinned_view(scan, survey, size_m) for scan in surveyed_scans(scans, survey)]
     tracked = track(views, p, survey.extent)
     if survey.timed and len(tracked.poses) > 2:
         instants = [view.t_ns for view in views]
         known = sorted(tracked.poses)
         motion = free_motion([instants[k] for k in known], [tracked.poses[k] for k in known], survey.extent)
         twist = twists(instants, tracked.poses, motion)
-        views = [thinned_view(scan, survey, size_m, twist.get(k)) for k, scan in enumerate(selected(scans, survey))]
+        views = [
+            thinned_view(scan, survey, size_m, twist.get(k)) for k, scan in enumerate(surveyed_scans(scans, survey))
+        ]
         tracked = track(views, p, survey.extent)
     _refuse_few(tracked, views)
     return views, tracked
@@ -206,7 +208,7 @@ def _fine_views(
 ) -> dict[int, ScanView]:
     """The key views with more points."""
     size_m, timed = p.fine * survey.extent, survey.timed
-    each = ((k, scan) for k, scan in enumerate(selected(scans, survey)) if k in found.keys)
+    each = ((k, scan) for k, scan in enumerate(surveyed_scans(scans, survey)) if k in found.keys)
     return {k: thinned_view(scan, survey, size_m, motion.twist_at(scan.t_ns) if timed else None) for k, scan in each}
 
 

@@ -97,7 +97,7 @@ def surveyed(scans: Callable[[], Iterable[Scan]], fewest_points: int, n_scans: i
     return Survey(chosen, offered, extent, _camera(clouds), any(scan.times_s is not None for scan in kept))
 
 
-def selected(scans: Callable[[], Iterable[Scan]], survey: Survey) -> Iterator[Scan]:
+def surveyed_scans(scans: Callable[[], Iterable[Scan]], survey: Survey) -> Iterator[Scan]:
     """The scans that are used, in order."""
     chosen = frozenset(survey.chosen)
     return (scan for place, scan in enumerate(scans()) if place in chosen)
