@@ -50,7 +50,6 @@ FEWEST_TO_FIT = 3
 MOST_FIXES = 1024  # poses that a fit uses one by one; the work of a fit does not grow with the log
 FEWEST_TO_CHECK, CHECK_GROWTH, FEWEST_WITH_OUTLIERS = 50, 0.25, 10
 FEWEST_TO_SPREAD = 48  # poses from which a fit is spread over scans
-_LEAST_GROWTH = 0.25  # part of the growth until the next fit after which worn weights make it due
 _DRIFT_S = 30.0  # time over which the process noise changes the velocity as much as the drift
 _RECENT = 0.1  # largest age of a given start over the fit's memory; until then disturbances change it little
 _GAUSSIAN_HALF_RAD = 0.2  # a given attitude with a larger 1 sigma (half angle) is not Gaussian
@@ -91,8 +90,7 @@ class BatchSchedule:
         if len(track.fixes) < FEWEST_TO_FIT:
             return track.changed(belief=self._first(track, prediction, innovation))
         last = track.batch
-        most = 1.0 if last is None else self._growth(last) * last.count
-        if last is None or track.since >= max(1.0, _LEAST_GROWTH * most if worn(last.components) else most):
+        if last is None or track.since >= max(1.0, self._growth(last) * last.count) or worn(last.components):
             forgot = last is not None and last.epoch_ns != track.fixes[0].t_ns
             if last is None or not spread or len(track.fixes) < FEWEST_TO_SPREAD:
                 return self.fitted(forgot, converged, track, whole(self.fit(track, prediction.belief, forgot)))
