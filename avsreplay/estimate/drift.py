@@ -36,7 +36,7 @@ from avsreplay.geometry import Array
 _ONSETS, _FINER = 12, 9  # number of onsets tried, the first at the epoch, and around the most likely one
 _LATEST_ONSET = 0.85  # share of the poses before the last onset tried
 _FOUND = 14.0  # log odds of a drift over free motion from which it is reported
-_CONSTANT = 5.3  # log odds over random disturbances from which it is reported
+_CONSTANT = 6.0  # log odds over random disturbances from which it is reported
 _ROUNDS = 10  # largest number of linearisations
 _LEAST_GAIN = 0.5  # decrease of the cost (half chi-square) above which another linearisation follows
 _PARTS = (1.0, 0.3, 0.1, 0.03)  # parts of a step, of which the first that decreases the cost is taken
