@@ -283,26 +283,6 @@ _DIAGNOSTIC = (
     "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\n"
     "string hardware_id\nKeyValue[] values\n",
 )
-_POSES = (_POSE, _POINT, _QUATERNION)
-_MARKER_PARTS = (
-    ("std_msgs/ColorRGBA", "float32 r\nfloat32 g\nfloat32 b\nfloat32 a\n"),
-    ("builtin_interfaces/Duration", "int32 sec\nuint32 nanosec\n"),
-    ("sensor_msgs/CompressedImage", "std_msgs/Header header\nstring format\nuint8[] data\n"),
-    ("visualization_msgs/UVCoordinate", "float32 u\nfloat32 v\n"),
-    ("visualization_msgs/MeshFile", "string filename\nuint8[] data\n"),
-)
-_MARKER_KINDS = (
-    "ARROW CUBE SPHERE CYLINDER LINE_STRIP LINE_LIST CUBE_LIST SPHERE_LIST POINTS TEXT_VIEW_FACING MESH_RESOURCE"
-    " TRIANGLE_LIST"
-)
-_MARKER = "".join(f"int32 {name}={k}\n" for k, name in enumerate(_MARKER_KINDS.split())) + (
-    "int32 ADD=0\nint32 MODIFY=0\nint32 DELETE=2\nint32 DELETEALL=3\n"
-    "std_msgs/Header header\nstring ns\nint32 id\nint32 type\nint32 action\ngeometry_msgs/Pose pose\n"
-    "geometry_msgs/Vector3 scale\nstd_msgs/ColorRGBA color\nbuiltin_interfaces/Duration lifetime\nbool frame_locked\n"
-    "geometry_msgs/Point[] points\nstd_msgs/ColorRGBA[] colors\nstring texture_resource\n"
-    "sensor_msgs/CompressedImage texture\nvisualization_msgs/UVCoordinate[] uv_coordinates\nstring text\n"
-    "string mesh_resource\nvisualization_msgs/MeshFile mesh_file\nbool mesh_use_embedded_materials\n"
-)
 
 SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
     "sensor_msgs/msg/PointCloud2": (
@@ -310,19 +290,14 @@ SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
         "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n",
         (_HEADER, _TIME, _FIELD),
     ),
-    "geometry_msgs/msg/PoseStamped": ("std_msgs/Header header\nPose pose\n", (_HEADER, _TIME, *_POSES)),
-    "geometry_msgs/msg/PoseWithCovarianceStamped": (
-        "std_msgs/Header header\nPoseWithCovariance pose\n",
-        (_HEADER, _TIME, _POSE_COV, *_POSES),
-    ),
-    "nav_msgs/msg/Path": (
-        "std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses\n",
-        (_HEADER, _TIME, ("geometry_msgs/PoseStamped", "std_msgs/Header header\nPose pose\n"), *_POSES),
+    "geometry_msgs/msg/PoseStamped": (
+        "std_msgs/Header header\nPose pose\n",
+        (_HEADER, _TIME, _POSE, _POINT, _QUATERNION),
     ),
     "nav_msgs/msg/Odometry": (
         "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/PoseWithCovariance pose\n"
         "geometry_msgs/TwistWithCovariance twist\n",
-        (_HEADER, _TIME, _POSE_COV, *_POSES, _TWIST_COV, _TWIST, _VECTOR3),
+        (_HEADER, _TIME, _POSE_COV, _POSE, _POINT, _QUATERNION, _TWIST_COV, _TWIST, _VECTOR3),
     ),
     "tf2_msgs/msg/TFMessage": (
         "geometry_msgs/TransformStamped[] transforms\n",
@@ -332,13 +307,6 @@ SCHEMAS: dict[str, tuple[str, tuple[tuple[str, str], ...]]] = {
         "std_msgs/Header header\nDiagnosticStatus[] status\n",
         (_HEADER, _TIME, _DIAGNOSTIC, _KEY_VALUE),
     ),
-    "visualization_msgs/msg/Marker": (_MARKER, (_HEADER, _TIME, *_POSES, _VECTOR3, *_MARKER_PARTS)),
-    "rcl_interfaces/msg/Log": (
-        "byte DEBUG=10\nbyte INFO=20\nbyte WARN=30\nbyte ERROR=40\nbyte FATAL=50\nbuiltin_interfaces/Time stamp\n"
-        "uint8 level\nstring name\nstring msg\nstring file\nstring function\nuint32 line\n",
-        (_TIME,),
-    ),
-    "std_msgs/msg/Float64": ("float64 data\n", ()),
 }
 
 
