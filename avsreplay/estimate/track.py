@@ -124,7 +124,11 @@ class Track:
     change_P: Array = field(default_factory=lambda: NO_CHANGE)
 
     def changed(self, **values: Any) -> Track:
-        """Return a copy with other values: ``dataclasses.replace``, faster for so many fields."""
+        """Return a copy with other values: ``dataclasses.replace``, faster for so many fields.
+
+        Raises:
+            TypeError: a name is not that of a field.
+        """
         new = object.__new__(Track)
         new.__dict__.update(self.__dict__, **values)
         if len(new.__dict__) != len(self.__dict__):
