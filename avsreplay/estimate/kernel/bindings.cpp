@@ -400,7 +400,9 @@ Numpy impulses(const Vector<4>& q0, const Vector<3>& w0, const Three& sigma, con
   for (size_t k = 0; k < n; ++k) {
     advance(flow, b, times(k) - t);
     t = times(k);
-    impulse(flow, *reinterpret_cast<double(*)[6][3]>(out + 18 * k));
+    double back[6][6];
+    backward(flow, back);
+    for (int r = 0; r < 6; ++r) std::memcpy(out + 18 * k + 3 * r, &back[r][3], 3 * sizeof(double));
   }
   return found;
 }

@@ -76,19 +76,6 @@ bool above(const Square P, double least) {
   return cholesky<DIM>(scaled, L);
 }
 
-void impulse(const Flow& flow, double out[6][3]) {
-  double D[3][3];
-  for (int r = 0; r < 3; ++r) std::memcpy(D[r], &flow.S[3 + r][3], sizeof D[r]);
-  const M3 rate = inverse(D);  // S = [A B; 0 D] with A orthogonal
-  for (int r = 0; r < 3; ++r)
-    for (int c = 0; c < 3; ++c) {
-      out[r][c] = 0;
-      out[3 + r][c] = rate.x[r][c];
-      for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) out[r][c] -= flow.S[i][r] * flow.S[i][3 + j] * rate.x[j][c];
-    }
-}
-
 void join(const Chart* charts, const Square* P, const double* weights, const double* quadrature, int count, Chart& mean,
           Square moments) {
   std::vector<double> off(DIM * count);

@@ -10,9 +10,6 @@ bool inverse_root(const double C[SEEN][SEEN], double root[SEEN][SEEN]);
 // Whether no eigenvalue of P, in units of its variances, is below `least`; false where a variance is not positive.
 bool above(const Square P, double least);
 
-// Error (dq_v, w) at the start of a flow that has the same effect as a unit of rate (3 columns) at its end.
-void impulse(const Flow& flow, double out[6][3]);
-
 // Chart and P (20, 20) of one Gaussian with the moments of a mixture; its mean is that of the first component, and what
 // the weights have moved it from the mean of the quadrature.
 void join(const Chart* charts, const Square* P, const double* weights, const double* quadrature, int count, Chart& mean,

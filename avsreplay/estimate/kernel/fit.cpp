@@ -65,18 +65,10 @@ void congruent(const Square T, const Square A, Square out) {
       for (int c = 0; c < DIM; ++c) out[r][c] += T[i][r] * AT[i][c];
 }
 
-// S^-1 Q S^-T of a flow: its noise propagated back to the start. S = [A B; 0 D] with A orthogonal.
+// S^-1 Q S^-T of a flow: its noise propagated back to the start.
 void at_start(const Flow& flow, double out[6][6]) {
-  double D[3][3], back[6][6] = {};
-  for (int r = 0; r < 3; ++r) std::memcpy(D[r], &flow.S[3 + r][3], sizeof D[r]);
-  const M3 rate = inverse(D);
-  for (int r = 0; r < 3; ++r)
-    for (int c = 0; c < 3; ++c) {
-      back[r][c] = flow.S[c][r];
-      back[3 + r][3 + c] = rate.x[r][c];
-      for (int i = 0; i < 3; ++i)
-        for (int j = 0; j < 3; ++j) back[r][3 + c] -= flow.S[i][r] * flow.S[i][3 + j] * rate.x[j][c];
-    }
+  double back[6][6];
+  backward(flow, back);
   double half[6][6] = {}, across[6][6];
   for (int r = 0; r < 6; ++r)
     for (int c = 0; c < 6; ++c) across[c][r] = back[r][c];
@@ -92,6 +84,20 @@ void at_start(const Flow& flow, double out[6][6]) {
 }
 
 }  // namespace
+
+void backward(const Flow& flow, double out[6][6]) {
+  double D[3][3];
+  for (int r = 0; r < 3; ++r) std::memcpy(D[r], &flow.S[3 + r][3], sizeof D[r]);
+  const M3 rate = inverse(D);  // S = [A B; 0 D] with A orthogonal
+  std::memset(out, 0, 36 * sizeof(double));
+  for (int r = 0; r < 3; ++r)
+    for (int c = 0; c < 3; ++c) {
+      out[r][c] = flow.S[c][r];
+      out[3 + r][3 + c] = rate.x[r][c];
+      for (int i = 0; i < 3; ++i)
+        for (int j = 0; j < 3; ++j) out[r][3 + c] -= flow.S[i][r] * flow.S[i][3 + j] * rate.x[j][c];
+    }
+}
 
 M3 inverse(const double A[3][3]) {
   M3 out;

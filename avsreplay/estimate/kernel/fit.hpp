@@ -72,6 +72,9 @@ class Problem {
   double penalty(const Chart& chart) const;
 };
 
+// S^-1 of a flow: errors (dq_v, w) at its start with the same effect as a unit error at its end.
+void backward(const Flow& flow, double out[6][6]);
+
 // The inverse of A (3, 3).
 M3 inverse(const double A[3][3]);
 
