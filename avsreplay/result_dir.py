@@ -31,7 +31,7 @@ from avsreplay.report.view import CloudView, PathView, View, thin_cloud, thin_su
 from avsreplay.rows import Row
 from avsreplay.run import Listener, ReplayedScan, Run
 from avsreplay.settings import dump
-from avsreplay.viewers import NewPaths, ResultLogWriter, residuals_of
+from avsreplay.viewers import NewPaths, ResultLogWriter, shown_cloud
 
 CHECKPOINT = "resume.bin"  # checkpoint of an interrupted run
 OWN = frozenset({"rows.jsonl", "estimate.tum", "registration.tum", "truth.tum", "beliefs.npz", "view.npz", "run.json",
@@ -150,10 +150,9 @@ class ViewWriter:
         self._clouds: list[CloudView] = []
         self._plans: list[PathView] = []
 
-    def take(self, scan: ReplayedScan, residuals: Array, path: tuple[Array, Array] | None) -> None:
-        """Take one scan: distances (n,) of its points to the model [m]; times and positions of a new flight, if any."""
-        source = scan.outcome.scan
-        self._clouds.append(thin_cloud(source.seq, source.points, residuals, source.intensities))
+    def take(self, scan: ReplayedScan, cloud: CloudView, path: tuple[Array, Array] | None) -> None:
+        """Take one scan: the points that are shown; times and positions of a new flight, if any."""
+        self._clouds.append(thin_cloud(cloud.seq, cloud.points, cloud.residual_m, cloud.intensity))
         if path is not None:
             self._plans.append(PathView(scan.row.t_ns, np.asarray(path[1], np.float32), scan.row.plan_miss_m))
 
@@ -258,7 +257,7 @@ class ResultWriter:
         return self._beliefs, self._take
 
     def _take(self, scan: ReplayedScan) -> None:
-        shown = residuals_of(self._run, scan), self._paths.of(scan.state)
+        shown = shown_cloud(self._run, scan), self._paths.of(scan.state)
         self._view.take(scan, *shown)
         self._log.take(scan, *shown)
 

@@ -60,7 +60,7 @@ class Job:
         source: log, bag or folder of scans.  options: how to read it.
         config_file: TOML file with settings, see docs/settings.md.
         assignments: settings ``a.b=value`` that replace those of the file.
-        prefetch: number of scans decoded ahead on a second thread; does not change the result.
+        prefetch: scans decoded ahead on a thread; the pipeline then has one, too. 0: one thread. Same result.
         growing: the log, if it is still written; a scan is replayed when it is there.
     """
 
@@ -68,7 +68,7 @@ class Job:
     options: SourceOptions = field(default_factory=SourceOptions)
     config_file: Path | None = None
     assignments: tuple[str, ...] = ()
-    prefetch: int = 2
+    prefetch: int = 0
     growing: GrowingLog | None = None
 
 
@@ -186,7 +186,7 @@ class Run:
             self.fit_reference(progress)
         listeners, self._scored = tuple(listeners), self._scored or self._scorer()
         outcomes = self._outcomes(self._stages, progress, "replaying", self._state, self.done)
-        if self.job.prefetch:  # the pipeline runs on a second thread; scoring and writing stay in this one
+        if self.job.prefetch:  # the pipeline has a thread of its own; scoring and writing stay in this one
             outcomes = ahead(outcomes, self.job.prefetch)
         for state, outcome in outcomes:
             truth = self._truth_of(outcome.scan)

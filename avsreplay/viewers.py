@@ -7,6 +7,7 @@ import os
 import socket
 import sys
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,47 +15,52 @@ import numpy as np
 
 from avsreplay import __version__, geometry
 from avsreplay.errors import MissingBackend, UsageError
-from avsreplay.estimate.measurement import measurement_jacobian
 from avsreplay.files import check_output
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.result_log import ResultFrame, ResultLog
+from avsreplay.outcome import Outcome
 from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan.guidance import Segment
-from avsreplay.records import Belief
 from avsreplay.report.export import row_poses
-from avsreplay.report.view import cone_lines
+from avsreplay.report.view import CloudView, cone_lines, thin_cloud
 from avsreplay.rows import Row, columns
 from avsreplay.run import ReplayedScan, Run
 from avsreplay.settings import dump
 
 PATH_POINTS = 41
+SHOWN_POINTS = 2000  # most points of a scan that a viewer gets; the log of the scans has all of them
 RESIDUAL_REACH = 0.05  # largest residual that is shown, over the model's extent
 _LOGGED_COLUMNS = ("rms_m", "inlier_ratio", "nis", "pos_1s_m", "rot_1s_deg", "ogm_rank", "t_go_s")
-_COLUMNS = tuple(column.name for column in columns())
+_POSE_COLUMNS = ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")
+_IN_MESSAGES = {"seq", "t_ns", *_POSE_COLUMNS, *(f"reg_{name}" for name in _POSE_COLUMNS)}  # what other messages hold
+_COLUMNS = tuple(column.name for column in columns() if column.name not in _IN_MESSAGES)
 RERUN_PORT = 9876  # port of a Rerun viewer
 
 
-def message_covariance(belief: Belief) -> Array:
+def message_covariance(outcome: Outcome) -> Array:
     """Return the (6, 6) covariance of the pose of {C}: position in {A} [m], rotation vector in {A} [rad].
 
     Args:
-        belief: mean and covariance of the estimator.
+        outcome: result of a scan, with the covariance of its pose in metres and half angles in {B}.
     """
-    H = measurement_jacobian(belief.x)
-    to_a = np.zeros((6, 6))
-    to_a[:3, :3] = np.eye(3)
-    to_a[3:, 3:] = 2.0 * geometry.matrix(belief.x.q_ab)  # half angle in {B} -> full angle in {A}
-    return np.asarray(to_a @ H @ belief.P @ H.T @ to_a.T)
+    to_a = np.eye(6)
+    to_a[3:, 3:] = 2.0 * geometry.matrix(outcome.belief.x.q_ab)  # half angle in {B} -> full angle in {A}
+    return np.asarray(to_a @ outcome.pose_covariance @ to_a.T)
 
 
-def residuals_of(run: Run, scan: ReplayedScan) -> Array:
-    """Return the distances (n,) of the points of a scan to the model at the estimate [m], at most 5 % of its extent.
+def shown_cloud(run: Run, scan: ReplayedScan) -> CloudView:
+    """Return at most 2000 points of a scan with their distances to the model at the estimate.
+
+    The points have an even stride in their order, and the distances are at most 5 % of the model's extent.
 
     Args:
         run: the open run.
         scan: one of its scans.
     """
-    return run.registrar.distance(scan.outcome.scan.points, scan.outcome.pose, RESIDUAL_REACH * run.surface.extent)
+    source, pose = scan.outcome.scan, scan.outcome.pose
+    cloud = thin_cloud(source.seq, source.points, None, source.intensities, most=SHOWN_POINTS)
+    distances = run.registrar.distance(cloud.points, pose, RESIDUAL_REACH * run.surface.extent)
+    return replace(cloud, residual_m=np.asarray(distances, np.float32))
 
 
 class NewPaths:
@@ -90,24 +96,24 @@ class ResultLogWriter:
         """Complete the file."""
         self._log.close()
 
-    def take(self, scan: ReplayedScan, residuals: Array, path: tuple[Array, Array] | None) -> None:
-        """Take one scan: distances (n,) of its points to the model [m]; times and positions of a new flight, if any."""
+    def take(self, scan: ReplayedScan, cloud: CloudView, path: tuple[Array, Array] | None) -> None:
+        """Take one scan: the points that are shown; times and positions of a new flight, if any."""
         row, outcome = scan.row, scan.outcome
         values = {name: value for name in _LOGGED_COLUMNS if (value := getattr(row, name)) is not None}
         self._log.write(
             ResultFrame(
                 t_ns=row.t_ns,
-                points=outcome.scan.points,
+                points=cloud.points,
                 estimate=outcome.pose,
-                covariance=message_covariance(outcome.belief),
+                covariance=message_covariance(outcome),
                 registration=next((pose for _, pose in row_poses([row], "registration")), None),
                 truth=scan.truth.pose,
                 path=path,
                 healthy=row.gamma == 1,
                 message=row.reason,
                 values=values,
-                residuals=residuals,
-                intensities=outcome.scan.intensities,
+                residuals=cloud.residual_m,
+                intensities=cloud.intensity,
                 columns=_numbers(row),
             )
         )
@@ -174,13 +180,13 @@ class RerunStream:
         """Take one scan of a run."""
         rr, row, outcome = self._rr, scan.row, scan.outcome
         rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
-        points = np.array(outcome.scan.points, np.float32, order="C")
-        share = residuals_of(self._run, scan) / (RESIDUAL_REACH * self._run.surface.extent)
-        rr.log("camera/scan", rr.Points3D(points, colors=_colours(share)))
+        cloud = shown_cloud(self._run, scan)
+        share = np.asarray(cloud.residual_m) / (RESIDUAL_REACH * self._run.surface.extent)
+        rr.log("camera/scan", rr.Points3D(cloud.points, colors=_colours(share)))
         self._place("camera/estimate", outcome.pose)
         if scan.truth.pose is not None:
             self._place("camera/truth", scan.truth.pose)
-        self._ellipsoid(outcome.belief, outcome.pose)
+        self._ellipsoid(outcome)
         path = self._paths.of(scan.state)
         if path is not None:
             rr.log("camera/plan", rr.LineStrips3D([path[1]]))
@@ -203,13 +209,13 @@ class RerunStream:
     def _place(self, path: str, pose: Pose) -> None:
         self._rr.log(path, self._rr.Transform3D(translation=pose.t, quaternion=pose.q))
 
-    def _ellipsoid(self, belief: Belief, pose: Pose) -> None:
+    def _ellipsoid(self, outcome: Outcome) -> None:
         """The 3 sigma ellipsoid of the position of {C}."""
-        variances, axes = np.linalg.eigh(message_covariance(belief)[:3, :3])
+        variances, axes = np.linalg.eigh(outcome.pose_covariance[:3, :3])
         axes[:, 0] *= np.linalg.det(axes)  # a rotation
         sizes = 3.0 * np.sqrt(np.maximum(variances, 0.0))
         q = geometry.quaternion(axes)
-        shape = self._rr.Ellipsoids3D(half_sizes=[sizes], centers=[pose.t], quaternions=[q])
+        shape = self._rr.Ellipsoids3D(half_sizes=[sizes], centers=[outcome.pose.t], quaternions=[q])
         self._rr.log("camera/position_3_sigma", shape)
 
 

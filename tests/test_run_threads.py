@@ -39,7 +39,8 @@ def test_the_pipeline_runs_beside_the_listeners():
         threads.add(threading.current_thread())
         return step(*args)
 
-    with pytest.MonkeyPatch.context() as patch, Run(Job(source=LOG, options=SourceOptions(n_scans=3))) as run:
+    job = Job(source=LOG, options=SourceOptions(n_scans=3), prefetch=1)
+    with pytest.MonkeyPatch.context() as patch, Run(job) as run:
         patch.setattr(pipeline, "step", noted)
         assert len(list(run.rows())) == 3
     assert threading.current_thread() not in threads
@@ -51,14 +52,14 @@ def test_an_error_of_the_pipeline_is_raised_where_the_rows_are_taken(monkeypatch
 
     monkeypatch.setattr(pipeline, "step", broken)
     before = set(threading.enumerate())
-    with Run(Job(source=LOG)) as run, pytest.raises(ZeroDivisionError, match="in the pipeline"):
+    with Run(Job(source=LOG, prefetch=2)) as run, pytest.raises(ZeroDivisionError, match="in the pipeline"):
         list(run.rows())
     assert set(threading.enumerate()) <= before
 
 
 def test_an_interrupted_replay_leaves_no_thread():
     before = set(threading.enumerate())
-    with Run(Job(source=LOG)) as run:
+    with Run(Job(source=LOG, prefetch=2)) as run:
         rows = run.rows()
         next(rows)
         rows.close()

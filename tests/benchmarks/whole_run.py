@@ -15,6 +15,11 @@ avsreplay record dense.toml -o dense.mcap
 
 from __future__ import annotations
 
+from avsreplay import arithmetic
+
+if __name__ == "__main__":
+    arithmetic.pin()  # as the command does: the waiting of OpenBLAS's second thread would count as processor time
+
 import argparse
 import tempfile
 import time
