@@ -294,7 +294,7 @@ def test_a_fit_uses_a_bounded_number_of_poses() -> None:
     innovation = estimator.innovate(
         prediction, tumbling.alignment(states[1024].T_ac, np.random.default_rng(0), 0.002, 0.002)
     )
-    after = estimator.batch._with(track, prediction, innovation)
+    after, _ = estimator.batch._with(track, prediction, innovation)
     assert len(after) <= 0.76 * batch_schedule.MOST_FIXES
     assert pose_count(after) == batch_schedule.MOST_FIXES + 1
 

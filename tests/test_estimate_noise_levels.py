@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import tumbling
@@ -18,9 +20,11 @@ from avsreplay.estimate.noise_levels import (
     NO_LEVELS,
     NoiseLevels,
     _expected,
+    _position_odds,
+    _variances,
     estimate_levels,
 )
-from avsreplay.estimate.normal_points import normal_points
+from avsreplay.estimate.normal_points import normal_points, position_rows
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.work import whole
 from avsreplay.geometry import Pose
@@ -84,6 +88,24 @@ def test_a_density_that_the_poses_cannot_tell_is_the_mean_of_what_they_allow() -
         found.append(levels_of(fixes(world.states, 1), world.states[0])[0].force)
     assert found[0] > 1e-5
     assert found[1] < 5e-6
+
+
+@pytest.mark.parametrize("force", [0.0, 1e-4])
+def test_the_density_of_a_force_is_found_from_positions_under_an_unknown_torque(force: float) -> None:
+    """The torque turns the body by more than a fit of free motion can use; the positions are linear all the same."""
+    found = []
+    for seed in range(3):
+        rng = np.random.Generator(np.random.PCG64([seed, 41]))
+        world = tumbling.pushed(seed, 3e-4, seconds=100.0, hz=HZ)
+        speed = np.cumsum(force * rng.normal(size=(len(world.states), 3)) / np.sqrt(HZ), axis=0)
+        moved = np.cumsum(speed, axis=0) / HZ
+        seen = [
+            replace(f, T_ac=Pose(f.T_ac.q, f.T_ac.t + m)) for f, m in zip(fixes(world.states, seed), moved, strict=True)
+        ]
+        arm = to_chart(world.states[0]).arm_c
+        rows = position_rows(poses_of(tuple(seen)), np.ones(len(seen)), arm, 36)
+        found.append(_expected(_position_odds(_variances(NO_LEVELS), rows)))
+    assert all(force / 2.0 < q < 2.0 * force + 5e-6 for q in found), found
 
 
 def test_the_expected_density_is_that_of_a_certain_likelihood_and_little_of_an_equal_one() -> None:

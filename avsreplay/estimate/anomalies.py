@@ -273,7 +273,7 @@ class AnomalyTest:
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
             at = replace(at, P=P)
         after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
-        anew = track.changed(since=0, recent=(), doubtful=(), pending=False, fitting=None, testing=None)
+        anew = track.changed(since=0, recent=(), doubtful=(), older=(), pending=False, fitting=None, testing=None)
         if isinstance(at, DrivenBelief):  # the filter continues, with rate and velocity free
             return self._used(anew.changed(belief=at, mode="filter", fixes=()), after)
         chart = to_chart(at.x)

@@ -86,7 +86,8 @@ class BatchSchedule:
         Between fits the filter's update is applied if the likelihood is Gaussian; otherwise every component of the
         mixture is updated by itself. ``spread``: a fit to many poses is left to ``advanced``.
         """
-        track = track.changed(fixes=self._with(track, prediction, innovation), R=innovation.R, since=track.since + 1)
+        fixes, older = self._with(track, prediction, innovation)
+        track = track.changed(fixes=fixes, older=older, R=innovation.R, since=track.since + 1)
         if len(track.fixes) < FEWEST_TO_FIT:
             return track.changed(belief=self._first(track, prediction, innovation))
         last = track.batch
@@ -146,6 +147,7 @@ class BatchSchedule:
         drift = track.drift
         if drift is not None and isinstance(belief, DrivenBelief):
             drift = replace(drift, rate=belief.u[:3], velocity=belief.u[3:], P=belief.P_u)
+        fixes, older = self._with(track, prediction, innovation) if self.checked_poses else ((), ())
         return track.changed(
             belief=belief,
             drift=drift,
@@ -154,13 +156,10 @@ class BatchSchedule:
             sigma_hits=track.sigma_hits + hits,
             r_floors=track.r_floors + self.noise.floors(innovation.R),
             R=innovation.R,
-            fixes=self.remembered(track, prediction, innovation),
+            fixes=fixes[-self.checked_poses :],
+            older=older,
             since=track.since + 1,
         )
-
-    def remembered(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
-        """The newest poses, for ``check_against_batch``."""
-        return self._with(track, prediction, innovation)[-self.checked_poses :] if self.checked_poses else ()
 
     def check_against_batch(self, track: Track, spread: bool = False) -> Track:
         """The filter's track, or the fit's where a fit to the same poses contradicts it.
@@ -245,15 +244,18 @@ class BatchSchedule:
         track = track.changed(mode="filter" if to_filter else "fit", window=window, since=0)
         return track.changed(belief=result.belief, batch=result, inflation=result.inflation)
 
-    def _with(self, track: Track, prediction: Prediction, innovation: Innovation) -> tuple[PoseFix, ...]:
-        """The poses within the fit's memory, including this one; of many poses the older half is joined in pairs."""
+    def _with(
+        self, track: Track, prediction: Prediction, innovation: Innovation
+    ) -> tuple[tuple[PoseFix, ...], tuple[PoseFix, ...]]:
+        """Poses within the fit's memory, with this one, and older ones; of many the first half is joined in pairs."""
         oldest = bisect_left(track.fixes, prediction.belief.t_ns - self._memory_ns(track), key=_instant)
         refines = track.drift is not None and track.mode == "filter"  # the test for a drift needs all of them
-        fixes = track.fixes[0 if refines else oldest :]
+        first = 0 if refines else oldest
+        fixes, older = track.fixes[first:], (*track.older, *track.fixes[:first])[-MOST_FIXES:]
         if len(fixes) >= MOST_FIXES:
             half, factors = MOST_FIXES // 2, np.array([track.window.factors[3], track.window.factors[0]])
             fixes = joined(fixes[:half], self.chart_at(prediction.belief, fixes[0].t_ns), factors) + fixes[half:]
-        return (*fixes, self.fix(prediction, innovation))
+        return (*fixes, self.fix(prediction, innovation)), older
 
     def fix(self, prediction: Prediction, innovation: Innovation) -> PoseFix:
         """The healthy pose at its own instant: a scan deskewed by the prior's motion is moved back by it."""

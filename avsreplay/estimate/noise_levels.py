@@ -24,18 +24,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay import geometry
 from avsreplay.estimate.batch import Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import impulses
 from avsreplay.estimate.dynamics import torque_density
 from avsreplay.estimate.error_state import RHO, VEL
+from avsreplay.estimate.normal_points import PositionRows, error_parts
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
 
 MOST_POINTS = 24  # normal points of an estimate
 FEWEST = 12  # poses from which the levels are estimated
-_VIEW_RAD = 0.5  # 1 sigma of the correlation of the common errors over the direction of view
 _CLAIMED_DOF, _LAW_DOF = 6.0, 1.0  # weight of the prior of the independent and of the common errors
 _STEP = 3.0  # largest factor on a variance in one step
 _DENSITIES = np.logspace(-8.0, 0.0, 65)  # root densities of a disturbance that are compared with none
@@ -76,14 +75,6 @@ NO_LEVELS = NoiseLevels()
 """The prior: noise as claimed, no disturbances."""
 
 
-def view_correlation(poses: Poses) -> Array:
-    """(n, n) correlation of the common errors of poses, by the direction from the target to the camera in {C}."""
-    u = (poses.t[:, None, :] @ geometry.matrix(poses.q))[:, 0]
-    u /= np.maximum(np.linalg.norm(u, axis=1), 1e-300)[:, None]
-    angle = np.arccos(np.clip(u @ u.T, -1.0, 1.0))
-    return np.asarray(np.exp(-0.5 * (angle / _VIEW_RAD) ** 2))
-
-
 def pose_error_covariance(points: Poses, levels: NoiseLevels, factors: Array) -> Array:
     """(2, n, n) covariance of the whitened residuals of attitude and of position, each the same for its three axes.
 
@@ -92,16 +83,8 @@ def pose_error_covariance(points: Poses, levels: NoiseLevels, factors: Array) ->
         levels: variance components.
         factors: (2,) noise factors with which the residuals are whitened.
     """
-    white, common = _parts(points)
+    white, common = error_parts(points)
     return np.array([(levels.white[b] * white + levels.common[b] * common) / factors[b] ** 2 for b in range(BLOCKS)])
-
-
-def _parts(points: Poses) -> tuple[Array, Array]:
-    """Covariances (n, n) of the independent and of the common errors of whitened poses at unit factors."""
-    n = len(points)
-    share = np.zeros(n) if points.shares is None else points.shares
-    amplitude = np.sqrt(share * (np.ones(n) if points.counts is None else points.counts))
-    return np.diag(1.0 - share), amplitude[:, None] * view_correlation(points) * amplitude
 
 
 def mean_share(points: Poses) -> float:
@@ -116,6 +99,7 @@ def estimate_levels(
     claimed: bool,
     fixed: tuple[float | None, float | None],
     others: tuple[Array, Array] | None = None,
+    positions: PositionRows | None = None,
 ) -> Parts[NoiseLevels]:
     """Improve variance components by a bounded number of steps, from those of an estimate with fewer poses, in parts.
 
@@ -126,6 +110,7 @@ def estimate_levels(
         claimed: only the disturbances are estimated.
         fixed: root densities of torque and force that are given; None to estimate them.
         others: columns and size of other unknowns, as in ``disturbed_likelihood``.
+        positions: of more poses, from which the density of the force is found; None for those of ``points``.
     """
     n, theta = len(points), _variances(levels)
     open_ = np.array([*([not claimed] * 4), *(f is None for f in fixed)])
@@ -137,7 +122,9 @@ def estimate_levels(
         yield n**3 // 40
     likely = theta.copy()
     for k in (k for k in (4, 5) if open_[k]):
-        theta[k] = _expected(_marginal(likely, k, parts, data)[1]) ** 2
+        alone = positions is not None and k == 5
+        odds = _position_odds(likely, positions) if alone and positions else _marginal(likely, k, parts, data)[1]
+        theta[k] = _expected(odds) ** 2
         yield n**3 // 40
     white, common = (float(theta[0]), float(theta[1])), (float(theta[2]), float(theta[3]))
     slack = _slack(data.e, theta, parts) if theta[4] or theta[5] else 1.0
@@ -161,13 +148,24 @@ def _expected(log_odds: Array) -> float:
 def _marginal(theta: Array, k: int, parts: Sequence[Array], data: _Residuals) -> tuple[float, Array]:
     """Log likelihood of the poses without disturbance k, and its increase (n,) with the squares of ``_DENSITIES``.
 
-    It is marginal over the initial values, without its constant. One decomposition gives all densities.
+    It is marginal over the initial values, without its constant.
     """
     without = theta.copy()
     without[k] = 0.0
-    root = np.linalg.cholesky(_covariance(without, parts))
+    return _density_odds(_covariance(without, parts), parts[k], data)
+
+
+def _position_odds(theta: Array, rows: PositionRows) -> Array:
+    """The increase (n,) of ``_marginal`` by a random force, from positions alone."""
+    V = np.kron(np.eye(3), theta[1] * rows.white + theta[3] * rows.common)
+    return _density_odds(V, rows.force, _Residuals(rows.e, rows.J, rows.info, np.zeros(len(rows.info))))[1]
+
+
+def _density_odds(V: Array, effects: Array, data: _Residuals) -> tuple[float, Array]:
+    """``_marginal`` for a disturbance with these ``effects`` (m, k) beside noise V; one decomposition gives it."""
+    root = np.linalg.cholesky(V)
     inverse, prior = np.linalg.inv(root), np.linalg.cholesky(data.info).T
-    columns = np.vstack([inverse @ parts[k], np.zeros((len(prior), parts[k].shape[1]))])
+    columns = np.vstack([inverse @ effects, np.zeros((len(prior), effects.shape[1]))])
     Q, R = np.linalg.qr(np.vstack([inverse @ data.J, prior]))
     e = np.concatenate([inverse @ data.e, prior @ data.off])
     left = e - Q @ (Q.T @ e)
@@ -264,7 +262,7 @@ def _components(points: Poses, problem: Problem, H: Array) -> Sequence[Array]:
     (6n, 3(n - 1)), their covariance being columns columns'.
     """
     n = len(points)
-    white, common = _parts(points)
+    white, common = error_parts(points)
     f = problem.factors**-2.0
     torque, force = _disturbances(points.times_s, problem.chart, H)
     columns = [np.ascontiguousarray(M.transpose(1, 0, 2)).reshape(6 * n, -1) for M in (torque, force)]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,83 @@ _POINTS, _SPAN_RAD = 128, 0.25  # most normal points, and least rotation over wh
 _FEW = 48  # poses up to which none are joined
 _NEIGHBOURS = 5  # poses with whose median a pose is compared
 _GROSS = 100.0  # squared difference of a gross error over the median of all poses, or over its expectation
+_VIEW_RAD = 0.5  # 1 sigma of the correlation of the common errors over the direction of view
+_FREE = np.repeat([1e3, 1e1, 1e2], 3)  # 1 sigma of position [m], velocity [m/s] and arm [m] before the positions
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PositionRows:
+    """Positions of many poses as n points that are linear in the motion of the mass centre, whatever the rotation.
+
+    Rows are whitened and ordered by axis of {C}, and for each axis by point.
+
+    Attributes:
+        e: (3n,) positions.  J: (3n, 9) of position and velocity at the first point and of the arm in {C}.
+        white, common: (n, n) covariance of the independent and of the common errors, the same for three axes.
+        force: (3n, 3(n - 1)) of impulses of the force between the points, of unit density.
+    """
+
+    e: Array
+    J: Array
+    white: Array
+    common: Array
+    force: Array
+
+    @property
+    def info(self) -> Array:
+        """(9, 9) information of the unknowns before the positions."""
+        return np.diag(_FREE**-2.0)
+
+
+def position_rows(poses: Poses, weights: Array, arm: Array, most: int) -> PositionRows:
+    """Weighted means of the positions over equal shares of the time.
+
+    The position is r + v t + R c with the measured rotation R, so that a mean of positions belongs to the mean of R.
+
+    Args:
+        poses: n poses, in free motion apart from disturbances.
+        weights: (n,) of the poses as measurements.
+        arm: (3,) approximate c [m], with which errors of R displace R c.
+        most: largest number of points.
+    """
+    t = poses.times_s - poses.times_s[0]
+    cells = np.minimum((t / (t[-1] * (1.0 + 1e-9)) * most).astype(int), most - 1)
+    first = np.flatnonzero(np.diff(cells, prepend=-1))
+    moved = np.hstack([geometry.skew(arm), np.eye(3)])
+    C = moved @ poses.C @ moved.T
+    w = weights / np.trace(C, axis1=1, axis2=2)
+    w /= np.repeat(np.add.reduceat(w, first), np.diff(first, append=len(t)))
+    R, middle = geometry.matrix(poses.q), (first + np.append(first[1:], len(t))) // 2
+    seen, turns, times = (np.add.reduceat(w.reshape(-1, *[1] * (a.ndim - 1)) * a, first) for a in (poses.t, R, t))
+    noise = np.add.reduceat((w * w)[:, None, None] * (R @ C @ np.swapaxes(R, 1, 2)), first)
+    root = np.linalg.inv(np.linalg.cholesky(np.swapaxes(R[middle], 1, 2) @ noise @ R[middle]))
+    root = root @ np.swapaxes(R[middle], 1, 2)
+    late = np.maximum(times[:, None] - 0.5 * (times[1:] + times[:-1]), 0.0) * np.sqrt(np.diff(times))
+    counts = 1.0 / np.add.reduceat(w * w, first)
+    shares = None if poses.shares is None else np.add.reduceat(w * poses.shares, first)
+    points = Poses(times, poses.q[middle], poses.t[middle], poses.C[middle], counts, shares)
+    white, common = error_parts(points)
+    J = np.concatenate([root, times[:, None, None] * root, root @ turns], axis=2)
+    force = (late[:, None, :, None] * root[:, :, None, :]).reshape(len(times), 3, -1)
+    e = (root @ (seen - seen[0])[:, :, None])[:, :, 0]
+    rows = [np.ascontiguousarray(a.transpose(1, 0, 2)).reshape(3 * len(times), -1) for a in (J, force)]
+    return PositionRows(np.ascontiguousarray(e.T).reshape(-1), rows[0], white, common, rows[1])
+
+
+def view_correlation(poses: Poses) -> Array:
+    """(n, n) correlation of the common errors of poses, by the direction from the target to the camera in {C}."""
+    u = (poses.t[:, None, :] @ geometry.matrix(poses.q))[:, 0]
+    u /= np.maximum(np.linalg.norm(u, axis=1), 1e-300)[:, None]
+    angle = np.arccos(np.clip(u @ u.T, -1.0, 1.0))
+    return np.asarray(np.exp(-0.5 * (angle / _VIEW_RAD) ** 2))
+
+
+def error_parts(points: Poses) -> tuple[Array, Array]:
+    """Covariances (n, n) of the independent and of the common errors of whitened poses at unit factors."""
+    n = len(points)
+    share = np.zeros(n) if points.shares is None else points.shares
+    amplitude = np.sqrt(share * (np.ones(n) if points.counts is None else points.counts))
+    return np.diag(1.0 - share), amplitude[:, None] * view_correlation(points) * amplitude
 
 
 def normal_points(poses: Poses, reference: Chart, factors: Array, most: int = _POINTS) -> Poses:

@@ -66,12 +66,11 @@ class Track:
     """The state of the estimator between two scans.
 
     Attributes:
-        belief: mean and covariance after the last scan.
-        mode: the estimator in use: 'near', 'start', 'fit' or 'filter'.
+        belief: after the last scan.  mode: the estimator in use: 'near', 'start', 'fit' or 'filter'.
         window: of the noise adaptation.
         sigma_hits: sigma bounds that cut the gain so far.  r_floors: eigenvalues of R raised so far.
         R: (6, 6) noise of the last healthy scan [m, half-angle], zero before the first.
-        fixes: healthy poses: all of them until the filter is in use, then the newest.
+        fixes: healthy poses that fits use.  older: those before.
         batch: the last batch fit whose estimate was adopted.  since: healthy poses since the last fit.
         reinitialised: how often a fit replaced the filter's estimate, or the given start was rejected.
         inflation: (2,) factor on R for errors correlated in time (attitude, position) by the last fit; None before it.
@@ -98,6 +97,7 @@ class Track:
     r_floors: int = 0
     R: Array = field(default_factory=lambda: _NO_NOISE)
     fixes: tuple[PoseFix, ...] = ()
+    older: tuple[PoseFix, ...] = ()
     batch: BatchResult | None = None
     since: int = 0
     reinitialised: int = 0
@@ -188,7 +188,7 @@ def turned(track: Track, T_ac: Pose, measured: Pose, alignment: Alignment) -> Tr
     x = replace(x, q_bc=geometry.multiply(x.q_bc, G.q), c_b=x.c_b + geometry.matrix(x.q_bc) @ G.t)
     fixes = tuple(replace(fix, T_ac=fix.T_ac @ G, C=adjoint @ fix.C @ adjoint.T) for fix in track.fixes)
     belief = replace(track.belief, x=x)
-    anew = track.changed(belief=belief, fixes=fixes, mode="start", batch=None, fitting=None, testing=None)
+    anew = track.changed(belief=belief, fixes=fixes, older=(), mode="start", batch=None, fitting=None, testing=None)
     return anew.changed(recent=(), doubtful=(), bias=None)
 
 
