@@ -18,6 +18,7 @@ from itertools import pairwise
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import (
     LATEST,
@@ -29,7 +30,7 @@ from avsreplay.estimate.batch_covariance import (
 )
 from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.dynamics import propagate_state
-from avsreplay.estimate.error_state import DIM, boxplus, hamilton
+from avsreplay.estimate.error_state import DIM, hamilton
 from avsreplay.estimate.measurement import in_camera, measurement_jacobian
 from avsreplay.estimate.mixture import Component, moments
 from avsreplay.estimate.noise import BOUND
@@ -195,14 +196,11 @@ def given_prior(belief: Belief) -> Prior:
     The Jacobian would not do: where two moments are nearly equal, the effect of the axes mu on the inertia depends on
     how far the moments differ, which the linearisation does not contain.
     """
-    mean, root = to_chart(belief.x), np.linalg.cholesky(belief.P)
+    x, mean, root = belief.x, to_chart(belief.x), np.linalg.cholesky(belief.P)
     draws = np.random.Generator(np.random.PCG64(0)).standard_normal((_DRAWS, DIM)) @ root.T
-    y = np.array([to_chart(_bounded(boxplus(belief.x, d))).minus(mean) for d in np.concatenate([draws, -draws])])
+    state, errors = (x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc), np.concatenate([draws, -draws])
+    y = _motion.spread(*state, errors, _EDGE, mean.flat)
     return Prior(mean, y.T @ y / len(y))
-
-
-def _bounded(x: State) -> State:
-    return replace(x, sigma=np.clip(x.sigma, -_EDGE, _EDGE))
 
 
 def rough_state(fixes: tuple[PoseFix, ...]) -> State:

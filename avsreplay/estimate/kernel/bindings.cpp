@@ -231,6 +231,30 @@ nb::tuple state(const Flat& from) {
   return nb::make_tuple(made(x.q_ab), made(x.w_b), made(x.r_a), made(x.v_a), made(x.sigma), made(x.c_b), made(x.q_bc));
 }
 
+// Steps (n, 20) from a chart to those of a state displaced by errors (n, 20), |sigma| being at most `most`. The terms of
+// the products are added in the order of error_state.py's hamilton.
+Numpy spread_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v, const Vector<2>& sigma,
+                const Vector<3>& c, const Vector<4>& q_bc, const Matrix<-1, DIM>& errors, double most, const Flat& from) {
+  const State mean = state_from(q_ab, w, r, v, sigma, c, q_bc);
+  const Chart origin = chart(from);
+  const auto product = [](const Quad& a, const Quad& b) {
+    return unit({a.w * b.x + b.w * a.x + a.y * b.z - a.z * b.y, a.w * b.y + b.w * a.y + a.z * b.x - a.x * b.z,
+                 a.w * b.z + b.w * a.z + a.x * b.y - a.y * b.x, a.w * b.w - a.x * b.x - a.y * b.y - a.z * b.z});
+  };
+  double* y;
+  Numpy out = array({errors.shape(0), (size_t)DIM}, &y);
+  for (size_t k = 0; k < errors.shape(0); ++k) {
+    const double* d = errors.data() + DIM * k;
+    State x = mean;
+    const Quad q = product(quad(mean.q_ab), half_angle(vector(d))), mu = product(half_angle(vector(d + 17)), quad(mean.q_bc));
+    std::memcpy(x.q_ab, &q, sizeof q), std::memcpy(x.q_bc, &mu, sizeof mu);
+    for (int i = 0; i < 3; ++i) x.w_b[i] += d[3 + i], x.r_a[i] += d[6 + i], x.v_a[i] += d[9 + i], x.c_b[i] += d[14 + i];
+    for (int i = 0; i < 2; ++i) x.sigma[i] = std::min(std::max(x.sigma[i] + d[12 + i], -most), most);
+    minus(chart_of(x), origin, y + DIM * k);
+  }
+  return out;
+}
+
 double least_gap_of(const Flat& from) { return least_gap(chart(from)); }
 
 Numpy errors(const Flat& from) {
@@ -446,6 +470,8 @@ NB_MODULE(_motion, m) {
         nb::arg("c_b"), nb::arg("q_bc"));
   m.def("least_gap", &least_gap_of, nb::arg("chart"));
   m.def("moved", &moved_by, nb::arg("chart"), nb::arg("y"));
+  m.def("spread", &spread_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
+        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("errors"), nb::arg("most"), nb::arg("chart"));
   m.def("minus", &minus_of, nb::arg("chart"), nb::arg("other"));
   m.def("state", &state, nb::arg("chart"));
   m.def("errors", &errors, nb::arg("chart"));
