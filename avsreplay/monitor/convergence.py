@@ -175,8 +175,8 @@ def block_nees(error: Array, P: Array) -> dict[str, float]:
 
 def block_1s(P: Array) -> dict[str, float]:
     """Root of the trace of each block of P (20, 20), in its own units (half angles)."""
-    variances = np.diagonal(P)
-    return {name: float(np.sqrt(np.maximum(variances[where].sum(), 0.0))) for name, where in BLOCKS.items()}
+    variances = P.diagonal().tolist()
+    return {name: math.sqrt(max(sum(variances[where]), 0.0)) for name, where in BLOCKS.items()}
 
 
 def violations(
@@ -202,11 +202,11 @@ def violations(
     scale = np.sqrt(np.maximum(np.diagonal(P), 1e-300))
     if not np.all(np.isfinite(P)) or float(np.linalg.eigvalsh(P / np.outer(scale, scale))[0]) < -1e-6:
         found.append("covariance")
-    if not np.all(np.abs(belief.x.sigma) < 1.0):
+    if not all(abs(ratio) < 1.0 for ratio in belief.x.sigma.tolist()):
         found.append("sigma")
+    claimed, measured = pose_covariance.diagonal().tolist(), R.diagonal().tolist()
     for block, factor in ((slice(0, 3), inflation[1]), (slice(3, 6), inflation[0])):
-        limit = max(float(factor), 1.0) * _NOT_WORSE**2 * float(np.trace(R[block, block]))
-        if not float(np.trace(pose_covariance[block, block])) <= limit:
+        if not sum(claimed[block]) <= max(float(factor), 1.0) * _NOT_WORSE**2 * sum(measured[block]):
             found.append("worse_than_measured")
             break
     if not float(residual @ np.linalg.solve(R + pose_covariance, residual)) <= gate:

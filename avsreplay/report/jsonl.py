@@ -26,6 +26,9 @@ from avsreplay.files import output_text
 from avsreplay.rows import Row
 
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
+_VALUES = attrgetter(*_NAMES)
+_ENCODE = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
+_OTHERS = (str, int, bool, type(None))  # types of values that JSON has
 _MAX_LINE, _MAX_FILE, _MAX_NAME, _MAX_TEXT = 1 << 20, 2 << 30, 100, 10_000
 _BLOCK = 1 << 20
 _MAX_JSON = 64 << 20
@@ -46,15 +49,15 @@ def _split(hint: Any) -> tuple[type, bool]:
 
 def plain(value: Any) -> Any:
     """A JSON value: numpy scalars as Python's, floats that are not finite as None."""
-    if hasattr(value, "item"):
+    kind = type(value)
+    if kind is not float and kind not in _OTHERS and hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def dump_row(row: Row) -> str:
     """One line of JSON, without the line end."""
-    record = {name: plain(getattr(row, name)) for name in _NAMES}
-    return json.dumps(record, ensure_ascii=False, allow_nan=False, separators=(", ", ": "))
+    return _ENCODE(dict(zip(_NAMES, map(plain, _VALUES(row)), strict=True)))
 
 
 class RowWriter:
