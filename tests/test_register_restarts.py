@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
@@ -296,3 +297,31 @@ def test_a_scan_with_the_work_of_one_registration_is_not_searched(monkeypatch: p
     assert not made
     registrar.register(scan, guess)
     assert made
+
+
+@pytest.mark.slow
+def test_the_covariance_contains_the_bias_of_the_noise(monkeypatch):
+    """Noise as large as a panel is thick displaces the minimum of the distances in the same way in every scan."""
+    box, panel = trimesh.creation.box((1.5, 1.2, 1.0)), trimesh.creation.box((3.0, 0.8, 0.05))
+    panel.apply_translation((2.4, 0.0, 0.1))
+    body = trimesh.util.concatenate([box, panel])
+    surface = Surface(np.array(body.vertices), np.array(body.faces, dtype=np.int32), "", "")
+    q = np.random.default_rng(2).standard_normal(4)
+    T_ac = Pose(q / np.linalg.norm(q), np.array([0.0, 0.0, 3.0 * surface.extent]))
+    clean = T_ac.apply(view(surface, 4000, T_ac.inverse().t))
+    rays = clean / np.linalg.norm(clean, axis=1, keepdims=True)
+
+    def squared_errors():
+        registrar = Registrar(surface)
+        for seed in range(6):
+            numbers = np.random.default_rng(seed).standard_normal((len(clean), 1))
+            found = registrar.register(clean + 0.01 * surface.extent * numbers * rays, T_ac)
+            step = found.T_ac.inverse() @ T_ac
+            d = np.concatenate([geometry.log(step.q), step.t])
+            yield found.status, d @ np.linalg.solve(found.covariance, d)
+
+    statuses, squared = zip(*squared_errors(), strict=True)
+    assert set(statuses) == {AlignStatus.ALIGNED}
+    assert np.mean(squared) < 1.5 * 6.0
+    monkeypatch.setattr(Neighbourhood, "with_bias", lambda _self, _scan, found, _budget: found)
+    assert np.mean([each for _, each in squared_errors()]) > 2.0 * np.mean(squared)

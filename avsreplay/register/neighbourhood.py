@@ -5,10 +5,14 @@ away from the minimum that the surface alone has; the cost is then lower along t
 shows a small part of the target has several minima, and nearly all points can be near the model at a wrong one; the
 scan is then registered again from poses displaced along these directions. A scan of a panel can be matched to its other
 side; it is registered again from a pose that is displaced towards the camera.
+
+In a scan with noise the minimum itself is displaced, because the closest point is a nonlinear function of the measured
+one. The covariance of its pose contains this displacement (``covariance.bias_of_noise``).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,10 +21,19 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus
-from avsreplay.register.backend import Target
+from avsreplay.register.backend import HornBackend, Target
+from avsreplay.register.covariance import bias_of_noise
 from avsreplay.register.degenerate import scaled_information
 from avsreplay.register.plausibility import PlausibilityTest
-from avsreplay.register.restarts import FAR_WORK, MEASURED_WORK, STOP_OF_EXTENT, Budget, Restart, Restarter
+from avsreplay.register.restarts import (
+    FAR_WORK,
+    MEASURED_WORK,
+    POOR_OF_GATE,
+    STOP_OF_EXTENT,
+    Budget,
+    Restart,
+    Restarter,
+)
 
 VALLEY_STEPS, VALLEY_POINTS = 8, 400  # steps of half a gate each way along the two least certain directions; points
 VALLEY_WORK = 7 * 2 * VALLEY_STEPS * VALLEY_POINTS  # cost of the search along the valley
@@ -29,6 +42,7 @@ DISPLACED_OF_EXTENT = 0.03  # rms displacement of the points of the scan
 UNMOVED, RADIUS_OF_EXTENT = 0.25, 0.25  # a pose nearer to its guess, in gates, is not compared; usual rms radius
 SEVERAL = "the scan shows a part of the target, and another pose near this one explains it as well"
 NOT_COMPARED = "the scan shows a part of the target, and no work is left to compare the poses near this one"
+UNCERTAIN_RAD = np.radians(1.0)  # a larger standard deviation of the attitude, caused by noise, is stated
 SIGMAS = 4.0  # a minimum whose excess cost is below so many standard errors of it explains the scan as well
 
 
@@ -37,7 +51,7 @@ class Neighbourhood:
 
     def __init__(self, target: Target, test: PlausibilityTest, restarter: Restarter) -> None:
         self._target, self._test, self._restarter = target, test, restarter
-        self._extent = target.surface.extent
+        self._extent, self._horn = target.surface.extent, HornBackend(target)
 
     def best(
         self, points: NDArray[Any], guess: Pose, found: Alignment, budget: Budget
@@ -82,7 +96,7 @@ class Neighbourhood:
         found, weak = [self._restarter.measure(points, T_ca)], self._weak(few, T_ca, count)
         if weak is None:
             return found
-        centre, radius, directions = weak
+        centre, radius, directions = weak[:3]
         nearer = np.concatenate([np.zeros(3), T_ca.t - centre])[None] / np.linalg.norm(T_ca.t - centre)
         for x in DISPLACED_OF_EXTENT * self._extent * np.concatenate([nearer, directions, -directions]):
             start = _displaced(T_ca, centre, radius, x)
@@ -90,6 +104,40 @@ class Neighbourhood:
             found.append(self._restarter.measure(points, ended.T_ca))
             budget.spend(MEASURED_WORK * len(points))
         return found
+
+    def with_bias(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
+        """Return the alignment with a covariance that contains the bias of the noise, where the fit is not close.
+
+        Where nothing else is stated, the message states a standard deviation of the attitude above ``UNCERTAIN_RAD``.
+
+        Args:
+            scan: (n, 3) in {A} [m].
+            found: the alignment.
+            budget: work that is left; it need not suffice.
+        """
+        P, target, T_ca = found.covariance, self._target, found.T_ac.inverse()
+        if P is None or found.rms_m <= POOR_OF_GATE * target.limits.gate_m:
+            return found
+        few = self._restarter.part(scan)
+        width = self._restarter.width(self._restarter.measure(few, T_ca))
+        camera_c = target.visibility.camera_c(target.index, few, T_ca)
+
+        def register(points: Array) -> Pose:
+            fit = self._horn.align_within(points, T_ca, width, near=True)
+            budget.spend(fit.work)
+            return fit.T_ca
+
+        bias, work = bias_of_noise(target.index, few, T_ca, camera_c, width, register)
+        budget.spend(work + MEASURED_WORK * len(few))
+        missing = 1.0 - 1.0 / max(float(bias @ np.linalg.solve(P, bias)), 1.0)  # the chi-square of the bias is then 1
+        wider = P + missing * np.outer(bias, bias)
+        found = replace(found, covariance=geometry.frozen(wider), info=geometry.frozen(np.linalg.inv(wider)))
+        sigma = float(np.sqrt(np.linalg.eigvalsh(wider[:3, :3])[-1]))
+        if sigma <= UNCERTAIN_RAD or found.message:
+            return found
+        return replace(
+            found, message=f"with this noise the attitude is known to {np.degrees(sigma):.1f} deg (1 sigma) only"
+        )
 
     def along_valley(self, points: NDArray[Any], T_ca: Pose) -> Pose:
         """Return the best pose along the two directions in which the scan determines it least, or the pose itself.
@@ -102,32 +150,34 @@ class Neighbourhood:
         weak = self._weak(few, T_ca, 2)
         if weak is None:
             return T_ca
-        centre, radius, floor = weak
-        width = self._restarter.width(self._restarter.measure(few, T_ca))
+        centre, radius, floor, at, camera_c = weak
+        width = self._restarter.width(at)
         steps = 0.5 * target.limits.gate_m * np.delete(np.arange(-VALLEY_STEPS, VALLEY_STEPS + 1), VALLEY_STEPS)
         tried = np.concatenate([np.zeros((1, 6)), np.multiply.outer(steps, floor).reshape(-1, 6)])
         turns = geometry.exp(tried[:, :3] / radius)
         moved = np.einsum("kij,nj->kni", geometry.matrix(turns), T_ca.apply(few) - centre)
         moved += (centre + tried[:, 3:])[:, None]
-        camera_c = target.visibility.camera_c(target.index, few, T_ca)
         d2 = target.index.closest(moved.reshape(-1, 3), camera_c=camera_c, most_m=width).d2.reshape(len(tried), -1)
         best = int(np.argmin(np.minimum(d2, width**2).mean(axis=1)))
         return _displaced(T_ca, centre, radius, tried[best]) if best else T_ca
 
-    def _weak(self, few: NDArray[Any], T_ca: Pose, count: int) -> tuple[Array, float, Array] | None:
+    def _weak(
+        self, few: NDArray[Any], T_ca: Pose, count: int
+    ) -> tuple[Array, float, Array, Restart, Array | None] | None:
         """Centroid and rms radius of the inliers, and the motions x (count, 6) that they determine least.
 
-        None with fewer than six inliers, which do not determine a pose.
+        Also the distances at the pose, and the position of the camera in {C} if only faces towards it are matched. None
+        with fewer than six inliers, which do not determine a pose.
         """
         target, gate = self._target, self._target.limits.gate_m
-        on = self._restarter.measure(few, T_ca).distance < gate
-        facing = target.visibility.camera_c(target.index, few, T_ca) is not None
-        sums = target.index.normal_equations(few, T_ca, gate, facing=facing)
+        at, camera_c = self._restarter.measure(few, T_ca), target.visibility.camera_c(target.index, few, T_ca)
+        on = at.distance < gate
+        sums = target.index.normal_equations(few, T_ca, gate, facing=camera_c is not None)
         if min(sums.inliers, int(on.sum())) < 6:
             return None
         centre = T_ca.apply(few[on]).mean(axis=0)
         info, radius = scaled_information(sums.info, sums.inliers, centre)
-        return centre, radius, np.linalg.eigh(info)[1][:, :count].T
+        return centre, radius, np.linalg.eigh(info)[1][:, :count].T, at, camera_c
 
 
 def _displaced(T_ca: Pose, centre: Array, radius_m: float, x: Array) -> Pose:

@@ -26,11 +26,9 @@ from avsreplay.register.rivals import LEAST_RAYS, NearSymmetry, prepared
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 
-FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
-TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
+FAR_RAD, TURNED_RAD = np.radians([30.0, 12.0])  # a search verifies larger rotations; also: with near-symmetries
 LAST_SCANS = 2  # work that is kept for a last registration, in ordinary registrations
 LEAST_TO_TURN, SURE_RATIO = 0.2, 0.9  # with fewer inliers no rotated starts are tried; another search follows
-NO_MOTION: Array = np.zeros((6, 0))
 PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
 NOT_VERIFIED = "rotated by more than 30 deg from the guess, and no work left for a global search"
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
@@ -106,9 +104,11 @@ class Registrar:
         healthy = self._restarter.healthy(first.inlier_ratio, first.rms_m)
         found, searched = (first, False) if healthy else self._recovered(scan, guess, first, halves, carried, budget)
         if self._far(guess, found) and not searched:
-            return self._searched(scan, found, carried, budget)
-        found = found if searched else self._unique(scan, guess, found, budget, halves, carried)
-        return found if searched or effort <= 1 else self._settled(scan, found, budget, halves, carried, unknown)
+            found = self._searched(scan, found, carried, budget)
+        elif not searched:
+            found = self._unique(scan, guess, found, budget, halves, carried)
+            found = found if effort <= 1 else self._settled(scan, found, budget, halves, carried, unknown)
+        return self._neighbourhood.with_bias(scan, found, budget)
 
     def acquire(self, points: NDArray[Any], effort: int = restarts.HEALTHY_SCANS) -> Alignment:
         """Find the pose without a guess: register the scan from the best pose of a search over all attitudes.
@@ -127,7 +127,7 @@ class Registrar:
             return refused
         if effort <= 1:
             return replace(quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED)
-        return self._acquire(scan, Budget(len(scan), effort), False)
+        return self._neighbourhood.with_bias(scan, self._acquire(scan, b := Budget(len(scan), effort), False), b)
 
     def _acquire(
         self, scan: NDArray[Any], budget: Budget, carried: bool, rounds: int = MOST_ATTEMPTS, known: Pose | None = None
@@ -239,7 +239,7 @@ class Registrar:
 
         DEGENERATE in the motions that the guess leaves unknown, if other poses explain the scan as well.
         """
-        unknown = motions_outside(NO_MOTION if unknown is None else unknown, found.free, self._index.extent_m)
+        unknown = motions_outside(np.zeros((6, 0)) if unknown is None else unknown, found.free, self._index.extent_m)
         unsure, accepted = unknown.size > 0, found.status in (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
         if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.near:
             return found

@@ -165,7 +165,7 @@ def _bias_of(index: SurfaceIndex, rows: _Rows, camera_c: Array | None) -> float:
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
     along = np.einsum("ij,ij->i", rays, rows.normal) * rows.weight
     noise_m = float(np.sqrt(CAUCHY_VARIANCE * (rows.left @ rows.left) / (along @ along)))
-    moved = noise_m * _normal_numbers(len(rays))[:, None] * rays
+    moved = noise_m * normal_numbers(len(rays))[:, None] * rays
     found = [_fitted(index, rows.foot + sign * moved, camera_c) for sign in (1.0, -1.0)]
     return float(np.mean([LARGEST_ERROR if each is None else each.delta for each in found]))
 
@@ -291,8 +291,8 @@ def _effect(rows: _Rows, B: Array) -> float:
 
 
 @lru_cache(maxsize=4)
-def _normal_numbers(count: int) -> Array:
-    """Quantiles (count,) of the normal distribution in an order without a pattern; read-only."""
+def normal_numbers(count: int) -> Array:
+    """Return quantiles (count,) of the normal distribution in an order without a pattern; read-only."""
     quantiles = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
     order = np.argsort(np.arange(count) * (0.5 * (np.sqrt(5.0) - 1.0)) % 1.0, kind="stable")
     numbers: Array = quantiles[order]

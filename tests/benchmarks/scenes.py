@@ -8,8 +8,10 @@ cylinder with closed ends) and a box. Every view is ray-cast from a random side 
 the extent along the ray. The scenes add walls, outliers, occlusion, a second object, noise, an error of scale or a bad
 guess. "Correct": within 2 deg and 0.02 of the extent of the true pose, or of a pose that differs by a symmetry of the
 mesh. With an error of scale up to 10 % the pose counts; with a factor of 1000 no pose is correct. "Accepted": status
-aligned. "Wrong": accepted, not correct, and the row says neither that the scan fits a target of another size nor that
-the view does not determine the size. Time is
+aligned. "Wrong": accepted, not correct, and the row says neither that the scan fits a target of another size, nor that
+the view does not determine the size, nor that noise leaves the attitude uncertain by more than 1 deg. "Beyond":
+accepted, and the squared error in the metric of the claimed covariance exceeds the 99.99 % point of Hotelling's T^2,
+whatever the row says. NEES is the mean of this squared error over 6, 1 for a correct covariance. Time is
 processor time; "x" is the ratio to the median of the clean scans of the same mesh. A row per scene over all meshes,
 and with --each one per scene and mesh.
 """
@@ -26,6 +28,7 @@ import numpy as np
 import trimesh
 
 from avsreplay import geometry
+from avsreplay.estimate.measurement import from_chi2
 from avsreplay.geometry import Array, Pose, exp
 from avsreplay.log import read_surface
 from avsreplay.records import Alignment, AlignStatus, Surface
@@ -41,6 +44,7 @@ FILES = {
 }
 NOISE = 0.002  # of the extent
 DISTANCE = 3.0  # extents from the camera to the middle of the target
+CLAIM = 27.86  # 99.99 % point of chi-square with 6 degrees of freedom: a larger squared error contradicts the claim
 RIGHT_DEG, RIGHT_OF_EXTENT = 2.0, 0.02
 
 
@@ -267,6 +271,13 @@ def gap(found: Alignment, truth: Pose, extent: float, least: Callable[[Pose], Po
     return float(np.degrees(geometry.angle(step.q))), float(np.linalg.norm(step.t)) / extent
 
 
+def claimed(found: Alignment, truth: Pose, least: Callable[[Pose], Pose]) -> tuple[float, float]:
+    """Squared error of an accepted pose in the metric of its covariance, and its 99.99 % point for a true claim."""
+    step = least(truth.inverse() @ found.T_ac).inverse()
+    d = np.concatenate([geometry.log(step.q), step.t])
+    return float(d @ np.linalg.solve(found.covariance, d)), from_chi2(CLAIM, found.dof)
+
+
 @dataclass
 class Score:
     """What came of one scene on one mesh."""
@@ -276,20 +287,22 @@ class Score:
     accepted: int = 0
     wrong: int = 0
     said: int = 0
+    beyond: int = 0
     statuses: str = ""
     seconds: list = None  # type: ignore[assignment]
     ratios: list = None  # type: ignore[assignment]
+    squared: list = None  # type: ignore[assignment]
 
 
 def measure(names: list[str], scenes: list[str], args: argparse.Namespace) -> None:
     """Run every scene on every mesh and print the table."""
-    total: dict[str, Score] = {scene: Score(seconds=[], ratios=[]) for scene in scenes}
+    total: dict[str, Score] = {scene: Score(seconds=[], ratios=[], squared=[]) for scene in scenes}
     for name, surface in meshes(names).items():
         registrar = Registrar(surface, RegisterParams(backend=args.backend))
         healthy = _healthy(registrar, surface, args)
         least = symmetries(name, surface)
         for scene in scenes:
-            score = Score(seconds=[], ratios=[])
+            score = Score(seconds=[], ratios=[], squared=[])
             for k in range(args.views):
                 _one(
                     registrar,
@@ -327,13 +340,17 @@ def _one(
     spent = time.process_time() - begun
     accepted = found.status is AlignStatus.ALIGNED
     right = False
+    if accepted and case.truth is not None:
+        squared, point = claimed(found, case.truth, least)
+        score.squared.append(squared)
+        score.beyond += squared > point
     if case.truth is not None:
         degrees, share = gap(found, case.truth, extent, least)
         right = degrees < RIGHT_DEG and share < RIGHT_OF_EXTENT
     score.cases += 1
     score.right += right
     score.accepted += accepted
-    said = any(text in found.message for text in ("than the model", "error of the size"))
+    said = any(text in found.message for text in ("than the model", "error of the size", "attitude is known to"))
     score.wrong += accepted and not right and not said
     score.said += said
     score.statuses += " " + ("+" if right else "-") + found.status.value
@@ -342,12 +359,13 @@ def _one(
 
 
 def _add(total: Score, score: Score) -> None:
-    for field in ("cases", "right", "accepted", "wrong", "said", "statuses", "seconds", "ratios"):
+    for field in ("cases", "right", "accepted", "wrong", "said", "beyond", "statuses", "seconds", "ratios", "squared"):
         setattr(total, field, getattr(total, field) + getattr(score, field))
 
 
 def _print(label: str, s: Score) -> None:
-    share = f"{s.right:3d} of {s.cases:3d} right, {s.accepted:3d} accepted, {s.wrong:3d} wrong, {s.said:3d} other size"
+    share = f"{s.right:3d} of {s.cases:3d} right, {s.accepted:3d} accepted, {s.wrong:3d} wrong, {s.said:3d} stated"
+    share += f", {s.beyond:3d} beyond, NEES {np.mean(s.squared) / 6.0 if s.squared else np.nan:5.2f}"
     times = f"{np.median(s.seconds):7.3f} s median {max(s.seconds):7.3f} s max, x {max(s.ratios):6.1f}"
     print(f"{label:36} {share}  {times} {s.statuses if s.cases < 9 else ''}", flush=True)
 
