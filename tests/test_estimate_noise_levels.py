@@ -28,6 +28,7 @@ from avsreplay.estimate.normal_points import normal_points, position_rows
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.work import whole
 from avsreplay.geometry import Pose
+from avsreplay.records import Manoeuvre
 
 PARAMS = EstimatorParams().resolved(2.0)
 SIGMA = np.repeat([np.radians(0.2), 0.004], 3)
@@ -90,20 +91,25 @@ def test_a_density_that_the_poses_cannot_tell_is_the_mean_of_what_they_allow() -
     assert found[1] < 5e-6
 
 
-@pytest.mark.parametrize("force", [0.0, 1e-4])
-def test_the_density_of_a_force_is_found_from_positions_under_an_unknown_torque(force: float) -> None:
-    """The torque turns the body by more than a fit of free motion can use; the positions are linear all the same."""
+@pytest.mark.parametrize(("force", "step"), [(0.0, 0.0), (1e-4, 0.0), (0.0, 0.01)])
+def test_the_density_of_a_force_is_found_from_positions_under_an_unknown_torque(force: float, step: float) -> None:
+    """The torque turns the body by more than a fit of free motion can use; the positions are linear all the same.
+
+    A manoeuvre, whose instant is known to 0.1 s, does not count as a force.
+    """
     found = []
     for seed in range(3):
         rng = np.random.Generator(np.random.PCG64([seed, 41]))
         world = tumbling.pushed(seed, 3e-4, seconds=100.0, hz=HZ)
         speed = np.cumsum(force * rng.normal(size=(len(world.states), 3)) / np.sqrt(HZ), axis=0)
         moved = np.cumsum(speed, axis=0) / HZ
+        moved[:, 1] += step * np.maximum(np.arange(len(moved)) / HZ - 40.3, 0.0)
         seen = [
             replace(f, T_ac=Pose(f.T_ac.q, f.T_ac.t + m)) for f, m in zip(fixes(world.states, seed), moved, strict=True)
         ]
-        arm = to_chart(world.states[0]).arm_c
-        rows = position_rows(poses_of(tuple(seen)), np.ones(len(seen)), arm, 36)
+        change = Manoeuvre(round(40.2e9), 0.1, np.array([0.0, step, 0.0]), np.zeros(3), np.eye(6), 0)
+        arm, one = to_chart(world.states[0]).arm_c, np.ones(len(seen))
+        rows = position_rows(poses_of(tuple(seen)), one, arm, 36, 0, [change] if step else [])
         found.append(_expected(_position_odds(_variances(NO_LEVELS), rows)))
     assert all(force / 2.0 < q < 2.0 * force + 5e-6 for q in found), found
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from avsreplay.estimate.batch import FitParams, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import LATEST, SPHERE, BatchCovariance, final_mixture
-from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, BatchSchedule
+from avsreplay.estimate.batch_schedule import FEWEST_TO_FIT, MOST_FIXES, BatchSchedule
 from avsreplay.estimate.chart import to_chart, to_errors
 from avsreplay.estimate.driven import DrivenBelief
 from avsreplay.estimate.error_state import VEL, W, definite_product
@@ -273,9 +273,9 @@ class AnomalyTest:
             P[VEL, VEL] += self._priors.velocity_mps**2 * np.eye(3)
             at = replace(at, P=P)
         after = tuple(e for e in window if e.prediction.belief.t_ns > t_ns)
-        anew = track.changed(since=0, recent=(), doubtful=(), older=(), pending=False, fitting=None, testing=None)
+        anew = track.changed(since=0, recent=(), doubtful=(), pending=False, fitting=None, testing=None)
         if isinstance(at, DrivenBelief):  # the filter continues, with rate and velocity free
-            return self._used(anew.changed(belief=at, mode="filter", fixes=()), after)
+            return self._used(anew.changed(belief=at, mode="filter", fixes=(), older=()), after)
         chart = to_chart(at.x)
         prior = Prior(
             chart,
@@ -284,7 +284,9 @@ class AnomalyTest:
         fixes = tuple(self.batch.fix(e.prediction, e.innovation) for e in after)
         result = self._fitted(track, fixes, prior, t_ns)
         mode = "filter" if track.mode == "filter" else "fit"
-        return anew.changed(belief=result.belief, mode=mode, fixes=fixes, batch=result, prior=prior, prior_ns=t_ns)
+        older = (*track.older, *(f for f in track.fixes if f.t_ns <= t_ns))[-MOST_FIXES:]
+        anew = anew.changed(fixes=fixes, older=older, prior=prior, prior_ns=t_ns)
+        return anew.changed(belief=result.belief, mode=mode, batch=result)
 
     def _fitted(self, track: Track, fixes: tuple[PoseFix, ...], prior: Prior, t_ns: int) -> BatchResult:
         """Fit of the poses after a manoeuvre with the prior at its instant."""

@@ -101,7 +101,7 @@ class DisturbanceSchedule:
         start = last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
         late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
         if count >= FEWEST and known is None and late > (0 if track.since else _LATEST):
-            poses = track.fixes, last, start, self.params, track.levels, track.older
+            poses = track.fixes, last, start, self.params, track.levels, track.older, track.manoeuvres
             if len(track.fixes) < FEWEST_TO_SPREAD:
                 return self._levelled(track, whole(improved_levels(*poses))).changed(unlevelled=0)
             return track.changed(testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)

@@ -40,7 +40,7 @@ from avsreplay.estimate.params import Adaptation, EstimatorParams
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Belief, State
+from avsreplay.records import Belief, Manoeuvre, State
 from avsreplay.settings import given
 
 _PAIR_RAD = 0.7
@@ -296,6 +296,7 @@ def improved_levels(
     params: EstimatorParams,
     levels: NoiseLevels,
     older: tuple[PoseFix, ...] = (),
+    changes: tuple[Manoeuvre, ...] = (),
 ) -> Parts[NoiseLevels]:
     """Noise levels from the residuals of the poses but those with gross errors, which are no noise, in parts.
 
@@ -305,7 +306,8 @@ def improved_levels(
         start: its chart, at the first pose.
         params: settings, auto values filled in.
         levels: the last estimate.
-        older: poses before these, which the fit cannot use because disturbances have turned the body too far since.
+        older: poses before these, which the fit cannot use because of disturbances or a manoeuvre since.
+        changes: the manoeuvres so far.
     """
     poses = poses_of(fixes)
     factors = levels.factors(result.share) * np.sqrt(result.inflation)
@@ -321,7 +323,8 @@ def improved_levels(
     claimed, positions = params.adapt is Adaptation.OFF, None
     if older and fixes[0].orbit is None:
         every = (*older, *fixes)
-        positions = position_rows(poses_of(every), np.array([f.weight for f in every]), chart.arm_c, _POSITIONS)
+        weights, far = np.array([f.weight for f in every]), poses_of(every)
+        positions = position_rows(far, weights, chart.arm_c, _POSITIONS, every[0].t_ns, changes)
         yield BUDGET
     found = yield from estimate_levels(points, problem, levels, claimed, params.disturbances, positions=positions)
     return replace(found, count=pose_count(fixes))

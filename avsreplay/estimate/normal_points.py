@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,13 +15,15 @@ from avsreplay.estimate.dynamics import rotation_path, translated
 from avsreplay.estimate.error_state import DIM
 from avsreplay.estimate.measurement import GATE
 from avsreplay.geometry import Array
+from avsreplay.records import Manoeuvre
 
 _POINTS, _SPAN_RAD = 128, 0.25  # most normal points, and least rotation over which poses are joined [rad]
 _FEW = 48  # poses up to which none are joined
 _NEIGHBOURS = 5  # poses with whose median a pose is compared
 _GROSS = 100.0  # squared difference of a gross error over the median of all poses, or over its expectation
 _VIEW_RAD = 0.5  # 1 sigma of the correlation of the common errors over the direction of view
-_FREE = np.repeat([1e3, 1e1, 1e2], 3)  # 1 sigma of position [m], velocity [m/s] and arm [m] before the positions
+_FREE = (1e2, 1e3, 1e1)  # 1 sigma of arm [m], position [m] and velocity [m/s] before the positions
+_LEAST_M = 1e-6  # least 1 sigma of a displacement [m]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,24 +33,23 @@ class PositionRows:
     Rows are whitened and ordered by axis of {C}, and for each axis by point.
 
     Attributes:
-        e: (3n,) positions.  J: (3n, 9) of position and velocity at the first point and of the arm in {C}.
+        e: (3n,) positions.  J: (3n, m) of arm in {C}, position, velocity, and changes of them.
+        info: (m, m) information of these unknowns before the positions.
         white, common: (n, n) covariance of the independent and of the common errors, the same for three axes.
         force: (3n, 3(n - 1)) of impulses of the force between the points, of unit density.
     """
 
     e: Array
     J: Array
+    info: Array
     white: Array
     common: Array
     force: Array
 
-    @property
-    def info(self) -> Array:
-        """(9, 9) information of the unknowns before the positions."""
-        return np.diag(_FREE**-2.0)
 
-
-def position_rows(poses: Poses, weights: Array, arm: Array, most: int) -> PositionRows:
+def position_rows(
+    poses: Poses, weights: Array, arm: Array, most: int, epoch_ns: int = 0, changes: Sequence[Manoeuvre] = ()
+) -> PositionRows:
     """Weighted means of the positions over equal shares of the time.
 
     The position is r + v t + R c with the measured rotation R, so that a mean of positions belongs to the mean of R.
@@ -57,6 +59,8 @@ def position_rows(poses: Poses, weights: Array, arm: Array, most: int) -> Positi
         weights: (n,) of the poses as measurements.
         arm: (3,) approximate c [m], with which errors of R displace R c.
         most: largest number of points.
+        epoch_ns: instant of the first pose.
+        changes: manoeuvres; an error of the instant of one displaces the later positions.
     """
     t = poses.times_s - poses.times_s[0]
     cells = np.minimum((t / (t[-1] * (1.0 + 1e-9)) * most).astype(int), most - 1)
@@ -75,11 +79,16 @@ def position_rows(poses: Poses, weights: Array, arm: Array, most: int) -> Positi
     shares = None if poses.shares is None else np.add.reduceat(w * poses.shares, first)
     points = Poses(times, poses.q[middle], poses.t[middle], poses.C[middle], counts, shares)
     white, common = error_parts(points)
-    J = np.concatenate([root, times[:, None, None] * root, root @ turns], axis=2)
+    changes = [m for m in changes if m.t_ns > epoch_ns]
+    since = [np.maximum(times - (m.t_ns - epoch_ns) * 1e-9, 0.0) for m in changes]
+    effects = [np.ones(len(times)), times, *(a for b in since for a in (b, b > 0.0))]
+    shifts = [max(_LEAST_M, m.t_1s_s * float(np.linalg.norm(m.velocity))) for m in changes]
+    J = np.concatenate([root @ turns, *(a[:, None, None] * root for a in effects)], axis=2)
+    sizes = np.repeat([*_FREE, *(a for size in shifts for a in (_FREE[2], size))], 3)
     force = (late[:, None, :, None] * root[:, :, None, :]).reshape(len(times), 3, -1)
     e = (root @ (seen - seen[0])[:, :, None])[:, :, 0]
     rows = [np.ascontiguousarray(a.transpose(1, 0, 2)).reshape(3 * len(times), -1) for a in (J, force)]
-    return PositionRows(np.ascontiguousarray(e.T).reshape(-1), rows[0], white, common, rows[1])
+    return PositionRows(np.ascontiguousarray(e.T).reshape(-1), rows[0], np.diag(sizes**-2.0), white, common, rows[1])
 
 
 def view_correlation(poses: Poses) -> Array:
