@@ -13,7 +13,6 @@ from scipy.stats import chi2
 from avsreplay.estimate import Estimator, EstimatorParams, Track
 from avsreplay.estimate.batch import FitParams, Problem, fit
 from avsreplay.estimate.batch_covariance import memory_s, process_noise_pass
-from avsreplay.estimate.batch_schedule import contradicted
 from avsreplay.estimate.chart import nees, to_chart, to_errors
 from avsreplay.estimate.error_state import boxplus
 from avsreplay.estimate.initialise import (
@@ -27,6 +26,7 @@ from avsreplay.estimate.initialise import (
     weak_prior,
 )
 from avsreplay.estimate.measurement import innovation_of
+from avsreplay.estimate.mixture import contradicted
 from avsreplay.estimate.noise_levels import NO_LEVELS, NoiseLevels
 from avsreplay.estimate.params import Constraint, Start
 from avsreplay.estimate.work import whole
@@ -169,16 +169,19 @@ def test_the_estimate_of_a_disturbed_body_is_consistent(start: Start) -> None:
     assert np.median(sizes) > 0.5
 
 
-def test_contradiction_counts_in_the_fits_own_spread() -> None:
+def test_a_difference_is_a_contradiction_beyond_the_larger_covariance() -> None:
     found = fixes(4, 100.0)
     cold = whole(batch_estimate(found, WHITE.resolved(2.0), FitParams(), NO_LEVELS))
     assert not contradicted(cold.belief, cold.belief)
     sizes = np.sqrt(np.linalg.eigvalsh(cold.belief.P))
     axis = np.linalg.eigh(cold.belief.P)[1][:, -1]
-    for off, expected in ((6.0, False), (9.0, True)):
-        there = replace(cold.belief, x=boxplus(cold.belief.x, 0.01 * off * sizes[-1] * axis))
-        small = replace(cold.belief, P=1e-4 * cold.belief.P)
-        assert contradicted(there, small) is expected
+    small = replace(cold.belief, P=1e-4 * cold.belief.P)
+    for claimed in (0.0, 0.25, 1.0, 4.0):  # variance of the belief over that of the fit
+        scale = max(1.0, claimed) ** 0.5
+        for off, expected in ((6.0, False), (9.0, True)):
+            there = boxplus(cold.belief.x, 0.01 * off * scale * sizes[-1] * axis)
+            P = max(claimed, 1e-3) * small.P
+            assert contradicted(replace(small, x=there, P=P), small) is expected
 
 
 def test_the_fit_begins_where_the_belief_came_from() -> None:

@@ -18,7 +18,7 @@ import numpy as np
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import FitParams, Prior
 from avsreplay.estimate.batch_covariance import SPHERE, memory_s, propagate_chart
-from avsreplay.estimate.chart import Chart, to_chart, to_errors
+from avsreplay.estimate.chart import Chart, to_chart
 from avsreplay.estimate.driven import DrivenBelief, propagated
 from avsreplay.estimate.dynamics import propagate_state
 from avsreplay.estimate.initialise import (
@@ -36,8 +36,8 @@ from avsreplay.estimate.measurement import (
     measured_pose,
     measurement_jacobian,
 )
-from avsreplay.estimate.mixture import carried, moments, not_worse, worn
-from avsreplay.estimate.noise import BOUND, NO_INFLATION, Noise, filled
+from avsreplay.estimate.mixture import carried, contradicted, moments, not_worse, worn
+from avsreplay.estimate.noise import NO_INFLATION, Noise, filled
 from avsreplay.estimate.noise_levels import NoiseLevels
 from avsreplay.estimate.params import EstimatorParams, Start
 from avsreplay.estimate.relative_orbit import RelativeOrbit
@@ -298,18 +298,6 @@ def _better_than_measured(belief: Belief, R: Array) -> bool:
     H = measurement_jacobian(belief.x)
     S = H @ belief.P @ H.T
     return all(float(np.trace(S[b, b])) <= float(np.trace(R[b, b])) for b in (slice(0, 3), slice(3, 6)))
-
-
-def contradicted(belief: Belief, fitted: Belief) -> bool:
-    """Return whether the belief's mean is outside the 99.99 % region of the fit, both at one instant.
-
-    Both use the same poses, so a consistent belief differs by less than the fit's covariance. The difference is taken
-    in the chart, where the order of the axes has no effect.
-    """
-    there = to_chart(fitted.x)
-    T = to_errors(there)
-    y = T @ to_chart(belief.x).minus(there)
-    return float(y @ np.linalg.solve(fitted.P, y)) > BOUND
 
 
 def with_last_pose(result: BatchResult, fix: PoseFix, noise: tuple[float, float]) -> BatchResult:

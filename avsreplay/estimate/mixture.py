@@ -14,9 +14,10 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate import _motion
-from avsreplay.estimate.chart import Chart, separated, to_errors, to_state
+from avsreplay.estimate.chart import Chart, separated, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import forecast_of, grasp_prediction, torque_density, translation
 from avsreplay.estimate.error_state import rotation
+from avsreplay.estimate.noise import BOUND, cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Belief, Forecast
@@ -208,3 +209,20 @@ def mixture_forecast(
         off = np.stack([(d * d).sum(axis=1) for d in (position, velocity, turn)], axis=1)
         total += component.weight * (variances + off)
     return forecast_of(times, total)
+
+
+def contradicted(belief: Belief, fitted: Belief) -> bool:
+    """Return whether the means differ by more than 99.99 % of the larger covariance, both at one instant.
+
+    Both use the same poses. Where a fit is efficient, their difference has the covariance P - P_fit (Hausman's test),
+    which is below P; a belief that claims less than the fit may differ by the fit's covariance. In each generalised
+    eigendirection of P and P_fit the larger of the two is therefore the scale. The difference is taken in the chart,
+    where the order of the axes has no effect.
+    """
+    here, there = to_chart(belief.x), to_chart(fitted.x)
+    T = to_errors(there)
+    root = cholesky_root(fitted.P)
+    claimed = np.linalg.solve(root, T @ np.linalg.solve(to_errors(here), cholesky_root(belief.P)))
+    ratios, axes = np.linalg.eigh(claimed @ claimed.T)
+    y = axes.T @ np.linalg.solve(root, T @ here.minus(there))
+    return float(np.sum(y * y / np.maximum(ratios, 1.0))) > BOUND
