@@ -67,8 +67,9 @@ def read_limited(path: Path, limit: int, hint: str, *, pipe: bool = False) -> by
             raise UnreadableInput(f"larger than {limit >> 20} MiB", where=str(path), hint=hint)
         return data
     except OSError as error:
-        what = "no such file" if isinstance(error, FileNotFoundError) else error.strerror or "cannot be read"
-        raise UnreadableInput(what, where=str(path), hint=hint) from None
+        if isinstance(error, FileNotFoundError):
+            raise UnreadableInput("no such file", where=str(path), hint="check the path") from None
+        raise UnreadableInput(error.strerror or "cannot be read", where=str(path), hint=hint) from None
 
 
 def parse_npy(data: bytes) -> NDArray[Any]:

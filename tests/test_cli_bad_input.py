@@ -100,7 +100,9 @@ def test_a_scenario_with_a_wrong_key(text, line, word, cli, tmp_path):
         (("--set", "faults.polcy=any"), "did you mean"),
         (("--set", "plan.a_max_mps2=-1"), "a_max_mps2"),
         (("--topic", "/nothing"), "/points"),
-        (("--truth-gap", "nan"), "truth_gap_s"),
+        (("--truth-gap", "nan"), "--truth-gap"),
+        (("--every-scan", "0"), "--every-scan is 0"),
+        (("--nope",), "see 'avsreplay run --help'"),
         (("--golden", "a", "--update-golden", "b"), "exclude"),
     ],
 )
@@ -119,6 +121,21 @@ def test_a_model_of_an_extreme_scale_is_one_line(command, scale, word, cli, log)
 @pytest.mark.parametrize("extent", ["nan", "inf", "0", "1e308", "1e-320"])
 def test_an_extent_that_no_target_has_is_one_line(extent, cli):
     check_one_line(cli("plan", "nothing", "--extent", extent), 2, "--extent")
+
+
+def test_a_missing_argument_names_the_help(cli):
+    check_one_line(cli("completion"), 2, "fish; see 'avsreplay completion --help'")
+
+
+def test_without_arguments_the_help_is_printed(cli):
+    done = cli()
+    assert (done.code, done.out) == (2, "")
+    assert done.err == cli("--help").out
+
+
+def test_a_log_or_a_folder_without_rows_is_no_result(cli, log, tmp_path):
+    check_one_line(cli("plan", log), 3, "name a directory written by run -o, or its rows.jsonl")
+    check_one_line(cli("plan", tmp_path), 3, "holds no rows.jsonl")
 
 
 def test_a_seed_beyond_64_bits_is_one_line(cli, log, tmp_path):

@@ -225,8 +225,11 @@ def entry_point() -> None:
         code = group.main(standalone_mode=False, prog_name="avsreplay", auto_envvar_prefix="AVSREPLAY")
     except AvsError as error:
         code = _fail(str(error), error.exit_code)
+    except click.exceptions.NoArgsIsHelpError as error:
+        click.echo(error.format_message(), err=True)
+        code = error.exit_code
     except click.ClickException as error:
-        code = _fail(error.format_message(), error.exit_code)
+        code = _fail(_with_help(error), error.exit_code)
     except (click.Abort, KeyboardInterrupt):
         code = _fail("interrupted", 130)
     except OSError as error:
@@ -239,6 +242,15 @@ def entry_point() -> None:
         closed = isinstance(output.failure, BrokenPipeError)
         code = 141 if closed else _fail(f"standard output: {output.failure.strerror or output.failure}", 3)
     sys.exit(code)
+
+
+def _with_help(error: click.ClickException) -> str:
+    """The message of an error, with the command that describes the arguments where it states no allowed values."""
+    message = error.format_message().replace("\n\t", " ")
+    invalid = isinstance(error, click.BadParameter) and not isinstance(error, click.MissingParameter)
+    if invalid or not isinstance(error, click.UsageError) or error.ctx is None:
+        return message
+    return f"{message.removesuffix('.')}; see '{error.ctx.command_path} --help'"
 
 
 def _standard_output() -> _Discarding | None:

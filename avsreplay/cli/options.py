@@ -126,7 +126,10 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
     try:
         return SourceOptions(**given)
     except ValueError as error:
-        raise UsageError(str(error), hint="correct the option") from None
+        field, _, what = str(error).partition(" ")
+        known = click.get_current_context().command.params
+        option = next((param.opts[0] for param in known if param.name == field), field)
+        raise UsageError(f"{option} {what}", hint="correct the option") from None
 
 
 def read_result(path: Path) -> Result:

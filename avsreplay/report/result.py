@@ -139,6 +139,8 @@ def load_result(path: str | Path) -> Result:
     """
     path = Path(path)
     folder, rows_path = (path, path / "rows.jsonl") if path.is_dir() else (None, path)
+    if folder and not rows_path.is_file():
+        raise UnreadableInput("holds no rows.jsonl", where=str(path), hint="name a directory written by run -o")
     whole = folder or (path.parent if path.name == "rows.jsonl" and (path.parent / "run.json").is_file() else None)
     header, unverified = _header(whole / "run.json") if whole else {}, "it is a single file of rows without run.json"
     if whole:
