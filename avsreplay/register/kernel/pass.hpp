@@ -1,23 +1,24 @@
 // One chunk of a pass: move, search, sum. Included inside a namespace named after the instruction set.
 //
-// The chunk is taken in sweeps so that the cache misses of many points overlap: moved points and their cells first, then
-// the lists, then the blocks a few points ahead of the search.
-static_assert(CHUNK % 4 == 0, "sums run over four points at a time");
+// A chunk is taken in strips, which fit into the first-level cache, and a strip in sweeps so that the cache misses of many
+// points overlap: moved points and their cells first, then the lists, then the blocks a few points ahead of the search.
+constexpr int STRIP = 128;  // points
+static_assert(CHUNK % STRIP == 0 && STRIP % 4 == 0, "sums run over four points at a time");
 
 // What is searched: everything, two blocks, the block of the kept neighbour, or nothing but this neighbour.
 enum Treat : uint8_t { IGNORED, SEARCHED, IN_PAIR, IN_BLOCK, KEPT };
 
-struct Chunk {
-  alignas(32) double p[3][CHUNK];   // moved, relative to the model's centre
-  alignas(32) double f[3][CHUNK];   // foot, the same
-  alignas(32) double n[3][CHUNK];   // normal, or v of the stiffness
-  alignas(32) double sign[CHUNK], whole[CHUNK];  // of the stiffness
-  alignas(32) double d2[CHUNK];
-  alignas(32) double take[CHUNK];   // 1: an inlier, 0: not
-  alignas(32) double c[3][CHUNK];   // moved, in {C}
-  int32_t lane[CHUNK];              // of the primitive that is nearest, -1: none
-  const uint32_t* list[CHUNK];      // of the cell of a point that is searched for, or null
-  Treat search[CHUNK];
+struct Strip {
+  alignas(32) double p[3][STRIP];   // moved, relative to the model's centre
+  alignas(32) double f[3][STRIP];   // foot, the same
+  alignas(32) double n[3][STRIP];   // normal, or v of the stiffness
+  alignas(32) double sign[STRIP], whole[STRIP];  // of the stiffness
+  alignas(32) double d2[STRIP];
+  alignas(32) double take[STRIP];   // 1: an inlier, 0: not
+  alignas(32) double c[3][STRIP];   // moved, in {C}
+  int32_t lane[STRIP];              // of the primitive that is nearest, -1: none
+  const uint32_t* list[STRIP];      // of the cell of a point that is searched for, or null
+  Treat search[STRIP];
 };
 
 static inline bool finite(const double* p) { return std::isfinite(p[0]) && std::isfinite(p[1]) && std::isfinite(p[2]); }
@@ -43,8 +44,9 @@ static inline Treat treat(const Kept& k, const double* q) {
   return moved2 < (double)k.block2 ? IN_BLOCK : moved2 < (double)k.pair2 ? IN_PAIR : SEARCHED;
 }
 
-static void gather(const Store& s, const View& v, int64_t first, int n, const double* T, const Kept* kept, Chunk& c,
-                   Sums& out) {
+// Returns how many of the points are not finite.
+static int gather(const Store& s, const View& v, int64_t first, int n, const double* T, const Kept* kept, Strip& c) {
+  int ignored = 0;
   for (int i = 0; i < n; ++i) {
     double p[3], q[3];
     read(v, first + i, p);
@@ -52,7 +54,7 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
     c.list[i] = nullptr;
     if (c.search[i] == IGNORED) {
       for (int k = 0; k < 3; ++k) c.c[k][i] = 0;
-      out.v[2] += 1;
+      ++ignored;
       continue;
     }
     move(T, p, q);
@@ -68,6 +70,7 @@ static void gather(const Store& s, const View& v, int64_t first, int n, const do
     c.list[i] = list_of(s, c.list[i]);
     if (c.list[i]) fetch(c.list[i]);
   }
+  return ignored;
 }
 
 // Square of a length, with room for rounding; negative where it is not positive.
@@ -129,14 +132,14 @@ static inline void fetch_ahead(const Store& s, Treat treat, const uint32_t* list
 
 // What the searches of a chunk took.
 struct Effort {
+  int64_t ignored = 0;                 // points that are not finite
   int64_t searched = 0, compared = 0;  // searches made, and the blocks and nodes that they compared
+  int32_t last = -1;                   // the primitive of the last point
 };
 
-// Finds the primitive of every point of the chunk. `remember`: where, for later passes.
+// Finds the primitive of every point of a strip. `remember`: where, for later passes.
 template <class Kind>
-static Effort search(const Scope& o, int64_t first, int n, const Kept* kept, Kept* remember, Chunk& c) {
-  int32_t last = -1;
-  Effort effort;
+static void search(const Scope& o, int64_t first, int n, const Kept* kept, Kept* remember, Strip& c, Effort& effort) {
   const auto own = [&](int i) { return kept ? kept[first + i].lane : -1; };
   const auto other = [&](int i) { return kept && c.search[i] == IN_PAIR ? kept[first + i].other : NO_CHILD; };
   for (int i = 0; i < n; ++i) {
@@ -150,19 +153,18 @@ static Effort search(const Scope& o, int64_t first, int n, const Kept* kept, Kep
       Kept* memory = remember ? remember + first + i : nullptr;
       c.lane[i] = keep_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), c.search[i] == IN_PAIR, kept[first + i], memory);
     } else {
-      const int32_t seed = lane < 0 && !c.list[i] ? last : lane;
+      const int32_t seed = lane < 0 && !c.list[i] ? effort.last : lane;
       Kept* memory = remember ? remember + first + i : nullptr;
       c.lane[i] = search_one<Kind>(o, query(o.s, c.c[0][i], c.c[1][i], c.c[2][i]), c.list[i], seed, memory, effort.compared);
       ++effort.searched;
     }
-    last = c.lane[i];
+    effort.last = c.lane[i];
   }
-  return effort;
 }
 
-// Calls put(i, points, feet, which of them are nearer than the bound) for every four points of the chunk.
+// Calls put(i, points, feet, which of them are nearer than the bound) for every four points of the strip.
 template <class Kind, class Put>
-static void each_four(const Scope& o, int n, Ask ask, Chunk& c, const Put& put) {
+static void each_four(const Scope& o, int n, Ask ask, Strip& c, const Put& put) {
   for (int i = n; i < (n + 3) / 4 * 4; ++i) {
     c.lane[i] = -1;
     for (int k = 0; k < 3; ++k) c.c[k][i] = 0;
@@ -181,7 +183,7 @@ static void each_four(const Scope& o, int n, Ask ask, Chunk& c, const Put& put) 
 
 // What is not an inlier is zero.
 template <class Kind>
-static void settle(const Scope& o, int n, Ask ask, Chunk& c) {
+static void settle(const Scope& o, int n, Ask ask, Strip& c) {
   const D4 zero = d4(0), centre[3] = {d4(o.s.centre.x), d4(o.s.centre.y), d4(o.s.centre.z)};
   each_four<Kind>(o, n, ask, c, [&](int i, const D4 (&p)[3], const Four& four, D4::Mask in) {
     const auto put = [&](double* to, D4 x) { store4(to + i, select(in, x, zero)); };
@@ -190,21 +192,37 @@ static void settle(const Scope& o, int n, Ask ask, Chunk& c) {
   });
 }
 
-static void sum_point(int n, const Chunk& c, Sums& out) {
-  D4 a[18] = {};
+// Sums over the strips of a chunk in the order of `Sums`, each by the place of a point among four.
+struct Fours {
+  D4 v[SUMS] = {};
+
+  // Local copies, because the compiler must assume that sums in memory change with the points.
+  template <int N>
+  void take(int from, D4 (&a)[N]) const {
+    for (int k = 0; k < N; ++k) a[k] = v[from + k];
+  }
+  template <int N>
+  void put(int from, const D4 (&a)[N]) {
+    for (int k = 0; k < N; ++k) v[from + k] = a[k];
+  }
+};
+
+static void sum_point(int n, const Strip& c, Fours& sums) {
+  D4 a[19];
+  sums.take(0, a);
   for (int i = 0; i < n; i += 4) {
     const D4 p[3] = {load4(c.p[0] + i), load4(c.p[1] + i), load4(c.p[2] + i)};
     const D4 f[3] = {load4(c.f[0] + i), load4(c.f[1] + i), load4(c.f[2] + i)};
     a[0] = a[0] + load4(c.take + i), a[1] = a[1] + load4(c.d2 + i);
-    for (int k = 0; k < 3; ++k) a[2 + k] = a[2 + k] + p[k], a[5 + k] = a[5 + k] + f[k];
-    for (int k = 0; k < 9; ++k) a[8 + k] = a[8 + k] + p[k / 3] * f[k % 3];
+    for (int k = 0; k < 3; ++k) a[4 + k] = a[4 + k] + p[k], a[7 + k] = a[7 + k] + f[k];
+    for (int k = 0; k < 9; ++k) a[10 + k] = a[10 + k] + p[k / 3] * f[k % 3];
   }
-  out.v[0] = sum_in_order(a[0]), out.v[1] = sum_in_order(a[1]);
-  for (int k = 0; k < 15; ++k) out.v[4 + k] = sum_in_order(a[2 + k]);
+  sums.put(0, a);
 }
 
-static void sum_newton(int n, const Chunk& c, Sums& out) {
-  D4 a[31] = {};
+static void sum_newton(int n, const Strip& c, Fours& sums) {
+  D4 a[31];
+  sums.take(19, a);
   for (int i = 0; i < n; i += 4) {
     const D4 p[3] = {load4(c.p[0] + i), load4(c.p[1] + i), load4(c.p[2] + i)};
     const D4 m[3] = {load4(c.n[0] + i), load4(c.n[1] + i), load4(c.n[2] + i)};
@@ -220,26 +238,26 @@ static void sum_newton(int n, const Chunk& c, Sums& out) {
     for (int r = 0; r < 3; ++r)
       for (int q = 0; q <= r; ++q, ++t) a[t] = a[t] + whole * p[r] * p[q];
   }
-  for (int k = 0; k < 31; ++k) out.v[19 + k] = sum_in_order(a[k]);
+  sums.put(19, a);
 }
 
-static void sum_plane(int n, const Chunk& c, Sums& out) {
-  D4 a[33] = {};
+static void sum_plane(int n, const Strip& c, Fours& sums) {
+  D4 a[35];
+  sums.take(0, a);
   for (int i = 0; i < n; i += 4) {
     const D4 p[3] = {load4(c.p[0] + i), load4(c.p[1] + i), load4(c.p[2] + i)};
     const D4 m[3] = {load4(c.n[0] + i), load4(c.n[1] + i), load4(c.n[2] + i)};
     const D4 e = (load4(c.f[0] + i) - p[0]) * m[0] + (load4(c.f[1] + i) - p[1]) * m[1] + (load4(c.f[2] + i) - p[2]) * m[2];
     const D4 j[6] = {p[1] * m[2] - p[2] * m[1], p[2] * m[0] - p[0] * m[2], p[0] * m[1] - p[1] * m[0], m[0], m[1], m[2]};
     a[0] = a[0] + load4(c.take + i), a[1] = a[1] + load4(c.d2 + i);
-    for (int k = 0; k < 3; ++k) a[2 + k] = a[2 + k] + p[k];
-    int t = 5;
+    for (int k = 0; k < 3; ++k) a[4 + k] = a[4 + k] + p[k];
+    int t = 7;
     for (int r = 0; r < 6; ++r)
       for (int q = 0; q <= r; ++q, ++t) a[t] = a[t] + j[r] * j[q];
     for (int r = 0; r < 6; ++r, ++t) a[t] = a[t] + j[r] * e;
     a[t] = a[t] + e * e;
   }
-  out.v[0] = sum_in_order(a[0]), out.v[1] = sum_in_order(a[1]);
-  for (int k = 0; k < 31; ++k) out.v[4 + k] = sum_in_order(a[2 + k]);
+  sums.put(0, a);
 }
 
 static inline Scope scope_of(const Store& s, const Facing& facing, bool sided, double bound, float lead) {
@@ -249,24 +267,29 @@ static inline Scope scope_of(const Store& s, const Facing& facing, bool sided, d
 template <class Kind>
 static void pass_kind(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, Kept* kept,
                       Sums& out) {
-  Chunk c;
-  const int n = (int)(last - first);
-  for (double& x : out.v) x = 0;
-  gather(s, v, first, n, look.T, kept, c, out);
   const Vec3 eye{look.T[3], look.T[7], look.T[11]};
   Scope o = scope_of(s, *look.facing, false, look.gate, look.lead);
   if (look.sided && s.mesh) o.eye = &eye;
-  const Effort effort = search<Kind>(o, first, n, kept, kept, c);
-  settle<Kind>(o, n, look.kind == Pass::point ? Ask::FOOT : look.kind == Pass::plane ? Ask::NORMAL : Ask::STIFFNESS, c);
-  look.kind == Pass::plane ? sum_plane(n, c, out) : sum_point(n, c, out);
-  if (look.kind == Pass::newton) sum_newton(n, c, out);
-  out.v[3] = (double)effort.searched, out.v[50] = (double)effort.compared;
+  const bool plane = look.kind == Pass::plane, newton = look.kind == Pass::newton;
+  Effort effort;
+  Fours sums;
+  Strip c;
+  for (int64_t at = first; at < last; at += STRIP) {
+    const int n = (int)std::min<int64_t>(STRIP, last - at);
+    effort.ignored += gather(s, v, at, n, look.T, kept, c);
+    search<Kind>(o, at, n, kept, kept, c, effort);
+    settle<Kind>(o, n, plane ? Ask::NORMAL : newton ? Ask::STIFFNESS : Ask::FOOT, c);
+    plane ? sum_plane(n, c, sums) : sum_point(n, c, sums);
+    if (newton) sum_newton(n, c, sums);
+  }
+  for (int k = 0; k < SUMS; ++k) out.v[k] = sum_in_order(sums.v[k]);
+  out.v[2] = (double)effort.ignored, out.v[3] = (double)effort.searched, out.v[50] = (double)effort.compared;
 }
 
 // Searches for the points whose kept neighbour is not nearer than `known`: what is kept says nothing of places farther
 // than the gate under which it was found. Returns whether there were any.
 template <class Kind>
-static bool search_beyond(const Scope& o, int n, double known, Chunk& c) {
+static bool search_beyond(const Scope& o, int n, double known, Strip& c) {
   if (known >= o.bound) return false;
   bool any = false;
   int64_t compared = 0;
@@ -281,22 +304,24 @@ static bool search_beyond(const Scope& o, int n, double known, Chunk& c) {
 
 template <class Kind>
 static int match_kind(const Store& s, const View& v, int64_t first, int64_t last, const Look& look, const Kept* kept, Match* out) {
-  Chunk c;
-  Sums counts{};
-  const int n = (int)(last - first);
-  gather(s, v, first, n, look.T, kept, c, counts);
   const Vec3 eye{look.T[3], look.T[7], look.T[11]};
   Scope o = scope_of(s, *look.facing, false, look.gate, 0.f);
   if (look.sided && s.mesh) o.eye = &eye;
-  search<Kind>(o, first, n, kept, nullptr, c);
-  settle<Kind>(o, n, Ask::NORMAL, c);
-  if (kept && search_beyond<Kind>(o, n, look.known, c)) settle<Kind>(o, n, Ask::NORMAL, c);
+  Effort effort;
+  Strip c;
   int found = 0;
-  for (int i = 0; i < n; ++i) {
-    if (!(c.take[i] > 0)) continue;
-    const double N[3] = {c.n[0][i], c.n[1][i], c.n[2][i]};
-    const double e = N[0] * (c.p[0][i] - c.f[0][i]) + N[1] * (c.p[1][i] - c.f[1][i]) + N[2] * (c.p[2][i] - c.f[2][i]);
-    out[found++] = {{c.c[0][i], c.c[1][i], c.c[2][i]}, {N[0], N[1], N[2]}, e, c.d2[i]};
+  for (int64_t at = first; at < last; at += STRIP) {
+    const int n = (int)std::min<int64_t>(STRIP, last - at);
+    gather(s, v, at, n, look.T, kept, c);
+    search<Kind>(o, at, n, kept, nullptr, c, effort);
+    settle<Kind>(o, n, Ask::NORMAL, c);
+    if (kept && search_beyond<Kind>(o, n, look.known, c)) settle<Kind>(o, n, Ask::NORMAL, c);
+    for (int i = 0; i < n; ++i) {
+      if (!(c.take[i] > 0)) continue;
+      const double N[3] = {c.n[0][i], c.n[1][i], c.n[2][i]};
+      const double e = N[0] * (c.p[0][i] - c.f[0][i]) + N[1] * (c.p[1][i] - c.f[1][i]) + N[2] * (c.p[2][i] - c.f[2][i]);
+      out[found++] = {{c.c[0][i], c.c[1][i], c.c[2][i]}, {N[0], N[1], N[2]}, e, c.d2[i]};
+    }
   }
   return found;
 }
@@ -324,13 +349,13 @@ static int64_t closest_kind(const Store& s, const View& v, int64_t first, int64_
                             bool sided, double bound, const Feet& out) {
   const double nan = std::numeric_limits<double>::quiet_NaN();
   const Scope o = scope_of(s, facing, sided, bound, 0.f);
-  Chunk c;
-  Sums counts{};
-  int64_t compared = 0;
-  for (int64_t at = first; at < last; at += CHUNK) {
-    const int n = (int)std::min<int64_t>(CHUNK, last - at);
-    gather(s, v, at, n, T, nullptr, c, counts);
-    compared += search<Kind>(o, at, n, nullptr, nullptr, c).compared;
+  Strip c;
+  Effort effort;
+  for (int64_t at = first; at < last; at += STRIP) {
+    const int n = (int)std::min<int64_t>(STRIP, last - at);
+    if ((at - first) % CHUNK == 0) effort.last = -1;  // the work is that of separate chunks
+    gather(s, v, at, n, T, nullptr, c);
+    search<Kind>(o, at, n, nullptr, nullptr, c, effort);
     each_four<Kind>(o, n, Ask::NORMAL, c, [&](int i, const D4 (&)[3], const Four& four, D4::Mask in) {
       const D4 none = d4(nan);
       double d2[4], v[6][4];
@@ -343,5 +368,5 @@ static int64_t closest_kind(const Store& s, const View& v, int64_t first, int64_
       }
     });
   }
-  return compared;
+  return effort.compared;
 }
