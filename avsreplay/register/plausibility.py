@@ -137,7 +137,9 @@ class PlausibilityTest:
         if not self._visibility.may_be_camera(T_ca):
             return False
         image = _Image(points)
-        spans = [np.ptp(ACROSS.T @ image.plane(each).T, axis=1) for each in (points, T_ca.inverse().apply(self._points))]
+        spans = [
+            np.ptp(ACROSS.T @ image.plane(each).T, axis=1) for each in (points, T_ca.inverse().apply(self._points))
+        ]
         return bool((spans[0] < PARTIAL * spans[1]).any())
 
     def turned_away(self, points: NDArray[Any], T_ca: Pose) -> bool:
