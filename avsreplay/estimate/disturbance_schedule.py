@@ -15,7 +15,14 @@ from avsreplay.estimate.chart import Chart
 from avsreplay.estimate.drift import DriftFound, find_drift
 from avsreplay.estimate.driven import DrivenBelief, driven_moments
 from avsreplay.estimate.driven_fit import DrivenMotion, driven_motion, levels_of
-from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, improved_levels, pose_count, poses_of
+from avsreplay.estimate.initialise import (
+    BatchResult,
+    PoseFix,
+    batch_estimate,
+    improved_levels,
+    pose_count,
+    poses_of,
+)
 from avsreplay.estimate.measurement import (
     chart_update,
     in_camera,
@@ -25,6 +32,7 @@ from avsreplay.estimate.measurement import (
 )
 from avsreplay.estimate.noise import NO_INFLATION
 from avsreplay.estimate.noise_levels import FEWEST, NoiseLevels
+from avsreplay.estimate.normal_points import PositionRows, position_rows
 from avsreplay.estimate.params import Adaptation
 from avsreplay.estimate.track import Track
 from avsreplay.estimate.work import Computation, ComputationKind, Parts, whole
@@ -37,6 +45,7 @@ LEVEL_GROWTH = 0.2  # share by which the poses grow between two estimates of the
 _DRIFT_OF_SPEED = 5e-3  # prior 1 sigma of a drift's acceleration over that of the velocity at the start [1/s]
 _LEAST_EXCESS = 1e-6  # of the variance of a belief over that of a pose, in whose direction it is used
 _LATEST = 3  # scans by which an estimate of the noise levels is put off because of fits
+_POSITIONS = 36  # points of the positions from which the density of a force is estimated
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
 
 
@@ -101,7 +110,7 @@ class DisturbanceSchedule:
         start = last.chart if last.epoch_ns == epoch_ns else self.batch.chart_at(track.belief, epoch_ns)
         late = track.unlevelled - max(FEWEST_TO_TEST, LEVEL_GROWTH * count)
         if count >= FEWEST and known is None and late > (0 if track.since else _LATEST):
-            poses = track.fixes, last, start, self.params, track.levels, track.older, track.manoeuvres
+            poses = track.fixes, last, start, self.params, track.levels, _positions(track, start)
             if len(track.fixes) < FEWEST_TO_SPREAD:
                 return self._levelled(track, whole(improved_levels(*poses))).changed(unlevelled=0)
             return track.changed(testing=Computation(ComputationKind.LEVELS, poses), unlevelled=0)
@@ -133,7 +142,9 @@ class DisturbanceSchedule:
             if found is None:
                 return None
             claimed, best, widths = self.params.adapt is Adaptation.OFF, found.hypotheses[0], found.widths
-            levels = yield from levels_of(best.fitted, track.levels, widths, claimed, self.params.disturbances)
+            forced = bool(best.fitted.u[3:].any())  # a constant force would count as a random one
+            seen = None if forced else _positions(track, best.fitted.chart)
+            levels = yield from levels_of(best.fitted, track.levels, widths, claimed, self.params.disturbances, seen)
             motions = []
             for h in found.hypotheses:
                 motion = yield from driven_motion(h.fitted, h.onset_1s_s, widths, levels)
@@ -170,6 +181,15 @@ class DisturbanceSchedule:
         result = replace(result, prior_rejected=last.prior_rejected, share=last.share, position_m2=last.position_m2)
         track = track.changed(drift=drift, levels=replace(driven.levels, count=count), fitting=None)
         return self.batch.adopted(track, result, to_filter=True)
+
+
+def _positions(track: Track, chart: Chart) -> PositionRows | None:
+    """The positions of all poses, where some have left the fit because of disturbances or a manoeuvre since."""
+    if not track.older or track.fixes[0].orbit is not None:
+        return None
+    every = (*track.older, *track.fixes)
+    weights, epoch_ns = np.array([f.weight for f in every]), every[0].t_ns
+    return position_rows(poses_of(every), weights, chart.arm_c, _POSITIONS, epoch_ns, track.manoeuvres)
 
 
 def no_worse_than_pose(belief: DrivenBelief, fix: PoseFix, factors: Array) -> DrivenBelief:

@@ -29,7 +29,7 @@ from avsreplay.estimate.dynamics import (
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, VEL, W, definite
 from avsreplay.estimate.measurement import GATE, measurement_jacobian, to_fixture
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels, mean_share
-from avsreplay.estimate.normal_points import normal_points
+from avsreplay.estimate.normal_points import PositionRows, normal_points
 from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.estimate.work import Parts
 from avsreplay.geometry import Array
@@ -126,7 +126,12 @@ def drift_columns(G: Array, times_s: Array, chart: Chart, onset_s: float) -> Arr
 
 
 def levels_of(
-    fitted: DrivenFit, levels: NoiseLevels, widths: Array, claimed: bool, fixed: tuple[float | None, float | None]
+    fitted: DrivenFit,
+    levels: NoiseLevels,
+    widths: Array,
+    claimed: bool,
+    fixed: tuple[float | None, float | None],
+    positions: PositionRows | None = None,
 ) -> Parts[NoiseLevels]:
     """Noise levels from the residuals of the poses about the motion with the acceleration, in parts.
 
@@ -136,13 +141,14 @@ def levels_of(
         widths: (6,) prior 1 sigma of the acceleration.
         claimed: the noise of the poses is as claimed; only the disturbances are estimated.
         fixed: root densities of torque and force that are given; None to estimate them.
+        positions: as in ``estimate_levels``.
     """
     old, kinds = fitted.problem, np.flatnonzero(fitted.u)
     points = normal_points(fitted.poses, fitted.chart, old.factors, MOST_POINTS)
     problem = Problem(points, old.prior, old.factors, fitted.chart, np.inf)
     begin = replace(levels, torque=0.0, force=0.0)
     unknowns = drift_unknowns(fitted, points, problem, widths, kinds)
-    return (yield from estimate_levels(points, problem, begin, claimed, fixed, unknowns))
+    return (yield from estimate_levels(points, problem, begin, claimed, fixed, unknowns, positions))
 
 
 def drift_unknowns(

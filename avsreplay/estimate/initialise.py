@@ -35,18 +35,17 @@ from avsreplay.estimate.measurement import in_camera, measurement_jacobian
 from avsreplay.estimate.mixture import Component, moments
 from avsreplay.estimate.noise import BOUND
 from avsreplay.estimate.noise_levels import MOST_POINTS, NoiseLevels, estimate_levels
-from avsreplay.estimate.normal_points import gross_errors, normal_points, position_rows
+from avsreplay.estimate.normal_points import PositionRows, gross_errors, normal_points
 from avsreplay.estimate.params import Adaptation, EstimatorParams
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.estimate.work import BUDGET, Parts
 from avsreplay.geometry import Array, Pose
-from avsreplay.records import Belief, Manoeuvre, State
+from avsreplay.records import Belief, State
 from avsreplay.settings import given
 
 _PAIR_RAD = 0.7
 _DRAWS, _EDGE = 500, 0.99
 _LEVEL_STEPS, _LEVEL_TOL = 20, 0.1
-_POSITIONS = 36  # points of the positions from which the density of a force is estimated
 _DETERMINED = 0.5  # a direction whose posterior sigma is above this share of the prior's is determined by the prior
 
 
@@ -295,8 +294,7 @@ def improved_levels(
     start: Chart,
     params: EstimatorParams,
     levels: NoiseLevels,
-    older: tuple[PoseFix, ...] = (),
-    changes: tuple[Manoeuvre, ...] = (),
+    positions: PositionRows | None = None,
 ) -> Parts[NoiseLevels]:
     """Noise levels from the residuals of the poses but those with gross errors, which are no noise, in parts.
 
@@ -306,8 +304,7 @@ def improved_levels(
         start: its chart, at the first pose.
         params: settings, auto values filled in.
         levels: the last estimate.
-        older: poses before these, which the fit cannot use because of disturbances or a manoeuvre since.
-        changes: the manoeuvres so far.
+        positions: as in ``estimate_levels``.
     """
     poses = poses_of(fixes)
     factors = levels.factors(result.share) * np.sqrt(result.inflation)
@@ -320,12 +317,7 @@ def improved_levels(
         chart = problem.chart
     problem.core.linearise(chart.flat)
     yield BUDGET
-    claimed, positions = params.adapt is Adaptation.OFF, None
-    if older and fixes[0].orbit is None:
-        every = (*older, *fixes)
-        weights, far = np.array([f.weight for f in every]), poses_of(every)
-        positions = position_rows(far, weights, chart.arm_c, _POSITIONS, every[0].t_ns, changes)
-        yield BUDGET
+    claimed = params.adapt is Adaptation.OFF
     found = yield from estimate_levels(points, problem, levels, claimed, params.disturbances, positions=positions)
     return replace(found, count=pose_count(fixes))
 
