@@ -136,7 +136,8 @@ class Outcome:
         pose_covariance: (6, 6) covariance of that pose: position in {A} [m], half-angle vector in {B} [rad].
         body: inertia, mass centre and rate in {C}.
         estimator: estimator in use: near, start, fit or filter.
-        sigma_hits, r_floors: how often a bound of the inertia ratios limited the gain, and a floor an eigenvalue of R.
+        sigma_hits: how often a bound of the inertia ratios limited the gain.
+        r_floors: how often an eigenvalue of R was raised to its floor.
         reinitialised: how often the filter or the given start was replaced by a fit so far.
         manoeuvres: all changes of the target's velocity found so far.  drift: constant torque or force, if any.
         monitors: observability, consistency and convergence.

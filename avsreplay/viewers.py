@@ -59,7 +59,7 @@ def shown_cloud(run: Run, scan: ReplayedScan) -> CloudView:
     """
     source, pose = scan.outcome.scan, scan.outcome.pose
     cloud = thin_cloud(source.seq, source.points, None, source.intensities, most=SHOWN_POINTS)
-    distances = run.registrar.distance(cloud.points, pose, RESIDUAL_REACH * run.surface.extent)
+    distances = run.registrar.distance(cloud.points, pose, RESIDUAL_REACH * run.registrar.index.extent_m)
     return replace(cloud, residual_m=np.asarray(distances, np.float32))
 
 
@@ -181,7 +181,7 @@ class RerunStream:
         rr, row, outcome = self._rr, scan.row, scan.outcome
         rr.set_time("log", timestamp=np.datetime64(row.t_ns, "ns"))
         cloud = shown_cloud(self._run, scan)
-        share = np.asarray(cloud.residual_m) / (RESIDUAL_REACH * self._run.surface.extent)
+        share = np.asarray(cloud.residual_m) / (RESIDUAL_REACH * self._run.registrar.index.extent_m)
         rr.log("camera/scan", rr.Points3D(cloud.points, colors=_colours(share)))
         self._place("camera/estimate", outcome.pose)
         if scan.truth.pose is not None:
