@@ -155,6 +155,12 @@ class Packer:
         self.out += struct.pack(f"<{len(values)}d", *values)
         return self
 
+    def doubles(self, values: NDArray[np.float64]) -> Packer:
+        """Append the numbers of an array of any shape as doubles."""
+        self._align(8)
+        self.out += values.astype("<f8").tobytes()
+        return self
+
     def f32s(self, *values: float) -> Packer:
         """Append floats as an array of fixed length."""
         self._align(4)

@@ -126,6 +126,10 @@ def _property(words: list[str]) -> _Property:
         raise BadFile(f"unreadable line '{' '.join(words)[:60]}'") from None
 
 
+_Lists = NDArray[np.int64] | list[NDArray[np.int64]]
+"""Lists of whole numbers, of equal length as rows of one array."""
+
+
 class _Text:
     """The body of an ascii file."""
 
@@ -157,17 +161,18 @@ class _Text:
         with np.errstate(all="ignore"):
             return {p.name: table[:, i].astype(p.kind) for i, p in enumerate(element.properties)}
 
-    def lists(self, element: _Element) -> list[NDArray[np.int64]]:
-        out = []
-        for line in self._take(element):
-            words = line.split()
-            if not words or not words[0].isdigit() or len(words) < 1 + int(words[0][:9]):
-                raise BadFile("a face line is shorter than its own count")
-            try:
-                out.append(np.array(words[1 : 1 + int(words[0])], dtype=np.int64))
-            except (ValueError, OverflowError):
-                raise BadFile("a face line holds something that is not a number") from None
-        return out
+    def lists(self, element: _Element) -> _Lists:
+        """Return the first list of each line; lists of equal length, the common case, are converted at once."""
+        rows = [line.split() for line in self._take(element)]
+        if not all(words and words[0].isdigit() and len(words) > int(words[0][:9]) for words in rows):
+            raise BadFile("a face line is shorter than its own count")
+        try:
+            lists = [words[1 : 1 + int(words[0])] for words in rows]
+            if rows and all(words[0] == rows[0][0] for words in rows):
+                return np.array(lists, dtype=np.int64)
+            return [np.array(each, dtype=np.int64) for each in lists]
+        except (ValueError, OverflowError):
+            raise BadFile("a face line holds something that is not a number") from None
 
 
 class _Binary:
@@ -201,11 +206,11 @@ class _Binary:
         table = self._read(self._dtype(element), element.size, element.name)
         return {p.name: table[p.name].astype(p.kind) for p in element.properties}
 
-    def lists(self, element: _Element) -> list[NDArray[np.int64]]:
+    def lists(self, element: _Element) -> _Lists:
         """Return the first list of each element; lists of equal length, the common case, are read at once."""
         same = self._uniform(element)
         if same is not None:
-            return list(same)
+            return same
         out = []
         for _ in range(element.size):
             found: NDArray[np.int64] | None = None
@@ -241,9 +246,9 @@ class _Binary:
         return values
 
 
-def _triangles(lists: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+def _triangles(lists: _Lists) -> NDArray[np.int64]:
     """Split polygons into fans of triangles."""
-    if lists and all(len(face) == 3 for face in lists):
-        return np.stack(lists)
+    if isinstance(lists, np.ndarray) and lists.shape[1] == 3:
+        return lists
     out = [(face[0], face[i], face[i + 1]) for face in lists for i in range(1, len(face) - 1)]
     return np.array(out, dtype=np.int64).reshape(-1, 3)

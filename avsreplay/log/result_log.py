@@ -239,6 +239,6 @@ def _marker(
     packer = Packer().header(t_ns, frame).string(name).i32(0).i32(kind)
     packer.i32(0).pose(Pose.identity()).f64s(scale, scale, scale).f32s(*colour)  # action, pose, scale, colour
     packer.i32(0).u32(0).u8(1)  # lifetime (none), locked to its frame
-    packer.u32(len(points)).f64s(*points.reshape(-1)).u32(0)  # points, no colours per point
+    packer.u32(len(points)).doubles(points).u32(0)  # points, no colours per point
     packer.string("").header(t_ns, "").string("").octets(b"").u32(0)  # no texture
     return packer.string("").string("").string("").octets(b"").u8(0).bytes()  # text, mesh resource, mesh file

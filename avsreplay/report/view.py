@@ -99,15 +99,21 @@ def thin_surface(surface: Surface, *, most: int = MOST_FACES) -> tuple[Floats, F
 def _clustered(vertices: Array, faces: Faces, size: float) -> tuple[Array, Faces]:
     """Replace the vertices of each grid cell by their mean; collapsed and duplicate faces are removed."""
     cells = np.floor((vertices - vertices.min(axis=0)) / size).astype(np.int64)
-    _, member = np.unique(cells, axis=0, return_inverse=True)
-    member = member.reshape(-1)
+    member = np.unique(_numbers(cells), return_inverse=True)[1]
     counts = np.bincount(member)
     merged = np.stack([np.bincount(member, weights=vertices[:, k]) / counts for k in range(3)], axis=1)
     mapped = member[faces]
     whole = (mapped[:, 0] != mapped[:, 1]) & (mapped[:, 1] != mapped[:, 2]) & (mapped[:, 2] != mapped[:, 0])
     mapped = mapped[whole]
-    _, first = np.unique(np.sort(mapped, axis=1), axis=0, return_index=True)
+    first = np.unique(_numbers(np.sort(mapped, axis=1)), return_index=True)[1]
     return merged, mapped[np.sort(first)].astype(np.int32)
+
+
+def _numbers(triples: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Numbers (n,) in the order of triples (n, 3) of integers from 0; equal triples have the same number."""
+    first, second, third = triples.T
+    pairs = np.unique(first * (second.max(initial=0) + 1) + second, return_inverse=True)[1]
+    return np.asarray(pairs * (third.max(initial=0) + 1) + third)
 
 
 def write_view(path: str | Path, view: View) -> None:
