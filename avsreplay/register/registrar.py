@@ -27,7 +27,8 @@ from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_s
 from avsreplay.register.surface_index import SurfaceIndex
 
 FAR_RAD, TURNED_RAD = np.radians([30.0, 12.0])  # a search verifies larger rotations; also: with near-symmetries
-LAST_SCANS = 2  # work that is kept for a last registration, in ordinary registrations
+ACCEPTED = (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
+LAST_SCANS, AFTER_WORK = 2, VALLEY_WORK + restarts.TEST_WORK + restarts.COMPARED_WORK  # kept for what follows a search
 LEAST_TO_TURN, SURE_RATIO = 0.2, 0.9  # with fewer inliers no rotated starts are tried; another search follows
 PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
 NOT_VERIFIED = "rotated by more than 30 deg from the guess, and no work left for a global search"
@@ -40,6 +41,7 @@ class Registrar:
     Attributes:
         params: the parameters as given.
         limits: the same with every automatic length resolved for this surface.
+        sided: the outer side of the faces is known.
     """
 
     def __init__(self, surface: Surface, params: RegisterParams | None = None) -> None:
@@ -57,7 +59,7 @@ class Registrar:
         self.limits = self.params.limits(surface.extent)
         factory = load_backend(self.params.backend)  # before the index, so that a wrong name is reported at once
         self._visibility = quality.Visibility(surface, self.params.camera)
-        surface = self._visibility.surface
+        surface, self.sided = self._visibility.surface, self._visibility.sided
         self._cache_dir = cache_dir = index_cache.folder_for(surface) if self.params.index_cache else None
         self._index = SurfaceIndex.build(surface, self.limits.reach_m, threads=self.params.threads, cache_dir=cache_dir)
         self._target = Target(surface, self._index, self.limits, self._visibility)
@@ -83,9 +85,8 @@ class Registrar:
             guess: predicted T_ac. ICP aligns the scan to the model, so it receives the inverse, and its result is
                 inverted.
             seq: number of the scan; two halves of it are compared if ``split_every`` divides it.
-            carried: the points were carried to one instant by the predicted motion. An error of this motion distorts
-                the scan like a systematic error, but the estimator models it (``Alignment.instants``): the covariance
-                then leaves it out, so that it is not counted twice.
+            carried: the points were carried to one instant by the predicted motion. Its error distorts the scan, but
+                the estimator models this (``Alignment.instants``), so that the covariance leaves it out.
             effort: most work, in ordinary registrations; with 1 an implausible pose is neither restarted nor searched.
             unknown: (6, k) motions d of the model of which the guess has no information; None for no motion. The scan
                 determines them only if no pose turned by a near-symmetry of the model explains it as well.
@@ -137,10 +138,14 @@ class Registrar:
         budget.spend(restarts.SCATTER_WORK * len(scan))
         few, results = self._restarter.part(target), list[Alignment]()
         whole: SearchResult | None = None
+        after = (
+            AFTER_WORK + LAST_SCANS * healthy_work(len(scan)) + self._symmetry.marked * self._symmetry.work(len(scan))
+        )
         for part, number in islice(attempts(target, self._index.extent_m, lambda: results[0].measured), rounds):
             if results and not budget.allows(self._symmetry.search.work(len(part), number)):
                 break
-            search = self._symmetry.search.search(part, number, whole if part is target else None, known, budget.left)
+            before = whole if part is target else None
+            search = self._symmetry.search.search(part, number, before, known, budget.left - after)
             budget.spend(search.work + restarts.TEST_WORK + restarts.COMPARED_WORK)
             whole = search if part is target else whole
             found, alone = self._acquired(scan, part, search, budget, carried)
@@ -222,11 +227,6 @@ class Registrar:
         """Return the index of the model."""
         return self._index
 
-    @property
-    def sided(self) -> bool:
-        """Return whether the outer side of the faces is known."""
-        return self._visibility.sided
-
     def _scan(self, points: NDArray[Any]) -> NDArray[Any]:
         finite = np.isfinite(points)
         scan = points if finite.all() else points[finite.all(axis=1)]
@@ -240,7 +240,7 @@ class Registrar:
         DEGENERATE in the motions that the guess leaves unknown, if other poses explain the scan as well.
         """
         unknown = motions_outside(np.zeros((6, 0)) if unknown is None else unknown, found.free, self._index.extent_m)
-        unsure, accepted = unknown.size > 0, found.status in (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
+        unsure, accepted = unknown.size > 0, found.status in ACCEPTED
         if not accepted or not (unsure or found.points - found.inliers >= LEAST_RAYS) or not self._symmetry.near:
             return found
         T_ca, part = found.T_ac.inverse(), self._restarter.part(scan)
@@ -268,7 +268,7 @@ class Registrar:
 
     def _searched(self, scan: NDArray[Any], found: Alignment, carried: bool, budget: Budget) -> Alignment:
         """The result of the global search if the budget allows it; otherwise the pose is not accepted."""
-        if not budget.brief:
+        if not budget.brief and budget.left > 0:
             return self._acquire(scan, budget, carried, known=found.T_ac.inverse())
         return replace(found, status=AlignStatus.BUDGET_EXHAUSTED, covariance=None, message=NOT_VERIFIED)
 
@@ -289,12 +289,11 @@ class Registrar:
         restart = not overlap or (hopeful and not self._far(guess, final))  # a far pose is always verified by a search
         steps = ("restart", "search", "turn") if restart else ("search", "restart", "turn")
         last = LAST_SCANS * healthy_work(len(scan))  # the best pose is registered once more
-        after = restarts.TEST_WORK + restarts.COMPARED_WORK + restarts.SCATTER_WORK * len(scan)
-        work = self._symmetry.search.work(len(scan), 0) + after + last // LAST_SCANS if overlap else 0
+        work = self._symmetry.search.work(len(scan), 0) + AFTER_WORK + last // LAST_SCANS if overlap else 0
         for step in () if budget.brief else steps:
             if step == "search":
                 known = final.T_ac.inverse() if final.measured else None
-                if overlap and (found := self._acquire(scan, budget, carried, 1, known)).status is AlignStatus.ALIGNED:
+                if overlap and (found := self._acquire(scan, budget, carried, 1, known)).status in ACCEPTED:
                     return found, True
                 continue
             if before and np.mean(before.distance < self.limits.gate_m) < LEAST_TO_TURN:
