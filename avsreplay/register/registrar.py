@@ -31,7 +31,7 @@ ACCEPTED = (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
 LAST_SCANS, AFTER_WORK = 2, VALLEY_WORK + restarts.TEST_WORK + restarts.COMPARED_WORK  # kept for what follows a search
 LEAST_TO_TURN, SURE_RATIO = 0.2, 0.9  # with fewer inliers no rotated starts are tried; another search follows
 PART_ONLY = "the scan shows too little of the visible surface: without a guess it fits the model in many places"
-NOT_VERIFIED = "rotated by more than 30 deg from the guess, and no work left for a global search"
+NOT_VERIFIED = f"rotated by more than {np.degrees(FAR_RAD):.0f} deg from the guess, and no work left for a search"
 POSTPONED = "the search for a pose is postponed, because the searches of the scans before found none"
 
 

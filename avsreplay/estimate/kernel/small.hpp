@@ -122,7 +122,8 @@ inline void shorten(M3& M) {
       for (double& value : row) value *= LARGEST_M / std::sqrt(square);
 }
 
-// A body's axes: the ratios and their slopes by half the differences of M's eigenvalues, which are kept a hair apart.
+// The ratios of a body and their derivatives with respect to half the differences of the eigenvalues of M. A difference of
+// successive eigenvalues below LEAST_GAP is replaced by LEAST_GAP.
 struct Axes {
   double m[3], sigma[2], slope[2];
 };

@@ -39,7 +39,7 @@ Triangle triangle(Corners t) {
   r.u = unit(t.b - t.a);
   const Vec3 ac = t.c - t.a;
   Vec3 w = ac - dot(ac, r.u) * r.u;
-  w = unit(w - dot(w, r.u) * r.u);  // twice is enough
+  w = unit(w - dot(w, r.u) * r.u);  // a second time, because rounding left a part of it
   r.w = w;
   r.cx = dot(ac, r.u), r.cy = dot(ac, r.w);
   return r;
@@ -121,7 +121,7 @@ Box box_of(const Store& s, uint32_t block) {
   return b;
 }
 
-// What a node's parent knows of it.
+// What the parent of a node stores of it.
 struct Bounds {
   Box box = no_box();
   float n_lo[3], n_hi[3], h_lo, h_hi;

@@ -10,7 +10,7 @@
 namespace avs {
 namespace {
 
-constexpr double MARGIN = 0.15;     // of the diagonal, around the box; beyond it the border's cells answer
+constexpr double MARGIN = 0.15;     // of the diagonal, around the box; a place beyond it is in the nearest cell of the border
 constexpr double DAMPING = 1e-4;    // of the mean information: what is not observable is not moved
 constexpr int64_t LEAST_MATCHED = 6;
 
@@ -103,7 +103,7 @@ void Field::offer(FieldCell& near, int16_t id, const Vec3& p) const {
   }
 }
 
-// Hands every cell what its three predecessors in this order know.
+// Offers the samples of its three predecessors in this order to every cell.
 void Field::sweep(int sx, int sy, int sz) {
   const int s[3] = {sx, sy, sz};
   const int64_t stride[3] = {size_[1] * size_[2], size_[2], 1};

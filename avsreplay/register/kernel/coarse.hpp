@@ -15,7 +15,7 @@ struct CoarseRule {
   bool facing;                  // only sampled points that face the origin of the scan
 };
 
-// A grid around the model. Each cell knows the sampled point nearest to its middle, and the nearest of those whose normal
+// A grid around the model. Each cell holds the sampled point nearest to its middle, and the nearest of those whose normal
 // is opposite to that one's: with a thin panel these are its two sides. Looking one up replaces a search, and is wrong by
 // at most a cell.
 class Field {

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstring>
 #include <memory>
 
 #include "cubes.hpp"
@@ -178,16 +177,6 @@ Looks looks(const Store& s, const Code& code, const View& v, const double* T, in
 }
 
 namespace {
-
-// Copies point k of a view to three numbers.
-void copy_point(const View& v, int64_t k, double* p) {
-  for (int a = 0; a < 3; ++a) {
-    const char* at = v.data + k * v.row + a * v.column;
-    float x;
-    v.single ? (void)std::memcpy(&x, at, sizeof x) : (void)std::memcpy(p + a, at, sizeof(double));
-    if (v.single) p[a] = (double)x;
-  }
-}
 
 // Squared distances, feet and normals of some points of a scan, with the work that finding them took.
 struct Found {

@@ -18,7 +18,7 @@ struct PatchRule {
 };
 
 // T: rows of [R t], scan into {C}. Points that are not finite are left out. `matches`: of an alignment of the same scan
-// that ended near T, or null; it shows in the time, never in the result.
+// that ended near T, or null; it changes the time, never the result.
 Evidence evidence(const Store& store, const Code& code, const View& points, const double* T, const PatchRule& rule,
                   Team& team, const Matches* matches);
 

@@ -1,4 +1,4 @@
-// Which faces look at the eye of a pass, decided for whole subtrees where their bounds allow it.
+// Which faces face the eye of a pass, decided for whole subtrees where their bounds allow it.
 // Included inside a namespace named after the instruction set.
 struct Classifier {
   const Store& s;

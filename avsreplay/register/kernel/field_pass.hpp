@@ -1,6 +1,6 @@
 // One pass of the coarse registration, four points at a time. Included inside a namespace named after the instruction set.
 
-// The sampled points that answer for four moved points; a lane without one has `none` 1. Where only samples that face the
+// The sampled points of the cells of four moved points; a lane without one has `none` 1. Where only samples that face the
 // eye count, the second of a cell is taken if the first does not.
 struct FieldMatch {
   D4 s[3], n[3], none;

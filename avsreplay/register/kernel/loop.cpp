@@ -10,8 +10,8 @@
 namespace avs {
 namespace {
 
-// Where each point was and what was nearest to it: where its next search begins, or, while it provably cannot have
-// changed, its neighbour. This shows in the time, never in the result.
+// The place and the nearest primitive of each point at its last search: the next search begins there, or is not made while
+// the nearest primitive cannot have changed. This changes the time, never the result.
 class Memory {
  public:
   Memory(const Store& s, int64_t n, bool allowed)
@@ -20,8 +20,8 @@ class Memory {
   Kept* data() { return kept_.data(); }
   std::vector<Kept> take() { return std::move(kept_); }
 
-  // How much farther than the nearest primitive the others must be known for the neighbours to outlast the next steps,
-  // whose lengths are taken to fall as fast as the last two, or by two where the last was the first.
+  // The distance beyond the nearest primitive to which others must be known, so that the neighbours remain the nearest during
+  // the next steps. The ratio of successive lengths is taken to be that of the last two, between 0.1 and 0.5.
   float lead(double turn, double move) {
     const double length = move + 0.5 * turn * extent_, fall = std::min(std::max(length / last_, 0.1), 0.5);
     const double wanted = STEPS * length * fall / (1 - fall);
@@ -77,14 +77,14 @@ void apply(const Store& s, const Step& step, double* T) {
   recentre(T, s.centre);
 }
 
-// Decides between Newton's and Horn's step after the plane passes. A Newton step stands while the sum of min(d^2, gate^2)
-// over the scan falls; else it is undone, Horn's step, which cannot raise the sum, is made in its place, and the next
+// Decides between Newton's and Horn's step after the plane passes. A Newton step is kept if the sum of min(d^2, gate^2)
+// over the scan falls; otherwise it is undone, Horn's step, which cannot raise the sum, is made in its place, and the next
 // Newton steps are limited to a quarter of the one that failed (a trust region). Once that is below `eps_m`, only Horn's
 // steps are made.
 //
 // Where feet pass from one primitive to another, the sum curves less than on each of them, so that a Newton step is a
 // fixed share of the way and the next ones have its direction. Broyden's update of the inverse of the derivative, from the
-// last step alone, makes up for it. Where such a step fails, the Newton step is made in its place.
+// last step alone, corrects this. Where such a step fails, the Newton step is made in its place.
 class Newton {
  public:
   // `extends`: to the fixed point of all points; that of a part of them need not be exact.
@@ -163,13 +163,7 @@ std::vector<double> part(const View& v, int64_t m) {
   for (int64_t k = 0; k < m; ++k) {
     state = state * 1664525u + 1013904223u;  // Numerical Recipes' generator
     const int64_t first = k * v.n / m, size = (k + 1) * v.n / m - first, i = first + (int64_t)((uint64_t)(state >> 8) * (uint64_t)size >> 24);
-    for (int a = 0; a < 3; ++a) {
-      const char* at = v.data + i * v.row + a * v.column;
-      float x;
-      double y;
-      v.single ? (void)std::memcpy(&x, at, sizeof x) : (void)std::memcpy(&y, at, sizeof y);
-      few[(size_t)(3 * k + a)] = v.single ? (double)x : y;
-    }
+    copy_point(v, i, few.data() + 3 * k);
   }
   return few;
 }
@@ -253,9 +247,18 @@ class Passes {
 
 // Length of the first step over all points that is expected after the passes over few, in units of the error of a mean.
 constexpr double FEW_MOVE = 3.0, FEW_TURN = 12.0;
-constexpr int64_t MANY = 4;  // times the few points: a scan from which they are taken
+constexpr int64_t SHARE = 4;  // the few points are at most one in four of a scan
 
 }  // namespace
+
+void copy_point(const View& v, int64_t k, double* p) {
+  for (int a = 0; a < 3; ++a) {
+    const char* at = v.data + k * v.row + a * v.column;
+    float x;
+    v.single ? (void)std::memcpy(&x, at, sizeof x) : (void)std::memcpy(p + a, at, sizeof(double));
+    if (v.single) p[a] = (double)x;
+  }
+}
 
 bool Matches::hold(int64_t n, const Vec3& eye, bool looks) const {
   if ((int64_t)kept.size() != n || looks != sided) return false;
@@ -286,9 +289,10 @@ Outcome icp(const Store& s, const Code& code, const View& v, const double* T, co
   begin();
   Passes passes(s, code, rule, team, sides, o);
   bool plane = rule.n_plane > 0;
-  if (rule.few > 0 && v.n >= MANY * rule.few) {
-    const std::vector<double> points = part(v, rule.few);
-    const View few{reinterpret_cast<const char*>(points.data()), rule.few, 3 * (int64_t)sizeof(double), sizeof(double), false};
+  const int64_t size = std::min(rule.few, v.n / SHARE);
+  if (rule.few > 0 && 2 * size >= rule.few) {
+    const std::vector<double> points = part(v, size);
+    const View few{reinterpret_cast<const char*>(points.data()), size, 3 * (int64_t)sizeof(double), sizeof(double), false};
     Memory memory(s, few.n, rule.keep);
     const bool good = passes.run(few, memory, plane, true);
     o.few_passes = o.passes;

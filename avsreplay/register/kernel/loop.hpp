@@ -42,9 +42,12 @@ struct Matches {
   bool hold(int64_t n, const Vec3& eye, bool sided) const;
 };
 
+// Copies point k of a view to p[3].
+void copy_point(const View& points, int64_t k, double* p);
 Sums run_pass(const Store& store, const Code& code, const View& points, const Look& look, Kept* kept, Team& team);
-// T: rows of [R t], scan into {C}. A scan of many more than `rule.few` points is first aligned by that many of its points,
-// until a step is below the error that so few points leave; then all of its points go to the fixed point.
+// T: rows of [R t], scan into {C}. A scan of at least twice `rule.few` points is first aligned by that many of its points,
+// or by one in four if these are fewer, until a step is below the error that so few points leave; then all of its points
+// go to the fixed point.
 Outcome icp(const Store& store, const Code& code, const View& points, const double* T, const Rule& rule, Team& team,
             Matches& matches);
 

@@ -45,8 +45,9 @@ inline Plane plane_of(const std::vector<std::pair<double, int64_t>>& near, const
   return plane;
 }
 
-// Sums over the corresponding points from[k] and to[k], k in [begin, end): J'WJ (6, 6) and J'We (6) of steps [theta; v] of the
-// first points, with e the distance along the mean of both normals and Tukey's weights times those of the points. totals: sum of the squares of Tukey's function, and of the weights.
+// Sums over the corresponding points from[k] and to[k], k in [begin, end): J'WJ (6, 6) and J'We (6) of steps [theta; v] of
+// the first points, with e the distance along the mean of both normals and Tukey's weights times those of the points.
+// totals: sum of the squares of Tukey's function, and of the weights.
 inline void add_pairs(const double* p, const double* n, const double* weight, const int64_t* from, const int64_t* to,
                       int64_t begin, int64_t end, double gate, double* N, double* g, double* e, double* totals) {
   double M[21] = {}, r[6] = {};

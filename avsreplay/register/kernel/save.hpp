@@ -1,5 +1,5 @@
 // A Store as bytes and back. Integrity (length, checksum, hash of the model) is the caller's; here every number that is
-// used as an index is checked, so that no file, however made, can lead a search out of its arrays.
+// used as an index is checked, so that no file can make a search read outside of its arrays.
 #pragma once
 #include <string>
 
@@ -10,7 +10,7 @@ namespace avs {
 constexpr uint32_t LAYOUT = 5;  // raise with any change of what is stored or how it is built
 
 std::string save(const Store& store);
-// Against damage on the disk, not against intent; of the same bytes in the order of this machine.
+// Detects damage, not intended changes; of the bytes in the order of this machine.
 uint64_t checksum(const char* data, size_t size);
 // False where the bytes are no sound Store of a surface with `ids` faces or points.
 bool restore(const char* data, size_t size, int64_t ids, bool mesh, Store& store);

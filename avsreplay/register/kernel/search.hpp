@@ -64,7 +64,7 @@ class Search {
         p_{(float)(q.x - s_.centre.x), (float)(q.y - s_.centre.y), (float)(q.z - s_.centre.z)},
         exact_(lenient(s_, scope.bound, 0.f)), limit_(lenient(s_, scope.bound, scope.lead)) {}
 
-  // `list`: of the query's cell, or null. `seed`: a lane to begin with, -1 for none; it shows in the time, never in the
+  // `list`: of the query's cell, or null. `seed`: a lane to begin with, -1 for none; it changes the time, never the
   // result.
   void run(const uint32_t* list, int32_t seed) {
     if (!is_near()) return;

@@ -1,4 +1,4 @@
-// A few threads that share numbered work. Which thread does which number never shows in a result.
+// A few threads that share numbered work. The results do not depend on which thread does which number.
 #pragma once
 #include <atomic>
 #include <condition_variable>
