@@ -15,13 +15,14 @@ from avsreplay.geometry import Pose, exp
 from avsreplay.records import AlignStatus, Fit, Surface
 from avsreplay.register import RegisterParams, Registrar
 from avsreplay.register.contract import boxes, example_pose, plate_scan, view
-from avsreplay.register.covariance import without_dominant_patches
+from avsreplay.register.covariance import systematic_errors, without_dominant_patches
 from avsreplay.register.degenerate import Directions
 from avsreplay.register.params import Camera
 from avsreplay.register.peers import best_motion, horn_matrix
 from avsreplay.register.quality import Visibility, evidence, grade
 from avsreplay.register.sampling import sample, thin
 from avsreplay.register.surface_index import SurfaceIndex
+from avsreplay.simulate.target import box
 
 RNG_SEED = 11
 
@@ -219,6 +220,22 @@ def test_sums_over_patches_are_those_of_the_residuals(surface: Surface, scan: np
             order = np.argsort(np.unique(plain.patch, return_index=True)[1])  # by the first point of each patch
             np.testing.assert_allclose(found.normals, whole.normals[order], rtol=1e-8, atol=1e-9)
             np.testing.assert_allclose(found.gradients, whole.gradients[order], rtol=1e-8, atol=1e-9)
+
+
+def test_the_noise_of_a_face_near_the_boundary_of_patches_does_not_correlate_them() -> None:
+    """Patches are parts of the model. Those of the measured points would divide the face by the sign of the noise."""
+    low, high, rng = np.array([-0.6, -0.5, -0.4]), np.array([0.55, 0.45, 0.001]), np.random.default_rng(4)
+    solid = box(low, high)
+    surface = Surface(solid.vertices, solid.faces, "box", "")
+    index, noise, values = SurfaceIndex.build(surface, 0.5), 0.004, []
+    for _ in range(20):
+        p = rng.uniform(low, high, (1500, 3))
+        p[:, 2] = np.where(np.arange(1500) < 1100, high[2], p[:, 2])
+        p[1100:1300, 0], p[1300:, 1] = high[0], high[1]
+        p += noise * rng.normal(size=(1500, 1)) * np.eye(3)[np.repeat([2, 0, 1], [1100, 200, 200])]
+        found = evidence(index, Visibility(surface), p, Pose.identity(), 0.05)
+        values.append(systematic_errors(found, surface.extent, 0.05 * surface.extent).block_m2)
+    assert np.sqrt(np.mean(values)) < 0.1 * noise
 
 
 @pytest.mark.parametrize(

@@ -67,7 +67,7 @@ class Evidence:
         gradients: (m, 6) sums of e J over each patch.
         offsets: (m, 6) sums of J over each patch.
         errors: (m,) sums of e.
-        places: (m, 3) centroid of each patch.
+        places: (m, 3) centroid of the points of each patch, projected onto their faces.
     """
 
     points: int

@@ -150,7 +150,8 @@ def evidence(
 ) -> Evidence:
     """Return the sums for ``points`` (n, 3) in {A} [m] at ``T_ca``; ``noise_m`` None: estimated from the residuals.
 
-    A patch is what lies in one cube; each point is its own patch if there are not more than ``LEAST_PATCHES`` cubes.
+    A patch is the points that project onto their faces in one cube; each point is its own patch if there are not more
+    than ``LEAST_PATCHES`` cubes.
     """
     facing = visibility.camera_c(index, points, T_ca) is not None
     size = PATCH_OF_EXTENT * index.extent_m

@@ -50,6 +50,12 @@ struct Part {
   double sum_d2 = 0, sum[3] = {0, 0, 0};
 };
 
+// Moves a point onto the plane of its face, which leaves J. Patches by the measured points would divide a face that lies near
+// the boundary of two cubes by the sign of e, and the errors within each patch would then look correlated.
+void onto_face(Match& m) {
+  for (int a = 0; a < 3; ++a) m.p[a] -= m.e * m.n[a];
+}
+
 constexpr int64_t BLOCK = 32;  // chunks whose matches are held at a time
 
 // The inliers of some chunks, sorted by the patches: those of a patch in the order of the scan.
@@ -130,12 +136,13 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
   for (int64_t first = 0; first < chunks; first += BLOCK) {
     const int64_t many = std::min(BLOCK, chunks - first);
     team.each(many, [&](int64_t k) {
-      const Match* found = sorted.chunk(k);
+      Match* found = sorted.chunk(k);
       Part& part = parts[(size_t)(first + k)];
-      part.inliers = matcher.inliers(first + k, sorted.chunk(k));
-      for (const Match* m = found; m != found + part.inliers; ++m) {
+      part.inliers = matcher.inliers(first + k, found);
+      for (Match* m = found; m != found + part.inliers; ++m) {
         part.sum_d2 += m->d2;
         for (int a = 0; a < 3; ++a) part.sum[a] += m->p[a];
+        onto_face(*m);
       }
     });
     for (int64_t k = 0; k < many; ++k) {
@@ -154,7 +161,7 @@ Evidence evidence(const Store& s, const Code& code, const View& v, const double*
   for (int64_t k = 0; k < chunks; ++k) {
     Match found[CHUNK];
     const int n = matcher.inliers(k, found);
-    for (int i = 0; i < n; ++i) code.add(found + i, &one, 1, out.patches.emplace_back());
+    for (int i = 0; i < n; ++i) onto_face(found[i]), code.add(found + i, &one, 1, out.patches.emplace_back());
   }
   return out;
 }

@@ -12,7 +12,7 @@ struct Evidence {
 };
 
 struct PatchRule {
-  double gate, side;  // [m]; a patch is what lies in one cube of this side
+  double gate, side;  // [m]; a patch is the points whose feet lie in one cube of this side
   int least;          // with no more patches than this every point is one
   bool facing;
 };
