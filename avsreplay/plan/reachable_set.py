@@ -24,7 +24,9 @@ Vector = list[float]
 # |P1 - P0| / (|P0| + |P1|) below which the closed form loses digits; eight Gauss nodes are exact to rounding there
 SMALL_TURN = 0.25
 MAX_NEWTON = 60
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+_POSITIVE = np.array([0.18343464249564978, 0.525532409916329, 0.7966664774136267, 0.9602898564975362])
+_OF_POSITIVE = np.array([0.36268378337836166, 0.3137066458778869, 0.22238103445337443, 0.10122853629037706])
+_NODES, _WEIGHTS = np.r_[-_POSITIVE[::-1], _POSITIVE], np.r_[_OF_POSITIVE[::-1], _OF_POSITIVE]  # Gauss-Legendre
 _GAUSS_S = 0.5 * (_NODES + 1.0)
 _GAUSS_W = 0.5 * _WEIGHTS
 _GAUSS = tuple(zip(_GAUSS_S.tolist(), _GAUSS_W.tolist(), strict=True))
