@@ -9,6 +9,11 @@ pure spin (it stays with the fit).
 
 from __future__ import annotations
 
+from avsreplay import arithmetic
+
+if __name__ == "__main__":
+    arithmetic.pin()  # as the command does: the waiting of OpenBLAS's second thread would count as processor time
+
 import argparse
 import time
 from collections.abc import Callable
