@@ -222,13 +222,9 @@ def test_sums_over_patches_are_those_of_the_residuals(surface: Surface, scan: np
             np.testing.assert_allclose(found.gradients, whole.gradients[order], rtol=1e-8, atol=1e-9)
 
 
-@pytest.mark.parametrize("top", [0.0, 0.001 - 0.5 * 0.05 * np.sqrt(1.15**2 + 0.95**2 + 0.4**2)])
-def test_the_noise_of_a_face_near_the_boundary_of_patches_does_not_correlate_them(top: float) -> None:
-    """Of a face in a coordinate plane, and of one next to a boundary of blocks.
-
-    Patches are parts of the model. Those of the measured points would divide the face by the sign of the noise.
-    """
-    low, high, rng = np.array([-0.6, -0.5, top - 0.4]), np.array([0.55, 0.45, top]), np.random.default_rng(4)
+def test_the_noise_of_a_face_near_the_boundary_of_patches_does_not_correlate_them() -> None:
+    """Patches are parts of the model. Those of the measured points would divide the face by the sign of the noise."""
+    low, high, rng = np.array([-0.6, -0.5, -0.4]), np.array([0.55, 0.45, 0.001]), np.random.default_rng(4)
     solid = box(low, high)
     surface = Surface(solid.vertices, solid.faces, "box", "")
     index, noise, values = SurfaceIndex.build(surface, 0.5), 0.004, []
@@ -237,8 +233,7 @@ def test_the_noise_of_a_face_near_the_boundary_of_patches_does_not_correlate_the
         p[:, 2] = np.where(np.arange(1500) < 1100, high[2], p[:, 2])
         p[1100:1300, 0], p[1300:, 1] = high[0], high[1]
         p += noise * rng.normal(size=(1500, 1)) * np.eye(3)[np.repeat([2, 0, 1], [1100, 200, 200])]
-        T_ac = example_pose()
-        found = evidence(index, Visibility(surface), T_ac.apply(p), T_ac.inverse(), 0.05)
+        found = evidence(index, Visibility(surface), p, Pose.identity(), 0.05)
         values.append(systematic_errors(found, surface.extent, 0.05 * surface.extent).block_m2)
     assert np.sqrt(np.mean(values)) < 0.1 * noise
 
@@ -273,9 +268,8 @@ def test_covariance_shrinks_with_points_and_grows_with_noise(surface: Surface, r
     exact = {n: T_ac.apply(view(surface, n, T_ac.inverse().t)) for n in (3000, 12000)}
 
     def trace(n: int, sigma: float) -> float:
-        """The median of nine scans: some noise looks like systematic errors, whose variance is then added."""
-        found = [registrar.register(exact[n] + rng.normal(0, sigma, exact[n].shape), T_ac) for _ in range(9)]
-        return float(np.median([np.trace(each.covariance) for each in found]))
+        found = registrar.register(exact[n] + rng.normal(0, sigma, exact[n].shape), T_ac)
+        return float(np.trace(found.covariance))
 
     assert trace(3000, 0.01) / trace(12000, 0.01) == pytest.approx(4.0, rel=0.5)
     assert trace(3000, 0.01) / trace(3000, 0.005) == pytest.approx(4.0, rel=0.5)

@@ -127,7 +127,7 @@ def _scan(rng: np.random.Generator, strain: float, noise: float = 0.003) -> Evid
     e = np.sum(n * (p @ (S + S.T)), axis=1) + rng.normal(0.0, noise, len(p))
     J = np.hstack([np.cross(p, n), n])
     e = e - J @ np.linalg.lstsq(J, e, rcond=None)[0]
-    patch = np.unique(np.floor(p / 0.1 + 0.5), axis=0, return_inverse=True)[1].reshape(-1)
+    patch = np.unique(np.floor(p / 0.1), axis=0, return_inverse=True)[1].reshape(-1)
     return summed(J, e, patch, p=p)
 
 
@@ -197,7 +197,7 @@ def test_parts_of_the_same_patches_have_only_their_own_errors() -> None:
         J = np.hstack([np.cross(p, n), n])
         e = 0.01 * p[:, 0] * n[:, 0] + rng.normal(0.0, 0.003, len(p))
         e = e - J @ np.linalg.lstsq(J, e, rcond=None)[0]
-        patch = np.unique(np.floor(p / 0.1 + 0.5), axis=0, return_inverse=True)[1].reshape(-1)
+        patch = np.unique(np.floor(p / 0.1), axis=0, return_inverse=True)[1].reshape(-1)
         errors = systematic_errors(summed(J, e, patch, p=p), 2.0, 0.1)
         half = rng.random(len(p)) < 0.5
         parts = [

@@ -71,7 +71,7 @@ def systematic_errors(found: Evidence, extent_m: float, patch_m: float) -> Syste
     g = g - N @ fit
     leverage = np.trace(N @ inverse, axis1=1, axis2=2) / len(fit)
     S = g[:, :, None] * g[:, None, :] / np.maximum(1.0 - leverage, 0.5)[:, None, None]
-    block, M = _block_variance(N, g, S, inverse, found.counts, _numbers(found.places, patch_m, BLOCK))
+    block, M = _block_variance(N, g, S, inverse, found.counts, _numbers(found.places, BLOCK * patch_m))
     P = inverse @ (S.sum(axis=0) + block * M) @ inverse
     strains = slice(6, 6 + int(np.count_nonzero(basis[:6].any(axis=0))))
     smooth = np.repeat(_common_variance(fit[strains], P[strains, strains]), 7)
@@ -88,7 +88,7 @@ def registration_covariance(found: Evidence, errors: Systematic) -> tuple[Array,
     """
     random, dof = sandwich_covariance(found.normals, _unexplained(errors, found))
     inverse = _pseudo_inverse(found.normals.sum(axis=0))
-    X = inverse @ _summed(found.normals[:, :, 3:], _numbers(found.places, errors.patch_m, BLOCK))
+    X = inverse @ _summed(found.normals[:, :, 3:], _numbers(found.places, BLOCK * errors.patch_m))
     Y = inverse @ _coupling(found, errors).sum(axis=0)
     P = random + errors.block_m2 * np.tensordot(X, X, ((0, 2), (0, 2))) + (errors.smooth_m2 * Y) @ Y.T
     return np.asarray(0.5 * (P + P.T)), dof * max(42.0 / _error_of_one(np.linalg.solve(P, random)), 1.0)
@@ -109,7 +109,7 @@ def split_nis(found: Evidence, errors: Systematic, across: Array) -> float | Non
     if found.counts.max(initial=1) == 1 or not len(across):
         return None
     unexplained, coupling = _unexplained(errors, found), _coupling(found, errors)
-    blocks = _numbers(found.places, errors.patch_m, BLOCK)
+    blocks = _numbers(found.places, BLOCK * errors.patch_m)
     values = []
     for along in across @ found.places.T:
         low = along < np.median(along)
@@ -142,7 +142,7 @@ def difference_covariance(first: Evidence, second: Evidence, errors: Systematic)
     parts = ((first, -1.0), (second, 1.0))
     places = np.vstack([first.places, second.places])
     which = np.split(np.arange(len(places)), [len(first.places)])
-    patches, blocks = (_numbers(places, errors.patch_m, size) for size in (1, BLOCK))
+    patches, blocks = (_numbers(places, size * errors.patch_m) for size in (1, BLOCK))
     moves, X, Y = np.zeros((patches.max() + 1, 6)), np.zeros((blocks.max() + 1, 6, 3)), np.zeros((6, 7))
     for (part, sign), k in zip(parts, which, strict=True):
         inverse = _pseudo_inverse(part.normals.sum(axis=0))
@@ -254,9 +254,9 @@ def _common_variance(values: Array, P: Array) -> float:
     return t if evidence > SIGNIFICANT else 0.0
 
 
-def _numbers(places: Array, side: float, size: int) -> NDArray[np.intp]:
-    """Numbers from 0 of the occupied cubes, of ``size`` patches a side, in which the places (m, 3) lie."""
-    cubes = np.floor((places / side + 0.5) / size).astype(np.int64)
+def _numbers(places: Array, side: float) -> NDArray[np.intp]:
+    """Numbers from 0 of the occupied cubes of this side in which the places (m, 3) lie."""
+    cubes = np.floor(places / side).astype(np.int64)
     cubes -= cubes.min(axis=0)
     shape = cubes.max(axis=0) + 1
     keys = (cubes[:, 0] * shape[1] + cubes[:, 1]) * shape[2] + cubes[:, 2]

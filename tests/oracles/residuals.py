@@ -38,9 +38,7 @@ def residuals(
     p, n = moved[near], found.normal[near]
     e = np.sum(n * (p - found.foot[near]), axis=1)
     at = p - e[:, None] * n
-    cells = np.unique(np.floor(at / (PATCH_OF_EXTENT * index.extent_m) + 0.5), axis=0, return_inverse=True)[1].reshape(
-        -1
-    )
+    cells = np.unique(np.floor(at / (PATCH_OF_EXTENT * index.extent_m)), axis=0, return_inverse=True)[1].reshape(-1)
     patch = cells if cells.max(initial=-1) >= LEAST_PATCHES else np.arange(len(p))
     return Residuals(np.hstack([np.cross(p, n), n]), e, patch, p, found.d2[near])
 

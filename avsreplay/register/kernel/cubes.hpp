@@ -13,10 +13,10 @@ struct Cube {
   bool operator==(const Cube& o) const { return x == o.x && y == o.y && z == o.z; }
 };
 
-// The cube of a point, with `per_m` cubes along a metre; the origin is at `origin` sides from the lower corner of its cube.
-inline Cube cube_of(const double* p, double per_m, double origin = 0) {
-  const auto cell = [per_m, origin](double x) {
-    double y = x * per_m + origin;
+// The cube of a point, with `per_m` cubes along a metre.
+inline Cube cube_of(const double* p, double per_m) {
+  const auto cell = [per_m](double x) {
+    double y = x * per_m;
     if (!(std::fabs(y) < 1e15)) y = y > 0 ? 1e15 : -1e15;
     const int64_t k = (int64_t)y;
     return k - (y < (double)k);

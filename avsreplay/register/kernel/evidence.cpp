@@ -56,8 +56,7 @@ void onto_face(Match& m) {
   for (int a = 0; a < 3; ++a) m.p[a] -= m.e * m.n[a];
 }
 
-constexpr double CENTRED = 0.5;  // a face in a coordinate plane is in the middle of cubes, not divided by rounding errors
-constexpr int64_t BLOCK = 32;    // chunks whose matches are held at a time
+constexpr int64_t BLOCK = 32;  // chunks whose matches are held at a time
 
 // The inliers of some chunks, sorted by the patches: those of a patch in the order of the scan.
 class Sorted {
@@ -72,7 +71,7 @@ class Sorted {
     begin_.assign(numbers.size() + 1, 0);
     for (int64_t k = 0; k < chunks; ++k)
       for (int64_t i = k * CHUNK; i < k * CHUNK + parts[k].inliers; ++i) {
-        const uint32_t p = patch_[(size_t)i] = numbers.of(cube_of(matches_[(size_t)i].p, per_m, CENTRED));
+        const uint32_t p = patch_[(size_t)i] = numbers.of(cube_of(matches_[(size_t)i].p, per_m));
         if (begin_.size() < p + 2) begin_.resize(p + 2, 0);
         ++begin_[p + 1];
       }

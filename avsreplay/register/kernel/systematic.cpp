@@ -277,13 +277,12 @@ void couple(const PatchTable& t, int64_t p, const double (&T)[3][6], Coupling& A
   }
 }
 
-// The number of the block of each patch, in the order of the blocks' places; returns how many there are. A block is of whole
-// patches, in the middle of one of which the origin lies.
+// The number of the block of each patch, in the order of the blocks' places; returns how many there are.
 int64_t number_blocks(const PatchTable& t, std::vector<int64_t>& number) {
   std::vector<std::array<double, 3>> cube((size_t)t.m);
   std::vector<int64_t> order((size_t)t.m);
   for (int64_t p = 0; p < t.m; ++p) {
-    for (int a = 0; a < 3; ++a) cube[p][a] = std::floor((t.places[3 * p + a] / t.side + 0.5) / BLOCK);
+    for (int a = 0; a < 3; ++a) cube[p][a] = std::floor(t.places[3 * p + a] / (BLOCK * t.side));
     order[p] = p;
   }
   std::sort(order.begin(), order.end(), [&](int64_t a, int64_t b) { return cube[a] < cube[b]; });
