@@ -209,17 +209,18 @@ def _unit_advice(
 ) -> list[Advice]:
     """The unit, and the crop around its groups of points; empty if it is the given one.
 
-    Between several units the registration decides: that in which most scans fit the model, the first of equal ones.
+    The registration decides: the unit is that in which most scans fit the model, the first of equal ones. If no scan
+    fits it, the text says so, because an object of another size fits some unit, too.
     """
-    scale, groups = next(iter(units.items()))
-    if len(units) > 1:
-        few = _few(clouds)
-        once = RegisterParams(index_cache=False)  # most of the units are wrong
-        fits = {each: _fitting(few, Registrar(scaled(surface, each / given), once))[0] for each in units}
-        scale, groups = max(units.items(), key=lambda item: fits[item[0]])
+    few = _few(clouds)
+    once = RegisterParams(index_cache=False)  # most of the units are wrong
+    fits = {each: _fitting(few, Registrar(scaled(surface, each / given), once)) for each in units}
+    scale, groups = max(units.items(), key=lambda item: fits[item[0]][0])
     if scale == given:
         return []
-    unit = Advice("fail", "unit", f"{said}: the model seems to be in {_UNITS[scale]}", _unit_option(scale, given))
+    doubt = "" if fits[scale][1] else ", or it is another object: it is not found in the scans"
+    text = f"{said}: the model seems to be in {_UNITS[scale]}{doubt}"
+    unit = Advice("fail", "unit", text, _unit_option(scale, given))
     size = scale / given * diameter(surface.vertices, trimmed=False)
     crop = _crop_advice(clouds, groups, _of_size(size)) if groups else None
     return [unit, crop] if crop else [unit]

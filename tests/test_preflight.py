@@ -216,6 +216,7 @@ def test_the_registration_decides_between_two_units_that_explain_the_sizes(surfa
     read = dataclasses.replace(surface, vertices=100.0 * surface.vertices * options.model_factor)
     found = preflight(Log(clouds, options=options), read, search=True)
     assert _found(found, "unit").option == "--model-unit mm"
+    assert "another object" not in _found(found, "unit").text
     assert _found(found, "background").option.startswith("--crop-")
     assert _found(found, "pose").grade == "ok"
 
@@ -226,6 +227,13 @@ def test_a_model_that_no_scan_shows_is_doubtful_though_the_sizes_agree(surface):
     assert _found(found, "size").grade == "ok"
     assert _found(found, "pose").grade == "check"
     assert "is it the right model" in _found(found, "pose").text
+
+
+def test_a_unit_in_which_no_scan_shows_the_model_may_be_another_object(surface):
+    cloud = np.random.default_rng(1).normal([0.0, 0.0, 12.0], 1.0, (2000, 3))
+    unit = _found(preflight(Log([cloud]), scaled(surface, 1000.0)), "unit")
+    assert (unit.grade, unit.option) == ("fail", "--model-unit mm")
+    assert "another object" in unit.text
 
 
 @pytest.fixture(scope="module")
