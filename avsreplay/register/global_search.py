@@ -47,7 +47,7 @@ STOP_RAD, STOP_OF_EXTENT = 1e-4, 1e-4  # a pass that moves the pose by less ends
 FIRST_FINE, FINE_PASSES = 5, 15  # passes of all poses, then of the best ones; from a wrong pose hundreds can be needed
 RIVAL_AFTER, MOST_RIVALS = 0.05, 4  # poses that are registered to the end, as RIVAL_WITHIN, and how many at most
 LOOK_UPS, ROUND_WORK = 4, 35_000  # look-ups in the grid that cost as much as a search on the model; cost of a round
-SHORT, FEWEST = 1.5, 4  # with so many rounds of work left half of the points are registered; with one, a FEWEST-th
+SHORT = 1.5  # with less work left than so many usual rounds, the last poses are registered with half of the points
 APART = 0.6  # usual share of the starts of the second selection that are different poses
 REGISTERED_WORK = 100  # usual cost of registering the last poses, for each point with which they are measured
 CELL_OF_EXTENT, LEAST_COSINE = 0.02, 0.05
@@ -151,8 +151,8 @@ class GlobalSearch:
             known: a pose T_ca that is compared as well: another one is unique only if it explains the scan better.
             left: work that is left, in point searches.
         """
-        self._spent, usual = self._looked(len(points), number), self.work(len(points), number)
-        self._registered = REFINED_POINTS // (FEWEST if left < usual else 2 if left < SHORT * usual else 1)
+        self._spent = self._looked(len(points), number)
+        self._registered = REFINED_POINTS // (2 if left < SHORT * self.work(len(points), number) else 1)
         scan = without_sparse_points(np.asarray(points, dtype=np.float64))
         few, some, fine = (np.ascontiguousarray(thin_to(scan, n)) for n in (COARSE_POINTS, MIDDLE_POINTS, FINE_POINTS))
         sight = self._target.visibility.direction_to_camera(scan)

@@ -138,14 +138,11 @@ class Registrar:
         budget.spend(restarts.SCATTER_WORK * len(scan))
         few, results = self._restarter.part(target), list[Alignment]()
         whole: SearchResult | None = None
-        after = (
-            AFTER_WORK + LAST_SCANS * healthy_work(len(scan)) + self._symmetry.marked * self._symmetry.work(len(scan))
-        )
         for part, number in islice(attempts(target, self._index.extent_m, lambda: results[0].measured), rounds):
             if results and not budget.allows(self._symmetry.search.work(len(part), number)):
                 break
             before = whole if part is target else None
-            search = self._symmetry.search.search(part, number, before, known, budget.left - after)
+            search = self._symmetry.search.search(part, number, before, known, budget.left)
             budget.spend(search.work + restarts.TEST_WORK + restarts.COMPARED_WORK)
             whole = search if part is target else whole
             found, alone = self._acquired(scan, part, search, budget, carried)
