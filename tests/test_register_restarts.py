@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from registration_cases import error, look, off, scaled, shared
 from true_scans import true_scans
 
 from avsreplay import geometry, toml_document
@@ -324,3 +325,15 @@ def test_the_covariance_contains_the_bias_of_the_noise(monkeypatch):
     assert set(statuses) == {AlignStatus.ALIGNED}
     monkeypatch.setattr(Neighbourhood, "with_bias", lambda _self, _scan, found, _budget: found)
     assert np.mean([each for _, each in squared_errors()]) > 2.0 * np.mean(squared)
+
+
+def test_a_wrong_minimum_of_a_target_with_small_parts_is_restarted(shared_data):
+    """The distances at this minimum change their sign within a twentieth of the extent; nearly all are inliers."""
+    surface = shared("spacecraft-meshes", "Kepler.obj")
+    if surface is None:
+        pytest.skip("../shared/data/spacecraft-meshes is not here")
+    target = scaled(surface)
+    scan, truth = look(target, 10_000, 0.0, 3)
+    found = Registrar(target).register(scan, off(truth, 10.0, 0.15, 103).inverse())
+    assert found.status is AlignStatus.ALIGNED
+    assert error(found.T_ac.inverse().matrix, truth)[0] < 0.2

@@ -198,7 +198,9 @@ class Restarter:
         shared, rms = self.structure(points, T_ca, gate), np.sqrt(np.mean(distance[distance < gate] ** 2))
         return bool(np.isfinite(shared) and shared > SHARED * rms)
 
-    def structure(self, points: NDArray[Any], T_ca: Pose, most_m: float = np.inf) -> float:
+    def structure(
+        self, points: NDArray[Any], T_ca: Pose, most_m: float = np.inf, side: float = PATCH_OF_EXTENT
+    ) -> float:
         """Return the rms [m] of the part of the residuals that neighbouring points share at a pose.
 
         From the products of the sums of two halves of each patch: noise of single points cancels in the mean, a wrong
@@ -208,6 +210,7 @@ class Restarter:
             points: (n, 3) in {A} [m].
             T_ca: the pose.
             most_m: points farther from the model are left out [m], as are those farther than ``START_OF_EXTENT``.
+            side: side of a cube of neighbouring points, over the extent.
 
         Returns:
             The rms; inf for a cloud, whose normals have no sign, and with fewer than 50 points near the model.
@@ -218,7 +221,7 @@ class Restarter:
         if np.count_nonzero(near) < LEAST_RESIDUALS or not len(target.surface.faces):
             return float("inf")
         e = np.einsum("ij,ij->i", found.normal[near], p[near] - found.foot[near])
-        cells = np.floor((p[near] - self._middle) / (PATCH_OF_EXTENT * self._extent)).astype(np.int64) + CELLS // 2
+        cells = np.floor((p[near] - self._middle) / (side * self._extent)).astype(np.int64) + CELLS // 2
         patch = np.unique(cells @ np.array([CELLS * CELLS, CELLS, 1]), return_inverse=True)[1]
         half = 2 * patch + np.arange(len(patch)) % 2
         sums, counts = (np.bincount(half, w, 2 * (int(patch.max()) + 1)).reshape(-1, 2) for w in (e, None))
@@ -233,7 +236,8 @@ class Restarter:
         """Return whether an alignment may be a local minimum.
 
         After a failure, a poor fit of a part of the scan, or a poor fit of all away from the guess. A misfit of nearly
-        all points of which neighbours share less than half is noise and no sign of a local minimum.
+        all points of which neighbours share less than half is noise and no sign of a local minimum. The neighbours are
+        close together, because on small parts of a target the distances at a wrong pose change their sign.
 
         Args:
             points: (n, 3) in {A} [m], part of the scan.
@@ -248,7 +252,7 @@ class Restarter:
             return found.rms_m > poor
         moved = T_ca.apply(points) - guess.inverse().apply(points)
         far = float(np.linalg.norm(moved, axis=1).mean()) > gate
-        return far and self.structure(points, T_ca) > max(poor, np.sqrt(0.5) * found.rms_m)
+        return far and self.structure(points, T_ca, side=0.5 * PATCH_OF_EXTENT) > max(poor, np.sqrt(0.5) * found.rms_m)
 
     def graduated(self, points: NDArray[Any], T_ca: Pose, start_m: float, budget: Budget) -> Restart:
         """Return the pose after passes with a falling rejection distance, from ``start_m`` [m] on."""
