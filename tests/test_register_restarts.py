@@ -323,6 +323,7 @@ def test_the_covariance_contains_the_bias_of_the_noise(monkeypatch):
 
     statuses, squared = zip(*squared_errors(), strict=True)
     assert set(statuses) == {AlignStatus.ALIGNED}
+    assert np.mean(squared) < 1.5 * 6.0
     monkeypatch.setattr(Neighbourhood, "with_bias", lambda _self, _scan, found, _budget: found)
     assert np.mean([each for _, each in squared_errors()]) > 2.0 * np.mean(squared)
 
