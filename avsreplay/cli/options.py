@@ -127,7 +127,8 @@ def read_options(flags: Mapping[str, Any]) -> SourceOptions:
         return SourceOptions(**given)
     except ValueError as error:
         field, _, what = str(error).partition(" ")
-        known = click.get_current_context().command.params
+        context = click.get_current_context(silent=True)
+        known = context.command.params if context else []
         option = next((param.opts[0] for param in known if param.name == field), field)
         raise UsageError(f"{option} {what}", hint="correct the option") from None
 

@@ -53,6 +53,6 @@ def summed(J: Array, e: Array, patch: NDArray[np.intp], noise_m: float = 0.3, p:
     np.add.at(offsets, patch, J)
     np.add.at(errors, patch, e)
     np.add.at(places, patch, np.zeros((len(e), 3)) if p is None else p)
-    places /= counts[:, None]
+    places /= np.maximum(counts, 1)[:, None]
     rms, centre = float(np.sqrt(np.mean(e**2))), places.mean(axis=0)
     return Evidence(len(e), len(e), rms, centre, noise_m, counts, normals, gradients, offsets, errors, places)
