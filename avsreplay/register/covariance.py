@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
 from avsreplay.register.size import normal_numbers
-from avsreplay.register.surface_index import Closest, SurfaceIndex, kernel_module
+from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
 BIAS_POINTS, LEAST_FOR_BIAS = 500, 30  # points of a simulated scan; with fewer points on the model none is made
 ROUNDS, GRAZING, ON_SURFACE = 3, 0.05, 0.002  # steps along a ray to the model; least cosine; distance over the extent
@@ -238,7 +238,7 @@ def bias_of_noise(
     normal, distance = found.normal[near], np.sqrt(found.d2[near])
     clean, rays = found.foot[near], normal
     if camera_c is not None:
-        clean, rays = _along_rays(index, p[near], camera_c, clean, width_m)
+        clean, rays = _along_rays(index, p[near], camera_c, clean, normal, width_m)
     cosine = np.einsum("ij,ij->i", rays, normal)
     noise = float(np.sqrt((distance @ distance) / max(float(cosine @ cosine), np.finfo(float).tiny)))
     moved = noise * normal_numbers(len(clean))[:, None] * rays
@@ -250,25 +250,30 @@ def bias_of_noise(
     for sign in (same, -same):
         step = register(T_ac.apply(clean + sign * moved)) @ T_ac
         bias += 0.5 * np.concatenate([geometry.log(step.q), step.t])
-    return bias, (ROUNDS + 3) * len(p)
+    return bias, (ROUNDS + 2) * len(p)
 
 
-def _along_rays(index: SurfaceIndex, p: Array, camera_c: Array, foot: Array, most_m: float) -> tuple[Array, Array]:
+def _along_rays(
+    index: SurfaceIndex, p: Array, camera_c: Array, foot: Array, normal: Array, most_m: float
+) -> tuple[Array, Array]:
     """Points (n, 3) in {C} moved along their rays onto the model, and the rays; ``foot`` where this does not end there.
 
-    Each step ends on the tangent plane at the closest point, at most ``most_m`` farther.
+    Each step ends on the tangent plane at the closest point, at most ``most_m`` farther. ``foot`` and ``normal`` (n, 3)
+    are those of ``p``.
     """
     rays = p - camera_c
     ranges = np.linalg.norm(rays, axis=1)
     rays = rays / ranges[:, None]
-    at: Closest = index.closest(p, camera_c=camera_c)
+    nearest = foot
     for _ in range(ROUNDS):
-        cosine = np.minimum(np.einsum("ij,ij->i", at.normal, rays), -GRAZING)
-        step = np.einsum("ij,ij->i", at.normal, at.foot - camera_c) / cosine - ranges
+        cosine = np.minimum(np.einsum("ij,ij->i", normal, rays), -GRAZING)
+        step = np.einsum("ij,ij->i", normal, nearest - camera_c) / cosine - ranges
         ranges = ranges + np.clip(step, -most_m, most_m)
-        at = index.closest(camera_c + ranges[:, None] * rays, camera_c=camera_c)
-    on = at.d2 < (ON_SURFACE * index.extent_m) ** 2
-    return np.where(on[:, None], camera_c + ranges[:, None] * rays, foot), rays
+        at = camera_c + ranges[:, None] * rays
+        found = index.closest(at, camera_c=camera_c)
+        nearest, normal = found.foot, found.normal
+    on = found.d2 < (ON_SURFACE * index.extent_m) ** 2
+    return np.where(on[:, None], at, foot), rays
 
 
 def _table_of(found: Evidence, errors: Systematic) -> Any:
