@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from avsreplay.outcome import PlanStatus
 from avsreplay.plan import CostatePath, PlanParams, rendezvous
 from avsreplay.plan.path import sample_goal
-from avsreplay.plan.reachable_set import Gauge, gauge, integrals, support
+from avsreplay.plan.reachable_set import _NODES, _WEIGHTS, Gauge, gauge, integrals, support
 from avsreplay.plan.rendezvous import _Margin
 
 ORIGIN = np.zeros(3)
@@ -211,3 +211,9 @@ def test_a_goal_without_relative_acceleration_does_not_divide_by_zero() -> None:
     found = Gauge(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), 1.0, 0.0)
     reached = _Margin(n0=1.0, n1=1.0, slope=1e8).step(goal, found, 0.0, 1e-12, 1e-6)
     assert 0.0 < reached <= goal.end
+
+
+def test_the_gauss_nodes_are_those_of_the_legendre_polynomial():
+    nodes, weights = np.polynomial.legendre.leggauss(len(_NODES))
+    assert np.allclose(_NODES, nodes, rtol=0.0, atol=1e-15)
+    assert np.allclose(_WEIGHTS, weights, rtol=0.0, atol=1e-15)
