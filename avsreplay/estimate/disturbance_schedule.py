@@ -15,14 +15,7 @@ from avsreplay.estimate.chart import Chart
 from avsreplay.estimate.drift import DriftFound, find_drift
 from avsreplay.estimate.driven import DrivenBelief, driven_moments
 from avsreplay.estimate.driven_fit import DrivenMotion, driven_motion, levels_of
-from avsreplay.estimate.initialise import (
-    BatchResult,
-    PoseFix,
-    batch_estimate,
-    improved_levels,
-    pose_count,
-    poses_of,
-)
+from avsreplay.estimate.initialise import BatchResult, PoseFix, batch_estimate, improved_levels, pose_count, poses_of
 from avsreplay.estimate.measurement import (
     chart_update,
     in_camera,

@@ -83,7 +83,7 @@ class Plausibility:
 
 
 class PlausibilityTest:
-    """The tests for one surface."""
+    """Tests of whether a scan agrees with a pose of one model."""
 
     def __init__(self, surface: Surface, index: SurfaceIndex, visibility: Visibility, gate_m: float) -> None:
         self._index, self._visibility, self._gate, self._extent = index, visibility, gate_m, surface.extent

@@ -26,7 +26,8 @@ from avsreplay.register.rivals import LEAST_RAYS, NearSymmetry, prepared
 from avsreplay.register.sampling import MOST_ATTEMPTS, attempts, thin, without_scattered_points
 from avsreplay.register.surface_index import SurfaceIndex
 
-FAR_RAD, TURNED_RAD = np.radians([30.0, 12.0])  # a search verifies larger rotations; also: with near-symmetries
+FAR_RAD = np.radians(30.0)  # a result rotated by more from its guess is verified by the global search
+TURNED_RAD = np.radians(12.0)  # the same for a model with near-symmetries
 ACCEPTED = (AlignStatus.ALIGNED, AlignStatus.DEGENERATE)
 LAST_SCANS, AFTER_WORK = 2, VALLEY_WORK + restarts.TEST_WORK + restarts.COMPARED_WORK  # kept for what follows a search
 LEAST_TO_TURN, SURE_RATIO = 0.2, 0.9  # with fewer inliers no rotated starts are tried; another search follows
@@ -128,7 +129,8 @@ class Registrar:
             return refused
         if effort <= 1:
             return replace(quality.not_measured(len(points), AlignStatus.BUDGET_EXHAUSTED), message=POSTPONED)
-        return self._neighbourhood.with_bias(scan, self._acquire(scan, b := Budget(len(scan), effort), False), b)
+        budget = Budget(len(scan), effort)
+        return self._neighbourhood.with_bias(scan, self._acquire(scan, budget, False), budget)
 
     def _acquire(
         self, scan: NDArray[Any], budget: Budget, carried: bool, rounds: int = MOST_ATTEMPTS, known: Pose | None = None

@@ -28,7 +28,7 @@ from avsreplay.rows import Row
 _NAMES = tuple(f.name for f in dataclasses.fields(Row))
 _VALUES = attrgetter(*_NAMES)
 _ENCODE = json.JSONEncoder(ensure_ascii=False, allow_nan=False).encode
-_OTHERS = (str, int, bool, type(None))  # types of values that JSON has
+_PLAIN = (float, str, int, bool, type(None))  # types of values that JSON has
 _MAX_LINE, _MAX_FILE, _MAX_NAME, _MAX_TEXT = 1 << 20, 2 << 30, 100, 10_000
 _BLOCK = 1 << 20
 _MAX_JSON = 64 << 20
@@ -49,8 +49,7 @@ def _split(hint: Any) -> tuple[type, bool]:
 
 def plain(value: Any) -> Any:
     """A JSON value: numpy scalars as Python's, floats that are not finite as None."""
-    kind = type(value)
-    if kind is not float and kind not in _OTHERS and hasattr(value, "item"):
+    if type(value) not in _PLAIN and hasattr(value, "item"):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
