@@ -322,6 +322,19 @@ def test_the_curvature_of_the_likelihood_enters_the_covariance() -> None:
     assert max(mended) < 3.0
 
 
+def test_the_variance_along_a_non_gaussian_direction_is_that_between_the_fits() -> None:
+    """With what is left within the fits on other directions, it would count 1.3 to 1.8 times."""
+    world = tumbling.draw(3, seconds=20.0)
+    poses, fitted, prior = grown(seen(world, 3), 21, 41)
+    problem = Problem(poses, prior, fitted.effective)
+    found = whole(covariance_of(problem, fitted, FitParams()))
+    assert len(found.directions) > 1
+    mixture = whole(final_mixture(found, problem, poses.latest(12, 20.0), (0.0, 0.0), 0, 0.0))
+    for direction in found.directions:
+        gaussian = float(direction.row @ fitted.P_chart @ direction.row)
+        assert all(float(direction.row @ c.P @ direction.row) < 0.01 * gaussian for c in mixture)
+
+
 def test_a_direction_of_which_a_profile_fit_cannot_be_propagated_keeps_its_variance(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -21,7 +21,7 @@ from avsreplay.estimate.measurement import (
     measurement_jacobian,
     to_fixture,
 )
-from avsreplay.estimate.mixture import Component, carried, moments, not_worse, worn
+from avsreplay.estimate.mixture import Component, carried, mixture_forecast, moments, not_worse, volumes, worn
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
 from avsreplay.estimate.track import Track
 from avsreplay.geometry import Array, Pose
@@ -68,6 +68,42 @@ def test_steps_of_a_chart_are_carried_as_the_error_states_are(h: float, arc: Orb
     there, step = propagate_chart(to_chart(x), h, arc)
     assert np.abs(there.minus(to_chart(later))).max() < 1e-12
     assert np.abs(step - np.linalg.solve(to_errors(to_chart(later)), Phi @ to_errors(to_chart(x)))).max() < 1e-11
+
+
+def spin_claims(axis: int) -> Array:
+    """(80, 2) predicted 1 sigma at one instant after each pose of a spin without disturbances.
+
+    In the columns, the Jacobians are taken along the trajectory of the fit, and at the corrected mean.
+    """
+    x = replace(tumbling.draw(axis, seconds=1.0, hz=1.0).states[0], w_b=0.1 * np.eye(3)[axis] + 1e-5)
+    rng = np.random.Generator(np.random.PCG64(axis))
+    widths = np.repeat([1e-3, 1e-4, 2e-3, 2e-4, 0.5, 1e-3], [3, 3, 3, 3, 5, 3])
+    along_the_fit = at_the_mean = (Component(1.0, 1.0, 0, to_chart(x), np.diag(widths**2)),)
+    claims = []
+    for t in range(1, 81):
+        there, d = dynamics.propagate_state(x, float(t))[0].T_ac, rng.normal(size=6) * np.repeat([1e-3, 2e-3], 3)
+        seen_there = (Pose(geometry.multiply(there.q, geometry.exp(d[:3])), there.t + d[3:]), ROOT, np.ones(2), 1.0)
+        along_the_fit = carried(along_the_fit, t * 1_000_000_000, *seen_there, (0.0, 0.0))
+        (corrected,) = carried(at_the_mean, t * 1_000_000_000, *seen_there, (0.0, 0.0))
+        at_the_mean, ahead = (replace(corrected, reference=None),), np.array([110.0 - t])
+        found = [mixture_forecast(c, c[0].t_ns, ahead, 0.0, 0.0) for c in (along_the_fit, at_the_mean)]
+        claims.append([float(each.pos_1s_m[0]) for each in found])
+    return np.array(claims)
+
+
+def test_in_a_spin_no_pose_makes_a_future_instant_less_certain() -> None:
+    rises = np.array([(claims[1:] / claims[:-1]).max(axis=0) for claims in map(spin_claims, range(3))])
+    assert np.all(rises[:, 0] < 1.0 + 1e-9)
+    assert rises[:, 1].max() > 1.02  # with a point of linearisation that follows the mean
+
+
+def test_volumes_are_those_of_the_conditional_covariances() -> None:
+    rng = np.random.default_rng(2)
+    P = [A @ A.T for A in rng.normal(size=(3, 20, 20))]
+    rest = [C[2:, 2:] - C[2:, :2] @ np.linalg.solve(C[:2, :2], C[:2, 2:]) for C in P]
+    expected = np.sqrt([np.linalg.det(C) for C in rest])
+    assert volumes(P, np.eye(20)[:2]) == pytest.approx(expected / expected.max(), rel=1e-9)
+    assert volumes(P[:1], []) == pytest.approx([1.0])
 
 
 def test_weights_follow_the_likelihood_of_the_poses_and_the_mean_follows_the_weights() -> None:

@@ -6,7 +6,8 @@ compared with the Gaussian one at two sigma along each of the weakest directions
 is repeated with that direction fixed on either side (profile likelihood), where the cost, minimised over all others,
 has risen by 3/2, as at root three sigma of a Gaussian. With the Gauss-Hermite weights 1/6, 4/6, 1/6 the three fits and
 their remaining covariances have the second moments. Of more than three such directions, n, the fits lie at the root of
-n sigma with the weights 1 / (2 n), so that no weight is negative. Each of them is propagated to the requested instant.
+n sigma with the weights 1 / (2 n). What remains is the covariance given all these coordinates, and its volume is a
+factor of the weight. Each fit is propagated to the requested instant.
 
 The fit takes the motion as deterministic. About its trajectory the problem is linear, so one pass of a Kalman filter
 over the poses, with the disturbance's covariance between them, is the maximum likelihood with process noise. The
@@ -26,7 +27,7 @@ from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import drift_equivalents
 from avsreplay.estimate.dynamics import MOST_RAD, SUBSTEP_RAD, torque_density, translation
 from avsreplay.estimate.error_state import DIM, LARGEST_MOVE, ROUNDING, definite
-from avsreplay.estimate.mixture import Component
+from avsreplay.estimate.mixture import Component, volumes
 from avsreplay.estimate.noise_levels import BLOCKS, NoiseLevels, mean_share, pose_error_covariance
 from avsreplay.estimate.relative_orbit import OrbitArc
 from avsreplay.estimate.work import Parts
@@ -43,8 +44,7 @@ _NEGLIGIBLE = 0.1  # a correction of fewer sigma is always applied
 LATEST, _SHARES = 12, (1.0, 0.5, 0.25, 0.0)  # poses that a larger correction must fit better, and its parts tried
 _DISTURBED = 12  # error states that a disturbance reaches: attitude to velocity; they depend on steps of these alone
 SPHERE = 3.0  # tr I / I of a sphere
-_TORQUES = (3e-4, 1e-4, 3e-5, 1e-5)  # 1 sigma of the acceleration by a constant torque, equally likely [rad/s2]
-_TORQUE = 0.1  # prior probability of a constant torque
+_TORQUE, _TORQUES = 0.1, (3e-4, 1e-4, 3e-5, 1e-5)  # probability of a constant torque; 1 sigma, equally likely [rad/s2]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -246,13 +246,14 @@ def final_mixture(
         spread: (20, 20) M in chart steps: M P M' is the covariance with the correlation of the poses' errors.
         unseen: (20, 20) in chart steps at the epoch, added to the covariance of each component (``unseen_torque``).
     """
-    fitted, n = found.fitted, len(found.directions)
-    bases: list[tuple[float, Chart, Pin | None]] = [(1.0 - n / found.node2, fitted.chart, None)]
-    bases += [(0.5 / found.node2, p.chart, p.pin) for d in found.directions for p in d.points]
-    out, rows = [], [d.row for d in found.directions]
+    fitted, n, rows, out = found.fitted, len(found.directions), [d.row for d in found.directions], []
+    points = [p for d in found.directions for p in d.points]
+    weights = volumes([fitted.P_chart, *(p.P for p in points)], rows)
+    weights *= np.append(1.0 - n / found.node2, np.full(2 * n, 0.5 / found.node2))
+    charts, pins = [fitted.chart, *(p.chart for p in points)], [None, *(p.pin for p in points)]
     added = np.zeros((DIM, DIM)) if unseen is None else _fixed(unseen, rows)
     recent = Problem(latest, problem.prior, fitted.effective)
-    for weight, chart, pin in bases:
+    for weight, chart, pin in zip((weights / weights.sum()).tolist(), charts, pins, strict=True):
         y, P = process_noise_pass(chart, pin, problem, noise)
         yield 3 * len(problem.poses)
         lost = not (np.all(np.isfinite(P)) and float(np.abs(y).max()) < LARGEST_MOVE)  # far beyond what is linear
@@ -261,9 +262,8 @@ def final_mixture(
             P = definite(P if spread is None else spread @ P @ spread.T)  # spread: for the trajectory of the fit alone
         if pin is None or not lost:
             there, share, step, beyond = _moved_on(chart, y, P, problem, recent, after_s)
-            if pin is None:
-                P, added = _fixed(P, rows), step @ added @ step.T  # added is valid about free motion only
-            P = step @ P @ step.T + added + beyond
+            added = step @ added @ step.T if pin is None else added  # it is valid about free motion only
+            P = step @ _fixed(P, rows) @ step.T + added + beyond
             lost = not _motion.above(P, -ROUNDING)  # about an unstable spin, by rounding at the epoch
         if pin is not None and lost:
             left = _without(found, pin)

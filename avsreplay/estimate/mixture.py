@@ -2,12 +2,19 @@
 
 Each component is linearised about its own trajectory: a pose corrects its mean and covariance as in the filter, and its
 weight by the likelihood of the pose. No new fit is needed while the weights are still those of a quadrature.
+
+Covariance and Jacobians of a component follow the trajectory that the fit gave it, not its corrected mean. In a spin
+about a principal axis the effect of the inertia is proportional to the nutation, whose estimate is noise. With a point
+of linearisation that moves from pose to pose, a direction without information would seem to have some (first-estimates
+Jacobians: Huang, Mourikis, Roumeliotis, Int. J. Robotics Research 29, 2010), and the predicted covariance of an instant
+would rise and fall from pose to pose. Along one trajectory and without disturbances, each pose can only reduce it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -16,7 +23,7 @@ from avsreplay import geometry
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, separated, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import forecast_of, grasp_prediction, torque_density, translation
-from avsreplay.estimate.error_state import rotation
+from avsreplay.estimate.error_state import DIM, rotation
 from avsreplay.estimate.noise import BOUND, cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
 from avsreplay.geometry import Array, Pose
@@ -38,6 +45,7 @@ class Component:
         weight: by now.  quadrature: its weight at the fit.
         t_ns: instant of ``chart``, its mean, and of ``P`` (20, 20), its covariance in the chart.
         share: part of the correction by process noise that the mean contains.
+        reference: motion about which ``P`` is linearised, ``chart`` where it is None.
     """
 
     weight: float
@@ -46,14 +54,20 @@ class Component:
     chart: Chart
     P: Array
     share: float = 1.0
+    reference: Chart | None = None
 
     @property
-    def belief(self) -> Belief:
-        """Mean, and covariance of the error states."""
-        chart = separated(self.chart, self.P)
-        T = to_errors(chart)
-        P = T @ self.P @ T.T
-        return Belief(self.t_ns, to_state(chart), 0.5 * (P + P.T))
+    def about(self) -> Belief:
+        """The motion about which the component is linearised, and the covariance of its error states."""
+        return _in_errors(self.t_ns, self.reference or self.chart, self.P)
+
+
+def _in_errors(t_ns: int, chart: Chart, P: Array) -> Belief:
+    """A chart as a state, and its covariance P (20, 20) in chart steps as that of the error states."""
+    chart = separated(chart, P)
+    T = to_errors(chart)
+    P = T @ P @ T.T
+    return Belief(t_ns, to_state(chart), 0.5 * (P + P.T))
 
 
 def moments(components: tuple[Component, ...]) -> Belief:
@@ -63,7 +77,7 @@ def moments(components: tuple[Component, ...]) -> Belief:
 
 @lru_cache(maxsize=4)
 def _belief(joined: Component) -> Belief:
-    return joined.belief
+    return _in_errors(joined.t_ns, joined.chart, joined.P)
 
 
 @lru_cache(maxsize=4)
@@ -84,6 +98,21 @@ def _joined(components: tuple[Component, ...]) -> Component:
 def worn(components: tuple[Component, ...]) -> bool:
     """Return whether the poses since the fit have changed the weights so much that another fit is due."""
     return sum(abs(c.weight - c.quadrature) for c in components) > _MOVED
+
+
+def volumes(P: Sequence[Array], rows: Sequence[Array]) -> Array:
+    """Volumes (n,) of 1 sigma of n covariances, relative to the largest one.
+
+    The probability of a fit with some directions fixed is that of its cost times this volume (Laplace's approximation):
+    a spin that is unstable for an inertia needs initial values in a small volume to look like the measured one.
+
+    Args:
+        P: n covariances (20, 20) in chart steps.
+        rows: (20,) each, of the coordinates along the fixed directions, which are given.
+    """
+    R = np.reshape(rows, (-1, DIM))
+    logs = np.array([np.linalg.slogdet(C)[1] - np.linalg.slogdet(R @ C @ R.T)[1] for C in P])
+    return np.asarray(np.exp(0.5 * (logs - logs.max()))) if np.isfinite(logs).all() else np.ones(len(P))
 
 
 def carried(
@@ -114,17 +143,27 @@ def carried(
         density = torque_density(_motion.state(c.chart.flat)[4], noise[0])
         h = (t_ns - c.t_ns) * 1e-9
         path = translation(h, None if orbit is None else orbit.at(c.t_ns))
-        chart, P, chi2, log_det = _motion.carry(
-            c.chart.flat, c.P, h, path, density, noise[1] ** 2, pose.q, pose.t, root, pair, weight
+        chart, reference, P, chi2, log_det = _motion.carry(
+            c.chart.flat,
+            (c.reference or c.chart).flat,
+            c.P,
+            h,
+            path,
+            density,
+            noise[1] ** 2,
+            pose.q,
+            pose.t,
+            root,
+            pair,
+            weight,
         )
-        found.append((chart, P, -0.5 * (chi2 + log_det)))
-    best = max(value for _, _, value in found)
-    weights = [c.weight * math.exp(value - best) for c, (_, _, value) in zip(components, found, strict=True)]
+        found.append(
+            (Component(c.weight, c.quadrature, t_ns, Chart(chart), P, c.share, Chart(reference)), chi2 + log_det)
+        )
+    best = min(value for _, value in found)
+    weights = [c.weight * math.exp(0.5 * (best - value)) for c, value in found]
     total = sum(weights)
-    return tuple(
-        Component(weight / total, c.quadrature, t_ns, Chart(chart), P, c.share)
-        for c, weight, (chart, P, _) in zip(components, weights, found, strict=True)
-    )
+    return tuple(replace(c, weight=weight / total) for (c, _), weight in zip(found, weights, strict=True))
 
 
 def not_worse(
@@ -183,27 +222,27 @@ def _missing(values: Array, axes: Array, whiten: Array) -> Array:
 def mixture_forecast(
     components: tuple[Component, ...], t_ns: int, times_s: Array, torque: float, force: float
 ) -> Forecast:
-    """Predicted 1 sigma of the grasp point, each component propagated about its own trajectory.
+    """Predicted 1 sigma of the grasp point about the published motion, each component about its own trajectory.
 
     About the mean alone the propagation would be wrong by orders of magnitude where the components differ in inertia:
     a spin that is stable for one of them is unstable for another.
 
     Args:
-        components: at the last pose, the first with the mean that is published.
+        components: at the last pose.
         t_ns: the present instant [ns].
         times_s: (n,) >= 0, ascending [s after the present].
         torque: root density of the angular disturbance [rad/s^1.5].
         force: root density of the linear disturbance [m/s^1.5].
     """
     times = np.asarray(times_s, dtype=np.float64)
-    total, centre = np.zeros((len(times), 3)), None
+    ahead, total = times + (t_ns - components[0].t_ns) * 1e-9, np.zeros((len(times), 3))
+    published = grasp_prediction(moments(components), ahead, 0.0, 0.0)
     for component in components:
-        ahead = times + (t_ns - component.t_ns) * 1e-9
-        predicted = grasp_prediction(component.belief, ahead, torque, force)
-        if predicted is None:
+        predicted = grasp_prediction(component.about, ahead, torque, force)
+        moved = grasp_prediction(_in_errors(t_ns, component.chart, component.P), ahead, 0.0, 0.0)
+        if published is None or predicted is None or moved is None:
             return Forecast(times, *np.full((3, len(times)), np.inf))
-        variances, motion = predicted
-        centre = motion if centre is None else centre
+        variances, motion, centre = predicted[0], moved[1], published[1]
         position, velocity = ((motion[:, k : k + 3] - centre[:, k : k + 3]) for k in (0, 3))
         turn = geometry.multiply(geometry.conjugate(centre[:, 6:]), motion[:, 6:])[:, :3]
         off = np.stack([(d * d).sum(axis=1) for d in (position, velocity, turn)], axis=1)

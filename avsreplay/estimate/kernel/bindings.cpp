@@ -377,10 +377,10 @@ nb::tuple transition_of(const Flat& from, double h, const Matrix<6, 6>& path) {
 }
 
 // Chart and P (20, 20) h seconds later and corrected by a pose; its chi-square and the log determinant.
-nb::tuple carry_of(const Flat& from, const Matrix<DIM, DIM>& P0, double h, const Matrix<6, 6>& path,
+nb::tuple carry_of(const Flat& from, const Flat& along, const Matrix<DIM, DIM>& P0, double h, const Matrix<6, 6>& path,
                    const Three& torque, double force, const Vector<4>& q, const Vector<3>& p, const Matrix<SEEN, SEEN>& root, const Two& factors,
                    double weight) {
-  Chart c = chart(from);
+  Chart c = chart(from), base = chart(along);
   Square P;
   std::memcpy(P, P0.data(), sizeof P);
   Measured pose = {};
@@ -388,8 +388,8 @@ nb::tuple carry_of(const Flat& from, const Matrix<DIM, DIM>& P0, double h, const
   std::memcpy(&pose.p, p.data(), sizeof pose.p);
   std::memcpy(pose.root, root.data(), sizeof pose.root);
   double told[2];
-  carry(c, P, h, as<double[6][6]>(path.data()), torque.data(), force, pose, factors.data(), weight, told);
-  return nb::make_tuple(flat(c), made(P), told[0], told[1]);
+  carry(c, base, P, h, as<double[6][6]>(path.data()), torque.data(), force, pose, factors.data(), weight, told);
+  return nb::make_tuple(flat(c), flat(base), made(P), told[0], told[1]);
 }
 
 // Of covariances C (n, 6, 6): roots (n, 6, 6) with root C root' = 1, and the inverses (n, 2, 3, 3) of the diagonal blocks.
@@ -454,23 +454,6 @@ nb::tuple propagate_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3
   return nb::make_tuple(made(x.q_ab), made(x.w_b), made(x.r_a), made(x.v_a), made(Phi), made(P));
 }
 
-// Number of the nearest order of the truth's axes among R_nb, and NEES: of all states in that order, in the chart, by block.
-nb::tuple nees_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
-                  const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Vector<4>& true_q_ab,
-                  const Vector<3>& true_w, const Vector<3>& true_r, const Vector<3>& true_v, const Vector<2>& true_sigma,
-                  const Vector<3>& true_c, const Vector<4>& true_q_bc, const Matrix<DIM, DIM>& P,
-                  const Matrix<-1, 3, 3>& R_nb, const Matrix<-1, 4>& q_bn) {
-  if (!R_nb.shape(0) || q_bn.shape(0) != R_nb.shape(0))
-    throw std::invalid_argument("rotations and quaternions must be equally many, one at least");
-  const State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
-  const State truth = state_from(true_q_ab, true_w, true_r, true_v, true_sigma, true_c, true_q_bc);
-  const Errors found = errors_squared(truth, x, as<Square>(P.data()), reinterpret_cast<const M3*>(R_nb.data()),
-                                      reinterpret_cast<const Quad*>(q_bn.data()), (int)R_nb.shape(0));
-  std::array<double, BLOCK_COUNT> block;
-  std::copy(found.block, found.block + BLOCK_COUNT, block.begin());
-  return nb::make_tuple(found.best, found.size, found.chart, block);
-}
-
 }  // namespace
 
 NB_MODULE(_motion, m) {
@@ -494,7 +477,7 @@ NB_MODULE(_motion, m) {
   m.def("errors", &errors, nb::arg("chart"));
   m.def("body", &body_numbers, nb::arg("chart"), nb::arg("P"), nb::arg("largest"));
   m.def("transition", &transition_of, nb::arg("chart"), nb::arg("h"), nb::arg("path"));
-  m.def("carry", &carry_of, nb::arg("chart"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
+  m.def("carry", &carry_of, nb::arg("chart"), nb::arg("base"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
         nb::arg("force"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("factors"), nb::arg("weight"));
   m.def("roots", &roots_of, nb::arg("C"));
   m.def("above", &above_of, nb::arg("P"), nb::arg("least"));
@@ -504,10 +487,6 @@ NB_MODULE(_motion, m) {
   m.def("propagate", &propagate_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
         nb::arg("force"));
-  m.def("nees", &nees_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
-        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("true_q_ab"), nb::arg("true_w_b"), nb::arg("true_r_a"),
-        nb::arg("true_v_a"), nb::arg("true_sigma"), nb::arg("true_c_b"), nb::arg("true_q_bc"), nb::arg("P"),
-        nb::arg("R_nb"), nb::arg("q_bn"));
   nb::class_<Problem>(m, "Problem")
       .def("__init__", &create, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),
            nb::arg("mean"), nb::arg("prior_info"))

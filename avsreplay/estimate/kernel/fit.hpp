@@ -91,7 +91,7 @@ void transition(Chart& chart, double h, const double path[6][6], const double* t
 
 // A Gaussian in chart steps h seconds later, corrected by a pose there, whose time does not matter. `told`: chi-square of
 // the pose and log determinant of its covariance, both before the correction and relative to the noise of the pose.
-void carry(Chart& chart, Square P, double h, const double path[6][6], const double torque_density[3],
+void carry(Chart& chart, Chart& base, Square P, double h, const double path[6][6], const double torque_density[3],
            double force_density, const Measured& pose, const double factors[2], double weight, double told[2]);
 
 // The rotation of a state, and its body with the derivative of sigma1..3 by the two that are states.

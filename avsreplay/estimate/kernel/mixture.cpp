@@ -55,6 +55,18 @@ void congruent(const double A[N][N], const double B[N][N], double out[N][N]) {
     for (int c = 0; c < r; ++c) out[r][c] = out[c][r] = 0.5 * (out[r][c] + out[c][r]);
 }
 
+// The motion of a chart h seconds later.
+Chart later(const Chart& from, double h, const double path[6][6]) {
+  State x = state_of(from);
+  double join[3][2];
+  Turn turn = turn_of(x);
+  avs::advance(turn, body_of(x, join), h);
+  translate(x, path);
+  std::memcpy(x.q_ab, turn.q, sizeof x.q_ab);
+  std::memcpy(x.w_b, turn.w, sizeof x.w_b);
+  return chart_of(x);
+}
+
 // chi-square and log determinant of off ~ N(0, 1 + H P H').
 void evidence(const double off[SEEN], const double H[SEEN][DIM], const Square P, double out[2]) {
   double HP[SEEN][DIM], L[SEEN][SEEN], D[SEEN], left[SEEN], det = 1;
@@ -134,11 +146,12 @@ void transition(Chart& chart, double h, const double path[6][6], const double* t
   divide<DIM, DIM>(T, F);
 }
 
-void carry(Chart& chart, Square P, double h, const double path[6][6], const double torque_density[3],
+void carry(Chart& chart, Chart& base, Square P, double h, const double path[6][6], const double torque_density[3],
            double force_density, const Measured& pose, const double factors[2], double weight, double told[2]) {
   Square F, moved_on, T;
   double Q[MOTION][MOTION], y[DIM] = {}, e[SEEN];
-  transition(chart, h, path, torque_density, force_density, F, Q);
+  chart = later(chart, h, path);
+  transition(base, h, path, torque_density, force_density, F, Q);
   congruent<DIM>(F, P, moved_on);
   std::memcpy(P, moved_on, sizeof(Square));
   Problem one;
@@ -147,11 +160,12 @@ void carry(Chart& chart, Square P, double h, const double path[6][6], const doub
   std::memset(one.prior_info, 0, sizeof one.prior_info);
   one.factors[0] = factors[0], one.factors[1] = factors[1];
   one.slack = std::numeric_limits<double>::infinity();
-  one.linearise(chart);
+  one.linearise(base);
+  one.cost_at(chart, one.d.data());
   one.weights[0] = weight;
   Rows H, HT;
   one.whitened(0, e, H);
-  errors_of(chart, T);
+  errors_of(base, T);
   product<SEEN, DIM>(H, T, HT);
   for (int r = 0; r < MOTION; ++r)
     for (int c = 0; c < MOTION; ++c) P[r][c] += Q[r][c];
