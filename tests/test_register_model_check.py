@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
@@ -60,6 +61,49 @@ def test_the_size_is_measured_until_an_error_is_excluded(factor: float, used: in
     check = checked(model, replace(model, vertices=factor * model.vertices), count=60)
     assert len(check._deltas) == used
     assert bool(check.notes()) == (factor != 1.0)
+
+
+def tumbling_box(factor: float, acceleration: float, count: int = 100) -> ModelCheck:
+    """The check after scans of a tumbling box that is ``factor`` times as large as the model.
+
+    ``acceleration``: of the mass centre [extents/s^2], along x.
+    """
+    model = box()
+    target = replace(model, vertices=factor * model.vertices)
+    registrar, rng = Registrar(model), np.random.default_rng(SEED)
+    check, extent = ModelCheck(registrar, model), model.extent
+    arm, rate = extent * np.array([0.04, -0.02, 0.03]), np.array([0.07, 0.1, -0.05])
+    for k in range(count):
+        t, q = 0.5 * k, geometry.exp(rate * 0.5 * k)
+        centre = extent * np.array([0.5 * acceleration * t**2, 0.001 * t, 3.0 - 0.002 * t])
+        T_ac = Pose(q, centre - geometry.rotate(geometry.matrix(q), arm))
+        points = T_ac.apply(view(target, 1500, T_ac.inverse().t))
+        points = points * (1.0 + 0.0003 * rng.standard_normal((len(points), 1)))
+        check.add(Scan(k, round(t * 1e9), points), registrar.register(points, T_ac))
+    return check
+
+
+def box() -> Surface:
+    shape = trimesh.creation.box((2.0, 1.4, 1.0))
+    return Surface(np.array(shape.vertices), np.array(shape.faces, dtype=np.int32), "box", "")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.99, 1.01, 1.04])
+def test_the_size_of_a_box_follows_from_its_free_motion(factor: float) -> None:
+    """No scan shows it: three faces fit a box of any size."""
+    check = tumbling_box(factor, 0.0)
+    assert check._of_residuals() is None
+    found = check.scale()
+    assert found is not None
+    assert found[0] == pytest.approx(factor, abs=max(4.0 * found[1], 0.1 * abs(factor - 1.0)))
+    assert "multiply --model-scale by" in check.notes()[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("acceleration", [0.0, 0.0002, 0.002])
+def test_the_motion_of_a_box_of_the_right_size_says_nothing_of_it(acceleration: float) -> None:
+    assert tumbling_box(1.0, acceleration).notes() == ()
 
 
 def moving_scans(surface: Surface, duration_s: float, count: int, sigma: float = 0.001) -> list[tuple[Scan, Pose]]:

@@ -6,7 +6,9 @@ Size: along a run, the factor between target and model is estimated from the res
 T_ac_true = T_ac Exp(d) and a target 1 + delta times as large as the model, the residual at p with normal n is
 n . (p - c) = J d + delta n . p. Least squares per scan give delta after the pose is eliminated (``size``); scans are
 weighted by the inverse of its variance, and their spread gives the standard error (jackknife over scans). The bias that
-noise causes is found on a few of the scans and subtracted; half of it counts as a standard error.
+noise causes is found on a few of the scans and subtracted; half of it counts as a standard error. Three faces of a box
+fit a box of any size, at a place that changes with it. The size follows from the places of all scans: the mass centre
+of a free target moves uniformly, and the error of the place changes with the side that is seen.
 
 Times: points without times are taken as measured at one instant. The motion between two scans and the order of the
 points give the duration of a scan by least squares; a significant one is reported.
@@ -17,7 +19,7 @@ checked before a run (``preflight``).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,7 +33,19 @@ from avsreplay.register.params import RegisterParams, RegistrationLimits
 from avsreplay.register.registrar import Registrar
 from avsreplay.register.restarts import allowed_scans
 from avsreplay.register.sampling import without_scattered_points
-from avsreplay.register.size import MOST_OF_MODEL, SIGMAS, diameter, fitted_duration, fitted_size, noise_bias
+from avsreplay.register.size import (
+    LEAST_RESIDUALS,
+    MOST_OF_MODEL,
+    SIGMAS,
+    WIDTH_OF_EXTENT,
+    diameter,
+    fitted_duration,
+    fitted_size,
+    noise_bias,
+    normal_jacobian,
+    robust_weights,
+)
+from avsreplay.register.surface_index import SurfaceIndex
 
 __all__ = [
     "POSES", "Availability", "Backend", "ModelCheck", "RegisterParams", "Registrar", "RegistrationLimits", "Target",
@@ -45,11 +59,28 @@ ENOUGH_SCANS = 16  # with which the check ends where they exclude an error of si
 BIAS_SCANS = 4  # scans on which the bias of the noise is found
 MOST_WEIGHT = 4.0  # largest weight of a scan, in units of the median weight
 LEAST_OF_MIRRORED = 0.9  # least share of the points of a scan on the mirrored model
+_PLACE_EVERY, _LEAST_PLACES = 2, 12  # scans of which one gives a place, and places that give the size
+_BLOCKS = 6  # of consecutive places, for the jackknife
+_LEAST_EXPLAINED = 0.5  # least share, explained by the size, of what a uniform motion leaves of the places
 _DURATION_EVERY, _MOST_DURATIONS, _LEAST_DURATIONS = 2, 24, 8  # aligned scans, and durations measured in a run
 _DURATION_POINTS = 800
 _LEAST_OF_PERIOD = 0.02  # least duration of a scan that is reported, over the period of the scans
 _MOST_TURN_RAD = 0.5  # between two scans; the motion is taken as uniform
 LEAST_ON_MODEL = 0.9  # least share of the points on the model at a pose that has not converged
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Place:
+    """Position (3,) of the origin of {C} in {A} [m] at ``t_ns``, its change (3,) with the size, its attitude (3, 3).
+
+    ``sigma_m`` is the standard error of the position.
+    """
+
+    t_ns: int
+    at: Array
+    change: Array
+    R: Array
+    sigma_m: float
 
 
 class ModelCheck:
@@ -67,6 +98,8 @@ class ModelCheck:
         self._deltas: list[float] = []
         self._weights: list[float] = []
         self._points: list[tuple[Array, Array | None]] = []  # points of each measured scan, and the camera, in {C}
+        self._places: list[_Place] = []
+        self._placed, self._stride = 0, _PLACE_EVERY  # scans that may give a place; one of ``_stride`` does
         self._unmatched: NDArray[Any] | None = None
         self._last: tuple[int, Pose] | None = None  # instant and pose of the last aligned scan
         self._durations: list[tuple[float, float, float]] = []  # duration, its standard error, period [s]
@@ -85,6 +118,9 @@ class ModelCheck:
             self._matched = True  # the scan is on the model, although the pose is not accepted
         if found.status is AlignStatus.AMBIGUOUS:
             self._ambiguous = self._ambiguous or found.free_directions
+        on_model = found.status is AlignStatus.NOT_CONVERGED and found.inlier_ratio >= LEAST_ON_MODEL
+        if (found.status is AlignStatus.ALIGNED or on_model) and not self._settled():
+            self._add_place(scan, found.T_ac)
         if found.status is not AlignStatus.ALIGNED:
             self._unmatched = points if self._unmatched is None else self._unmatched
             return
@@ -97,6 +133,14 @@ class ModelCheck:
 
     def scale(self) -> tuple[float, float] | None:
         """Return the size of the target over that of the model and its standard error; None with too few scans."""
+        found = [each for each in (self._of_residuals(), self._of_places()) if each is not None]
+        if len(found) < 2:
+            return found[0] if found else None
+        (size, sigma), (other, other_sigma) = found
+        share = sigma**2 / (sigma**2 + other_sigma**2)
+        return size + share * (other - size), max(float(np.sqrt(share)) * other_sigma, 0.5 * abs(other - size))
+
+    def _of_residuals(self) -> tuple[float, float] | None:
         if len(self._deltas) < LEAST_SCANS:
             return None
         mean, spread, weight = self._mean()
@@ -104,6 +148,37 @@ class ModelCheck:
         bias = [noise_bias(self._registrar.index, *self._points[k]) for k in tried]
         mean_bias = float(weight[tried] @ np.array(bias) / weight[tried].sum())
         return 1.0 + mean - mean_bias, float(np.hypot(spread, 0.5 * mean_bias))
+
+    def _of_places(self) -> tuple[float, float] | None:
+        """Size and standard error (jackknife over blocks) from the places of the scans; None if it explains little."""
+        if len(self._places) < _LEAST_PLACES:
+            return None
+        least = float(np.median([place.sigma_m for place in self._places])) / MOST_WEIGHT
+        A, y = np.empty((len(self._places), 3, 10)), np.empty((len(self._places), 3))
+        for k, place in enumerate(self._places):  # at = c + v t - R rho - change delta
+            t_s = 1e-9 * (place.t_ns - self._places[0].t_ns)
+            row = np.column_stack([np.eye(3), t_s * np.eye(3), place.R, -place.change])
+            A[k], y[k] = row / max(place.sigma_m, least), place.at / max(place.sigma_m, least)
+        block = np.arange(len(y)) * _BLOCKS // len(y)
+        delta, left = _last_unknown(A, y)
+        without = np.array([_last_unknown(A[block != k], y[block != k])[0] for k in range(_BLOCKS)])
+        spread = float(np.sqrt((_BLOCKS - 1) / _BLOCKS * np.sum((without - without.mean()) ** 2)))
+        uniform = _last_unknown(A[:, :, :9], y)[1]
+        return (1.0 + delta, spread) if left < (1.0 - _LEAST_EXPLAINED) * uniform else None
+
+    def _add_place(self, scan: Scan, T_ac: Pose) -> None:
+        self._placed += 1
+        if (self._placed - 1) % self._stride:
+            return
+        T_ca = T_ac.inverse()
+        p = T_ca.apply(np.asarray(scan.points[_some(scan.points, POINTS)], dtype=np.float64))
+        found = _place_of_size(self._registrar.index, p, T_ca.t if self._registrar.sided else None)
+        if found is None:
+            return
+        moved, change, sigma_m = found
+        self._places.append(_Place(scan.t_ns, T_ac.t + T_ac.R @ moved, T_ac.R @ change, T_ac.R, sigma_m))
+        if len(self._places) == MOST_SCANS:
+            self._places, self._stride = self._places[::2], 2 * self._stride
 
     def _mean(self) -> tuple[float, float, Array]:
         """The weighted mean of the errors of size, its standard error (jackknife), and the weights of the scans."""
@@ -123,18 +198,19 @@ class ModelCheck:
         if not self._aligned:
             several = f"the scans fit the model in more than one pose ({self._ambiguous}): give the first one by --init"
             return (several,) if self._ambiguous else ()
-        return *self._size(), *self._duration_note()
+        found = [note for note in (self._size(), self._duration_note()) if note is not None]
+        return (max(found)[1],) if found else ()  # each error makes the other one appear, with fewer standard errors
 
-    def _size(self) -> tuple[str, ...]:
+    def _size(self) -> tuple[float, str] | None:
+        """Standard errors by which the size is wrong, and the text; None if it is right."""
         found = self.scale()
-        if found is None:
-            return ()
-        if abs(found[0] - 1.0) < max(_LEAST_RUN_ERROR, SIGMAS * found[1]):
-            return ()
+        if found is None or abs(found[0] - 1.0) < max(_LEAST_RUN_ERROR, SIGMAS * found[1]):
+            return None
+        error = abs(found[0] - 1.0)
         small, long = ("small", "long") if found[0] > 1.0 else ("large", "short")
-        percent = 100.0 * abs(found[0] - 1.0)
         return (
-            f"the model is {percent:.1f} % too {small} (1 sigma {100.0 * found[1]:.2g} %): "
+            error / max(found[1], np.finfo(float).tiny),
+            f"the model is {100.0 * error:.1f} % too {small} (1 sigma {100.0 * found[1]:.2g} %): "
             f"multiply --model-scale by {found[0]:.4f}, or the ranges of the sensor are too {long} by as much",
         )
 
@@ -176,13 +252,15 @@ class ModelCheck:
         mean, spread, period = self._duration()
         return len(self._durations) < _MOST_DURATIONS and abs(mean) + SIGMAS * spread > _LEAST_OF_PERIOD * period
 
-    def _duration_note(self) -> tuple[str, ...]:
+    def _duration_note(self) -> tuple[float, str] | None:
+        """The duration of a scan in its standard errors, and the text; None if it is not significant."""
         if len(self._durations) < _LEAST_DURATIONS:
-            return ()
+            return None
         mean, spread, period = self._duration()
         if abs(mean) < max(_LEAST_OF_PERIOD * period, SIGMAS * spread):
-            return ()
+            return None
         return (
+            abs(mean) / max(spread, np.finfo(float).tiny),
             f"the points of a scan have no times, but they fit a moving target that is measured point after point in "
             f"{abs(mean):.3g} +- {spread:.1g} s: record the time of each point (field 't'); less exactly, "
             f"--scan-duration {mean:.3g} gives times by the order of the points",
@@ -211,6 +289,34 @@ def _some(points: NDArray[Any], count: int) -> NDArray[np.intp]:
     """Numbers of about ``count`` finite points (n, 3), in their order."""
     finite = np.flatnonzero(np.isfinite(points).all(axis=1))
     return finite[:: max(1, len(finite) // count)]
+
+
+def _place_of_size(index: SurfaceIndex, p: Array, camera_c: Array | None) -> tuple[Array, Array, float] | None:
+    """Position of a registered scan from the distances along normals, and its change with the size of the target.
+
+    ``p``: (n, 3) points in {C} [m], at the registered pose; ``camera_c`` as for ``fitted_size``.
+    Returns the translation (3,) of the origin of {C} [m], its change (3,) with delta [m], both in {C}, and the standard
+    error of the translation [m]; None with fewer than 50 residuals.
+    """
+    found = index.closest(p, camera_c=camera_c, most_m=WIDTH_OF_EXTENT * index.extent_m)
+    near = np.isfinite(found.d2)
+    if np.count_nonzero(near) < LEAST_RESIDUALS:
+        return None
+    n, q = found.normal[near], p[near]
+    e = np.einsum("ij,ij->i", n, q - found.foot[near])
+    weight, noise = robust_weights(e)
+    J, a = weight[:, None] * normal_jacobian(q, n), weight * np.einsum("ij,ij->i", q, n)
+    of_e, of_a = np.linalg.lstsq(J, np.column_stack([weight * e, a]), rcond=1e-6)[0].T
+    return of_e[3:], -of_a[3:], noise * float(np.sqrt(np.trace(np.linalg.pinv(J.T @ J)[3:, 3:])))
+
+
+def _last_unknown(A: Array, y: Array) -> tuple[float, float]:
+    """Least-squares value of the last unknown of A (n, 3, k) x = y (n, 3), and the sum of the squared residuals."""
+    rows, right = A.reshape(-1, A.shape[2]), y.ravel()
+    scale = np.maximum(np.linalg.norm(rows, axis=0), np.finfo(float).tiny)
+    x = np.linalg.lstsq(rows / scale, right, rcond=1e-9)[0] / scale
+    left = right - rows @ x
+    return float(x[-1]), float(left @ left)
 
 
 def _jackknife(values: Array, weight: Array) -> tuple[float, float, Array]:

@@ -236,7 +236,7 @@ def _step(
     n, q, foot = found.normal[near], q[near], found.foot[near]
     centre = q.mean(axis=0)
     e = np.einsum("ij,ij->i", n, q - foot)
-    weight, noise = _weights(e)
+    weight, noise = robust_weights(e)
     moving = q - centre if motion is None else motion[near]
     J, a = weight[:, None] * normal_jacobian(q - centre, n), weight * np.einsum("ij,ij->i", n, moving)
     of_a, of_e = np.linalg.lstsq(J, np.column_stack([a, weight * e]), rcond=1e-6)[0].T
@@ -248,8 +248,8 @@ def _step(
     return _Rows(q, foot, n, J, free, left, weight, noise, step, Pose.identity()), of_e - step * of_a, centre
 
 
-def _weights(e: Array) -> tuple[Array, float]:
-    """The square roots (k,) of the Cauchy weights, and the robust standard deviation of e."""
+def robust_weights(e: Array) -> tuple[Array, float]:
+    """Return the square roots (k,) of the Cauchy weights of residuals e (k,) [m], and their robust 1 sigma [m]."""
     noise = max(float(np.median(np.abs(e))) / NORMAL_QUANTILE, np.finfo(float).tiny)
     return 1.0 / np.sqrt(1.0 + (e / (CAUCHY * noise)) ** 2), noise
 
