@@ -197,9 +197,8 @@ def quaternion(R_ab: ArrayLike) -> Array:
     return normalise(np.take_along_axis(four_q_qT, best[..., None, None], axis=-2)[..., 0, :])
 
 
-def _quaternion(
-    xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float, zz: float
-) -> Array:
+def _quaternion(*R: float) -> Array:
+    xx, xy, xz, yx, yy, yz, zx, zy, zz = R
     squares = (1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz)
     a, b, c, d, e, f = xy + yx, xz + zx, yz + zy, zy - yz, xz - zx, yx - xy
     rows = ((squares[0], a, b, d), (a, squares[1], c, e), (b, c, squares[2], f), (d, e, f, squares[3]))
@@ -245,6 +244,9 @@ def angle(q: ArrayLike) -> Array:
         (...) angles in [0, pi] [rad].
     """
     a: Array = np.asarray(q, dtype=np.float64)
+    if a.ndim == 1:
+        x, y, z, w = a.tolist()
+        return np.asarray(2.0 * math.atan2(math.sqrt(x * x + y * y + z * z), abs(w)))
     return np.asarray(2.0 * np.arctan2(np.linalg.norm(a[..., :3], axis=-1), np.abs(a[..., 3])))
 
 
@@ -279,8 +281,7 @@ class Pose:
     """Pose T_ab of frame b in frame a: takes coordinates in b to coordinates in a, ``p_a = R_ab p_b + t_ab_a``.
 
     Attributes:
-        q: (4,) unit quaternion q_ab ``[x y z w]``, w >= 0.
-        t: (3,) origin of b in a [m].
+        q: (4,) unit quaternion q_ab ``[x y z w]``, w >= 0.  t: (3,) origin of b in a [m].
     """
 
     q: Array
@@ -342,8 +343,7 @@ class MeasuredPose:
     """A pose T_ac of {C} in {A} that a tracker measured (markers, motion capture), in place of a point cloud.
 
     Attributes:
-        covariance: (6, 6) covariance of the error d = [theta; v], both in {C} [rad, m], where T_true = T_ac @ Exp(d);
-            None where the source states none.
+        covariance: (6, 6) of the error d = [theta; v] in {C} [rad, m], T_true = T_ac @ Exp(d); None where not stated.
     """
 
     T_ac: Pose

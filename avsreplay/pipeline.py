@@ -98,7 +98,7 @@ class Monitors:
         window = self.consistency.judge(consistency)
         failed = self._violations(estimator, prior, innovation if gamma else None, track)
         consistent = window.consistent and not (track.window.many_outliers or in_doubt(track) or failed)
-        forecast = estimator.track_forecast(track, self.convergence.params.times_s)
+        forecast = estimator.track_forecast(track, self.convergence.times_s)
         judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True)
         report = MonitorReport(
             ogm_rank=rank.rank,
@@ -129,7 +129,7 @@ class Monitors:
     ) -> tuple[str, ...]:
         """The consistency checks that the estimate fails after a healthy scan."""
         found = healthy and estimator.residual_after(track, prior, healthy)
-        return violations(track.belief, estimator.pose_covariance(track.belief), *found) if found else ()
+        return violations(track.belief, *found) if found else ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

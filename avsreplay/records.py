@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.geometry import Array, MeasuredPose, Pose, frozen, matrix, rotate
+from avsreplay.geometry import Array, MeasuredPose, Pose, frozen, matrix, multiply, rotate
 
 BLOCKS: Mapping[str, slice] = {
     "attitude": slice(0, 3),  # dq_v, half angle, {B}
@@ -107,6 +107,7 @@ class State:
     sigma: Array
     c_b: Array
     q_bc: Array
+    _T_ac: Pose | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name, size in (("q_ab", 4), ("w_b", 3), ("r_a", 3), ("v_a", 3), ("sigma", 2), ("c_b", 3), ("q_bc", 4)):
@@ -114,8 +115,10 @@ class State:
 
     @property
     def T_ac(self) -> Pose:
-        """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho."""
-        return Pose(geometry.multiply(self.q_ab, self.q_bc), self.r_a + rotate(matrix(self.q_ab), self.c_b))
+        """Return the pose of {C} in {A}: A(eta) = A(q) A(mu), rho = rho_o + A(q) varrho; it is computed once."""
+        pose = self._T_ac or Pose(multiply(self.q_ab, self.q_bc), self.r_a + rotate(matrix(self.q_ab), self.c_b))
+        object.__setattr__(self, "_T_ac", pose)
+        return pose
 
     @property
     def fixture_velocity(self) -> Array:
@@ -244,11 +247,7 @@ class Alignment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Belief:
-    """Mean and covariance of the state at an instant.
-
-    Attributes:
-        P: (20, 20) covariance of the error states, see the package's docstring; dq_v and dmu_v are HALF-angle vectors.
-    """
+    """Mean x and covariance P (20, 20) of the error states at an instant; dq_v and dmu_v are HALF-angle vectors."""
 
     t_ns: int
     x: State

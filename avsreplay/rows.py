@@ -14,7 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from avsreplay.geometry import Pose
+from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import CaptureError, Outcome, Plan, PoseError, Score
 from avsreplay.records import Innovation, Manoeuvre, ScanStatus
 
@@ -91,7 +91,7 @@ def _exact(value: Value[T], table: bool = False) -> T:
 
 def finite(value: float | None) -> float | None:
     """Return a value, or None where it is None, NaN or infinite."""
-    return float(value) if value is not None and np.isfinite(value) else None
+    return float(value) if value is not None and math.isfinite(value) else None
 
 
 def _if_innovation(get: Callable[[Innovation], float | None]) -> Value[float | None]:
@@ -132,7 +132,13 @@ def _of_error(get: Callable[[Score], PoseError | CaptureError | None], name: str
 
 def _full_angle_deg(variance: float) -> float:
     """Standard deviation of a full angle [deg] from the variance of the half angle [rad2], at least 0."""
-    return float(np.degrees(2.0 * np.sqrt(max(float(variance), 0.0))))
+    return math.degrees(2.0 * math.sqrt(max(variance, 0.0)))
+
+
+def _traces(C: Array) -> tuple[float, float]:
+    """Sums of the first three and of the last three variances of a covariance (6, 6)."""
+    a, b, c, d, e, f = C.diagonal().tolist()
+    return a + b + c, d + e + f
 
 
 def _since_start_s(outcome: Outcome, t_ns: int) -> float:
@@ -187,7 +193,7 @@ class Row:
     cauchy_weight: float | None = _number(_if_innovation(lambda i: i.weight), atol=0.0001)
     innov_m: float | None = _metres(_if_innovation(lambda i: finite(i.distance_m)))
     innov_deg: float | None = column(
-        _if_innovation(lambda i: finite(np.degrees(i.angle_rad))), "deg", ".3f", 0.0001, 0.0001
+        _if_innovation(lambda i: finite(math.degrees(i.angle_rad))), "deg", ".3f", 0.0001, 0.0001
     )
     estimator: str = _exact(lambda o, s: o.estimator)
     x_m: float | None = _metres(lambda o, s: float(o.pose.t[0]))
@@ -197,8 +203,8 @@ class Row:
     qy: float | None = _number(lambda o, s: float(o.pose.q[1]))
     qz: float | None = _number(lambda o, s: float(o.pose.q[2]))
     qw: float | None = _number(lambda o, s: float(o.pose.q[3]))
-    pos_1s_m: float | None = _number(lambda o, s: float(np.sqrt(max(np.diag(o.pose_covariance)[:3].sum(), 0.0))), "m")
-    rot_1s_deg: float | None = _number(lambda o, s: _full_angle_deg(np.diag(o.pose_covariance)[3:].sum()), "deg")
+    pos_1s_m: float | None = _number(lambda o, s: math.sqrt(max(_traces(o.pose_covariance)[0], 0.0)), "m")
+    rot_1s_deg: float | None = _number(lambda o, s: _full_angle_deg(_traces(o.pose_covariance)[1]), "deg")
     wx_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[0]), "rad/s")
     wy_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[1]), "rad/s")
     wz_radps: float | None = _number(lambda o, s: float(o.belief.x.w_b[2]), "rad/s")
@@ -253,8 +259,8 @@ class Row:
     nees_sigma: float | None = _nees("sigma")
     nees_varrho: float | None = _nees("varrho")
     nees_mu: float | None = _nees("mu")
-    r_pos_m: float | None = _number(_if_innovation(lambda i: float(np.sqrt(np.diag(i.R)[:3].mean()))), "m")
-    r_rot_deg: float | None = _number(_if_innovation(lambda i: _full_angle_deg(np.diag(i.R)[3:].mean())), "deg")
+    r_pos_m: float | None = _number(_if_innovation(lambda i: math.sqrt(max(_traces(i.R)[0] / 3.0, 0.0))), "m")
+    r_rot_deg: float | None = _number(_if_innovation(lambda i: _full_angle_deg(_traces(i.R)[1] / 3.0)), "deg")
     sigma_hits: int | None = _exact(lambda o, s: o.sigma_hits)
     r_floors: int | None = _exact(lambda o, s: o.r_floors)
     reinitialised: int | None = _exact(lambda o, s: o.reinitialised)
@@ -284,9 +290,7 @@ class Row:
     unconverged_blocks: str | None = _exact(lambda o, s: ", ".join(o.monitors.unconverged) or None)
     grasp_pos_1s_m: float | None = _number(lambda o, s: float(o.monitors.forecast.pos_1s_m.max()), "m")
     grasp_vel_1s_mps: float | None = _number(lambda o, s: float(o.monitors.forecast.vel_1s_mps.max()), "m/s")
-    grasp_rot_1s_deg: float | None = _number(
-        lambda o, s: float(np.degrees(o.monitors.forecast.rot_1s_rad.max())), "deg"
-    )
+    grasp_rot_1s_deg: float | None = _number(lambda o, s: math.degrees(o.monitors.forecast.rot_1s_rad.max()), "deg")
     plan_status: str | None = _exact(lambda o, s: None if o.plan is None else o.plan.status.value)
     capture_time_s: float | None = _seconds(_if_planned(lambda o, p: _since_start_s(o, p.t_ns) + p.t_go_s), table=True)
     t_go_s: float | None = _seconds(_if_planned(lambda o, p: p.t_go_s - (o.scan.t_ns - p.t_ns) * 1e-09))

@@ -12,12 +12,10 @@ import numpy as np
 
 from avsreplay import geometry
 from avsreplay.estimate import Estimator
-from avsreplay.estimate.chart import nearest_permutation, nees
-from avsreplay.estimate.error_state import boxminus
+from avsreplay.estimate.chart import nearest_permutation, nees_by_block
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.reference import Reference, healthy_pose, reference_of
 from avsreplay.geometry import Array, Pose
-from avsreplay.monitor.convergence import block_nees
 from avsreplay.outcome import CaptureError, Outcome, PoseError, Score
 from avsreplay.pipeline import PipelineState, planned_segment
 from avsreplay.plan import Motion, interpolated, miss
@@ -198,5 +196,4 @@ def _nees(outcome: Outcome, truth: State | None) -> tuple[float | None, Mapping[
     """NEES of all states and of each block. A cold start's first poses have none: their belief is not normal."""
     if truth is None or outcome.estimator == "start":
         return None, {}
-    belief = outcome.belief
-    return nees(belief, truth), block_nees(boxminus(matched_truth(belief, truth), belief.x), belief.P)
+    return nees_by_block(outcome.belief, truth)

@@ -15,6 +15,7 @@ from avsreplay.estimate.chart import (
     AxisPermutation,
     nearest_permutation,
     nees,
+    nees_by_block,
     permute_axes,
     permute_covariance,
     separated,
@@ -22,8 +23,8 @@ from avsreplay.estimate.chart import (
     to_errors,
     to_state,
 )
-from avsreplay.estimate.error_state import DMU, DQ, boxminus, boxplus
-from avsreplay.records import Belief, State
+from avsreplay.estimate.error_state import DMU, DQ, boxminus, boxplus, semidefinite
+from avsreplay.records import BLOCKS, Belief, State
 
 EACH = pytest.mark.parametrize("naming", AXIS_PERMUTATIONS, ids=lambda n: "".join(map(str, n.perm)))
 
@@ -80,6 +81,22 @@ def test_nees_is_independent_of_the_axis_names(world: tumbling.World, naming: Ax
     assert nees(belief, x) == pytest.approx(size, rel=0.05)
 
 
+@pytest.mark.parametrize("naming", AXIS_PERMUTATIONS[::5])
+def test_nees_of_every_block_is_that_of_the_solved_equations(world: tumbling.World, naming: AxisPermutation) -> None:
+    x, rng = world.states[0], np.random.Generator(np.random.PCG64(1))
+    root = 1e-3 * rng.normal(size=(20, 20))
+    P = root @ root.T
+    belief = Belief(0, boxplus(x, root @ rng.normal(size=20)), P)
+    truth = permute_axes(x, naming)
+    named, size = nearest_permutation(belief, truth)
+    e, y = boxminus(named, belief.x), to_chart(truth).minus(to_chart(belief.x))
+    d = to_errors(to_chart(belief.x)) @ y
+    assert size == pytest.approx(e @ np.linalg.solve(P, e), rel=1e-6)
+    total, blocks = nees_by_block(belief, truth)
+    assert total == pytest.approx(d @ np.linalg.solve(P, d), rel=1e-6)
+    assert blocks == pytest.approx({name: e[b] @ np.linalg.solve(P[b, b], e[b]) for name, b in BLOCKS.items()})
+
+
 @pytest.mark.parametrize("size", [1.0, 30.0, 1e3, 1e8])
 def test_the_inertia_stays_in_its_range_however_large_the_step(world: tumbling.World, size: float) -> None:
     rng, chart = np.random.Generator(np.random.PCG64(3)), to_chart(world.states[0])
@@ -95,8 +112,23 @@ def test_a_covariance_of_zero_ends_in_no_error(world: tumbling.World) -> None:
     """Standard deviations of 1e-200 are allowed in the settings, and their squares are 0."""
     x, P = world.states[0], np.eye(20) * 1e-6
     P[6:9, 6:9] = 0.0
-    named, _ = nearest_permutation(Belief(0, x, P), permute_axes(x, AXIS_PERMUTATIONS[5]))
+    other = permute_axes(x, AXIS_PERMUTATIONS[5])
+    named, _ = nearest_permutation(Belief(0, x, P), other)
     assert np.abs(boxminus(named, x)).max() < 1e-12
+    total, blocks = nees_by_block(Belief(0, x, P), other)
+    assert np.isnan([total, blocks["position"]]).all()
+    assert blocks["velocity"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_covariance_is_semidefinite_in_units_of_its_variances() -> None:
+    scale = np.geomspace(1e-6, 1e3, 20)
+    P = np.outer(scale, scale) * (np.eye(20) + 0.5)
+    assert semidefinite(P)
+    assert semidefinite(np.zeros((20, 20)))
+    P[0, 1] = P[1, 0] = 1.51 * scale[0] * scale[1]
+    assert not semidefinite(P)
+    P[0, 1] = P[1, 0] = np.nan
+    assert not semidefinite(P)
 
 
 def test_a_wrong_inertia_is_not_explained_by_a_permutation(world: tumbling.World) -> None:

@@ -109,6 +109,25 @@ def propagate(
     torque: tuple[float, float, float],
     force: float,
 ) -> tuple[Array, Array, Array, Array, Array, Array]: ...
+def nees(
+    q_ab: Array,
+    w_b: Array,
+    r_a: Array,
+    v_a: Array,
+    sigma: Array,
+    c_b: Array,
+    q_bc: Array,
+    true_q_ab: Array,
+    true_w_b: Array,
+    true_r_a: Array,
+    true_v_a: Array,
+    true_sigma: Array,
+    true_c_b: Array,
+    true_q_bc: Array,
+    P: Array,
+    R_nb: Array,
+    q_bn: Array,
+) -> tuple[int, float, float, list[float]]: ...
 
 class Problem:
     def __init__(

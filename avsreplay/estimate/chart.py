@@ -15,7 +15,7 @@ permutations, proper rotations R_bn (columns: new axes in the old {B}). sigma fo
 sign if the permutation is odd: s'_i = parity * s_perm(i). The truth is therefore compared modulo these.
 
 Displacement, difference, state, Jacobian and inertia of a chart are computed by the extension (``kernel/chart.cpp``),
-which the fit uses as well.
+which the fit uses as well, and so is NEES (``kernel/nees.cpp``).
 
 ``body_parameters`` gives inertia, mass centre and rate in {C}, which do not depend on order and signs of the axes.
 """
@@ -31,9 +31,9 @@ import numpy as np
 from avsreplay import geometry
 from avsreplay.estimate import _motion
 from avsreplay.estimate.dynamics import sigma3, sigma_join
-from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W
+from avsreplay.estimate.error_state import DIM, DMU, DQ, SIGMA, VARRHO, W
 from avsreplay.geometry import Array
-from avsreplay.records import Belief, BodyParameters, State
+from avsreplay.records import BLOCKS, Belief, BodyParameters, State
 
 ETA, RATE, POSITION, VELOCITY = (slice(k, k + 3) for k in (0, 3, 6, 9))
 INERTIA, ARM = slice(12, 17), slice(17, 20)
@@ -77,9 +77,6 @@ AXIS_PERMUTATIONS = _axis_permutations()
 _BASIS = _basis()
 _R_NB = np.array([p.R_bn.T for p in AXIS_PERMUTATIONS])
 _Q_BN = np.array([p.q_bn for p in AXIS_PERMUTATIONS])
-_Q_NB = geometry.conjugate(_Q_BN)
-_PARITY = np.array([[p.parity] for p in AXIS_PERMUTATIONS])
-_PERMS = np.array([p.perm[:2] for p in AXIS_PERMUTATIONS])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -143,7 +140,7 @@ class Chart:
 
 def to_chart(x: State) -> Chart:
     """Chart coordinates of a state; |sigma| must be below 1."""
-    return Chart(_motion.chart(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc))
+    return Chart(_motion.chart(*_parts(x)))
 
 
 def to_state(c: Chart) -> State:
@@ -206,43 +203,41 @@ def permute_covariance(P: Array, x: State, permutation: AxisPermutation) -> Arra
 
 
 def nearest_permutation(estimate: Belief, truth: State) -> tuple[State, float]:
-    """``truth`` in the axis permutation nearest to the estimate by its covariance, and the NEES e' P^-1 e there."""
-    errors = _errors(truth, estimate.x)
-    try:
-        scaled = np.linalg.solve(estimate.P, errors.T)
-    except np.linalg.LinAlgError:  # standard deviations of the start so small that their squares are 0
-        scaled = np.linalg.pinv(estimate.P) @ errors.T
-    sizes = np.einsum("ni,in->n", errors, scaled)
-    best = int(np.argmin(sizes))
-    return permute_axes(truth, AXIS_PERMUTATIONS[best]), float(sizes[best])
+    """``truth`` in the axis permutation nearest to the estimate by its covariance, and the NEES e' P^-1 e there.
 
-
-def _errors(truth: State, x: State) -> Array:
-    """(24, 20) ``boxminus(permute_axes(truth, p), x)`` of every permutation p, at once."""
-    triple = np.array([truth.sigma[0], truth.sigma[1], sigma3(truth.sigma)])
-    d = np.empty((len(AXIS_PERMUTATIONS), DIM))
-    d[:, DQ] = _vector_parts(geometry.multiply(geometry.multiply(geometry.conjugate(x.q_ab), truth.q_ab), _Q_BN))
-    d[:, DMU] = _vector_parts(geometry.multiply(_Q_NB, geometry.multiply(truth.q_bc, geometry.conjugate(x.q_bc))))
-    d[:, W], d[:, VARRHO] = _R_NB @ truth.w_b - x.w_b, _R_NB @ truth.c_b - x.c_b
-    d[:, RHO], d[:, VEL] = truth.r_a - x.r_a, truth.v_a - x.v_a
-    d[:, SIGMA] = _PARITY * triple[_PERMS] - x.sigma
-    return d
-
-
-def _vector_parts(q: Array) -> Array:
-    """Vector part (n, 3), of the sign with w >= 0."""
-    return np.where(q[:, 3:] >= 0.0, q[:, :3], -q[:, :3])
+    Where the covariance is singular, the permutation is the nearest by the variances, and the NEES is their sum.
+    """
+    best, size, _, _ = _compared(estimate, truth)
+    return permute_axes(truth, AXIS_PERMUTATIONS[best]), size
 
 
 def nees(belief: Belief, truth: State) -> float:
     """Normalised estimation error squared over the 20 states, in the chart: independent of the axis permutation.
 
     Where two moments are nearly equal, sigma and mu are not valid coordinates; in the chart they are one smooth
-    matrix, and what cannot be observed is only a direction with a large variance.
+    matrix, and what cannot be observed is only a direction with a large variance. NaN where the covariance is singular.
     """
-    here = to_chart(belief.x)
-    d = to_errors(here) @ to_chart(truth).minus(here)  # in error states, as P is
-    return float(d @ np.linalg.solve(belief.P, d))
+    return _compared(belief, truth)[2]
+
+
+def nees_by_block(belief: Belief, truth: State) -> tuple[float, dict[str, float]]:
+    """``nees``, and e' P^-1 e of each block of error states, for the axis permutation nearest to the estimate.
+
+    Args:
+        belief: the estimate and its covariance.
+        truth: true state at the same instant.
+    """
+    _, _, total, blocks = _compared(belief, truth)
+    return total, dict(zip(BLOCKS, blocks, strict=True))
+
+
+def _compared(belief: Belief, truth: State) -> tuple[int, float, float, list[float]]:
+    """Number of the nearest permutation, NEES of the error states in it, NEES in the chart, and that of each block."""
+    return _motion.nees(*_parts(belief.x), *_parts(truth), belief.P, _R_NB, _Q_BN)
+
+
+def _parts(x: State) -> tuple[Array, Array, Array, Array, Array, Array, Array]:
+    return x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc
 
 
 def body_parameters(belief: Belief) -> BodyParameters:

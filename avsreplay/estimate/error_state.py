@@ -19,6 +19,7 @@ DQ, W, RHO, VEL, SIGMA, VARRHO, DMU = (BLOCKS[name] for name in BLOCKS)
 
 ROUNDING = 1e-9  # least eigenvalue of a covariance, in units of its variances, that rounding may make negative
 _LEAST = 1e-9  # least eigenvalue of a product of a root with itself, in the same units
+_SMALLEST = 1e-300 * np.eye(DIM)
 LARGEST_MOVE = 1e3  # largest correction in chart steps, of which none has a larger unit than a metre or a radian
 
 Quad = tuple[float, float, float, float]
@@ -93,6 +94,11 @@ def _unit(q: Quad) -> Array:
     x, y, z, w = q
     n = 1.0 / math.sqrt(x * x + y * y + z * z + w * w)
     return np.array((x * n, y * n, z * n, w * n))
+
+
+def semidefinite(P: Array) -> bool:
+    """Whether P (20, 20) is finite and no eigenvalue, in units of its variances, is below -1e-6; variances may be 0."""
+    return _motion.above(P + _SMALLEST, -1e-6)
 
 
 def definite(P: Array) -> Array:

@@ -20,7 +20,7 @@ from avsreplay.estimate.batch_schedule import BatchSchedule
 from avsreplay.estimate.chart import ANY_HALF_RAD, to_state
 from avsreplay.estimate.disturbance_schedule import DisturbanceSchedule
 from avsreplay.estimate.driven import DrivenBelief, drive_in, driven_forecast
-from avsreplay.estimate.error_state import RHO
+from avsreplay.estimate.error_state import RHO, semidefinite
 from avsreplay.estimate.initialise import given_prior, guessed_belief, pose_count
 from avsreplay.estimate.measurement import (
     gate_of,
@@ -222,10 +222,8 @@ class Estimator:
 
     def residual_after(
         self, track: Track, prediction: Prediction, innovation: Innovation
-    ) -> tuple[Array, Array, Array, float] | None:
-        """Residual (6,) of the measured pose after the update, its noise R (6, 6) by now, inflation (2,) and gate.
-
-        The gate is the 99.99 % point of the residual squared by R plus the covariance of the pose. None before a fit.
+    ) -> tuple[bool, Array, Array, Array, Array, float] | None:
+        """What ``monitor.convergence.violations`` tests after the belief, in its order; None before a fit.
 
         Args:
             track: after a healthy scan.
@@ -238,8 +236,9 @@ class Estimator:
         R, x = self.noise.rescaled(innovation.R, prediction.window, track.window), prediction.belief.x
         if prediction.blur is not None:  # the points were moved to one instant with the error of the prior's motion
             R = R + in_camera(prediction.blur, x.T_ac.q, x.q_bc)
-        gate = gate_of(innovation.dof, R, R + self.pose_covariance(track.belief))
-        return left, R, NO_INFLATION if track.inflation is None else track.inflation, gate
+        covariance, inflation = self.pose_covariance(track.belief), track.inflation
+        gate = gate_of(innovation.dof, R, R + covariance)
+        return semidefinite(track.belief.P), covariance, left, R, NO_INFLATION if inflation is None else inflation, gate
 
     def _replayed(self, track: Track, epoch: Epoch) -> tuple[Track, Epoch]:
         """A stored scan, predicted and used again from another track: the track after it, and the scan as used."""

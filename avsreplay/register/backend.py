@@ -131,15 +131,17 @@ class HornBackend:
         sums = self._index.normal_equations(points, T_ca, self._gate)
         return sums.sum_d2 + (sums.points - sums.inliers) * self._gate**2
 
-    def align_within(self, points: NDArray[Any], guess: Pose, gate_m: float, near: bool = False) -> Fit:
-        """Return T_ca with correspondences nearer than ``gate_m`` [m] from the first pass to the last.
+    def align_within(
+        self, points: NDArray[Any], guess: Pose, gate_m: float, near: bool = False, most: int = MOST_WITHIN
+    ) -> Fit:
+        """Return T_ca with correspondences nearer than ``gate_m`` [m] in all passes, at most ``most``.
 
         ``near``: the guess is a registered pose, so that no point-to-plane passes and no passes over few points come
         first: they would end further from the result than it is.
         """
         facing = self._visibility.camera_c(self._index, points, guess) is not None
         rule = self._rules[facing]
-        plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, MOST_WITHIN)
+        plane, few, most = 0 if near else rule.n_plane, 0 if near else rule.few, min(rule.n_max, most)
         within = replace(rule, n_max=most, n_plane=plane, few=few, gate_m=gate_m, floor_m=gate_m, tighten=0.0)
         return self._with(points, guess, within, _most(WITHIN_WORK, len(points)))
 

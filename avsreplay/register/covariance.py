@@ -38,6 +38,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -45,11 +47,15 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
-from avsreplay.register.size import normal_numbers
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
-BIAS_POINTS, LEAST_FOR_BIAS = 500, 30  # points of a simulated scan; with fewer points on the model none is made
-ROUNDS, GRAZING, ON_SURFACE = 3, 0.05, 0.002  # steps along a ray to the model; least cosine; distance over the extent
+LEAST_FOR_BIAS = 30  # with fewer points on the model no scan is simulated
+BIAS_ROUNDS, SMALL_STEP = 4, 0.1  # simulations of a scan; chi-square of the step of the true pose that ends them
+RAY_STEPS, GRAZING, ON_SURFACE = (
+    2,
+    0.05,
+    0.002,
+)  # steps along a ray to the model; least cosine; distance over the extent
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -209,13 +215,16 @@ def bias_of_noise(
     T_ca: Pose,
     camera_c: Array | None,
     width_m: float,
+    P: Array,
     register: Callable[[Array], Pose],
 ) -> tuple[Array, int]:
     """Return the error (6,) of a registered pose that the noise of its scan causes in the mean, and the work.
 
-    The points of the scan are moved along their rays onto the model at this pose. Normal noise along the rays, with
-    both signs, so that what is linear in it cancels, gives two simulated scans. Its size is that which gives the
-    distances from the model that the scan has.
+    Sought is the true pose for which simulated scans are registered at this pose. The points are moved along their rays
+    onto the model at the true pose of the last round. Normal noise along the rays, with both signs, so that what is
+    linear in it cancels, gives the simulated points. Its size is that which gives the distances from the model that the
+    scan has. The step of a registration of these points from this pose corrects the true pose. The rounds end with a
+    small step.
 
     Args:
         index: of the model.
@@ -223,57 +232,88 @@ def bias_of_noise(
         T_ca: registered pose.
         camera_c: (3,) position of the camera in {C} [m]; None: the noise is taken along the normals.
         width_m: rejection distance of the registration [m].
-        register: returns T_ca of a scan (k, 3) in {A} [m], registered from the given pose.
+        P: (6, 6) covariance of the pose.
+        register: returns T_ca of a scan (k, 3) in {A} [m] after a pass from the given pose.
 
     Returns:
         d = [theta; v] in {C}, T_ac_true = T_ac Exp(d); zero with fewer than 30 points on the model. The work is that
         without ``register``, in point searches.
     """
-    few = points[:: max(1, len(points) // BIAS_POINTS)]
-    p = T_ca.apply(few)
+    p = T_ca.apply(points)
     found = index.closest(p, camera_c=camera_c, most_m=width_m)
     near = np.isfinite(found.d2)
     if np.count_nonzero(near) < LEAST_FOR_BIAS:
         return np.zeros(6), len(p)
-    normal, distance = found.normal[near], np.sqrt(found.d2[near])
-    clean, rays = found.foot[near], normal
-    if camera_c is not None:
-        clean, rays = _along_rays(index, p[near], camera_c, clean, normal, width_m)
-    cosine = np.einsum("ij,ij->i", rays, normal)
-    noise = float(np.sqrt((distance @ distance) / max(float(cosine @ cosine), np.finfo(float).tiny)))
-    moved = noise * normal_numbers(len(clean))[:, None] * rays
-    simulated = index.closest(clean + moved, camera_c=camera_c, most_m=width_m).d2
-    same = np.sqrt(
-        float(distance @ distance) / max(float(np.minimum(simulated, width_m**2).sum()), np.finfo(float).tiny)
-    )
-    bias, T_ac = np.zeros(6), T_ca.inverse()
-    for sign in (same, -same):
-        step = register(T_ac.apply(clean + sign * moved)) @ T_ac
-        bias += 0.5 * np.concatenate([geometry.log(step.q), step.t])
-    return bias, (ROUNDS + 2) * len(p)
+    on, foot, normal = p[near], found.foot[near], found.normal[near]
+    along = None if camera_c is None else _Rays(index, on, camera_c, foot, normal, width_m)
+    clean, rays = (foot, normal) if along is None else along.onto_model(Pose.identity(), RAY_STEPS)
+    noise = noise_along(rays, normal, np.sqrt(found.d2[near]), np.ones(len(on)))
+    simulated = index.closest(clean + noise[:, None] * rays, camera_c=camera_c, most_m=width_m).d2
+    same = float(np.minimum(simulated, width_m**2).sum())
+    noise *= np.sqrt(float(found.d2[near].sum()) / max(same, np.finfo(float).tiny))
+    back, true, bias = T_ca.inverse(), Pose.identity(), np.zeros(6)
+    for k in range(BIAS_ROUNDS):
+        if k and along is not None:
+            clean, rays = along.onto_model(true.inverse(), 1)
+        moved = noise[:, None] * rays
+        step = register(back.apply(true.apply(np.concatenate([clean + moved, clean - moved])))) @ back
+        true = step @ true
+        bias, d = (np.concatenate([geometry.log(each.q), each.t]) for each in (true, step))
+        if d @ np.linalg.solve(P, d) < SMALL_STEP:
+            break
+    return bias, (2 + RAY_STEPS) * len(p)
 
 
-def _along_rays(
-    index: SurfaceIndex, p: Array, camera_c: Array, foot: Array, normal: Array, most_m: float
-) -> tuple[Array, Array]:
-    """Points (n, 3) in {C} moved along their rays onto the model, and the rays; ``foot`` where this does not end there.
+def noise_along(rays: Array, normal: Array, residual: Array, weight: Array) -> Array:
+    """Return normal noise (k,) along rays [m] that gives residuals along the normals of the same mean square.
 
-    Each step ends on the tangent plane at the closest point, at most ``most_m`` farther. ``foot`` and ``normal`` (n, 3)
-    are those of ``p``.
+    Args:
+        rays: (k, 3) unit vectors.
+        normal: (k, 3) unit normals of the model.
+        residual: (k,) residuals times ``weight`` [m].
+        weight: (k,) square root of the weight of each residual.
     """
-    rays = p - camera_c
-    ranges = np.linalg.norm(rays, axis=1)
-    rays = rays / ranges[:, None]
-    nearest = foot
-    for _ in range(ROUNDS):
-        cosine = np.minimum(np.einsum("ij,ij->i", normal, rays), -GRAZING)
-        step = np.einsum("ij,ij->i", normal, nearest - camera_c) / cosine - ranges
-        ranges = ranges + np.clip(step, -most_m, most_m)
-        at = camera_c + ranges[:, None] * rays
-        found = index.closest(at, camera_c=camera_c)
-        nearest, normal = found.foot, found.normal
-    on = found.d2 < (ON_SURFACE * index.extent_m) ** 2
-    return np.where(on[:, None], at, foot), rays
+    along = weight * np.einsum("ij,ij->i", rays, normal)
+    size = np.sqrt(float(residual @ residual) / max(float(along @ along), np.finfo(float).tiny))
+    return np.asarray(size * _normal_numbers(1 << len(rays).bit_length())[: len(rays)])
+
+
+@lru_cache(maxsize=4)
+def _normal_numbers(count: int) -> Array:
+    """Numbers (count,) of a normal distribution, the first of them evenly distributed as well; read-only."""
+    share = (0.5 + np.arange(count) * (0.5 * (np.sqrt(5.0) - 1.0))) % 1.0
+    numbers = np.array([NormalDist().inv_cdf(float(x)) for x in share])
+    numbers.flags.writeable = False
+    return numbers
+
+
+class _Rays:
+    """Points (n, 3) in {C} that are moved along their rays onto the model.
+
+    Each step ends on the tangent plane at the last closest point, at most ``most_m`` from the point. ``foot`` and
+    ``normal`` (n, 3) are those of the points; where the steps do not end on the model, ``foot`` is taken.
+    """
+
+    def __init__(
+        self, index: SurfaceIndex, points: Array, camera_c: Array, foot: Array, normal: Array, most_m: float
+    ) -> None:
+        self._index, self._points, self._camera, self._most = index, points, camera_c, most_m
+        self._foot, self._nearest, self._normal = foot, foot, normal
+
+    def onto_model(self, T: Pose, steps: int) -> tuple[Array, Array]:
+        """Return the points, moved by T with the camera, on the model, and the unit rays (n, 3)."""
+        eye = T.apply(self._camera)
+        rays = T.apply(self._points) - eye
+        measured = np.linalg.norm(rays, axis=1)
+        rays /= measured[:, None]
+        for _ in range(steps):
+            cosine = np.minimum(np.einsum("ij,ij->i", self._normal, rays), -GRAZING)
+            ranges = np.einsum("ij,ij->i", self._normal, self._nearest - eye) / cosine
+            at = eye + np.clip(ranges, measured - self._most, measured + self._most)[:, None] * rays
+            found = self._index.closest(at, camera_c=eye)
+            self._nearest, self._normal = found.foot, found.normal
+        on = found.d2 < (ON_SURFACE * self._index.extent_m) ** 2
+        return np.where(on[:, None], at, self._foot), rays
 
 
 def _table_of(found: Evidence, errors: Systematic) -> Any:

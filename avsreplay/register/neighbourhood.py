@@ -43,7 +43,7 @@ UNMOVED, RADIUS_OF_EXTENT = 0.25, 0.25  # a pose nearer to its guess, in gates, 
 SEVERAL = "the scan shows a part of the target, and another pose near this one explains it as well"
 NOT_COMPARED = "the scan shows a part of the target, and no work is left to compare the poses near this one"
 UNCERTAIN_RAD = np.radians(1.0)  # a larger standard deviation of the attitude, caused by noise, is stated
-BIAS_ROUNDS = 4  # simulations of a scan, each at the pose without the last bias
+BIAS_POINTS = 1000  # of the simulated scan by which the bias of the noise is found
 SIGMAS = 4.0  # a minimum whose excess cost is below so many standard errors of it explains the scan as well
 
 
@@ -109,7 +109,6 @@ class Neighbourhood:
     def with_bias(self, scan: NDArray[Any], found: Alignment, budget: Budget) -> Alignment:
         """Return the alignment with a covariance that contains the bias of the noise, where the fit is not close.
 
-        The bias is that of a scan at the pose without it: each simulation is at the pose that the last one gives.
         Where nothing else is stated, the message states a standard deviation of the attitude above ``UNCERTAIN_RAD``.
 
         Args:
@@ -120,20 +119,17 @@ class Neighbourhood:
         P, target, T_ca = found.covariance, self._target, found.T_ac.inverse()
         if P is None or found.rms_m <= POOR_OF_GATE * target.limits.gate_m:
             return found
-        few = self._restarter.part(scan)
+        few = scan[:: max(1, len(scan) // BIAS_POINTS)]
         width = self._restarter.width(self._restarter.measure(few, T_ca))
         camera_c = target.visibility.camera_c(target.index, few, T_ca)
 
         def register(points: Array) -> Pose:
-            fit = self._horn.align_within(points, T_ca, width, near=True)
+            fit = self._horn.align_within(points, T_ca, width, near=True, most=1)
             budget.spend(fit.work)
             return fit.T_ca
 
-        bias = np.zeros(6)
-        for _ in range(BIAS_ROUNDS):
-            at = (found.T_ac @ Pose(geometry.exp(bias[:3]), bias[3:])).inverse()
-            bias, work = bias_of_noise(target.index, few, at, camera_c, width, register)
-            budget.spend(work + MEASURED_WORK * len(few))
+        bias, work = bias_of_noise(target.index, few, T_ca, camera_c, width, P, register)
+        budget.spend(work + MEASURED_WORK * len(few))
         missing = 1.0 - 1.0 / max(float(bias @ np.linalg.solve(P, bias)), 1.0)  # the chi-square of the bias is then 1
         wider = P + missing * np.outer(bias, bias)
         found = replace(found, covariance=geometry.frozen(wider), info=geometry.frozen(np.linalg.inv(wider)))

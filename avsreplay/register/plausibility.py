@@ -163,11 +163,12 @@ class PlausibilityTest:
             The score and the reason of a rejection.
         """
         camera_c = self._visibility.camera_c(self._index, points, T_ca)
-        noise = self.noise(self.measure(points, T_ca), T_ca, guess)
         rays = np.asarray(points if scene is None else scene, dtype=np.float64)
+        p, reach = T_ca.apply(rays), self._index.reach_m
+        found = self._index.closest(p, camera_c=camera_c, most_m=reach)
+        distance = np.minimum(np.sqrt(found.d2), reach) if scene is None else self.measure(points, T_ca)
+        noise = self.noise(distance, T_ca, guess)
         width = max(self._gate, 3.0 * noise)
-        p = T_ca.apply(rays)
-        found = self._index.closest(p, camera_c=camera_c, most_m=min(2.0 * width, self._index.reach_m))
         on = found.d2 < width**2
         if np.count_nonzero(on) < LEAST_COMPARED:
             return Plausibility(noise, 1.0, False, f"fewer than {LEAST_COMPARED} of its points are on the model")

@@ -21,8 +21,6 @@ Renault, J. Applied Econometrics 8, 1993).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -30,6 +28,7 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry
 from avsreplay.geometry import Array, Pose
+from avsreplay.register.covariance import noise_along
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
 LEAST_RESIDUALS = 50
@@ -163,9 +162,7 @@ def noise_bias(index: SurfaceIndex, p: Array, camera_c: Array | None) -> float:
 def _bias_of(index: SurfaceIndex, rows: _Rows, camera_c: Array | None) -> float:
     rays = rows.normal if camera_c is None else rows.foot - np.asarray(camera_c)
     rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    along = np.einsum("ij,ij->i", rays, rows.normal) * rows.weight
-    noise_m = float(np.sqrt(CAUCHY_VARIANCE * (rows.left @ rows.left) / (along @ along)))
-    moved = noise_m * normal_numbers(len(rays))[:, None] * rays
+    moved = noise_along(rays, rows.normal, np.sqrt(CAUCHY_VARIANCE) * rows.left, rows.weight)[:, None] * rays
     found = [_fitted(index, rows.foot + sign * moved, camera_c) for sign in (1.0, -1.0)]
     return float(np.mean([LARGEST_ERROR if each is None else each.delta for each in found]))
 
@@ -288,16 +285,6 @@ def _effect(rows: _Rows, B: Array) -> float:
     random = float(rows.left @ rows.left) / len(rows.left) / s[kept] ** 2
     variance = max(0.0, float(np.mean(amplitudes**2 - random)))
     return float(np.sqrt(variance * np.sum((change @ Vt.T[:, kept]) ** 2)))
-
-
-@lru_cache(maxsize=4)
-def normal_numbers(count: int) -> Array:
-    """Return quantiles (count,) of the normal distribution in an order without a pattern; read-only."""
-    quantiles = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
-    order = np.argsort(np.arange(count) * (0.5 * (np.sqrt(5.0) - 1.0)) % 1.0, kind="stable")
-    numbers: Array = quantiles[order]
-    numbers.flags.writeable = False
-    return numbers
 
 
 def diameter(points: NDArray[Any], *, trimmed: bool = True) -> float:

@@ -219,8 +219,7 @@ def run(case: Case, seed: int, tested: bool = True, free: bool = False) -> Resul
         failed = ()
         found = estimator.residual_after(track, prediction, innovation) if verdict.gamma else None
         if found is not None:
-            covariance = estimator.pose_covariance(track.belief)
-            failed = violations(track.belief, covariance, *found)
+            failed = violations(track.belief, *found)
         result.violations += list(failed)
         result.failed_at += [t] * len(failed)
         honest = honest and not in_doubt(track) and not failed

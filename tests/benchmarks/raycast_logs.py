@@ -1,10 +1,12 @@
 """Whole runs on logs made without code of avsreplay: own dynamics, ray casting by Embree, written by rosbags.
 
-python tests/benchmarks/raycast_logs.py [--cases clean,push,...] [--seeds 0,1] [--hz 2] [--rate 0.1] [--keep FOLDER]
+python tests/benchmarks/raycast_logs.py [--cases clean,push,...] [--seeds 0,1] [--hz 2] [--rate 0.1] [--mesh FILE]
+    [--keep FOLDER]
 
-The target is a spacecraft of trimesh's primitives (body, two panels, dish, boom) with random sizes, written as an STL
-file in millimetres. Its inertia tensor and its mass centre are random, its motion is integrated from the full tensor
-with DOP853, and 80 x 80 rays with 2 mm range noise (1 sigma) give the scans at HZ for SECONDS. A case adds an event:
+The target is a spacecraft of primitives of trimesh (body, two panels, dish, boom) with random sizes, or the mesh of
+FILE, enlarged to a diagonal of 4 m. It is written as an STL file in millimetres. Its inertia tensor and its mass centre
+are random, its motion is integrated from the full tensor with DOP853, and 80 x 80 rays with 2 mm range noise (1 sigma)
+give the scans at HZ for SECONDS. A case adds an event:
 
 clean   none                                    wall    a wall behind the target, half of all points
 push    velocity step of 10 mm/s at 44.8 s      turn    rate step of 0.01 rad/s at 44.8 s
@@ -94,6 +96,14 @@ def spacecraft(rng: np.random.Generator) -> trimesh.Trimesh:
     return trimesh.util.concatenate([*parts, dish, boom, nozzle])
 
 
+def of_file(path: Path) -> trimesh.Trimesh:
+    """The mesh of a file with the centre of its box in the origin and a diagonal of 4 m."""
+    mesh = trimesh.load(path, force="mesh")
+    mesh.apply_translation(-mesh.bounds.mean(axis=0))
+    mesh.apply_scale(4.0 / np.linalg.norm(mesh.extents))
+    return mesh
+
+
 def motion(
     rng: np.random.Generator, times: np.ndarray, case: str, rate: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -140,7 +150,7 @@ def motion(
 def make(folder: Path, case: str, seed: int, asked: argparse.Namespace) -> None:
     """Write ``log`` (a ROS 2 bag), ``model.stl`` and ``centre.npy`` (motion of the mass centre) to ``folder``."""
     rng = np.random.default_rng([seed, 77])
-    mesh = spacecraft(rng)
+    mesh = spacecraft(rng) if asked.mesh is None else of_file(asked.mesh)
     mm = mesh.copy()
     mm.apply_scale(1000.0)
     mm.export(folder / "model.stl")
@@ -300,6 +310,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=100.0)
     parser.add_argument("--hz", type=float, default=2.0)
     parser.add_argument("--rate", type=float, default=0.1, help="mean rate of the targets [rad/s]")
+    parser.add_argument("--mesh", type=Path, help="mesh of the target, in place of random spacecraft")
     parser.add_argument("--keep", type=Path, help="write the logs and results to this folder and keep them")
     asked = parser.parse_args()
     print("| " + " | ".join(HEADS) + " |\n|" + "---|" * len(HEADS), flush=True)

@@ -4,17 +4,17 @@
                                       [--points 4000] [--backend horn] [--seed 1]
 
 Meshes: HST, Kepler, bunny and dragon from ../shared/data where it exists, the built-in target, a cylinder stage (a
-cylinder with closed ends), a box, a bracket of three boxes, and a box with a thin panel. Every view is ray-cast from a
-random side at three extents, with noise of 0.002 of the extent along the ray. The scenes add walls, outliers,
-occlusion, a second object, noise, an error of scale or a bad guess, or show another body of the same extent alone, at
-the predicted place if there is a guess. "Correct": within 2 deg and 0.02 of the extent of the true pose, or of a pose
-that differs by a symmetry of the mesh. With an error of scale up to 10 % the pose counts; with a factor of 1000, and of
-another body, no pose is correct. "Accepted": status aligned. "Wrong": accepted, not correct, and the row says neither
-that the scan fits a target of another size, nor that the view does not determine the size, nor that noise leaves the
-attitude uncertain by more than 1 deg; where no pose is correct, every accepted one is wrong. "Beyond": accepted, and
-the squared error in the metric of the claimed covariance exceeds the 99.99 % point of Hotelling's T^2, whatever the row
-says. NEES is the mean of this squared error over 6, 1 for a correct covariance. Time is
-processor time; "x" is the ratio to the median of the clean scans of the same mesh. A row per scene over all meshes,
+cylinder with closed ends), a box, a bracket of three boxes, a box with a thin panel, and mesh files by their path.
+Every view is ray-cast from a random side at three extents, with noise of 0.002 of the extent along the ray. The scenes
+add walls, outliers, occlusion, a second object, noise, an error of scale or a bad guess, or show another body of the
+same extent alone, at the predicted place if there is a guess. "Correct": within 2 deg and 0.02 of the extent of the
+true pose, or of a pose that differs by a symmetry of the mesh. With an error of scale up to 10 % the pose counts; with
+a factor of 1000, and of another body, no pose is correct. "Accepted": status aligned. "Wrong": accepted, not correct,
+and the row says neither that the scan fits a target of another size, nor that the view does not determine the size, nor
+that noise leaves the attitude uncertain by more than 1 deg; where no pose is correct, every accepted one is wrong.
+"Beyond": accepted, and the squared error in the metric of the claimed covariance exceeds the 99.99 % point of
+Hotelling's T^2, whatever the row says. NEES is the mean of this squared error over 6, 1 for a correct covariance. Time
+is processor time; "x" is the ratio to the median of the clean scans of the same mesh. A row per scene over all meshes,
 and with --each one per scene and mesh.
 """
 
@@ -28,6 +28,7 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
 from avsreplay import geometry
 from avsreplay.estimate.measurement import from_chi2
@@ -89,6 +90,8 @@ def meshes(names: list[str]) -> dict[str, Surface]:
         elif name in BOXES:
             parts = [trimesh.creation.box(size).apply_translation(at) for size, at in BOXES[name]]
             found[name] = _surface(trimesh.util.concatenate(parts), name)
+        elif name not in FILES:
+            found[Path(name).stem] = read_surface(Path(name))
         elif (DATA / FILES[name]).exists():
             found[name] = read_surface(DATA / FILES[name])
         else:
@@ -277,11 +280,25 @@ QUICK = ("clean, 3 deg", "clean, 60 deg", "outliers 60 %, 3 deg", "wall 50 %, se
 
 
 def symmetries(name: str, surface: Surface) -> Callable[[Pose], Pose]:
-    """Maps an error in {C} to the least one among the symmetries of the made-up bodies."""
+    """Maps an error in {C} to the least one among the symmetries of the mesh.
+
+    Tested are the rotations of a cube and those by a whole fraction of a turn (down to 1/24) about an axis of {C},
+    through the centre of the box, which displace no vertex by more than 1e-3 of the extent from the surface.
+    """
     if name == "cylinder":
         return _least_of_cylinder
-    turns = [exp(np.pi * axis) for axis in np.eye(3)] if name == "box" else []
-    group = [Pose.identity(), *[Pose(q, np.zeros(3)) for q in turns]]
+    mesh = trimesh.Trimesh(surface.vertices, surface.faces, process=False)
+    points = surface.vertices[:: max(1, len(surface.vertices) // 500)]
+    centre = 0.5 * (surface.vertices.min(0) + surface.vertices.max(0))
+    turns = [Rotation.from_matrix(m) for m in Rotation.create_group("O").as_matrix()]
+    turns += [
+        Rotation.from_rotvec(2 * np.pi * k / n * axis) for axis in np.eye(3) for n in range(3, 25) for k in (1, -1)
+    ]
+    group = [Pose.identity()]
+    for turn in turns:
+        moved = turn.apply(points - centre) + centre
+        if np.abs(trimesh.proximity.closest_point(mesh, moved)[1]).max() < 1e-3 * surface.extent:
+            group.append(Pose(exp(turn.as_rotvec()), centre - turn.apply(centre)))
     return lambda step: min((step @ s for s in group), key=lambda p: float(geometry.angle(p.q)))
 
 

@@ -454,6 +454,23 @@ nb::tuple propagate_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3
   return nb::make_tuple(made(x.q_ab), made(x.w_b), made(x.r_a), made(x.v_a), made(Phi), made(P));
 }
 
+// Number of the nearest order of the truth's axes among R_nb, and NEES: of all states in that order, in the chart, by block.
+nb::tuple nees_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
+                  const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Vector<4>& true_q_ab,
+                  const Vector<3>& true_w, const Vector<3>& true_r, const Vector<3>& true_v, const Vector<2>& true_sigma,
+                  const Vector<3>& true_c, const Vector<4>& true_q_bc, const Matrix<DIM, DIM>& P,
+                  const Matrix<-1, 3, 3>& R_nb, const Matrix<-1, 4>& q_bn) {
+  if (!R_nb.shape(0) || q_bn.shape(0) != R_nb.shape(0))
+    throw std::invalid_argument("rotations and quaternions must be equally many, one at least");
+  const State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
+  const State truth = state_from(true_q_ab, true_w, true_r, true_v, true_sigma, true_c, true_q_bc);
+  const Errors found = errors_squared(truth, x, as<Square>(P.data()), reinterpret_cast<const M3*>(R_nb.data()),
+                                      reinterpret_cast<const Quad*>(q_bn.data()), (int)R_nb.shape(0));
+  std::array<double, BLOCK_COUNT> block;
+  std::copy(found.block, found.block + BLOCK_COUNT, block.begin());
+  return nb::make_tuple(found.best, found.size, found.chart, block);
+}
+
 }  // namespace
 
 NB_MODULE(_motion, m) {
@@ -487,6 +504,10 @@ NB_MODULE(_motion, m) {
   m.def("propagate", &propagate_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("h"), nb::arg("path"), nb::arg("torque"),
         nb::arg("force"));
+  m.def("nees", &nees_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
+        nb::arg("c_b"), nb::arg("q_bc"), nb::arg("true_q_ab"), nb::arg("true_w_b"), nb::arg("true_r_a"),
+        nb::arg("true_v_a"), nb::arg("true_sigma"), nb::arg("true_c_b"), nb::arg("true_q_bc"), nb::arg("P"),
+        nb::arg("R_nb"), nb::arg("q_bn"));
   nb::class_<Problem>(m, "Problem")
       .def("__init__", &create, nb::arg("times"), nb::arg("q"), nb::arg("t"), nb::arg("root"), nb::arg("info"),
            nb::arg("mean"), nb::arg("prior_info"))

@@ -20,4 +20,15 @@ void join(const Chart* charts, const Square* P, const double* weights, const dou
 void propagate(State& x, Square P, double h, const double path[6][6], const double torque_density[3],
                double force_density, Square Phi);
 
+// The truth in the order of its principal axes that is nearest to an estimate: its number among the rotations R_nb (with the
+// quaternions q_bn of their inverses), and e' P^-1 e of the error states e there, of all and of each block (records.BLOCKS);
+// `chart`: of the error in the chart, which does not depend on the order. NaN where the part of P is singular; then the
+// errors are compared by their variances.
+constexpr int BLOCK_COUNT = 7;
+struct Errors {
+  int best;
+  double size, chart, block[BLOCK_COUNT];
+};
+Errors errors_squared(const State& truth, const State& x, const Square P, const M3* R_nb, const Quad* q_bn, int count);
+
 }  // namespace avs

@@ -1,0 +1,116 @@
+// Normalised estimation errors squared: the truth in the nearest order of its principal axes against an estimate.
+#include <cmath>
+#include <cstring>
+#include <limits>
+
+#include "covariance.hpp"
+
+namespace avs {
+namespace {
+
+constexpr int BLOCK_START[BLOCK_COUNT] = {0, 3, 6, 9, 12, 14, 17}, BLOCK_SIZE[BLOCK_COUNT] = {3, 3, 3, 3, 2, 3, 3};
+
+// An LU factorisation of the first n rows and columns of A, with row pivots; false where A is singular or not finite.
+struct Factored {
+  int n = 0, pivot[DIM];
+  Square LU;
+
+  bool of(const Square A, int first, int size) {
+    n = size;
+    for (int r = 0; r < n; ++r)
+      for (int c = 0; c < n; ++c) LU[r][c] = A[first + r][first + c];
+    for (int k = 0; k < n; ++k) {
+      int best = k;
+      for (int r = k + 1; r < n; ++r)
+        if (std::fabs(LU[r][k]) > std::fabs(LU[best][k])) best = r;
+      pivot[k] = best;
+      const double largest = std::fabs(LU[best][k]);
+      if (!(largest > 0) || !std::isfinite(largest)) return false;
+      if (best != k)
+        for (int c = 0; c < n; ++c) std::swap(LU[k][c], LU[best][c]);
+      for (int r = k + 1; r < n; ++r) {
+        const double f = LU[r][k] /= LU[k][k];
+        for (int c = k + 1; c < n; ++c) LU[r][c] -= f * LU[k][c];
+      }
+    }
+    return true;
+  }
+
+  // e' A^-1 e.
+  double squared(const double* e) const {
+    double x[DIM];
+    std::memcpy(x, e, n * sizeof(double));
+    for (int k = 0; k < n; ++k) std::swap(x[k], x[pivot[k]]);
+    for (int k = 0; k < n; ++k)
+      for (int r = k + 1; r < n; ++r) x[r] -= LU[r][k] * x[k];
+    double sum = 0;
+    for (int k = n - 1; k >= 0; --k) {
+      x[k] /= LU[k][k];
+      for (int r = 0; r < k; ++r) x[r] -= LU[r][k] * x[k];
+    }
+    for (int k = 0; k < n; ++k) sum += e[k] * x[k];
+    return sum;
+  }
+};
+
+void put(const Quad& q, double* half_angle) {
+  const double sign = q.w >= 0 ? 1 : -1;
+  half_angle[0] = sign * q.x, half_angle[1] = sign * q.y, half_angle[2] = sign * q.z;
+}
+
+// The error states of the truth, its principal axes turned by R_nb = R_bn', from the estimate.
+void difference(const State& truth, const State& x, const M3& R_nb, const Quad& q_bn, double d[DIM]) {
+  put(conjugate(quad(x.q_ab)) * quad(truth.q_ab) * q_bn, d);
+  put(conjugate(q_bn) * (quad(truth.q_bc) * conjugate(quad(x.q_bc))), d + 17);
+  const V3 w = R_nb * vector(truth.w_b), c = R_nb * vector(truth.c_b);
+  const double s1 = truth.sigma[0], s2 = truth.sigma[1], ratio[3] = {s1, s2, -(s1 + s2) / (1 + s1 * s2)};
+  const M3& R = R_nb;
+  const double even = std::fabs(R.x[0][0] * R.x[1][1] * R.x[2][2]) + std::fabs(R.x[0][1] * R.x[1][2] * R.x[2][0]) +
+                      std::fabs(R.x[0][2] * R.x[1][0] * R.x[2][1]);
+  const double parity = even > 0.5 ? 1 : -1;
+  for (int k = 0; k < 3; ++k) {
+    d[3 + k] = w.x[k] - x.w_b[k], d[6 + k] = truth.r_a[k] - x.r_a[k], d[9 + k] = truth.v_a[k] - x.v_a[k];
+    d[14 + k] = c.x[k] - x.c_b[k];
+  }
+  for (int k = 0; k < 2; ++k) {
+    double named = 0;
+    for (int axis = 0; axis < 3; ++axis) named += std::fabs(R.x[k][axis]) * ratio[axis];
+    d[12 + k] = parity * named - x.sigma[k];
+  }
+}
+
+}  // namespace
+
+Errors errors_squared(const State& truth, const State& x, const Square P, const M3* R_nb, const Quad* q_bn, int count) {
+  Errors out;
+  Factored whole, part;
+  const bool regular = whole.of(P, 0, DIM);
+  double nearest[DIM] = {}, d[DIM];
+  out.size = std::numeric_limits<double>::infinity();
+  for (int k = 0; k < count; ++k) {
+    difference(truth, x, R_nb[k], q_bn[k], d);
+    double size = 0;
+    if (regular) size = whole.squared(d);
+    else
+      for (int i = 0; i < DIM; ++i) size += P[i][i] > 0 ? d[i] * d[i] / P[i][i] : 0;
+    if (k == 0 || size < out.size) {
+      out.best = k, out.size = size;
+      std::memcpy(nearest, d, sizeof d);
+    }
+  }
+  for (int b = 0; b < BLOCK_COUNT; ++b)
+    out.block[b] = part.of(P, BLOCK_START[b], BLOCK_SIZE[b]) ? part.squared(nearest + BLOCK_START[b]) : NAN;
+  const Chart here = chart_of(x);
+  double y[DIM];
+  Square T;
+  minus(chart_of(truth), here, y);
+  errors_of(here, T);
+  for (int r = 0; r < DIM; ++r) {
+    d[r] = 0;
+    for (int i = 0; i < DIM; ++i) d[r] += T[r][i] * y[i];
+  }
+  out.chart = regular ? whole.squared(d) : NAN;
+  return out;
+}
+
+}  // namespace avs
