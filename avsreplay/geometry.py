@@ -8,11 +8,12 @@ Quaternions are ``[x y z w]``, Hamilton, active: ``matrix(q_ab)`` takes coordina
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from avsreplay.errors import value_class
 
 Array = NDArray[np.float64]
 
@@ -276,7 +277,7 @@ def bounding_diagonal(points: ArrayLike) -> float:
     return float(np.linalg.norm(np.ptp(np.ascontiguousarray(np.asarray(points).T), axis=1)))  # numpy is slow along rows
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Pose:
     """Pose T_ab of frame b in frame a: takes coordinates in b to coordinates in a, ``p_a = R_ab p_b + t_ab_a``.
 
@@ -338,12 +339,11 @@ class Pose:
         return np.asarray(points_b, dtype=np.float64) @ self.R.T + self.t
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class MeasuredPose:
     """A pose T_ac of {C} in {A} that a tracker measured (markers, motion capture), in place of a point cloud.
 
-    Attributes:
-        covariance: (6, 6) of the error d = [theta; v] in {C} [rad, m], T_true = T_ac @ Exp(d); None where not stated.
+    ``covariance`` (6, 6) is that of the error d = [theta; v] in {C} [rad, m], T_true = T_ac @ Exp(d); None: not stated.
     """
 
     T_ac: Pose

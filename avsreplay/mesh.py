@@ -7,11 +7,10 @@ connected by edges of exactly two faces.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 
 PAIRED_EDGES = 0.95  # least share of the edges of a closed part that two opposite half-edges form
@@ -146,7 +145,7 @@ def open_faces(vertices: Array, faces: Faces) -> NDArray[np.bool_]:
     return opened
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class _Edges:
     """Number (3 m,) of the edge of each half-edge, its direction (3 m,) as 1 or -1, and the pairs with two faces.
 
@@ -163,7 +162,7 @@ class _Edges:
         return balanced
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class _Parts:
     """Part (m,) of each face; whether (m,) it must be reversed for a consistent winding; which parts are closed."""
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import (
     Alignment,
@@ -35,7 +36,7 @@ class PlanStatus(Enum):
     NO_CONVERGENCE = "no_convergence"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Plan:
     """A rendezvous in least time: meet the grasp point in position and velocity with |u| <= a_max (eq:terminal).
 
@@ -90,7 +91,7 @@ class Plan:
         return self.status in (PlanStatus.OPTIMAL, PlanStatus.FEASIBLE)
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@value_class(kw_only=True)
 class MonitorReport:
     """What the monitors report after a scan.
 
@@ -122,7 +123,7 @@ class MonitorReport:
     forecast: Forecast
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@value_class(kw_only=True)
 class Outcome:
     """Result of the pipeline for one scan.
 
@@ -184,7 +185,7 @@ class CaptureError:
     angle_deg: float
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+@value_class(kw_only=True)
 class Score:
     """An outcome compared with ground truth; None where there is no truth for it.
 

@@ -8,7 +8,7 @@ scan, which lets the filter take over from the batch fit. Nothing here has acces
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from avsreplay import geometry, monitor
 from avsreplay.config import Guess
+from avsreplay.errors import value_class
 from avsreplay.estimate import Estimator, Prediction, Track
 from avsreplay.estimate.chart import body_parameters
 from avsreplay.estimate.track import deskew, in_doubt, with_scan_duration
@@ -32,7 +33,7 @@ from avsreplay.register import Registrar, allowed_scans, measured_alignment
 MAX_POSITION_3S_OF_REACH, MAX_ATTITUDE_3S_RAD = 0.25, np.radians(15.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Measurement:
     """A registered scan.
 
@@ -46,7 +47,7 @@ class Measurement:
     instants: Array | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class MonitorState:
     """What the monitors carry from scan to scan."""
 
@@ -56,7 +57,7 @@ class MonitorState:
     violations: int = 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Monitors:
     """Observability, consistency and convergence; they do not change the estimate."""
 
@@ -132,7 +133,7 @@ class Monitors:
         return violations(track.belief, *found) if found else ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Stages:
     """The stages of the chain, configured for one log.
 
@@ -155,7 +156,7 @@ class Stages:
     initialise: Callable[[Scan], tuple[Pose | None, str]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class PipelineState:
     """What is carried from scan to scan.
 
@@ -346,5 +347,4 @@ def planner_input(
     estimator: Estimator, belief: Belief, target: TargetGeometry, gamma: int, converged: bool, forecast: Forecaster
 ) -> PlannerInput:
     """Return the input of guidance after a scan."""
-    scene = target_scene(estimator, belief, target, forecast)
-    return PlannerInput(belief.t_ns, gamma, converged, scene, forecast)
+    return PlannerInput(belief.t_ns, gamma, converged, target_scene(estimator, belief, target, forecast), forecast)

@@ -7,7 +7,7 @@ also the frame of the model. ``T_ac`` is the pose of {C} in {A}. SI units and ra
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import Enum
 from typing import Any
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, MeasuredPose, Pose, frozen, matrix, multiply, rotate
 
 BLOCKS: Mapping[str, slice] = {
@@ -68,7 +69,7 @@ class Reason(Enum):
     CLOCK = "clock"  # the stamp steps back or jumps
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Surface:
     """A target model in {C}: a triangle mesh, or a point cloud if ``faces`` is empty.
 
@@ -90,7 +91,7 @@ class Surface:
         return geometry.bounding_diagonal(self.vertices)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class State:
     """Motion and parameters of a target (eq:x): the mean to which the 20 error states refer.
 
@@ -126,7 +127,7 @@ class State:
         return self.v_a + rotate(matrix(self.q_ab), np.cross(self.w_b, self.c_b))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Label:
     """An injected fault: its kind and the interval on the log clock in which it acts."""
 
@@ -137,7 +138,7 @@ class Label:
     strength: float | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Scan:
     """One point cloud, or one measured pose, as the reader returns it.
 
@@ -162,7 +163,7 @@ class Scan:
     places: NDArray[Any] | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Truth:
     """Ground truth at a scan, for scoring only: T_ac, full state and label of the injected fault, None if unknown."""
 
@@ -171,7 +172,7 @@ class Truth:
     fault: str | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class LogHeader:
     """The metadata of a log; with them it can be replayed without options.
 
@@ -189,7 +190,7 @@ class LogHeader:
     notes: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Fit:
     """What a back end returns.
 
@@ -206,7 +207,7 @@ class Fit:
     work: int = 0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Alignment:
     """A pose with its quality, measured in the same way for every back end (register.quality).
 
@@ -245,7 +246,7 @@ class Alignment:
         return self.inliers / self.points if self.points else 0.0
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Belief:
     """Mean x and covariance P (20, 20) of the error states at an instant; dq_v and dmu_v are HALF-angle vectors."""
 
@@ -257,7 +258,7 @@ class Belief:
         object.__setattr__(self, "P", frozen(self.P, 20, 20))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Innovation:
     """Innovation alpha = z - h(x-) of z = (rho, deta_v) [m, half angle] and its covariance.
 
@@ -281,7 +282,7 @@ class Innovation:
     free: Array | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Verdict:
     """Result of the fault detector: gamma 1 (healthy) or 0 (faulty), and the reason."""
 
@@ -289,7 +290,7 @@ class Verdict:
     reason: Reason
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Manoeuvre:
     """A change of the target's velocity that free motion does not explain.
 
@@ -310,7 +311,7 @@ class Drift(Manoeuvre):
     """A constant acceleration since ``t_ns``: ``rate`` in {C} [rad/s2] by a torque, ``velocity`` [m/s2] by a force."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class BodyParameters:
     """Parameters of the target in {C}, independent of the order of the principal axes.
 
@@ -332,7 +333,7 @@ class BodyParameters:
     limited_1s: tuple[float, float, float, float]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Forecast:
     """Predicted standard deviations (n,) of the grasp point; each is the root of the trace of its 3x3 covariance.
 

@@ -14,6 +14,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.outcome import CaptureError, Outcome, Plan, PoseError, Score
 from avsreplay.records import Innovation, Manoeuvre, ScanStatus
@@ -159,7 +160,7 @@ def _nees(block: str) -> float | None:
     return column(value, "", ".2f", 1e-2, 1e-3)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@value_class(kw_only=True, eq=True)
 class Row:
     """The result of one scan. None: does not apply (no truth, no measurement, no plan, no fault)."""
 

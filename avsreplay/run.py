@@ -13,7 +13,7 @@ from avsreplay import arithmetic, pipeline, settings
 from avsreplay.binary_files import pack_state, unpack
 from avsreplay.build import first_state, stages
 from avsreplay.config import Against, RunConfig, load_config, pose_text, with_acceleration
-from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate.acceleration import AccelerationFit, acceleration_text, fit_acceleration
 from avsreplay.estimate.initialise import PoseFix
 from avsreplay.estimate.reference import Reference
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 RECONSTRUCTED, MOST_LOSSES = Path("auto"), 100  # a model built from the log; losses listed one by one in run.json
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class ReplayedScan:
     """One scan of a run: the pipeline's outcome and state after it, the truth, and the row."""
 

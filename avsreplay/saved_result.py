@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from avsreplay import plan, settings, toml_document
-from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.estimate import Estimator, EstimatorParams
 from avsreplay.plan import Limits, PlanParams, RobotParams, SupervisorParams
 from avsreplay.records import Belief, Surface
@@ -31,7 +31,7 @@ class PlanningConfig(Settings):
     supervisor: SupervisorParams = setting(SupervisorParams, "Supervision.")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Saved:
     """The part of a result directory that planning uses.
 

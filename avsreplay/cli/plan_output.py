@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+from avsreplay.errors import value_class
 
 if TYPE_CHECKING:
     from avsreplay.outcome import Plan
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     from avsreplay.report.table import Table
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class PossibleChange:
     """One change of the problem with which a plan is found.
 
@@ -35,7 +36,7 @@ class PossibleChange:
         return self.at_s + self.plan.t_go_s
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Answer:
     """Everything that planning from a saved result found.
 

@@ -19,12 +19,12 @@ the first poses that contradict it, so that an impact after a free flight has no
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.estimate.reference import r0_covariance
 from avsreplay.geometry import Array, Pose
@@ -39,7 +39,7 @@ _UNKNOWN = 1e3  # 1 sigma of the prior of all but the arm, in lengths of the arm
 _PASSES = 4
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class FreeFall:
     """The frame in which a target with a constant acceleration moves freely.
 
@@ -89,7 +89,7 @@ def accelerated(free: Trajectory, acceleration: Array) -> Trajectory:
     return at
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class AccelerationFit:
     """A fitted acceleration.
 

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.measurement import GATE
@@ -53,7 +54,7 @@ class FitParams(Settings):
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Poses:
     """Healthy poses T_ac, oldest first.
 
@@ -106,7 +107,7 @@ class Poses:
         return Poses(self.times_s[-count:] - epoch_s, self.q[-count:], self.t[-count:], self.C[-count:], arc=arc)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Prior:
     """A Gaussian prior of the initial values: mean and covariance P (20, 20) of the chart coordinates.
 
@@ -127,7 +128,7 @@ class Prior:
         return np.sqrt(np.diagonal(self.P))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class BatchFit:
     """The result of a fit.
 
@@ -172,7 +173,7 @@ class BatchFit:
         return float(np.sqrt(np.mean(self.d[:, :3] ** 2) * 3)), float(np.sqrt(np.mean(self.d[:, 3:] ** 2) * 3))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Pin:
     """A pseudo-measurement row . (chart - centre) = ``target`` with ``one_sigma``: it fixes one direction."""
 

@@ -23,12 +23,12 @@ which the fit uses as well, and so is NEES (``kernel/nees.cpp``).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from itertools import permutations, product
 
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.dynamics import sigma3, sigma_join
 from avsreplay.estimate.error_state import DIM, DMU, DQ, SIGMA, VARRHO, W
@@ -42,7 +42,7 @@ _LARGEST_1S = 3.0  # largest 1 sigma of the logarithm of the mass moments; above
 _LEAST_GAP, _MOST_MOVED = 0.02, 0.1  # least difference of two values of M, and largest move for its sake [sigma]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class AxisPermutation:
     """One of the 24: R_bn (3, 3), its quaternion, new axis i is old axis perm[i] up to sign, parity of perm."""
 
@@ -79,7 +79,7 @@ _R_NB = np.array([p.R_bn.T for p in AXIS_PERMUTATIONS])
 _Q_BN = np.array([p.q_bn for p in AXIS_PERMUTATIONS])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Chart:
     """A state in chart coordinates, as the extension's 34 numbers ``flat``."""
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.estimate.batch_schedule import CHECK_GROWTH, FEWEST_TO_SPREAD, BatchSchedule
 from avsreplay.estimate.chart import Chart
 from avsreplay.estimate.drift import DriftFound, find_drift
@@ -42,7 +43,7 @@ _POSITIONS = 36  # points of the positions from which the density of a force is 
 _MORE = 1.3  # factor on a disturbance from which the poses are fitted again at once
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class _Driven:
     """A drift, the noise levels with it, and the motion of each hypothesis with its weight."""
 

@@ -10,11 +10,12 @@ as on the initial values. With a Gaussian prior on the size the evidence against
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.chart import Chart
 from avsreplay.estimate.driven_fit import (
@@ -96,7 +97,7 @@ def find_drift(
     return DriftFound(likely, best.width * widths, within.spread_s)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class DrivenHypothesis:
     """The fit with a drift since some instant, its probability, and the 1 sigma of the instant [s], 0 for the epoch."""
 
@@ -105,7 +106,7 @@ class DrivenHypothesis:
     onset_1s_s: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class DriftFound:
     """A drift.
 
@@ -119,7 +120,7 @@ class DriftFound:
     onset_1s_s: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class _Found:
     """Log odds of a drift since ``onset_s``, its most likely size u (6,), the fit's step y, and its most likely prior.
 
@@ -205,7 +206,7 @@ def _cost(frame: DrivenFit, poses: Poses) -> float:
     return Problem(every, frame.problem.prior, frame.problem.factors).cost(frame.chart)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class _Onset:
     """The posterior of the onset among instants (n,) by the log odds (n,) of a drift since each."""
 

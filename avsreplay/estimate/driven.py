@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import (
@@ -44,7 +45,7 @@ _STEP_RAD = 0.1  # step of the integral in drift_equivalents
 _SIMPSON_RAD = 0.4  # largest rotation of two steps of Simpson's rule in drift_response
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class DrivenBelief(Belief):
     """A belief about a body on which a constant torque or force acts.
 

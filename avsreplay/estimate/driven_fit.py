@@ -7,12 +7,13 @@ filter over the poses, with the disturbances between them, gives their joint mea
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import sandwich
@@ -40,7 +41,7 @@ _PASSES, _SMALL = 10, 0.1  # most linearisations; size of a step, in 1 sigma, af
 _U, _ONSET = slice(DIM, DIM + 6), DIM + 6  # the acceleration and its onset after the 20 initial values
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class DrivenFit:
     """A fit to poses from which a constant acceleration has been removed.
 
@@ -160,7 +161,7 @@ def drift_unknowns(
     return columns[:, :, kinds], (fitted.u / widths)[kinds]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class DrivenMotion:
     """The motion with an acceleration that fits all poses, about which the problem is linear.
 

@@ -8,12 +8,11 @@ independent sigma; ``transition`` applies the chain rule for sigma3(sigma1, sigm
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.error_state import DIM, DMU, DQ, RHO, SIGMA, VARRHO, VEL, W, hamilton
 from avsreplay.estimate.relative_orbit import OrbitArc, RelativeOrbit
@@ -62,7 +61,7 @@ def disturbance(sigma: Array) -> Triple:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Flow:
     """The rotational part of a step.
 
@@ -196,7 +195,7 @@ def seconds_to(belief: Belief, t_ns: int) -> float:
     return h
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class RotationHistory:
     """Rotation at n instants from one initial state.
 

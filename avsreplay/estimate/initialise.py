@@ -12,12 +12,13 @@ direction stays with the fit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, Prior, Problem, fit
 from avsreplay.estimate.batch_covariance import (
@@ -49,7 +50,7 @@ _LEVEL_STEPS, _LEVEL_TOL = 20, 0.1
 _DETERMINED = 0.5  # a direction whose posterior sigma is above this share of the prior's is determined by the prior
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class PoseFix:
     """A healthy pose T_ac at an instant.
 
@@ -77,7 +78,7 @@ class PoseFix:
         return self.t_ns - self.lag_ns
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class BatchResult:
     """The last batch fit: its values at the epoch (the first pose) and the resulting belief.
 

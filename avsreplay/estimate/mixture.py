@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, separated, to_chart, to_errors, to_state
 from avsreplay.estimate.dynamics import forecast_of, grasp_prediction, torque_density, translation
@@ -34,7 +35,7 @@ _POSE = np.ix_([0, 1, 2, 6, 7, 8], [0, 1, 2, 6, 7, 8])  # half angle in {C} and 
 _MOVED = 0.5  # sum of the changes of the weights above which the mixture is not a quadrature
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Component:
     """One Gaussian of a mixture.
 

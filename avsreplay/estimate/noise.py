@@ -14,10 +14,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.estimate.measurement import registration_noise, residual
 from avsreplay.estimate.params import Adaptation, EstimatorParams, NoiseSource, Start
 from avsreplay.geometry import Array, frozen
@@ -45,7 +45,7 @@ def integrated_autocorrelation(e: Array) -> float:
     return 1.0 + 2.0 * max((found for found, bound in sums if found > bound), default=0.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class NoiseEpoch:
     """One healthy epoch.
 
@@ -62,7 +62,7 @@ class NoiseEpoch:
     weight: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class NoiseWindow:
     """The last healthy epochs, oldest first, at most the window's length.
 

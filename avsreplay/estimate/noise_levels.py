@@ -24,6 +24,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses, Problem
 from avsreplay.estimate.chart import Chart, to_errors, to_state
 from avsreplay.estimate.driven import impulses
@@ -214,7 +215,7 @@ def _variances(levels: NoiseLevels) -> Array:
     return np.array([*levels.white, *levels.common, levels.torque**2, levels.force**2])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class _Residuals:
     """Whitened residuals e (6n,) and their Jacobian J (6n, 20); information and offset (20,) of the prior.
 

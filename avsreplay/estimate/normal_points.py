@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Poses, Prior, Problem
 from avsreplay.estimate.chart import Chart, to_state
 from avsreplay.estimate.dynamics import rotation_path, translated
@@ -26,7 +26,7 @@ _FREE = (1e2, 1e3, 1e1)  # 1 sigma of arm [m], position [m] and velocity [m/s] b
 _LEAST_M = 1e-6  # least 1 sigma of a displacement [m]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class PositionRows:
     """Positions of many poses as n points that are linear in the motion of the mass centre, whatever the rotation.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from avsreplay import geometry
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.estimate.batch import BatchFit, FitParams, Poses, fit
 from avsreplay.estimate.chart import Chart, to_chart, to_state
 from avsreplay.estimate.dynamics import pose_rows, propagate_state, rotation_path, translated
@@ -23,7 +23,7 @@ _FEWEST = 4
 _FIRST_TURN = np.pi  # the window starts at half a turn and doubles
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Reference:
     """The motion with the maximum likelihood over all poses.
 

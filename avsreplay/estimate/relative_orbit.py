@@ -12,15 +12,14 @@ gradient torque is neglected.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.estimate.params import EstimatorParams
 from avsreplay.geometry import Array
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class RelativeOrbit:
     """The camera's circular orbit.
 
@@ -52,7 +51,7 @@ class RelativeOrbit:
         return OrbitArc(self, t_ns)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class OrbitArc:
     """An orbit from the instant ``start_ns`` on."""
 

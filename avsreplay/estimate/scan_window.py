@@ -16,6 +16,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.batch_covariance import SPHERE
 from avsreplay.estimate.driven import DrivenBelief, driven_steps
@@ -63,7 +64,7 @@ class ChangePriors:
     half_angle: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Explanation:
     """A hypothesis with its most likely parameters.
 
@@ -94,7 +95,7 @@ class Explanation:
         return self.chi2 < EXPLAINED * self.dof
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Window:
     """Innovations y (6n,) about the trajectory predicted from the belief before the window.
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Prior
 from avsreplay.estimate.dynamics import propagate_state, rotation_path
 from avsreplay.estimate.error_state import DMU, VARRHO
@@ -36,14 +37,13 @@ _TURN_WITHIN_RAD = 0.2  # largest change of the other rotations if a rotation th
 _ALIKE = 0.966  # cosine of 15 deg, between motions that count as the same
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class SensorBias:
     """An error of the sensor in effect.
 
     Attributes:
         offset: (6,) of the measured poses in {A} at its onset: position [m] and half angle.
-        P: (6, 6) its covariance.
-        last: the last scan with this error.
+        P: (6, 6) its covariance.  last: the last scan with this error.
     """
 
     offset: Array
@@ -51,7 +51,7 @@ class SensorBias:
     last: Epoch
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Epoch:
     """A scan as the estimator received it: the track before it (without history), its prediction and innovation."""
 
@@ -207,7 +207,7 @@ def motion_covariance(d: Array, q_bc: Array) -> Array:
     return np.asarray(E @ E.T)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Prediction:
     """The prior at the instant of a scan.
 

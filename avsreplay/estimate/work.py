@@ -9,9 +9,11 @@ later ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import Enum
 from typing import Any, Generic, TypeVar
+
+from avsreplay.errors import value_class
 
 T = TypeVar("T")
 Parts = Generator[int, None, T]
@@ -76,7 +78,7 @@ class ComputationKind(Enum):
     DRIFT = "drift"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Computation:
     """A computation that a track carries on, and what its result changes.
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay.binary_files import BadFile
+from avsreplay.errors import value_class
 
 _TYPES = {
     "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
@@ -40,7 +41,7 @@ class _Element:
         return all(p.count is None for p in self.properties)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Ply:
     """The content of a PLY file.
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import MeasuredPose
 from avsreplay.log.bytes_io import BadMessage
 from avsreplay.log.cdr import Cursor
@@ -63,7 +64,7 @@ class Layout:
         return np.ndarray(self.shape, self.order + field.kind, self.data, field.offset, strides)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Cloud:
     """A decoded cloud: finite points (n, 3) [m] in ``frame``, their times [s] after the stamp and intensities, or None.
 

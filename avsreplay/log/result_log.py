@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from pathlib import Path
 from typing import Any
 
 from numpy.typing import NDArray
 
-from avsreplay.errors import UnreadableInput
+from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.log.cdr import Packer, point_cloud2, pose_stamped, transform
 from avsreplay.records import Surface
@@ -45,7 +45,7 @@ _FLOAT64 = struct.Struct("<xBxxd")  # encapsulation of little-endian CDR, then t
 _INFO, _WARN = 20, 30  # levels of rcl_interfaces/msg/Log
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class ResultFrame:
     """The content of the result log for one scan.
 

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import BLOCKS, Alignment, AlignStatus, Belief, Innovation, Reason, ScanStatus, Verdict
 from avsreplay.settings import Settings, setting
@@ -38,7 +39,7 @@ _WORDS: Mapping[str, str] = {
 }
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Gramian:
     """The Gramian so far.
 

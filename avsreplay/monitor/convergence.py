@@ -15,6 +15,7 @@ from enum import Enum
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
 from avsreplay.records import BLOCKS, Belief, Forecast, Innovation
 from avsreplay.settings import Settings, given, setting
@@ -204,7 +205,7 @@ def violations(
     return tuple(found)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class ConsistencyTrack:
     """Whitened innovations L^-1 alpha of the last healthy epochs, (n, 6), oldest first.
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.plan import _cone
 from avsreplay.plan.attitude import Turn, turn_time, turn_to, with_turn, without_turn
@@ -65,7 +66,7 @@ class Miss:
         return self.distance_m <= tolerance.position_m and self.speed_mps <= tolerance.speed_mps and angle
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Execution:
     """Result of a simulated approach.
 

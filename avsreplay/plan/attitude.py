@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan import _cone
@@ -31,7 +32,7 @@ Attitude = Callable[[Array], Array]
 """Times (n,) [s] -> quaternions (n, 4) that take coordinates of a body to {A}."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Turn:
     """A turn of the gripper; afterwards it follows the fixture.
 

@@ -14,13 +14,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.plan import _cone
 
 Index = NDArray[np.signedinteger[Any]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class PointRows:
     """Scalar rows c.(r - origin) + rate (h/h_ref - 1) of the robot's position at given instants.
 
@@ -43,7 +44,7 @@ class PointRows:
     lead: Array | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Subproblem:
     """Least end time near a reference. Lengths in metres, times in seconds.
 
@@ -81,7 +82,7 @@ class Subproblem:
     cones: tuple[tuple[int | Index, PointRows], ...] = ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Solution:
     """Solution of a subproblem: interval length h [s], thrust u (n, 3) [m/s2] and the slack [m]."""
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan import _cone
@@ -30,7 +31,7 @@ TOWARD_AXIS = 2.0  # weight of the fixture's axis in the direction away from the
 LEAD_BACK = 0.3  # a constraint violated at the start is restored within this fraction of the flight
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class ReferencePath:
     """A path to linearise about: thrust time t [s] and positions (2 n, 3) at the middle and end of every interval."""
 
@@ -194,7 +195,7 @@ def feasible(case: Case, path: StepPath, over: float, allowed: float) -> bool:
     return bool(short and exact and over <= allowed)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Abort:
     """Aborts from instants of a path outside the corridor: the largest acceleration away from the centre of mass.
 

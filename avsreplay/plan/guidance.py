@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import partial
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.arm import Arm
@@ -31,13 +32,12 @@ UNCHANGED = 0.01  # share of the capture tolerance: without a measurement, a pla
 _CLOSING = (Action.APPROACH, Action.APPROACH_ON_PREDICTION, Action.CAPTURE)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class PlannerInput:
     """Input of guidance after a scan.
 
     Attributes:
-        t_ns: Instant of the scan.
-        gamma: 1 if the scan is healthy, else 0.
+        t_ns: Instant of the scan.  gamma: 1 if it is healthy, else 0.
         converged: Whether the estimate may be used for planning.
         scene: The target in {A} after t_ns.
         forecast: Times (n,) [s after t_ns] -> 1 sigma of the grasp point if no further measurement arrives.
@@ -50,7 +50,7 @@ class PlannerInput:
     forecast: Callable[[Array], Forecast]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Segment:
     """A path that begins at ``t_ns`` from r0, v0; before that instant the robot flies the segment ``previous``.
 
@@ -96,7 +96,7 @@ class Segment:
         return self.t_ns + (round(self.path.t_go_s * 1e9) if self.path else 0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class GuidanceState:
     """State of guidance carried from scan to scan.
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.plan.limits import Scene
 from avsreplay.plan.path import RobotPath
@@ -16,7 +16,7 @@ from avsreplay.plan.robot import Limits
 EXACT_M = 1e-9  # an offset within this distance is on an axis [m]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class JointPath:
     """The joints during the last metres of a plan.
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.plan import _cone
 from avsreplay.plan.rendezvous import PlanParams
@@ -25,7 +26,7 @@ THRUST_SHARE = 1.0 - 1e-5  # share of a_max used by the cone programme; the rest
 CONSTRAINTS = ("cone", "corridor", "sphere", "body", "workspace")  # in the order of the columns of ``margins``
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Scene:
     """The target after the instant of planning.
 
@@ -104,7 +105,7 @@ class Scene:
                 raise ValueError(f"keepout_m is {limits.keepout_m}, must be below {most:.3f} to leave the grasp point")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class TargetGeometry:
     """Shape of the target for guidance.
 
@@ -133,7 +134,7 @@ def hull_vertices(vertices: Array) -> Array:
     return vertices
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Margins:
     """Margins of the geometric constraints at n points; a constraint holds where its margin is not negative.
 
@@ -283,7 +284,7 @@ class SampledScene:
         return _cone.spline(times, np.concatenate([self.scene.goal(times)[0], turn], axis=1)), times
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Case:
     """Everything that does not change with the reference.
 

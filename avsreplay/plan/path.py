@@ -8,11 +8,12 @@ equal intervals.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Protocol
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen
 from avsreplay.outcome import Plan
 from avsreplay.plan.reachable_set import integrals
@@ -45,7 +46,7 @@ class RobotPath(Protocol):
         """
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class CostatePath:
     """The robot coasts during the latency and then thrusts along the primer vector (eq:u).
 
@@ -151,7 +152,7 @@ class CostatePath:
         return float(np.max(np.linalg.norm(self.thrust(times), axis=1))) if math.isfinite(self.t_go_s) else math.nan
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class StepPath:
     """The robot thrusts with constant acceleration over each of n equal intervals, as constrained plans do.
 
@@ -263,7 +264,7 @@ def _terminal_errors(path: RobotPath, goal: Trajectory) -> tuple[float, float]:
     return float(np.linalg.norm(rho[0] - r[0])), float(np.linalg.norm(rate[0] - v[0]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class SampledGoal:
     """Difference between the goal and a coasting robot on a grid of thrust times, interpolated by cubic Hermite pieces.
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan, PlanStatus
 from avsreplay.plan.path import CostatePath, SampledGoal, sample_goal
@@ -62,7 +63,7 @@ class PlanParams(Settings):
             raise ValueError(f"latency_s is {self.latency_s}, must be below horizon_s = {self.horizon_s}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class _Search:
     """End of the certified steps: no capture before ``t``; if ``reached``, a capture at ``t`` to rounding."""
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.outcome import Plan
 from avsreplay.plan.limits import Scene, in_fixture_axes, margins
@@ -101,7 +102,7 @@ def _text(band: Band, scale: float, unit: str, digits: int) -> str:
     return f"mean {mean} {unit}, 5-95 % {p05} to {p95} {unit}"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Disturbance:
     """Errors of the thrust: accelerations that are constant over each second, normal, independent between the axes.
 

@@ -16,11 +16,11 @@ are read several times, one by one: memory holds thinned views and the full poin
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from avsreplay.errors import UnreadableInput
+from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.fusion import (
     MISSED,
@@ -77,7 +77,7 @@ MOST_FUSED = 150  # scans whose points are averaged; more are thinned evenly
 Scans = Callable[[], Iterable[Scan]]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Assembly:
     """Views that agree with one another.
 

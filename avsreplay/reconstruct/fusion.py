@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
 
+from avsreplay.errors import value_class
 from avsreplay.estimate.chart import to_chart, to_state
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.registration import PAIR_POINTS, SAME_SIDE, Pairing, moved, registered
@@ -252,7 +253,7 @@ def refuted(missed: Array) -> bool:
     return tail < FALSE_ALARM
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Sight:
     """The view of a scan: points (n, 3) and position of the camera in {A} [m], and its pose."""
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from avsreplay import geometry
-from avsreplay.errors import MissingBackend, UnreadableInput, UsageError
+from avsreplay.errors import MissingBackend, UnreadableInput, UsageError, value_class
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.reconstruct.fusion import Sight
 from avsreplay.reconstruct.tracking import FreeMotion
@@ -26,7 +26,7 @@ FEWEST_IN_REGION = 10  # least number of points of a region
 FEWEST_EMPTY = 3.0  # least number of scans without a return from a surface that they faced
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Reconstruction:
     """A model made from scans.
 
@@ -215,7 +215,7 @@ class Region:
     deviation_m: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Deviations:
     """Distances of a reconstructed surface from a CAD model.
 

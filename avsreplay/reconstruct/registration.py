@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.reconstruct.views import ScanView, sight_lines
 from avsreplay.register.size import normal_jacobian
@@ -26,7 +26,7 @@ FEWEST_COMMON = 30  # points that two scans must share to be compared
 FINE_STARTS = 6  # poses of a search that are registered with all points
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Patchwork:
     """The model so far: points (n, 3) [m] and unit normals (n, 3) in {C}, with a search tree over the points."""
 
@@ -35,7 +35,7 @@ class Patchwork:
     tree: Any
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Match:
     """A registered scan.
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.estimate.batch import Problem
 from avsreplay.estimate.chart import Chart, to_errors
 from avsreplay.estimate.dynamics import propagate_state
@@ -27,7 +28,7 @@ MOTION_SHARE = 0.7  # share of the poses that must agree with it
 MOTION_RMS = 0.01  # largest deviation of these on the surface, as a share of the extent
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class FreeMotion:
     """One torque-free and force-free motion of a rigid body through poses.
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Scan
 from avsreplay.register.surface_index import kernel_module
@@ -23,7 +23,7 @@ SIDES = np.array([0.61, 0.53, 0.59])  # the two sides of a thin wall have normal
 FAR_OF_EXTENT = 0.6  # a scan whose centroid is farther than this from the origin of {A} was taken from the origin
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class ScanView:
     """A scan thinned for registration.
 
@@ -43,7 +43,7 @@ class ScanView:
     rays: Any
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Survey:
     """Result of one pass over a log.
 
@@ -60,7 +60,7 @@ class Survey:
     timed: bool
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Twist:
     """Motion of the target during a scan: pose at the stamp, rate w_c (3,) [rad/s], velocity v_a (3,) [m/s] of {C}."""
 

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from avsreplay.errors import MissingBackend, UsageError
+from avsreplay.errors import MissingBackend, UsageError, value_class
 from avsreplay.geometry import MeasuredPose, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register.surface_index import IcpParams, SurfaceIndex
@@ -43,7 +43,7 @@ FIXED_WORK = 11_000  # fixed cost of the quality of a pose, in point searches
 ALIGN_WORK, WITHIN_WORK = (60_000, 25), (40_000, 18)  # most of an alignment and per point, also with a fixed gate
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Target:
     """What a back end is built from.
 

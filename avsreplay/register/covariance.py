@@ -37,7 +37,7 @@ The sums run over patches in C++ (``kernel/systematic.cpp``, ``kernel/covariance
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import lru_cache
 from statistics import NormalDist
 from typing import Any
@@ -46,6 +46,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
 
@@ -58,7 +59,7 @@ RAY_STEPS, GRAZING, ON_SURFACE = (
 )  # steps along a ray to the model; least cosine; distance over the extent
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Evidence:
     """Sums over the inliers at a pose, by patches of the model; all in {C}.
 
@@ -94,7 +95,7 @@ class Evidence:
         return replace(self, **{name: getattr(self, name)[keep] for name in names[names.index("counts") :]})
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Systematic:
     """Errors of a scan that the sandwich estimate over patches does not contain.
 

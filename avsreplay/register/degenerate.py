@@ -7,11 +7,12 @@ each direction, whatever the size of the target. Directions below ``FREE_BELOW``
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.register.covariance import Evidence
 
@@ -19,7 +20,7 @@ FREE_BELOW = 1e-3  # a motion that moves the rms point by 1 but its surface dist
 AXIS_WITHIN = 0.966  # cosine of 15 deg: a direction nearer than that to an axis is given the name of the axis
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Directions:
     """Observable and unobservable directions of one view.
 

@@ -7,13 +7,14 @@ appears in the residual n . (p_c - c) = J d + noise, J = [p_c x n, n]. Sums over
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import mesh
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Alignment, AlignStatus, Fit, Surface
 from avsreplay.register.covariance import (
@@ -105,7 +106,7 @@ class Visibility:
         return float(np.linalg.norm(outside)) >= clear
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class PoseQuality:
     """The quality of a pose by the kernel; from ``bounded`` on it holds only if ``observable``.
 

@@ -9,13 +9,14 @@ result, then rotations about them. The best pose is found by truncated squared d
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Alignment, AlignStatus, Fit
 from avsreplay.register.backend import FIXED_WORK, Target, healthy_work
@@ -85,7 +86,7 @@ class Budget:
         return not self.exhausted and searches + kept <= self.left
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Restart:
     """A pose T_ca, the distances (k,) [m] of the points used, and their robust noise [m]."""
 

@@ -20,13 +20,14 @@ Renault, J. Applied Econometrics 8, 1993).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.register.covariance import noise_along
 from avsreplay.register.surface_index import SurfaceIndex, kernel_module
@@ -46,7 +47,7 @@ OBSERVABLE = 0.05  # an amplitude that the pose and the size explain to all but 
 CAUCHY, CAUCHY_VARIANCE = 2.0, 1.56  # width of the weights in standard deviations; variance over the weighted one
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class SizeError:
     """Size of the target estimated from one scan.
 
@@ -92,7 +93,7 @@ def size_error(index: SurfaceIndex, points: NDArray[Any], T_ca: Pose, camera_c: 
     return both if both.significant else None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class _Rows:
     """The weighted rows of the last round, and the result.
 

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from avsreplay.errors import MissingBackend, UsageError
+from avsreplay.errors import MissingBackend, UsageError, value_class
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
 from avsreplay.register import index_cache
@@ -64,7 +64,7 @@ class IcpParams(Settings):
             raise ValueError(f"n_plane is {self.n_plane}, must not exceed n_max = {self.n_max}")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Closest:
     """Closest points of n queries: foot (n, 3) [m], d2 (n,) squared distance [m^2], id (n,) face or point, normal."""
 
@@ -74,7 +74,7 @@ class Closest:
     normal: Array
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class IcpResult:
     """Result of the ICP loop.
 
@@ -101,7 +101,7 @@ class IcpResult:
     matches: Any = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class NormalEquations:
     """Point-to-plane sums at a pose, for d = [theta; v] in {C} with T_ac_true = T_ac @ Exp(d).
 
@@ -122,7 +122,7 @@ class NormalEquations:
     ignored: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class PatchSums:
     """Sums over the inliers at a pose by patches of the model, with J and e as in :class:`NormalEquations`, e negated.
 
@@ -147,7 +147,7 @@ class PatchSums:
     places: Array
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class SurfaceIndex:
     """An indexed surface. Build it with :meth:`build`; it is read-only and may be shared by threads.
 

@@ -17,6 +17,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array
 from avsreplay.records import State, Surface
 from avsreplay.report import Summary, charts
@@ -230,7 +231,7 @@ def _overlaid(runs: Sequence[ComparedRun], columns: Sequence[charts.Columns]) ->
     return out
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Flight:
     """A planned flight in {C}.
 

@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 from decimal import ROUND_DOWN, Decimal
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from avsreplay.binary_files import read_limited
-from avsreplay.errors import UnreadableInput, UsageError
+from avsreplay.errors import UnreadableInput, UsageError, value_class
 from avsreplay.geometry import Array, Pose, bounding_diagonal
 from avsreplay.records import Label, State, Surface
 from avsreplay.report import Summary
@@ -33,7 +33,7 @@ _RUN_AGAIN = "the result is not as a run wrote it: run again"
 _MAX_TUM, _LEAST, _LARGEST, _UNIT, _LONGEST_S = 512 << 20, 1e-12, 1e15, 1e-3, 9_000_000_000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Result:
     """The result of a run as read from its directory.
 

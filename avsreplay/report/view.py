@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from avsreplay import geometry
 from avsreplay.binary_files import read_npz
-from avsreplay.errors import UnreadableInput
+from avsreplay.errors import UnreadableInput, value_class
 from avsreplay.files import output_path
 from avsreplay.geometry import Array, Pose
 from avsreplay.records import Surface
@@ -38,7 +37,7 @@ Floats = NDArray[np.float32]
 Faces = NDArray[np.int32]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class CloudView:
     """Some points of scan ``seq``: (n, 3) in {A} [m], distances to the model (n,) [m] and intensities (n,) or None."""
 
@@ -48,7 +47,7 @@ class CloudView:
     intensity: Floats | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class PathView:
     """A planned path: time of planning, (n, 3) positions in {A} [m], distance to the true grasp point [m]."""
 
@@ -57,7 +56,7 @@ class PathView:
     miss_m: float | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class View:
     """Model (vertices (n, 3) in {C} [m], faces (m, 3), possibly none), clouds and paths."""
 

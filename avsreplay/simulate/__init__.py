@@ -7,10 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Pose
 from avsreplay.records import LogHeader, Scan, ScanStatus, State, Surface, Truth
 from avsreplay.simulate import faults
@@ -37,7 +38,7 @@ _NAMES = "motion", "start", "noise", "fault", "plate", "camera", "camera_pose", 
 _STREAMS = {name: k for k, name in enumerate(_NAMES)}
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Simulation:
     """A simulated log.
 

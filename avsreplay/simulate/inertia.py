@@ -8,19 +8,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from avsreplay import geometry
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, frozen
 from avsreplay.mesh import is_closed
 from avsreplay.records import Surface
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Body:
     """Mass properties of a rigid body.
 

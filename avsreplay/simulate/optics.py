@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, setting
@@ -57,7 +57,7 @@ class Material(Settings):
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class FaceOptics:
     """Optical properties of the faces of a surface, each (m,).
 
@@ -168,7 +168,7 @@ def face_groups(surface: Surface) -> list[frozenset[str]]:
     return [names[int(k)] for k in np.asarray(nearest)]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class TracedRays:
     """Rays cast on surfaces.
 

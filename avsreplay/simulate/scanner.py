@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from avsreplay.errors import value_class
 from avsreplay.geometry import Array, frozen, rotate
 from avsreplay.records import Surface
 from avsreplay.simulate.motion import Motion
@@ -33,7 +34,7 @@ from avsreplay.simulate.rays import Engine, Pattern, RayCaster, ScannerParams, r
 from avsreplay.simulate.scene import Appendage, Limb, MovingCamera, Plume, SceneBody, appendage_faces
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Returns:
     """The returns of a scan.
 

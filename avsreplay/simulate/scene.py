@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from avsreplay import geometry
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Label, Surface
 from avsreplay.settings import Settings, is_unit, setting
@@ -261,7 +261,7 @@ class CameraParams(Settings):
     pose_std_deg: float = setting(0.0, "1 sigma of the attitude that it reports, each axis.", unit="deg", low=0.0)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class MovingCamera:
     """A moving camera: its parameters and the phases (6,) of its vibration [rad]."""
 
@@ -289,7 +289,7 @@ class MovingCamera:
         return Pose(geometry.multiply(true.q, error), true.t + p.pose_std_m * rng.standard_normal(3))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class SceneBody:
     """An object with its surface, ready for ray casting."""
 

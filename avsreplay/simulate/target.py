@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from avsreplay import geometry
-from avsreplay.errors import UsageError
+from avsreplay.errors import UsageError, value_class
 from avsreplay.geometry import Array, Pose, frozen
 from avsreplay.records import Surface
 from avsreplay.settings import Settings, is_unit, setting
@@ -136,7 +136,7 @@ def _at(x: float, y: float, z: float, roll: float = 0.0, pitch: float = 0.0, yaw
     return Pose(geometry.multiply(turns[2], geometry.multiply(turns[1], turns[0])), np.array([x, y, z]))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@value_class
 class Solid:
     """A closed triangle surface.
 
