@@ -85,11 +85,11 @@ void apply(const Store& s, const Step& step, double* T) {
 // Where feet pass from one primitive to another, the sum curves less than on each of them, so that a Newton step is a
 // fixed share of the way and the next ones have its direction. Broyden's update of the inverse of the derivative, from the
 // last step alone, corrects this. Where such a step fails, the Newton step is made in its place.
+//
+// The sum is not continuous where a face turns away from the camera. A rise that no curvature explains is such a jump, and
+// does not count against a step, except the third in an alignment, so that steps cannot lead back and forth for ever.
 class Newton {
  public:
-  // `extends`: to the fixed point of all points; that of a part of them need not be exact.
-  explicit Newton(bool extends) : extends_(extends) {}
-
   struct Choice {
     Step step;
     bool undo;     // go back to the pose before the last step first
@@ -101,7 +101,7 @@ class Newton {
     const Step horn = horn_step(sums);
     const double cost = sums.v[1] + outside * gate * gate;
     const bool comparable = used_ && gate == gate_;
-    if (comparable && !(cost < cost_)) return instead();
+    if (comparable && !(cost < cost_) && !is_jump(cost - cost_)) return instead();
     if (used_) longest_ *= LONGER;
     const bool second = used_;
     used_ = extended_ = false, gate_ = gate, cost_ = cost, horn_ = horn;
@@ -111,7 +111,7 @@ class Newton {
     if (plain_.turn < eps_rad && plain_.move < eps_m && plain_.length < longest_) return {horn, false, true, plain_};
     Step step = plain_;
     used_ = true, extended_ = extend(motion, second) && to_step(motion, most, step);
-    length_ = step.length;
+    length_ = step.length, slope_ = motion.slope;
     return {step, false, false, step};
   }
 
@@ -119,6 +119,11 @@ class Newton {
   static constexpr double SHORTER = 0.25, LONGER = 2.0;
   static constexpr double LEAST_SHARE = 0.35;  // of the way that a Newton step is taken to be
   static constexpr double LEAST_COSINE = 0.7;  // between a Newton step and the last step
+  static constexpr double FARTHEST = 2.0;      // an extended step over the last one
+  static constexpr double JUMP = 4.0;          // a rise over the slope of the Newton step, with six times its curvature
+  static constexpr int MOST_JUMPS = 2;
+
+  bool is_jump(double rise) { return rise > JUMP * slope_ && jumps_++ < MOST_JUMPS; }
 
   // What is done in place of a step that raised the sum.
   Choice instead() {
@@ -131,8 +136,8 @@ class Newton {
     return {horn_, true, false, horn_};
   }
 
-  // Broyden's step from the Newton step and the last step, where both have about the same direction and it is not longer
-  // than the last one. Returns whether it was taken.
+  // Broyden's step from the Newton step and the last step, where both have about the same direction; no longer than the last
+  // one, or than twice the last one where that had the direction of the step before it. Returns whether it was taken.
   bool extend(Motion& motion, bool second) {
     double now[6], step[6], along = 0, share = 0, made = 0, newton = 0, length = 0;
     for (int i = 0; i < 6; ++i) {
@@ -142,18 +147,23 @@ class Newton {
     }
     const double factor = along / std::max(share, LEAST_SHARE * made);
     for (int i = 0; i < 6; ++i) step[i] = now[i] + factor * (made_[i] - newton_[i] + now[i]), length += step[i] * step[i];
-    const bool taken = extends_ && second && along > LEAST_COSINE * std::sqrt(made * newton) && share < made && !(length > made);
+    const double most = FARTHEST * FARTHEST * made, shorter = length > most ? std::sqrt(most / length) : 1;
+    const bool same = second && along > LEAST_COSINE * std::sqrt(made * newton) && share < made;
+    in_line_ = same ? in_line_ + 1 : 0;
+    const bool taken = same && shorter * shorter * length >= newton && (in_line_ > 1 || !(length > made));
+    for (double& x : step) x *= shorter;
     std::copy(now, now + 6, newton_);
     std::copy(taken ? step : now, (taken ? step : now) + 6, made_);
     for (int i = 0; i < 6; ++i) motion.d[i] = made_[i] / (i < 3 ? motion.radius : 1);
     return taken;
   }
 
-  double cost_ = 0, gate_ = 0, length_ = 0, longest_ = worst();
+  double cost_ = 0, gate_ = 0, length_ = 0, slope_ = 0, longest_ = worst();
   double newton_[6] = {}, made_[6] = {};  // the last Newton step and the step made, turns in units of length
   Step horn_{}, plain_{};
   bool used_ = false, extended_ = false;
-  const bool extends_;
+  int jumps_ = 0;    // rises that did not count
+  int in_line_ = 0;  // successive steps with about the direction of the step before
 };
 
 // Every n / m-th point of a scan, at a place within its n / m points that follows no pattern of rows and columns.
@@ -176,7 +186,7 @@ class Passes {
 
   // `few`: the points are a part of the scan. Returns whether there were inliers to the end.
   bool run(const View& v, Memory& memory, bool plane, bool few) {
-    Newton newton(!few);
+    Newton newton;
     double before[12];
     const int most = few ? rule_.n_max / 2 : rule_.n_max, last_plane = o_.passes + rule_.n_plane;
     while (o_.passes < most && o_.work() < most_work() && !o_.converged) {

@@ -1,5 +1,6 @@
 #include "step.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <cstring>
 
@@ -107,7 +108,7 @@ Step horn_step(const Sums& sums) {
 bool plane_step(const Sums& sums, double longest, Step& s) {
   const double* a = sums.v;
   const double c[3] = {a[4] / a[0], a[5] / a[0], a[6] / a[0]};
-  Motion m{{}, {c[0], c[1], c[2]}, 0};
+  Motion m{{}, {c[0], c[1], c[2]}, 0, 0};
   double H[6][6];
   int k = 7;
   for (int i = 0; i < 6; ++i)
@@ -122,6 +123,7 @@ bool newton_motion(const Sums& sums, Motion& m) {
   // - gradient = [sum p x foot; sum foot - p].
   m = {{a[15] - a[17], a[16] - a[12], a[11] - a[13], a[7] - a[4], a[8] - a[5], a[9] - a[6]},
        {a[4] / a[0], a[5] / a[0], a[6] / a[0]},
+       0,
        0};
   double H[6][6];
   int k = 19;
@@ -135,7 +137,11 @@ bool newton_motion(const Sums& sums, Motion& m) {
   for (int i = 0; i < 3; ++i) H[3 + i][3 + i] += w;
   H[3][1] += p[2], H[3][2] -= p[1], H[4][0] -= p[2], H[4][2] += p[0], H[5][0] += p[1], H[5][1] -= p[0];
   shift(H, m.d, m.centre);
-  return solve6(H, m.d, m.radius);
+  double downhill[6];
+  std::copy(m.d, m.d + 6, downhill);
+  if (!solve6(H, m.d, m.radius)) return false;
+  for (int i = 0; i < 6; ++i) m.slope += downhill[i] * m.d[i];
+  return true;
 }
 
 bool to_step(Motion m, double longest, Step& s) {

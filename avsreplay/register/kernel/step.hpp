@@ -17,9 +17,9 @@ Step horn_step(const Sums& sums);
 // no inlier is expected to move farther [m].
 bool plane_step(const Sums& sums, double longest, Step& step);
 
-// d = [turn; shift] about `centre`; a turn times `radius` is a length.
+// d = [turn; shift] about `centre`; a turn times `radius` is a length. `slope`: derivative of half the cost along -d.
 struct Motion {
-  double d[6], centre[3], radius;
+  double d[6], centre[3], radius, slope;
 };
 // One Newton step of the sum of squared distances of the inliers, whose stationary points are the fixed points of Horn's
 // iteration: the gradient from Horn's moments, the second derivative from each foot's face, edge or vertex. False where
