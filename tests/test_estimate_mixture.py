@@ -97,6 +97,22 @@ def test_in_a_spin_no_pose_makes_a_future_instant_less_certain() -> None:
     assert rises[:, 1].max() > 1.02  # with a point of linearisation that follows the mean
 
 
+def test_the_forecast_of_a_mixture_has_its_second_moments() -> None:
+    x, P = body(4)
+    here, times, off = to_chart(x), np.array([0.0, 1.0, 30.0]), np.zeros(20)
+    alone = mixture_forecast((Component(1.0, 1.0, 0, here, P),), 0, times, *NOISE)
+    T = to_errors(here)
+    expected = dynamics.grasp_forecast(Belief(0, x, T @ P @ T.T), times, *NOISE)
+    for found, wanted in ((alone.pos_1s_m, expected.pos_1s_m), (alone.vel_1s_mps, expected.vel_1s_mps)):
+        assert found == pytest.approx(wanted, rel=1e-9)
+    assert alone.rot_1s_rad == pytest.approx(expected.rot_1s_rad, rel=1e-9)
+    off[9] = 0.01  # m/s
+    pair = tuple(Component(0.5, 0.5, 0, here.moved(side * off), P) for side in (1.0, -1.0))
+    both = mixture_forecast((replace(pair[0], weight=0.0, chart=here), *pair), 0, times, *NOISE)
+    assert both.pos_1s_m**2 == pytest.approx(alone.pos_1s_m**2 + (0.01 * times) ** 2, rel=1e-9)
+    assert both.vel_1s_mps**2 == pytest.approx(alone.vel_1s_mps**2 + 1e-4, rel=1e-9)
+
+
 def test_volumes_are_those_of_the_conditional_covariances() -> None:
     rng = np.random.default_rng(2)
     P = [A @ A.T for A in rng.normal(size=(3, 20, 20))]

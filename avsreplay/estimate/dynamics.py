@@ -272,11 +272,12 @@ def grasp_forecast(belief: Belief, times_s: Array, torque: float, force: float) 
     Raises:
         ValueError: times that do not ascend from 0.
     """
-    times = ascending(times_s)
-    predicted = grasp_prediction(belief, times, torque, force)
-    if predicted is None:
+    times, x = ascending(times_s), belief.x
+    if max(map(abs, x.w_b.tolist())) * float(times.max(initial=0.0)) > MOST_RAD:
         return Forecast(times, *np.full((3, len(times)), np.inf))
-    return forecast_of(times, predicted[0])
+    P, density = np.ascontiguousarray(belief.P), torque_density(x.sigma, torque)
+    state = x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc
+    return forecast_of(times, _motion.forecast(*state, P, density, force**2, times))
 
 
 def ascending(times_s: Array) -> Array:
@@ -291,25 +292,6 @@ def forecast_of(times_s: Array, variances: Array) -> Forecast:
     """Return the 1 sigma of variances (n, 3) of position [m], velocity [m/s] and half angle; rounding below 0 is 0."""
     position, velocity, half_angle = np.sqrt(np.maximum(variances, 0.0)).T
     return Forecast(times_s, position, velocity, 2.0 * half_angle)
-
-
-def grasp_prediction(belief: Belief, times_s: Array, torque: float, force: float) -> tuple[Array, Array] | None:
-    """Variances (n, 3) of the grasp point's position, velocity and half-angle attitude, and its motion (n, 10).
-
-    The motion is position [m], velocity [m/s] in {A}, and attitude q_ac. The result is None where the target would turn
-    by more than ``MOST_RAD``.
-
-    Args:
-        belief: mean and covariance now.
-        times_s: (n,) >= 0, ascending [s after now].
-        torque: root density of the angular disturbance [rad/s^1.5].
-        force: root density of the linear disturbance [m/s^1.5].
-    """
-    x = belief.x
-    if max(map(abs, x.w_b.tolist())) * float(times_s.max(initial=0.0)) > MOST_RAD:
-        return None
-    P, density = np.ascontiguousarray(belief.P), torque_density(x.sigma, torque)
-    return _motion.forecast(x.q_ab, x.w_b, x.r_a, x.v_a, x.sigma, x.c_b, x.q_bc, P, density, force**2, times_s)
 
 
 def pose_rows(x: State, times_s: Array, arc: OrbitArc | None = None) -> Array:

@@ -19,11 +19,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from avsreplay import geometry
 from avsreplay.errors import value_class
 from avsreplay.estimate import _motion
 from avsreplay.estimate.chart import Chart, separated, to_chart, to_errors, to_state
-from avsreplay.estimate.dynamics import forecast_of, grasp_prediction, torque_density, translation
+from avsreplay.estimate.dynamics import MOST_RAD, forecast_of, torque_density, translation
 from avsreplay.estimate.error_state import DIM, rotation
 from avsreplay.estimate.noise import BOUND, cholesky_root
 from avsreplay.estimate.relative_orbit import RelativeOrbit
@@ -57,19 +56,6 @@ class Component:
     share: float = 1.0
     reference: Chart | None = None
 
-    @property
-    def about(self) -> Belief:
-        """The motion about which the component is linearised, and the covariance of its error states."""
-        return _in_errors(self.t_ns, self.reference or self.chart, self.P)
-
-
-def _in_errors(t_ns: int, chart: Chart, P: Array) -> Belief:
-    """A chart as a state, and its covariance P (20, 20) in chart steps as that of the error states."""
-    chart = separated(chart, P)
-    T = to_errors(chart)
-    P = T @ P @ T.T
-    return Belief(t_ns, to_state(chart), 0.5 * (P + P.T))
-
 
 def moments(components: tuple[Component, ...]) -> Belief:
     """Mean and second moments about it: the mean of the first component, and what the weights have moved it since."""
@@ -78,7 +64,10 @@ def moments(components: tuple[Component, ...]) -> Belief:
 
 @lru_cache(maxsize=4)
 def _belief(joined: Component) -> Belief:
-    return _in_errors(joined.t_ns, joined.chart, joined.P)
+    chart = separated(joined.chart, joined.P)
+    T = to_errors(chart)
+    P = T @ joined.P @ T.T
+    return Belief(joined.t_ns, to_state(chart), 0.5 * (P + P.T))
 
 
 @lru_cache(maxsize=4)
@@ -236,19 +225,22 @@ def mixture_forecast(
         force: root density of the linear disturbance [m/s^1.5].
     """
     times = np.asarray(times_s, dtype=np.float64)
-    ahead, total = times + (t_ns - components[0].t_ns) * 1e-9, np.zeros((len(times), 3))
-    published = grasp_prediction(moments(components), ahead, 0.0, 0.0)
-    for component in components:
-        predicted = grasp_prediction(component.about, ahead, torque, force)
-        moved = grasp_prediction(_in_errors(t_ns, component.chart, component.P), ahead, 0.0, 0.0)
-        if published is None or predicted is None or moved is None:
-            return Forecast(times, *np.full((3, len(times)), np.inf))
-        variances, motion, centre = predicted[0], moved[1], published[1]
-        position, velocity = ((motion[:, k : k + 3] - centre[:, k : k + 3]) for k in (0, 3))
-        turn = geometry.multiply(geometry.conjugate(centre[:, 6:]), motion[:, 6:])[:, :3]
-        off = np.stack([(d * d).sum(axis=1) for d in (position, velocity, turn)], axis=1)
-        total += component.weight * (variances + off)
-    return forecast_of(times, total)
+    ahead, published = times + (t_ns - components[0].t_ns) * 1e-9, _joined(components)
+    about = [separated(c.reference or c.chart, c.P) for c in components]
+    fastest = max(float(np.abs(chart.w_c).max()) for chart in (*about, *(c.chart for c in components), published.chart))
+    if fastest * float(ahead.max(initial=0.0)) > MOST_RAD:
+        return Forecast(times, *np.full((3, len(times)), np.inf))
+    moments = _motion.mixture_forecast(
+        np.array([c.chart.flat for c in components]),
+        np.array([chart.flat for chart in about]),
+        np.array([c.P for c in components]),
+        np.array([c.weight for c in components]),
+        np.array([torque_density(_motion.state(chart.flat)[4], torque) for chart in about]),
+        separated(published.chart, published.P).flat,
+        force**2,
+        ahead,
+    )
+    return forecast_of(times, moments)
 
 
 def contradicted(belief: Belief, fitted: Belief) -> bool:

@@ -133,13 +133,13 @@ Numpy chart_from(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, 
   return flat(chart_of(state_from(q_ab, w, r, v, sigma, c, q_bc)));
 }
 
-// Per instant: variances of position, velocity and half-angle attitude; position, velocity and attitude q_ac.
-nb::tuple forecast_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
-                      const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Matrix<DIM, DIM>& P,
-                      const Three& torque, double force, const Times& times) {
+// Per instant: variances of position, velocity and half-angle attitude.
+Numpy forecast_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>& r, const Vector<3>& v,
+                  const Vector<2>& sigma, const Vector<3>& c, const Vector<4>& q_bc, const Matrix<DIM, DIM>& P,
+                  const Three& torque, double force, const Times& times) {
   const size_t n = times.shape(0);
-  double *variances, *motion;
-  Numpy first = array({n, 3}, &variances), second = array({n, 10}, &motion);
+  double* variances;
+  Numpy out = array({n, 3}, &variances);
   {
     nb::gil_scoped_release release;
     const State x = state_from(q_ab, w, r, v, sigma, c, q_bc);
@@ -151,15 +151,9 @@ nb::tuple forecast_of(const Vector<4>& q_ab, const Vector<3>& w, const Vector<3>
       advance(flow, body, times(k) - t);
       t = times(k);
       forecast(x, as<Square>(P.data()), force, t, flow, variances + 3 * k);
-      const Quad q = quad(flow.at.q), q_ac = q * quad(x.q_bc);
-      const V3 arm = vector(x.c_b), position = vector(x.r_a) + t * vector(x.v_a) + matrix(q) * arm;
-      const V3 velocity = vector(x.v_a) + matrix(q) * cross(vector(flow.at.w), arm);
-      std::memcpy(motion + 10 * k, &position, sizeof position);
-      std::memcpy(motion + 10 * k + 3, &velocity, sizeof velocity);
-      std::memcpy(motion + 10 * k + 6, &q_ac, sizeof q_ac);
     }
   }
-  return nb::make_tuple(first, second);
+  return out;
 }
 
 // The state's seven arrays and P, once a pose has been seen.
@@ -431,6 +425,25 @@ Numpy impulses(const Vector<4>& q0, const Vector<3>& w0, const Three& sigma, con
   return found;
 }
 
+// Per instant, of a mixture: second moments of position, velocity and half-angle attitude about the motion of a chart.
+Numpy mixture_forecast_of(const Matrix<-1, CHART>& charts, const Matrix<-1, CHART>& references,
+                          const Matrix<-1, DIM, DIM>& P, const Vector<-1>& weights, const Matrix<-1, 3>& torque,
+                          const Flat& published, double force, const Times& times) {
+  const size_t count = charts.shape(0), n = times.shape(0);
+  if (references.shape(0) != count || P.shape(0) != count || weights.shape(0) != count || torque.shape(0) != count)
+    throw std::invalid_argument("charts, covariances, weights and densities must be equally many");
+  double* moments;
+  Numpy out = array({n, 3}, &moments);
+  {
+    nb::gil_scoped_release release;
+    mixture_forecast(reinterpret_cast<const Chart*>(charts.data()), reinterpret_cast<const Chart*>(references.data()),
+                     reinterpret_cast<const Square*>(P.data()), weights.data(),
+                     reinterpret_cast<const double(*)[3]>(torque.data()), count, chart(published), force, times.data(), n,
+                     reinterpret_cast<double(*)[3]>(moments));
+  }
+  return out;
+}
+
 nb::tuple join_of(const Matrix<-1, CHART>& charts, const Matrix<-1, DIM, DIM>& P, const Vector<-1>& weights,
                   const Vector<-1>& quadrature) {
   const size_t n = charts.shape(0);
@@ -481,6 +494,8 @@ NB_MODULE(_motion, m) {
         nb::arg("colour"));
   m.def("forecast", &forecast_of, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),
         nb::arg("c_b"), nb::arg("q_bc"), nb::arg("P"), nb::arg("torque"), nb::arg("force"), nb::arg("times"));
+  m.def("mixture_forecast", &mixture_forecast_of, nb::arg("charts"), nb::arg("references"), nb::arg("P"),
+        nb::arg("weights"), nb::arg("torque"), nb::arg("published"), nb::arg("force"), nb::arg("times"));
   m.def("change", &change_of, nb::arg("Phi"), nb::arg("P"), nb::arg("H"), nb::arg("alpha"), nb::arg("S"), nb::arg("R"),
         nb::arg("colour"), nb::arg("one_sigma"), nb::arg("scale"), nb::arg("share"));
   m.def("chart", &chart_from, nb::arg("q_ab"), nb::arg("w_b"), nb::arg("r_a"), nb::arg("v_a"), nb::arg("sigma"),

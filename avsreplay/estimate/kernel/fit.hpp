@@ -89,7 +89,8 @@ void translate(State& x, const double path[6][6]);
 void transition(Chart& chart, double h, const double path[6][6], const double* torque_density, double force_density,
                 Square F, double (*Q)[MOTION]);
 
-// A Gaussian in chart steps h seconds later, corrected by a pose there, whose time does not matter. `told`: chi-square of
+// A Gaussian h seconds later, corrected by a pose there, whose time does not matter. P is in steps of `base`, along
+// which the Jacobians are taken; `chart` is its mean. `told`: chi-square of
 // the pose and log determinant of its covariance, both before the correction and relative to the noise of the pose.
 void carry(Chart& chart, Chart& base, Square P, double h, const double path[6][6], const double torque_density[3],
            double force_density, const Measured& pose, const double factors[2], double weight, double told[2]);
@@ -101,5 +102,11 @@ Body body_of(const State& x, double join[3][2]);
 // Variances of the grasp point's position, velocity and half-angle attitude t seconds after the state x with covariance
 // P, `flow` being the rotation since x.
 void forecast(const State& x, const Square P, double force_density, double t, const Flow& flow, double variances[3]);
+
+// Second moments of the grasp point's position, velocity and half-angle attitude about the motion `published`, at n
+// ascending times: of a mixture of `count` charts, each with its weight, and its covariance in steps of `references`.
+void mixture_forecast(const Chart* charts, const Chart* references, const Square* P, const double* weights,
+                      const double (*torque_density)[3], size_t count, const Chart& published, double force_density,
+                      const double* times, size_t n, double (*out)[3]);
 
 }  // namespace avs

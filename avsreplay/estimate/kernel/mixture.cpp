@@ -88,6 +88,34 @@ void evidence(const double off[SEEN], const double H[SEEN][DIM], const Square P,
   out[1] = det > 1 ? log_of(det) : 0;  // of 1 and a positive semidefinite matrix
 }
 
+// Position and velocity in {A} and attitude q_ac of the fixture t seconds after x, when the body has turned to `at`.
+struct Fixture {
+  V3 position, velocity;
+  Quad q;
+};
+
+Fixture fixture(const State& x, double t, const Turn& at) {
+  const V3 arm = vector(x.c_b), v = vector(x.v_a);
+  const M3 A = matrix(quad(at.q));
+  return {vector(x.r_a) + t * v + A * arm, v + A * cross(vector(at.w), arm), quad(at.q) * quad(x.q_bc)};
+}
+
+// The fixture of a chart at each of n ascending times after it.
+std::vector<Fixture> path_of(const Chart& chart, const double* times, size_t n) {
+  const State x = state_of(chart);
+  double join[3][2], t = 0;
+  const Body body = body_of(x, join);
+  Turn turn = turn_of(x);
+  std::vector<Fixture> out;
+  for (size_t k = 0; k < n; t = times[k++]) {
+    avs::advance(turn, body, times[k] - t);
+    out.push_back(fixture(x, times[k], turn));
+  }
+  return out;
+}
+
+double square(const V3& v) { return v.x[0] * v.x[0] + v.x[1] * v.x[1] + v.x[2] * v.x[2]; }
+
 }  // namespace
 
 void errors_transition(const Flow& flow, const double join[3][2], const double path[6][6], Square Phi) {
@@ -173,6 +201,33 @@ void carry(Chart& chart, Chart& base, Square P, double h, const double path[6][6
   evidence(e, HT, P, told);
   pass(y, P, e, HT, none);
   chart = moved(chart, y);
+}
+
+void mixture_forecast(const Chart* charts, const Chart* references, const Square* P, const double* weights,
+                      const double (*torque_density)[3], size_t count, const Chart& published, double force_density,
+                      const double* times, size_t n, double (*out)[3]) {
+  const std::vector<Fixture> centre = path_of(published, times, n);
+  for (size_t k = 0; k < n; ++k) out[k][0] = out[k][1] = out[k][2] = 0;
+  for (size_t i = 0; i < count; ++i) {
+    const std::vector<Fixture> mean = path_of(charts[i], times, n);
+    Square T, errors;
+    errors_of(references[i], T);
+    congruent<DIM>(T, P[i], errors);
+    const State x = state_of(references[i]);
+    double join[3][2], t = 0;
+    Body body = body_of(x, join);
+    std::memcpy(body.push, torque_density[i], sizeof body.push);
+    Flow flow = begin(turn_of(x));
+    for (size_t k = 0; k < n; t = times[k++]) {
+      avs::advance(flow, body, times[k] - t);
+      double variances[3];
+      forecast(x, errors, force_density, times[k], flow, variances);
+      const Quad turn = conjugate(centre[k].q) * mean[k].q;
+      const double apart[3] = {square(mean[k].position - centre[k].position), square(mean[k].velocity - centre[k].velocity),
+                               turn.x * turn.x + turn.y * turn.y + turn.z * turn.z};
+      for (int block = 0; block < 3; ++block) out[k][block] += weights[i] * (variances[block] + apart[block]);
+    }
+  }
 }
 
 }  // namespace avs
