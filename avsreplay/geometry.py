@@ -315,13 +315,13 @@ class Pose:
     @property
     def matrix(self) -> Array:
         """Return the (4, 4) homogeneous matrix T_ab."""
-        rows = zip(_rows(*self.q.tolist()), self.t.tolist(), strict=True)
-        return np.array([*((*row, t) for row, t in rows), (0.0, 0.0, 0.0, 1.0)])
+        (a, b, c), (x, y, z) = _rows(*self.q.tolist()), self.t.tolist()
+        return np.array((*a, x, *b, y, *c, z, 0.0, 0.0, 0.0, 1.0)).reshape(4, 4)
 
     def inverse(self) -> Pose:
         """Return the inverse T_ba."""
-        q_ba = conjugate(self.q)
-        return Pose(q_ba, -rotate(matrix(q_ba), self.t))
+        (x, y, z, w), (u, v, s) = self.q.tolist(), self.t.tolist()
+        return Pose(np.array((-x, -y, -z, w)), np.array([-(a * u + b * v + c * s) for a, b, c in _rows(-x, -y, -z, w)]))
 
     def __matmul__(self, other: Pose) -> Pose:
         """Compose: T_ab @ T_bc = T_ac."""

@@ -199,9 +199,19 @@ def _grouped_units(
 
 
 def _groups(clouds: Sequence[NDArray[Any]], size_m: float) -> list[Array]:
-    """Groups of points of a size, one of a scan; a group that grows with the gap is a part of something larger."""
-    found = [[part_of_size(cloud, size_m, _ONE_SIDE, gap) for gap in _GAPS] for cloud in clouds]
-    return [one for one, two in found if one is not None and two is not None and len(two) < 1.2 * len(one)]
+    """Groups of points of a size, one of a scan; none where less than half of the scans have one.
+
+    A group that grows with the gap is a part of something larger.
+    """
+    found = list[Array]()
+    for k, cloud in enumerate(clouds):
+        if 2 * (k - len(found)) >= len(clouds):
+            return []
+        one = part_of_size(cloud, size_m, _ONE_SIDE, _GAPS[0])
+        two = None if one is None else part_of_size(cloud, size_m, _ONE_SIDE, _GAPS[1])
+        if one is not None and two is not None and len(two) < 1.2 * len(one):
+            found.append(one)
+    return found
 
 
 def _unit_advice(

@@ -93,11 +93,13 @@ class Monitors:
             track: estimate after the scan.
             belief: what is published of it.
         """
-        gramian = self._gramian(state.gramian, estimator, prior, innovation if gamma else None, track)
+        healthy = innovation if gamma else None
+        gramian = self._gramian(state.gramian, estimator, prior, healthy, track)
         rank = monitor.measure(gramian)
         consistency = self.consistency.observe(state.consistency, innovation, gamma)
         window = self.consistency.judge(consistency)
-        failed = self._violations(estimator, prior, innovation if gamma else None, track)
+        found = healthy and estimator.residual_after(track, prior, healthy)
+        failed = violations(track.belief, *found) if found else ()
         consistent = window.consistent and not (track.window.many_outliers or in_doubt(track) or failed)
         forecast = estimator.track_forecast(track, self.convergence.times_s)
         judged = self.convergence.judge(state.convergence, belief, forecast, consistent is True)
@@ -124,13 +126,6 @@ class Monitors:
         if (refitted := estimator.refitted_rows(track)) is not None:
             return monitor.from_trajectory(gramian.scale, *refitted)
         return monitor.observe(gramian, *estimator.gramian_row(track, prior, healthy))
-
-    def _violations(
-        self, estimator: Estimator, prior: Prediction, healthy: Innovation | None, track: Track
-    ) -> tuple[str, ...]:
-        """The consistency checks that the estimate fails after a healthy scan."""
-        found = healthy and estimator.residual_after(track, prior, healthy)
-        return violations(track.belief, *found) if found else ()
 
 
 @value_class
@@ -203,9 +198,11 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     gamma, belief = verdict.gamma, stages.estimator.published(track)
     seen = innovation, gamma, track, belief
     monitors, report = stages.monitors.observe(state.monitors, stages.estimator, prior, *seen)
-    forecast = partial(stages.estimator.track_forecast, track)
-    known = planner_input(stages.estimator, belief, stages.target, gamma, report.converged, forecast)
-    guidance = stages.guidance.step(state.guidance or stages.guidance.initial(scan.t_ns), known)
+    guidance = state.guidance or stages.guidance.initial(scan.t_ns)
+    if guidance.captured_ns is None:
+        forecast = partial(stages.estimator.track_forecast, track)
+        known = planner_input(stages.estimator, belief, stages.target, gamma, report.converged, forecast)
+        guidance = stages.guidance.step(guidance, known)
     outcome = Outcome(
         scan=scan,
         start_ns=state.start_ns,
@@ -230,7 +227,7 @@ def step(stages: Stages, state: PipelineState, scan: Scan) -> tuple[PipelineStat
     )
     pose = measurement.alignment.T_ac if gamma else state.last_pose
     failed = state.failed + (measurement.alignment.points > 0) if pose is None else 0
-    return replace(state, monitors=monitors, guidance=guidance, track=track, last_pose=pose, failed=failed), outcome
+    return PipelineState(monitors, guidance, track, pose, state.origin, state.start_ns, failed), outcome
 
 
 def fold(stages: Stages, state: PipelineState, scans: Iterable[Scan]) -> Iterator[tuple[PipelineState, Outcome]]:
@@ -309,8 +306,8 @@ def _prediction_lost(stages: Stages, scan: Scan, predicted: Prediction) -> bool:
         return False
     variance = np.diag(predicted.H @ predicted.belief.P @ predicted.H.T)
     position, half_angle = 3.0 * np.sqrt(variance[:3].sum()), 3.0 * np.sqrt(variance[3:].sum())
-    position_limit = MAX_POSITION_3S_OF_REACH * stages.registrar.limits.reach_m
-    return bool(position > position_limit or 2.0 * half_angle > MAX_ATTITUDE_3S_RAD)
+    most = MAX_POSITION_3S_OF_REACH * stages.registrar.limits.reach_m
+    return bool(position > most or 2.0 * half_angle > MAX_ATTITUDE_3S_RAD)
 
 
 def _deskewed(stages: Stages, state: PipelineState, scan: Scan, predicted: Prediction) -> NDArray[Any]:

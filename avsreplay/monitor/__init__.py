@@ -114,10 +114,11 @@ def from_trajectory(scale: Array, rows: Array, R: Array, Phi_k0: Array) -> Grami
 
 
 def _added(state: Gramian, rows: Array, R: Array, Phi_k0: Array) -> Gramian:
-    white = np.linalg.solve(np.linalg.cholesky(R), rows)
-    n = state.scale.size
-    added = np.stack([rows.reshape(-1, n), white.reshape(-1, n)])
-    root, whitened = np.linalg.qr(np.concatenate([np.stack([state.root, state.white]), added], axis=1), mode="r")
+    n, more = state.scale.size, rows.shape[0] * rows.shape[1]
+    both = np.empty((2, n + more, n))  # of the rows as they are and of the whitened ones
+    both[0, :n], both[0, n:] = state.root, rows.reshape(-1, n)
+    both[1, :n], both[1, n:] = state.white, np.linalg.solve(np.linalg.cholesky(R), rows).reshape(-1, n)
+    root, whitened = np.linalg.qr(both, mode="r")
     return Gramian(root, whitened, Phi_k0, state.scale)
 
 

@@ -342,4 +342,4 @@ class Convergence:
 
     def _predicted(self, forecast: Forecast) -> bool:
         predicted = (forecast.pos_1s_m, forecast.vel_1s_mps, forecast.rot_1s_rad)
-        return all(bool(np.all(values <= limit)) for values, limit in zip(predicted, self._grasp_limits, strict=True))
+        return all(float(values.max()) <= limit for values, limit in zip(predicted, self._grasp_limits, strict=True))

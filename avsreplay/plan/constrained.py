@@ -159,9 +159,10 @@ def _free_plan(case: Case, free: Plan) -> Plan | None:
     times = np.linspace(case.wait_s, path.t_go_s, BETWEEN * limits.nodes + 1)
     if margins_at(case, path, times[::BETWEEN]).values.min() < 0.0:  # few instants show most violations
         return None
-    if not case.within_axes(path.thrust(times)):
+    if limits.accel_axes_mps2 is not None and not case.within_axes(path.thrust(times)):
         return None
-    if float(np.linalg.norm(path.at(times)[1], axis=1).max()) > (limits.speed_max_mps or math.inf):
+    speed = limits.speed_max_mps
+    if speed is not None and float(np.linalg.norm(path.at(times)[1], axis=1).max()) > speed:
         return None
     if limits.contact_accel_mps2 is not None:
         rate = case.scene.goal(np.array([path.t_go_s, path.t_go_s - 1e-4]))[1]
